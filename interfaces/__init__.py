@@ -1,0 +1,3 @@
+"""The Protocols and frozen records that all other packages speak."""
+
+from __future__ import annotations

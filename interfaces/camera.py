@@ -1,0 +1,38 @@
+"""A rectified stereo pair: two ideal pinholes side by side."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from .records import FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class StereoCalibration:
+    """A rectified stereo pair; the measurement frame is the left optical frame (x right, y down, z forward).
+
+    The right eye stands at (+baseline_m, 0, 0) in the left optical frame and looks the same way, so that
+    u_left = cx + f·x/z, u_right = cx + f·(x − baseline)/z and v = cy + f·y/z in both.
+
+    Attributes:
+        focal_px: focal length f of both eyes [px].
+        principal_point_px: (cx, cy) of both eyes; integer coordinates are pixel centres.
+        baseline_m: distance of the eyes [m].
+        image_size_px: (width, height).
+        pixel_sigma: 1-sigma of a marker centre's image coordinates, per coordinate [px].
+    """
+
+    focal_px: float
+    principal_point_px: tuple[float, float]
+    baseline_m: float
+    image_size_px: tuple[int, int]
+    pixel_sigma: float = 0.2
+
+    def project(self, x: FloatArray) -> FloatArray:
+        """Image coordinates (..., 4) as (ul, vl, ur, vr) [px] of points (..., 3) [m] in the left optical frame."""
+        cx, cy = self.principal_point_px
+        scale = self.focal_px / x[..., 2]
+        u_left, v = cx + scale * x[..., 0], cy + scale * x[..., 1]
+        return np.stack([u_left, v, u_left - scale * self.baseline_m, v], axis=-1)

@@ -1,0 +1,18 @@
+"""The machine's own clock."""
+
+from __future__ import annotations
+
+import time
+from datetime import UTC, datetime
+
+
+class SystemClock:
+    """The machine's monotonic and wall clocks."""
+
+    def now(self) -> float:
+        """Monotonic time [s]."""
+        return time.monotonic()
+
+    def utc(self) -> str:
+        """Wall-clock time, ISO 8601 in UTC."""
+        return datetime.now(UTC).isoformat(timespec="milliseconds")

@@ -1,0 +1,83 @@
+"""The capabilities that hardware, simulation and recordings share. Each has a contract test in tests/contracts."""
+
+from __future__ import annotations
+
+from types import TracebackType
+from typing import Protocol, Self, runtime_checkable
+
+from .camera import StereoCalibration
+from .records import JointReading, MarkerFix, MarkerMiss, StereoFrame
+
+
+class Clock(Protocol):
+    """Where the time stamps come from."""
+
+    def now(self) -> float:
+        """Monotonic time [s], the clock of all readings and frames."""
+        ...
+
+    def utc(self) -> str:
+        """Wall-clock time, ISO 8601 in UTC."""
+        ...
+
+
+class Source(Protocol):
+    """Something that is opened, read and closed. Opening happens in `__enter__`, never in `__init__`."""
+
+    def __enter__(self) -> Self: ...
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None: ...
+
+
+@runtime_checkable
+class JointSource(Source, Protocol):
+    """Joint encoders."""
+
+    @property
+    def joints(self) -> tuple[str, ...]:
+        """Names of the joints in the order of `q`."""
+        ...
+
+    def read(self, timeout_s: float) -> JointReading | None:
+        """The next reading, in strictly increasing time; None when none came within `timeout_s`.
+
+        Raises:
+            SourceEnded: there will be no more.
+            SourceLost: the device went away.
+        """
+        ...
+
+
+@runtime_checkable
+class StereoCamera(Source, Protocol):
+    """Two eyes on one clock with the encoders."""
+
+    @property
+    def calibration(self) -> StereoCalibration:
+        """The calibration the images belong to."""
+        ...
+
+    def read(self, timeout_s: float) -> StereoFrame | None:
+        """The next frame, in strictly increasing time; None when none came within `timeout_s`.
+
+        Raises:
+            SourceEnded: there will be no more.
+            SourceLost: the device went away.
+        """
+        ...
+
+
+@runtime_checkable
+class MarkerSource(Source, Protocol):
+    """The marker's position: a tracked camera, or a recording."""
+
+    def read(self, timeout_s: float) -> MarkerFix | MarkerMiss | None:
+        """The next fix or the reason why there is none, in strictly increasing time; None after `timeout_s`.
+
+        Raises:
+            SourceEnded: there will be no more.
+            SourceLost: the device went away.
+        """
+        ...

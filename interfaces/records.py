@@ -1,0 +1,117 @@
+"""What flows: readings, frames, fixes and pairs. Frozen; SI; arrays are float64 and read-only."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+FloatArray = NDArray[np.float64]
+ImageArray = NDArray[np.uint8]
+
+
+def frozen_array(values: ArrayLike) -> FloatArray:
+    """A read-only float64 copy of `values`."""
+    array = np.array(values, dtype=np.float64)
+    array.setflags(write=False)
+    return array
+
+
+class Reason(StrEnum):
+    """Why a frame or a fix did not become a pair. The names are the keys of the counters in `status`."""
+
+    NO_MARKER = "no_marker"  # nothing of the marker's colour, or too few pixels
+    AT_BORDER = "at_border"  # the marker touches the image border
+    OCCLUDED = "occluded"  # its outline is not a whole disc
+    EPIPOLAR = "epipolar"  # the two eyes' rows disagree
+    SIZE_MISMATCH = "size_mismatch"  # the two eyes' radii, or radius and depth, disagree
+    AMBIGUOUS = "ambiguous"  # more than one candidate fits
+    IMPLAUSIBLE_SPEED = "implausible_speed"  # farther from the last fix than a hand can move it
+    NO_JOINTS = "no_joints"  # no encoder readings around the frame's time
+    STALE = "stale"  # encoder readings around the frame's time too far apart
+    MOVING = "moving"  # joints too fast for the uncertainty of the time stamps
+    TOO_NEAR = "too_near"  # nearer than the smallest step to the predecessor: wait
+    PAUSED = "paused"  # an operator paused the sampler
+
+
+@dataclass(frozen=True, slots=True)
+class JointReading:
+    """One reading of all encoders.
+
+    Attributes:
+        t: time of the reading on the source's monotonic clock [s].
+        q: joint angles [rad] (m for a prismatic joint), shape (d,), in the robot description's order.
+    """
+
+    t: float
+    q: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class StereoFrame:
+    """Both eyes' images of one instant.
+
+    Attributes:
+        t: middle of the exposure on the same clock as the joint readings [s].
+        left, right: images, shape (height, width, 3), uint8, BGR as OpenCV has it. Pixel (i, j) (column, row)
+            covers the square around (i, j): its centre has the image coordinates u = i, v = j.
+    """
+
+    t: float
+    left: ImageArray
+    right: ImageArray
+
+
+@dataclass(frozen=True, slots=True)
+class MarkerFix:
+    """The marker's centre, found.
+
+    Attributes:
+        t: time of the image it comes from [s].
+        x: position in the measurement frame [m], shape (3,).
+        cov: its covariance [m²], shape (3, 3).
+        centres_px: (ul, vl, ur, vr), where the centre is seen by the left and the right eye, or None
+            when the source measures positions directly (a laser tracker, a recording).
+    """
+
+    t: float
+    x: FloatArray
+    cov: FloatArray
+    centres_px: tuple[float, float, float, float] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class MarkerMiss:
+    """A frame in which the marker was not found, or was doubtful."""
+
+    t: float
+    reason: Reason
+
+
+@dataclass(frozen=True, slots=True)
+class Pair:
+    """One training experience.
+
+    Attributes:
+        store: identity (UUID) of the store that numbered it.
+        seq: sequence number in that store, from 1, without gaps.
+        segment: a run of pairs each one step from its predecessor has one number.
+        t: time of the frame on the sampler's monotonic clock [s].
+        utc: wall-clock time of the acceptance, ISO 8601.
+        q: joint angles interpolated to the frame's time [rad], shape (d,).
+        x: marker position in the measurement frame [m], shape (3,).
+        cov: covariance of x [m²], shape (3, 3).
+        centres_px: as in `MarkerFix`.
+    """
+
+    store: str
+    seq: int
+    segment: int
+    t: float
+    utc: str
+    q: FloatArray
+    x: FloatArray
+    cov: FloatArray
+    centres_px: tuple[float, float, float, float] | None = None

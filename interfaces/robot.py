@@ -1,0 +1,199 @@
+"""robot.toml and its URDF: which joints, which camera, which marker."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import msgspec
+import numpy as np
+from kbmaps import RigidChain
+from msgspec import Meta
+from scipy.spatial.transform import Rotation
+
+from .camera import StereoCalibration
+from .errors import ConfigError, RobotError
+from .records import FloatArray, frozen_array
+from .toml_file import convert, line_of, read_toml
+from .urdf import MOVING, UrdfTree, chain_between
+
+Vector3 = tuple[float, float, float]
+Positive = Annotated[float, Meta(gt=0)]
+# One chunk of a zenoh key: no separators, no wild cards, and not the @ that hides a chunk from wild cards.
+Name = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.-]*$")]
+
+
+class RobotSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The table [robot].
+
+    Attributes:
+        name: the robot's name, one chunk of its zenoh keys.
+        urdf: the URDF file, relative to robot.toml.
+        joints: the joints that are read and learnt, in the order of q.
+        marker_link: the link that carries the marker.
+        marker_xyz: the marker in that link [m].
+        marker_known: False when the marker's place is only roughly known: fitted first, and not a finding.
+        hold: who bears the arm's weight while recording.
+        held_at: positions [rad or m] of other joints between camera and marker, which stand still; 0 where not named.
+    """
+
+    name: Name
+    urdf: str
+    joints: Annotated[tuple[str, ...], Meta(min_length=1)]
+    marker_link: str
+    marker_xyz: Vector3 = (0.0, 0.0, 0.0)
+    marker_known: bool = True
+    hold: Literal["torque_free", "zero_force", "held"] = "torque_free"
+    held_at: dict[str, float] = {}
+
+
+class CameraSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The table [camera]: the measurement frame, and the stereo geometry where there is one.
+
+    Attributes:
+        parent_link: the link the cameras stand on or ride on.
+        xyz, rpy: pose of the left optical frame in it [m], [rad], URDF convention.
+        pose_known: False when the instrument stands anywhere: fitted first, and not a finding.
+        focal_px, principal_point_px, baseline_m, image_size_px: the rectified stereo pair; all or none.
+        pixel_sigma: 1-sigma of a marker centre's image coordinates [px].
+    """
+
+    parent_link: str
+    xyz: Vector3 = (0.0, 0.0, 0.0)
+    rpy: Vector3 = (0.0, 0.0, 0.0)
+    pose_known: bool = True
+    focal_px: Positive | None = None
+    principal_point_px: tuple[float, float] | None = None
+    baseline_m: Positive | None = None
+    image_size_px: tuple[int, int] | None = None
+    pixel_sigma: Positive = 0.2
+
+    @property
+    def pose(self) -> FloatArray:
+        """Pose of the left optical frame in the parent link, shape (4, 4)."""
+        T = np.eye(4)
+        T[:3, :3] = Rotation.from_euler("xyz", self.rpy).as_matrix()
+        T[:3, 3] = self.xyz
+        return T
+
+
+@dataclass(frozen=True)
+class RobotDescription:
+    """A robot as its files describe it: the nominal model.
+
+    Attributes:
+        file: robot.toml.
+        tree: the URDF.
+        chain: measurement frame to marker over `joints`.
+        lower, upper: joint limits [rad or m], shape (d,).
+        calibration: the stereo pair, or None when [camera] does not describe one.
+    """
+
+    file: Path
+    robot: RobotSection
+    camera: CameraSection
+    tree: UrdfTree
+    chain: RigidChain
+    lower: FloatArray
+    upper: FloatArray
+    calibration: StereoCalibration | None
+
+    @classmethod
+    def load(cls, file: Path) -> RobotDescription:
+        """Read robot.toml and its URDF; the tables other than [robot] and [camera] are the daemon's to check.
+
+        Raises:
+            ConfigError: robot.toml cannot be read, or has an unknown, missing or wrong key (with its line).
+            RobotError: URDF and robot.toml do not fit each other.
+        """
+        tables, text = read_toml(file)
+        return cls.from_tables(tables, text, file)
+
+    @classmethod
+    def from_tables(cls, tables: dict[str, Any], text: str, file: Path) -> RobotDescription:
+        """As `load`, from the tables and the text of robot.toml."""
+        for section in ("robot", "camera"):
+            if section not in tables:
+                raise ConfigError(
+                    f"the table [{section}] is missing", file=file, remedy="`bodyschema config init` shows one"
+                )
+        robot = convert(tables["robot"], RobotSection, file=file, text=text, prefix=("robot",))
+        camera = convert(tables["camera"], CameraSection, file=file, text=text, prefix=("camera",))
+        try:
+            return cls._assemble(robot, camera, file)
+        except RobotError as error:
+            if error.file is not None:
+                raise
+            line = line_of(text, ("camera" if "camera" in error.what else "robot",))
+            raise RobotError(
+                error.what, file=file, line=_line_naming(text, error.what) or line, remedy=error.remedy
+            ) from None
+
+    @classmethod
+    def _assemble(cls, robot: RobotSection, camera: CameraSection, file: Path) -> RobotDescription:
+        if len(set(robot.joints)) != len(robot.joints):
+            raise RobotError("joints names a joint twice")
+        tree = UrdfTree.load(file.parent / robot.urdf)
+        limits = [tree.joint(name) for name in robot.joints]
+        for joint in limits:
+            if joint.kind not in MOVING:
+                raise RobotError(f"joint {joint.name!r} is fixed", remedy="Take it out of joints")
+        for name in robot.held_at:
+            tree.joint(name)
+        tree.require_link(camera.parent_link)
+        tree.require_link(robot.marker_link)
+        chain = chain_between(
+            tree,
+            robot.joints,
+            robot.held_at,
+            start=camera.parent_link,
+            end=robot.marker_link,
+            T_start_camera=camera.pose,
+            marker_xyz=np.array(robot.marker_xyz),
+        )
+        return cls(
+            file=file,
+            robot=robot,
+            camera=camera,
+            tree=tree,
+            chain=chain,
+            lower=frozen_array([joint.lower for joint in limits]),
+            upper=frozen_array([joint.upper for joint in limits]),
+            calibration=_calibration(camera),
+        )
+
+    @property
+    def name(self) -> str:
+        """The robot's name."""
+        return self.robot.name
+
+    @property
+    def joints(self) -> tuple[str, ...]:
+        """Names of the joints in the order of q."""
+        return self.robot.joints
+
+
+def _calibration(camera: CameraSection) -> StereoCalibration | None:
+    parts = {
+        "focal_px": camera.focal_px,
+        "principal_point_px": camera.principal_point_px,
+        "baseline_m": camera.baseline_m,
+        "image_size_px": camera.image_size_px,
+    }
+    missing = [name for name, value in parts.items() if value is None]
+    if len(missing) == len(parts):
+        return None
+    if missing:
+        raise RobotError(
+            f"the stereo camera is described in part: {', '.join(missing)} missing", remedy="Give all or none"
+        )
+    return StereoCalibration(**parts, pixel_sigma=camera.pixel_sigma)  # pyright: ignore[reportArgumentType]
+
+
+def _line_naming(text: str, message: str) -> int | None:
+    names = [part for part in message.split("'")[1::2] if part]
+    for number, line in enumerate(text.splitlines(), 1):
+        if any(f'"{name}"' in line or f"'{name}'" in line for name in names):
+            return number
+    return None

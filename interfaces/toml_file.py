@@ -1,0 +1,106 @@
+"""TOML files into typed structs, with errors that name the line to mend."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from pathlib import Path
+from typing import Any, TypeVar
+
+import msgspec
+
+from .errors import ConfigError
+from .suggest import did_you_mean
+
+T = TypeVar("T")
+
+_UNKNOWN = re.compile(r"Object contains unknown field `(?P<field>[^`]*)`(?: - at `\$(?P<path>[^`]*)`)?")
+_HEADER = re.compile(r"\s*\[\[?([^\]]+)\]\]?")
+_KEY = re.compile(r"\s*([A-Za-z0-9_.\"'-]+)\s*=")
+_PLACE = re.compile(r"(?P<what>.*?) - at `\$(?P<path>[^`]*)`$", re.DOTALL)
+
+
+def read_toml(file: Path) -> tuple[dict[str, Any], str]:
+    """The tables of `file` and its text; ConfigError with the line when it cannot be read."""
+    try:
+        text = file.read_text(encoding="utf-8")
+    except FileNotFoundError as error:
+        raise ConfigError("there is no such file", file=file, remedy="`bodyschema config init` writes one") from error
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"cannot be read: {error}", file=file) from error
+    try:
+        return tomllib.loads(text), text
+    except tomllib.TOMLDecodeError as error:
+        line = re.search(r"line (\d+)", str(error))
+        raise ConfigError(f"not TOML: {error}", file=file, line=int(line[1]) if line else None) from error
+
+
+def convert(tables: object, kind: type[T], *, file: Path, text: str, prefix: tuple[str, ...] = ()) -> T:
+    """`tables` as the struct `kind`; ConfigError with the line when something is unknown, missing or wrong.
+
+    Args:
+        prefix: the keys under which `tables` stands in the file.
+    """
+    try:
+        return msgspec.convert(tables, kind)
+    except msgspec.ValidationError as error:
+        raise _located(str(error), kind, file, text, prefix) from error
+
+
+def line_of(text: str, keys: tuple[str, ...]) -> int | None:
+    """The line (from 1) that gives the longest leading part of the key path `keys`; None when no line gives any."""
+    best: int | None = None
+    longest = 0
+    table: tuple[str, ...] = ()
+    for number, line in enumerate(text.splitlines(), 1):
+        header, key = _HEADER.match(line), _KEY.match(line)
+        if header:
+            table = given = _dotted(header[1])
+        elif key:
+            given = table + _dotted(key[1])
+        else:
+            continue
+        if len(given) > longest and given == keys[: len(given)]:
+            best, longest = number, len(given)
+    return best
+
+
+def _dotted(key: str) -> tuple[str, ...]:
+    return tuple(part.strip().strip("\"'") for part in key.split("."))
+
+
+def _located(message: str, kind: type, file: Path, text: str, prefix: tuple[str, ...]) -> ConfigError:
+    unknown = _UNKNOWN.match(message)
+    if unknown:
+        keys = prefix + _keys(unknown["path"] or "")
+        field = unknown["field"]
+        where = ".".join(keys)
+        return ConfigError(
+            f"unknown key {field!r}{f' in [{where}]' if where else ''}",
+            file=file,
+            line=line_of(text, (*keys, field)),
+            remedy=did_you_mean(field, _fields(kind, _keys(unknown["path"] or ""))),
+        )
+    place = _PLACE.match(message)
+    keys = prefix + _keys(place["path"] if place else "")
+    what = place["what"] if place else message
+    named = f"{'.'.join(keys)}: " if keys else ""
+    return ConfigError(f"{named}{what[:1].lower()}{what[1:]}", file=file, line=line_of(text, keys) if keys else None)
+
+
+def _keys(path: str) -> tuple[str, ...]:
+    return tuple(part for part in re.sub(r"\[[^\]]*\]", "", path).split(".") if part)
+
+
+def _fields(kind: Any, keys: tuple[str, ...]) -> list[str]:
+    for key in keys:
+        hints = {field.encode_name: field.type for field in msgspec.structs.fields(kind)}
+        kind = _struct_of(hints.get(key))
+        if kind is None:
+            return []
+    return [field.encode_name for field in msgspec.structs.fields(kind)]
+
+
+def _struct_of(hint: Any) -> Any:
+    candidates = [hint, *getattr(hint, "__args__", ())]
+    return next((c for c in candidates if isinstance(c, type) and issubclass(c, msgspec.Struct)), None)
