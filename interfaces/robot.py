@@ -8,9 +8,10 @@ from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
-from kbmaps import RigidChain
 from msgspec import Meta
 from scipy.spatial.transform import Rotation
+
+from kbmaps import RigidChain
 
 from .camera import StereoCalibration
 from .errors import ConfigError, RobotError

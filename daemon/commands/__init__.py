@@ -1,0 +1,3 @@
+"""One module per command; each imports what it needs when it runs, so that `bodyschema --help` stays quick."""
+
+from __future__ import annotations

@@ -1,0 +1,162 @@
+"""robot.toml as a whole: one file, a table for each package, unknown keys refused.
+
+Precedence: what the command line says, then the environment (`BODYSCHEMA_<TABLE>_<KEY>`, a TOML value or a bare
+word), then the file.
+"""
+
+from __future__ import annotations
+
+import os
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import msgspec
+from msgspec import Meta
+
+from drivers.config import DriversConfig
+from interfaces.errors import ConfigError
+from interfaces.robot import RobotDescription
+from interfaces.suggest import did_you_mean
+from interfaces.toml_file import convert, line_of, read_toml
+from sim_backend.config import SimConfig
+from vision.config import VisionConfig
+
+Endpoint = Annotated[str, Meta(pattern=r"^[a-z0-9-]+/.+")]
+NonNegative = Annotated[float, Meta(ge=0)]
+Positive = Annotated[float, Meta(gt=0)]
+Count = Annotated[int, Meta(ge=1)]
+
+ENVIRONMENT = "BODYSCHEMA_"
+
+
+class ZenohConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The table [zenoh]: where the two processes listen."""
+
+    sampler: Endpoint = "tcp/127.0.0.1:7447"
+    learner: Endpoint = "tcp/127.0.0.1:7448"
+
+
+class DaemonConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The table [daemon]: the sampler's rules, and where state is kept.
+
+    Attributes:
+        state_dir: where store and checkpoint live, relative to robot.toml; by default
+            $XDG_STATE_HOME/bodyschema/<robot name>.
+        min_step_deg, max_step_deg: Euclidean norm over all joints of the step between neighbouring pairs. Nearer:
+            wait. Farther: a new segment. Prismatic joints count with `metres_per_degree`.
+        metres_per_degree: how far a prismatic joint moves for what counts as one degree.
+        any_step: accept every pair whatever its step (recordings of static poses far apart); each starts a segment
+            of its own where the step is larger than `max_step_deg`.
+        max_reading_gap_s: encoder readings around a frame may be this far apart.
+        max_marker_speed_m_s: a marker that moved faster since its last fix is not believed.
+        segment_gap_s: a pause between pairs longer than this starts a new segment.
+    """
+
+    state_dir: str | None = None
+    min_step_deg: Positive = 1.0
+    max_step_deg: Positive = 3.0
+    metres_per_degree: Positive = 0.005
+    any_step: bool = False
+    max_reading_gap_s: Positive = 0.1
+    max_marker_speed_m_s: Positive = 3.0
+    segment_gap_s: Positive = 1.0
+
+
+class LearnerConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The table [learner].
+
+    Attributes:
+        step_size: μ0 of the normalised LMS rule, between 0 and 2.
+        replays_per_pair: how often stored pairs are learnt again, on average, for every new one.
+        replay_capacity: how many of the newest pairs are kept for replay.
+        solve_every: the exact solver's map is refreshed after so many new pairs.
+        checkpoint_every_s: time between checkpoints.
+        seed: of the replay's permutations.
+    """
+
+    step_size: Annotated[float, Meta(gt=0, lt=2)] = 0.5
+    replays_per_pair: NonNegative = 8.0
+    replay_capacity: Count = 20_000
+    solve_every: Count = 25
+    checkpoint_every_s: Positive = 5.0
+    seed: int = 0
+
+
+class Tables(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """All tables of robot.toml; [robot] and [camera] are checked by `interfaces.robot`."""
+
+    robot: dict[str, Any]
+    camera: dict[str, Any]
+    zenoh: ZenohConfig = ZenohConfig()
+    daemon: DaemonConfig = DaemonConfig()
+    drivers: DriversConfig = DriversConfig()
+    vision: VisionConfig = VisionConfig()
+    learner: LearnerConfig = LearnerConfig()
+    sim: SimConfig = SimConfig()
+
+
+@dataclass(frozen=True)
+class Config:
+    """Everything that robot.toml says, checked."""
+
+    file: Path
+    robot: RobotDescription
+    tables: Tables
+
+    @classmethod
+    def load(cls, file: Path, environment: Mapping[str, str] = os.environ) -> Config:
+        """Read robot.toml, its URDF and the environment.
+
+        Raises:
+            ConfigError: something is unknown, missing or wrong; the message names file, line, key and remedy.
+        """
+        raw, text = read_toml(file)
+        known = [field.encode_name for field in msgspec.structs.fields(Tables)]
+        for name in raw:
+            if name not in known:
+                line = line_of(text, (name,))
+                raise ConfigError(f"unknown table [{name}]", file=file, line=line, remedy=did_you_mean(name, known))
+        overridden = _override(raw, known, environment)
+        robot = RobotDescription.from_tables(overridden, text, file)
+        tables = convert(overridden, Tables, file=file, text=text)
+        if tables.daemon.min_step_deg >= tables.daemon.max_step_deg:
+            line = line_of(text, ("daemon", "min_step_deg"))
+            raise ConfigError("min_step_deg is not below max_step_deg", file=file, line=line)
+        return cls(file, robot, tables)
+
+    @property
+    def state_dir(self) -> Path:
+        """Where store and checkpoint live."""
+        if self.tables.daemon.state_dir is not None:
+            return (self.file.parent / self.tables.daemon.state_dir).resolve()
+        home = os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state"
+        return Path(home) / "bodyschema" / self.robot.name
+
+    @property
+    def store_file(self) -> Path:
+        """The sampler's pairs."""
+        return self.state_dir / "pairs.sqlite"
+
+    @property
+    def checkpoint_file(self) -> Path:
+        """The learner's state."""
+        return self.state_dir / "learner.ckpt"
+
+
+def _override(raw: dict[str, Any], known: list[str], environment: Mapping[str, str]) -> dict[str, Any]:
+    merged = {name: dict(table) if isinstance(table, dict) else table for name, table in raw.items()}
+    for variable, value in environment.items():
+        table, _, key = variable.removeprefix(ENVIRONMENT).lower().partition("_")
+        if variable.startswith(ENVIRONMENT) and table in known and key:
+            merged.setdefault(table, {})[key] = _toml_value(value)
+    return merged
+
+
+def _toml_value(text: str) -> Any:
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        return text

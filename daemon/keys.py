@@ -1,0 +1,57 @@
+"""The zenoh keys of one robot."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class Keys:
+    """Keys under `bodyschema/<robot name>/`."""
+
+    robot: str
+
+    def _key(self, name: str) -> str:
+        return f"bodyschema/{self.robot}/{name}"
+
+    @property
+    def pair(self) -> str:
+        """Publication of accepted pairs."""
+        return self._key("pair")
+
+    @property
+    def pairs(self) -> str:
+        """Stored pairs: `pairs?from=SEQ;to=SEQ`, answered by the sampler."""
+        return self._key("pairs")
+
+    @property
+    def predict(self) -> str:
+        """Joint angles to marker positions, answered by the learner."""
+        return self._key("predict")
+
+    @property
+    def jacobian(self) -> str:
+        """Joint angles to Jacobians, answered by the learner."""
+        return self._key("jacobian")
+
+    @property
+    def model(self) -> str:
+        """The model as one self-describing file, answered by the learner."""
+        return self._key("model")
+
+    @property
+    def simulation(self) -> str:
+        """The simulated world: its truth and its tool; there only with --sim, and nothing that learns asks it."""
+        return self._key("simulation")
+
+    def status(self, process: str) -> str:
+        """State of `sampler` or `learner`, as a publication and a queryable."""
+        return self._key(f"status/{process}")
+
+    def command(self, process: str) -> str:
+        """Commands to `sampler` or `learner`."""
+        return self._key(f"command/{process}")
+
+    def alive(self, process: str) -> str:
+        """Liveliness token of `sampler` or `learner`."""
+        return self._key(f"alive/{process}")

@@ -1,0 +1,191 @@
+"""What goes over zenoh. JSON unless the request's encoding asks for MessagePack; every message carries its schema's number.
+
+Requests are checked for unknown keys; replies and publications may grow keys, so readers ignore what they do not know.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal, TypeVar
+
+import msgspec
+import numpy as np
+from msgspec import Meta
+
+from interfaces.errors import RequestError
+from interfaces.records import Pair, frozen_array
+
+JSON = "application/json"
+MSGPACK = "application/msgpack"
+SCHEMA = 1
+LARGEST_BATCH = 10_000
+
+M = TypeVar("M")
+
+_json_encoder = msgspec.json.Encoder()
+_msgpack_encoder = msgspec.msgpack.Encoder()
+
+
+class PairMessage(msgspec.Struct, frozen=True):
+    """One pair: units and frames as in `interfaces.records.Pair`; `cov` is the upper triangle row by row [m²]."""
+
+    store: str
+    seq: Annotated[int, Meta(ge=1)]
+    segment: int
+    t: float
+    utc: str
+    q: list[float]
+    x: tuple[float, float, float]
+    cov: tuple[float, float, float, float, float, float]
+    R: tuple[float, float, float, float] | None = None
+    schema: int = SCHEMA
+
+
+class PairsReply(msgspec.Struct, frozen=True):
+    """Stored pairs in order. `last_seq` is the newest pair in the store: ask again from where the reply ends."""
+
+    store: str
+    last_seq: int
+    pairs: list[PairMessage]
+    schema: int = SCHEMA
+
+
+class JointsRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """`{"q": [rad…]}` or `{"q": [[rad…]…]}`."""
+
+    q: list[float] | list[list[float]]
+
+
+class PredictReply(msgspec.Struct, frozen=True):
+    """Predictions, a row for each row of the request.
+
+    Attributes:
+        x: marker positions in the measurement frame [m].
+        sigma: their 1-sigma per axis [m].
+        in_support: whether the joint angles lie where data was.
+        model: hash of the model that answered.
+        pairs: how many pairs it had learnt.
+        age_s: time since the last of them, or null before any.
+    """
+
+    x: list[list[float]]
+    sigma: list[list[float]]
+    in_support: list[bool]
+    model: str
+    pairs: int
+    age_s: float | None
+    R: None = None
+    schema: int = SCHEMA
+
+
+class JacobianReply(msgspec.Struct, frozen=True):
+    """Jacobians dx/dq [m/rad], a 3 × d matrix for each row of the request."""
+
+    J: list[list[list[float]]]
+    model: str
+    pairs: int
+    schema: int = SCHEMA
+
+
+class CommandRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A command to one of the processes; which it knows is in its documentation."""
+
+    command: Literal["pause", "resume", "reset_to_prior", "tool_changed", "checkpoint"]
+
+
+class CommandReply(msgspec.Struct, frozen=True):
+    """The command was carried out; `message` says what that meant."""
+
+    command: str
+    message: str
+    schema: int = SCHEMA
+
+
+class ErrorReply(msgspec.Struct, frozen=True):
+    """What was wrong with a request; nothing was changed."""
+
+    error: str
+    schema: int = SCHEMA
+
+
+def encode(message: object, encoding: str = JSON) -> bytes:
+    """A message's bytes in `encoding`."""
+    return _msgpack_encoder.encode(message) if encoding == MSGPACK else _json_encoder.encode(message)
+
+
+def decode(payload: bytes, kind: type[M], encoding: str = JSON) -> M:
+    """The message in `payload`.
+
+    Raises:
+        RequestError: it is not of this kind; the message says where.
+    """
+    try:
+        decoder: Any = msgspec.msgpack if encoding == MSGPACK else msgspec.json
+        return decoder.decode(payload, type=kind)
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise RequestError(f"not a {kind.__name__}: {error}") from error
+
+
+def pair_to_wire(pair: Pair) -> PairMessage:
+    """A pair as its message."""
+    xx, xy, xz, yy, yz, zz = pair.cov[np.triu_indices(3)].tolist()
+    x, y, z = pair.x.tolist()
+    return PairMessage(
+        store=pair.store,
+        seq=pair.seq,
+        segment=pair.segment,
+        t=pair.t,
+        utc=pair.utc,
+        q=pair.q.tolist(),
+        x=(x, y, z),
+        cov=(xx, xy, xz, yy, yz, zz),
+    )
+
+
+def pair_from_wire(message: PairMessage, joints: int) -> Pair:
+    """A message as a pair.
+
+    Raises:
+        RequestError: it has another number of joints, or a number that is not finite.
+    """
+    q = np.array(message.q)
+    numbers = np.concatenate([q, message.x, message.cov, [message.t]])
+    if len(q) != joints:
+        raise RequestError(f"pair {message.seq} has {len(q)} joint angles, this robot has {joints}")
+    if not np.isfinite(numbers).all():
+        raise RequestError(f"pair {message.seq} has a number that is not finite")
+    cov = np.zeros((3, 3))
+    cov[np.triu_indices(3)] = message.cov
+    return Pair(
+        store=message.store,
+        seq=message.seq,
+        segment=message.segment,
+        t=message.t,
+        utc=message.utc,
+        q=frozen_array(q),
+        x=frozen_array(message.x),
+        cov=frozen_array(cov + np.triu(cov, 1).T),
+    )
+
+
+def joint_angles(request: JointsRequest, joints: tuple[str, ...]) -> np.ndarray:
+    """The request's joint angles, shape (n, d) [rad].
+
+    Raises:
+        RequestError: a row of the wrong length, a number that is not finite, an empty or too large batch.
+    """
+    rows = request.q if request.q and isinstance(request.q[0], list) else [request.q]
+    if not request.q:
+        raise RequestError("q is empty; send one vector of joint angles or a list of them")
+    if len(rows) > LARGEST_BATCH:
+        raise RequestError(f"q has {len(rows)} rows; send at most {LARGEST_BATCH} at once")
+    for number, row in enumerate(rows):
+        if not isinstance(row, list) or len(row) != len(joints):
+            length = len(row) if isinstance(row, list) else 1
+            raise RequestError(
+                f"row {number} of q has {length} numbers; this robot has {len(joints)} joints: {', '.join(joints)}"
+            )
+    q = np.array(rows, dtype=np.float64)
+    if not np.isfinite(q).all():
+        row, column = np.argwhere(~np.isfinite(q))[0]
+        raise RequestError(f"row {row} of q is not finite at joint {joints[column]!r}")
+    return q
