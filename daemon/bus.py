@@ -188,7 +188,7 @@ class Bus:
         asked = str(query.encoding) if query.encoding is not None else JSON
         encoding = MSGPACK if asked.startswith(MSGPACK) else JSON
         payload = query.payload.to_bytes() if query.payload is not None else b""
-        parameters = {name: value for name, value in _parameters(str(query.parameters))}
+        parameters = dict(_parameters(str(query.parameters)))
         try:
             answer = handler(Request(parameters, payload, encoding))
         except BodyschemaError as error:
