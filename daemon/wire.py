@@ -1,4 +1,4 @@
-"""What goes over zenoh: JSON, or MessagePack when the request's encoding asks for it. Every message has a schema number.
+"""What goes over zenoh: JSON, or MessagePack when the request asks for it. Every message carries a schema number.
 
 Requests are checked for unknown keys; replies and publications may grow keys, so readers ignore what they do not know.
 """
