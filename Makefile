@@ -1,0 +1,50 @@
+# Everything a newcomer needs: make demo, make test. Each sets up .venv first when it is missing or out of date.
+PYTHON ?= $(shell command -v python3.11 || command -v python3)
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+export OPENBLAS_NUM_THREADS ?= 1
+
+.PHONY: help setup demo test check soak bench lock wheel clean
+
+help:           ## Show this list
+	@grep -E '^[a-z]+: .*##|^[a-z]+:  *##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 10
+
+setup: $(STAMP) ## Set up .venv with everything, the command is then .venv/bin/bodyschema
+
+$(STAMP): pyproject.toml requirements.lock
+	@$(PYTHON) -c 'import sys; sys.exit(0 if sys.version_info[:2] == (3, 11) else "bodyschema is developed with Python 3.11 (its simulator, pybullet, has wheels for no newer one). Install python3.11, or name it: make PYTHON=/path/to/python3.11 ...")'
+	@echo "Setting up $(VENV) (about 250 MB are downloaded the first time; one to two minutes)"
+	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	@$(BIN)/python -m pip install --disable-pip-version-check --quiet --only-binary :all: --require-hashes -r requirements.lock
+	@$(BIN)/python -m pip install --disable-pip-version-check --quiet --no-deps --no-build-isolation -e .
+	@touch $@
+
+demo: setup     ## Watch the whole thing learn in simulation, about a minute
+	@$(BIN)/bodyschema demo
+
+test: setup     ## Run the tests
+	@$(BIN)/python -m pytest
+
+check: setup    ## Lint: ruff, pyright, import-linter
+	@$(BIN)/ruff check .
+	@$(BIN)/ruff format --check .
+	@$(BIN)/pyright
+	@$(BIN)/lint-imports
+
+soak: setup     ## The long tests: many seeds, many kills
+	@$(BIN)/python -m pytest -m soak --timeout 3600
+
+bench: setup    ## Side-by-side figures, as ratios within one run
+	@set -e; for file in benchmarks/[a-z]*.py; do echo; echo "== $$file"; $(BIN)/python $$file; done
+
+lock:           ## Renew requirements.lock from pyproject.toml
+	@$(BIN)/python -m pip install --disable-pip-version-check --quiet uv
+	@$(BIN)/uv pip compile --quiet --upgrade --python-version 3.11 --extra sim --extra export --extra dev \
+		--generate-hashes --no-emit-index-url --no-annotate --no-header pyproject.toml -o requirements.lock
+
+wheel: setup    ## Build the wheel into dist/
+	@$(BIN)/python -m build --no-isolation --wheel
+
+clean:          ## Remove .venv and what was built
+	rm -rf $(VENV) dist build
