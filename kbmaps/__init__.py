@@ -1,0 +1,46 @@
+"""Kinematic Bézier Maps: forward kinematics that is linear in its parameters, and learners for it.
+
+Numpy and scipy only; no I/O, no clock, no logging. Angles [rad], lengths [m], float64.
+"""
+
+from kbmaps.align import Alignment, align
+from kbmaps.basis import JointBasis, learning_bases
+from kbmaps.chain import RigidChain
+from kbmaps.errors import (
+    BasisError,
+    ChainError,
+    DegenerateDataError,
+    KBMapsError,
+    ModelFormatError,
+    NonFiniteError,
+    SettingError,
+    ShapeError,
+    SingularAlphaError,
+)
+from kbmaps.exact import ExactLearner, ExactSolution
+from kbmaps.kbmap import KBMap, prediction_errors
+from kbmaps.nlms import NLMS
+from kbmaps.support import SupportSet
+
+__all__ = [
+    "NLMS",
+    "Alignment",
+    "BasisError",
+    "ChainError",
+    "DegenerateDataError",
+    "ExactLearner",
+    "ExactSolution",
+    "JointBasis",
+    "KBMap",
+    "KBMapsError",
+    "ModelFormatError",
+    "NonFiniteError",
+    "RigidChain",
+    "SettingError",
+    "ShapeError",
+    "SingularAlphaError",
+    "SupportSet",
+    "align",
+    "learning_bases",
+    "prediction_errors",
+]

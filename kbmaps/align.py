@@ -1,0 +1,231 @@
+"""Best rigid fit of a nominal chain to measurements: instrument pose, marker offset, or both."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from kbmaps.arrays import BoolArray, FloatArray, frozen, rows
+from kbmaps.chain import RigidChain, cross_matrix
+from kbmaps.errors import DegenerateDataError, SettingError, ShapeError
+
+# A residual norm of noise σ per axis has the median 1.538 σ in three dimensions.
+_MEDIAN_NORM = 1.538
+# Pairs beyond this many σ count as outliers; 7 σ leave out less than one good pair in a million.
+_OUTLIER_SIGMAS = 7.0
+_ROUNDS = 60
+_STEP_TOLERANCE = 1e-12
+# Singular values below this share of the largest are directions that the data do not determine.
+_RANK_TOLERANCE = 1e-7
+# No residual below a nanometre makes an outlier: on noise-free data that is rounding.
+_ROUNDING_M = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Alignment:
+    """A nominal chain fitted to measured pairs by rigid motion alone.
+
+    Attributes:
+        chain: the nominal chain with what was fitted built in.
+        T_measured_nominal: pose (4, 4) of the nominal measurement frame in the real one; identity if it was known.
+        marker_shift: move of the marker (3,) [m] in the marker frame; zero if it was known.
+        rms: RMS distance [m] between the fitted chain and the pairs that are no outliers.
+        inliers: which pairs (n,) are no outliers.
+    """
+
+    chain: RigidChain
+    T_measured_nominal: FloatArray
+    marker_shift: FloatArray
+    rms: float
+    inliers: BoolArray
+
+
+@dataclass
+class _Fit:
+    """The present estimate for nominal poses: x ≈ rotation (p + R δ) + translation."""
+
+    nominal_rotations: FloatArray
+    nominal_positions: FloatArray
+    x: FloatArray
+    fit_pose: bool
+    fit_marker: bool
+    rotation: FloatArray
+    translation: FloatArray
+    shift: FloatArray
+
+    def markers(self) -> FloatArray:
+        """Marker positions (n, 3) in the nominal frame."""
+        return self.nominal_positions + self.nominal_rotations @ self.shift
+
+    def errors(self) -> FloatArray:
+        return self.x - (self.markers() @ self.rotation.T + self.translation)
+
+    def place(self, weights: FloatArray) -> None:
+        """The best pose for the present marker."""
+        self.rotation, self.translation = rigid_motion(self.markers(), self.x, weights)
+
+    def improve(self, weights: FloatArray) -> float:
+        """One weighted Gauss-Newton step in all that is fitted; returns its size (rad and m added)."""
+        turned = self.markers() @ self.rotation.T
+        columns: list[FloatArray] = []
+        if self.fit_pose:
+            # rotation ← exp(ω) rotation moves a point by ω × point = −[point]× ω.
+            columns += [-np.stack([cross_matrix(point) for point in turned]), np.tile(np.eye(3), (len(turned), 1, 1))]
+        if self.fit_marker:
+            columns.append(self.rotation @ self.nominal_rotations)
+        root = np.sqrt(weights)[:, None]
+        design = (np.concatenate(columns, axis=2) * root[:, :, None]).reshape(3 * len(turned), -1)
+        step = np.linalg.lstsq(design, (self.errors() * root).ravel(), rcond=_RANK_TOLERANCE)[0]
+        if self.fit_pose:
+            self.rotation = _exp(step[:3]) @ self.rotation
+            self.translation = self.translation + step[3:6]
+        if self.fit_marker:
+            self.shift = self.shift + step[-3:]
+        return float(np.abs(step).sum())
+
+
+def align(
+    chain: RigidChain,
+    q: ArrayLike,
+    x: ArrayLike,
+    *,
+    pose_known: bool,
+    marker_known: bool,
+    sigma: float | None = None,
+) -> Alignment:
+    """Fits what is not known of the instrument's pose and the marker's place to measured pairs.
+
+    Needs no first guess and withstands gross outliers. The final fit is plain least squares over the pairs that are
+    no outliers. Where pose and marker can make up for each other (a chain whose last frame hardly turns), the
+    combination that changes the nominal chain least is returned.
+
+    Args:
+        chain: the nominal chain.
+        q: joint angles (n, d) [rad, m].
+        x: measured marker positions (n, 3) [m].
+        pose_known: the instrument stands where the chain says.
+        marker_known: the marker sits where the chain says.
+        sigma: noise of one coordinate [m], if known: nothing within 7 sigma is ever called an outlier.
+
+    Raises:
+        ShapeError, NonFiniteError
+        SettingError: sigma is not positive.
+        DegenerateDataError: too few pairs, or positions on one line.
+    """
+    angles, positions = rows("q", q, chain.joints), rows("x", x, 3)
+    if len(angles) != len(positions):
+        raise ShapeError("x", f"({len(angles)}, 3) to go with q", positions.shape)
+    if sigma is not None and not (sigma > 0.0 and math.isfinite(sigma)):
+        raise SettingError(f"sigma must be finite and greater than 0, got {sigma!r}")
+    _check_enough(len(angles), pose_known, marker_known)
+    poses = chain.poses(angles)
+    fit = _Fit(
+        poses[:, :3, :3],
+        poses[:, :3, 3],
+        positions,
+        not pose_known,
+        not marker_known,
+        np.eye(3),
+        np.zeros(3),
+        np.zeros(3),
+    )
+    if fit.fit_pose:
+        _check_spread(positions, "the measured positions x")
+        if marker_known:
+            _check_spread(fit.nominal_positions, "the nominal marker positions at q")
+    inliers = np.ones(len(angles), dtype=np.bool_)
+    if fit.fit_pose or fit.fit_marker:
+        inliers = _fit_robustly(fit, sigma or 0.0)
+    return _alignment(chain, fit, inliers)
+
+
+def rigid_motion(points: FloatArray, targets: FloatArray, weights: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """The proper rotation (3, 3) and translation (3,) that take points (n, 3) nearest to targets, in closed form.
+
+    Kabsch 1976, "A solution for the best rotation to relate two sets of vectors".
+    """
+    share = weights / weights.sum()
+    centre_points, centre_targets = share @ points, share @ targets
+    covariance = (points - centre_points).T @ ((targets - centre_targets) * share[:, None])
+    u, _, vt = np.linalg.svd(covariance)
+    handed = np.diag([1.0, 1.0, float(np.sign(np.linalg.det(u @ vt)))])
+    rotation = vt.T @ handed @ u.T
+    return rotation, centre_targets - rotation @ centre_points
+
+
+def _fit_robustly(fit: _Fit, sigma: float) -> BoolArray:
+    """Improves `fit` by graduated non-convexity, then by least squares on the inliers, which it returns (n,).
+
+    Geman-McClure weights whose scale shrinks from the largest residual to the bulk's (Yang et al. 2020, "Graduated
+    Non-Convexity for Robust Spatial Perception"): the first fits are nearly least squares and need no good guess.
+    """
+    weights = np.ones(len(fit.x))
+    if fit.fit_pose:
+        fit.place(weights)
+    norms = np.linalg.norm(fit.errors(), axis=1)
+    scale = float(norms.max())
+    for _ in range(_ROUNDS):
+        goal = 3.0 * _spread(norms, sigma)
+        scale = max(scale / 1.4, goal)
+        weights = (scale**2 / (scale**2 + norms**2)) ** 2 if scale > 0.0 else weights
+        step = fit.improve(weights)
+        norms = np.linalg.norm(fit.errors(), axis=1)
+        if scale == goal and step < _STEP_TOLERANCE:
+            break
+    inliers = np.ones(len(fit.x), dtype=np.bool_)
+    for _ in range(_ROUNDS):
+        chosen = norms <= max(_OUTLIER_SIGMAS * _spread(norms, sigma), _ROUNDING_M)
+        step = fit.improve(chosen.astype(np.float64))
+        norms = np.linalg.norm(fit.errors(), axis=1)
+        settled = bool((chosen == inliers).all()) and step < _STEP_TOLERANCE
+        inliers = chosen
+        if settled:
+            break
+    return inliers
+
+
+def _spread(norms: FloatArray, sigma: float) -> float:
+    """Standard deviation of one coordinate's error: from the median distance, at least sigma [m]."""
+    return max(float(np.median(norms)) / _MEDIAN_NORM, sigma)
+
+
+def _alignment(chain: RigidChain, fit: _Fit, inliers: BoolArray) -> Alignment:
+    transform = np.eye(4)
+    transform[:3, :3], transform[:3, 3] = fit.rotation, fit.translation
+    square = np.square(fit.errors()).sum(axis=1)[inliers]
+    inliers.flags.writeable = False
+    fitted = chain.with_tool(fit.shift).transformed(transform)
+    return Alignment(fitted, frozen(transform), frozen(fit.shift), math.sqrt(float(square.mean())), inliers)
+
+
+def _check_enough(pairs: int, pose_known: bool, marker_known: bool) -> None:
+    needed = 1 if pose_known else 3 if marker_known else 4
+    if pairs < needed:
+        missing = " and ".join(
+            name
+            for name, known in (("the instrument's pose", pose_known), ("the marker's place", marker_known))
+            if not known
+        )
+        raise DegenerateDataError(
+            f"fitting {missing or 'nothing'} needs at least {needed} pairs, got {pairs}; record more"
+        )
+
+
+def _check_spread(points: FloatArray, what: str) -> None:
+    singular = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    if not singular[1] > 1e-6 * max(float(singular[0]), 1e-6):
+        raise DegenerateDataError(
+            f"{what} lie on one line or in one place, so no pose can be fitted to them; record pairs that spread out"
+        )
+
+
+def _exp(rotation_vector: FloatArray) -> FloatArray:
+    """Rotation matrix (3, 3) of a rotation vector (3,) [rad] (Rodrigues)."""
+    angle = float(np.linalg.norm(rotation_vector))
+    k = cross_matrix(rotation_vector)
+    sinc = float(np.sinc(angle / np.pi))
+    half_sinc = float(np.sinc(0.5 * angle / np.pi))
+    return np.eye(3) + sinc * k + 0.5 * half_sinc**2 * (k @ k)

@@ -1,0 +1,67 @@
+"""Array types and the checks made where arrays enter the package."""
+
+from __future__ import annotations
+
+import math
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from kbmaps.errors import NonFiniteError, ShapeError
+
+FloatArray: TypeAlias = NDArray[np.float64]
+BoolArray: TypeAlias = NDArray[np.bool_]
+IntArray: TypeAlias = NDArray[np.intp]
+
+
+def frozen(values: ArrayLike) -> FloatArray:
+    """A read-only float64 copy in C order."""
+    copy = np.array(values, dtype=np.float64, order="C")
+    copy.flags.writeable = False
+    return copy
+
+
+def vector(name: str, values: ArrayLike, width: int) -> FloatArray:
+    """`values` as a finite float64 vector (width,).
+
+    Raises:
+        ShapeError, NonFiniteError
+    """
+    array = np.asarray(values, dtype=np.float64)
+    if array.shape != (width,):
+        raise ShapeError(name, f"({width},)", array.shape)
+    # A sum over a list is several times cheaper than np.isfinite on so few numbers.
+    if not math.isfinite(sum(array.tolist())):
+        raise NonFiniteError(name)
+    return array
+
+
+def rows(name: str, values: ArrayLike, width: int) -> FloatArray:
+    """`values` as finite float64 rows (n, width).
+
+    Raises:
+        ShapeError, NonFiniteError
+    """
+    array = np.asarray(values, dtype=np.float64)
+    if array.ndim != 2 or array.shape[1] != width:
+        raise ShapeError(name, f"(n, {width})", array.shape)
+    if not np.isfinite(array).all():
+        raise NonFiniteError(name)
+    return array
+
+
+def rows_or_vector(name: str, values: ArrayLike, width: int) -> FloatArray:
+    """`values` as a finite vector (width,) or finite rows (n, width); the result keeps which of the two it was.
+
+    Raises:
+        ShapeError, NonFiniteError
+    """
+    array = np.asarray(values, dtype=np.float64)
+    if array.ndim == 1:
+        return vector(name, array, width)
+    if array.ndim != 2 or array.shape[1] != width:
+        raise ShapeError(name, f"({width},) or (n, {width})", array.shape)
+    if not np.isfinite(array).all():
+        raise NonFiniteError(name)
+    return array

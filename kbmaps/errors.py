@@ -1,0 +1,62 @@
+"""Everything that kbmaps refuses, as one tree.
+
+KBMapsError
+├── ShapeError            an array has the wrong shape
+├── NonFiniteError        a number is NaN or infinite
+├── BasisError            a basis cannot be built from these parameters
+│   └── SingularAlphaError    alpha is too near to 90 degrees
+├── ChainError            transforms or axes do not describe a rigid chain
+├── SettingError          a learner's setting is outside its range
+├── DegenerateDataError   the data do not determine what is asked for
+└── ModelFormatError      these bytes are not a stored map
+"""
+
+from __future__ import annotations
+
+
+class KBMapsError(Exception):
+    """Root of all errors raised by kbmaps."""
+
+
+class ShapeError(KBMapsError):
+    """An array has the wrong shape."""
+
+    def __init__(self, name: str, expected: str, got: tuple[int, ...]) -> None:
+        super().__init__(f"{name} must have shape {expected}, got {got}")
+
+
+class NonFiniteError(KBMapsError):
+    """A number is NaN or infinite; nothing was changed."""
+
+    def __init__(self, name: str) -> None:
+        super().__init__(f"{name} holds NaN or infinite values; drop or mend these samples before passing them on")
+
+
+class BasisError(KBMapsError):
+    """A basis cannot be built from these parameters, or the bases do not fit each other."""
+
+
+class SingularAlphaError(BasisError):
+    """alpha lies within 80..100 degrees, where the Bernstein basis degenerates."""
+
+    def __init__(self, alpha_deg: float) -> None:
+        super().__init__(
+            f"alpha = {alpha_deg:.6g} deg is refused: from 80 to 100 deg the middle weight cos(alpha) vanishes and "
+            "control points grow without bound; choose e.g. 60 deg, or an orthonormal basis for wide ranges"
+        )
+
+
+class ChainError(KBMapsError):
+    """Transforms or axes do not describe a rigid chain."""
+
+
+class SettingError(KBMapsError):
+    """A learner's setting is outside its range."""
+
+
+class DegenerateDataError(KBMapsError):
+    """The data do not determine what is asked for."""
+
+
+class ModelFormatError(KBMapsError):
+    """These bytes are not a stored map: damaged, truncated, or of another format."""

@@ -1,0 +1,285 @@
+"""Exact least squares: the best control points for all pairs so far. Ulbrich et al. 2009, eqs. (16)-(18)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from kbmaps import lapack
+from kbmaps.arrays import FloatArray, rows, rows_or_vector
+from kbmaps.basis import JointBasis
+from kbmaps.errors import BasisError, NonFiniteError, SettingError, ShapeError
+from kbmaps.factor import RowFactor, ShiftedGram
+from kbmaps.kbmap import POSITION_OUTPUTS, KBMap
+from kbmaps.stack import BasisStack
+
+_BLOCK = 128
+# Below this reciprocal condition number a triangular solve would return rounding errors.
+_SMALLEST_RCOND = 1e-13
+# Relative to the trace of the Gram matrix: just enough to keep its Cholesky factorisation alive.
+_VANISHING_RIDGE = 1e-13
+_REFINEMENTS = 30
+# Evidence: multiplicative step of the search for lambda, its limits relative to the mean diagonal of the Gram matrix.
+_SEARCH_STEP = math.log(8.0)
+_SEARCH_LIMITS = (1e-12, 1e6)
+_FIRST_PRECISION = 1e-2
+# Variances below (1 pm)² are rounding.
+_VARIANCE_FLOOR = 1e-24
+
+
+@dataclass(frozen=True)
+class ExactSolution:
+    """A fitted map and what the fit says about it.
+
+    Attributes:
+        map: in the bases of the prior that the learner was given.
+        noise_std: estimated noise of one coordinate at weight 1 [m]; None where the data do not tell.
+        prior_precision: λ = (noise_std / spread of the prior's coefficients)²; 0 for the unregularised solution.
+        log_evidence: log marginal likelihood of the positions at λ; None for the unregularised solution.
+        residual_rms: weighted RMS distance between the map and the pairs it was fitted to [m].
+    """
+
+    map: KBMap
+    noise_std: float | None
+    prior_precision: float
+    log_evidence: float | None
+    residual_rms: float
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """One λ: the multipliers (k, 3), noise variance and evidence."""
+
+    multipliers: FloatArray
+    variance: float
+    log_evidence: float
+
+
+class ExactLearner:
+    """Collects pairs at a bounded cost and memory, and solves for the map when asked.
+
+    The pairs are kept as the rows of `RowFactor`; the prior is no part of them, so it may change (`rebase`).
+    With m = 3^d control points the memory is 16 m² bytes (77 MB at d = 7).
+
+    Args:
+        prior: where the solution stays in the directions that the data do not show.
+        bases: what the solution is computed in; it decides what "nearest to the prior" means. None takes the prior's.
+            Scaled orthonormal bases over the joints' ranges (`learning_bases`) are advised.
+
+    Raises:
+        ShapeError: the prior holds an orientation. BasisError: bases do not fit the prior.
+    """
+
+    def __init__(self, prior: KBMap, bases: Sequence[JointBasis] | None = None) -> None:
+        self._bases = prior.bases if bases is None else tuple(bases)
+        self._stack = BasisStack(self._bases)
+        self._factor = RowFactor(prior.size, POSITION_OUTPUTS)
+        self._pending: list[tuple[FloatArray, FloatArray]] = []
+        self._pending_rows = 0
+        self._pairs = 0
+        self._log_weights = 0.0
+        self._last_precision = _FIRST_PRECISION
+        self.rebase(prior)
+
+    @property
+    def pairs(self) -> int:
+        """How many pairs have been learnt."""
+        return self._pairs
+
+    @property
+    def prior(self) -> KBMap:
+        return self._prior
+
+    def rebase(self, prior: KBMap) -> None:
+        """Another prior for the same data.
+
+        Raises:
+            ShapeError: the prior holds an orientation. BasisError: it has other joints.
+        """
+        if prior.has_orientation:
+            raise ShapeError("prior.net", f"({POSITION_OUTPUTS}, ...): this learner learns positions", prior.net.shape)
+        if len(prior.bases) != len(self._bases):
+            raise BasisError(f"the prior has {len(prior.bases)} joints, the learner {len(self._bases)}")
+        self._prior_coefficients = prior.in_basis(self._bases).net.reshape(POSITION_OUTPUTS, -1).T
+        self._prior = prior
+
+    def learn(self, q: ArrayLike, x: ArrayLike, weight: ArrayLike | None = None) -> None:
+        """One pair, q (d,) [rad] and x (3,) [m], or many, (n, d) and (n, 3).
+
+        Args:
+            weight: relative inverse variance of each pair, () or (n,), greater than 0; None means 1.
+
+        Raises:
+            ShapeError, NonFiniteError, SettingError (a weight that is not positive): nothing has changed.
+        """
+        angles = np.atleast_2d(rows_or_vector("q", q, self._stack.joints))
+        positions = np.atleast_2d(rows_or_vector("x", x, POSITION_OUTPUTS))
+        if len(angles) != len(positions):
+            raise ShapeError("x", f"({len(angles)}, 3) to go with q", positions.shape)
+        weights = _checked_weights(weight, len(angles))
+        for start in range(0, len(angles), _BLOCK):
+            part = slice(start, start + _BLOCK)
+            self._collect(angles[part], positions[part], weights[part])
+        self._pairs += len(angles)
+        self._log_weights += float(np.log(weights).sum())
+
+    def solve(self, prior_precision: float | Literal["evidence"] | None = None) -> ExactSolution:
+        """The map for all pairs so far.
+
+        Args:
+            prior_precision: None: least squares without regularisation; where the pairs do not determine it, the
+                solution nearest to the prior in the learner's bases. λ > 0: minimises Σ weight ‖f(q) − x‖² + λ ‖g − g0‖²
+                over the coefficients g, the posterior mean for a Gaussian prior of variance noise² / λ around g0.
+                "evidence": λ of the greatest marginal likelihood.
+
+        Raises:
+            SettingError: prior_precision is neither None, "evidence", nor a number above 0.
+        """
+        if isinstance(prior_precision, str):
+            if prior_precision != "evidence":
+                raise SettingError(f'prior_precision must be None, "evidence" or a number, got {prior_precision!r}')
+        elif prior_precision is not None and not (prior_precision > 0.0 and math.isfinite(prior_precision)):
+            raise SettingError(f"prior_precision must be finite and greater than 0, got {prior_precision!r}")
+        self._flush()
+        if self._pairs == 0:
+            return ExactSolution(self._prior, None, 0.0, None, 0.0)
+        errors = self._factor.targets - self._factor.rows @ self._prior_coefficients
+        if prior_precision is None:
+            return self._solve_unregularised(errors)
+        gram = ShiftedGram(self._factor.gram())
+        if isinstance(prior_precision, str):
+            prior_precision = self._most_evident(gram, errors)
+            self._last_precision = prior_precision
+        return self._solve_ridge(gram, errors, prior_precision)
+
+    def _collect(self, q: FloatArray, x: FloatArray, weights: FloatArray) -> None:
+        scale = np.sqrt(weights)[:, None]
+        self._pending.append((self._stack.full(q) * scale, x * scale))
+        self._pending_rows += len(q)
+        if self._pending_rows >= _BLOCK:
+            self._flush()
+
+    def _flush(self) -> None:
+        if self._pending:
+            weighted_rows, targets = zip(*self._pending, strict=True)
+            self._factor.add(np.concatenate(weighted_rows), np.concatenate(targets))
+            self._pending.clear()
+            self._pending_rows = 0
+
+    def _solve_unregularised(self, errors: FloatArray) -> ExactSolution:
+        factor = self._factor
+        if factor.triangular and lapack.reciprocal_condition(factor.rows) > _SMALLEST_RCOND:
+            change = lapack.triangular_solve(factor.rows, errors)
+        else:
+            change = self._nearest(errors)
+        freedom = POSITION_OUTPUTS * (self._pairs - factor.unknowns)
+        square = self._residual_square(errors, change)
+        noise = math.sqrt(square / freedom) if freedom > 0 else None
+        return self._solution(change, noise, 0.0, None, square)
+
+    def _nearest(self, errors: FloatArray) -> FloatArray:
+        """The smallest change of the coefficients (m, 3) that explains `errors` (k, 3).
+
+        Iterated Tikhonov: each pass leaves the share λ / (σ² + λ) of what a singular value σ has still to explain, and
+        corrects the rounding of the pass before. Directions with σ² far below λ stay at the prior.
+        """
+        a = self._factor.rows
+        gram = ShiftedGram(self._factor.gram())
+        ridge = _VANISHING_RIDGE * gram.trace
+        while not gram.factorise(ridge):
+            ridge *= 10.0
+        change = a.T @ gram.solve(errors)
+        left = float("inf")
+        for _ in range(_REFINEMENTS):
+            remaining = errors - a @ change
+            size = float(np.linalg.norm(remaining))
+            if not size < 0.5 * left:
+                break
+            left = size
+            change = change + a.T @ gram.solve(remaining)
+        return change
+
+    def _solve_ridge(self, gram: ShiftedGram, errors: FloatArray, precision: float) -> ExactSolution:
+        fit = self._fit(gram, errors, precision)
+        a = self._factor.rows
+        # One step of refinement through the rows themselves mends the rounding of the Gram matrix.
+        remaining = errors - a @ (a.T @ fit.multipliers) - precision * fit.multipliers
+        change = a.T @ (fit.multipliers + gram.solve(remaining))
+        square = self._residual_square(errors, change)
+        return self._solution(change, math.sqrt(fit.variance), precision, fit.log_evidence, square)
+
+    def _fit(self, gram: ShiftedGram, errors: FloatArray, precision: float) -> _Fit:
+        """Evidence of λ. With A the kept rows, the errors of one coordinate are N(0, s² (A Aᵀ / λ + I))."""
+        if not gram.factorise(precision):
+            raise SettingError(f"prior_precision = {precision:.3g} is below rounding here; use None or a larger one")
+        multipliers = gram.solve(errors)
+        samples = POSITION_OUTPUTS * self._pairs
+        explained = precision * float(np.einsum("ko,ko->", errors, multipliers))
+        variance = max((explained + self._factor.residual_square) / samples, _VARIANCE_FLOOR)
+        spread = gram.log_determinant - len(errors) * math.log(precision)
+        log_evidence = -0.5 * samples * (math.log(2.0 * math.pi * variance) + 1.0)
+        log_evidence += 0.5 * POSITION_OUTPUTS * (self._log_weights - spread)
+        return _Fit(multipliers, variance, log_evidence)
+
+    def _most_evident(self, gram: ShiftedGram, errors: FloatArray) -> float:
+        """λ of the greatest evidence: climbs from the last one in steps, then takes the vertex of a parabola."""
+        mean = gram.trace / len(errors)
+        low, high = (math.log(limit * mean) for limit in _SEARCH_LIMITS)
+        known: dict[float, float] = {}
+
+        def evidence(position: float) -> float:
+            if position not in known:
+                known[position] = self._fit(gram, errors, math.exp(position)).log_evidence
+            return known[position]
+
+        middle = min(max(math.log(self._last_precision), low), high)
+        step = _SEARCH_STEP
+        while True:
+            below, above = max(middle - step, low), min(middle + step, high)
+            best = max((middle, below, above), key=evidence)
+            if best == middle:
+                break
+            middle = best
+        if below < middle < above:
+            vertex = _vertex((below, middle, above), (evidence(below), evidence(middle), evidence(above)))
+            middle = max((middle, vertex), key=evidence)
+        return math.exp(middle)
+
+    def _residual_square(self, errors: FloatArray, change: FloatArray) -> float:
+        remaining = errors - self._factor.rows @ change
+        return float(np.square(remaining).sum()) + self._factor.residual_square
+
+    def _solution(
+        self, change: FloatArray, noise: float | None, precision: float, log_evidence: float | None, square: float
+    ) -> ExactSolution:
+        shape = (POSITION_OUTPUTS, *(basis.size for basis in self._bases))
+        learnt = KBMap(self._bases, (self._prior_coefficients + change).T.reshape(shape), self._prior.metadata)
+        rms = math.sqrt(square / self._pairs)
+        return ExactSolution(learnt.in_basis(self._prior.bases), noise, precision, log_evidence, rms)
+
+
+def _vertex(positions: tuple[float, float, float], heights: tuple[float, float, float]) -> float:
+    """Where the parabola through three points, the middle one highest, has its maximum."""
+    (a, b, c), (fa, fb, fc) = positions, heights
+    left, right = (b - a) * (fb - fc), (b - c) * (fb - fa)
+    if left == right:
+        return b
+    return b - 0.5 * ((b - a) * left - (b - c) * right) / (left - right)
+
+
+def _checked_weights(weight: ArrayLike | None, pairs: int) -> FloatArray:
+    if weight is None:
+        return np.ones(pairs)
+    weights = np.asarray(weight, dtype=np.float64)
+    if weights.shape not in ((), (pairs,)):
+        raise ShapeError("weight", f"() or ({pairs},)", weights.shape)
+    if not np.isfinite(weights).all():
+        raise NonFiniteError("weight")
+    if weights.size and weights.min() <= 0.0:
+        raise SettingError("every weight must be greater than 0; leave a pair out instead of weighting it 0")
+    return np.broadcast_to(weights, (pairs,))

@@ -1,0 +1,112 @@
+"""The rows of a least-squares problem in bounded memory."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from kbmaps import lapack
+from kbmaps.arrays import FloatArray
+
+
+class RowFactor:
+    """Rows A (k, m) and targets (k, outputs) of a least-squares problem, never more of them than unknowns.
+
+    Up to m rows are kept as they come. From then on A is their triangular QR factor, into which later rows are
+    folded: ‖A g − targets‖² + residual_square stays the sum of squares over all rows ever added, for every g,
+    at the same memory and the same cost a row. No normal equations are formed, so nothing is lost to squaring the
+    condition number. Inputs are trusted.
+    """
+
+    def __init__(self, unknowns: int, outputs: int) -> None:
+        self.unknowns = unknowns
+        self.residual_square = 0.0
+        self._rows = np.zeros((unknowns, unknowns))
+        self._targets = np.zeros((unknowns, outputs))
+        self._filled = 0
+        self._triangular = False
+
+    @property
+    def rows(self) -> FloatArray:
+        """A (k, m); upper triangular once `triangular`."""
+        return self._rows[: self._filled]
+
+    @property
+    def targets(self) -> FloatArray:
+        """Targets (k, outputs) that go with `rows`."""
+        return self._targets[: self._filled]
+
+    @property
+    def triangular(self) -> bool:
+        return self._triangular
+
+    def add(self, rows: FloatArray, targets: FloatArray) -> None:
+        """More rows (n, m) with targets (n, outputs)."""
+        taken = 0
+        if not self._triangular:
+            taken = min(len(rows), self.unknowns - self._filled)
+            self._rows[self._filled : self._filled + taken] = rows[:taken]
+            self._targets[self._filled : self._filled + taken] = targets[:taken]
+            self._filled += taken
+            if self._filled == self.unknowns:
+                self._triangularise()
+        if taken < len(rows):
+            below, below_targets = np.asfortranarray(rows[taken:]), np.array(targets[taken:], order="F")
+            self._rows, self._targets, remainder = lapack.qr_append(self._rows, self._targets, below, below_targets)
+            self.residual_square += float(np.square(remainder).sum())
+
+    def gram(self) -> FloatArray:
+        """A new A Aᵀ (k, k), Fortran-ordered, of which only the upper triangle counts."""
+        if self._triangular:
+            return lapack.upper_times_transpose(self._rows.copy(order="F"))
+        return (self.rows @ self.rows.T).T
+
+    def _triangularise(self) -> None:
+        self._rows = np.asfortranarray(self._rows)
+        self._rows, self._targets = lapack.qr_in_place(self._rows, np.asfortranarray(self._targets))
+        self._triangular = True
+
+
+class ShiftedGram:
+    """K + λ I factorised for one λ after the other, within K's own buffer.
+
+    The Cholesky factor lives in the lower triangle and the diagonal, K itself in the upper one and a copy of its
+    diagonal.
+
+    Args:
+        gram: K (k, k), Fortran-ordered, positive semidefinite; the upper triangle counts. Taken over, not copied.
+    """
+
+    _COPY_COLUMNS = 64
+
+    def __init__(self, gram: FloatArray) -> None:
+        self._buffer = gram
+        self._diagonal = gram.diagonal().copy()
+        self.shift: float | None = None
+
+    @property
+    def trace(self) -> float:
+        return float(self._diagonal.sum())
+
+    def factorise(self, shift: float) -> bool:
+        """Factorises K + shift·I; False (and unusable until the next call) if it is not positive definite."""
+        if self.shift == shift:
+            return True
+        size, step = len(self._buffer), self._COPY_COLUMNS
+        for begin in range(0, size, step):
+            end = min(begin + step, size)
+            self._buffer[end:, begin:end] = self._buffer[begin:end, end:].T
+            corner = self._buffer[begin:end, begin:end]
+            corner[:] = np.triu(corner, 1) + np.triu(corner, 1).T
+        np.einsum("ii->i", self._buffer)[:] = self._diagonal + shift
+        positive = lapack.cholesky_lower_in_place(self._buffer)
+        self.shift = shift if positive else None
+        return positive
+
+    def solve(self, rhs: FloatArray) -> FloatArray:
+        """Solution of (K + shift·I) y = rhs."""
+        return lapack.cholesky_solve(self._buffer, rhs)
+
+    @property
+    def log_determinant(self) -> float:
+        """log det (K + shift·I)."""
+        return 2.0 * float(np.log(self._buffer.diagonal()).sum())

@@ -1,0 +1,211 @@
+"""The Kinematic Bézier Map: forward kinematics that is linear in its control points."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from types import MappingProxyType
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from kbmaps import serial
+from kbmaps.arrays import FloatArray, frozen, rows, rows_or_vector
+from kbmaps.basis import JointBasis
+from kbmaps.errors import BasisError, NonFiniteError, ShapeError
+from kbmaps.stack import BasisStack
+
+POSITION_OUTPUTS = 3
+POSE_OUTPUTS = 12
+_BATCH_ROWS = 4096
+
+
+@dataclass(frozen=True, eq=False)
+class KBMap:
+    """Position (and orientation, when learnt) of the marker in the measurement frame, of d joints.
+
+    f(q) = Σ_i w_i(q) b_i with w = w_1(q_1) ⊗ … ⊗ w_d(q_d). Ulbrich et al. 2009, eqs. (10) and (15).
+
+    Attributes:
+        bases: one basis a joint, in the order of q.
+        net: the coefficients as planes (outputs, m1, ..., md), m = 3 for a revolute joint and 2 for a prismatic one;
+            control points [m] where the bases are Bernstein. Read-only. Outputs 0..2 are the position x, y, z [m];
+            a map of 12 outputs continues with the columns e1, e2, e3 of the marker's rotation matrix (3..5, 6..8, 9..11).
+        metadata: short texts that travel with the map; no part of `digest`.
+
+    Raises:
+        ShapeError, NonFiniteError, BasisError
+    """
+
+    bases: tuple[JointBasis, ...]
+    net: FloatArray
+    metadata: Mapping[str, str] = field(default_factory=dict[str, str])
+    _stack: BasisStack = field(init=False, repr=False)
+    _planes: FloatArray = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        bases = tuple(self.bases)
+        if not bases:
+            raise BasisError("a map needs at least one joint")
+        net = frozen(self.net)
+        sizes = tuple(basis.size for basis in bases)
+        if net.ndim != len(bases) + 1 or net.shape[1:] != sizes or net.shape[0] not in (POSITION_OUTPUTS, POSE_OUTPUTS):
+            raise ShapeError("net", f"(3 or 12, {', '.join(map(str, sizes))})", net.shape)
+        if not np.isfinite(net).all():
+            raise NonFiniteError("net")
+        stack = BasisStack(bases)
+        object.__setattr__(self, "bases", bases)
+        object.__setattr__(self, "net", net)
+        object.__setattr__(self, "metadata", MappingProxyType(dict(self.metadata)))
+        object.__setattr__(self, "_stack", stack)
+        object.__setattr__(self, "_planes", net.reshape(-1, stack.right_size))
+
+    @property
+    def joints(self) -> int:
+        """Number of joints d."""
+        return len(self.bases)
+
+    @property
+    def size(self) -> int:
+        """Number of control points: 3^d for d revolute joints."""
+        return math.prod(basis.size for basis in self.bases)
+
+    @property
+    def has_orientation(self) -> bool:
+        return self.net.shape[0] == POSE_OUTPUTS
+
+    def predict(self, q: ArrayLike) -> FloatArray:
+        """Marker position (3,) [m] for joint angles q (d,) [rad], or (n, 3) for (n, d).
+
+        Raises:
+            ShapeError, NonFiniteError
+        """
+        return self._outputs(rows_or_vector("q", q, self.joints), 0, POSITION_OUTPUTS)
+
+    def orientation(self, q: ArrayLike) -> FloatArray:
+        """The marker's axes as columns of (3, 3), or (n, 3, 3); orthonormal as far as the map was learnt so.
+
+        Raises:
+            ShapeError: the map holds positions only, or q has the wrong length. NonFiniteError.
+        """
+        if not self.has_orientation:
+            raise ShapeError("net", f"({POSE_OUTPUTS}, ...) to give an orientation", self.net.shape)
+        checked = rows_or_vector("q", q, self.joints)
+        axes = self._outputs(checked, POSITION_OUTPUTS, POSE_OUTPUTS)
+        return axes.reshape(*axes.shape[:-1], 3, 3).swapaxes(-1, -2)
+
+    def jacobian(self, q: ArrayLike) -> FloatArray:
+        """Derivative (3, d) of the position [m/rad, or m/m], or (n, 3, d) for q (n, d).
+
+        Raises:
+            ShapeError, NonFiniteError
+        """
+        checked = rows_or_vector("q", q, self.joints)
+        batch = np.atleast_2d(checked)
+        jacobian = np.concatenate([self._jacobian(chunk) for chunk in _chunks(batch)])
+        return jacobian[0] if checked.ndim == 1 else jacobian
+
+    def weights(self, q: ArrayLike) -> FloatArray:
+        """The full weight vector (3^d,) for q (d,), or (n, 3^d): the Kronecker product over the joints.
+
+        Raises:
+            ShapeError, NonFiniteError
+        """
+        checked = rows_or_vector("q", q, self.joints)
+        full = self._stack.full(np.atleast_2d(checked))
+        return full[0] if checked.ndim == 1 else full
+
+    def in_basis(self, bases: Sequence[JointBasis]) -> KBMap:
+        """The same map with its net expressed in other bases; exact up to rounding.
+
+        Raises:
+            BasisError: another number of joints, or a prismatic basis for a revolute joint.
+        """
+        target = tuple(bases)
+        if len(target) != self.joints:
+            raise BasisError(f"need {self.joints} bases, one a joint; got {len(target)}")
+        net = self.net
+        for k, (old, new) in enumerate(zip(self.bases, target, strict=True)):
+            if old != new:
+                net = np.moveaxis(np.tensordot(old.change_to(new), net, axes=(1, k + 1)), 0, k + 1)
+        return KBMap(target, net, self.metadata)
+
+    def with_metadata(self, metadata: Mapping[str, str]) -> KBMap:
+        """The same map with other texts."""
+        return KBMap(self.bases, self.net, metadata)
+
+    @property
+    def control_points(self) -> FloatArray:
+        """Bézier control points (m1, ..., md, 3) [m], in the bases that `JointBasis.to_bernstein` names."""
+        bernstein = self.in_basis([basis.to_bernstein() for basis in self.bases])
+        return frozen(np.moveaxis(bernstein.net[:POSITION_OUTPUTS], 0, -1))
+
+    @property
+    def digest(self) -> str:
+        """Sixteen hexadecimal digits that tell this map (bases and net) from any other."""
+        state = hashlib.blake2b(repr([(b.kind, b.parameters) for b in self.bases]).encode(), digest_size=8)
+        state.update(self.net.astype("<f8", copy=False).tobytes())
+        return state.hexdigest()
+
+    def to_bytes(self) -> bytes:
+        """The map as one self-describing byte string (see `kbmaps.serial`)."""
+        return serial.encode(self.bases, self.net, self.metadata)
+
+    @classmethod
+    def from_bytes(cls, data: bytes) -> KBMap:
+        """The map that `to_bytes` wrote.
+
+        Raises:
+            ModelFormatError: the bytes are damaged, truncated, or something else.
+        """
+        return cls(*serial.decode(data))
+
+    def _outputs(self, q: FloatArray, begin: int, end: int) -> FloatArray:
+        """Outputs begin..end, (end − begin,) or (n, end − begin), contracted half by half."""
+        stack = self._stack
+        planes = self._planes[begin * stack.left_size : end * stack.left_size]
+        if q.ndim == 1:
+            left, right = stack.halves(q)
+            return (planes @ right).reshape(end - begin, -1) @ left
+        out = np.empty((len(q), end - begin))
+        for start, chunk in zip(range(0, len(q), _BATCH_ROWS), _chunks(q), strict=False):
+            left, right = stack.halves(chunk)
+            by_left = (right @ planes.T).reshape(len(chunk), end - begin, -1)
+            out[start : start + len(chunk)] = (by_left @ left[:, :, None])[:, :, 0]
+        return out
+
+    def _jacobian(self, q: FloatArray) -> FloatArray:
+        stack = self._stack
+        weights, slopes = stack.joint_weights(q), stack.joint_derivatives(q)
+        planes = self._planes[: POSITION_OUTPUTS * stack.left_size]
+        by_left = (stack.right(weights) @ planes.T).reshape(len(q), POSITION_OUTPUTS, -1)
+        cube = planes.reshape(POSITION_OUTPUTS, stack.left_size, stack.right_size)
+        by_right = np.einsum("nl,olr->nor", stack.left(weights), cube, optimize=True)
+        columns = np.empty((len(q), POSITION_OUTPUTS, self.joints))
+        for k in range(self.joints):
+            varied = weights.copy()
+            varied[:, k] = slopes[:, k]
+            in_left = k < stack.split
+            half, partial = (stack.left(varied), by_left) if in_left else (stack.right(varied), by_right)
+            columns[:, :, k] = (partial @ half[:, :, None])[:, :, 0]
+        return columns
+
+
+def _chunks(q: FloatArray) -> list[FloatArray]:
+    """Batches of rows small enough to stay in the cache; one empty batch for none."""
+    return [q[start : start + _BATCH_ROWS] for start in range(0, max(len(q), 1), _BATCH_ROWS)]
+
+
+def prediction_errors(kbmap: KBMap, q: ArrayLike, x: ArrayLike) -> FloatArray:
+    """Distances (n,) [m] between predicted and given positions x (n, 3) [m] at q (n, d) [rad].
+
+    Raises:
+        ShapeError, NonFiniteError
+    """
+    angles = rows("q", q, kbmap.joints)
+    positions = rows("x", x, POSITION_OUTPUTS)
+    if len(angles) != len(positions):
+        raise ShapeError("x", f"({len(angles)}, 3) to go with q", positions.shape)
+    return np.linalg.norm(kbmap.predict(angles) - positions, axis=1)

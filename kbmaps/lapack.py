@@ -1,0 +1,85 @@
+"""The few LAPACK routines used here, typed. All work on Fortran-ordered arrays and may overwrite their inputs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, cast
+
+import numpy as np
+from scipy.linalg import lapack
+
+from kbmaps.arrays import FloatArray
+
+_PANEL_COLUMNS = 32
+
+
+def _routine(name: str) -> Callable[..., Any]:
+    return cast(Callable[..., Any], getattr(lapack, name))
+
+
+_dgeqrf, _dormqr = _routine("dgeqrf"), _routine("dormqr")
+_dtpqrt, _dtpmqrt = _routine("dtpqrt"), _routine("dtpmqrt")
+_dlauum, _dpotrf, _dpotrs = _routine("dlauum"), _routine("dpotrf"), _routine("dpotrs")
+_dtrcon, _dtrtrs = _routine("dtrcon"), _routine("dtrtrs")
+
+
+def qr_in_place(square: FloatArray, targets: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """R (m, m) and Qᵀ·targets for a square matrix, overwriting both."""
+    size = len(square)
+    factor, tau, _, _ = _dgeqrf(square, lwork=64 * size, overwrite_a=1)
+    rotated, _, _ = _dormqr("L", "T", factor, tau, targets, lwork=64 * size, overwrite_c=1)
+    for column in range(size):
+        factor[column + 1 :, column] = 0.0
+    return factor, rotated
+
+
+def qr_append(
+    factor: FloatArray, targets: FloatArray, rows: FloatArray, row_targets: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """R and Qᵀ·targets after rows were put below them, and what of the rows' targets no solution can reach.
+
+    Overwrites all four.
+    """
+    panel = min(_PANEL_COLUMNS, len(factor))
+    updated, reflectors, blocks, _ = _dtpqrt(0, panel, factor, rows, overwrite_a=1, overwrite_b=1)
+    rotated, remainder, _ = _dtpmqrt(
+        0, reflectors, blocks, targets, row_targets, side="L", trans="T", overwrite_a=1, overwrite_b=1
+    )
+    return updated, rotated, remainder
+
+
+def upper_times_transpose(upper: FloatArray) -> FloatArray:
+    """The upper triangle of U Uᵀ, overwriting U."""
+    product, _ = _dlauum(upper, lower=0, overwrite_c=1)
+    return cast(FloatArray, product)
+
+
+def cholesky_lower_in_place(symmetric: FloatArray) -> bool:
+    """Puts the Cholesky factor into the lower triangle; the part above the diagonal is neither read nor written.
+
+    Returns:
+        False if the matrix is not positive definite.
+    """
+    result, info = _dpotrf(symmetric, lower=1, clean=0, overwrite_a=1)
+    assert result is symmetric, "dpotrf copied: the array is not Fortran-ordered float64"
+    return info == 0
+
+
+def cholesky_solve(lower: FloatArray, rhs: FloatArray) -> FloatArray:
+    """Solution of L Lᵀ y = rhs."""
+    solution, _ = _dpotrs(lower, rhs, lower=1)
+    return cast(FloatArray, solution)
+
+
+def reciprocal_condition(upper: FloatArray) -> float:
+    """Estimate of 1 / cond₁(U)."""
+    rcond, _ = _dtrcon(upper, norm="1", uplo="U", diag="N")
+    return float(rcond)
+
+
+def triangular_solve(upper: FloatArray, rhs: FloatArray) -> FloatArray:
+    """Solution of U y = rhs."""
+    solution, info = _dtrtrs(upper, rhs, lower=0)
+    if info:
+        raise np.linalg.LinAlgError("singular triangular factor")
+    return cast(FloatArray, solution)

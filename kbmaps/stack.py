@@ -1,0 +1,86 @@
+"""The bases of all joints together: weight vectors as Kronecker products of two halves of the joints."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from kbmaps.arrays import FloatArray
+from kbmaps.basis import JointBasis
+
+_FIRST = np.array([0, 0, 1])
+_SECOND = np.array([0, 1, 1])
+
+
+class BasisStack:
+    """Evaluates all joints at once and keeps the weight vector factored into a left and a right half.
+
+    The full weight vector is kron(left, right). With about as many joints on either side, both are of length
+    3^(d/2), so contracting a net of 3^d control points with them needs no vector of length 3^d.
+    Inputs are trusted: validated by the callers.
+    """
+
+    def __init__(self, bases: Sequence[JointBasis]) -> None:
+        self.sizes = tuple(basis.size for basis in bases)
+        self.joints = len(self.sizes)
+        self.split = self.joints // 2
+        self.left_size = math.prod(self.sizes[: self.split])
+        self.right_size = math.prod(self.sizes[self.split :])
+        self._half_phases = np.array([basis.terms.phases for basis in bases]).T * 0.5
+        self._slides = np.array([basis.is_prismatic for basis in bases])
+        self._any_slides = bool(self._slides.any())
+        self._start, self._span = self._half_phases * 2.0
+        self._mix = np.zeros((self.joints, 3, 3))
+        for k, basis in enumerate(bases):
+            self._mix[k, : basis.size, : basis.size] = basis.terms.mix
+
+    def joint_weights(self, q: FloatArray) -> FloatArray:
+        """Basis functions (..., d, 3) of every joint for q (..., d); a prismatic joint's third entry is 0."""
+        sines = np.sin(0.5 * q[..., None, :] - self._half_phases)
+        products = (sines[..., _FIRST, :] * sines[..., _SECOND, :]).swapaxes(-1, -2)
+        if self._any_slides:
+            share = (q - self._start) / self._span
+            stroke = np.stack([1.0 - share, share, np.zeros_like(share)], axis=-1)
+            products = np.where(self._slides[:, None], stroke, products)
+        return (products[..., None, :] @ self._mix)[..., 0, :]
+
+    def joint_derivatives(self, q: FloatArray) -> FloatArray:
+        """Derivatives (..., d, 3) of the basis functions of every joint."""
+        first, second = self._half_phases
+        phases = np.stack([2.0 * first, first + second, 2.0 * second])
+        products = 0.5 * np.sin(q[..., None, :] - phases).swapaxes(-1, -2)
+        if self._any_slides:
+            slope = np.broadcast_to(1.0 / self._span, q.shape)
+            stroke = np.stack([-slope, slope, np.zeros_like(slope)], axis=-1)
+            products = np.where(self._slides[:, None], stroke, products)
+        return (products[..., None, :] @ self._mix)[..., 0, :]
+
+    def halves(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Left (left_size,) and right (right_size,) weights for q (d,); for q (n, d) with a leading n."""
+        weights = self.joint_weights(q)
+        return self.left(weights), self.right(weights)
+
+    def left(self, weights: FloatArray) -> FloatArray:
+        """The left half's Kronecker product of joint weights (..., d, 3)."""
+        return self._kronecker(weights, 0, self.split)
+
+    def right(self, weights: FloatArray) -> FloatArray:
+        """The right half's Kronecker product of joint weights (..., d, 3)."""
+        return self._kronecker(weights, self.split, self.joints)
+
+    def full(self, q: FloatArray) -> FloatArray:
+        """Full weight vectors (n, 3^d) for q (n, d)."""
+        left, right = self.halves(q)
+        return (left[:, :, None] * right[:, None, :]).reshape(len(q), -1)
+
+    def _kronecker(self, weights: FloatArray, begin: int, end: int) -> FloatArray:
+        lead = weights.shape[:-2]
+        if begin == end:
+            return np.ones((*lead, 1))
+        product = weights[..., begin, : self.sizes[begin]]
+        for k in range(begin + 1, end):
+            factor = weights[..., k, : self.sizes[k]]
+            product = (product[..., :, None] * factor[..., None, :]).reshape(*lead, -1)
+        return product
