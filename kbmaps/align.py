@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -14,8 +15,9 @@ from kbmaps.errors import DegenerateDataError, SettingError, ShapeError
 
 # A residual norm of noise σ per axis has the median 1.538 σ in three dimensions.
 _MEDIAN_NORM = 1.538
-# Pairs beyond this many σ count as outliers; 7 σ leave out less than one good pair in a million.
-_OUTLIER_SIGMAS = 7.0
+# Pairs beyond this many σ are outliers. Far out, since the errors of an uncalibrated arm have long tails themselves
+# and must not be rejected.
+_OUTLIER_SIGMAS = 15.0
 _ROUNDS = 60
 _STEP_TOLERANCE = 1e-12
 # Singular values below this share of the largest are directions that the data do not determine.
@@ -52,9 +54,9 @@ class _Fit:
     x: FloatArray
     fit_pose: bool
     fit_marker: bool
-    rotation: FloatArray
-    translation: FloatArray
-    shift: FloatArray
+    rotation: FloatArray = field(default_factory=lambda: np.eye(3))
+    translation: FloatArray = field(default_factory=lambda: np.zeros(3))
+    shift: FloatArray = field(default_factory=lambda: np.zeros(3))
 
     def markers(self) -> FloatArray:
         """Marker positions (n, 3) in the nominal frame."""
@@ -78,7 +80,8 @@ class _Fit:
             columns.append(self.rotation @ self.nominal_rotations)
         root = np.sqrt(weights)[:, None]
         design = (np.concatenate(columns, axis=2) * root[:, :, None]).reshape(3 * len(turned), -1)
-        step = np.linalg.lstsq(design, (self.errors() * root).ravel(), rcond=_RANK_TOLERANCE)[0]
+        target = (self.errors() * root).ravel()
+        step = cast(FloatArray, np.linalg.lstsq(design, target, rcond=_RANK_TOLERANCE)[0])
         if self.fit_pose:
             self.rotation = _exp(step[:3]) @ self.rotation
             self.translation = self.translation + step[3:6]
@@ -108,7 +111,7 @@ def align(
         x: measured marker positions (n, 3) [m].
         pose_known: the instrument stands where the chain says.
         marker_known: the marker sits where the chain says.
-        sigma: noise of one coordinate [m], if known: nothing within 7 sigma is ever called an outlier.
+        sigma: noise of one coordinate [m], if known: nothing within 15 sigma is ever called an outlier.
 
     Raises:
         ShapeError, NonFiniteError
@@ -122,16 +125,7 @@ def align(
         raise SettingError(f"sigma must be finite and greater than 0, got {sigma!r}")
     _check_enough(len(angles), pose_known, marker_known)
     poses = chain.poses(angles)
-    fit = _Fit(
-        poses[:, :3, :3],
-        poses[:, :3, 3],
-        positions,
-        not pose_known,
-        not marker_known,
-        np.eye(3),
-        np.zeros(3),
-        np.zeros(3),
-    )
+    fit = _Fit(poses[:, :3, :3], poses[:, :3, 3], positions, not pose_known, not marker_known)
     if fit.fit_pose:
         _check_spread(positions, "the measured positions x")
         if marker_known:
@@ -204,13 +198,9 @@ def _alignment(chain: RigidChain, fit: _Fit, inliers: BoolArray) -> Alignment:
 def _check_enough(pairs: int, pose_known: bool, marker_known: bool) -> None:
     needed = 1 if pose_known else 3 if marker_known else 4
     if pairs < needed:
-        missing = " and ".join(
-            name
-            for name, known in (("the instrument's pose", pose_known), ("the marker's place", marker_known))
-            if not known
-        )
         raise DegenerateDataError(
-            f"fitting {missing or 'nothing'} needs at least {needed} pairs, got {pairs}; record more"
+            f"aligning needs at least {needed} pairs when pose_known = {pose_known} and marker_known = {marker_known}, "
+            f"got {pairs}; record more"
         )
 
 

@@ -217,7 +217,7 @@ class JointBasis:
         """
         if self.is_prismatic != other.is_prismatic:
             raise BasisError(f"a {self.kind} basis cannot change to a {other.kind} one: prismatic and revolute joints")
-        return np.linalg.solve(other.matrix, self.matrix)
+        return cast(FloatArray, np.linalg.solve(other.matrix, self.matrix))
 
     def to_bernstein(self) -> JointBasis:
         """The Bernstein basis to show this joint's control points in: itself where it already is one.

@@ -180,7 +180,7 @@ class RigidChain:
         """Coefficients (3, m1, ..., md) of the upper part of one column of T(q)."""
         if len(bases) != self.joints:
             raise BasisError(f"need {self.joints} bases, one a joint; got {len(bases)}")
-        tensor = self.fixed[-1][:, column]
+        tensor: FloatArray = self.fixed[-1][:, column]
         for k in range(self.joints - 1, -1, -1):
             basis = bases[k]
             if basis.is_prismatic != bool(self.prismatic[k]):
@@ -188,8 +188,8 @@ class RigidChain:
                 raise BasisError(f"joint {k} is {wanted} but its basis is {basis.kind}")
             # monomials = weights @ inv(matrix), so Σ_i monomial_i A_i = Σ_j weight_j Σ_i inv(matrix)_ji A_i
             terms = self._joint_terms(k)[: basis.size]
-            by_weight = np.tensordot(np.linalg.inv(basis.matrix), self.fixed[k] @ terms, axes=1)
-            tensor = np.tensordot(by_weight, tensor, axes=(2, 0)).swapaxes(0, 1)
+            by_weight = np.einsum("ji,irc->rjc", np.linalg.inv(basis.matrix), self.fixed[k] @ terms)
+            tensor = np.tensordot(by_weight, tensor, axes=(2, 0)).astype(np.float64, copy=False)
         return tensor[:3]
 
 

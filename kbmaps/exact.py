@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from kbmaps import lapack
-from kbmaps.arrays import FloatArray, rows, rows_or_vector
+from kbmaps.arrays import FloatArray, rows_or_vector
 from kbmaps.basis import JointBasis
 from kbmaps.errors import BasisError, NonFiniteError, SettingError, ShapeError
 from kbmaps.factor import RowFactor, ShiftedGram
@@ -133,9 +133,9 @@ class ExactLearner:
 
         Args:
             prior_precision: None: least squares without regularisation; where the pairs do not determine it, the
-                solution nearest to the prior in the learner's bases. λ > 0: minimises Σ weight ‖f(q) − x‖² + λ ‖g − g0‖²
-                over the coefficients g, the posterior mean for a Gaussian prior of variance noise² / λ around g0.
-                "evidence": λ of the greatest marginal likelihood.
+                solution nearest to the prior in the learner's bases. λ > 0: minimises
+                Σ weight ‖f(q) − x‖² + λ ‖g − g0‖² over the coefficients g, the posterior mean for a Gaussian prior of
+                variance noise² / λ around g0. "evidence": λ of the greatest marginal likelihood.
 
         Raises:
             SettingError: prior_precision is neither None, "evidence", nor a number above 0.
@@ -173,9 +173,11 @@ class ExactLearner:
 
     def _solve_unregularised(self, errors: FloatArray) -> ExactSolution:
         factor = self._factor
-        if factor.triangular and lapack.reciprocal_condition(factor.rows) > _SMALLEST_RCOND:
-            change = lapack.triangular_solve(factor.rows, errors)
+        if factor.triangular:
+            change = lapack.triangular_solve(factor.rows, errors, _SMALLEST_RCOND)
         else:
+            change = lapack.smallest_solution(factor.rows, errors, _SMALLEST_RCOND)
+        if change is None:
             change = self._nearest(errors)
         freedom = POSITION_OUTPUTS * (self._pairs - factor.unknowns)
         square = self._residual_square(errors, change)
@@ -183,7 +185,7 @@ class ExactLearner:
         return self._solution(change, noise, 0.0, None, square)
 
     def _nearest(self, errors: FloatArray) -> FloatArray:
-        """The smallest change of the coefficients (m, 3) that explains `errors` (k, 3).
+        """The smallest change of the coefficients (m, 3) that explains `errors` (k, 3), whatever the rank.
 
         Iterated Tikhonov: each pass leaves the share λ / (σ² + λ) of what a singular value σ has still to explain, and
         corrects the rounding of the pass before. Directions with σ² far below λ stay at the prior.

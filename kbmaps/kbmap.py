@@ -32,7 +32,7 @@ class KBMap:
         bases: one basis a joint, in the order of q.
         net: the coefficients as planes (outputs, m1, ..., md), m = 3 for a revolute joint and 2 for a prismatic one;
             control points [m] where the bases are Bernstein. Read-only. Outputs 0..2 are the position x, y, z [m];
-            a map of 12 outputs continues with the columns e1, e2, e3 of the marker's rotation matrix (3..5, 6..8, 9..11).
+            a map of 12 outputs continues with the columns e1, e2, e3 of the marker's rotation matrix.
         metadata: short texts that travel with the map; no part of `digest`.
 
     Raises:

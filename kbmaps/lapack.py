@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Any, cast
 
 import numpy as np
-from scipy.linalg import lapack
+from scipy.linalg import lapack  # pyright: ignore[reportMissingTypeStubs]
 
 from kbmaps.arrays import FloatArray
 
@@ -71,15 +71,26 @@ def cholesky_solve(lower: FloatArray, rhs: FloatArray) -> FloatArray:
     return cast(FloatArray, solution)
 
 
-def reciprocal_condition(upper: FloatArray) -> float:
-    """Estimate of 1 / cond₁(U)."""
+def triangular_solve(upper: FloatArray, rhs: FloatArray, smallest_rcond: float) -> FloatArray | None:
+    """Solution of U y = rhs; None if U is nearer to singular than smallest_rcond."""
     rcond, _ = _dtrcon(upper, norm="1", uplo="U", diag="N")
-    return float(rcond)
+    if not rcond > smallest_rcond:
+        return None
+    return cast(FloatArray, _dtrtrs(upper, rhs, lower=0)[0])
 
 
-def triangular_solve(upper: FloatArray, rhs: FloatArray) -> FloatArray:
-    """Solution of U y = rhs."""
-    solution, info = _dtrtrs(upper, rhs, lower=0)
-    if info:
-        raise np.linalg.LinAlgError("singular triangular factor")
-    return cast(FloatArray, solution)
+def smallest_solution(rows: FloatArray, rhs: FloatArray, smallest_rcond: float) -> FloatArray | None:
+    """The solution (m, outputs) of least norm of rows (k, m) @ y = rhs with k <= m, by the QR factors of rowsᵀ.
+
+    None if the rows are nearer to linearly dependent than smallest_rcond.
+    """
+    count, unknowns = rows.shape
+    factor, tau, _, _ = _dgeqrf(rows.T.copy(order="F"), lwork=64 * count, overwrite_a=1)
+    upper = np.asfortranarray(np.triu(factor[:count]))
+    rcond, _ = _dtrcon(upper, norm="1", uplo="U", diag="N")
+    if not rcond > smallest_rcond:
+        return None
+    solution = np.zeros((unknowns, rhs.shape[1]), order="F")
+    solution[:count] = _dtrtrs(upper, rhs, lower=0, trans=1)[0]
+    rotated, _, _ = _dormqr("L", "N", factor, tau, solution, lwork=64 * count, overwrite_c=1)
+    return cast(FloatArray, rotated)

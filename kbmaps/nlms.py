@@ -106,6 +106,6 @@ def _checked_order(order: ArrayLike, pairs: int) -> IntArray:
     sequence = np.asarray(order)
     if sequence.ndim != 1 or not np.issubdtype(sequence.dtype, np.integer):
         raise ShapeError("order", "(k,) integers", sequence.shape)
-    if len(sequence) and not (0 <= int(sequence.min()) and int(sequence.max()) < pairs):
+    if len(sequence) and (int(sequence.min()) < 0 or int(sequence.max()) >= pairs):
         raise SettingError(f"order holds indices outside 0..{pairs - 1}")
     return sequence.astype(np.intp)
