@@ -1,0 +1,42 @@
+"""`bodyschema demo`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+OUT = Path("bodyschema-demo")
+
+
+def demo(
+    *,
+    out: Annotated[Path, Parameter(help="Folder for the recording, the curve and the plot.")] = OUT,
+    pairs: Annotated[int, Parameter(help="Pairs to learn before the tool change.")] = 600,
+    pairs_after: Annotated[int, Parameter(help="Pairs to learn after it.")] = 300,
+    seed: Annotated[int, Parameter(help="Another robot, another path, other noise.")] = 0,
+) -> None:
+    """Watch the whole thing learn, in simulation, in about a minute.
+
+    A humanoid's arm is guided by a virtual hand, its head cameras see a red ball on the tool. The sampler and the
+    learner run as the two real processes; half-way the tool becomes 250 mm longer. Needs the extra `sim`
+    (`pip install 'bodyschema[sim]'`) and no hardware. Next: `bodyschema replay` on the recording it leaves.
+    """
+    from rich.console import Console
+
+    from daemon.demo.play import play
+    from daemon.demo.plot import plot_curve, write_curve
+    from daemon.demo.scene import prepare
+    from daemon.demo.view import show_outcome, shown_on
+    from daemon.wiring import require_simulation
+
+    require_simulation()
+    console = Console()
+    scene = prepare(out, seed)
+    with shown_on(console) as show:
+        outcome = play(scene, first=pairs, second=pairs_after, seed=seed, show=show)
+    write_curve(outcome.rows, scene.curve_file)
+    plot_curve(outcome.rows, outcome.first_tool.pairs, scene.plot_file)
+    export_recording(scene)
+    show_outcome(console, outcome, scene)

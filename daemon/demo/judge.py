@@ -1,0 +1,100 @@
+"""The judge alone knows the simulated robot's truth, and holds the learner's answers against it.
+
+It asks about poses that were never learnt: poses near those the arm has been guided through, each joint moved by a
+few degrees, so that they lie in the data's region without being data.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+
+import numpy as np
+
+from daemon.bus import Bus
+from daemon.keys import Keys
+from daemon.wire import JointsRequest, PairsReply, PredictReply, decode, encode
+from interfaces.records import FloatArray
+from interfaces.robot import RobotDescription
+from kbmaps import RigidChain
+
+POSES = 300
+JITTER_DEG = 3.0
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """What the judge found.
+
+    Attributes:
+        pairs: pairs that the answering model had learnt.
+        error_m: mean distance between prediction and truth on held-out poses [m].
+        nominal_m: the same for the nominal model [m].
+        within_sigma: share of coordinates that lie within the claimed 1-sigma.
+    """
+
+    pairs: int
+    error_m: float
+    nominal_m: float
+    within_sigma: float
+
+
+class Judge:
+    """Compares the learner's answers with the simulated truth."""
+
+    def __init__(self, robot: RobotDescription, sampler: Bus, learner: Bus, seed: int) -> None:
+        self._robot, self._sampler, self._learner = robot, sampler, learner
+        self._keys = Keys(robot.name)
+        self._rng = np.random.default_rng(seed)
+        self._seen = np.empty((0, len(robot.joints)))
+        self._region_start = 0
+
+    @property
+    def seen(self) -> int:
+        """How many accepted pairs the judge knows of."""
+        return len(self._seen)
+
+    def follow(self) -> None:
+        """Fetch the joint angles of the pairs accepted since the last call."""
+        while True:
+            request = f"{self._keys.pairs}?from={len(self._seen) + 1}"
+            reply = decode(self._sampler.ask_one(request), PairsReply)
+            if reply.pairs:
+                self._seen = np.vstack([self._seen, [pair.q for pair in reply.pairs]])
+            if len(self._seen) >= reply.last_seq or not reply.pairs:
+                return
+
+    def new_region(self) -> None:
+        """From now on the data's region is where the arm goes from here."""
+        self._region_start = len(self._seen)
+
+    def change_tool(self, marker_xyz: FloatArray) -> None:
+        """Put another tool into the robot's hand."""
+        self._sampler.ask_one(self._keys.simulation, json.dumps({"tool": marker_xyz.tolist()}).encode())
+
+    def truth(self) -> RigidChain:
+        """The simulated robot as it really is."""
+        raw = json.loads(self._sampler.ask_one(self._keys.simulation))
+        return RigidChain(
+            fixed=np.array(raw["fixed"]), axes=np.array(raw["axes"]), prismatic=np.array(raw["prismatic"], dtype=bool)
+        )
+
+    def verdict(self) -> Verdict | None:
+        """Hold the learner's present answers against the truth; None before any pair."""
+        self.follow()
+        region = self._seen[self._region_start :]
+        if not len(region):
+            return None
+        poses = region[self._rng.integers(len(region), size=POSES)]
+        poses = poses + self._rng.normal(0.0, np.radians(JITTER_DEG), poses.shape)
+        poses = np.clip(poses, self._robot.lower, self._robot.upper)
+        x_true = self.truth().positions(poses)
+        request = encode(JointsRequest(poses.tolist()))
+        answer = decode(self._learner.ask_one(self._keys.predict, request), PredictReply)
+        miss = np.array(answer.x) - x_true
+        return Verdict(
+            pairs=answer.pairs,
+            error_m=float(np.linalg.norm(miss, axis=1).mean()),
+            nominal_m=float(np.linalg.norm(self._robot.chain.positions(poses) - x_true, axis=1).mean()),
+            within_sigma=float((np.abs(miss) <= np.array(answer.sigma)).mean()),
+        )

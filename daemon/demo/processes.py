@@ -1,0 +1,111 @@
+"""The processes of the demo: the daemon as `bodyschema run` starts it, and one that asks for predictions."""
+
+from __future__ import annotations
+
+import json
+import queue
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import IO
+
+from daemon.bus import Bus
+from interfaces.errors import BusError
+
+from .scene import Scene
+
+START_LIMIT_S = 60.0
+END_LIMIT_S = 15.0
+
+
+class Daemon:
+    """`bodyschema run --sim` with its output in the scene's log."""
+
+    def __init__(self, process: subprocess.Popen[bytes], scene: Scene) -> None:
+        self._process, self._scene = process, scene
+
+    def check(self) -> None:
+        """BusError when it has ended."""
+        if self._process.poll() is not None:
+            raise BusError(
+                f"the daemon ended with exit code {self._process.returncode}; {self._scene.log_file} says why"
+            )
+
+    def wait_for(self, endpoint: str) -> None:
+        """Return as soon as one of its processes listens on `endpoint`; BusError when it does not in time."""
+        limit = time.monotonic() + START_LIMIT_S
+        while True:
+            self.check()
+            try:
+                with Bus(connect=endpoint, client=True):
+                    return
+            except BusError:
+                if time.monotonic() > limit:
+                    raise
+            time.sleep(0.1)
+
+
+@contextmanager
+def started_daemon(scene: Scene) -> Iterator[Daemon]:
+    """Sampler and learner, from here to the end of the with statement."""
+    command = [sys.executable, "-m", "daemon", "run", "--sim", "--robot", str(scene.robot_file)]
+    with scene.log_file.open("wb") as log:
+        process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=log, stderr=log)
+        try:
+            yield Daemon(process, scene)
+        finally:
+            _end(process)
+
+
+class Asker:
+    """What the asking process has said so far."""
+
+    def __init__(self, lines: queue.SimpleQueue[bytes]) -> None:
+        self._lines = lines
+        self.answers = 0
+        self.unanswered = 0
+        self.p50_ms = 0.0
+        self.worst_ms = 0.0
+
+    def update(self) -> None:
+        """Take in what it said since the last call."""
+        while not self._lines.empty():
+            said = json.loads(self._lines.get())
+            self.answers += said["answers"]
+            self.unanswered += said["unanswered"] + said["refused"]
+            self.p50_ms, self.worst_ms = said["p50_ms"], said["worst_ms"]
+
+
+@contextmanager
+def started_asker(scene: Scene, seed: int) -> Iterator[Asker]:
+    """A process that asks for predictions, from here to the end of the with statement."""
+    command = [sys.executable, "-m", "daemon.demo.asker", str(scene.robot_file), str(seed)]
+    lines: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+    process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
+    assert process.stdout is not None
+    reader = threading.Thread(target=_collect, args=(process.stdout, lines), name="asker's lines")
+    reader.start()
+    try:
+        yield Asker(lines)
+    finally:
+        _end(process)
+        reader.join()
+        process.stdout.close()
+
+
+def _collect(stream: IO[bytes], lines: queue.SimpleQueue[bytes]) -> None:
+    for line in stream:
+        lines.put(line)
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    process.send_signal(signal.SIGTERM)
+    try:
+        process.wait(END_LIMIT_S)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()

@@ -1,0 +1,95 @@
+"""The demo's folder: a robot.toml of its own with free ports, the robot's URDF, and what the demo leaves behind."""
+
+from __future__ import annotations
+
+import shutil
+import socket
+from dataclasses import dataclass
+from pathlib import Path
+
+from daemon.wiring import demonstration_model
+from interfaces.errors import ConfigError
+
+OURS = ("robot.toml", "recording.csv", "learning_curve.csv", "learning_curve.png", "daemon.log", "state")
+
+
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """Where everything of one demo is."""
+
+    folder: Path
+
+    @property
+    def robot_file(self) -> Path:
+        """The robot's description with the demo's ports and seed."""
+        return self.folder / "robot.toml"
+
+    @property
+    def log_file(self) -> Path:
+        """What the two processes logged."""
+        return self.folder / "daemon.log"
+
+    @property
+    def recording_file(self) -> Path:
+        """All accepted pairs."""
+        return self.folder / "recording.csv"
+
+    @property
+    def curve_file(self) -> Path:
+        """The learning curve as numbers."""
+        return self.folder / "learning_curve.csv"
+
+    @property
+    def plot_file(self) -> Path:
+        """The learning curve as a picture."""
+        return self.folder / "learning_curve.png"
+
+
+def prepare(folder: Path, seed: int) -> Scene:
+    """Lay out the demo's folder; what an earlier demo left there is replaced.
+
+    Raises:
+        ConfigError: the folder holds files that no demo made, or cannot be written.
+    """
+    model = demonstration_model()
+    known = {*OURS, *(path.name for path in model.parent.iterdir())}
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        foreign = sorted(path.name for path in folder.iterdir() if path.name not in known)
+        if foreign:
+            raise ConfigError(f"holds {foreign[0]!r}, which no demo made", file=folder, remedy="Give another --out")
+        for path in list(folder.iterdir()):
+            shutil.rmtree(path) if path.is_dir() else path.unlink()
+        for path in model.parent.iterdir():
+            if path.suffix in {".urdf", ".toml"}:
+                shutil.copyfile(path, folder / path.name)
+        scene = Scene(folder.resolve())
+        scene.robot_file.write_text(model.read_text(encoding="utf-8") + _own_tables(seed), encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(
+            f"cannot be written: {error.strerror}", file=folder, remedy="Give another --out or free some space"
+        ) from error
+    return scene
+
+
+def _own_tables(seed: int) -> str:
+    sampler, learner = _free_ports(2)
+    return f"""
+[zenoh]
+sampler = "tcp/127.0.0.1:{sampler}"
+learner = "tcp/127.0.0.1:{learner}"
+
+[daemon]
+state_dir = "state"
+
+[sim]
+seed = {seed}
+"""
+
+
+def _free_ports(count: int) -> list[int]:
+    sockets = [socket.create_server(("127.0.0.1", 0)) for _ in range(count)]
+    ports = [server.getsockname()[1] for server in sockets]
+    for server in sockets:
+        server.close()
+    return ports
