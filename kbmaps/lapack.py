@@ -1,4 +1,4 @@
-"""The few LAPACK routines used here, typed. All work on Fortran-ordered arrays and may overwrite their inputs."""
+"""The few BLAS and LAPACK routines used here, typed. They work on Fortran order and may overwrite their inputs."""
 
 from __future__ import annotations
 
@@ -6,21 +6,27 @@ from collections.abc import Callable
 from typing import Any, cast
 
 import numpy as np
-from scipy.linalg import lapack  # pyright: ignore[reportMissingTypeStubs]
+from scipy.linalg import blas, lapack  # pyright: ignore[reportMissingTypeStubs]
 
 from kbmaps.arrays import FloatArray
 
 _PANEL_COLUMNS = 32
 
 
-def _routine(name: str) -> Callable[..., Any]:
-    return cast(Callable[..., Any], getattr(lapack, name))
+def _routine(name: str, library: object = lapack) -> Callable[..., Any]:
+    return cast(Callable[..., Any], getattr(library, name))
 
 
+_dger = _routine("dger", blas)
 _dgeqrf, _dormqr = _routine("dgeqrf"), _routine("dormqr")
 _dtpqrt, _dtpmqrt = _routine("dtpqrt"), _routine("dtpmqrt")
 _dlauum, _dpotrf, _dpotrs = _routine("dlauum"), _routine("dpotrf"), _routine("dpotrs")
 _dtrcon, _dtrtrs = _routine("dtrcon"), _routine("dtrtrs")
+
+
+def add_outer_in_place(matrix: FloatArray, column: FloatArray, row: FloatArray) -> None:
+    """matrix (n, m), in C order, += column (n,) ⊗ row (m,), without a temporary of its size."""
+    _dger(1.0, row, column, a=matrix.T, overwrite_a=1)
 
 
 def qr_in_place(square: FloatArray, targets: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from numpy.typing import ArrayLike
 
+from kbmaps import lapack
 from kbmaps.arrays import FloatArray, IntArray, rows, vector
 from kbmaps.errors import SettingError, ShapeError
 from kbmaps.kbmap import POSITION_OUTPUTS, KBMap
@@ -37,7 +36,6 @@ class NLMS:
         self._stack = BasisStack(kbmap.bases)
         # One row for each output and left weight, one column for each right weight.
         self._planes = np.array(kbmap.net.reshape(-1, self._stack.right_size))
-        self._step = np.empty_like(self._planes)
 
     @property
     def mu0(self) -> float:
@@ -57,15 +55,13 @@ class NLMS:
         """
         angles = vector("q", q, self._stack.joints)
         position = vector("x", x, POSITION_OUTPUTS)
-        weights = self._stack.joint_weights(angles)
-        left, right = self._stack.left(weights), self._stack.right(weights)
+        left, right = self._stack.halves(angles)
         predicted = (self._planes @ right).reshape(POSITION_OUTPUTS, -1) @ left
-        # ‖w‖² of a Kronecker product is the product of the joints' ‖w_k‖².
-        mu = self._mu0 / math.prod(np.square(weights).sum(axis=1).tolist())
+        # ‖w‖² of a Kronecker product is the product of its factors' norms.
+        mu = self._mu0 / float((left @ left) * (right @ right))
         # Ulbrich et al. 2009, eq. (20)
         error = mu * (position - predicted)
-        np.multiply((error[:, None] * left).reshape(-1, 1), right, out=self._step)
-        self._planes += self._step
+        lapack.add_outer_in_place(self._planes, (error[:, None] * left).ravel(), right)
 
     def replay(self, q: ArrayLike, x: ArrayLike, order: ArrayLike | None = None) -> None:
         """Steps for the pairs q (n, d) [rad], x (n, 3) [m] in the sequence `order` (indices), else as they stand.
