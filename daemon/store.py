@@ -1,0 +1,386 @@
+"""The pair store: one SQLite file, one transaction for each pair, one writer, any number of readers."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import fcntl
+import os
+import shutil
+import sqlite3
+import uuid
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from threading import Lock
+from types import TracebackType
+from typing import Any, Self
+
+import msgspec
+import numpy as np
+
+from interfaces.errors import StoreError
+from interfaces.records import FloatArray, MarkerFix, Pair, frozen_array
+
+SCHEMA_VERSION = 1
+APPLICATION_ID = 0x42534348  # "BSCH": how `file` and we tell a pair store from another SQLite file
+NOTHING_CHANGED = "Nothing was changed"
+
+_TABLES = """
+CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID;
+CREATE TABLE sessions (
+    id INTEGER PRIMARY KEY, started_utc TEXT NOT NULL, robot_toml TEXT NOT NULL, urdf TEXT NOT NULL,
+    config TEXT NOT NULL, version TEXT NOT NULL, host TEXT NOT NULL
+);
+CREATE TABLE pairs (
+    seq INTEGER PRIMARY KEY, session INTEGER NOT NULL REFERENCES sessions, segment INTEGER NOT NULL,
+    t REAL NOT NULL, utc TEXT NOT NULL, q TEXT NOT NULL, x TEXT NOT NULL, cov TEXT NOT NULL, centres_px TEXT
+);
+"""
+_COLUMNS = "seq, segment, t, utc, q, x, cov, centres_px"
+_UPPER = np.triu_indices(3)
+
+
+@dataclass(frozen=True, slots=True)
+class Session:
+    """What one run of the sampler worked with; kept beside the pairs so that they can be understood later.
+
+    Attributes:
+        joints: names in the order of q. They belong to the whole store: another order is another store.
+        robot_toml, urdf: texts of the two files.
+        config: all tables after overriding, as JSON.
+    """
+
+    joints: tuple[str, ...]
+    started_utc: str
+    robot_toml: str
+    urdf: str
+    config: str
+    version: str
+    host: str
+
+
+class PairReader:
+    """Reads a pair store, also while a sampler writes it. Use as a context manager; any thread may read.
+
+    Attributes:
+        identity: UUID of the store.
+        joints: names in the order of q.
+    """
+
+    def __init__(self, file: Path) -> None:
+        self.file = file
+        self.identity = ""
+        self.joints: tuple[str, ...] = ()
+        self._connection: sqlite3.Connection | None = None
+        self._lock = Lock()
+
+    def __enter__(self) -> Self:
+        if not self.file.exists():
+            raise StoreError(f"there is no store {self.file}. The sampler makes it: start it with `bodyschema sampler`")
+        with _explained(self.file):
+            self._connection = _connect(self.file, readonly=True)
+            try:
+                _check_kind(self._connection, self.file)
+                meta = _meta(self._connection)
+            except BaseException:
+                self._close()
+                raise
+        self.identity, self.joints = meta["store"], tuple(msgspec.json.decode(meta["joints"]))
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._close()
+
+    def read(self, from_seq: int = 1, to_seq: int | None = None, limit: int | None = None) -> list[Pair]:
+        """Pairs `from_seq` to `to_seq` (inclusive; None: the newest) in order, at most `limit` of them.
+
+        Raises:
+            StoreError: the file cannot be read.
+        """
+        rows = self._rows(
+            f"SELECT {_COLUMNS} FROM pairs WHERE seq BETWEEN ? AND ? ORDER BY seq LIMIT ?",
+            (from_seq, 2**62 if to_seq is None else to_seq, -1 if limit is None else limit),
+        )
+        return [_pair(self.identity, row) for row in rows]
+
+    def last(self) -> Pair | None:
+        """The newest pair, or None when there is none."""
+        rows = self._rows(f"SELECT {_COLUMNS} FROM pairs ORDER BY seq DESC LIMIT 1", ())
+        return _pair(self.identity, rows[0]) if rows else None
+
+    def last_seq(self) -> int:
+        """Sequence number of the newest pair; 0 when there is none."""
+        return self._rows("SELECT coalesce(max(seq), 0) FROM pairs", ())[0][0]
+
+    def joint_ranges(self) -> tuple[FloatArray, FloatArray] | None:
+        """Smallest and largest joint angles over all pairs, each shape (d,) [rad or m]; None when there is none."""
+        columns = ", ".join(
+            f"min(json_extract(q, '$[{i}]')), max(json_extract(q, '$[{i}]'))" for i in range(len(self.joints))
+        )
+        ranges = self._rows(f"SELECT {columns} FROM pairs", ())[0]
+        return None if ranges[0] is None else (frozen_array(ranges[0::2]), frozen_array(ranges[1::2]))
+
+    def _rows(self, statement: str, values: tuple[Any, ...]) -> list[Any]:
+        with self._lock, _explained(self.file):
+            if self._connection is None:
+                raise StoreError(f"the store {self.file} is closed; use it in a with statement")
+            return self._connection.execute(statement, values).fetchall()
+
+    def _close(self) -> None:
+        with self._lock:
+            if self._connection is not None:
+                self._connection.close()
+                self._connection = None
+
+
+class PairStore:
+    """Writes a pair store, which it makes when there is none. Use as a context manager, from one thread.
+
+    A pair that `append` returned is on the disk (`synchronous=FULL`). Sequence numbers run from 1 without gaps. Only
+    one process can have a store open for writing; its death, whatever its kind, frees it.
+    """
+
+    def __init__(self, file: Path, session: Session) -> None:
+        self.file = file
+        self.reader = PairReader(file)
+        self._session = session
+        self._lock_file: int | None = None
+        self._connection: sqlite3.Connection | None = None
+        self._seq = 0
+        self._session_id = 0
+
+    @property
+    def identity(self) -> str:
+        """UUID of the store."""
+        return self.reader.identity
+
+    def __enter__(self) -> Self:
+        try:
+            self._open()
+        except BaseException:
+            self._close()
+            raise
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._close()
+
+    def append(self, segment: int, utc: str, q: FloatArray, fix: MarkerFix) -> Pair:
+        """Number a pair and commit it.
+
+        Raises:
+            StoreError: the disk is full or broken; the pair is not in the store.
+        """
+        if self._connection is None:
+            raise StoreError(f"the store {self.file} is closed; use it in a with statement")
+        pair = Pair(self.identity, self._seq + 1, segment, fix.t, utc, q, fix.x, fix.cov, fix.centres_px)
+        with _explained(self.file), _transaction(self._connection):
+            self._connection.execute(
+                f"INSERT INTO pairs (session, {_COLUMNS}) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)",
+                (self._session_id, *_row(pair)),
+            )
+        self._seq = pair.seq
+        return pair
+
+    def read(self, from_seq: int = 1, to_seq: int | None = None, limit: int | None = None) -> list[Pair]:
+        """As `PairReader.read`; from any thread."""
+        return self.reader.read(from_seq, to_seq, limit)
+
+    def last(self) -> Pair | None:
+        """As `PairReader.last`; from any thread."""
+        return self.reader.last()
+
+    def _open(self) -> None:
+        self._make_directory()
+        self._lock_file = _lock(self.file)
+        with _explained(self.file):
+            self._connection = _connect(self.file)
+            if not self._connection.execute("SELECT count(*) FROM sqlite_schema").fetchone()[0]:
+                self._create(self._connection)
+            _check_kind(self._connection, self.file)
+            _check_health(self._connection, self.file)
+            self._check_joints(tuple(msgspec.json.decode(_meta(self._connection)["joints"])))
+            self._connection.execute("PRAGMA journal_mode = WAL")
+            self._connection.execute("PRAGMA synchronous = FULL")
+            self._session_id = self._begin_session(self._connection)
+        self.reader.__enter__()
+        self._seq = self.reader.last_seq()
+
+    def _make_directory(self) -> None:
+        try:
+            self.file.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise StoreError(
+                f"cannot make the directory {self.file.parent}: {error.strerror}. Give another one with --state-dir, "
+                "or as state_dir in the table [daemon] of robot.toml"
+            ) from error
+
+    def _create(self, connection: sqlite3.Connection) -> None:
+        meta = {"store": str(uuid.uuid4()), "created_utc": self._session.started_utc}
+        meta["joints"] = msgspec.json.encode(self._session.joints).decode()
+        with _transaction(connection):
+            for statement in _TABLES.split(";"):
+                connection.execute(statement)
+            connection.executemany("INSERT INTO meta VALUES (?, ?)", meta.items())
+            connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
+            connection.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
+
+    def _begin_session(self, connection: sqlite3.Connection) -> int:
+        session = self._session
+        with _transaction(connection):
+            done = connection.execute(
+                "INSERT INTO sessions (started_utc, robot_toml, urdf, config, version, host) VALUES (?, ?, ?, ?, ?, ?)",
+                (session.started_utc, session.robot_toml, session.urdf, session.config, session.version, session.host),
+            )
+        return int(done.lastrowid or 0)
+
+    def _check_joints(self, stored: tuple[str, ...]) -> None:
+        if stored != self._session.joints:
+            raise StoreError(
+                f"{self.file} holds pairs of the joints {', '.join(stored)}; robot.toml has "
+                f"{', '.join(self._session.joints)}. Give this robot a state_dir of its own (--state-dir), "
+                f"or move the file away. {NOTHING_CHANGED}"
+            )
+
+    def _close(self) -> None:
+        self.reader.__exit__(None, None, None)
+        if self._connection is not None:
+            self._connection.close()
+            self._connection = None
+        if self._lock_file is not None:
+            os.close(self._lock_file)
+            self._lock_file = None
+
+
+def _connect(file: Path, *, readonly: bool = False) -> sqlite3.Connection:
+    uri = f"{file.absolute().as_uri()}?mode={'ro' if readonly else 'rwc'}"
+    return sqlite3.connect(uri, uri=True, isolation_level=None, check_same_thread=not readonly)
+
+
+@contextmanager
+def _transaction(connection: sqlite3.Connection) -> Iterator[None]:
+    connection.execute("BEGIN IMMEDIATE")
+    try:
+        yield
+        connection.execute("COMMIT")
+    except BaseException:
+        with contextlib.suppress(sqlite3.Error):  # a full disk has rolled back already
+            connection.execute("ROLLBACK")
+        raise
+
+
+def _lock(file: Path) -> int:
+    """A lock on a file beside the store, which the process's end frees and which its children do not inherit."""
+    lock_file = file.with_name(file.name + ".lock")
+    try:
+        descriptor = os.open(lock_file, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+    except OSError as error:
+        raise StoreError(_unwritable(file, error.errno, error.strerror)) from error
+    try:
+        fcntl.lockf(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        os.close(descriptor)
+        raise StoreError(
+            f"another sampler is writing {file}. Stop it (`bodyschema status` shows it), "
+            "or give this one a --state-dir of its own"
+        ) from error
+    return descriptor
+
+
+def _check_kind(connection: sqlite3.Connection, file: Path) -> None:
+    if connection.execute("PRAGMA application_id").fetchone()[0] != APPLICATION_ID:
+        raise StoreError(
+            f"{file} is not a pair store but another SQLite file. Move it away, or give another --state-dir. "
+            f"{NOTHING_CHANGED}"
+        )
+    version = connection.execute("PRAGMA user_version").fetchone()[0]
+    if version > SCHEMA_VERSION:
+        raise StoreError(
+            f"{file} was written by a newer bodyschema (schema {version}, this one knows {SCHEMA_VERSION}). "
+            f"Install the newer bodyschema, or give another --state-dir. {NOTHING_CHANGED}"
+        )
+
+
+def _check_health(connection: sqlite3.Connection, file: Path) -> None:
+    found = connection.execute("PRAGMA quick_check(1)").fetchone()[0]
+    count, newest = connection.execute("SELECT count(*), coalesce(max(seq), 0) FROM pairs").fetchone()
+    if found != "ok" or count != newest:
+        what = found if found != "ok" else f"{newest - count} pairs are missing"
+        raise StoreError(_damaged(file, what))
+
+
+def _meta(connection: sqlite3.Connection) -> dict[str, str]:
+    return dict(connection.execute("SELECT key, value FROM meta").fetchall())
+
+
+@contextmanager
+def _explained(file: Path) -> Iterator[None]:
+    """Errors of SQLite as StoreErrors that name the file and the remedy."""
+    try:
+        yield
+    except sqlite3.Error as error:
+        raise StoreError(_explanation(file, error)) from error
+
+
+def _explanation(file: Path, error: sqlite3.Error) -> str:
+    name = getattr(error, "sqlite_errorname", "")
+    if name == "SQLITE_FULL" or (name.startswith("SQLITE_IOERR") and _free_bytes(file) < 2**16):
+        return _unwritable(file, errno.ENOSPC, "")
+    if name.startswith(("SQLITE_READONLY", "SQLITE_CANTOPEN")):
+        return _unwritable(file, errno.EROFS, str(error))
+    if name.startswith("SQLITE_NOTADB"):
+        return f"{file} is not a pair store. Move it away, or give another --state-dir. {NOTHING_CHANGED}"
+    if name.startswith("SQLITE_CORRUPT") or isinstance(error, sqlite3.DataError):
+        return _damaged(file, str(error))
+    return f"{file}: {error} ({name or type(error).__name__}). Check the disk"
+
+
+def _unwritable(file: Path, number: int | None, what: str) -> str:
+    if number == errno.ENOSPC:
+        return f"the disk of {file} is full. Free some space, or give a --state-dir on another disk. {NOTHING_CHANGED}"
+    why = "the disk is read-only" if number == errno.EROFS else what
+    return f"cannot write {file}: {why}. Give a --state-dir that can be written"
+
+
+def _damaged(file: Path, what: str) -> str:
+    return (
+        f"{file} is damaged ({what}). Keep it, save what can be read with `sqlite3 {file.name} .recover`, "
+        f"and give another --state-dir. {NOTHING_CHANGED}"
+    )
+
+
+def _free_bytes(file: Path) -> int:
+    return shutil.disk_usage(file.parent).free
+
+
+def _row(pair: Pair) -> tuple[Any, ...]:
+    centres = None if pair.centres_px is None else _json(pair.centres_px)
+    arrays = (_json(pair.q.tolist()), _json(pair.x.tolist()), _json(pair.cov[_UPPER].tolist()))
+    return (pair.seq, pair.segment, pair.t, pair.utc, *arrays, centres)
+
+
+def _pair(store: str, row: tuple[Any, ...]) -> Pair:
+    seq, segment, t, utc, q, x, upper, centres = row
+    cov = np.zeros((3, 3))
+    cov[_UPPER] = msgspec.json.decode(upper)
+    return Pair(
+        store=store,
+        seq=seq,
+        segment=segment,
+        t=t,
+        utc=utc,
+        q=frozen_array(msgspec.json.decode(q)),
+        x=frozen_array(msgspec.json.decode(x)),
+        cov=frozen_array(cov + np.triu(cov, 1).T),
+        centres_px=None if centres is None else tuple(msgspec.json.decode(centres)),
+    )
+
+
+def _json(numbers: object) -> str:
+    return msgspec.json.encode(numbers).decode()
