@@ -1,0 +1,69 @@
+"""The demo as a newcomer runs it, only shorter."""
+
+from __future__ import annotations
+
+import csv
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("pybullet")
+
+FIRST, SECOND = 60, 30
+
+
+@dataclass(frozen=True)
+class Demo:
+    folder: Path
+    result: subprocess.CompletedProcess[str]
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory: pytest.TempPathFactory) -> Demo:
+    folder = tmp_path_factory.mktemp("demo") / "out"
+    command = [sys.executable, "-m", "daemon", "demo", "--out", str(folder), "--seed", "3"]
+    command += ["--pairs", str(FIRST), "--pairs-after", str(SECOND)]
+    return Demo(folder, subprocess.run(command, capture_output=True, text=True, timeout=110))
+
+
+def test_the_demo_ends_well(demo: Demo) -> None:
+    assert demo.result.returncode == 0, demo.result.stderr
+
+
+def test_the_demo_leaves_a_recording_with_every_pair(demo: Demo) -> None:
+    with (demo.folder / "recording.csv").open(newline="") as stream:
+        assert len(list(csv.DictReader(stream))) >= FIRST + SECOND
+
+
+def test_the_demo_plots_the_curve_it_measured(demo: Demo) -> None:
+    with (demo.folder / "learning_curve.csv").open(newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    assert len(rows) >= 2
+    assert (demo.folder / "learning_curve.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_the_learnt_model_beats_the_nominal_one(demo: Demo) -> None:
+    with (demo.folder / "learning_curve.csv").open(newline="") as stream:
+        last = list(csv.DictReader(stream))[-1]
+    assert float(last["held_out_error_mm"]) < 0.7 * float(last["nominal_error_mm"])
+
+
+def test_predictions_were_answered_all_the_while(demo: Demo) -> None:
+    assert " 0 went unanswered" in demo.result.stdout
+
+
+def test_without_a_terminal_the_demo_prints_plain_lines(demo: Demo) -> None:
+    assert "\x1b" not in demo.result.stdout
+
+
+def test_the_demo_refuses_a_folder_that_is_not_its_own(tmp_path: Path) -> None:
+    precious = tmp_path / "thesis.tex"
+    precious.write_text("years of work")
+    command = [sys.executable, "-m", "daemon", "demo", "--out", str(tmp_path)]
+    result = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert result.returncode == 1
+    assert "thesis.tex" in result.stderr
+    assert precious.read_text() == "years of work"
