@@ -1,0 +1,230 @@
+"""Recordings: many pairs on disk, as CSV or Parquet (columns: `interfaces.recording_columns`)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import MappingProxyType
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .errors import RecordingError
+from .recording_columns import (
+    CENTRES,
+    COVARIANCE,
+    ORIENTATION,
+    POSITION,
+    SIGMA,
+    Fault,
+    Table,
+    check_finite,
+    check_header,
+    check_values,
+    extra_columns,
+    full_covariances,
+)
+from .recording_csv import FIRST_ROW_LINE, read_csv_table, write_csv_rows
+from .recording_parquet import INTEGER_COLUMNS, read_parquet_table, write_parquet_table
+from .records import FloatArray, frozen_array
+
+CSV, PARQUET = ".csv", ".parquet"
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """Many pairs, in the order in which they were measured.
+
+    Attributes:
+        joints: names in the order of q.
+        q: joint angles [rad] (m for a prismatic joint), shape (n, d).
+        x: marker positions in the measurement frame [m], shape (n, 3).
+        t: times [s], shape (n,), strictly increasing inside a segment, or None.
+        cov: covariances of x [m²], shape (n, 3, 3), or None.
+        segment: numbers of the runs, shape (n,), or None.
+        centres_px: (ul, vl, ur, vr) [px], shape (n, 4), or None.
+        orientation: unit quaternions (x, y, z, w), shape (n, 4), or None.
+        extra: the columns current_<joint> [A] and temperature_<joint> [°C] that are there, each of shape (n,).
+        file: where it was read from, or None.
+
+    Raises:
+        RecordingError: a value cannot be; the message names row (of a CSV file: line) and column.
+        ValueError: the arrays' shapes do not fit each other.
+    """
+
+    joints: tuple[str, ...]
+    q: FloatArray
+    x: FloatArray
+    t: FloatArray | None = None
+    cov: FloatArray | None = None
+    segment: NDArray[np.int64] | None = None
+    centres_px: FloatArray | None = None
+    orientation: FloatArray | None = None
+    extra: Mapping[str, FloatArray] = field(default_factory=dict)
+    file: Path | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("q", "x", "t", "cov", "centres_px", "orientation"):
+            value = getattr(self, name)
+            object.__setattr__(self, name, None if value is None else frozen_array(value))
+        if self.segment is not None:
+            segment = np.array(self.segment, dtype=np.int64)
+            segment.setflags(write=False)
+            object.__setattr__(self, "segment", segment)
+        extra = {name: frozen_array(column) for name, column in self.extra.items()}
+        object.__setattr__(self, "extra", MappingProxyType(extra))
+        self._check_shapes()
+        try:
+            self._check_values()
+        except Fault as fault:
+            raise _located(fault, self.file) from None
+
+    def __len__(self) -> int:
+        return len(self.q)
+
+    @classmethod
+    def read(cls, file: Path | str, joints: tuple[str, ...]) -> Self:
+        """The recording in `file`, CSV or Parquet by its ending.
+
+        Args:
+            joints: the robot's joints in the order of q; each has to have its column.
+
+        Raises:
+            RecordingError: the file cannot be read; the message names line, column and remedy.
+        """
+        file, joints = Path(file), tuple(joints)
+        readers = {CSV: read_csv_table, PARQUET: read_parquet_table}
+        reader = readers.get(file.suffix.lower())
+        if reader is None:
+            raise RecordingError(f"recordings end in {CSV} or {PARQUET}", file=file, remedy="Rename or convert it")
+        try:
+            table = reader(file, joints)
+            check_values(table)
+        except Fault as fault:
+            raise _located(fault, file) from None
+        except OSError as error:
+            raise RecordingError(f"cannot be read: {error.strerror or error}", file=file) from error
+        return cls.from_table(table, joints, file)
+
+    @classmethod
+    def from_table(cls, table: Table, joints: tuple[str, ...], file: Path | None = None) -> Self:
+        """The recording that a table with a checked header holds."""
+
+        def optional(names: tuple[str, ...]) -> FloatArray | None:
+            return table.columns(names) if table.has(names) else None
+
+        sigma, upper = optional(SIGMA), optional(COVARIANCE)
+        cov = None if upper is None else full_covariances(upper)
+        if sigma is not None:
+            cov = np.zeros((len(sigma), 3, 3))
+            cov[:, range(3), range(3)] = sigma**2
+        t, segment = optional(("t",)), optional(("segment",))
+        return cls(
+            joints=joints,
+            q=table.columns(joints),
+            x=table.columns(POSITION),
+            t=None if t is None else t[:, 0],
+            cov=cov,
+            segment=None if segment is None else segment[:, 0].astype(np.int64),
+            centres_px=optional(CENTRES),
+            orientation=optional(ORIENTATION),
+            extra={name: table.columns((name,))[:, 0] for name in table.names if name in extra_columns(joints)},
+            file=file,
+        )
+
+    def to_table(self) -> Table:
+        """All columns; covariances always as their upper triangle, so that they come back exactly."""
+        blocks: list[tuple[tuple[str, ...], FloatArray]] = []
+        if self.t is not None:
+            blocks.append((("t",), self.t[:, None]))
+        if self.segment is not None:
+            blocks.append((("segment",), self.segment[:, None].astype(np.float64)))
+        blocks += [(self.joints, self.q), (POSITION, self.x)]
+        if self.cov is not None:
+            rows, columns = np.triu_indices(3)
+            blocks.append((COVARIANCE, self.cov[:, rows, columns]))
+        if self.centres_px is not None:
+            blocks.append((CENTRES, self.centres_px))
+        if self.orientation is not None:
+            blocks.append((ORIENTATION, self.orientation))
+        blocks += [((name,), column[:, None]) for name, column in self.extra.items()]
+        names = tuple(name for group, _ in blocks for name in group)
+        return Table(names, np.hstack([values for _, values in blocks]))
+
+    def write_csv(self, file: Path) -> None:
+        """Write CSV; reading it gives every number back exactly.
+
+        Raises:
+            RecordingError: the file cannot be written.
+        """
+        table = self.to_table()
+        integers = frozenset(i for i, name in enumerate(table.names) if name in INTEGER_COLUMNS)
+        try:
+            with file.open("w", encoding="utf-8", newline="\n") as out:
+                out.write(",".join(table.names) + "\n")
+                write_csv_rows(out, table.values.tolist(), integers)
+        except OSError as error:
+            raise RecordingError(f"cannot be written: {error.strerror or error}", file=file) from error
+
+    def write_parquet(self, file: Path) -> None:
+        """Write Parquet; reading it gives every number back exactly.
+
+        Raises:
+            RecordingError: the file cannot be written, or the extra `export` is not installed.
+        """
+        try:
+            write_parquet_table(file, self.to_table())
+        except OSError as error:
+            raise RecordingError(f"cannot be written: {error.strerror or error}", file=file) from error
+
+    def rows(self, chosen: NDArray[np.bool_] | NDArray[np.int64]) -> Recording:
+        """The recording of the rows that a mask or indices choose."""
+
+        def pick(values: FloatArray | None) -> FloatArray | None:
+            return None if values is None else values[chosen]
+
+        return Recording(
+            joints=self.joints,
+            q=self.q[chosen],
+            x=self.x[chosen],
+            t=pick(self.t),
+            cov=pick(self.cov),
+            segment=None if self.segment is None else self.segment[chosen],
+            centres_px=pick(self.centres_px),
+            orientation=pick(self.orientation),
+            extra={name: column[chosen] for name, column in self.extra.items()},
+        )
+
+    def _check_shapes(self) -> None:
+        n, d = self.q.shape if self.q.ndim == 2 else (-1, -1)
+        if n < 1 or d != len(self.joints):
+            raise ValueError(f"q has the shape {self.q.shape}, not (n, {len(self.joints)}) with n of at least 1")
+        shapes = {"x": (n, 3), "t": (n,), "cov": (n, 3, 3), "segment": (n,), "centres_px": (n, 4)}
+        shapes["orientation"] = (n, 4)
+        for name, shape in shapes.items():
+            value = getattr(self, name)
+            if value is not None and value.shape != shape:
+                raise ValueError(f"{name} has the shape {value.shape}, not {shape}")
+        for name, column in self.extra.items():
+            if column.shape != (n,):
+                raise ValueError(f"extra column {name} has the shape {column.shape}, not {(n,)}")
+        if self.cov is not None and not (self.cov == np.swapaxes(self.cov, 1, 2)).all():
+            raise ValueError("cov is not symmetric")
+
+    def _check_values(self) -> None:
+        table = self.to_table()
+        check_header(table.names, self.joints)
+        check_finite(table)
+        check_values(table)
+
+
+def _located(fault: Fault, file: Path | None) -> RecordingError:
+    where = "recording" if file is None else file
+    if file is not None and file.suffix.lower() == CSV:
+        line = 1 if fault.row is None and fault.column is not None else None
+        line = fault.row + FIRST_ROW_LINE if fault.row is not None else line
+        return RecordingError(fault.what, file=where, line=line, column=fault.column, remedy=fault.remedy)
+    what = fault.what if fault.row is None else f"row {fault.row + 1}: {fault.what}"
+    return RecordingError(what, file=where, column=fault.column, remedy=fault.remedy)

@@ -1,0 +1,123 @@
+"""Recordings as CSV: a header, then numbers, every float with all the digits that bring it back exactly."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from itertools import chain
+from pathlib import Path
+from typing import TextIO
+
+import numpy as np
+
+from .recording_columns import Fault, Table, check_finite, check_header
+from .records import FloatArray
+
+FIRST_ROW_LINE = 2
+
+
+def read_csv_table(file: Path, joints: tuple[str, ...]) -> Table:
+    """The numbers in `file`, all finite, under a checked header.
+
+    Raises:
+        Fault: something is wrong with the text; rows count from 0 below the header.
+        OSError: the file cannot be read.
+    """
+    text = _decoded(file.read_bytes())
+    if not text.strip():
+        raise Fault("the file is empty", remedy="A recording has a header line and at least one row")
+    header, *lines = (line.removesuffix("\r") for line in text.split("\n"))
+    names = tuple(name.strip() for name in header.split(","))
+    _check_header_line(names, joints)
+    whole = lines[-1:] == [""]
+    if whole:
+        lines.pop()
+    if not lines:
+        raise Fault("there are no rows below the header", remedy="Record at least one pair")
+    table = Table(names, _numbers(lines, names, whole))
+    check_finite(table)
+    if not whole:
+        raise Fault(
+            "the last line has no line end, so its last number may be cut off",
+            row=len(lines) - 1,
+            column=names[-1],
+            remedy="Add a line end if the number is whole, otherwise delete the line",
+        )
+    return table
+
+
+def write_csv_rows(out: TextIO, rows: Iterable[Iterable[float]], integers: frozenset[int]) -> None:
+    """Append rows; columns whose index is in `integers` are written without a decimal point."""
+    out.writelines(
+        ",".join(repr(int(value)) if index in integers else repr(value) for index, value in enumerate(row)) + "\n"
+        for row in rows
+    )
+
+
+def _decoded(data: bytes) -> str:
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = data.count(b"\n", 0, error.start)
+        raise Fault(
+            f"the byte 0x{data[error.start]:02x} is not UTF-8 text",
+            row=line - 1,
+            remedy="Save the recording as CSV in UTF-8, without quotes",
+        ) from error
+
+
+def _check_header_line(names: tuple[str, ...], joints: tuple[str, ...]) -> None:
+    if len(names) == 1 and (";" in names[0] or "\t" in names[0]):
+        raise Fault("the columns are not separated by commas", remedy="Save the recording with commas between columns")
+    if all(_number(name) is not None for name in names):
+        raise Fault("the first line has numbers where the names of the columns should be", remedy="Add a header line")
+    check_header(names, joints)
+
+
+def _numbers(lines: list[str], names: tuple[str, ...], whole: bool) -> FloatArray:
+    """All rows at once; only when that fails are the fields looked at one by one."""
+    rows = [line.split(",") for line in lines]
+    strict = all(line.isascii() and "_" not in line for line in lines)  # float() takes "1_0" and foreign digits
+    if strict and all(len(row) == len(names) for row in rows):
+        try:
+            flat = np.fromiter(map(float, chain.from_iterable(rows)), dtype=np.float64, count=len(rows) * len(names))
+        except ValueError:
+            pass
+        else:
+            return flat.reshape(len(rows), len(names))
+    raise _first_wrong_field(rows, names, whole)
+
+
+def _first_wrong_field(rows: list[list[str]], names: tuple[str, ...], whole: bool) -> Fault:
+    for index, row in enumerate(rows):
+        if len(row) != len(names):
+            return _wrong_width(rows, index, names, whole)
+        for name, text in zip(names, row, strict=True):
+            if _number(text) is None:
+                what = "the field is empty" if not text.strip() else f"{_shortened(text)} is not a number"
+                return Fault(what, row=index, column=name, remedy="Write it like -0.5 or 1e-3, without quotes")
+    raise AssertionError("every field is a number")
+
+
+def _wrong_width(rows: list[list[str]], index: int, names: tuple[str, ...], whole: bool) -> Fault:
+    row = rows[index]
+    if index == len(rows) - 1 and not whole:
+        return Fault("the last line is torn: the recording was cut off here", row=index, remedy="Delete this line")
+    if row == [""]:
+        return Fault("the line is empty", row=index, remedy="Delete the line")
+    fewer = len(row) < len(names)
+    what = f"{len(row)} field{'s' if len(row) > 1 else ''} where the header names {len(names)}"
+    column = names[len(row)] if fewer else None
+    return Fault(what, row=index, column=column, remedy="Mend or delete the line")
+
+
+def _number(text: str) -> float | None:
+    if not text.isascii() or "_" in text:
+        return None
+    try:
+        return float(text)
+    except ValueError:
+        return None
+
+
+def _shortened(text: str) -> str:
+    return repr(text if len(text) <= 40 else text[:37] + "...")

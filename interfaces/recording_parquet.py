@@ -1,0 +1,83 @@
+"""Recordings as Parquet. Needs the extra `export`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .errors import RecordingError
+from .recording_columns import Fault, Table, check_finite, check_header
+
+INTEGER_COLUMNS = frozenset({"segment"})
+
+
+def read_parquet_table(file: Path, joints: tuple[str, ...]) -> Table:
+    """The numbers in `file`, all finite, under a checked header.
+
+    Raises:
+        RecordingError: the extra `export` is not installed.
+        Fault: something is wrong with the file.
+        OSError: the file cannot be read.
+    """
+    arrow, parquet = _modules(file)
+    with file.open("rb") as stream:
+        try:
+            content = parquet.ParquetFile(stream).read()
+        except (arrow.ArrowException, OSError, ValueError) as error:
+            raise Fault(
+                f"not a whole Parquet file: {_first_line(error)}",
+                remedy="Write it again; a Parquet file whose writing was cut off cannot be read",
+            ) from error
+    names = tuple(content.column_names)
+    check_header(names, joints)
+    if content.num_rows == 0:
+        raise Fault("there are no rows", remedy="Record at least one pair")
+    values = np.column_stack([_column(arrow, name, content.column(name)) for name in names])
+    table = Table(names, values)
+    check_finite(table)
+    return table
+
+
+def write_parquet_table(file: Path, table: Table) -> None:
+    """Write `table` to `file`.
+
+    Raises:
+        RecordingError: the extra `export` is not installed.
+        OSError: the file cannot be written.
+    """
+    arrow, parquet = _modules(file)
+    columns = {
+        name: arrow.array(column.astype(np.int64) if name in INTEGER_COLUMNS else column)
+        for name, column in zip(table.names, table.values.T, strict=True)
+    }
+    with file.open("wb") as stream:
+        parquet.write_table(arrow.table(columns), stream)
+
+
+def _column(arrow: Any, name: str, column: Any) -> np.ndarray:
+    kind = column.type
+    if not (arrow.types.is_floating(kind) or arrow.types.is_integer(kind)):
+        raise Fault(f"the column holds {kind}, not numbers", column=name, remedy="Write it as double")
+    if column.null_count:
+        row = int(np.flatnonzero(column.is_null().to_numpy())[0])
+        raise Fault("the value is missing", row=row, column=name, remedy="Mend or delete the row")
+    return column.to_numpy().astype(np.float64)
+
+
+def _modules(file: Path) -> tuple[Any, Any]:
+    try:
+        import pyarrow
+        import pyarrow.parquet
+    except ImportError as error:
+        raise RecordingError(
+            "Parquet needs the extra `export`",
+            file=file,
+            remedy="Install it with `pip install 'bodyschema[export]'`, or use CSV",
+        ) from error
+    return pyarrow, pyarrow.parquet
+
+
+def _first_line(error: BaseException) -> str:
+    return str(error).strip().split("\n")[0].rstrip(".")
