@@ -1,0 +1,22 @@
+"""What the learner does with pairs, without I/O and without a clock."""
+
+from __future__ import annotations
+
+from .learning import Learning
+from .nominal import NominalModel
+from .snapshot import NoFrameError, Prediction, Snapshot
+from .solver import DirectSolver, ExactSolver, Solved
+from .state import LearningState, StateError
+
+__all__ = [
+    "DirectSolver",
+    "ExactSolver",
+    "Learning",
+    "LearningState",
+    "NoFrameError",
+    "NominalModel",
+    "Prediction",
+    "Snapshot",
+    "Solved",
+    "StateError",
+]

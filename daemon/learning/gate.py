@@ -1,0 +1,39 @@
+"""Which pairs to doubt: one gross outlier must not spoil the map, a changed tool must be followed."""
+
+from __future__ import annotations
+
+import math
+
+# A pair this many times farther from the prediction than expected is doubted.
+DOUBT = 5.0
+# So many doubted pairs in a row are no outliers: the world has changed.
+CHANGE = 6
+
+
+class Gate:
+    """Counts doubted pairs in a row."""
+
+    def __init__(self, in_a_row: int = 0) -> None:
+        self.in_a_row = in_a_row
+
+    def doubts(self, distance_m: float, limit_m: float) -> bool:
+        """Whether to doubt a pair that lies `distance_m` from its prediction."""
+        doubted = distance_m > limit_m
+        self.in_a_row = self.in_a_row + 1 if doubted else 0
+        return doubted
+
+    @property
+    def changed(self) -> bool:
+        """Whether the run of doubted pairs is a change."""
+        return self.in_a_row >= CHANGE
+
+
+def limit_m(inside_m: float, outside_m: float, unexplained: float) -> float:
+    """How far from its prediction a pair may lie [m].
+
+    Args:
+        inside_m: RMS distance of recent pairs from their predictions.
+        outside_m: the same of the prior, which is what is left where no data was.
+        unexplained: how far from all data the pair lies, 0 to 1.
+    """
+    return DOUBT * math.sqrt(inside_m**2 + unexplained * outside_m**2)

@@ -1,0 +1,391 @@
+"""The learner: pairs in, models side by side, a snapshot that answers.
+
+Two threads may use one object: one calls `learn`, the other `work`, and each holds the lock for short pieces only.
+Whoever answers queries takes `snapshot`, which needs no lock.
+"""
+
+from __future__ import annotations
+
+import copy
+import threading
+
+import numpy as np
+
+from daemon.config import LearnerConfig
+from daemon.status import CurvePoint
+from interfaces.errors import RequestError
+from interfaces.records import FloatArray, Pair
+from kbmaps import DegenerateDataError, KBMap, SupportSet
+
+from .curve import Curve
+from .gate import CHANGE, Gate, limit_m
+from .members import EXACT, INSTANT, PRIOR, Members
+from .memory import PairMemory, Permutations
+from .nominal import NominalModel
+from .scores import ErrorMemory, choose
+from .snapshot import Snapshot
+from .solver import LARGEST_NET, ExactSolver
+from .state import Counters, LearningHeader, LearningState, StateError
+
+# RMS distance between a nominal model and reality that surprises nobody [m].
+EXPECTED_M = 0.1
+# A measurement farther away than this is not one in metres [m].
+FARTHEST_M = 1000.0
+REPLAY_STEPS = 64
+FEED_PAIRS = 256
+KEPT_DOUBTS = 64
+
+
+class Learning:
+    """Learns the forward kinematics of one robot from pairs."""
+
+    def __init__(self, nominal: NominalModel, settings: LearnerConfig, solver: ExactSolver) -> None:
+        self._nominal, self._settings, self._solver = nominal, settings, solver
+        self._lock = threading.Lock()
+        self._counters, self._curve = Counters(), Curve()
+        self._memory = PairMemory(nominal.joints, settings.replay_capacity)
+        self._doubts = PairMemory(nominal.joints, KEPT_DOUBTS)
+        self._learnt_at: float | None = None
+        self._task = 0
+        # The background thread's own: what the solver has been given.
+        self._solver_task, self._fed, self._asked_at, self._asked = 0, 0, 0, False
+        self._solve_soon = False
+        self._begin_at_nominal()
+        self._publish()
+
+    @property
+    def snapshot(self) -> Snapshot:
+        """The model that answers now."""
+        return self._snapshot
+
+    @property
+    def nominal(self) -> NominalModel:
+        """Where learning starts."""
+        return self._nominal
+
+    @property
+    def aligning(self) -> bool:
+        """Whether the frame is not known yet."""
+        return self._members is None
+
+    @property
+    def counters(self) -> Counters:
+        """A copy of all that is counted."""
+        with self._lock:
+            return copy.copy(self._counters)
+
+    @property
+    def curve(self) -> list[CurvePoint]:
+        """Mean prequential error [m] of the answering model over the pairs."""
+        with self._lock:
+            return self._curve.points
+
+    def prequential_m(self) -> dict[str, float]:
+        """Recent mean distance between prediction and measurement, before learning [m], by model."""
+        with self._lock:
+            means = {name: memory.mean_m for name, memory in self._errors.items()}
+        return {name: mean for name, mean in means.items() if mean is not None}
+
+    def claimed_error_m(self) -> float | None:
+        """Mean distance to the truth [m] that is claimed for predictions where data is; None while unknown."""
+        with self._lock:
+            answering = self._errors.get(self._answering)
+            return answering.claimed_m if answering is not None else None
+
+    def learn(self, pair: Pair, now: float) -> None:
+        """Learn one pair at once.
+
+        Raises:
+            RequestError: it is not a pair of this robot and store, or not newer than the last one; nothing changed.
+        """
+        with self._lock:
+            self._check(pair)
+            self._counters.store, self._counters.last_seq = pair.store, pair.seq
+            self._counters.pairs += 1
+            self._counters.since_change += 1
+            self._learnt_at = now
+            if self._members is None:
+                self._memory.append(pair.q, pair.x)
+            else:
+                self._learn_online(self._members, pair)
+            self._publish()
+
+    def refuse(self) -> None:
+        """Count a pair that could not be taken."""
+        with self._lock:
+            self._counters.refused += 1
+
+    def recovered(self, pairs: int) -> None:
+        """Count pairs that had to be fetched from history."""
+        with self._lock:
+            self._counters.gaps_recovered += pairs
+
+    def tool_changed(self) -> None:
+        """From now on another tool: pairs so far no longer count, what they taught is where learning starts again."""
+        with self._lock:
+            self._change_tool(EXPECTED_M)
+            self._publish()
+
+    def reset_to_prior(self, *, forget_store: bool = False) -> None:
+        """Forget what was learnt. With `forget_store`, pairs may come from another store, from its first one on."""
+        with self._lock:
+            if forget_store:
+                self._counters = Counters(refused=self._counters.refused)
+                self._curve, self._learnt_at = Curve(), None
+            self._counters.since_change = 0
+            self._begin_at_nominal()
+            self._publish()
+
+    def solve_soon(self) -> None:
+        """Let the exact solver catch up although fewer than `solve_every` pairs are new."""
+        self._solve_soon = True
+
+    def work(self) -> bool:
+        """One small piece of background work; False when there is none."""
+        return self._align() or self._serve_solver() or self._replay()
+
+    def state(self) -> LearningState:
+        """Everything needed to go on from here."""
+        with self._lock:
+            q, x = self._memory.all()
+            doubted_q, doubted_x = self._doubts.all()
+            nets = {} if self._members is None else {name: m.net for name, m in self._members.maps.items()}
+            header = LearningHeader(
+                fingerprint=self._nominal.fingerprint,
+                counters=copy.copy(self._counters),
+                answering=self._answering,
+                errors=copy.deepcopy(self._errors),
+                curve=self._curve.points,
+                curve_stride=self._curve.stride,
+                doubted_in_a_row=self._gate.in_a_row,
+                next_alignment=self._next_alignment,
+                replays_due=self._replays_due,
+            )
+        kept = {"q": q, "x": x, "doubted_q": doubted_q, "doubted_x": doubted_x}
+        return LearningState(header, kept | {f"net_{name}": net for name, net in nets.items()})
+
+    def restore(self, state: LearningState) -> None:
+        """Go on from a state; the exact solver gets the kept pairs again in the background.
+
+        Raises:
+            StateError: it belongs to another nominal model.
+        """
+        header = state.header
+        if header.fingerprint != self._nominal.fingerprint:
+            raise StateError("it belongs to another nominal model: robot.toml or the URDF has changed since")
+        nets = {name[4:]: net for name, net in state.arrays.items() if name.startswith("net_")}
+        with self._lock:
+            if nets:
+                self._begin(KBMap(self._nominal.bases, nets[PRIOR]), EXPECTED_M)
+                self._members_now.restore(nets)
+            else:
+                self._begin_at_nominal()
+            for q, x in zip(state.arrays["q"], state.arrays["x"], strict=True):
+                self._keep(q, x)
+            for q, x in zip(state.arrays["doubted_q"], state.arrays["doubted_x"], strict=True):
+                self._doubts.append(q, x)
+            self._counters, self._errors, self._answering = header.counters, dict(header.errors), header.answering
+            self._curve = Curve(header.curve, header.curve_stride)
+            self._gate = Gate(header.doubted_in_a_row)
+            self._next_alignment, self._replays_due = header.next_alignment, header.replays_due
+            self._publish()
+
+    def _begin_at_nominal(self) -> None:
+        known = self._nominal.frame_known
+        self._begin(self._nominal.prior() if known else None, EXPECTED_M)
+        self._next_alignment = None if known else self._nominal.pairs_to_align
+
+    def _begin(self, prior: KBMap | None, expected_m: float) -> None:
+        """Start anew from `prior` (None: wait for an alignment), with no pairs."""
+        self._members = Members(prior, self._settings.step_size) if prior is not None else None
+        self._errors = {name: ErrorMemory(expected_m) for name in (PRIOR, INSTANT)} if prior is not None else {}
+        self._answering = PRIOR
+        self._memory.clear()
+        self._doubts.clear()
+        self._order = Permutations(self._settings.seed)
+        self._support = SupportSet(self._nominal.bases)
+        self._support_view: SupportSet | None = None
+        self._gate = Gate()
+        self._next_alignment: int | None = None
+        self._replays_due = 0.0
+        self._task += 1
+
+    @property
+    def _members_now(self) -> Members:
+        if self._members is None:
+            raise RuntimeError("there are no models before the alignment")
+        return self._members
+
+    def _check(self, pair: Pair) -> None:
+        counters = self._counters
+        if counters.store not in (None, pair.store):
+            raise RequestError(
+                f"pair {pair.seq} comes from the store {pair.store}, this learner learnt from {counters.store}"
+            )
+        if pair.seq <= counters.last_seq:
+            raise RequestError(f"pair {pair.seq} has been learnt already; the last one was {counters.last_seq}")
+        if len(pair.q) != self._nominal.joints:
+            raise RequestError(
+                f"pair {pair.seq} has {len(pair.q)} joint angles, this robot has {self._nominal.joints}"
+            )
+        if not all(np.isfinite(part).all() for part in (pair.q, pair.x, pair.cov)):
+            raise RequestError(f"pair {pair.seq} has a number that is not finite")
+        if np.abs(pair.x).max() > FARTHEST_M:
+            raise RequestError(f"pair {pair.seq} lies {np.abs(pair.x).max():.0f} m away; positions are in metres")
+
+    def _learn_online(self, members: Members, pair: Pair) -> None:
+        errors, variance = members.errors(pair.q, pair.x), np.diag(pair.cov)
+        limit = self._limit_m(pair.q, variance)
+        if self._gate.doubts(float(np.linalg.norm(errors[self._answering])), limit):
+            self._counters.doubted += 1
+            self._doubts.append(pair.q, pair.x)
+            members.learn(pair.q, pair.x, limit)
+            if self._gate.changed:
+                self._follow_change()
+            return
+        for name, error in errors.items():
+            self._errors[name].add(error, variance)
+        self._answering = choose(self._errors, self._answering)
+        self._curve.add(self._counters.pairs, self._errors[self._answering].mean_m or 0.0)
+        members.learn(pair.q, pair.x, np.inf)
+        self._keep(pair.q, pair.x)
+        self._replays_due += self._settings.replays_per_pair
+
+    def _limit_m(self, q: FloatArray, variance: FloatArray) -> float:
+        unexplained = float(self._support.unexplained(q)) if self._support.size else 1.0
+        inside = max(self._errors[self._answering].rms_m, float(np.sqrt(variance.sum())), 1e-3)
+        return limit_m(inside, self._errors[PRIOR].rms_m, unexplained)
+
+    def _keep(self, q: FloatArray, x: FloatArray) -> None:
+        self._memory.append(q, x)
+        if self._support.add(q):
+            # Queries read it while it grows, so they get a copy; it grows ever more rarely.
+            self._support_view = copy.deepcopy(self._support)
+
+    def _follow_change(self) -> None:
+        """The doubted pairs in a row are the new truth: begin again with them."""
+        run_q, run_x, _ = self._doubts.since(self._doubts.count - CHANGE)
+        distances = np.linalg.norm(self._members_now.maps[self._answering].predict(run_q) - run_x, axis=1)
+        self._change_tool(max(float(np.median(distances)), EXPECTED_M))
+        for q, x in zip(run_q, run_x, strict=True):
+            self._keep(q, x)
+        self._members_now.replay(run_q, run_x)
+        self._counters.since_change = CHANGE
+
+    def _change_tool(self, expected_m: float) -> None:
+        self._counters.changes += 1
+        self._counters.since_change = 0
+        if self._members is None:
+            self._begin_at_nominal()
+        else:
+            self._begin(self._members.maps[self._answering], expected_m)
+
+    def _align(self) -> bool:
+        """Fit what is not known once enough pairs have come, and again each time that they have doubled."""
+        with self._lock:
+            if self._next_alignment is None or self._memory.count < self._next_alignment:
+                return False
+            task, count = self._task, self._memory.count
+            q, x = self._memory.all()
+        try:
+            prior = self._nominal.aligned_prior(q, x)
+        except DegenerateDataError:
+            prior = None
+        with self._lock:
+            if task != self._task:
+                return True
+            if prior is None:
+                self._next_alignment = count + self._nominal.pairs_to_align
+                return True
+            self._next_alignment = 2 * count
+            if self._members is None:
+                self._start_members(prior)
+            else:
+                self._members.move_prior(prior)
+                if self._solver_task == task:
+                    self._solver.rebase(prior)
+                    self._asked_at, self._solve_soon = 0, True
+            self._publish()
+        return True
+
+    def _start_members(self, prior: KBMap) -> None:
+        """The first alignment: the pairs that waited for it are learnt now, each once, in their order."""
+        q, x = self._memory.all()
+        self._begin(prior, EXPECTED_M)
+        self._next_alignment = 2 * len(q)
+        for row_q, row_x in zip(q, x, strict=True):
+            self._keep(row_q, row_x)
+        self._members_now.replay(q, x)
+        self._replays_due = self._settings.replays_per_pair * len(q)
+
+    def _serve_solver(self) -> bool:
+        """Give the exact solver its pairs, ask it from time to time, take what it found."""
+        with self._lock:
+            if self._members is None or self._members.prior.size > LARGEST_NET:
+                return False
+            task, prior = self._task, self._members.prior
+            if task != self._solver_task:
+                self._fed, self._asked_at, self._asked = 0, 0, False
+            q, x, fed = self._memory.since(self._fed, FEED_PAIRS)
+        if task != self._solver_task:
+            self._solver.start(task, prior)
+            self._solver_task = task
+            return True
+        if self._take_solution(task):
+            return True
+        if len(q):
+            self._solver.learn(q, x)
+            self._fed = fed
+            return True
+        new = self._fed - self._asked_at
+        if self._asked or new == 0 or (new < self._settings.solve_every and not self._solve_soon):
+            return False
+        self._solver.solve()
+        self._asked, self._asked_at, self._solve_soon = True, self._fed, False
+        return True
+
+    def _take_solution(self, task: int) -> bool:
+        solved = self._solver.poll()
+        if solved is None:
+            return False
+        if solved.task != task:
+            return True
+        self._asked = False
+        with self._lock:
+            if task == self._task:
+                self._members_now.take(solved.map)
+                self._errors.setdefault(EXACT, ErrorMemory(EXPECTED_M))
+                self._publish()
+        return True
+
+    def _replay(self) -> bool:
+        with self._lock:
+            if self._members is None or self._replays_due < 1.0 or not len(self._memory):
+                return False
+            places = self._order.take(min(REPLAY_STEPS, int(self._replays_due)), len(self._memory))
+            self._members.replay(*self._memory.at(places))
+            self._replays_due -= len(places)
+            self._counters.replayed += len(places)
+            self._publish()
+        return True
+
+    def _publish(self) -> None:
+        members, errors = self._members, self._errors
+        nothing = ErrorMemory(EXPECTED_M)
+        self._snapshot = Snapshot(
+            answering=self._answering,
+            map=members.maps[self._answering] if members is not None else None,
+            support=self._support_view,
+            sigma_inside=errors.get(self._answering, nothing).sigma,
+            sigma_outside=errors.get(PRIOR, nothing).sigma,
+            pairs=self._counters.pairs,
+            learnt_at=self._learnt_at,
+            waiting_for=self._waiting_for(),
+        )
+
+    def _waiting_for(self) -> str:
+        needed, have = self._nominal.pairs_to_align, self._memory.count
+        return (
+            f"there is no model yet: robot.toml says {self._nominal.unknown}, so positions have no frame until about "
+            f"{needed} pairs have come ({have} so far). Start the sampler with `bodyschema sampler` and guide the arm"
+        )

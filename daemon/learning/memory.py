@@ -1,0 +1,74 @@
+"""The pairs that are kept for replay, and the order in which they are replayed."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from interfaces.records import FloatArray
+
+IntArray = NDArray[np.intp]
+
+
+class PairMemory:
+    """The newest `capacity` pairs, in arrays. Pairs are counted from the last `clear`."""
+
+    def __init__(self, joints: int, capacity: int) -> None:
+        self._q = np.empty((capacity, joints))
+        self._x = np.empty((capacity, 3))
+        self._count = 0
+
+    @property
+    def count(self) -> int:
+        """Pairs added since the last `clear`, kept or not."""
+        return self._count
+
+    def __len__(self) -> int:
+        return min(self._count, len(self._q))
+
+    def append(self, q: FloatArray, x: FloatArray) -> None:
+        """Keep one pair, q (d,) and x (3,); the oldest makes room."""
+        place = self._count % len(self._q)
+        self._q[place], self._x[place] = q, x
+        self._count += 1
+
+    def clear(self) -> None:
+        """Forget all pairs."""
+        self._count = 0
+
+    def since(self, count: int, limit: int | None = None) -> tuple[FloatArray, FloatArray, int]:
+        """The kept pairs from the one numbered `count` (from 0) on: q (n, d), x (n, 3), and the count after them."""
+        begin = max(count, self._count - len(self._q))
+        end = self._count if limit is None else min(self._count, begin + limit)
+        places = np.arange(begin, end) % len(self._q)
+        return self._q[places], self._x[places], end
+
+    def all(self) -> tuple[FloatArray, FloatArray]:
+        """All kept pairs in order: q (n, d), x (n, 3)."""
+        q, x, _ = self.since(0)
+        return q, x
+
+    def at(self, places: IntArray) -> tuple[FloatArray, FloatArray]:
+        """The pairs at places 0 ... len − 1, in no particular order: q (n, d), x (n, 3)."""
+        return self._q[places], self._x[places]
+
+
+class Permutations:
+    """Places to replay: in each epoch every place once, in a random order that follows from seed and epoch."""
+
+    def __init__(self, seed: int) -> None:
+        self._seed = seed
+        self._epoch = 0
+        self._order: IntArray = np.empty(0, dtype=np.intp)
+
+    def take(self, count: int, places: int) -> IntArray:
+        """Up to `count` of the places 0 ... places − 1; fewer at the end of an epoch."""
+        if not len(self._order):
+            self._order = np.random.default_rng([self._seed, self._epoch]).permutation(places)
+            self._epoch += 1
+        taken, self._order = self._order[:count], self._order[count:]
+        return taken
+
+    def restart(self) -> None:
+        """Drop what is left of the epoch: the places have changed their meaning."""
+        self._order = np.empty(0, dtype=np.intp)

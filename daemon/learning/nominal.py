@@ -1,0 +1,92 @@
+"""The nominal model: where learning starts."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from interfaces.records import FloatArray, frozen_array
+from interfaces.robot import RobotDescription
+from kbmaps import JointBasis, KBMap, RigidChain, align, learning_bases
+
+# Narrower ranges (a joint that hardly moves) would make the basis needlessly stiff, and equal limits impossible.
+NARROWEST_RANGE = 0.1
+LARGEST_FIT = 1000
+
+
+@dataclass(frozen=True)
+class NominalModel:
+    """The chain as robot.toml and URDF describe it, and which parts of it are only roughly known.
+
+    Attributes:
+        chain: measurement frame to marker.
+        lower, upper: joint limits, shape (d,) [rad or m].
+        pose_known, marker_known: as in robot.toml.
+        bases: what is learnt in: scaled orthonormal bases over the joints' ranges, at most one turn wide.
+    """
+
+    chain: RigidChain
+    lower: FloatArray
+    upper: FloatArray
+    pose_known: bool = True
+    marker_known: bool = True
+    bases: tuple[JointBasis, ...] = field(init=False)
+
+    def __post_init__(self) -> None:
+        low, high = np.array(self.lower), np.array(self.upper)
+        turning = ~self.chain.prismatic
+        low[turning], high[turning] = low[turning].clip(-np.pi, np.pi), high[turning].clip(-np.pi, np.pi)
+        missing = np.maximum(NARROWEST_RANGE - (high - low), 0.0) / 2.0
+        object.__setattr__(self, "lower", frozen_array(self.lower))
+        object.__setattr__(self, "upper", frozen_array(self.upper))
+        object.__setattr__(self, "bases", learning_bases(low - missing, high + missing, self.chain.prismatic.tolist()))
+
+    @classmethod
+    def of(cls, robot: RobotDescription) -> NominalModel:
+        """The nominal model of a robot description."""
+        return cls(robot.chain, robot.lower, robot.upper, robot.camera.pose_known, robot.robot.marker_known)
+
+    @property
+    def joints(self) -> int:
+        """Number of joints d."""
+        return self.chain.joints
+
+    @property
+    def frame_known(self) -> bool:
+        """Whether predictions mean something before any pair."""
+        return self.pose_known and self.marker_known
+
+    @property
+    def pairs_to_align(self) -> int:
+        """Pairs to wait for before what is not known is fitted: twice what determines it, and some spread."""
+        return 0 if self.frame_known else 5 if self.pose_known else 10
+
+    @property
+    def unknown(self) -> str:
+        """What robot.toml calls not known, in its own words."""
+        flags = (("[camera] pose_known", self.pose_known), ("[robot] marker_known", self.marker_known))
+        return " and ".join(f"{name} = false" for name, known in flags if not known)
+
+    @property
+    def fingerprint(self) -> str:
+        """Tells this nominal model from any other; a learner's state only fits the one it came from."""
+        known = f"{self.pose_known} {self.marker_known} ".encode()
+        return hashlib.blake2b(known + self.prior().digest.encode(), digest_size=8).hexdigest()
+
+    def prior(self) -> KBMap:
+        """The chain as a map in the learning bases."""
+        return self.chain.to_kbmap(self.bases)
+
+    def aligned_prior(self, q: FloatArray, x: FloatArray) -> KBMap:
+        """The prior with what is not known fitted to pairs, q (n, d) [rad] and x (n, 3) [m].
+
+        Raises:
+            DegenerateDataError: the pairs do not determine it.
+        """
+        chosen = np.linspace(0, len(q) - 1, min(len(q), LARGEST_FIT)).round().astype(int)
+        fit = align(
+            self.chain, q[chosen], x[chosen], pose_known=self.pose_known, marker_known=self.marker_known
+        )
+        return fit.chain.to_kbmap(self.bases)

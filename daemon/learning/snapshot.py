@@ -1,0 +1,78 @@
+"""What queries are answered from: a model that later learning does not touch."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from interfaces.errors import RequestError
+from interfaces.records import FloatArray
+from kbmaps import KBMap, SupportSet
+
+# Beyond this share of the prior's variance left open, joint angles do not lie where data was.
+IN_SUPPORT = 0.25
+
+
+class NoFrameError(RequestError):
+    """There is no model yet: the frame that positions would be given in is not known."""
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """Marker positions for a batch of joint angles.
+
+    Attributes:
+        x: positions in the measurement frame (n, 3) [m].
+        sigma: their 1-sigma per axis (n, 3) [m].
+        in_support: whether each row lies where data was (n,).
+    """
+
+    x: FloatArray
+    sigma: FloatArray
+    in_support: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """The model that answers, at one moment.
+
+    Attributes:
+        answering: which one it is.
+        map: None while the frame is not known.
+        support: where data was; None before any.
+        sigma_inside: 1-sigma per axis where data was (3,) [m].
+        sigma_outside: 1-sigma per axis that is left open far from all data (3,) [m].
+        pairs: how many pairs it had learnt.
+        learnt_at: time of the last of them [s], or None.
+        waiting_for: what is missing while there is no map.
+    """
+
+    answering: str
+    map: KBMap | None
+    support: SupportSet | None
+    sigma_inside: FloatArray
+    sigma_outside: FloatArray
+    pairs: int
+    learnt_at: float | None
+    waiting_for: str
+
+    @cached_property
+    def digest(self) -> str:
+        """Hash of the model, empty while there is none."""
+        return self.map.digest if self.map is not None else ""
+
+    def require_map(self) -> KBMap:
+        """The map; NoFrameError when there is none yet."""
+        if self.map is None:
+            raise NoFrameError(self.waiting_for)
+        return self.map
+
+    def predict(self, q: FloatArray) -> Prediction:
+        """Predictions for joint angles q (n, d) [rad]; NoFrameError while there is no map."""
+        x = self.require_map().predict(q)
+        unexplained = np.ones(len(q)) if self.support is None else np.asarray(self.support.unexplained(q))
+        variance = self.sigma_inside**2 + unexplained[:, None] * self.sigma_outside**2
+        return Prediction(x, np.sqrt(variance), unexplained < IN_SUPPORT)

@@ -1,0 +1,70 @@
+"""The learner's state as plain values and arrays: what a checkpoint holds."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import msgspec
+
+from daemon.status import CurvePoint
+from interfaces.errors import BodyschemaError
+from interfaces.records import FloatArray
+
+from .scores import ErrorMemory
+
+
+class StateError(BodyschemaError):
+    """A stored state does not fit this learner."""
+
+
+class Counters(msgspec.Struct, kw_only=True):
+    """Everything that is counted. `pairs` are learnt online, each once; `last_seq` is the newest of them.
+
+    Attributes:
+        store: identity of the store the pairs came from.
+        since_change: pairs since the tool was last changed, or since the beginning.
+        changes: tool changes that were told or found.
+        doubted: pairs that looked like gross outliers.
+    """
+
+    store: str | None = None
+    pairs: int = 0
+    last_seq: int = 0
+    since_change: int = 0
+    replayed: int = 0
+    refused: int = 0
+    gaps_recovered: int = 0
+    changes: int = 0
+    doubted: int = 0
+
+
+class LearningHeader(msgspec.Struct, kw_only=True):
+    """The part of the state that is not arrays.
+
+    Attributes:
+        fingerprint: of the nominal model it started from.
+        answering: the model that answers.
+        errors: prequential errors by model.
+        doubted_in_a_row: length of the present run of doubted pairs.
+        next_alignment: pairs at which what is not known is fitted again; None when it is not.
+        replays_due: replay steps that are still owed.
+    """
+
+    fingerprint: str
+    counters: Counters
+    answering: str
+    errors: dict[str, ErrorMemory]
+    curve: list[CurvePoint]
+    curve_stride: int
+    doubted_in_a_row: int
+    next_alignment: int | None
+    replays_due: float
+
+
+@dataclass(frozen=True)
+class LearningState:
+    """A learner's state: `arrays` holds the nets by model, and the kept and doubted pairs."""
+
+    header: LearningHeader
+    arrays: Mapping[str, FloatArray]
