@@ -20,10 +20,12 @@ from kbmaps.errors import (
 from kbmaps.exact import ExactLearner, ExactSolution
 from kbmaps.kbmap import KBMap, prediction_errors
 from kbmaps.nlms import NLMS
-from kbmaps.support import SupportSet
+from kbmaps.support import SUPPORT_LIMIT, SupportSet
+from kbmaps.tool import with_refitted_marker
 
 __all__ = [
     "NLMS",
+    "SUPPORT_LIMIT",
     "Alignment",
     "BasisError",
     "ChainError",
@@ -43,4 +45,5 @@ __all__ = [
     "align",
     "learning_bases",
     "prediction_errors",
+    "with_refitted_marker",
 ]

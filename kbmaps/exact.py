@@ -50,6 +50,16 @@ class ExactSolution:
     log_evidence: float | None
     residual_rms: float
 
+    @property
+    def prior_std(self) -> float | None:
+        """Standard deviation of the coefficients around the prior [m]; None for the unregularised solution.
+
+        Times `SupportSet.spread` (in the learner's bases) it is the 1-sigma of a predicted coordinate.
+        """
+        if self.noise_std is None or self.prior_precision == 0.0:
+            return None
+        return self.noise_std / math.sqrt(self.prior_precision)
+
 
 @dataclass(frozen=True)
 class _Fit:
