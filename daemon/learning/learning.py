@@ -22,7 +22,7 @@ from .gate import CHANGE, Gate, limit_m
 from .members import EXACT, INSTANT, PRIOR, Members
 from .memory import PairMemory, Permutations
 from .nominal import NominalModel
-from .scores import ErrorMemory, choose
+from .scores import FEWEST_TO_ANSWER, ErrorMemory, choose
 from .snapshot import Snapshot
 from .solver import LARGEST_NET, ExactSolver
 from .state import Counters, LearningHeader, LearningState, StateError
@@ -34,6 +34,8 @@ FARTHEST_M = 1000.0
 REPLAY_STEPS = 64
 FEED_PAIRS = 256
 KEPT_DOUBTS = 64
+REGION_RAD = np.radians(3.0)
+REGION_SAMPLES = 256
 
 
 class Learning:
@@ -87,10 +89,17 @@ class Learning:
         return {name: mean for name, mean in means.items() if mean is not None}
 
     def claimed_error_m(self) -> float | None:
-        """Mean distance to the truth [m] that is claimed for predictions where data is; None while unknown."""
+        """Mean distance to the truth [m] that is claimed in the data's region; None while there are too few pairs.
+
+        The region: within a few degrees (`REGION_RAD` per joint) of the kept pairs.
+        """
         with self._lock:
-            answering = self._errors.get(self._answering)
-            return answering.claimed_m if answering is not None else None
+            answering, snapshot, count = self._errors.get(self._answering), self._snapshot, len(self._memory)
+            if answering is None or answering.weight < FEWEST_TO_ANSWER:
+                return None
+            rng = np.random.default_rng(0)
+            q, _ = self._memory.at(rng.integers(count, size=REGION_SAMPLES))
+        return snapshot.expected_error_m(q + rng.normal(0.0, 1.0, q.shape) * self._nominal.reach(REGION_RAD))
 
     def learn(self, pair: Pair, now: float) -> None:
         """Learn one pair at once.
@@ -239,7 +248,7 @@ class Learning:
         if self._gate.doubts(float(np.linalg.norm(errors[self._answering])), limit):
             self._counters.doubted += 1
             self._doubts.append(pair.q, pair.x)
-            members.learn(pair.q, pair.x, limit)
+            members.learn(pair.q, errors, limit)
             if self._gate.changed:
                 self._follow_change()
             return
@@ -247,7 +256,7 @@ class Learning:
             self._errors[name].add(error, variance)
         self._answering = choose(self._errors, self._answering)
         self._curve.add(self._counters.pairs, self._errors[self._answering].mean_m or 0.0)
-        members.learn(pair.q, pair.x, np.inf)
+        members.learn(pair.q, errors, np.inf)
         self._keep(pair.q, pair.x)
         self._replays_due += self._settings.replays_per_pair
 
@@ -353,7 +362,8 @@ class Learning:
         self._asked = False
         with self._lock:
             if task == self._task:
-                self._members_now.take(solved.map)
+                q, x, _ = self._memory.since(self._asked_at)
+                self._members_now.take(solved.map, q, x)
                 self._errors.setdefault(EXACT, ErrorMemory(EXPECTED_M))
                 self._publish()
         return True

@@ -13,12 +13,15 @@ PRIOR, INSTANT, EXACT = "prior", "nlms", "exact"
 
 
 class Members:
-    """All in the bases of the prior. `maps` is by model, the most trusted first."""
+    """All in the bases of the prior. `maps` is by model, the most trusted first.
+
+    The exact solution is some pairs old when it comes, and grows older: instant steps keep it fresh in between.
+    """
 
     def __init__(self, prior: KBMap, step_size: float) -> None:
         self._step_size = step_size
-        self._nlms = NLMS(prior, step_size)
         self._maps = {PRIOR: prior, INSTANT: prior}
+        self._learners = {INSTANT: NLMS(prior, step_size)}
 
     @property
     def maps(self) -> Mapping[str, KBMap]:
@@ -34,38 +37,40 @@ class Members:
         """Measured minus predicted position (3,) [m] by model, for one pair."""
         return {name: x - model.predict(q) for name, model in self._maps.items()}
 
-    def learn(self, q: FloatArray, x: FloatArray, limit_m: float) -> None:
-        """One step of the instant learner towards x (3,), as if it were at most `limit_m` from the prediction."""
-        error = x - self._maps[INSTANT].predict(q)
-        distance = float(np.linalg.norm(error))
-        self._nlms.learn(q, x if distance <= limit_m else x - error * (1.0 - limit_m / distance))
-        self._renew()
+    def learn(self, q: FloatArray, errors: Mapping[str, FloatArray], limit_m: float) -> None:
+        """One step for the pair at q (d,) with these errors, as if none were longer than `limit_m`."""
+        for name, learner in self._learners.items():
+            error = errors[name] * min(1.0, limit_m / max(float(np.linalg.norm(errors[name])), 1e-300))
+            learner.learn(q, self._maps[name].predict(q) + error)
+            self._renew(name)
 
     def replay(self, q: FloatArray, x: FloatArray) -> None:
         """Steps of the instant learner for q (n, d), x (n, 3), in their order."""
-        self._nlms.replay(q, x)
-        self._renew()
+        self._learners[INSTANT].replay(q, x)
+        self._renew(INSTANT)
 
-    def take(self, solution: KBMap) -> None:
-        """A new solution of the exact solver."""
-        self._maps[EXACT] = solution
+    def take(self, solution: KBMap, q: FloatArray, x: FloatArray) -> None:
+        """A new solution of the exact solver, and the pairs q (n, d), x (n, 3) that it does not know yet."""
+        learner = NLMS(solution, self._step_size)
+        learner.replay(q, x)
+        self._learners[EXACT] = learner
+        self._renew(EXACT)
 
     def move_prior(self, prior: KBMap) -> None:
         """Another prior: everything learnt on top of the old one moves along."""
         change = prior.net - self.prior.net
-        for name in list(self._maps):
-            self._maps[name] = KBMap(prior.bases, self._maps[name].net + change)
-        self._nlms = NLMS(self._maps[INSTANT], self._step_size)
+        self.restore({name: model.net + change for name, model in self._maps.items()})
 
     def restore(self, nets: Mapping[str, FloatArray]) -> None:
         """The models that `nets` names."""
         for name, net in nets.items():
             self._maps[name] = KBMap(self.prior.bases, net)
-        self._nlms = NLMS(self._maps[INSTANT], self._step_size)
+            if name != PRIOR:
+                self._learners[name] = NLMS(self._maps[name], self._step_size)
 
-    def _renew(self) -> None:
+    def _renew(self, name: str) -> None:
         try:
-            self._maps[INSTANT] = self._nlms.map
+            self._maps[name] = self._learners[name].map
         except NonFiniteError:  # overflow on absurd numbers: begin again rather than answer NaN
-            self._nlms = NLMS(self.prior, self._step_size)
-            self._maps[INSTANT] = self.prior
+            self._learners[name] = NLMS(self.prior, self._step_size)
+            self._maps[name] = self.prior

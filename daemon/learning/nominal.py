@@ -69,6 +69,10 @@ class NominalModel:
         flags = (("[camera] pose_known", self.pose_known), ("[robot] marker_known", self.marker_known))
         return " and ".join(f"{name} = false" for name, known in flags if not known)
 
+    def reach(self, angle: float) -> FloatArray:
+        """`angle` [rad] for each joint that turns, and as much of its stroke [m] for each that slides (d,)."""
+        return np.where(self.chain.prismatic, angle * (self.upper - self.lower) / np.pi, angle)
+
     @property
     def fingerprint(self) -> str:
         """Tells this nominal model from any other; a learner's state only fits the one it came from."""

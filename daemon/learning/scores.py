@@ -64,17 +64,6 @@ class ErrorMemory(msgspec.Struct):
         noise = np.array(self.noise) / max(self.weight, 1.0)
         return np.sqrt(np.maximum(square - noise, noise * _resolution(self.weight)))
 
-    @property
-    def claimed_m(self) -> float | None:
-        """Mean distance to the truth [m] that these errors let us claim; None while they are few."""
-        if self.weight < FEWEST_TO_ANSWER:
-            return None
-        square, noise = sum(self.square) / self.weight, sum(self.noise) / self.weight
-        true_square = max(square - noise, noise * _resolution(3.0 * self.weight))
-        # The ratio of mean to RMS stands for the shape of the distribution, whatever it is.
-        shape = self.distance / self.weight / math.sqrt(square) if square > 0.0 else 1.0
-        return math.sqrt(true_square) * shape
-
 
 def choose(errors: Mapping[str, ErrorMemory], present: str) -> str:
     """The model that shall answer: the best on recent pairs; the present one while nobody is clearly better.

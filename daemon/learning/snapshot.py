@@ -14,6 +14,8 @@ from kbmaps import KBMap, SupportSet
 
 # Beyond this share of the prior's variance left open, joint angles do not lie where data was.
 IN_SUPPORT = 0.25
+# Mean length of a Gaussian error over its RMS length, three equal axes: sqrt(8 / π) / sqrt(3).
+MEAN_OVER_RMS = 0.9213
 
 
 class NoFrameError(RequestError):
@@ -76,3 +78,8 @@ class Snapshot:
         unexplained = np.ones(len(q)) if self.support is None else np.asarray(self.support.unexplained(q))
         variance = self.sigma_inside**2 + unexplained[:, None] * self.sigma_outside**2
         return Prediction(x, np.sqrt(variance), unexplained < IN_SUPPORT)
+
+    def expected_error_m(self, q: FloatArray) -> float:
+        """Mean distance to the truth [m] that the sigmas of predictions at q (n, d) [rad] claim."""
+        variance = np.square(self.predict(q).sigma).sum(axis=1)
+        return MEAN_OVER_RMS * float(np.sqrt(variance).mean())
