@@ -172,7 +172,7 @@ class KBMap:
         out = np.empty((len(q), end - begin))
         for start, chunk in zip(range(0, len(q), _BATCH_ROWS), _chunks(q), strict=False):
             left, right = stack.halves(chunk)
-            by_left = (right @ planes.T).reshape(len(chunk), end - begin, -1)
+            by_left = (right @ planes.T).reshape(len(chunk), end - begin, stack.left_size)
             out[start : start + len(chunk)] = (by_left @ left[:, :, None])[:, :, 0]
         return out
 
@@ -180,7 +180,7 @@ class KBMap:
         stack = self._stack
         weights, slopes = stack.joint_weights(q), stack.joint_derivatives(q)
         planes = self._planes[: POSITION_OUTPUTS * stack.left_size]
-        by_left = (stack.right(weights) @ planes.T).reshape(len(q), POSITION_OUTPUTS, -1)
+        by_left = (stack.right(weights) @ planes.T).reshape(len(q), POSITION_OUTPUTS, stack.left_size)
         cube = planes.reshape(POSITION_OUTPUTS, stack.left_size, stack.right_size)
         by_right = np.einsum("nl,olr->nor", stack.left(weights), cube, optimize=True)
         columns = np.empty((len(q), POSITION_OUTPUTS, self.joints))
