@@ -15,8 +15,6 @@ from interfaces.errors import SourceEnded, SourceError
 from interfaces.recording import Recording
 from interfaces.records import FloatArray, JointReading, MarkerFix, frozen_array
 
-ROW_INTERVAL_S = 1 / 30  # between rows without times, the rate of the usual cameras
-RESET_GAP_S = 10.0  # between runs whose clocks have nothing to do with each other
 DEFAULT_SIGMA_M = 1e-3
 AHEAD = 8  # rows by which one source may lead the other
 
@@ -30,8 +28,7 @@ class Replay:
     Attributes:
         joints: the encoders' side.
         marker: the camera's side.
-        t: times of the rows [s], shape (n,): the recording's own; where it has none a thirtieth of a second apart;
-            where its clock was reset between segments, moved on.
+        t: times of the rows [s], shape (n,): `Recording.play_times`.
     """
 
     def __init__(
@@ -51,7 +48,7 @@ class Replay:
                 `calibration` says, and without that 1 mm.
             now: the clock for the speed.
         """
-        self.t = row_times(recording)
+        self.t = recording.play_times
         cov = recording.cov if recording.cov is not None else default_covariances(recording, sigma_m, calibration)
         self._pace = _Pace(self.t, speed, now)
         self.joints = ReplayJoints(recording, self.t, self._pace)
@@ -110,17 +107,6 @@ class ReplayMarker:
             centres = (ul, vl, ur, vr)
         x, cov = frozen_array(self._recording.x[row]), frozen_array(self._cov[row])
         return MarkerFix(float(self._t[row]), x, cov, centres)
-
-
-def row_times(recording: Recording) -> FloatArray:
-    """Strictly increasing times of the rows [s], shape (n,)."""
-    if recording.t is None:
-        return frozen_array(np.arange(len(recording)) * ROW_INTERVAL_S)
-    steps = np.diff(recording.t)
-    if (steps > 0).all():
-        return recording.t
-    steps = np.where(steps > 0, steps, RESET_GAP_S)
-    return frozen_array(recording.t[0] + np.concatenate([[0.0], np.cumsum(steps)]))
 
 
 def default_covariances(

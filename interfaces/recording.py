@@ -31,6 +31,8 @@ from .recording_parquet import INTEGER_COLUMNS, read_parquet_table, write_parque
 from .records import FloatArray, frozen_array
 
 CSV, PARQUET = ".csv", ".parquet"
+ROW_INTERVAL_S = 1 / 30  # between rows without times, the rate of the usual cameras
+RESET_GAP_S = 10.0  # between runs whose clocks have nothing to do with each other
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,6 +85,22 @@ class Recording:
 
     def __len__(self) -> int:
         return len(self.q)
+
+    @property
+    def play_times(self) -> FloatArray:
+        """Strictly increasing times to play the rows at [s], shape (n,).
+
+        The recording's own; where it has none a thirtieth of a second apart; where its clock was reset between
+        segments, moved on.
+        """
+        if self.t is None:
+            return frozen_array(np.arange(len(self)) * ROW_INTERVAL_S)
+        steps = np.diff(self.t)
+        if (steps > 0).all():
+            return self.t
+        moved = self.t[0] + np.cumsum(np.append(0.0, np.where(steps > 0, steps, RESET_GAP_S)))
+        strictly = bool((np.diff(moved) > 0).all())  # steps far below the size of the times are lost in rounding
+        return frozen_array(moved if strictly else np.arange(len(self)) * ROW_INTERVAL_S)
 
     @classmethod
     def read(cls, file: Path | str, joints: tuple[str, ...]) -> Self:

@@ -6,11 +6,11 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from drivers.replay import AHEAD, RESET_GAP_S, Replay
+from drivers.replay import AHEAD, Replay
 from interfaces.camera import StereoCalibration
 from interfaces.errors import SourceEnded, SourceError
 from interfaces.protocols import JointSource, MarkerSource
-from interfaces.recording import Recording
+from interfaces.recording import RESET_GAP_S, Recording
 from interfaces.records import JointReading, MarkerFix
 
 STEREO = StereoCalibration(

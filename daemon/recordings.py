@@ -1,0 +1,81 @@
+"""Pairs as recordings, and recordings into files: all at once and whole, or not at all."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from interfaces.errors import RecordingError
+from interfaces.recording import CSV, PARQUET, Recording
+from interfaces.records import Pair
+
+from .mcap_export import write_mcap
+from .store import PairReader
+
+MCAP = ".mcap"
+STORE_ENDINGS = (".sqlite", ".sqlite3", ".db")
+
+_WRITERS: dict[str, Callable[[Recording, Path], None]] = {
+    CSV: Recording.write_csv,
+    PARQUET: Recording.write_parquet,
+    MCAP: write_mcap,
+}
+
+
+def from_pairs(pairs: Sequence[Pair], joints: tuple[str, ...]) -> Recording:
+    """The recording of `pairs`, at least one; with pixel centres where every pair has them."""
+    centres = [pair.centres_px for pair in pairs]
+    return Recording(
+        joints=joints,
+        q=np.array([pair.q for pair in pairs]),
+        x=np.array([pair.x for pair in pairs]),
+        t=np.array([pair.t for pair in pairs]),
+        cov=np.array([pair.cov for pair in pairs]),
+        segment=np.array([pair.segment for pair in pairs]),
+        centres_px=None if None in centres else np.array(centres),
+    )
+
+
+def from_store(file: Path) -> Recording:
+    """All pairs of a store, which a sampler may be writing meanwhile.
+
+    Raises:
+        StoreError: it cannot be read.
+        RecordingError: it has no pairs.
+    """
+    with PairReader(file) as reader:
+        pairs = reader.read()
+        if not pairs:
+            raise RecordingError("the store has no pairs yet", file=file, remedy="Move the arm in front of the camera")
+        return from_pairs(pairs, reader.joints)
+
+
+def check_target(out: Path, *, force: bool) -> None:
+    """RecordingError unless a recording can be written to `out`: its ending is known and nothing is in the way."""
+    if out.suffix.lower() not in _WRITERS:
+        raise RecordingError(f"recordings end in {', '.join(_WRITERS)}", file=out, remedy="Give another name")
+    if not out.parent.is_dir():
+        raise RecordingError(f"there is no folder {out.parent}", file=out, remedy="Make it first")
+    if out.exists() and not force:
+        raise RecordingError("the file is there already", file=out, remedy="Give another name, or --force")
+
+
+def write(recording: Recording, out: Path) -> None:
+    """Write `recording` in the format of the ending of `out`. The file appears when it is whole.
+
+    Raises:
+        RecordingError: it cannot be written, or the extra `export` is not installed.
+    """
+    part = out.with_name(f".{out.stem}.part{out.suffix}")
+    try:
+        _WRITERS[out.suffix.lower()](recording, part)
+        os.replace(part, out)
+    except RecordingError as error:
+        raise RecordingError(error.what, file=out, remedy=error.remedy) from error
+    except OSError as error:
+        raise RecordingError(f"cannot be written: {error.strerror or error}", file=out) from error
+    finally:
+        part.unlink(missing_ok=True)
