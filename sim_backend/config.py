@@ -1,0 +1,111 @@
+"""The table [sim]: what the simulated robot, its sensors and the guiding hand are like."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import msgspec
+from msgspec import Meta
+
+NonNegative = Annotated[float, Meta(ge=0)]
+Positive = Annotated[float, Meta(gt=0)]
+Rate = Annotated[int, Meta(ge=1, le=1000)]
+
+
+class EncoderConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The table [sim.encoders].
+
+    Attributes:
+        ticks_per_turn: resolution of a revolute joint's encoder.
+        ticks_per_metre: resolution of a prismatic joint's encoder.
+        noise_ticks: 1-sigma of the noise that is added before a reading is rounded to whole ticks.
+        rate_hz: readings a second.
+    """
+
+    ticks_per_turn: Annotated[int, Meta(ge=1)] = 4096
+    ticks_per_metre: Annotated[int, Meta(ge=1)] = 20_000
+    noise_ticks: NonNegative = 0.3
+    rate_hz: Rate = 120
+
+
+class CameraConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The table [sim.camera].
+
+    Attributes:
+        rate_hz: stereo frames a second.
+        noise: 1-sigma of the image noise [grey levels].
+        clutter: number of coloured objects in the background; 0 is a plain wall.
+        scene_step: the arm is rendered at every so manieth pixel and scaled up; the marker's surroundings never are.
+        supersampling: samples across one pixel around the marker.
+        ball_radius_m: radius of the marker ball [m].
+        ball_rgb: its colour.
+    """
+
+    rate_hz: Rate = 30
+    noise: NonNegative = 2.0
+    clutter: Annotated[int, Meta(ge=0, le=1000)] = 60
+    scene_step: Annotated[int, Meta(ge=1, le=4)] = 2
+    supersampling: Annotated[int, Meta(ge=1, le=8)] = 3
+    ball_radius_m: Positive = 0.02
+    ball_rgb: tuple[float, float, float] = (0.86, 0.07, 0.06)
+
+
+class ErrorConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The table [sim.errors]: how the true robot differs from its description, as 1-sigma of what the seed draws.
+
+    Attributes:
+        joint_offset_rad: zero position of each joint's encoder [rad] (m for a prismatic joint, a tenth of it).
+        link_length_m: each coordinate of each joint's place on its parent link [m].
+        link_axis_rad: each component of the rotation of each joint's frame [rad].
+        camera_position_m: each coordinate of the cameras' place [m].
+        camera_rotation_rad: each component of their rotation [rad].
+        tool_m: each coordinate of the marker's place on the hand [m].
+    """
+
+    joint_offset_rad: NonNegative = 0.05
+    link_length_m: NonNegative = 0.005
+    link_axis_rad: NonNegative = 0.01
+    camera_position_m: NonNegative = 0.005
+    camera_rotation_rad: NonNegative = 0.02
+    tool_m: NonNegative = 0.01
+
+
+class GuideConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The table [sim.guide]: the virtual hand.
+
+    Attributes:
+        speed_rad_s: speed in joint space, Euclidean norm over all learnt joints, the gaze's included [rad/s].
+        force_limit_n: strongest pull at wrist and elbow [N].
+        torque_limit_nm: strongest twist at the wrist [N·m].
+        gravity_compensation: the arm's drives bear its weight (zero-force mode); otherwise the hand has to.
+        gaze_speed_rad_s: greatest speed of each head joint [rad/s].
+    """
+
+    speed_rad_s: Positive = 0.87
+    force_limit_n: Positive = 80.0
+    torque_limit_nm: Positive = 15.0
+    gravity_compensation: bool = True
+    gaze_speed_rad_s: Positive = 1.5
+
+
+class ToolChange(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """One of [[sim.tool_changes]]: from `at_s` [s] on the hand holds a tool with its ball at `marker_xyz` [m]."""
+
+    at_s: NonNegative
+    marker_xyz: tuple[float, float, float]
+
+
+class SimConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The table [sim].
+
+    Attributes:
+        seed: all that is random is drawn from it.
+        tool_changes: tool changes at given simulated times, besides those that `SimWorld.change_tool` asks for.
+    """
+
+    seed: Annotated[int, Meta(ge=0)] = 1
+    encoders: EncoderConfig = EncoderConfig()
+    camera: CameraConfig = CameraConfig()
+    errors: ErrorConfig = ErrorConfig()
+    guide: GuideConfig = GuideConfig()
+    tool_changes: tuple[ToolChange, ...] = ()

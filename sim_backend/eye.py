@@ -1,0 +1,118 @@
+"""One stereo frame: the robot by TinyRenderer, the ball by ray casting, the room behind, the sensor's noise."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from interfaces.camera import StereoCalibration
+from interfaces.records import FloatArray, ImageArray
+
+from .ball import cast_ball
+from .config import CameraConfig
+from .panorama import background, cluttered_room
+from .randomness import Stream, generator
+from .raster import Grid, Raster
+
+TO_LIGHT = np.array([0.35, 0.45, 0.82]) / np.linalg.norm([0.35, 0.45, 0.82])
+# Free pixels around the ball in its finely sampled rectangle, and the most samples across it.
+_MARGIN_PX = 4
+_MOST_SAMPLES = 480
+_NOISE_FIELDS = 8
+_NOISE_SHIFT_PX = 64
+
+
+class StereoEyes:
+    """Paints stereo frames.
+
+    Args:
+        seed: background and image noise are drawn from it; a frame's noise from its number too.
+    """
+
+    def __init__(self, raster: Raster, calibration: StereoCalibration, config: CameraConfig, seed: int) -> None:
+        self._raster, self._calibration, self._config, self._seed = raster, calibration, config, seed
+        width, height = calibration.image_size_px
+        step = config.scene_step
+        self._scene = Grid(0, 0, -(-width // step), -(-height // step), 1 / step)
+        self._directions = self._scene.directions(calibration)
+        self._room = cluttered_room(config.clutter, generator(seed, Stream.BACKGROUND))
+        self._noise = self._noise_fields(width, height)
+        self._bgr = np.array(config.ball_rgb[::-1])
+
+    def paint(
+        self, number: int, T_world_camera: FloatArray, x_world: FloatArray, images: tuple[ImageArray, ImageArray]
+    ) -> None:
+        """Paint frame `number` into the left and the right image (height, width, 3), BGR.
+
+        Args:
+            T_world_camera: pose of the left eye (4, 4).
+            x_world: centre of the ball (3,) [m].
+        """
+        far = background(self._room, self._directions, T_world_camera[:3, :3])
+        rng = generator(self._seed, Stream.IMAGE_NOISE, number)
+        T_world_eye = T_world_camera.copy()
+        for image in images:
+            x_eye = T_world_eye[:3, :3].T @ (x_world - T_world_eye[:3, 3])
+            self._paint_scene(image, T_world_eye, far)
+            self._paint_ball(image, T_world_eye, x_eye)
+            self._add_noise(image, rng)
+            T_world_eye[:3, 3] += T_world_camera[:3, 0] * self._calibration.baseline_m
+
+    def _paint_scene(self, image: ImageArray, T_world_eye: FloatArray, far: ImageArray) -> None:
+        bgr, depth = self._raster.render(T_world_eye, self._scene)
+        scene = np.where(np.isinf(depth)[..., None], far, bgr)
+        height, width = image.shape[:2]
+        step = self._config.scene_step
+        if step > 1:
+            scene = cv2.resize(scene, (self._scene.columns * step, self._scene.rows * step))
+        image[:] = scene[:height, :width]
+
+    def _paint_ball(self, image: ImageArray, T_world_eye: FloatArray, x_eye: FloatArray) -> None:
+        window = self._window(x_eye)
+        if window is None:
+            return
+        left, top, width, height = window
+        fine = max(1, min(self._config.supersampling, _MOST_SAMPLES // max(width, height)))
+        grid = Grid(left, top, width * fine, height * fine, fine)
+        bgr, depth = self._raster.render(T_world_eye, grid)
+        patch = image[top : top + height, left : left + width]
+        samples = np.where(np.isinf(depth)[..., None], patch.repeat(fine, 0).repeat(fine, 1), bgr).astype(np.float32)
+        mask, colours = cast_ball(
+            grid.directions(self._calibration),
+            x_eye,
+            self._config.ball_radius_m,
+            depth,
+            self._bgr,
+            T_world_eye[:3, :3].T @ TO_LIGHT,
+        )
+        samples[mask] = colours
+        patch[:] = np.round(samples.reshape(height, fine, width, fine, 3).mean(axis=(1, 3)))
+
+    def _window(self, x_eye: FloatArray) -> tuple[int, int, int, int] | None:
+        """The rectangle (left, top, width, height) around the ball that lies in the image; None when there is none."""
+        radius = self._config.ball_radius_m
+        if x_eye[2] < 2 * radius:
+            return None
+        calibration = self._calibration
+        centre = calibration.project(x_eye)[:2]
+        # The outline of a sphere off the axis reaches farther than f·r/z.
+        reach = calibration.focal_px * radius / (x_eye[2] - radius)
+        reach = reach * np.linalg.norm(x_eye) / x_eye[2] + _MARGIN_PX
+        low = np.maximum(np.floor(centre - reach).astype(int), 0)
+        high = np.minimum(np.ceil(centre + reach).astype(int) + 1, calibration.image_size_px)
+        if (high <= low).any():
+            return None
+        return int(low[0]), int(low[1]), int(high[0] - low[0]), int(high[1] - low[1])
+
+    def _noise_fields(self, width: int, height: int) -> np.ndarray:
+        """A stock of noise images: drawing one afresh for every frame would cost as much as rendering it."""
+        shape = (_NOISE_FIELDS, height + _NOISE_SHIFT_PX, width + _NOISE_SHIFT_PX, 3)
+        rng = generator(self._seed, Stream.IMAGE_NOISE)
+        return np.round(self._config.noise * rng.standard_normal(shape, dtype=np.float32)).astype(np.int16)
+
+    def _add_noise(self, image: ImageArray, rng: np.random.Generator) -> None:
+        if self._config.noise == 0:
+            return
+        field, dy, dx = int(rng.integers(_NOISE_FIELDS)), *(int(d) for d in rng.integers(_NOISE_SHIFT_PX, size=2))
+        height, width = image.shape[:2]
+        cv2.add(image, self._noise[field, dy : dy + height, dx : dx + width], dst=image, dtype=cv2.CV_8U)

@@ -1,0 +1,142 @@
+"""The mechanical side of the simulated world: the hand, the arm, the head, step by step."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from dataclasses import dataclass
+from math import lcm
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+
+from interfaces.camera import StereoCalibration
+from interfaces.records import FloatArray
+
+from .arm import TorqueFreeArm
+from .bullet import Body
+from .config import SimConfig
+from .encoders import Encoders
+from .gaze import Gaze
+from .hand import VirtualHand
+from .path import GuidePath
+from .physics_urdf import physics_urdf
+from .randomness import Stream, generator
+from .roles import JointRoles
+from .sight import Sight
+from .truth import TrueRobot
+
+_SLOWEST_PHYSICS_HZ = 240
+
+
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """What a frame shows.
+
+    Attributes:
+        angles: true joint angles [rad or m], shape (d,).
+        T_world_camera: pose of the left eye, shape (4, 4).
+        x_world: centre of the ball [m], shape (3,).
+    """
+
+    angles: FloatArray
+    T_world_camera: FloatArray
+    x_world: FloatArray
+
+
+def physics_rate(encoder_hz: int, camera_hz: int) -> int:
+    """Steps a second: at least 240, and a whole number between any two readings or frames."""
+    common = lcm(encoder_hz, camera_hz)
+    return common * max(1, -(-_SLOWEST_PHYSICS_HZ // common))
+
+
+class Physics:
+    """The guided robot. Time is counted in steps; nothing here knows who reads what."""
+
+    def __init__(self, truth: TrueRobot, calibration: StereoCalibration, config: SimConfig) -> None:
+        self._truth, self._calibration, self._config = truth, calibration, config
+        self.rate_hz = physics_rate(config.encoders.rate_hz, config.camera.rate_hz)
+        self.steps = 0
+        self.urdf = physics_urdf(truth)
+        self.marker_xyz = np.array(truth.robot.robot.marker_xyz)
+        self._encoders = Encoders(
+            config.encoders, truth.offsets, truth.robot.chain.prismatic, generator(config.seed, Stream.ENCODERS)
+        )
+        self._exit = ExitStack()
+
+    def __enter__(self) -> Self:
+        robot, config = self._truth.robot, self._config
+        with ExitStack() as stack:
+            self._body = stack.enter_context(Body(self.urdf, robot.joints, dt=1 / self.rate_hz))
+            watched = stack.enter_context(Body(self.urdf, robot.joints))
+            roles = JointRoles.of(robot)
+            self._gazing = list(roles.gaze)
+            self._gaze = Gaze(robot, self._calibration, roles.gaze, config.guide.gaze_speed_rad_s)
+            self._sight = Sight(self._truth, self._calibration, roles, self._gaze, watched, config.camera.ball_radius_m)
+            self._path = GuidePath(
+                self._sight,
+                robot.lower,
+                robot.upper,
+                roles.guided,
+                config.guide.speed_rad_s / self.rate_hz,
+                generator(config.seed, Stream.WAYPOINTS),
+            )
+            self._hand = VirtualHand(self._body, self._truth, roles, config.guide, self._path.waypoints)
+            start = self._path.waypoints[0]
+            self._body.set_angles(start - self._truth.offsets)
+            self._command = start[self._gazing]
+            self._plan(start)
+            self._arm = TorqueFreeArm(
+                self._body, roles, self._hand.friction, gravity_compensation=config.guide.gravity_compensation
+            )
+            self._exit = stack.pop_all()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._exit.__exit__(kind, error, trace)
+
+    def step(self) -> None:
+        """One step of time."""
+        if self._next == len(self._postures):
+            self._plan(self._postures[-1])
+        self._hand.pull(self._goals, self._next)
+        self._next += 1
+        self._arm.step(self._command - self._truth.offsets[self._gazing])
+        self.steps += 1
+
+    def read_encoders(self) -> FloatArray:
+        """A reading (d,) of all encoders; the gaze follows it."""
+        q = self._encoders.read(self._body.angles())
+        self._command = self._gaze.track(q, self._command, 1 / self._config.encoders.rate_hz)
+        return q
+
+    def scene(self) -> Scene:
+        """What a frame taken now shows."""
+        robot = self._truth.robot
+        T_world_hand = self._body.link_pose(robot.robot.marker_link)
+        marker = self._truth.marker(self.marker_xyz)
+        return Scene(
+            angles=self._body.angles(),
+            T_world_camera=self._body.link_pose(robot.camera.parent_link) @ self._truth.T_parent_camera,
+            x_world=T_world_hand[:3, :3] @ marker + T_world_hand[:3, 3],
+        )
+
+    def change_tool(self, marker_xyz: FloatArray) -> None:
+        """From now on the hand holds a tool with its marker at `marker_xyz` (3,) [m] in the marker link."""
+        self.marker_xyz = marker_xyz
+        self._gaze.hold_tool(marker_xyz)
+        self._sight.hold_tool(marker_xyz)
+        here = self._postures[self._next - 1]
+        self._path.replan(here)
+        self._plan(here)
+
+    def _plan(self, posture: FloatArray) -> None:
+        """Plan the next hop, from `posture` (d,), where the path is now."""
+        hop = self._path.hop()
+        while not len(hop):
+            hop = self._path.hop()
+        self._postures = np.vstack([posture, hop])
+        self._goals = self._hand.goals(self._postures)
+        self._next = 1

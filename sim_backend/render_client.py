@@ -1,0 +1,136 @@
+"""The world's side of the renderer's process."""
+
+from __future__ import annotations
+
+import mmap
+import os
+import select
+import subprocess
+import sys
+from contextlib import ExitStack
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+
+from interfaces.camera import StereoCalibration
+from interfaces.errors import SourceLost
+from interfaces.records import FloatArray, ImageArray
+
+from .config import SimConfig
+from .physics import Scene
+from .render_messages import SLOTS, Frame, Setup, Tool, frame_bytes, send, slot_images
+
+_END_S = 5.0
+
+
+class RenderProcess:
+    """Starts the renderer, sends it scenes and fetches images, in order. At most SLOTS frames may be under way.
+
+    The images lie in anonymous memory that the kernel frees with its last user: nothing is left behind, however
+    either process ends.
+    """
+
+    def __init__(
+        self, urdf: str, joints: tuple[str, ...], marker_link: str, calibration: StereoCalibration, config: SimConfig
+    ) -> None:
+        self._setup = Setup(
+            urdf=urdf,
+            joints=joints,
+            marker_link=marker_link,
+            focal_px=calibration.focal_px,
+            principal_point_px=calibration.principal_point_px,
+            baseline_m=calibration.baseline_m,
+            image_size_px=calibration.image_size_px,
+            camera=config.camera,
+            seed=config.seed,
+        )
+        self._requests = self._answers = -1
+        self._exit = ExitStack()
+
+    def __enter__(self) -> Self:
+        size = SLOTS * frame_bytes(self._setup.image_size_px)
+        with ExitStack() as stack:
+            memory = os.memfd_create("bodyschema_frames")
+            stack.callback(os.close, memory)
+            os.ftruncate(memory, size)
+            self._shared = stack.enter_context(mmap.mmap(memory, size))
+            its_requests, self._requests = os.pipe()
+            self._answers, its_answers = os.pipe()
+            stack.callback(os.close, self._answers)
+            try:
+                self.process = _start(memory, its_requests, its_answers)
+            finally:
+                os.close(its_requests)
+                os.close(its_answers)
+            stack.callback(self._end)
+            stack.callback(os.close, self._requests)
+            self._send(self._setup)
+            self._exit = stack.pop_all()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._exit.__exit__(kind, error, trace)
+
+    def hold_tool(self, tip: FloatArray) -> None:
+        """Frames requested from now on show a stick to `tip` (3,) [m] in the marker link."""
+        self._send(Tool(tip=(float(tip[0]), float(tip[1]), float(tip[2]))))
+
+    def request(self, number: int, scene: Scene) -> None:
+        """Ask for frame `number`."""
+        self._send(
+            Frame(
+                number=number,
+                angles=scene.angles.tolist(),
+                T_world_camera=scene.T_world_camera.ravel().tolist(),
+                x_world=scene.x_world.tolist(),
+            )
+        )
+
+    def fetch(self, number: int, timeout_s: float) -> tuple[ImageArray, ImageArray] | None:
+        """Frame `number`, the earliest not yet fetched, as images of the caller's own; None after `timeout_s`.
+
+        Raises:
+            SourceLost: the renderer's process has died.
+        """
+        if not select.select([self._answers], [], [], max(0.0, timeout_s))[0]:
+            return None
+        if not os.read(self._answers, 1):
+            raise self._lost()
+        left, right = slot_images(self._shared, number, self._setup.image_size_px)
+        return np.array(left), np.array(right)
+
+    def _send(self, message: Setup | Tool | Frame) -> None:
+        try:
+            send(self._requests, message)
+        except BrokenPipeError as error:
+            raise self._lost() from error
+
+    def _lost(self) -> SourceLost:
+        return SourceLost(
+            f"the renderer's process {self.process.pid} has ended (exit code {self.process.poll()}); "
+            "its message stands on standard error; open the simulation again"
+        )
+
+    def _end(self) -> None:
+        try:
+            self.process.wait(_END_S)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.wait()
+
+
+def _start(memory: int, requests: int, answers: int) -> subprocess.Popen[bytes]:
+    """Start the renderer with this very copy of the package, whatever the working directory."""
+    here = str(Path(__file__).resolve().parents[1])
+    path = os.pathsep.join(part for part in (here, os.environ.get("PYTHONPATH", "")) if part)
+    return subprocess.Popen(
+        [sys.executable, "-m", "sim_backend.renderer", str(memory), str(requests), str(answers)],
+        pass_fds=(memory, requests, answers),
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+        env={**os.environ, "PYTHONPATH": path},
+    )

@@ -1,0 +1,101 @@
+"""What the world says to its renderer: length-prefixed MessagePack over a pipe."""
+
+from __future__ import annotations
+
+import os
+import struct
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from interfaces.records import ImageArray
+
+from .config import CameraConfig
+
+_LENGTH = struct.Struct("<I")
+# Frames in the shared memory; more than can be under way at once.
+SLOTS = 4
+
+
+class Setup(msgspec.Struct, frozen=True, tag=True):
+    """The robot and the cameras. Comes first, once."""
+
+    urdf: str
+    joints: tuple[str, ...]
+    marker_link: str
+    focal_px: float
+    principal_point_px: tuple[float, float]
+    baseline_m: float
+    image_size_px: tuple[int, int]
+    camera: CameraConfig
+    seed: int
+
+
+class Tool(msgspec.Struct, frozen=True, tag=True):
+    """A stick from the marker link's origin to `tip` [m], in the marker link."""
+
+    tip: tuple[float, float, float]
+
+
+class Frame(msgspec.Struct, frozen=True, tag=True):
+    """Paint this frame into slot `number` modulo SLOTS, then answer with one byte.
+
+    Attributes:
+        angles: true joint angles [rad or m].
+        T_world_camera: pose of the left eye, row by row, 16 numbers.
+        x_world: centre of the ball [m].
+    """
+
+    number: int
+    angles: list[float]
+    T_world_camera: list[float]
+    x_world: list[float]
+
+
+Message = Setup | Tool | Frame
+_encoder = msgspec.msgpack.Encoder()
+_decoder = msgspec.msgpack.Decoder(Message)
+
+
+def send(pipe: int, message: Message) -> None:
+    """Write a message to a file descriptor; BrokenPipeError when nobody reads."""
+    body = _encoder.encode(message)
+    data = memoryview(_LENGTH.pack(len(body)) + body)
+    while data:
+        data = data[os.write(pipe, data) :]
+
+
+def receive(pipe: int) -> Message | None:
+    """The next message from a file descriptor; None at its end."""
+    head = _read(pipe, _LENGTH.size)
+    if head is None:
+        return None
+    body = _read(pipe, _LENGTH.unpack(head)[0])
+    return None if body is None else _decoder.decode(body)
+
+
+def frame_bytes(image_size_px: tuple[int, int]) -> int:
+    """Bytes of one stereo frame."""
+    width, height = image_size_px
+    return 2 * width * height * 3
+
+
+def slot_images(shared: Any, number: int, image_size_px: tuple[int, int]) -> tuple[ImageArray, ImageArray]:
+    """The left and right image (height, width, 3) of frame `number` in the shared memory."""
+    width, height = image_size_px
+    size = frame_bytes(image_size_px)
+    pixels = np.frombuffer(shared, dtype=np.uint8, count=size, offset=(number % SLOTS) * size)
+    left, right = pixels.reshape(2, height, width, 3)
+    return left, right
+
+
+def _read(pipe: int, count: int) -> bytes | None:
+    parts: list[bytes] = []
+    while count:
+        part = os.read(pipe, count)
+        if not part:
+            return None
+        parts.append(part)
+        count -= len(part)
+    return b"".join(parts)

@@ -1,0 +1,111 @@
+"""The renderer's process: `python -m sim_backend.renderer MEMORY REQUESTS ANSWERS` with three inherited descriptors.
+
+It ends when its parent closes the pipe, or when the parent is no more: then nobody reads what it paints.
+"""
+
+from __future__ import annotations
+
+import mmap
+import os
+import select
+import signal
+import sys
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from interfaces.camera import StereoCalibration
+from interfaces.records import FloatArray, ImageArray
+
+from .bullet import Body
+from .eye import TO_LIGHT, StereoEyes
+from .raster import Raster
+from .render_messages import SLOTS, Frame, Message, Setup, Tool, frame_bytes, receive, slot_images
+
+_PARENT_CHECK_S = 1.0
+_STICK_RADIUS_M = 0.005
+_SHORTEST_STICK_M = 0.01
+
+
+class Stick:
+    """The tool: a thin rod from the hand to the ball. It is seen, weighs nothing and touches nothing."""
+
+    def __init__(self, body: Body, link: str) -> None:
+        self._body, self._link = body, link
+        self._id = -1
+        self._T_link_stick: tuple[FloatArray, Rotation] = (np.zeros(3), Rotation.identity())
+
+    def change(self, tip: FloatArray) -> None:
+        """Take a rod to `tip` (3,) [m] in the link."""
+        bullet, client = self._body.bullet, self._body.client
+        if self._id >= 0:
+            bullet.removeBody(self._id, physicsClientId=client)
+            self._id = -1
+        length = float(np.linalg.norm(tip))
+        if length < _SHORTEST_STICK_M:
+            return
+        shape = bullet.createVisualShape(
+            bullet.GEOM_CYLINDER,
+            radius=_STICK_RADIUS_M,
+            length=length,
+            rgbaColor=[0.16, 0.17, 0.18, 1],
+            physicsClientId=client,
+        )
+        self._id = bullet.createMultiBody(0, -1, shape, physicsClientId=client)
+        turn = Rotation.align_vectors(tip[None] / length, [[0.0, 0.0, 1.0]])[0]
+        self._T_link_stick = (tip / 2, turn)
+
+    def follow(self) -> None:
+        """Move the rod to where the link is now."""
+        if self._id < 0:
+            return
+        T = self._body.link_pose(self._link)
+        middle, turn = self._T_link_stick
+        orientation = Rotation.from_matrix(T[:3, :3]) * turn
+        self._body.bullet.resetBasePositionAndOrientation(
+            self._id,
+            (T[:3, :3] @ middle + T[:3, 3]).tolist(),
+            orientation.as_quat().tolist(),
+            physicsClientId=self._body.client,
+        )
+
+
+def serve(memory: int, requests: int, answers: int) -> None:
+    """Paint frames until the requests end."""
+    setup = _next(requests)
+    if not isinstance(setup, Setup):
+        return
+    calibration = StereoCalibration(setup.focal_px, setup.principal_point_px, setup.baseline_m, setup.image_size_px)
+    with Body(setup.urdf, setup.joints) as body, mmap.mmap(memory, SLOTS * frame_bytes(setup.image_size_px)) as shared:
+        raster = Raster(body.bullet, body.client, calibration, TO_LIGHT)
+        eyes = StereoEyes(raster, calibration, setup.camera, setup.seed)
+        stick = Stick(body, setup.marker_link)
+        while (message := _next(requests)) is not None:
+            if isinstance(message, Tool):
+                stick.change(np.array(message.tip))
+            elif isinstance(message, Frame):
+                _paint(message, body, stick, eyes, slot_images(shared, message.number, setup.image_size_px))
+                os.write(answers, b"\0")
+
+
+def _paint(frame: Frame, body: Body, stick: Stick, eyes: StereoEyes, images: tuple[ImageArray, ImageArray]) -> None:
+    body.set_angles(np.array(frame.angles))
+    stick.follow()
+    eyes.paint(frame.number, np.array(frame.T_world_camera).reshape(4, 4), np.array(frame.x_world), images)
+
+
+def _next(requests: int) -> Message | None:
+    """The next request; None when the parent has closed the pipe or is gone (a fork of it may keep the pipe open)."""
+    parent = os.getppid()
+    while not select.select([requests], [], [], _PARENT_CHECK_S)[0]:
+        if os.getppid() != parent:
+            return None
+    return receive(requests)
+
+
+if __name__ == "__main__":
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle; it closes the pipe
+    try:
+        serve(*(int(argument) for argument in sys.argv[1:4]))
+    except BrokenPipeError:
+        os._exit(0)

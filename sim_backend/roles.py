@@ -1,0 +1,82 @@
+"""Which learnt joints turn the cameras towards the marker, which ones the virtual hand moves, and where it holds on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from interfaces.records import FloatArray
+from interfaces.robot import RobotDescription
+from interfaces.urdf import UrdfTree, chain_between
+from kbmaps import RigidChain
+
+from .truth import TrueRobot, with_offsets
+
+
+@dataclass(frozen=True)
+class JointRoles:
+    """The parts that the learnt joints play.
+
+    The way from the cameras to the marker first goes up to a common link and then down. Joints on the way up carry the
+    cameras: they gaze. Joints on the way down carry the marker: they are guided. Where there is no way down (cameras
+    on a hand that looks at a marker in the world), those on the way up are guided.
+
+    Attributes:
+        gaze: indices of the gazing joints in q.
+        guided: indices of the guided joints in q, in their order from the robot's root.
+        wrist: the link that the last guided joint moves; the hand holds it.
+        elbow: the link half-way between the first guided joint and the wrist; the other hand holds it.
+    """
+
+    gaze: tuple[int, ...]
+    guided: tuple[int, ...]
+    wrist: str
+    elbow: str
+
+    @classmethod
+    def of(cls, robot: RobotDescription) -> JointRoles:
+        """The roles of a robot's learnt joints."""
+        way = robot.tree.path(robot.camera.parent_link, robot.robot.marker_link)
+        upward = {joint.name: up for joint, up in way}
+        index = {name: k for k, name in enumerate(robot.joints)}
+        gaze = tuple(k for name, k in index.items() if upward[name])
+        guided = tuple(k for name, k in index.items() if not upward[name])
+        if not guided:
+            gaze, guided = (), gaze[::-1]
+        links = [robot.tree.joints[robot.joints[k]].child for k in guided]
+        return cls(gaze=gaze, guided=guided, wrist=links[-1], elbow=links[_half_way(robot, guided)])
+
+
+def root_link(tree: UrdfTree) -> str:
+    """The link that hangs on no joint."""
+    children = {joint.child for joint in tree.joints.values()}
+    return next(link for link in tree.links if link not in children)
+
+
+def chain_from_root(truth: TrueRobot, roles: JointRoles, link: str) -> tuple[RigidChain, tuple[int, ...]]:
+    """The true chain from the robot's root to a guided link, over reported angles; and which entries of q it needs."""
+    root = root_link(truth.tree)
+    on_way = {joint.name for joint, _ in truth.tree.path(root, link)}
+    indices = tuple(k for k in roles.guided if truth.robot.joints[k] in on_way)
+    names = tuple(truth.robot.joints[k] for k in indices)
+    chain = chain_between(truth.tree, names, {}, start=root, end=link, T_start_camera=np.eye(4), marker_xyz=np.zeros(3))
+    return with_offsets(chain, truth.offsets[list(indices)]), indices
+
+
+def _half_way(robot: RobotDescription, guided: tuple[int, ...]) -> int:
+    origins = _origins(robot, guided)
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(origins, axis=0), axis=1))])
+    return int(np.abs(along - along[-1] / 2).argmin())
+
+
+def _origins(robot: RobotDescription, guided: tuple[int, ...]) -> FloatArray:
+    """Origins (n, 3) of the guided joints' frames [m] with all joints at zero."""
+    root = root_link(robot.tree)
+    origins = []
+    for k in guided:
+        T = np.eye(4)
+        for joint, _ in robot.tree.path(root, robot.tree.joints[robot.joints[k]].child):
+            T = T @ joint.T_parent_joint
+        origins.append(T[:3, 3])
+    return np.array(origins)

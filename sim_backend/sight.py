@@ -1,0 +1,120 @@
+"""Whether both cameras really see the ball at a posture, and whether the arm is clear of the body there."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from interfaces.camera import StereoCalibration
+from interfaces.records import FloatArray
+
+from .bullet import Body
+from .gaze import Gaze
+from .roles import JointRoles
+from .truth import TrueRobot
+
+# The ball stays this far inside the images [px], and between these distances from the eyes [m].
+_MARGIN_PX = 12.0
+_NEAREST_M = 0.25
+_FARTHEST_M = 2.0
+# Rays begin this far from the eye [m], outside of the head's own shape, and go to the ball's middle and rim.
+_RAY_START_M = 0.06
+_RIM = 0.8
+
+
+class Sight:
+    """Judges postures of the true robot.
+
+    Args:
+        body: the true robot in a pybullet world that nothing else uses.
+    """
+
+    def __init__(
+        self,
+        truth: TrueRobot,
+        calibration: StereoCalibration,
+        roles: JointRoles,
+        gaze: Gaze,
+        body: Body,
+        ball_radius_m: float,
+    ) -> None:
+        self._truth, self._calibration, self._roles, self._gaze = truth, calibration, roles, gaze
+        self._body = body
+        self._radius = ball_radius_m
+        self._near_pairs = self._clearance_pairs()
+        self._chain = truth.chain(np.array(truth.robot.robot.marker_xyz))
+
+    def hold_tool(self, marker_xyz: FloatArray) -> None:
+        """From now on judge for a tool with its marker at `marker_xyz` (3,) [m]."""
+        self._chain = self._truth.chain(marker_xyz)
+
+    def gazed(self, q: FloatArray) -> FloatArray:
+        """q (n, d) with the head turned to the marker."""
+        return self._gaze.solve(q)
+
+    def in_images(self, q: FloatArray) -> np.ndarray:
+        """Which of the postures (n, d) have the whole ball inside both images, at a sensible distance."""
+        x = self._chain.positions(q)
+        deep = np.maximum(x[:, 2], 1e-3)
+        pixels = self._calibration.project(np.column_stack([x[:, :2], deep]))
+        border = _MARGIN_PX + self._calibration.focal_px * self._radius / deep
+        size = np.tile(self._calibration.image_size_px, 2)
+        inside = ((pixels > border[:, None]) & (pixels < size - 1 - border[:, None])).all(axis=1)
+        return inside & (x[:, 2] > _NEAREST_M) & (x[:, 2] < _FARTHEST_M)
+
+    def clear(self, q: FloatArray) -> bool:
+        """Whether nothing stands between the eyes and the ball at one posture (d,), and the arm touches no body."""
+        body = self._body
+        body.set_angles(q - self._truth.offsets)
+        body.bullet.performCollisionDetection(physicsClientId=body.client)
+        return not self._blocked(q) and not self._touching()
+
+    def visible(self, q: FloatArray) -> np.ndarray:
+        """Which of the postures (n, d) pass both tests."""
+        seen = self.in_images(q)
+        for k in np.flatnonzero(seen):
+            seen[k] = self.clear(q[k])
+        return seen
+
+    def _blocked(self, q: FloatArray) -> bool:
+        T_world_camera = self._body.link_pose(self._truth.robot.camera.parent_link) @ self._truth.T_parent_camera
+        x = self._chain.positions(q)
+        starts, ends = [], []
+        for shift in (0.0, self._calibration.baseline_m):
+            eye = np.array([shift, 0.0, 0.0])
+            away = (x - eye) / np.linalg.norm(x - eye)
+            across = np.cross(away, [0.0, 1.0, 0.0])
+            for rim in (np.zeros(3), across, -across, np.cross(away, across), -np.cross(away, across)):
+                starts.append(eye + _RAY_START_M * away)
+                ends.append(x + self._radius * (_RIM * rim - away))
+        starts, ends = (
+            np.array(points) @ T_world_camera[:3, :3].T + T_world_camera[:3, 3] for points in (starts, ends)
+        )
+        hits = self._body.bullet.rayTestBatch(starts.tolist(), ends.tolist(), physicsClientId=self._body.client)
+        return any(hit[0] == self._body.id for hit in hits)
+
+    def _touching(self) -> bool:
+        body = self._body
+        return any(
+            body.bullet.getClosestPoints(body.id, body.id, 0.0, arm, other, physicsClientId=body.client)
+            for arm, other in self._near_pairs
+        )
+
+    def _clearance_pairs(self) -> list[tuple[int, int]]:
+        """Pairs of the moving arm's outer links and the links that the arm does not move."""
+        tree, body = self._truth.tree, self._body
+        first = tree.joints[self._truth.robot.joints[self._roles.guided[0]]]
+        arm = _below(tree.joints.values(), first.child)
+        outer = _below(tree.joints.values(), self._roles.elbow) - {self._roles.elbow}
+        others = [link for link in body.links if link not in arm]
+        return [(body.links[link], body.links[other]) for link in sorted(outer) for other in others]
+
+
+def _below(joints, link: str) -> set[str]:
+    """The link and all that hang on it."""
+    found = {link}
+    grown = True
+    while grown:
+        more = {joint.child for joint in joints if joint.parent in found} - found
+        grown = bool(more)
+        found |= more
+    return found

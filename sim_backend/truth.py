@@ -1,0 +1,105 @@
+"""The true robot: the described one with errors drawn from the seed. For judges and for the simulation itself only."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from interfaces.records import FloatArray, frozen_array
+from interfaces.robot import RobotDescription
+from interfaces.urdf import MOVING, UrdfJoint, UrdfTree, chain_between
+from kbmaps import RigidChain
+
+from .config import ErrorConfig, SimConfig
+from .geometry import joint_motion, transform
+from .randomness import Stream, generator
+
+# A slide's zero is known better than a turn's: metres for radians, at this rate.
+_METRES_PER_RADIAN = 0.1
+
+
+@dataclass(frozen=True)
+class TrueRobot:
+    """The robot that is simulated.
+
+    Attributes:
+        robot: its description, the nominal model.
+        tree: its true kinematics; joints that are not learnt are locked (kind fixed, their position in their origin).
+        offsets: reported minus true angle [rad or m], shape (d,), in the order of `robot.joints`.
+        T_parent_camera: true pose of the left eye in the camera's parent link, shape (4, 4).
+        tool_error: true minus described place of the marker in the marker link [m], shape (3,).
+    """
+
+    robot: RobotDescription
+    tree: UrdfTree
+    offsets: FloatArray
+    T_parent_camera: FloatArray
+    tool_error: FloatArray
+
+    @classmethod
+    def draw(cls, robot: RobotDescription, config: SimConfig) -> TrueRobot:
+        """Draw the true robot; the same description and configuration give the same one."""
+        rng = generator(config.seed, Stream.ERRORS)
+        errors = config.errors
+        way = [joint.name for joint, _ in robot.tree.path(robot.camera.parent_link, robot.robot.marker_link)]
+        moving = [name for name in way if robot.tree.joints[name].kind in MOVING]
+        offsets = {name: _offset(robot.tree.joints[name], errors, rng) for name in moving}
+        joints = dict(robot.tree.joints)
+        for name in moving:
+            error = _pose_error(errors.link_length_m, errors.link_axis_rad, rng)
+            joints[name] = replace(joints[name], T_parent_joint=frozen_array(joints[name].T_parent_joint @ error))
+        camera_error = _pose_error(errors.camera_position_m, errors.camera_rotation_rad, rng)
+        tool_error = errors.tool_m * rng.standard_normal(3)
+        for name, joint in joints.items():
+            if joint.kind in MOVING and name not in robot.joints:
+                held_at = robot.robot.held_at.get(name, 0.0) - offsets.get(name, 0.0)
+                joints[name] = _locked(joint, held_at)
+        return cls(
+            robot=robot,
+            tree=replace(robot.tree, joints=joints),
+            offsets=frozen_array([offsets[name] for name in robot.joints]),
+            T_parent_camera=frozen_array(robot.camera.pose @ camera_error),
+            tool_error=frozen_array(tool_error),
+        )
+
+    def marker(self, marker_xyz: FloatArray) -> FloatArray:
+        """Where the marker of a tool described by `marker_xyz` (3,) really is in the marker link [m]."""
+        return marker_xyz + self.tool_error
+
+    def chain(self, marker_xyz: FloatArray) -> RigidChain:
+        """True left eye to true marker over the reported angles, for a tool described by `marker_xyz` (3,) [m]."""
+        chain = chain_between(
+            self.tree,
+            self.robot.joints,
+            {},
+            start=self.robot.camera.parent_link,
+            end=self.robot.robot.marker_link,
+            T_start_camera=self.T_parent_camera,
+            marker_xyz=self.marker(marker_xyz),
+        )
+        return with_offsets(chain, self.offsets)
+
+
+def with_offsets(chain: RigidChain, offsets: FloatArray) -> RigidChain:
+    """A chain over true angles as one over reported angles = true angles + offsets (d,)."""
+    fixed = chain.fixed.copy()
+    for k, offset in enumerate(offsets):
+        fixed[k + 1] = joint_motion(chain.axes[k], bool(chain.prismatic[k]), -offset) @ fixed[k + 1]
+    return RigidChain(fixed=fixed, axes=chain.axes, prismatic=chain.prismatic)
+
+
+def _offset(joint: UrdfJoint, errors: ErrorConfig, rng: np.random.Generator) -> float:
+    scale = _METRES_PER_RADIAN if joint.kind == "prismatic" else 1.0
+    return float(scale * errors.joint_offset_rad * rng.standard_normal())
+
+
+def _pose_error(length: float, angle: float, rng: np.random.Generator) -> FloatArray:
+    shift, turn = length * rng.standard_normal(3), angle * rng.standard_normal(3)
+    return transform(Rotation.from_rotvec(turn), shift)
+
+
+def _locked(joint: UrdfJoint, position: float) -> UrdfJoint:
+    motion = joint_motion(joint.axis, joint.kind == "prismatic", position)
+    return replace(joint, kind="fixed", T_parent_joint=frozen_array(joint.T_parent_joint @ motion))

@@ -1,0 +1,236 @@
+"""The simulated world in lock step: physics, encoders and cameras on one simulated clock."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from contextlib import ExitStack
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+
+from interfaces.camera import StereoCalibration
+from interfaces.clock import SystemClock
+from interfaces.errors import ConfigError, SourceEnded
+from interfaces.records import FloatArray, ImageArray, JointReading, StereoFrame, frozen_array
+from interfaces.robot import RobotDescription
+from kbmaps import RigidChain
+
+from .config import SimConfig
+from .physics import Physics
+from .render_client import RenderProcess
+from .sources import SimClock, SimJoints, SimStereoCamera
+from .truth import TrueRobot
+
+# How far the world runs ahead of its readers: frames that were taken but not read, and seconds of joint readings.
+FRAMES_AHEAD = 2
+_READINGS_AHEAD_S = 4.0
+
+
+@dataclass(slots=True)
+class WorldStats:
+    """Counts since the world was opened."""
+
+    readings: int = 0
+    frames: int = 0
+    tool_changes: int = 0
+
+
+class SimWorld:
+    """A robot that is guided by hand, its encoders and its stereo cameras.
+
+    Whoever reads next moves the world on: nothing happens between reads, and simulated time passes as fast as the
+    readers take it. The world never runs more than two frames, or four seconds of joint readings, ahead of an
+    open source, so two threads may read joints and camera each at its own pace. The same description and
+    configuration give the same readings and frames, bit by bit. Open both sources before the first read.
+
+    Args:
+        robot: the robot as described; it needs a stereo calibration.
+
+    Raises:
+        ConfigError: [camera] has no stereo calibration, or pybullet is not installed (both on entering).
+    """
+
+    def __init__(self, robot: RobotDescription, config: SimConfig) -> None:
+        self.robot, self.config = robot, config
+        self.clock = SimClock(self.now)
+        self.stats = WorldStats()
+        self._moved = threading.Condition()
+        self._exit = ExitStack()
+        self._readings: deque[JointReading] = deque()
+        self._frame_times: deque[float] = deque()
+        self._planned = deque(sorted(config.tool_changes, key=lambda change: change.at_s))
+        self._wanted_tool: FloatArray | None = None
+        self._joints_open = self._camera_open = self._running = False
+        self._taken = self._delivered = 0
+
+    def __enter__(self) -> Self:
+        calibration = _stereo(self.robot)
+        self._truth = TrueRobot.draw(self.robot, self.config)
+        with ExitStack() as stack:
+            self._physics = stack.enter_context(Physics(self._truth, calibration, self.config))
+            self._renderer = stack.enter_context(
+                RenderProcess(
+                    self._physics.urdf, self.robot.joints, self.robot.robot.marker_link, calibration, self.config
+                )
+            )
+            self._renderer.hold_tool(self._truth.marker(self._physics.marker_xyz))
+            self.joints = SimJoints(self)
+            self.camera = SimStereoCamera(self, calibration)
+            self._exit = stack.pop_all()
+        self.clock.start(SystemClock())
+        self._running = True
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        with self._moved:
+            self._running = False
+            self._moved.notify_all()
+        self._exit.__exit__(kind, error, trace)
+
+    def now(self) -> float:
+        """Simulated time of the world's front [s]; a frame may be up to two frame intervals older."""
+        return self._physics.steps / self._physics.rate_hz
+
+    def change_tool(self, marker_xyz: tuple[float, float, float] | FloatArray) -> float:
+        """Put another tool into the hand, its marker described to be at `marker_xyz` [m] in the marker link.
+
+        May be called from any thread. The guide chooses new postures for it and the gaze follows it at once.
+
+        Returns:
+            Simulated time [s]: all frames after it show the new tool.
+        """
+        with self._moved:
+            self._wanted_tool = np.array(marker_xyz, dtype=np.float64)
+            return self.now()
+
+    def true_chain(self) -> RigidChain:
+        """The truth, for judges: true left eye to true marker over the angles that the encoders report."""
+        with self._moved:
+            wanted = self._physics.marker_xyz if self._wanted_tool is None else self._wanted_tool
+            return self._truth.chain(wanted)
+
+    def open_joints(self, is_open: bool) -> None:
+        """Begin or end to keep readings for the joint source."""
+        with self._moved:
+            self._joints_open = is_open
+            self._readings.clear()
+            self._moved.notify_all()
+
+    def open_camera(self, is_open: bool) -> None:
+        """Begin or end to take frames for the camera."""
+        with self._moved:
+            self._camera_open = is_open
+            self._moved.notify_all()
+
+    def next_reading(self, timeout_s: float) -> JointReading | None:
+        """The next reading; None when none came within `timeout_s`, because the camera has to be read first."""
+        end = time.monotonic() + timeout_s
+        with self._moved:
+            while True:
+                self._check_running()
+                if self._readings:
+                    self._moved.notify_all()
+                    return self._readings.popleft()
+                if self._may_take_frame():
+                    self._step()
+                elif not self._moved.wait(end - time.monotonic()):
+                    return None
+
+    def next_frame(self, timeout_s: float) -> StereoFrame | None:
+        """The next frame; None when none came within `timeout_s`."""
+        end = time.monotonic() + timeout_s
+        if not self._take_frames(end):
+            return None
+        images = self._renderer.fetch(self._delivered, end - time.monotonic())
+        if images is None:
+            return None
+        with self._moved:
+            self._delivered += 1
+            t = self._frame_times.popleft()
+            self._moved.notify_all()
+        return _frame(t, images)
+
+    def _take_frames(self, end: float) -> bool:
+        """Move on until there are frames for the renderer to work on ahead; False when there is none at all in time."""
+        with self._moved:
+            while self._may_take_frame():
+                self._check_running()
+                if self._may_keep_reading():
+                    self._step()
+                elif self._frame_times:
+                    break
+                elif not self._moved.wait(end - time.monotonic()):
+                    return False
+            self._check_running()
+            return True
+
+    def _may_take_frame(self) -> bool:
+        return not self._camera_open or self._taken - self._delivered < FRAMES_AHEAD
+
+    def _may_keep_reading(self) -> bool:
+        return len(self._readings) < _READINGS_AHEAD_S * self.config.encoders.rate_hz
+
+    def _check_running(self) -> None:
+        if not self._running:
+            raise SourceEnded("the simulated world has been closed")
+
+    def _step(self) -> None:
+        """One step of time, and what falls due at its end: first a reading, then a frame."""
+        physics = self._physics
+        physics.step()
+        self._change_tool_when_due()
+        t = self.now()
+        if physics.steps % (physics.rate_hz // self.config.encoders.rate_hz) == 0:
+            q = physics.read_encoders()
+            if self._joints_open:
+                self._readings.append(JointReading(t, frozen_array(q)))
+                self.stats.readings += 1
+        if self._camera_open and physics.steps % (physics.rate_hz // self.config.camera.rate_hz) == 0:
+            self._renderer.request(self._taken, physics.scene())
+            self._frame_times.append(t)
+            self._taken += 1
+            self.stats.frames += 1
+
+    def _change_tool_when_due(self) -> None:
+        while self._planned and self._planned[0].at_s <= self.now():
+            self._wanted_tool = np.array(self._planned.popleft().marker_xyz)
+        if self._wanted_tool is None:
+            return
+        self._physics.change_tool(self._wanted_tool)
+        self._renderer.hold_tool(self._truth.marker(self._wanted_tool))
+        self._wanted_tool = None
+        self.stats.tool_changes += 1
+
+
+def true_chain(
+    robot: RobotDescription, config: SimConfig, marker_xyz: tuple[float, float, float] | FloatArray | None = None
+) -> RigidChain:
+    """The truth of the world that `robot` and `config` would open, for judges in another process; needs no pybullet.
+
+    Args:
+        marker_xyz: the described marker of the tool in the hand [m]; None for that of robot.toml.
+    """
+    described = robot.robot.marker_xyz if marker_xyz is None else marker_xyz
+    return TrueRobot.draw(robot, config).chain(np.array(described, dtype=np.float64))
+
+
+def _stereo(robot: RobotDescription) -> StereoCalibration:
+    if robot.calibration is None:
+        raise ConfigError(
+            "the simulation renders stereo images, but [camera] describes no stereo pair",
+            file=robot.file,
+            remedy="Add focal_px, principal_point_px, baseline_m and image_size_px to [camera]",
+        )
+    return robot.calibration
+
+
+def _frame(t: float, images: tuple[ImageArray, ImageArray]) -> StereoFrame:
+    for image in images:
+        image.setflags(write=False)
+    return StereoFrame(t, *images)
