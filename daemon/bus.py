@@ -103,12 +103,16 @@ class Bus:
 
         self._declared.append(self._open.declare_subscriber(key, receive))
 
-    def answer(self, key: str, handler: Callable[[Request], bytes]) -> None:
-        """Answer queries under `key`; what `handler` raises goes back as an error reply."""
+    def answer(self, key: str, handler: Callable[[Request], bytes], *, encoding: str | None = None) -> None:
+        """Answer queries under `key`; what `handler` raises goes back as an error reply.
+
+        Args:
+            encoding: of the answers; None: the one that the request has.
+        """
 
         def receive(query: zenoh.Query) -> None:
             with query:
-                self._reply(key, query, handler)
+                self._reply(key, query, handler, encoding)
 
         self._declared.append(self._open.declare_queryable(key, receive, complete=True))
 
@@ -184,7 +188,9 @@ class Bus:
             )
         return f"cannot open zenoh on {self._listen}: {message.split(' at /')[0]}. Mend the table [zenoh] of robot.toml"
 
-    def _reply(self, key: str, query: zenoh.Query, handler: Callable[[Request], bytes]) -> None:
+    def _reply(
+        self, key: str, query: zenoh.Query, handler: Callable[[Request], bytes], answer_encoding: str | None
+    ) -> None:
         asked = str(query.encoding) if query.encoding is not None else JSON
         encoding = MSGPACK if asked.startswith(MSGPACK) else JSON
         payload = query.payload.to_bytes() if query.payload is not None else b""
@@ -198,7 +204,7 @@ class Bus:
             text = f"internal error, please report it: {type(error).__name__}: {error}"
             query.reply_err(encode(ErrorReply(text), encoding), encoding=zenoh.Encoding(encoding))
         else:
-            query.reply(key, answer, encoding=zenoh.Encoding(encoding))
+            query.reply(key, answer, encoding=zenoh.Encoding(answer_encoding or encoding))
 
 
 @contextmanager

@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -126,6 +126,11 @@ class Config:
             line = line_of(text, ("daemon", "min_step_deg"))
             raise ConfigError("min_step_deg is not below max_step_deg", file=file, line=line)
         return cls(file, robot, tables)
+
+    def with_state_dir(self, folder: Path) -> Config:
+        """The same with another place for store and checkpoint, relative to the working directory."""
+        daemon = msgspec.structs.replace(self.tables.daemon, state_dir=str(folder.absolute()))
+        return replace(self, tables=msgspec.structs.replace(self.tables, daemon=daemon))
 
     @property
     def state_dir(self) -> Path:

@@ -72,6 +72,8 @@ class LearnerStatus(msgspec.Struct, frozen=True, kw_only=True):
         model: hash of the model that answers.
         gaps_recovered: pairs that had to be fetched from the sampler's history.
         refused: pairs that could not be taken.
+        doubted: pairs that looked like gross outliers and were learnt with care.
+        changes: tool changes that were told, or found in the pairs.
         checkpoint_age_s: time since the last checkpoint, or null before any.
         health: sentences about what is wrong; empty when all is well.
     """
@@ -91,6 +93,8 @@ class LearnerStatus(msgspec.Struct, frozen=True, kw_only=True):
     model: str
     gaps_recovered: int
     refused: int
+    doubted: int
+    changes: int
     checkpoint_age_s: float | None
     uptime_s: float
     health: list[str]

@@ -16,6 +16,7 @@ from interfaces.records import Pair, frozen_array
 
 JSON = "application/json"
 MSGPACK = "application/msgpack"
+OCTETS = "application/octet-stream"
 SCHEMA = 1
 LARGEST_BATCH = 10_000
 

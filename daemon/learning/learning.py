@@ -145,6 +145,10 @@ class Learning:
             self._begin_at_nominal()
             self._publish()
 
+    def restart_solver(self) -> None:
+        """The exact solver has lost its pairs: give it all of them again. For the thread that calls `work`."""
+        self._solver_task = 0
+
     def solve_soon(self) -> None:
         """Let the exact solver catch up although fewer than `solve_every` pairs are new."""
         self._solve_soon = True
@@ -234,9 +238,7 @@ class Learning:
         if pair.seq <= counters.last_seq:
             raise RequestError(f"pair {pair.seq} has been learnt already; the last one was {counters.last_seq}")
         if len(pair.q) != self._nominal.joints:
-            raise RequestError(
-                f"pair {pair.seq} has {len(pair.q)} joint angles, this robot has {self._nominal.joints}"
-            )
+            raise RequestError(f"pair {pair.seq} has {len(pair.q)} joint angles, this robot has {self._nominal.joints}")
         if not all(np.isfinite(part).all() for part in (pair.q, pair.x, pair.cov)):
             raise RequestError(f"pair {pair.seq} has a number that is not finite")
         if np.abs(pair.x).max() > FARTHEST_M:
@@ -361,7 +363,7 @@ class Learning:
             return True
         self._asked = False
         with self._lock:
-            if task == self._task:
+            if task == self._task and solved.map is not None:
                 q, x, _ = self._memory.since(self._asked_at)
                 self._members_now.take(solved.map, q, x)
                 self._errors.setdefault(EXACT, ErrorMemory(EXPECTED_M))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -54,6 +55,11 @@ class NominalModel:
         return self.chain.joints
 
     @property
+    def size(self) -> int:
+        """Number of control points of a map: 3^d where all joints turn."""
+        return math.prod(basis.size for basis in self.bases)
+
+    @property
     def frame_known(self) -> bool:
         """Whether predictions mean something before any pair."""
         return self.pose_known and self.marker_known
@@ -90,7 +96,5 @@ class NominalModel:
             DegenerateDataError: the pairs do not determine it.
         """
         chosen = np.linspace(0, len(q) - 1, min(len(q), LARGEST_FIT)).round().astype(int)
-        fit = align(
-            self.chain, q[chosen], x[chosen], pose_known=self.pose_known, marker_known=self.marker_known
-        )
+        fit = align(self.chain, q[chosen], x[chosen], pose_known=self.pose_known, marker_known=self.marker_known)
         return fit.chain.to_kbmap(self.bases)

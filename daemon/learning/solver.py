@@ -21,11 +21,12 @@ class Solved:
     Attributes:
         task: number of the task it belongs to.
         pairs: how many pairs it is the solution of.
+        map: None when these pairs have no solution.
     """
 
     task: int
     pairs: int
-    map: KBMap
+    map: KBMap | None
 
 
 class ExactSolver(Protocol):
@@ -48,7 +49,7 @@ class ExactSolver(Protocol):
         ...
 
     def poll(self) -> Solved | None:
-        """The newest solution that has not been given yet."""
+        """The answer to a `solve` that has not been given yet, without waiting."""
         ...
 
 
@@ -85,13 +86,14 @@ class DirectSolver:
         except SettingError:
             # The precision was lost in rounding: without a solution the others go on answering.
             self._precision = None
+            self._solved = Solved(self._task, learner.pairs, None)
             return
         if retune:
             self._precision, self._tuned_at = solution.prior_precision or None, learner.pairs
         self._solved = Solved(self._task, learner.pairs, solution.map)
 
     def poll(self) -> Solved | None:
-        """The newest solution that has not been given yet."""
+        """The answer to the last `solve`, once."""
         solved, self._solved = self._solved, None
         return solved
 

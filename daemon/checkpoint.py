@@ -1,0 +1,158 @@
+"""The learner's state on disk: one file, replaced as a whole, so that a kill leaves the old one or the new one.
+
+Layout, all little-endian:
+
+    magic     8 bytes   b"BSCKPT\\r\\n"
+    version   uint32    1
+    length    uint32    bytes of the header
+    header    MessagePack: `_Header`
+    arrays    float64, in the header's order
+    checksum  16 bytes  BLAKE2b of everything before
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import hashlib
+import math
+import os
+import struct
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from daemon.learning import LearningState
+from daemon.learning.state import LearningHeader
+from interfaces.errors import BodyschemaError
+from interfaces.records import FloatArray
+
+MAGIC = b"BSCKPT\r\n"
+VERSION = 1
+_PREFIX = struct.Struct("<8sII")
+_CHECKSUM_BYTES = 16
+
+
+class CheckpointError(BodyschemaError):
+    """A checkpoint cannot be written or read."""
+
+
+class _ArrayEntry(msgspec.Struct, frozen=True):
+    name: str
+    shape: tuple[int, ...]
+
+
+class _Header(msgspec.Struct, frozen=True):
+    robot: str
+    written_utc: str
+    learning: LearningHeader
+    arrays: list[_ArrayEntry]
+
+
+def write_checkpoint(file: Path, state: LearningState, *, robot: str, utc: str) -> None:
+    """Replace the checkpoint `file` by `state`.
+
+    Raises:
+        CheckpointError: the disk is full or read-only; the old checkpoint is still there.
+    """
+    data = _encode(state, robot, utc)
+    temporary = file.with_name(file.name + ".tmp")
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        _write_through(temporary, data)
+        os.replace(temporary, file)
+        _sync_folder(file.parent)
+    except OSError as error:
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
+        raise CheckpointError(_unwritable(file, error)) from error
+
+
+def read_checkpoint(file: Path, *, robot: str) -> LearningState | None:
+    """The state in `file`; None when there is no such file.
+
+    Raises:
+        CheckpointError: it cannot be read, is damaged, or belongs to another robot.
+    """
+    try:
+        data = file.read_bytes()
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        raise CheckpointError(f"cannot read the checkpoint {file}: {error.strerror}") from error
+    header, payload = _decode(file, data)
+    if header.robot != robot:
+        raise CheckpointError(f"the checkpoint {file} belongs to the robot {header.robot!r}, this one is {robot!r}")
+    arrays: dict[str, FloatArray] = {}
+    for entry in header.arrays:
+        size = 8 * math.prod(entry.shape)
+        arrays[entry.name] = np.frombuffer(payload[:size], dtype="<f8").astype(np.float64).reshape(entry.shape)
+        payload = payload[size:]
+    return LearningState(header.learning, arrays)
+
+
+def set_aside(file: Path) -> Path:
+    """Rename a checkpoint that is of no use, so that it is kept and not in the way; the new path."""
+    number = 1
+    while (aside := file.with_name(f"{file.name}.unusable-{number}")).exists():
+        number += 1
+    try:
+        file.rename(aside)
+    except OSError as error:
+        raise CheckpointError(f"cannot move the unusable checkpoint {file} aside: {error.strerror}") from error
+    return aside
+
+
+def _encode(state: LearningState, robot: str, utc: str) -> bytes:
+    entries = [_ArrayEntry(name, array.shape) for name, array in state.arrays.items()]
+    header = msgspec.msgpack.encode(_Header(robot, utc, state.header, entries))
+    arrays = [np.ascontiguousarray(array, dtype="<f8").tobytes() for array in state.arrays.values()]
+    body = b"".join([_PREFIX.pack(MAGIC, VERSION, len(header)), header, *arrays])
+    return body + _checksum(body)
+
+
+def _decode(file: Path, data: bytes) -> tuple[_Header, memoryview]:
+    if len(data) < _PREFIX.size + _CHECKSUM_BYTES or not data.startswith(MAGIC):
+        raise CheckpointError(f"{file} is not a checkpoint")
+    _, version, length = _PREFIX.unpack_from(data)
+    if version != VERSION:
+        raise CheckpointError(f"the checkpoint {file} has the version {version}; this bodyschema reads {VERSION}")
+    body, checksum = data[:-_CHECKSUM_BYTES], data[-_CHECKSUM_BYTES:]
+    if _checksum(body) != checksum:
+        raise CheckpointError(f"the checkpoint {file} is damaged: its checksum does not match")
+    end = _PREFIX.size + length
+    try:
+        header = msgspec.msgpack.decode(body[_PREFIX.size : end], type=_Header)
+    except msgspec.DecodeError as error:
+        raise CheckpointError(f"the checkpoint {file} cannot be understood: {error}") from error
+    payload = memoryview(body)[end:]
+    if len(payload) != sum(8 * math.prod(entry.shape) for entry in header.arrays):
+        raise CheckpointError(f"the checkpoint {file} does not hold the arrays that its header announces")
+    return header, payload
+
+
+def _write_through(file: Path, data: bytes) -> None:
+    with file.open("wb") as stream:
+        stream.write(data)
+        stream.flush()
+        os.fsync(stream.fileno())
+
+
+def _sync_folder(folder: Path) -> None:
+    """Without this, a power cut may undo the renaming."""
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _checksum(body: bytes) -> bytes:
+    return hashlib.blake2b(body, digest_size=_CHECKSUM_BYTES).digest()
+
+
+def _unwritable(file: Path, error: OSError) -> str:
+    if error.errno == errno.ENOSPC:
+        return f"the checkpoint {file} could not be written: the disk is full. Free some space; learning goes on"
+    return f"the checkpoint {file} could not be written: {error.strerror}. Learning goes on; give a --state-dir that can be written"

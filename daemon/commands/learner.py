@@ -1,0 +1,47 @@
+"""`bodyschema learner`."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+
+def learner(
+    *,
+    robot: Annotated[Path, Parameter(help="The robot's description.")] = Path("robot.toml"),
+    state_dir: Annotated[Path | None, Parameter(help="Where the checkpoint lives; else as robot.toml says.")] = None,
+    verbose: Annotated[bool, Parameter(negative="", help="Log more.")] = False,
+) -> None:
+    """Learn the robot's kinematics and answer queries. Ends with SIGTERM or Ctrl-C.
+
+    Needs robot.toml (`bodyschema config init`). New pairs come from `bodyschema sampler`, on this machine or another;
+    without one the learner answers from what it knows. Next: `bodyschema predict`, `bodyschema status`.
+    """
+    # Before numpy is loaded: its threads would fight with each other and with the answers for the cores.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    from daemon import logs
+    from daemon.config import Config
+    from daemon.learner import run_learner
+    from daemon.signals import on_termination
+    from interfaces.clock import SystemClock
+
+    logs.set_up(verbose=verbose)
+    config = Config.load(robot)
+    if state_dir is not None:
+        config = config.with_state_dir(state_dir)
+    ending = Ending()
+    with on_termination(ending.begin):
+        run_learner(config, SystemClock(), lambda: ending.begun)
+
+
+class Ending:
+    """Whether somebody has asked the process to end."""
+
+    begun = False
+
+    def begin(self) -> None:
+        """Ask it to end."""
+        self.begun = True

@@ -1,0 +1,82 @@
+"""`bodyschema predict`."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import Parameter
+
+if TYPE_CHECKING:
+    from daemon.config import Config
+    from daemon.wire import JointsRequest, PredictReply
+
+
+def predict(
+    *q: Annotated[float, Parameter(help="One value for each joint, in robot.toml's order [rad; m if it slides].")],
+    robot: Annotated[Path, Parameter(help="The robot's description.")] = Path("robot.toml"),
+    deg: Annotated[bool, Parameter(negative="", help="Angles are in degrees.")] = False,
+    as_json: Annotated[bool, Parameter(name="--json", negative="", help="Print the learner's reply as it is.")] = False,
+) -> None:
+    """Ask the learner where the marker is, in the measurement frame.
+
+    Without values, reads them from standard input as JSON: one vector, or a list of them. Write negative values
+    after `--`. Needs a running learner (`bodyschema run` or `bodyschema learner`).
+
+    Example: `bodyschema predict --deg -- 10 -20 30 40 0 15 5`
+    """
+    from daemon.bus import client
+    from daemon.config import Config
+    from daemon.keys import Keys
+    from daemon.wire import PredictReply, decode, encode
+
+    config = Config.load(robot)
+    request = _request(q, config, deg)
+    with client(config.tables.zenoh.learner) as bus:
+        payload = bus.ask_one(Keys(config.robot.name).predict, encode(request))
+    if as_json:
+        sys.stdout.write(payload.decode() + "\n")
+        return
+    _show(decode(payload, PredictReply))
+
+
+def _request(values: tuple[float, ...], config: Config, deg: bool) -> JointsRequest:
+    """What to ask; RequestError when it is no vector of joint angles."""
+    import numpy as np
+
+    from daemon.wire import JointsRequest, decode, joint_angles
+    from interfaces.errors import RequestError
+
+    if values:
+        request = JointsRequest(list(values))
+    elif sys.stdin.isatty():
+        raise RequestError(
+            f"no joint angles; give {len(config.robot.joints)} ({', '.join(config.robot.joints)}), or JSON on stdin"
+        )
+    else:
+        request = decode(b'{"q":' + sys.stdin.buffer.read() + b"}", JointsRequest)
+    angles = joint_angles(request, config.robot.joints)
+    if deg:
+        turns = ~config.robot.chain.prismatic
+        angles[:, turns] = np.radians(angles[:, turns])
+    return JointsRequest(angles.tolist())
+
+
+def _show(reply: PredictReply) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    for name in ("x", "y", "z"):
+        table.add_column(f"{name} [mm]", justify="right", no_wrap=True)
+    table.add_column("1-sigma [mm]", justify="right", no_wrap=True)
+    table.add_column("", no_wrap=True)
+    for x, sigma, inside in zip(reply.x, reply.sigma, reply.in_support, strict=True):
+        spread = " ".join(f"{1e3 * value:.1f}" for value in sigma)
+        where = "where data was" if inside else "away from all data: an extrapolation"
+        table.add_row(*(f"{1e3 * value:.1f}" for value in x), spread, where)
+    console = Console(highlight=False)
+    console.print(table)
+    age = "none yet" if reply.age_s is None else f"the last one {reply.age_s:.1f} s ago"
+    console.print(f"model {reply.model}, {reply.pairs} pairs learnt, {age}", style="dim")

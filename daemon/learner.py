@@ -1,0 +1,292 @@
+"""The process that learns and answers. It needs a sampler for new pairs, but goes on answering without one.
+
+Threads: zenoh's (queries, from an immutable snapshot; published pairs, into a queue), one that learns each pair at
+once, one at low priority for replay and the exact solver's orders, and the main thread for status and checkpoints.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import logging
+import os
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from importlib.metadata import version
+
+from daemon.answers import Answers
+from daemon.bus import Bus, Request
+from daemon.checkpoint import CheckpointError, read_checkpoint, set_aside, write_checkpoint
+from daemon.config import Config
+from daemon.feed import PairFeed
+from daemon.keys import Keys
+from daemon.learning import Learning, NominalModel, StateError
+from daemon.learning.solver import LARGEST_NET
+from daemon.solver_process import SolverLostError, SolverProcess
+from daemon.status import LearnerStatus
+from daemon.wire import OCTETS, CommandReply, CommandRequest, PairsReply, decode, encode
+from interfaces.protocols import Clock
+from kbmaps import KBMapsError
+
+log = logging.getLogger(__name__)
+
+TICK_S = 0.05
+STATUS_EVERY_S = 1.0
+HISTORY_LIMIT_S = 5.0
+IDLE_S = 0.02
+SOLVE_WHEN_IDLE_S = 0.5
+BACKGROUND_NICENESS = 10
+# Python hands the interpreter from thread to thread this often at least; its own 5 ms would be a query's delay.
+SWITCH_INTERVAL_S = 2e-4
+
+
+class Learner:
+    """One robot's learner with its answers, its checkpoint and its state of health."""
+
+    def __init__(self, config: Config, solver: SolverProcess, bus: Bus, clock: Clock) -> None:
+        self._config, self._solver, self._bus, self._clock = config, solver, bus, clock
+        self._settings, self._robot = config.tables.learner, config.robot
+        self._keys = Keys(config.robot.name)
+        self._nominal = NominalModel.of(config.robot)
+        self._learning = Learning(self._nominal, self._settings, solver)
+        self._set_aside: str | None = None
+        self._restore()
+        self._feed = PairFeed(self._learning, self._history, clock)
+        self._answers = Answers(self._learning, config.robot.joints, config.robot.name, clock)
+        self._sampler_alive = False
+        self._started_at = clock.now()
+        self._checkpointed_at: float | None = None
+        self._checkpointed_pairs = self._learning.counters.pairs
+        self._checkpoint_problem: str | None = None
+        self._checkpoint_lock = threading.Lock()
+        self._stop = threading.Event()
+        self._failure: Exception | None = None
+
+    @contextlib.contextmanager
+    def serving(self) -> Iterator[None]:
+        """Answer, learn and replay from here to the end of the with statement; then write a last checkpoint."""
+        threads = [
+            threading.Thread(target=self._guarded, args=(loop,), name=loop.__name__.strip("_"))
+            for loop in (self._learn_pairs, self._work_in_background)
+        ]
+        for thread in threads:
+            thread.start()
+        try:
+            self._declare()
+            yield
+        finally:
+            self._stop.set()
+            self._feed.wake()
+            for thread in threads:
+                thread.join()
+            self.checkpoint()
+
+    def tick(self) -> None:
+        """What the main thread does from time to time: a checkpoint when one is due.
+
+        Raises:
+            BaseException: whatever ended one of the threads.
+        """
+        if self._failure is not None:
+            raise self._failure
+        now = self._clock.now()
+        if now - (self._checkpointed_at or self._started_at) >= self._settings.checkpoint_every_s:
+            if self._learning.counters.pairs != self._checkpointed_pairs:
+                self.checkpoint()
+
+    def checkpoint(self) -> None:
+        """Write a checkpoint; when that fails, health says so."""
+        with self._checkpoint_lock:
+            state = self._learning.state()
+            try:
+                write_checkpoint(self._config.checkpoint_file, state, robot=self._robot.name, utc=self._clock.utc())
+            except CheckpointError as error:
+                if self._checkpoint_problem is None:
+                    log.error("%s", error)
+                self._checkpoint_problem = str(error)
+            else:
+                self._checkpoint_problem = None
+                self._checkpointed_pairs = state.header.counters.pairs
+            self._checkpointed_at = self._clock.now()
+
+    def status(self) -> LearnerStatus:
+        """The learner's state."""
+        counters, snapshot = self._learning.counters, self._learning.snapshot
+        now = self._clock.now()
+        written = self._checkpointed_at if self._checkpoint_problem is None else None
+        return LearnerStatus(
+            robot=self._robot.name,
+            store=counters.store,
+            state=self._state(counters.pairs),
+            pairs=counters.pairs,
+            last_seq=counters.last_seq,
+            pairs_since_change=counters.since_change,
+            sampler_alive=self._sampler_alive,
+            replayed=counters.replayed,
+            answering=snapshot.answering,
+            prequential_m=self._learning.prequential_m(),
+            claimed_error_m=self._learning.claimed_error_m(),
+            curve=self._learning.curve,
+            model=snapshot.digest,
+            gaps_recovered=counters.gaps_recovered,
+            refused=counters.refused,
+            doubted=counters.doubted,
+            changes=counters.changes,
+            checkpoint_age_s=None if written is None else now - written,
+            uptime_s=now - self._started_at,
+            health=list(self._health()),
+            version=version("bodyschema"),
+        )
+
+    def _state(self, pairs: int) -> str:
+        if self._feed.paused:
+            return "paused"
+        if pairs == 0:
+            return "waiting"
+        return "aligning" if self._learning.aligning else "learning"
+
+    def _health(self) -> Iterator[str]:
+        if not self._sampler_alive:
+            yield (
+                f"no sampler on {self._config.tables.zenoh.sampler}, so no new pairs; start it with "
+                "`bodyschema sampler`. Predictions go on"
+            )
+        for problem in (self._feed.problem, self._checkpoint_problem, self._set_aside):
+            if problem is not None:
+                yield problem
+        if self._nominal.size > LARGEST_NET:
+            yield f"{self._nominal.joints} joints are too many for the exact solver; the others learn without it"
+
+    def _restore(self) -> None:
+        file = self._config.checkpoint_file
+        try:
+            state = read_checkpoint(file, robot=self._robot.name)
+            if state is None:
+                return
+            self._learning.restore(state)
+        except (CheckpointError, StateError, KBMapsError) as error:
+            aside = set_aside(file)
+            self._set_aside = f"{error}. It was kept as {aside}; the learner learns again from the sampler's history"
+            log.error("%s", self._set_aside)
+            self._learning = Learning(self._nominal, self._settings, self._solver)
+        else:
+            log.info("went on from %s with %d pairs", file, self._learning.counters.pairs)
+
+    def _declare(self) -> None:
+        bus, keys, answers = self._bus, self._keys, self._answers
+        bus.answer(keys.predict, answers.predict)
+        bus.answer(keys.jacobian, answers.jacobian)
+        bus.answer(keys.model, answers.model, encoding=OCTETS)
+        bus.answer(keys.status("learner"), lambda request: encode(self.status(), request.encoding))
+        bus.answer(keys.command("learner"), self._command)
+        bus.subscribe(keys.pair, self._feed.offer)
+        bus.watch(keys.alive("sampler"), self._sampler_changed)
+        bus.token(keys.alive("learner"))
+
+    def _sampler_changed(self, alive: bool) -> None:
+        self._sampler_alive = alive
+        if alive:
+            self._feed.wake()
+
+    def _history(self, begin: int) -> PairsReply:
+        payload = self._bus.ask_one(f"{self._keys.pairs}?from={begin}", timeout_s=HISTORY_LIMIT_S)
+        return decode(payload, PairsReply)
+
+    def _command(self, request: Request) -> bytes:
+        command = decode(request.payload, CommandRequest, request.encoding).command
+        carried_out: dict[str, Callable[[], str]] = {
+            "pause": self._pause,
+            "resume": self._resume,
+            "reset_to_prior": self._reset_to_prior,
+            "tool_changed": self._tool_changed,
+            "checkpoint": self._checkpoint_now,
+        }
+        message = carried_out[command]()
+        log.info("command %s: %s", command, message)
+        return encode(CommandReply(command, message), request.encoding)
+
+    def _pause(self) -> str:
+        self._feed.pause()
+        return "no pairs are learnt until resume; predictions go on"
+
+    def _resume(self) -> str:
+        self._feed.resume()
+        return "pairs are learnt again, those missed first"
+
+    def _reset_to_prior(self) -> str:
+        with self._feed.lock:
+            foreign = self._feed.foreign_store
+            self._learning.reset_to_prior(forget_store=foreign is not None)
+            self._feed.restart()
+        self._feed.wake()
+        self.checkpoint()
+        if foreign is not None:
+            return f"the learner begins anew with the pairs of the store {foreign}"
+        return "the learner is back at the nominal model; only pairs from now on count"
+
+    def _tool_changed(self) -> str:
+        with self._feed.lock:
+            self._learning.tool_changed()
+        self.checkpoint()
+        return "pairs with the old tool no longer count; what they taught is where learning starts again"
+
+    def _checkpoint_now(self) -> str:
+        self.checkpoint()
+        if self._checkpoint_problem is not None:
+            raise CheckpointError(self._checkpoint_problem)
+        return f"written to {self._config.checkpoint_file}"
+
+    def _guarded(self, loop: Callable[[], None]) -> None:
+        try:
+            loop()
+        except Exception as error:
+            self._failure = error
+
+    def _learn_pairs(self) -> None:
+        while not self._stop.is_set():
+            self._feed.step(IDLE_S)
+
+    def _work_in_background(self) -> None:
+        with contextlib.suppress(OSError):  # niceness is a courtesy: without it answers are a little later
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), BACKGROUND_NICENESS)
+        idle_since = self._clock.now()
+        while not self._stop.is_set():
+            try:
+                worked = self._learning.work()
+            except SolverLostError as error:
+                log.warning("%s", error)
+                self._learning.restart_solver()
+                self._stop.wait(1.0)
+                continue
+            if worked:
+                idle_since = self._clock.now()
+                self._stop.wait(1e-4)  # whoever waits for the lock gets it now
+            elif not self._stop.wait(IDLE_S) and self._clock.now() - idle_since > SOLVE_WHEN_IDLE_S:
+                self._learning.solve_soon()
+
+
+def run_learner(config: Config, clock: Clock, stopping: Callable[[], bool]) -> None:
+    """Learn and answer until `stopping()`.
+
+    Raises:
+        BusError: the learner's port is in use.
+        CheckpointError: an unusable checkpoint cannot be moved aside.
+    """
+    sys.setswitchinterval(SWITCH_INTERVAL_S)
+    endpoints = config.tables.zenoh
+    with SolverProcess() as solver, Bus(listen=endpoints.learner, connect=endpoints.sampler) as bus:
+        learner = Learner(config, solver, bus, clock)
+        publish = bus.publisher(Keys(config.robot.name).status("learner"))
+        gc.collect()
+        gc.freeze()  # what start-up left behind need not be looked through again
+        with learner.serving():
+            log.info("the learner of %s answers on %s", config.robot.name, endpoints.learner)
+            published_at = clock.now() - STATUS_EVERY_S
+            while not stopping():
+                if clock.now() - published_at >= STATUS_EVERY_S:
+                    published_at = clock.now()
+                    publish(encode(learner.status()))
+                learner.tick()
+                time.sleep(TICK_S)

@@ -1,0 +1,223 @@
+"""The exact solver in a process of its own.
+
+One solve takes tenths of a second inside LAPACK, which holds the interpreter's lock: in a thread it would keep
+answers waiting that long. The child works at low priority, at most half of the time, and ends with its parent.
+
+Both directions carry frames: four bytes of length, then a MessagePack message.
+"""
+
+from __future__ import annotations
+
+import os
+import select
+import struct
+import subprocess
+import sys
+import time
+from types import TracebackType
+from typing import IO, Self
+
+import msgspec
+import numpy as np
+
+from daemon.learning import DirectSolver, Solved
+from interfaces.errors import BodyschemaError
+from interfaces.records import FloatArray
+from kbmaps import KBMap
+
+NICENESS = 10
+LONGEST_REST_S = 5.0
+END_LIMIT_S = 5.0
+_LENGTH = struct.Struct("<I")
+
+
+class SolverLostError(BodyschemaError):
+    """The solver's process has ended; `start` begins a new one."""
+
+
+class StartTask(msgspec.Struct, frozen=True, tag="start"):
+    """Forget all pairs and begin with this prior."""
+
+    task: int
+    prior: bytes
+
+
+class Rebase(msgspec.Struct, frozen=True, tag="rebase"):
+    """Another prior for the same pairs."""
+
+    prior: bytes
+
+
+class Learn(msgspec.Struct, frozen=True, tag="learn"):
+    """Pairs: q (n, joints) and x (n, 3) as little-endian float64."""
+
+    joints: int
+    q: bytes
+    x: bytes
+
+
+class Solve(msgspec.Struct, frozen=True, tag="solve"):
+    """Solve for all pairs so far."""
+
+
+class Solution(msgspec.Struct, frozen=True):
+    """The answer to `Solve`; without a map when there is no solution."""
+
+    task: int
+    pairs: int
+    map: bytes | None
+
+
+_orders = msgspec.msgpack.Decoder(StartTask | Rebase | Learn | Solve)
+_solutions = msgspec.msgpack.Decoder(Solution)
+
+
+class SolverProcess:
+    """An `ExactSolver` in a child process, started with the first task. Use as a context manager.
+
+    All methods but `__exit__` raise SolverLostError when the child has died.
+    """
+
+    def __init__(self) -> None:
+        self._child: subprocess.Popen[bytes] | None = None
+        self._received = bytearray()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._end()
+
+    @property
+    def pid(self) -> int | None:
+        """Process id of the child, or None before the first task."""
+        return self._child.pid if self._child is not None else None
+
+    def start(self, task: int, prior: KBMap) -> None:
+        """Forget all pairs and begin a new task."""
+        if self._child is None:
+            command = [sys.executable, "-m", "daemon.solver_process"]
+            environment = os.environ | {"OPENBLAS_NUM_THREADS": "1"}
+            # In a process group of its own: Ctrl-C in a terminal is the parent's to handle.
+            self._child = subprocess.Popen(
+                command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment, process_group=0
+            )
+        self._send(StartTask(task, prior.to_bytes()))
+
+    def rebase(self, prior: KBMap) -> None:
+        """Another prior for the same pairs."""
+        self._send(Rebase(prior.to_bytes()))
+
+    def learn(self, q: FloatArray, x: FloatArray) -> None:
+        """More pairs, q (n, d) [rad] and x (n, 3) [m]."""
+        self._send(Learn(q.shape[1], q.astype("<f8").tobytes(), x.astype("<f8").tobytes()))
+
+    def solve(self) -> None:
+        """Ask for the solution of all pairs so far."""
+        self._send(Solve())
+
+    def poll(self) -> Solved | None:
+        """The next solution that has come, without waiting."""
+        child = self._child
+        if child is None or child.stdout is None:
+            return None
+        while select.select([child.stdout], [], [], 0)[0]:
+            part = os.read(child.stdout.fileno(), 1 << 20)
+            if not part:
+                raise self._lost()
+            self._received += part
+        return self._next_solution()
+
+    def _next_solution(self) -> Solved | None:
+        if len(self._received) < _LENGTH.size:
+            return None
+        end = _LENGTH.size + _LENGTH.unpack_from(self._received)[0]
+        if len(self._received) < end:
+            return None
+        solution = _solutions.decode(bytes(self._received[_LENGTH.size : end]))
+        del self._received[:end]
+        solved = None if solution.map is None else KBMap.from_bytes(solution.map)
+        return Solved(solution.task, solution.pairs, solved)
+
+    def _send(self, order: StartTask | Rebase | Learn | Solve) -> None:
+        if self._child is None or self._child.stdin is None:
+            raise SolverLostError("the exact solver has not been started")
+        try:
+            _write(self._child.stdin, order)
+        except OSError as error:
+            raise self._lost() from error
+
+    def _lost(self) -> SolverLostError:
+        code = self._end()
+        return SolverLostError(f"the exact solver's process ended with exit code {code}; it is started again")
+
+    def _end(self) -> int | None:
+        child, self._child = self._child, None
+        self._received.clear()
+        if child is None or child.stdin is None or child.stdout is None:
+            return None
+        try:
+            child.stdin.close()
+        except OSError:
+            pass  # what was left in the buffer finds no reader any more
+        child.terminate()
+        try:
+            return child.wait(END_LIMIT_S)
+        except subprocess.TimeoutExpired:
+            child.kill()
+            return child.wait()
+        finally:
+            child.stdout.close()
+
+
+def serve(orders: IO[bytes], solutions: IO[bytes]) -> None:
+    """Carry out orders until they end; rest after each solve for as long as it took."""
+    solver = DirectSolver()
+    while (order := _read(orders)) is not None:
+        if isinstance(order, StartTask):
+            solver.start(order.task, KBMap.from_bytes(order.prior))
+        elif isinstance(order, Rebase):
+            solver.rebase(KBMap.from_bytes(order.prior))
+        elif isinstance(order, Learn):
+            solver.learn(
+                np.frombuffer(order.q, dtype="<f8").reshape(-1, order.joints),
+                np.frombuffer(order.x, dtype="<f8").reshape(-1, 3),
+            )
+        else:
+            _solve(solver, solutions)
+
+
+def _solve(solver: DirectSolver, solutions: IO[bytes]) -> None:
+    begin = time.monotonic()
+    solver.solve()
+    solved = solver.poll()
+    if solved is not None:
+        learnt = None if solved.map is None else solved.map.to_bytes()
+        _write(solutions, Solution(solved.task, solved.pairs, learnt))
+    time.sleep(min(time.monotonic() - begin, LONGEST_REST_S))
+
+
+def _write(stream: IO[bytes], message: msgspec.Struct) -> None:
+    payload = msgspec.msgpack.encode(message)
+    stream.write(_LENGTH.pack(len(payload)) + payload)
+    stream.flush()
+
+
+def _read(stream: IO[bytes]) -> StartTask | Rebase | Learn | Solve | None:
+    """The next order; None when the parent has gone, even in the middle of one."""
+    head = stream.read(_LENGTH.size)
+    if len(head) < _LENGTH.size:
+        return None
+    length = _LENGTH.unpack(head)[0]
+    payload = stream.read(length)
+    return _orders.decode(payload) if len(payload) == length else None
+
+
+if __name__ == "__main__":
+    os.nice(NICENESS)
+    try:
+        serve(sys.stdin.buffer, sys.stdout.buffer)
+    except BrokenPipeError:
+        os._exit(0)  # the parent died while a solution was on its way; flushing at exit would only fail again
