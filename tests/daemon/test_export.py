@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from small_arm import JOINTS, ROBOT, URDF, write_small_arm
 
 from daemon.cli import app
 from daemon.mcap_export import write_mcap
@@ -15,28 +16,10 @@ from interfaces.errors import ConfigError, RecordingError, StoreError
 from interfaces.recording import Recording
 from interfaces.records import MarkerFix
 
-JOINTS = ("waist", "shoulder")
-URDF = """<robot name="arm"><link name="base"/><link name="upper"/><link name="hand"/>
-<joint name="waist" type="revolute"><parent link="base"/><child link="upper"/><axis xyz="0 0 1"/>
-<limit lower="-3" upper="3" effort="1" velocity="1"/></joint>
-<joint name="shoulder" type="revolute"><parent link="upper"/><child link="hand"/><origin xyz="0.3 0 0"/>
-<axis xyz="0 1 0"/><limit lower="-2" upper="2" effort="1" velocity="1"/></joint></robot>"""
-ROBOT = """[robot]
-name = "arm"
-urdf = "arm.urdf"
-joints = ["waist", "shoulder"]
-marker_link = "hand"
-[camera]
-parent_link = "base"
-"""
-
 
 @pytest.fixture
 def robot(tmp_path: Path) -> Path:
-    (tmp_path / "arm.urdf").write_text(URDF)
-    file = tmp_path / "robot.toml"
-    file.write_text(ROBOT)
-    return file
+    return write_small_arm(tmp_path)
 
 
 @pytest.fixture

@@ -1,0 +1,64 @@
+"""`bodyschema record`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+from cyclopts.validators import Number
+
+
+def record(
+    out: Annotated[Path, Parameter(help="The file to write; its ending .csv, .parquet or .mcap says the format.")],
+    /,
+    *,
+    robot: Annotated[Path, Parameter(help="robot.toml of the running sampler.")] = Path("robot.toml"),
+    from_seq: Annotated[
+        int, Parameter(name="--from", help="Sequence number of the first pair.", validator=Number(gte=1))
+    ] = 1,
+    follow: Annotated[bool, Parameter(help="Go on with the pairs to come, until Ctrl-C.", negative="")] = False,
+    force: Annotated[bool, Parameter(help="Replace OUT when it is there.", negative="")] = False,
+) -> None:
+    """Copy the running sampler's pairs into a file.
+
+    Needs a running sampler (`bodyschema run` or `bodyschema sampler`); for the store of one that is not running take
+    `bodyschema export`. Next: `bodyschema replay` on a CSV or Parquet file.
+    """
+    from rich.console import Console
+
+    from daemon import recordings
+    from daemon.bus import client
+    from daemon.config import Config
+    from daemon.recorder import History, copy_history, follow_history
+    from daemon.signals import on_termination
+
+    recordings.check_target(out, force=force)
+    config = Config.load(robot)
+    console = Console(highlight=False, soft_wrap=True)
+    joints = config.robot.joints
+    with client(config.tables.zenoh.sampler) as bus:
+        history = History(bus, config.robot, from_seq)
+        if follow:
+            stop = Stop()
+            with on_termination(stop):
+                console.print(f"writing pairs to {out} as they come; Ctrl-C ends it", markup=False)
+                count = follow_history(history, joints, out, stop.is_set)
+        else:
+            count = copy_history(history, joints, out)
+    last = f", the last has the number {history.next_seq - 1}" if count else "; no file was left"
+    console.print(f"{count} pairs written to {out}{last}", markup=False)
+
+
+class Stop:
+    """A plain flag that a signal handler may set."""
+
+    def __init__(self) -> None:
+        self._set = False
+
+    def __call__(self) -> None:
+        self._set = True
+
+    def is_set(self) -> bool:
+        """Whether it was called."""
+        return self._set

@@ -1,0 +1,143 @@
+"""Copies the running sampler's pairs into a file: first its history, then what comes."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from pathlib import Path
+from threading import Event
+from typing import TextIO
+
+from interfaces.errors import BusError, RecordingError
+from interfaces.recording import CSV
+from interfaces.recording_csv import write_csv_rows
+from interfaces.recording_parquet import INTEGER_COLUMNS
+from interfaces.records import Pair
+from interfaces.robot import RobotDescription
+
+from . import recordings
+from .bus import Bus
+from .keys import Keys
+from .wire import PairsReply, decode, pair_from_wire
+
+log = logging.getLogger(__name__)
+
+LIVE_WAIT_S = 0.5
+
+
+class History:
+    """The sampler's stored pairs from one sequence number on, page by page. Publications only say when to look.
+
+    Attributes:
+        next_seq: sequence number of the next pair.
+    """
+
+    def __init__(self, bus: Bus, robot: RobotDescription, from_seq: int) -> None:
+        self._bus, self._joints, self._keys = bus, robot.joints, Keys(robot.name)
+        self._news = Event()
+        self._store: str | None = None
+        self.next_seq = from_seq
+        bus.subscribe(self._keys.pair, lambda _: self._news.set())
+
+    def page(self) -> list[Pair]:
+        """The next pairs, at most what one reply holds; none when there are no more for now.
+
+        Raises:
+            BusError: the sampler does not answer.
+            RecordingError: it writes another store now, whose numbers mean other pairs.
+        """
+        self._news.clear()
+        reply = decode(self._bus.ask_one(f"{self._keys.pairs}?from={self.next_seq}"), PairsReply)
+        if self._store not in (None, reply.store):
+            raise RecordingError(
+                f"the sampler writes another store now ({reply.store})",
+                file=self._store,
+                remedy="Record it into another file",
+            )
+        self._store = reply.store
+        pairs = [pair_from_wire(message, len(self._joints)) for message in reply.pairs]
+        if pairs:
+            self.next_seq = pairs[-1].seq + 1
+        return pairs
+
+    def wait(self) -> None:
+        """Return when a pair was published, or after a moment."""
+        self._news.wait(LIVE_WAIT_S)
+
+
+def copy_history(history: History, joints: tuple[str, ...], out: Path) -> int:
+    """Write all pairs that there are into `out`; their number.
+
+    Raises:
+        RecordingError: there are none, or `out` cannot be written.
+        BusError: the sampler does not answer.
+    """
+    pairs: list[Pair] = []
+    while page := history.page():
+        pairs += page
+    if not pairs:
+        raise RecordingError(
+            f"the sampler has no pairs from number {history.next_seq} on",
+            file=out,
+            remedy="Move the arm in front of the camera, or wait for pairs with --follow",
+        )
+    recordings.write(recordings.from_pairs(pairs, joints), out)
+    return len(pairs)
+
+
+def follow_history(history: History, joints: tuple[str, ...], out: Path, stopped: Callable[[], bool]) -> int:
+    """Write pairs into `out` as they come until `stopped`; their number.
+
+    CSV is written line by line, so that whatever ends the process leaves all rows. The other formats are only whole
+    with their last byte and are written at the end. A sampler that goes away is waited for.
+
+    Raises:
+        RecordingError: `out` cannot be written, or the sampler came back with another store.
+    """
+    if out.suffix.lower() != CSV:
+        pairs: list[Pair] = []
+        _follow(history, stopped, pairs.extend)
+        if pairs:
+            recordings.write(recordings.from_pairs(pairs, joints), out)
+        return len(pairs)
+    try:
+        with out.open("w", encoding="utf-8", newline="\n") as stream:
+            rows = _CsvRows(stream, joints)
+            _follow(history, stopped, rows.add)
+    except OSError as error:
+        raise RecordingError(f"cannot be written: {error.strerror or error}", file=out) from error
+    if not rows.count:
+        out.unlink()
+    return rows.count
+
+
+def _follow(history: History, stopped: Callable[[], bool], take: Callable[[list[Pair]], object]) -> None:
+    answering = True
+    while not stopped():
+        try:
+            page = history.page()
+        except BusError as error:
+            if answering:
+                log.warning("%s. Waiting for it", error)
+            page, answering = [], False
+        else:
+            answering = True
+        if page:
+            take(page)
+        else:
+            history.wait()
+
+
+class _CsvRows:
+    def __init__(self, stream: TextIO, joints: tuple[str, ...]) -> None:
+        self._stream, self._joints = stream, joints
+        self.count = 0
+
+    def add(self, pairs: list[Pair]) -> None:
+        table = recordings.from_pairs(pairs, self._joints).to_table()
+        if not self.count:
+            self._stream.write(",".join(table.names) + "\n")
+        integers = frozenset(i for i, name in enumerate(table.names) if name in INTEGER_COLUMNS)
+        write_csv_rows(self._stream, table.values.tolist(), integers)
+        self._stream.flush()
+        self.count += len(pairs)

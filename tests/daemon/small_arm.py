@@ -1,0 +1,28 @@
+"""A robot of two joints in two files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+JOINTS = ("waist", "shoulder")
+URDF = """<robot name="arm"><link name="base"/><link name="upper"/><link name="hand"/>
+<joint name="waist" type="revolute"><parent link="base"/><child link="upper"/><axis xyz="0 0 1"/>
+<limit lower="-3" upper="3" effort="1" velocity="1"/></joint>
+<joint name="shoulder" type="revolute"><parent link="upper"/><child link="hand"/><origin xyz="0.3 0 0"/>
+<axis xyz="0 1 0"/><limit lower="-2" upper="2" effort="1" velocity="1"/></joint></robot>"""
+ROBOT = """[robot]
+name = "arm"
+urdf = "arm.urdf"
+joints = ["waist", "shoulder"]
+marker_link = "hand"
+[camera]
+parent_link = "base"
+"""
+
+
+def write_small_arm(folder: Path, tables: str = "") -> Path:
+    """Write robot.toml, with `tables` appended, and its URDF into `folder`; the path of robot.toml."""
+    (folder / "arm.urdf").write_text(URDF)
+    file = folder / "robot.toml"
+    file.write_text(ROBOT + tables)
+    return file
