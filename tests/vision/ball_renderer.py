@@ -1,0 +1,154 @@
+"""A small ray tracer for one ball before a picture: rays against a sphere, nothing about ellipses.
+
+Every sub-pixel sends a ray from the eye through the image plane; where it meets the sphere, the surface is lit
+(ambient, diffuse, specular); elsewhere the picture behind shows. Blur, exposure and noise come after.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from interfaces.camera import StereoCalibration
+from interfaces.records import FloatArray, ImageArray, StereoFrame
+
+CALIBRATION = StereoCalibration(
+    focal_px=600.0,
+    principal_point_px=(319.5, 239.5),
+    baseline_m=0.12,
+    image_size_px=(640, 480),
+    pixel_sigma=1e-6,
+)
+
+
+@dataclass(frozen=True)
+class Look:
+    """How a scene is lit and taken; levels are fractions of white.
+
+    Attributes:
+        ball_rgb: reflectance of the ball.
+        light: direction to the light in the eye's frame (x right, y down, z forward), any length.
+        samples: rays per pixel and direction; 1 gives hard, aliased edges.
+        blur_px: 1-sigma of the lens blur [px].
+        noise_sd: 1-sigma of each channel [grey levels].
+    """
+
+    ball_rgb: tuple[float, float, float] = (0.85, 0.08, 0.08)
+    light: tuple[float, float, float] = (-0.5, -1.0, -1.2)
+    ambient: float = 0.35
+    diffuse: float = 0.6
+    specular: float = 0.35
+    shininess: float = 30.0
+    exposure: float = 1.0
+    samples: int = 6
+    blur_px: float = 0.7
+    noise_sd: float = 3.0
+
+
+def clutter(rng: np.random.Generator, size_px: tuple[int, int]) -> FloatArray:
+    """A picture (height, width, 3) RGB of 0..1: smooth wall, boxes, some of them brown and brick red, and lines."""
+    width, height = size_px
+    coarse = rng.uniform(0.25, 0.7, (6, 8, 1)) * np.array([1.0, 0.98, 0.94])
+    picture = cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC)
+    brown, brick = (0.42, 0.26, 0.17), (0.55, 0.24, 0.17)
+    for number in range(14):
+        corner = rng.integers((-60, -60), (width, height))
+        extent = rng.integers(30, 160, 2)
+        colour = brown if number % 4 == 0 else brick if number % 7 == 1 else tuple(rng.uniform(0.1, 0.8, 3))
+        if number % 4 and number % 7 != 1:
+            colour = tuple(0.7 * np.mean(colour) + 0.3 * np.array(colour))
+        cv2.rectangle(picture, corner.tolist(), (corner + extent).tolist(), colour, -1, cv2.LINE_AA)
+    for _ in range(6):
+        ends = rng.integers((0, 0), (width, height), (2, 2))
+        cv2.line(picture, ends[0].tolist(), ends[1].tolist(), (0.1, 0.1, 0.12), int(rng.integers(1, 6)), cv2.LINE_AA)
+    return picture
+
+
+def render_pair(
+    x: FloatArray,
+    radius_m: float,
+    look: Look,
+    pictures: tuple[FloatArray, FloatArray],
+    rng: np.random.Generator,
+    calibration: StereoCalibration = CALIBRATION,
+    t: float = 0.0,
+) -> StereoFrame:
+    """Both eyes' view of a ball around `x` (3,) [m] in the left optical frame, before the two pictures."""
+    x_right = x - np.array([calibration.baseline_m, 0.0, 0.0])
+    left, right = (
+        take(paint_ball(picture, x_eye, radius_m, look, calibration), look, rng)
+        for picture, x_eye in zip(pictures, (x, x_right), strict=True)
+    )
+    return StereoFrame(t, left, right)
+
+
+def paint_ball(
+    picture: FloatArray, x_eye: FloatArray, radius_m: float, look: Look, calibration: StereoCalibration
+) -> FloatArray:
+    """`picture` with the ball before it; both RGB of 0..1, shape (height, width, 3)."""
+    height, width = picture.shape[:2]
+    centre = calibration.project(x_eye)[:2]
+    reach = 2.0 * calibration.focal_px * radius_m / x_eye[2] + 8.0
+    first = np.maximum(np.floor(centre - reach), 0).astype(int)
+    last = np.minimum(np.ceil(centre + reach) + 1, (width, height)).astype(int)
+    painted = picture.copy()
+    if (last <= first).any():
+        return painted
+    n = look.samples
+    sub = (np.arange(n) + 0.5) / n - 0.5
+    u = (np.arange(first[0], last[0])[:, None] + sub).ravel()
+    v = (np.arange(first[1], last[1])[:, None] + sub).ravel()
+    rays = _rays(u, v, calibration)
+    window = painted[first[1] : last[1], first[0] : last[0]]
+    behind = np.repeat(np.repeat(window, n, axis=0), n, axis=1)
+    shown = _lit(rays, x_eye, radius_m, look, behind)
+    window[:] = shown.reshape(len(v) // n, n, len(u) // n, n, 3).mean(axis=(1, 3))
+    return painted
+
+
+def take(picture: FloatArray, look: Look, rng: np.random.Generator) -> ImageArray:
+    """What the camera makes of a picture: lens blur, exposure, noise, eight bits, BGR."""
+    grey_levels = 255.0 * look.exposure * picture[..., ::-1]
+    if look.blur_px > 0:
+        grey_levels = cv2.GaussianBlur(grey_levels, (0, 0), look.blur_px)
+    noise = rng.standard_normal(grey_levels.shape, dtype=np.float32) * look.noise_sd
+    return np.clip(np.rint(grey_levels + noise), 0, 255).astype(np.uint8)
+
+
+def random_look(rng: np.random.Generator, look: Look = Look()) -> Look:
+    """`look` with light, exposure and gloss of its own."""
+    light = (float(rng.uniform(-1.5, 1.5)), float(rng.uniform(-1.5, 0.3)), -1.0)
+    return replace(
+        look,
+        light=light,
+        ambient=float(rng.uniform(0.3, 0.5)),
+        diffuse=float(rng.uniform(0.4, 0.7)),
+        specular=float(rng.uniform(0.0, 0.5)),
+        exposure=float(rng.uniform(0.6, 1.2)),
+    )
+
+
+def _rays(u: FloatArray, v: FloatArray, calibration: StereoCalibration) -> FloatArray:
+    cx, cy = calibration.principal_point_px
+    grid_u, grid_v = np.meshgrid((u - cx) / calibration.focal_px, (v - cy) / calibration.focal_px)
+    rays = np.stack([grid_u, grid_v, np.ones_like(grid_u)], axis=-1)
+    return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
+
+
+def _lit(rays: FloatArray, x_eye: FloatArray, radius_m: float, look: Look, behind: FloatArray) -> FloatArray:
+    along = rays @ x_eye
+    discriminant = along**2 - (x_eye @ x_eye - radius_m**2)
+    hit = (discriminant > 0) & (along > 0)
+    depth = along[hit] - np.sqrt(discriminant[hit])
+    points = depth[:, None] * rays[hit]
+    normals = (points - x_eye) / radius_m
+    light = np.array(look.light) / np.linalg.norm(look.light)
+    facing = normals @ light
+    mirrored = 2.0 * facing[:, None] * normals - light
+    gloss = np.clip(-(mirrored * rays[hit]).sum(axis=-1), 0.0, None) ** look.shininess * (facing > 0)
+    diffuse = look.ambient + look.diffuse * np.clip(facing, 0.0, None)
+    shown = behind.copy()
+    shown[hit] = diffuse[:, None] * np.array(look.ball_rgb) + (look.specular * gloss)[:, None]
+    return shown

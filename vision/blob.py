@@ -1,0 +1,160 @@
+"""Patches of the marker's colour, and the ball among them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from interfaces.records import FloatArray, ImageArray, Reason
+
+from .colour import ColourGate
+from .config import VisionConfig
+from .outline import fit_outline
+from .sphere import Pinhole
+
+# A patch that fills less of its enclosing circle is not the image of a ball.
+_LEAST_FILL = 0.45
+# Below this a patch may be the ball together with something of similar hue behind it.
+_WHOLE_DISC_FILL = 0.8
+# Pixels around a patch that the outline may reach into.
+_APRON_PX = 12
+
+
+@dataclass(frozen=True, slots=True)
+class Region:
+    """A rectangle of pixels; the last column and row belong to the outside."""
+
+    left: int
+    top: int
+    right: int
+    bottom: int
+
+    def crop(self, image: ImageArray) -> ImageArray:
+        """The part of `image` (height, width, ...) in this rectangle; a view."""
+        return image[self.top : self.bottom, self.left : self.right]
+
+    def grown(self, by: int, within: tuple[int, int]) -> Region:
+        """Larger by `by` pixels on each side, cut at an image of (width, height)."""
+        return Region(
+            max(self.left - by, 0),
+            max(self.top - by, 0),
+            min(self.right + by, within[0]),
+            min(self.bottom + by, within[1]),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Patch:
+    """Connected pixels of the marker's colour.
+
+    Attributes:
+        box: the pixels' bounding box in the image.
+        centre_px, radius_px: the rough circle, shape (2,) and float [px].
+        fill: share of the enclosing circle that the patch fills.
+    """
+
+    box: Region
+    centre_px: FloatArray
+    radius_px: float
+    fill: float
+
+
+@dataclass(frozen=True, slots=True)
+class Disc:
+    """The image of a ball.
+
+    Attributes:
+        centre_px: centre of its ellipse, shape (2,) [px].
+        radius_px: radius of the circle of the same area [px].
+        cov_px: covariance of the centre, shape (2, 2) [px²].
+    """
+
+    centre_px: FloatArray
+    radius_px: float
+    cov_px: FloatArray
+
+    def is_same_as(self, other: Disc) -> bool:
+        """Whether two discs, of overlapping patches, show the same ball."""
+        return float(np.linalg.norm(self.centre_px - other.centre_px)) < max(self.radius_px, other.radius_px)
+
+
+def find_patches(image: ImageArray, region: Region, gate: ColourGate, config: VisionConfig) -> list[Patch]:
+    """Patches of the marker's colour in `region` of a BGR image, the most disc-like first."""
+    pixels = region.crop(image)
+    patches = _patches(gate.mask(pixels), region, config)
+    for patch in list(patches):
+        if patch.fill < _WHOLE_DISC_FILL:
+            patches += _brighter_part(image, patch, gate, config)
+    return sorted(patches, key=lambda patch: -patch.fill)[: config.max_candidates]
+
+
+def measure(image: ImageArray, patch: Patch, eye: Pinhole, gate: ColourGate, config: VisionConfig) -> Disc | Reason:
+    """The ball's image at `patch`, or why it is none."""
+    height, width = image.shape[:2]
+    if not _clear_of_border(patch.box, config.border_margin_px, (width, height)):
+        return Reason.AT_BORDER
+    if patch.fill < _LEAST_FILL:
+        return Reason.OCCLUDED
+    around = patch.box.grown(_APRON_PX, (width, height))
+    corner = np.array([around.left, around.top], dtype=np.float64)
+    outline = fit_outline(
+        around.crop(image).astype(np.float32),
+        gate,
+        patch.centre_px - corner,
+        patch.radius_px,
+        eye.shape(patch.centre_px),
+    )
+    if outline is None or outline.visible < config.min_visible:
+        return Reason.OCCLUDED
+    centre_px = outline.centre_px + corner
+    reach = outline.radius_px + config.border_margin_px
+    if (centre_px - reach < 0).any() or (centre_px + reach > (width - 1, height - 1)).any():
+        return Reason.AT_BORDER
+    return Disc(centre_px, outline.radius_px, outline.cov_px)
+
+
+def _clear_of_border(box: Region, margin_px: float, size: tuple[int, int]) -> bool:
+    return (
+        min(box.left, box.top) >= margin_px and box.right <= size[0] - margin_px and box.bottom <= size[1] - margin_px
+    )
+
+
+def _patches(mask: ImageArray, region: Region, config: VisionConfig) -> list[Patch]:
+    _, _, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=4)
+    large = np.flatnonzero(stats[1:, cv2.CC_STAT_AREA] >= config.min_pixels) + 1
+    by_size = large[np.argsort(-stats[large, cv2.CC_STAT_AREA], kind="stable")]
+    patches = (_patch(mask, stats[label], region) for label in by_size[: 4 * config.max_candidates])
+    return [patch for patch in patches if patch is not None]
+
+
+def _patch(mask: ImageArray, stats: np.ndarray, region: Region) -> Patch | None:
+    left, top, width, height = (int(stats[i]) for i in range(4))
+    box = Region(left, top, left + width, top + height)
+    contours, _ = cv2.findContours(box.crop(mask).copy(), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    contour = max(contours, key=len)
+    moments = cv2.moments(contour)
+    (x, y), enclosing = cv2.minEnclosingCircle(contour)
+    if moments["m00"] <= 0:
+        return None
+    # A contour runs through the centres of the border pixels, half a pixel inside the patch.
+    radius = float(np.sqrt(moments["m00"] / np.pi)) + 0.5
+    enclosing += 0.5
+    fill = (radius / enclosing) ** 2
+    if fill >= _WHOLE_DISC_FILL:
+        x, y = moments["m10"] / moments["m00"], moments["m01"] / moments["m00"]
+    else:
+        radius = enclosing
+    corner = np.array([region.left + left, region.top + top])
+    whole = Region(corner[0], corner[1], corner[0] + width, corner[1] + height)
+    return Patch(whole, corner + np.array([x, y]), radius, fill)
+
+
+def _brighter_part(image: ImageArray, patch: Patch, gate: ColourGate, config: VisionConfig) -> list[Patch]:
+    """What is left of a patch when only pixels with at least half of its strongest colour count."""
+    pixels = patch.box.crop(image)
+    amount = gate.amount(pixels)
+    own = gate.mask(pixels) > 0
+    strongest = float(np.percentile(amount[own], 95.0))
+    return _patches((own & (amount > 0.5 * strongest)).astype(np.uint8), patch.box, config)

@@ -1,0 +1,74 @@
+"""The table [vision] of robot.toml."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import msgspec
+from msgspec import Meta
+
+Positive = Annotated[float, Meta(gt=0)]
+Ratio = Annotated[float, Meta(gt=1)]
+Fraction = Annotated[float, Meta(ge=0, le=1)]
+
+ColourName = Literal["red", "orange", "yellow", "green", "cyan", "blue", "magenta"]
+
+
+class HueBand(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A band of hues, and how colourful and bright a pixel has to be.
+
+    Attributes:
+        hue_deg: centre of the band on the colour circle [deg]; red 0, green 120, blue 240.
+        half_width_deg: largest distance from the centre [deg].
+        min_saturation: 0 is grey, 1 a pure colour.
+        min_value: 0 is black, 1 the brightest the camera can tell.
+    """
+
+    hue_deg: Annotated[float, Meta(ge=0, lt=360)]
+    half_width_deg: Annotated[float, Meta(gt=0, le=90)] = 16.0
+    min_saturation: Fraction = 0.5
+    min_value: Fraction = 0.15
+
+
+NAMED_COLOURS: dict[str, HueBand] = {
+    "red": HueBand(0.0),
+    "orange": HueBand(28.0, half_width_deg=12.0),
+    "yellow": HueBand(56.0, half_width_deg=14.0),
+    "green": HueBand(120.0, half_width_deg=30.0),
+    "cyan": HueBand(180.0, half_width_deg=20.0),
+    "blue": HueBand(230.0, half_width_deg=24.0),
+    "magenta": HueBand(310.0, half_width_deg=24.0),
+}
+
+
+class VisionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The table [vision]: what the marker looks like, and when a find is doubtful.
+
+    Attributes:
+        colour: a name, or a band of hues as the table [vision.colour].
+        radius_m: radius of the marker ball [m].
+        min_pixels: a patch of the marker's colour smaller than this is no candidate [px²].
+        border_margin_px: how far the ball's outline has to stay from the image border [px].
+        min_visible: share of the outline that has to be seen where the fitted ellipse says.
+        epipolar_px: largest difference of the eyes' rows [px], on top of the noise of the two centres ...
+        epipolar_sigmas: ... which counts this many times.
+        eye_size_ratio: largest ratio of the sizes the two eyes claim for the ball.
+        depth_size_ratio: largest ratio between the radius seen and the one expected at the triangulated depth.
+        max_candidates: at most this many patches per eye are looked at closely, the most disc-like first.
+    """
+
+    colour: ColourName | HueBand = "red"
+    radius_m: Positive = 0.020
+    min_pixels: Annotated[int, Meta(ge=12)] = 30
+    border_margin_px: Annotated[float, Meta(ge=0)] = 3.0
+    min_visible: Annotated[float, Meta(ge=0.5, le=1)] = 0.85
+    epipolar_px: Annotated[float, Meta(ge=0)] = 0.5
+    epipolar_sigmas: Annotated[float, Meta(ge=0)] = 4.0
+    eye_size_ratio: Ratio = 1.2
+    depth_size_ratio: Ratio = 1.3
+    max_candidates: Annotated[int, Meta(ge=1)] = 12
+
+    @property
+    def band(self) -> HueBand:
+        """The colour as a band of hues."""
+        return NAMED_COLOURS[self.colour] if isinstance(self.colour, str) else self.colour

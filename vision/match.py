@@ -1,0 +1,58 @@
+"""Which disc in the left eye and which in the right are the marker."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from itertools import product
+
+import numpy as np
+
+from interfaces.camera import StereoCalibration
+from interfaces.records import Reason
+
+from .blob import Disc
+from .config import VisionConfig
+from .sphere import Pinhole
+from .triangulate import Location, locate
+
+
+class StereoMatcher:
+    """Checks pairs of discs against the geometry of two eyes and one ball of known size."""
+
+    def __init__(self, calibration: StereoCalibration, config: VisionConfig) -> None:
+        self._calibration, self._config = calibration, config
+        self._eye = Pinhole(calibration.focal_px, calibration.principal_point_px)
+
+    def match(self, left: Sequence[Disc], right: Sequence[Disc]) -> Location | Reason:
+        """The one pair that fits, or why there is none; both sequences hold at least one disc."""
+        outcomes = [self._check(one, other) for one, other in product(left, right)]
+        found = [outcome for outcome in outcomes if isinstance(outcome, Location)]
+        if len(found) == 1:
+            return found[0]
+        if found:
+            return Reason.AMBIGUOUS
+        # The check that the best pair failed at.
+        return Reason.SIZE_MISMATCH if Reason.SIZE_MISMATCH in outcomes else Reason.EPIPOLAR
+
+    def _check(self, left: Disc, right: Disc) -> Location | Reason:
+        location = locate(self._calibration, self._config.radius_m, left, right)
+        if location is None:
+            return Reason.EPIPOLAR
+        _, vl, _, vr = location.centres_px
+        sigma = math.sqrt(location.variances_px[1] + location.variances_px[3])
+        if abs(vl - vr) > self._config.epipolar_px + self._config.epipolar_sigmas * sigma:
+            return Reason.EPIPOLAR
+        return location if self._sizes_fit(location, left, right) else Reason.SIZE_MISMATCH
+
+    def _sizes_fit(self, location: Location, left: Disc, right: Disc) -> bool:
+        baseline = np.array([self._calibration.baseline_m, 0.0, 0.0])
+        ratios = []
+        for disc, x_eye in ((left, location.x), (right, location.x - baseline)):
+            expected = self._eye.outline(x_eye, self._config.radius_m)
+            if expected is None:
+                return False
+            ratios.append(disc.radius_px / expected.radius_px)
+        between_eyes = max(ratios) / min(ratios)
+        against_depth = max(*ratios, 1.0 / min(ratios))
+        return between_eyes <= self._config.eye_size_ratio and against_depth <= self._config.depth_size_ratio

@@ -1,0 +1,216 @@
+"""Sub-pixel outline of a ball's image.
+
+The image is sampled along rays from a rough centre. Along each ray the pixels go from the ball's colour to the
+background's; how much of the ray the ball covers tells where its edge is. Coverage is measured along the direction in
+colour space that tells ball from background best while the ball's brightness, which varies with shading, counts
+for little: a shaded limb before a grey wall is told by its hue, a limb before black by its light. Both ends of
+the mixture are taken next to the edge, per ray. So neither shading nor highlights pull the centre, and an
+anti-aliased edge counts by its coverage.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import cast
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from interfaces.records import FloatArray
+
+from .colour import ColourGate, Float32Array
+
+# Half-widths [px] of the ring in which the edge is looked for: about the rough circle, then about the outline.
+_WINDOWS_PX = (4.0, 2.0, 2.0)
+_RING_STEP_PX = 0.5
+_BACKGROUND_PX = 2.0
+_INNER_COLUMNS = 6
+# How much the brightness at the limb may differ from the one a little inside (1-sigma, relative) ...
+_SHADING_SIGMA = 0.3
+# ... and how much any channel may, apart from that (1-sigma, grey levels).
+_CHANNEL_SIGMA = 4.0
+# A ray tells the edge where ball and background are this many of these sigmas apart.
+_LEAST_SEPARATION = 3.0
+# Error of one edge point before an even background [px]; an uneven one adds to it.
+_EDGE_SIGMA_PX = 0.1
+# Residuals beyond this are no longer edge noise [px], whatever the spread is.
+_LEAST_GATE_PX, _LARGEST_GATE_PX, _GATE_SIGMAS = 0.8, 2.0, 3.5
+# What is left when all noise has averaged out [px].
+_FLOOR_PX = 0.01
+# Beyond this the outline points do not determine centre and radius.
+_LARGEST_CONDITION = 1e6
+
+
+@dataclass(frozen=True, slots=True)
+class Outline:
+    """A ball's outline, fitted.
+
+    Attributes:
+        centre_px: centre of the ellipse, shape (2,) [px].
+        radius_px: radius of the circle of the same area [px].
+        cov_px: covariance of the centre, shape (2, 2) [px²].
+        visible: share of the outline that was seen where the ellipse is.
+    """
+
+    centre_px: FloatArray
+    radius_px: float
+    cov_px: FloatArray
+    visible: float
+
+
+@dataclass(frozen=True, slots=True)
+class _Edges:
+    """Where rays leave the ball, in the frame in which the outline is a circle around the rough centre.
+
+    Attributes:
+        angles: directions of the rays, shape (n,) [rad].
+        distance_px: distance of the edge from the rough centre, shape (n,) [px].
+        weight: how much each counts, 0..1, shape (n,); 0 where the ray does not tell.
+    """
+
+    angles: FloatArray
+    distance_px: FloatArray
+    weight: FloatArray
+
+
+def fit_outline(
+    image: Float32Array, gate: ColourGate, centre_px: FloatArray, radius_px: float, shape: FloatArray
+) -> Outline | None:
+    """Refine a rough circle to the outline of the ball; None when there is no outline near it.
+
+    Args:
+        image: BGR, shape (height, width, 3), grey levels.
+        centre_px: rough centre (2,), in the pixel coordinates of `image` [px].
+        radius_px: rough radius [px], right to about a fifth.
+        shape: the ellipse's shape (2, 2), see `sphere.Ellipse`.
+    """
+    outline = None
+    for window_px in _WINDOWS_PX:
+        half = min(window_px, 0.6 * radius_px)
+        edges = _find_edges(image, gate, centre_px, radius_px, shape, half)
+        outline = None if edges is None else _fit_circle(edges, centre_px, shape)
+        if outline is None or not _near(outline, centre_px, radius_px):
+            return None
+        centre_px, radius_px = outline.centre_px, outline.radius_px
+    return outline
+
+
+def _near(outline: Outline, centre_px: FloatArray, radius_px: float) -> bool:
+    """Whether one step of refinement stayed where its ring could see."""
+    moved = float(np.linalg.norm(outline.centre_px - centre_px))
+    return moved < max(2.0, 0.5 * radius_px) and 0.5 < outline.radius_px / radius_px < 2.0
+
+
+def _find_edges(
+    image: Float32Array, gate: ColourGate, centre_px: FloatArray, radius_px: float, shape: FloatArray, half_px: float
+) -> _Edges | None:
+    count = int(np.clip(round(2 * np.pi * radius_px), 24, 400))
+    angles: FloatArray = np.linspace(0.0, 2 * np.pi, count, endpoint=False)
+    cells = max(2, round(2 * half_px / _RING_STEP_PX))
+    step = 2 * half_px / cells
+    inner = np.linspace(0.3 * radius_px, radius_px - half_px, _INNER_COLUMNS)
+    ring = radius_px - half_px + (np.arange(cells) + 0.5) * step
+    outer = radius_px + half_px + (np.arange(round(_BACKGROUND_PX / _RING_STEP_PX)) + 0.5) * _RING_STEP_PX
+    samples = _sample(image, centre_px, angles, np.concatenate([inner, ring, outer]).astype(np.float64), shape)
+    inside, outside = samples[:, : len(inner)], samples[:, len(inner) + cells :]
+
+    colour = _ball_colour(inside, gate)
+    if colour is None:
+        return None
+    level = np.maximum(_mean_of_three(gate.amount(inside[:, -2:]).mean(axis=1)), 0.0)
+    background = _mean_of_three(outside.mean(axis=1))
+    towards, separation = _discriminant(level, colour, background)
+    told = separation > _LEAST_SEPARATION**2
+    scale = 1.0 / np.where(told, separation, 1.0)
+    # The share of ball in each sample: 1 on the ball, 0 on the background.
+    covered = np.matmul(samples[:, len(inner) :] - background[:, None], towards[:, :, None])[..., 0] * scale[:, None]
+    distance = radius_px - half_px + covered[:, :cells].sum(axis=1) * step
+    unevenness_px = half_px * np.sqrt(np.mean(covered[:, cells:] ** 2, axis=1))
+    return _Edges(angles, distance, told / (1.0 + (unevenness_px / _EDGE_SIGMA_PX) ** 2))
+
+
+def _sample(
+    image: Float32Array, centre_px: FloatArray, angles: FloatArray, radii: FloatArray, shape: FloatArray
+) -> Float32Array:
+    """`image` at every angle (rows) and radius (columns) of the ellipse's own polar coordinates."""
+    directions = np.stack([np.cos(angles), np.sin(angles)], axis=1) @ shape
+    at = (centre_px + directions[:, None, :] * radii[:, None]).astype(np.float32)
+    samples = cv2.remap(image, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return cast(Float32Array, samples)
+
+
+def _ball_colour(inside: Float32Array, gate: ColourGate) -> FloatArray | None:
+    """The ball's colour (3,) per unit of its amount; the median leaves highlights out."""
+    samples = inside.reshape(-1, 3)
+    amount = gate.amount(samples)
+    coloured = amount > 1.0
+    if np.count_nonzero(coloured) < len(amount) // 2:
+        return None
+    return np.median(samples[coloured] / amount[coloured, None], axis=0).astype(np.float64)
+
+
+def _discriminant(level: FloatArray, colour: FloatArray, background: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Fisher's linear discriminant between ball and background, ray by ray.
+
+    The ball is `level · colour`, with a covariance of (σ_s · level)² along `colour` and of σ_c² in all channels.
+
+    Args:
+        level: the ball's level at the limb, shape (n,).
+        background: shape (n, 3).
+
+    Returns:
+        The direction in colour space (n, 3), and the squared separation along it (n,) in sigmas.
+    """
+    apart = level[:, None] * colour - background
+    along = (_SHADING_SIGMA * level) ** 2
+    # Inverse of σ_c² I + along · colour colourᵀ by Sherman and Morrison.
+    share = along * (apart @ colour) / (_CHANNEL_SIGMA**2 + along * (colour @ colour))
+    direction = (apart - share[:, None] * colour) / _CHANNEL_SIGMA**2
+    return direction, np.einsum("nc,nc->n", direction, apart)
+
+
+def _mean_of_three(values: NDArray[np.floating]) -> FloatArray:
+    """Mean over three neighbours along the closed first axis."""
+    wrapped = np.concatenate([values[-1:], values, values[:1]]).astype(np.float64)
+    return (wrapped[:-2] + wrapped[1:-1] + wrapped[2:]) / 3.0
+
+
+def _fit_circle(edges: _Edges, centre_px: FloatArray, shape: FloatArray) -> Outline | None:
+    """Least squares for the centre's shift and the radius; points too far off are left out in turn."""
+    design = np.stack([np.cos(edges.angles), np.sin(edges.angles), np.ones_like(edges.angles)], axis=1)
+    told = edges.weight > 0
+    weight = edges.weight
+    solution, cov, residual = np.zeros(3), np.eye(3), edges.distance_px
+    for _ in range(3):
+        if np.count_nonzero(weight) < len(weight) // 2:
+            return None
+        normal = (design * weight[:, None]).T @ design
+        if np.linalg.cond(normal) > _LARGEST_CONDITION:
+            return None
+        cov = np.linalg.inv(normal)
+        solution = cov @ (design.T @ (weight * edges.distance_px))
+        residual = edges.distance_px - design @ solution
+        spread = 1.4826 * float(np.median(np.abs(residual[told])))
+        gate = np.clip(_GATE_SIGMAS * spread, _LEAST_GATE_PX, _LARGEST_GATE_PX)
+        used, weight = weight, np.where(np.abs(residual) < gate, edges.weight, 0.0)
+        cov = _noise_density(edges.angles, np.sqrt(used) * residual, float(solution[2])) * cov
+    if solution[2] <= 0:
+        return None
+    return Outline(
+        centre_px=centre_px + shape @ solution[:2],
+        radius_px=float(solution[2]),
+        cov_px=shape @ cov[:2, :2] @ shape + _FLOOR_PX**2 * np.eye(2),
+        visible=float(np.count_nonzero(weight)) / len(weight),
+    )
+
+
+def _noise_density(angles: FloatArray, residual: FloatArray, radius_px: float) -> float:
+    """Variance [px²] of one outline point in the slow waves round the outline, of which the centre's error is one.
+
+    Neighbouring outline points share pixels and background, so their variance alone would claim too little. A
+    shift of the centre is the wave that goes once round; it was fitted away, and the next ones tell its size.
+    """
+    harmonics = np.arange(2, max(6, round(radius_px / 3)) + 1)
+    waves = np.exp(-1j * harmonics[:, None] * angles) @ residual
+    return float(np.mean(np.abs(waves) ** 2)) / len(angles)

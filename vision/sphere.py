@@ -1,0 +1,102 @@
+"""How a pinhole sees a sphere: an ellipse whose centre is not the image of the sphere's centre.
+
+The rays that touch a sphere form a circular cone around the direction of its centre, with half-angle
+γ = asin(radius / distance). The image plane cuts that cone in an ellipse whose major axis points away from the
+principal point. With θ the angle between that direction and the optical axis and D = cos²γ − sin²θ:
+
+    centre of the ellipse   f · sinθ cosθ / D     from the principal point (the sphere's centre: f · tanθ)
+    major semi-axis         f · sinγ cosγ / D
+    minor semi-axis         f · sinγ / √D
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from interfaces.records import FloatArray
+
+# A cone that reaches past 80° from the optical axis has no usable image.
+_LARGEST_ANGLE = math.radians(80.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Ellipse:
+    """Image of a sphere.
+
+    Attributes:
+        centre_px: centre of the ellipse, shape (2,) [px].
+        radius_px: radius of the circle of the same area [px].
+        shape: symmetric matrix of determinant 1, shape (2, 2), that turns the circle of that radius into the ellipse.
+    """
+
+    centre_px: FloatArray
+    radius_px: float
+    shape: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class Pinhole:
+    """One eye: focal length [px] and principal point [px]."""
+
+    focal_px: float
+    principal_point_px: tuple[float, float]
+
+    def outline(self, x_eye: FloatArray, radius_m: float) -> Ellipse | None:
+        """The outline of a sphere around `x_eye` (3,) [m] in this eye's frame; None when it is not before the eye."""
+        distance = float(np.linalg.norm(x_eye))
+        if not (x_eye[2] > 0 and distance > radius_m):
+            return None
+        gamma = math.asin(radius_m / distance)
+        theta = math.acos(min(1.0, float(x_eye[2]) / distance))
+        if theta + gamma > _LARGEST_ANGLE:
+            return None
+        spread = math.cos(gamma) ** 2 - math.sin(theta) ** 2
+        away = _unit(x_eye[:2])
+        centre = np.array(self.principal_point_px) + away * (self.focal_px * math.sin(theta) * math.cos(theta) / spread)
+        major = self.focal_px * math.sin(gamma) * math.cos(gamma) / spread
+        minor = self.focal_px * math.sin(gamma) / math.sqrt(spread)
+        return Ellipse(centre, math.sqrt(major * minor), _stretch(away, math.sqrt(major / minor)))
+
+    def distance_over_radius(self, centre_px: FloatArray, radius_px: float) -> float:
+        """How many sphere radii away a sphere is whose outline has this centre and radius (rough: one fixed point)."""
+        tan_theta = float(np.linalg.norm(centre_px - self.principal_point_px)) / self.focal_px
+        # For small γ the ellipse has the area π f² sin²γ / cos³θ.
+        cos_theta = 1.0 / math.hypot(1.0, tan_theta)
+        sin_gamma = radius_px / self.focal_px * cos_theta**1.5
+        return 1.0 / min(sin_gamma, 0.9)
+
+    def sphere_centre(self, centre_px: FloatArray, distance_over_radius: float) -> FloatArray:
+        """The image (2,) [px] of the centre of a sphere whose outline has its centre at `centre_px` (2,) [px].
+
+        Args:
+            distance_over_radius: distance of the sphere's centre from the eye in units of its radius.
+        """
+        offset = centre_px - np.array(self.principal_point_px)
+        tan_ellipse = float(np.linalg.norm(offset)) / self.focal_px
+        if tan_ellipse == 0.0:
+            return centre_px
+        # With T = tanθ and s = sin²γ the centre lies at T / (1 − s(1 + T²)); solved for T, stably for small s.
+        s = distance_over_radius**-2
+        a = tan_ellipse * s
+        root = math.sqrt(max(0.0, 1.0 + 4.0 * a * tan_ellipse * (1.0 - s)))
+        tan_theta = 2.0 * tan_ellipse * (1.0 - s) / (1.0 + root)
+        return np.array(self.principal_point_px) + offset * (tan_theta / tan_ellipse)
+
+    def shape(self, centre_px: FloatArray) -> FloatArray:
+        """The shape (2, 2) of the outline of a small sphere seen at `centre_px` (2,) [px]."""
+        offset = centre_px - np.array(self.principal_point_px)
+        tan_theta = float(np.linalg.norm(offset)) / self.focal_px
+        return _stretch(_unit(offset), (1.0 + tan_theta**2) ** 0.25)
+
+
+def _unit(direction: FloatArray) -> FloatArray:
+    length = float(np.linalg.norm(direction))
+    return direction / length if length > 0 else np.array([1.0, 0.0])
+
+
+def _stretch(direction: FloatArray, factor: float) -> FloatArray:
+    along = np.outer(direction, direction)
+    return factor * along + (np.eye(2) - along) / factor

@@ -1,0 +1,39 @@
+"""A stereo camera and a tracker as one source of marker fixes."""
+
+from __future__ import annotations
+
+from types import TracebackType
+from typing import Self
+
+from interfaces.protocols import StereoCamera
+from interfaces.records import MarkerFix, MarkerMiss
+
+from .tracker import StereoTracker
+
+
+class TrackedCamera:
+    """A `MarkerSource`: opens and closes the camera, and tracks the marker in every frame."""
+
+    def __init__(self, camera: StereoCamera, tracker: StereoTracker) -> None:
+        self._camera, self._tracker = camera, tracker
+
+    def __enter__(self) -> Self:
+        self._camera.__enter__()
+        self._tracker.forget()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._camera.__exit__(kind, error, trace)
+
+    def read(self, timeout_s: float) -> MarkerFix | MarkerMiss | None:
+        """The marker in the next frame, or why it was not found; None when no frame came within `timeout_s` [s].
+
+        Raises:
+            SourceEnded: there will be no more.
+            SourceLost: the device went away.
+            SourceError: the images do not fit the calibration.
+        """
+        frame = self._camera.read(timeout_s)
+        return None if frame is None else self._tracker.track(frame)

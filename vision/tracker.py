@@ -1,0 +1,152 @@
+"""From a stereo frame to a marker fix, or the reason why there is none."""
+
+from __future__ import annotations
+
+import logging
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from interfaces.camera import StereoCalibration
+from interfaces.errors import ConfigError, SourceError
+from interfaces.records import FloatArray, ImageArray, MarkerFix, MarkerMiss, Reason, StereoFrame, frozen_array
+
+from .blob import Disc, Region, find_patches, measure
+from .colour import ColourGate
+from .config import VisionConfig
+from .match import StereoMatcher
+from .sphere import Pinhole
+from .triangulate import Location
+
+_log = logging.getLogger(__name__)
+
+# Half the side of the region searched around the predicted centre: radii, plus pixels, plus steps between frames.
+_REGION_RADII, _REGION_PX, _REGION_STEPS = 1.6, 14.0, 0.7
+# After a longer pause the last fixes predict nothing [s].
+_LONGEST_PAUSE_S = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class _Track:
+    """Where the marker was: time [s], (ul, vl, ur, vr) [px], their velocity [px/s], larger radius of the two [px]."""
+
+    t: float
+    centres_px: FloatArray
+    velocity_px_s: FloatArray
+    radius_px: float
+
+
+class StereoTracker:
+    """Finds one coloured ball in rectified stereo images.
+
+    Near where the last frames predict it, else in the whole images. Whatever the images show, `track` answers with
+    a fix or a reason.
+    """
+
+    def __init__(self, calibration: StereoCalibration, config: VisionConfig | None = None) -> None:
+        """Prepare for images of `calibration`; ConfigError when it describes no stereo pair."""
+        _check_calibration(calibration)
+        self.calibration = calibration
+        self.config = config or VisionConfig()
+        self._gate = ColourGate(self.config.band)
+        self._eye = Pinhole(calibration.focal_px, calibration.principal_point_px)
+        self._matcher = StereoMatcher(calibration, self.config)
+        width, height = calibration.image_size_px
+        self._whole = Region(0, 0, width, height)
+        self._track: _Track | None = None
+
+    def track(self, frame: StereoFrame) -> MarkerFix | MarkerMiss:
+        """The marker in `frame`, in the left optical frame, or why there is none.
+
+        Raises:
+            SourceError: the images are not uint8 BGR of the calibration's size.
+        """
+        for eye, image in (("left", frame.left), ("right", frame.right)):
+            self._check_image(eye, image)
+        regions = self._predicted_regions(frame.t)
+        found = self._look(frame, regions) if regions else None
+        if not isinstance(found, Location):
+            found = self._look(frame, (self._whole, self._whole))
+        if isinstance(found, Reason):
+            if self._track is not None:
+                _log.debug("marker lost at %.3f s: %s", frame.t, found)
+            self._track = None
+            return MarkerMiss(frame.t, found)
+        self._remember(frame.t, found)
+        ul, vl, ur, vr = (float(value) for value in found.centres_px)
+        return MarkerFix(frame.t, frozen_array(found.x), frozen_array(found.cov), (ul, vl, ur, vr))
+
+    def forget(self) -> None:
+        """Look for the marker in the whole images next time."""
+        self._track = None
+
+    def _look(self, frame: StereoFrame, regions: tuple[Region, Region]) -> Location | Reason:
+        left = self._discs(frame.left, regions[0])
+        if isinstance(left, Reason):
+            return left
+        right = self._discs(frame.right, regions[1])
+        if isinstance(right, Reason):
+            return right
+        return self._matcher.match(left, right)
+
+    def _discs(self, image: ImageArray, region: Region) -> list[Disc] | Reason:
+        """The discs in one eye; when there is none, why the most disc-like patch is none."""
+        discs: list[Disc] = []
+        reason: Reason | None = None
+        for patch in find_patches(image, region, self._gate, self.config):
+            outcome = measure(image, patch, self._eye, self._gate, self.config)
+            if isinstance(outcome, Reason):
+                reason = reason or outcome
+            elif not any(outcome.is_same_as(disc) for disc in discs):
+                discs.append(outcome)
+        return discs or reason or Reason.NO_MARKER
+
+    def _predicted_regions(self, t: float) -> tuple[Region, Region] | None:
+        track = self._track
+        if track is None or not 0 < t - track.t <= _LONGEST_PAUSE_S:
+            return None
+        step = track.velocity_px_s * (t - track.t)
+        half = _REGION_RADII * track.radius_px + _REGION_PX + _REGION_STEPS * float(np.abs(step).max())
+        left, right = (self._region(centre, half) for centre in (track.centres_px + step).reshape(2, 2))
+        return None if left is None or right is None else (left, right)
+
+    def _region(self, centre_px: FloatArray, half_px: float) -> Region | None:
+        width, height = self.calibration.image_size_px
+        low = np.clip(np.floor(centre_px - half_px), 0, (width, height)).astype(int)
+        high = np.clip(np.ceil(centre_px + half_px) + 1, 0, (width, height)).astype(int)
+        return Region(*low.tolist(), *high.tolist()) if (high > low).all() else None
+
+    def _remember(self, t: float, found: Location) -> None:
+        velocity = np.zeros(4)
+        if self._track is not None and 0 < t - self._track.t <= _LONGEST_PAUSE_S:
+            velocity = (found.centres_px - self._track.centres_px) / (t - self._track.t)
+        radius_px = self.calibration.focal_px * self.config.radius_m / float(found.x[2])
+        self._track = _Track(t, found.centres_px, velocity, radius_px)
+
+    def _check_image(self, eye: str, image: ImageArray) -> None:
+        width, height = self.calibration.image_size_px
+        if image.shape != (height, width, 3) or image.dtype != np.uint8:
+            raise SourceError(
+                f"the {eye} image is {_described(image)}; the calibration is for {width}x{height} pixels of three "
+                "colours (uint8, BGR). Set the camera to that size, or mend [camera] image_size_px"
+            )
+
+
+def _described(image: ImageArray) -> str:
+    size = f"{image.shape[1]}x{image.shape[0]} pixels" if image.ndim in (2, 3) else f"an array of shape {image.shape}"
+    colours = f" of {image.shape[2]} channels" if image.ndim == 3 else " of grey" if image.ndim == 2 else ""
+    return f"{size}{colours} ({image.dtype})"
+
+
+def _check_calibration(calibration: StereoCalibration) -> None:
+    width, height = calibration.image_size_px
+    for name, value in (("focal_px", calibration.focal_px), ("baseline_m", calibration.baseline_m)):
+        if not (math.isfinite(value) and value > 0):
+            raise ConfigError(f"[camera] {name} is {value}", remedy="It has to be a number above 0")
+    if not (math.isfinite(calibration.pixel_sigma) and calibration.pixel_sigma >= 0):
+        raise ConfigError(f"[camera] pixel_sigma is {calibration.pixel_sigma}", remedy="It has to be 0 or more")
+    if not all(math.isfinite(value) for value in calibration.principal_point_px):
+        raise ConfigError(f"[camera] principal_point_px is {calibration.principal_point_px}", remedy="Give two numbers")
+    if min(width, height) < 16:
+        raise ConfigError(f"[camera] image_size_px is {width}x{height}", remedy="16x16 is the least")

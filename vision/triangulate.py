@@ -1,0 +1,81 @@
+"""From two image points of a rectified pair to a point with covariance."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from interfaces.camera import StereoCalibration
+from interfaces.records import FloatArray
+
+from .blob import Disc
+from .sphere import Pinhole
+
+
+@dataclass(frozen=True, slots=True)
+class Location:
+    """A ball, located.
+
+    Attributes:
+        x: its centre in the left optical frame, shape (3,) [m].
+        cov: covariance of x, shape (3, 3) [m²].
+        centres_px: image of its centre as (ul, vl, ur, vr), shape (4,) [px].
+        variances_px: variances of `centres_px`, shape (4,) [px²].
+    """
+
+    x: FloatArray
+    cov: FloatArray
+    centres_px: FloatArray
+    variances_px: FloatArray
+
+
+def triangulate(
+    calibration: StereoCalibration, centres_px: FloatArray, variances_px: FloatArray
+) -> tuple[FloatArray, FloatArray] | None:
+    """The point seen at `centres_px` (ul, vl, ur, vr) [px] with `variances_px` (4,) [px²].
+
+    Returns:
+        The most likely point (3,) [m] in the left optical frame and its covariance (3, 3) [m²], to first order;
+        None when the rays do not meet before the eyes.
+    """
+    ul, vl, ur, vr = centres_px
+    disparity = ul - ur
+    if not disparity > 0:
+        return None
+    cx, cy = calibration.principal_point_px
+    share_left = variances_px[3] / (variances_px[1] + variances_px[3])
+    v = share_left * vl + (1.0 - share_left) * vr
+    depth_per_px = calibration.baseline_m / disparity
+    x = depth_per_px * np.array([ul - cx, v - cy, calibration.focal_px])
+    # Columns: derivatives by ul, vl, ur, vr.
+    jacobian = np.outer(x / disparity, (-1.0, 0.0, 1.0, 0.0))
+    jacobian[0, 0] += depth_per_px
+    jacobian[1, 1] += depth_per_px * share_left
+    jacobian[1, 3] += depth_per_px * (1.0 - share_left)
+    return x, (jacobian * variances_px) @ jacobian.T
+
+
+def locate(calibration: StereoCalibration, radius_m: float, left: Disc, right: Disc) -> Location | None:
+    """The ball of `radius_m` whose images are the two discs; None when its rays do not meet before the eyes.
+
+    How far the sphere's centre is from the ellipse's depends on its distance: first the one its size tells, then
+    the triangulated one.
+    """
+    eye = Pinhole(calibration.focal_px, calibration.principal_point_px)
+    variances = np.concatenate([np.diag(disc.cov_px) for disc in (left, right)]) + calibration.pixel_sigma**2
+    distances = [eye.distance_over_radius(disc.centre_px, disc.radius_px) for disc in (left, right)]
+    rough = _centres(eye, left, right, distances)
+    point = triangulate(calibration, rough, variances)
+    if point is None:
+        return None
+    to_right_eye = np.array([calibration.baseline_m, 0.0, 0.0])
+    distances = [max(1.1, float(np.linalg.norm(x)) / radius_m) for x in (point[0], point[0] - to_right_eye)]
+    centres = _centres(eye, left, right, distances)
+    point = triangulate(calibration, centres, variances)
+    return None if point is None else Location(*point, centres, variances)
+
+
+def _centres(eye: Pinhole, left: Disc, right: Disc, distances_over_radius: list[float]) -> FloatArray:
+    one, other = distances_over_radius
+    return np.concatenate([eye.sphere_centre(left.centre_px, one), eye.sphere_centre(right.centre_px, other)])
