@@ -155,4 +155,7 @@ def _checksum(body: bytes) -> bytes:
 def _unwritable(file: Path, error: OSError) -> str:
     if error.errno == errno.ENOSPC:
         return f"the checkpoint {file} could not be written: the disk is full. Free some space; learning goes on"
-    return f"the checkpoint {file} could not be written: {error.strerror}. Learning goes on; give a --state-dir that can be written"
+    return (
+        f"the checkpoint {file} could not be written: {error.strerror}. Learning goes on; "
+        "give a --state-dir that can be written"
+    )

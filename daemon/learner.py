@@ -91,10 +91,10 @@ class Learner:
         """
         if self._failure is not None:
             raise self._failure
-        now = self._clock.now()
-        if now - (self._checkpointed_at or self._started_at) >= self._settings.checkpoint_every_s:
-            if self._learning.counters.pairs != self._checkpointed_pairs:
-                self.checkpoint()
+        waited_s = self._clock.now() - (self._checkpointed_at or self._started_at)
+        new = self._learning.counters.pairs != self._checkpointed_pairs
+        if new and waited_s >= self._settings.checkpoint_every_s:
+            self.checkpoint()
 
     def checkpoint(self) -> None:
         """Write a checkpoint; when that fails, health says so."""

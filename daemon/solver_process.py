@@ -8,6 +8,7 @@ Both directions carry frames: four bytes of length, then a MessagePack message.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import select
 import struct
@@ -158,10 +159,8 @@ class SolverProcess:
         self._received.clear()
         if child is None or child.stdin is None or child.stdout is None:
             return None
-        try:
+        with contextlib.suppress(OSError):  # what was left in the buffer finds no reader any more
             child.stdin.close()
-        except OSError:
-            pass  # what was left in the buffer finds no reader any more
         child.terminate()
         try:
             return child.wait(END_LIMIT_S)

@@ -53,7 +53,7 @@ class PairsReply(msgspec.Struct, frozen=True):
 class JointsRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """`{"q": [rad…]}` or `{"q": [[rad…]…]}`."""
 
-    q: list[float] | list[list[float]]
+    q: list[float | list[float]]
 
 
 class PredictReply(msgspec.Struct, frozen=True):
@@ -174,9 +174,10 @@ def joint_angles(request: JointsRequest, joints: tuple[str, ...]) -> np.ndarray:
     Raises:
         RequestError: a row of the wrong length, a number that is not finite, an empty or too large batch.
     """
-    rows = request.q if request.q and isinstance(request.q[0], list) else [request.q]
     if not request.q:
         raise RequestError("q is empty; send one vector of joint angles or a list of them")
+    one_vector = not any(isinstance(entry, list) for entry in request.q)
+    rows = [request.q] if one_vector else request.q
     if len(rows) > LARGEST_BATCH:
         raise RequestError(f"q has {len(rows)} rows; send at most {LARGEST_BATCH} at once")
     for number, row in enumerate(rows):
