@@ -19,6 +19,7 @@ _MEDIAN_NORM = 1.538
 # and must not be rejected.
 _OUTLIER_SIGMAS = 15.0
 _ROUNDS = 60
+_START_PAIRS = 300
 _STEP_TOLERANCE = 1e-12
 # Singular values below this share of the largest are directions that the data do not determine.
 _RANK_TOLERANCE = 1e-7
@@ -65,6 +66,19 @@ class _Fit:
     def errors(self) -> FloatArray:
         return self.x - (self.markers() @ self.rotation.T + self.translation)
 
+    def norms(self) -> FloatArray:
+        return np.linalg.norm(self.errors(), axis=1)
+
+    def spread(self, least: float) -> float:
+        """Standard deviation [m] of one coordinate's error, from the middle distance, at least `least`.
+
+        The middle lies above the median by the pairs that what is fitted can explain whatever they are (Rousseeuw and
+        Leroy 1987, least median of squares): else a few pairs would look perfect and the others be outliers.
+        """
+        free_pairs = 2 * self.fit_pose + self.fit_marker
+        rank = min(len(self.x) // 2 + free_pairs, len(self.x) - 1)
+        return max(float(np.partition(self.norms(), rank)[rank]) / _MEDIAN_NORM, least)
+
     def place(self, weights: FloatArray) -> None:
         """The best pose for the present marker."""
         self.rotation, self.translation = rigid_motion(self.markers(), self.x, weights)
@@ -75,7 +89,7 @@ class _Fit:
         columns: list[FloatArray] = []
         if self.fit_pose:
             # rotation ← exp(ω) rotation moves a point by ω × point = −[point]× ω.
-            columns += [-np.stack([cross_matrix(point) for point in turned]), np.tile(np.eye(3), (len(turned), 1, 1))]
+            columns += [-cross_matrix(turned), np.broadcast_to(np.eye(3), (len(turned), 3, 3))]
         if self.fit_marker:
             columns.append(self.rotation @ self.nominal_rotations)
         root = np.sqrt(weights)[:, None]
@@ -131,6 +145,8 @@ def align(
         if marker_known:
             _check_spread(fit.nominal_positions, "the nominal marker positions at q")
     inliers = np.ones(len(angles), dtype=np.bool_)
+    if fit.fit_pose and fit.fit_marker:
+        fit.shift = _start_shift(fit, sigma or 0.0)
     if fit.fit_pose or fit.fit_marker:
         inliers = _fit_robustly(fit, sigma or 0.0)
     return _alignment(chain, fit, inliers)
@@ -150,6 +166,25 @@ def rigid_motion(points: FloatArray, targets: FloatArray, weights: FloatArray) -
     return rotation, centre_targets - rotation @ centre_points
 
 
+def _start_shift(fit: _Fit, sigma: float) -> FloatArray:
+    """Marker shift (3,) whose fit explains a sample of the pairs best, of several starting points.
+
+    Pose and marker together have local minima, mostly with few joints or small ranges.
+    """
+    chosen = np.unique(np.linspace(0, len(fit.x) - 1, _START_PAIRS).astype(np.intp))
+    reach = float(np.linalg.norm(fit.x - np.median(fit.x, axis=0), axis=1).mean())
+    best, best_spread = np.zeros(3), math.inf
+    for start in reach * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)]):
+        trial = _Fit(fit.nominal_rotations[chosen], fit.nominal_positions[chosen], fit.x[chosen], True, True)
+        trial.shift = start
+        _fit_robustly(trial, sigma)
+        spread = trial.spread(0.0)
+        # A better start must be clearly better, so that rounding does not choose among equals.
+        if spread < 0.9 * best_spread - _ROUNDING_M:
+            best, best_spread = trial.shift, spread
+    return best
+
+
 def _fit_robustly(fit: _Fit, sigma: float) -> BoolArray:
     """Improves `fit` by graduated non-convexity, then by least squares on the inliers, which it returns (n,).
 
@@ -159,31 +194,26 @@ def _fit_robustly(fit: _Fit, sigma: float) -> BoolArray:
     weights = np.ones(len(fit.x))
     if fit.fit_pose:
         fit.place(weights)
-    norms = np.linalg.norm(fit.errors(), axis=1)
+    norms = fit.norms()
     scale = float(norms.max())
     for _ in range(_ROUNDS):
-        goal = 3.0 * _spread(norms, sigma)
+        goal = 3.0 * fit.spread(sigma)
         scale = max(scale / 1.4, goal)
         weights = (scale**2 / (scale**2 + norms**2)) ** 2 if scale > 0.0 else weights
         step = fit.improve(weights)
-        norms = np.linalg.norm(fit.errors(), axis=1)
+        norms = fit.norms()
         if scale == goal and step < _STEP_TOLERANCE:
             break
     inliers = np.ones(len(fit.x), dtype=np.bool_)
     for _ in range(_ROUNDS):
-        chosen = norms <= max(_OUTLIER_SIGMAS * _spread(norms, sigma), _ROUNDING_M)
+        chosen = norms <= max(_OUTLIER_SIGMAS * fit.spread(sigma), _ROUNDING_M)
         step = fit.improve(chosen.astype(np.float64))
-        norms = np.linalg.norm(fit.errors(), axis=1)
+        norms = fit.norms()
         settled = bool((chosen == inliers).all()) and step < _STEP_TOLERANCE
         inliers = chosen
         if settled:
             break
     return inliers
-
-
-def _spread(norms: FloatArray, sigma: float) -> float:
-    """Standard deviation of one coordinate's error: from the median distance, at least sigma [m]."""
-    return max(float(np.median(norms)) / _MEDIAN_NORM, sigma)
 
 
 def _alignment(chain: RigidChain, fit: _Fit, inliers: BoolArray) -> Alignment:

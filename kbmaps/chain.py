@@ -203,7 +203,7 @@ def check_rigid(name: str, transform: FloatArray) -> None:
         raise ChainError(f"{name} is not a rigid transform: a proper rotation, a translation and the row 0 0 0 1")
 
 
-def cross_matrix(vector_: FloatArray) -> FloatArray:
-    """The matrix K (3, 3) with K @ y = vector × y."""
-    x, y, z = vector_
-    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+def cross_matrix(vectors: FloatArray) -> FloatArray:
+    """The matrices K (..., 3, 3) with K @ y = vectors × y, for vectors (..., 3)."""
+    # Column i of K is vector × e_i, row i of this cross product.
+    return np.cross(vectors[..., None, :], np.eye(3)).swapaxes(-1, -2)
