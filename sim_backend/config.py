@@ -62,7 +62,7 @@ class ErrorConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
         tool_m: each coordinate of the marker's place on the hand [m].
     """
 
-    joint_offset_rad: NonNegative = 0.05
+    joint_offset_rad: NonNegative = 0.045
     link_length_m: NonNegative = 0.005
     link_axis_rad: NonNegative = 0.01
     camera_position_m: NonNegative = 0.005

@@ -11,8 +11,9 @@ from kbmaps import RigidChain
 
 # Damping of the least-squares step, in squared tangents of angle: large enough to stay calm where the head points at
 # the marker along one of its own axes.
-_DAMPING = 1e-3
+_DAMPING = 1e-2
 _SOLVE_STEPS = 12
+_LONGEST_STEP = 0.4
 _TRACK_GAIN = 0.25
 _NEAREST_M = 0.05
 _NUDGE = 1e-6
@@ -66,9 +67,11 @@ class Gaze:
         nudged = q[:, None] + _NUDGE * np.eye(q.shape[1])[self._joints]
         changed = self._off_centre(nudged.reshape(-1, q.shape[1])).reshape(*nudged.shape[:2], 2)
         J = ((changed - off_centre[:, None]) / _NUDGE).swapaxes(1, 2)
-        damped = J @ J.swapaxes(1, 2) + _DAMPING * np.eye(2)
-        step = -(J.swapaxes(1, 2) @ np.linalg.solve(damped, off_centre[..., None]))[..., 0]
-        return np.clip(step, -0.5, 0.5)
+        step = _damped_step(J, off_centre)
+        # A joint at its limit that would have to go on is out of the game; the others do what is left.
+        angles = q[:, self._joints]
+        stuck = ((angles <= self._lower) & (step < 0)) | ((angles >= self._upper) & (step > 0))
+        return np.clip(_damped_step(J * ~stuck[:, None], off_centre), -_LONGEST_STEP, _LONGEST_STEP)
 
     def _off_centre(self, q: FloatArray) -> FloatArray:
         """Tangents (n, 2) of the angles by which the marker, seen from between the eyes, misses the images' middle."""
@@ -77,6 +80,12 @@ class Gaze:
 
     def _clipped(self, angles: FloatArray) -> FloatArray:
         return np.clip(angles, self._lower, self._upper)
+
+
+def _damped_step(J: FloatArray, error: FloatArray) -> FloatArray:
+    """Levenberg-Marquardt steps (n, g) for Jacobians (n, 2, g) and errors (n, 2)."""
+    damped = J @ J.swapaxes(1, 2) + _DAMPING * np.eye(2)
+    return -(J.swapaxes(1, 2) @ np.linalg.solve(damped, error[..., None]))[..., 0]
 
 
 def nominal_chain(robot: RobotDescription, marker_xyz: FloatArray) -> RigidChain:

@@ -132,5 +132,5 @@ def _start(memory: int, requests: int, answers: int) -> subprocess.Popen[bytes]:
         pass_fds=(memory, requests, answers),
         stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,
-        env={**os.environ, "PYTHONPATH": path},
+        env={**os.environ, "PYTHONPATH": path, "OPENBLAS_NUM_THREADS": "1"},
     )

@@ -11,6 +11,7 @@ import select
 import signal
 import sys
 
+import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -104,6 +105,7 @@ def _next(requests: int) -> Message | None:
 
 
 if __name__ == "__main__":
+    cv2.setNumThreads(1)  # the other processor is the tracker's
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle; it closes the pipe
     try:
         serve(*(int(argument) for argument in sys.argv[1:4]))

@@ -25,8 +25,8 @@ class JointRoles:
     Attributes:
         gaze: indices of the gazing joints in q.
         guided: indices of the guided joints in q, in their order from the robot's root.
-        wrist: the link that the last guided joint moves; the hand holds it.
-        elbow: the link half-way between the first guided joint and the wrist; the other hand holds it.
+        wrist: the link that carries the marker (or the hand's cameras); the hand holds it.
+        elbow: the link of the guided joint half-way to the wrist; the other hand holds it there.
     """
 
     gaze: tuple[int, ...]
@@ -42,10 +42,11 @@ class JointRoles:
         index = {name: k for k, name in enumerate(robot.joints)}
         gaze = tuple(k for name, k in index.items() if upward[name])
         guided = tuple(k for name, k in index.items() if not upward[name])
+        wrist = robot.robot.marker_link
         if not guided:
-            gaze, guided = (), gaze[::-1]
-        links = [robot.tree.joints[robot.joints[k]].child for k in guided]
-        return cls(gaze=gaze, guided=guided, wrist=links[-1], elbow=links[_half_way(robot, guided)])
+            gaze, guided, wrist = (), gaze[::-1], robot.camera.parent_link
+        elbow = robot.tree.joints[robot.joints[guided[_half_way(robot, guided, wrist)]]].child
+        return cls(gaze=gaze, guided=guided, wrist=wrist, elbow=elbow)
 
 
 def root_link(tree: UrdfTree) -> str:
@@ -64,19 +65,17 @@ def chain_from_root(truth: TrueRobot, roles: JointRoles, link: str) -> tuple[Rig
     return with_offsets(chain, truth.offsets[list(indices)]), indices
 
 
-def _half_way(robot: RobotDescription, guided: tuple[int, ...]) -> int:
-    origins = _origins(robot, guided)
+def _half_way(robot: RobotDescription, guided: tuple[int, ...], wrist: str) -> int:
+    """Position in `guided` of the joint nearest to half the arm's length, with all joints at zero."""
+    links = [*(robot.tree.joints[robot.joints[k]].child for k in guided), wrist]
+    origins = np.array([_origin(robot.tree, link) for link in links])
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(origins, axis=0), axis=1))])
-    return int(np.abs(along - along[-1] / 2).argmin())
+    return int(np.abs(along[:-1] - along[-1] / 2).argmin())
 
 
-def _origins(robot: RobotDescription, guided: tuple[int, ...]) -> FloatArray:
-    """Origins (n, 3) of the guided joints' frames [m] with all joints at zero."""
-    root = root_link(robot.tree)
-    origins = []
-    for k in guided:
-        T = np.eye(4)
-        for joint, _ in robot.tree.path(root, robot.tree.joints[robot.joints[k]].child):
-            T = T @ joint.T_parent_joint
-        origins.append(T[:3, 3])
-    return np.array(origins)
+def _origin(tree: UrdfTree, link: str) -> FloatArray:
+    """Place (3,) of a link's frame in the root link with all joints at zero [m]."""
+    T = np.eye(4)
+    for joint, _ in tree.path(root_link(tree), link):
+        T = T @ joint.T_parent_joint
+    return T[:3, 3]

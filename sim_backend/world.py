@@ -59,6 +59,7 @@ class SimWorld:
         self.clock = SimClock(self.now)
         self.stats = WorldStats()
         self._moved = threading.Condition()
+        self._fetching = threading.Lock()
         self._exit = ExitStack()
         self._readings: deque[JointReading] = deque()
         self._frame_times: deque[float] = deque()
@@ -91,7 +92,8 @@ class SimWorld:
         with self._moved:
             self._running = False
             self._moved.notify_all()
-        self._exit.__exit__(kind, error, trace)
+        with self._fetching:  # a reader may still wait for the renderer
+            self._exit.__exit__(kind, error, trace)
 
     def now(self) -> float:
         """Simulated time of the world's front [s]; a frame may be up to two frame intervals older."""
@@ -145,16 +147,17 @@ class SimWorld:
     def next_frame(self, timeout_s: float) -> StereoFrame | None:
         """The next frame; None when none came within `timeout_s`."""
         end = time.monotonic() + timeout_s
-        if not self._take_frames(end):
-            return None
-        images = self._renderer.fetch(self._delivered, end - time.monotonic())
-        if images is None:
-            return None
-        with self._moved:
-            self._delivered += 1
-            t = self._frame_times.popleft()
-            self._moved.notify_all()
-        return _frame(t, images)
+        with self._fetching:
+            if not self._take_frames(end):
+                return None
+            images = self._renderer.fetch(self._delivered, end - time.monotonic())
+            if images is None:
+                return None
+            with self._moved:
+                self._delivered += 1
+                t = self._frame_times.popleft()
+                self._moved.notify_all()
+            return _frame(t, images)
 
     def _take_frames(self, end: float) -> bool:
         """Move on until there are frames for the renderer to work on ahead; False when there is none at all in time."""
