@@ -29,6 +29,7 @@ def record(
 
     from daemon import recordings
     from daemon.bus import client
+    from daemon.commands.learner import Ending
     from daemon.config import Config
     from daemon.recorder import History, copy_history, follow_history
     from daemon.signals import on_termination
@@ -40,25 +41,11 @@ def record(
     with client(config.tables.zenoh.sampler) as bus:
         history = History(bus, config.robot, from_seq)
         if follow:
-            stop = Stop()
-            with on_termination(stop):
+            ending = Ending()
+            with on_termination(ending.begin):
                 console.print(f"writing pairs to {out} as they come; Ctrl-C ends it", markup=False)
-                count = follow_history(history, joints, out, stop.is_set)
+                count = follow_history(history, joints, out, lambda: ending.begun)
         else:
             count = copy_history(history, joints, out)
     last = f", the last has the number {history.next_seq - 1}" if count else "; no file was left"
     console.print(f"{count} pairs written to {out}{last}", markup=False)
-
-
-class Stop:
-    """A plain flag that a signal handler may set."""
-
-    def __init__(self) -> None:
-        self._set = False
-
-    def __call__(self) -> None:
-        self._set = True
-
-    def is_set(self) -> bool:
-        """Whether it was called."""
-        return self._set

@@ -1,0 +1,118 @@
+"""`bodyschema replay`."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import Parameter
+from cyclopts.validators import Number
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from daemon.status import LearnerStatus, SamplerStatus
+
+LINE_EVERY_S = 2.0
+
+
+def replay(
+    recording: Annotated[Path, Parameter(help="A recording (.csv, .parquet).")],
+    /,
+    *,
+    robot: Annotated[Path | None, Parameter(help="robot.toml; else the one beside the recording, or here.")] = None,
+    speed: Annotated[
+        float, Parameter(help="1 as it was recorded, 0 as fast as the sampler takes it.", validator=Number(gte=0))
+    ] = 0.0,
+    any_step: Annotated[
+        bool, Parameter(help="Accept rows whatever their step and speed: single poses far apart.", negative="")
+    ] = False,
+    held_out: Annotated[float, Parameter(help="Share of the rows to leave out and judge by.")] = 0.3,
+    as_json: Annotated[bool, Parameter(name="--json", help="Print the figures as JSON.", negative="")] = False,
+    keep: Annotated[Path | None, Parameter(help="Keep store, checkpoint and logs in this new folder.")] = None,
+) -> None:
+    """Feed a recording through sampler and learner; prints the error before and after on rows left out.
+
+    The two processes run as they do live, on ports and with a store of their own, so a running daemon is not
+    disturbed. Contiguous blocks of rows are held out. "Before" is the nominal model with what robot.toml calls not
+    known fitted to the other rows; "after" is what the learner answers when it has learnt them. Needs robot.toml and
+    nothing else. Next: `bodyschema run` with the real arm.
+    """
+    import tempfile
+
+    from rich.console import Console
+
+    from daemon.config import Config
+    from daemon.evaluate import split_blocks
+    from daemon.replay.report import as_text
+    from daemon.replay.run import Job
+    from daemon.replay.run import replay as run_replay
+    from daemon.replay.steps import Steps, require_path
+    from daemon.wire import encode
+    from interfaces.recording import Recording
+
+    config = Config.load(_robot_file(robot, recording))
+    rows = Recording.read(recording, config.robot.joints)
+    split = split_blocks(len(rows), held_out)
+    any_step |= config.tables.daemon.any_step
+    if not any_step:
+        require_path(Steps.of(rows, config.robot, config.tables.daemon), rows)
+    if keep is not None:
+        _make_folder(keep)
+    with tempfile.TemporaryDirectory(prefix="bodyschema-replay-") as temporary:
+        job = Job(config, rows, split, speed, any_step, keep or Path(temporary))
+        with _progress(Console(stderr=True, highlight=False)) as show:
+            report = run_replay(job, show)
+    sys.stdout.write((encode(report).decode() if as_json else as_text(report)) + "\n")
+
+
+def _robot_file(robot: Path | None, recording: Path) -> Path:
+    if robot is not None:
+        return robot
+    beside = recording.parent / "robot.toml"
+    return beside if beside.exists() else Path("robot.toml")
+
+
+def _make_folder(folder: Path) -> None:
+    from interfaces.errors import RecordingError
+
+    try:
+        folder.mkdir(parents=True)
+    except FileExistsError as error:
+        raise RecordingError("is there already", file=folder, remedy="Give --keep a new folder") from error
+    except OSError as error:
+        raise RecordingError(f"cannot be made: {error.strerror}", file=folder) from error
+
+
+@contextmanager
+def _progress(console: Console) -> Iterator[Callable[[SamplerStatus, LearnerStatus], None]]:
+    """One line that changes on a terminal; elsewhere a line every two seconds."""
+    if console.is_terminal:
+        with console.status("starting sampler and learner") as status:
+            yield lambda sampler, learner: status.update(_line(sampler, learner))
+        return
+    import time
+
+    last = -LINE_EVERY_S
+
+    def show(sampler: SamplerStatus, learner: LearnerStatus) -> None:
+        nonlocal last
+        if time.monotonic() - last >= LINE_EVERY_S:
+            last = time.monotonic()
+            console.print(_line(sampler, learner), soft_wrap=True)
+
+    yield show
+
+
+def _line(sampler: SamplerStatus, learner: LearnerStatus) -> str:
+    from daemon.screen import mm
+
+    error = learner.prequential_m.get(learner.answering)
+    return (
+        f"{sampler.frames} rows fed, {sampler.pairs} pairs accepted, {learner.pairs} learnt, "
+        f"{learner.replayed} replayed, {learner.state} ({learner.answering}), "
+        f"error before learning each {mm(error)}"
+    )

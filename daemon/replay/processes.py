@@ -1,0 +1,88 @@
+"""Sampler and learner as the two processes of a live system, on free ports, fed with a recording."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from daemon.bus import Bus
+from interfaces.errors import BusError
+
+START_LIMIT_S = 60.0
+END_LIMIT_S = 15.0
+
+
+@dataclass(frozen=True, slots=True)
+class Process:
+    """One of the two processes; its output goes into `log`."""
+
+    name: str
+    log: Path
+    popen: subprocess.Popen[bytes]
+
+    def check(self) -> None:
+        """BusError with its last words when it has ended."""
+        code = self.popen.poll()
+        if code is None:
+            return
+        lines = self.log.read_text(errors="replace").strip().splitlines() or ["it said nothing"]
+        raise BusError(f"the {self.name} ended with exit code {code}: {lines[-1].removeprefix('bodyschema: ')}")
+
+    def wait_for(self, endpoint: str) -> None:
+        """Return as soon as it listens on `endpoint`; BusError when it ends before, or does not in time."""
+        limit = time.monotonic() + START_LIMIT_S
+        while True:
+            self.check()
+            try:
+                with Bus(connect=endpoint, client=True):
+                    return
+            except BusError:
+                if time.monotonic() > limit:
+                    raise
+            time.sleep(0.1)
+
+    def end(self) -> None:
+        """Ask it to end; kill it when it does not in time."""
+        if self.popen.poll() is None:
+            self.popen.send_signal(signal.SIGTERM)
+        try:
+            self.popen.wait(END_LIMIT_S)
+        except subprocess.TimeoutExpired:
+            self.popen.kill()
+            self.popen.wait()
+
+
+@contextmanager
+def started(name: str, arguments: list[str], environment: Mapping[str, str], log: Path) -> Iterator[Process]:
+    """`bodyschema NAME ARGUMENTS` from here to the end of the with statement."""
+    command = [sys.executable, "-m", "daemon", name, *arguments]
+    with log.open("wb") as stream:
+        popen = subprocess.Popen(
+            command, stdin=subprocess.DEVNULL, stdout=stream, stderr=stream, env=os.environ | environment
+        )
+        process = Process(name, log, popen)
+        try:
+            yield process
+        finally:
+            process.end()
+
+
+def override(table: str, key: str, value: object) -> dict[str, str]:
+    """One key of robot.toml as an environment variable, which goes before the file."""
+    return {f"BODYSCHEMA_{table}_{key}".upper(): json.dumps(value)}
+
+
+def free_endpoint() -> str:
+    """An endpoint on the loopback that nobody listens on."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"

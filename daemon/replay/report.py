@@ -1,0 +1,113 @@
+"""What a replay found, as JSON and as text."""
+
+from __future__ import annotations
+
+import msgspec
+
+from daemon.evaluate import BLOCKS, ErrorFigures
+from daemon.screen import mm
+
+
+class Figures(msgspec.Struct, frozen=True):
+    """Distances between prediction and measurement on the held-out rows [mm]."""
+
+    mean_mm: float
+    rms_mm: float
+    median_mm: float
+    p95_mm: float
+    max_mm: float
+
+    @classmethod
+    def of(cls, figures: ErrorFigures) -> Figures:
+        """The same in mm."""
+        metres = (figures.mean_m, figures.rms_m, figures.median_m, figures.p95_m, figures.max_m)
+        return cls(*(1e3 * value for value in metres))
+
+
+class ReplayReport(msgspec.Struct, frozen=True, kw_only=True):
+    """What a replay found.
+
+    Attributes:
+        rows: in the recording.
+        held_out: of these, rows that were left out, in `held_out_blocks` of 10 contiguous blocks.
+        accepted: pairs that the sampler made of the others; `rejected` by reason.
+        any_step: whether the sampler's step and speed rules were relaxed.
+        before: best alignment of what robot.toml calls not known, fitted to the rows that were learnt.
+        after: the learner's predictions, asked for over zenoh.
+        fitted: what `before` fitted, in robot.toml's words.
+        answering: the model that answered.
+        prequential_mm: recent mean error on pairs before they were learnt, by model [mm].
+        claimed_mm: mean error to the truth that the learner claims where data is [mm], or null.
+        in_support_share: share of held-out rows that the learner says lie where data was.
+        within_sigma_share: share of held-out coordinates within the 1-sigma claimed for them and the recording's noise.
+        replayed: replay steps of the instant learner.
+        learning_s: time from the first pair to the end of learning [s].
+    """
+
+    recording: str
+    robot: str
+    rows: int
+    held_out: int
+    held_out_blocks: int
+    accepted: int
+    rejected: dict[str, int]
+    any_step: bool
+    steps: str
+    fitted: list[str]
+    before: Figures
+    after: Figures
+    answering: str
+    prequential_mm: dict[str, float]
+    claimed_mm: float | None
+    in_support_share: float
+    within_sigma_share: float
+    doubted: int
+    replayed: int
+    learning_s: float
+    schema: int = 1
+
+
+def as_text(report: ReplayReport) -> str:
+    """The report for a terminal."""
+    rejected = ", ".join(f"{count} {reason}" for reason, count in sorted(report.rejected.items())) or "none"
+    fitted = f"the nominal model with {' and '.join(report.fitted)} fitted" if report.fitted else "the nominal model"
+    lines = [
+        f"{report.rows} rows of {report.recording}; {report.held_out} held out "
+        f"({report.held_out_blocks} of {BLOCKS} contiguous blocks)",
+        f"the sampler accepted {report.accepted} pairs; rejected: {rejected}",
+    ]
+    if report.any_step:
+        lines.append(f"--any-step: the step and speed rules were relaxed; {report.steps}")
+    lines += [
+        "",
+        "error on the held-out rows        mean         RMS      median        95 %",
+        f"before: aligned          {_row(report.before)}",
+        f"after: learnt            {_row(report.after)}",
+        "",
+        f"before is {fitted} to the rows that were learnt; after is what the learner answers (model: "
+        f"{report.answering}). {_verdict(report)}",
+        f"error on new pairs before they were learnt: {_by_model(report.prequential_mm)}",
+        f"the learner claims {mm(_metres(report.claimed_mm))} where data is; its 1-sigma covers "
+        f"{report.within_sigma_share:.0%} of the held-out coordinates (68 % is right); "
+        f"{report.in_support_share:.0%} of the held-out rows lie where data was",
+        f"{report.replayed} replay steps, {report.doubted} pairs doubted, {report.learning_s:.1f} s",
+    ]
+    return "\n".join(lines)
+
+
+def _row(figures: Figures) -> str:
+    columns = (figures.mean_mm, figures.rms_mm, figures.median_mm, figures.p95_mm)
+    return "".join(f"{value:9.3f} mm" for value in columns)
+
+
+def _verdict(report: ReplayReport) -> str:
+    ratio = report.after.mean_mm / report.before.mean_mm
+    return f"Learning {'lowered' if ratio < 1 else 'raised'} the mean error to {ratio:.0%}."
+
+
+def _by_model(errors: dict[str, float]) -> str:
+    return ", ".join(f"{name} {value:.3f} mm" for name, value in errors.items()) or "none"
+
+
+def _metres(value_mm: float | None) -> float | None:
+    return None if value_mm is None else 1e-3 * value_mm

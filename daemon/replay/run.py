@@ -1,0 +1,213 @@
+"""The replay itself: feed, wait until all is learnt, ask for predictions, judge them."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from daemon.bus import Bus, client
+from daemon.config import Config
+from daemon.evaluate import ErrorFigures, Split, aligned_chain, coverage
+from daemon.keys import Keys
+from daemon.status import LearnerStatus, SamplerStatus
+from daemon.wire import JointsRequest, PredictReply, decode, encode
+from interfaces.errors import BusError, RecordingError
+from interfaces.recording import Recording
+from interfaces.records import FloatArray
+
+from .processes import Process, free_endpoint, override, started
+from .report import Figures, ReplayReport
+from .steps import Steps
+
+GLANCE_S = 0.25
+# The learner has settled when nothing of it has changed for so long: it begins idle work after half a second.
+SETTLED_S = 2.0
+STALL_LIMIT_S = 120.0
+BATCH = 2000
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """What to replay.
+
+    Attributes:
+        speed: 1 as recorded, 0 as fast as the sampler takes it.
+        any_step: relax the sampler's step and speed rules.
+        folder: for store, checkpoint, logs and the rows that are learnt.
+    """
+
+    config: Config
+    recording: Recording
+    split: Split
+    speed: float
+    any_step: bool
+    folder: Path
+
+    @property
+    def learnt_rows(self) -> Recording:
+        """The rows that are fed."""
+        return self.recording.rows(~self.split.held_out)
+
+    @property
+    def held_out_rows(self) -> Recording:
+        """The rows that are left out."""
+        return self.recording.rows(self.split.held_out)
+
+
+@dataclass(frozen=True, slots=True)
+class Learnt:
+    """The state of things when all was learnt."""
+
+    sampler: SamplerStatus
+    learner: LearnerStatus
+    seconds: float
+
+
+def replay(job: Job, report: Callable[[SamplerStatus, LearnerStatus], None]) -> ReplayReport:
+    """Replay a recording and judge what was learnt.
+
+    Args:
+        report: called with the state of things about four times a second.
+
+    Raises:
+        EvaluationError: the recording does not determine what robot.toml calls not known.
+        RecordingError: the sampler accepted nothing.
+        BusError: a process ended, or made no progress.
+        RequestError: the learner cannot answer yet.
+    """
+    held_out = job.held_out_rows
+    before = aligned_chain(job.config.robot, job.learnt_rows).positions(held_out.q)
+    with _running(job) as live:
+        learnt = live.until_learnt(report)
+        prediction = live.predictions(held_out.q)
+    return _report(job, before, learnt, prediction)
+
+
+def _report(job: Job, before: FloatArray, learnt: Learnt, prediction: PredictReply) -> ReplayReport:
+    robot, held_out = job.config.robot, job.held_out_rows
+    sampler, learner = learnt.sampler, learnt.learner
+    x, sigma = np.array(prediction.x), np.array(prediction.sigma)
+    noise = 0.0 if held_out.cov is None else np.sqrt(np.diagonal(held_out.cov, axis1=1, axis2=2))
+    claimed = learner.claimed_error_m
+    unknown = (("pose_known = false", robot.camera.pose_known), ("marker_known = false", robot.robot.marker_known))
+    return ReplayReport(
+        recording=str(job.recording.file),
+        robot=robot.name,
+        rows=len(job.recording),
+        held_out=len(held_out),
+        held_out_blocks=job.split.blocks,
+        accepted=sampler.pairs,
+        rejected=sampler.rejected,
+        any_step=job.any_step,
+        steps=str(Steps.of(job.recording, robot, job.config.tables.daemon)),
+        fitted=[name for name, known in unknown if not known],
+        before=Figures.of(ErrorFigures.of(before, held_out.x)),
+        after=Figures.of(ErrorFigures.of(x, held_out.x)),
+        answering=learner.answering,
+        prequential_mm={name: 1e3 * error for name, error in learner.prequential_m.items()},
+        claimed_mm=None if claimed is None else 1e3 * claimed,
+        in_support_share=float(np.mean(prediction.in_support)),
+        within_sigma_share=coverage(x, held_out.x, sigma, noise),
+        doubted=learner.doubted,
+        replayed=learner.replayed,
+        learning_s=learnt.seconds,
+    )
+
+
+class _Live:
+    def __init__(self, job: Job, sampler: tuple[Process, Bus], learner: tuple[Process, Bus]) -> None:
+        self._keys = Keys(job.config.robot.name)
+        (self._sampler, self._sampler_bus), (self._learner, self._learner_bus) = sampler, learner
+        self._recording = job.recording
+        pauses_s = np.diff(job.learnt_rows.play_times) / job.speed if job.speed else np.zeros(1)
+        self._stall_limit_s = STALL_LIMIT_S + float(pauses_s.max(initial=0.0))
+
+    def until_learnt(self, report: Callable[[SamplerStatus, LearnerStatus], None]) -> Learnt:
+        """Wait until the recording is through, every pair is learnt, and the learner has come to rest."""
+        begin = changed = time.monotonic()
+        last: tuple[object, ...] = ()
+        while True:
+            sampler, learner = self._status()
+            report(sampler, learner)
+            now, state = time.monotonic(), (sampler.frames, learner.pairs, learner.replayed, learner.model)
+            if state != last:
+                last, changed = state, now
+            through = sampler.state == "ended"
+            if through and not sampler.pairs:
+                raise RecordingError(
+                    f"the sampler accepted none of the rows: {_counted(sampler.rejected)}",
+                    file=self._recording.file or "recording",
+                    remedy="--any-step relaxes its step and speed rules",
+                )
+            if through and learner.pairs + learner.refused >= sampler.pairs and now - changed > SETTLED_S:
+                return Learnt(sampler, learner, changed - begin)
+            if now - changed > self._stall_limit_s:
+                raise BusError(f"no progress for {self._stall_limit_s:.0f} s; --keep DIR keeps the logs that say why")
+            time.sleep(GLANCE_S)
+
+    def predictions(self, q: FloatArray) -> PredictReply:
+        """The learner's predictions for q (n, d), in batches."""
+        replies = [
+            decode(
+                self._learner_bus.ask_one(
+                    self._keys.predict, encode(JointsRequest(q[begin : begin + BATCH].tolist())), timeout_s=30.0
+                ),
+                PredictReply,
+            )
+            for begin in range(0, len(q), BATCH)
+        ]
+        return PredictReply(
+            x=[row for reply in replies for row in reply.x],
+            sigma=[row for reply in replies for row in reply.sigma],
+            in_support=[row for reply in replies for row in reply.in_support],
+            model=replies[-1].model,
+            pairs=replies[-1].pairs,
+            age_s=replies[-1].age_s,
+        )
+
+    def _status(self) -> tuple[SamplerStatus, LearnerStatus]:
+        self._sampler.check()
+        self._learner.check()
+        sampler = self._sampler_bus.ask_one(self._keys.status("sampler"), timeout_s=30.0)
+        learner = self._learner_bus.ask_one(self._keys.status("learner"), timeout_s=30.0)
+        return decode(sampler, SamplerStatus), decode(learner, LearnerStatus)
+
+
+@contextmanager
+def _running(job: Job) -> Iterator[_Live]:
+    """Both processes; the learner is there before the first pair, as in a live system."""
+    fed = job.folder / "learnt_rows.csv"
+    job.learnt_rows.write_csv(fed)
+    sampler_endpoint, learner_endpoint = free_endpoint(), free_endpoint()
+    environment = {
+        **override("zenoh", "sampler", sampler_endpoint),
+        **override("zenoh", "learner", learner_endpoint),
+        **override("drivers", "recording", str(fed.resolve())),
+        **override("drivers", "speed", float(job.speed)),
+        **override("daemon", "any_step", job.any_step),
+    }
+    arguments = ["--robot", os.fspath(job.config.file), "--state-dir", os.fspath(job.folder)]
+    with (
+        started("learner", arguments, environment, job.folder / "learner.log") as learner,
+        _connected(learner, learner_endpoint) as learner_bus,
+        started("sampler", arguments, environment, job.folder / "sampler.log") as sampler,
+        _connected(sampler, sampler_endpoint) as sampler_bus,
+    ):
+        yield _Live(job, (sampler, sampler_bus), (learner, learner_bus))
+
+
+@contextmanager
+def _connected(process: Process, endpoint: str) -> Iterator[Bus]:
+    process.wait_for(endpoint)
+    with client(endpoint) as bus:
+        yield bus
+
+
+def _counted(rejected: dict[str, int]) -> str:
+    return ", ".join(f"{count} {reason}" for reason, count in sorted(rejected.items())) or "there were none"
