@@ -103,9 +103,9 @@ class KBMap:
             ShapeError, NonFiniteError
         """
         checked = rows_or_vector("q", q, self.joints)
-        batch = np.atleast_2d(checked)
-        jacobian = np.concatenate([self._jacobian(chunk) for chunk in _chunks(batch)])
-        return jacobian[0] if checked.ndim == 1 else jacobian
+        if checked.ndim == 1:
+            return self._jacobian(checked)
+        return np.concatenate([self._jacobian(chunk) for chunk in _chunks(checked)])
 
     def weights(self, q: ArrayLike) -> FloatArray:
         """The full weight vector (3^d,) for q (d,), or (n, 3^d): the Kronecker product over the joints.
@@ -177,19 +177,22 @@ class KBMap:
         return out
 
     def _jacobian(self, q: FloatArray) -> FloatArray:
-        stack = self._stack
+        """Derivative (..., 3, d) for q (..., d)."""
+        stack, lead = self._stack, q.shape[:-1]
         weights, slopes = stack.joint_weights(q), stack.joint_derivatives(q)
         planes = self._planes[: POSITION_OUTPUTS * stack.left_size]
-        by_left = (stack.right(weights) @ planes.T).reshape(len(q), POSITION_OUTPUTS, stack.left_size)
         cube = planes.reshape(POSITION_OUTPUTS, stack.left_size, stack.right_size)
-        by_right = np.einsum("nl,olr->nor", stack.left(weights), cube, optimize=True)
-        columns = np.empty((len(q), POSITION_OUTPUTS, self.joints))
+        by_left = (stack.right(weights) @ planes.T).reshape(*lead, POSITION_OUTPUTS, stack.left_size)
+        by_right = stack.left(weights) @ cube.swapaxes(0, 1).reshape(stack.left_size, -1)
+        by_right = by_right.reshape(*lead, POSITION_OUTPUTS, stack.right_size)
+        columns = np.empty((*lead, POSITION_OUTPUTS, self.joints))
         for k in range(self.joints):
             varied = weights.copy()
-            varied[:, k] = slopes[:, k]
-            in_left = k < stack.split
-            half, partial = (stack.left(varied), by_left) if in_left else (stack.right(varied), by_right)
-            columns[:, :, k] = (partial @ half[:, :, None])[:, :, 0]
+            varied[..., k, :] = slopes[..., k, :]
+            if k < stack.split:
+                columns[..., k] = (by_left @ stack.left(varied)[..., None])[..., 0]
+            else:
+                columns[..., k] = (by_right @ stack.right(varied)[..., None])[..., 0]
         return columns
 
 

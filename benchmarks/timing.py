@@ -1,0 +1,23 @@
+"""Comparing costs on a machine that others use too: rivals take turns, medians are compared."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Callable, Mapping
+
+
+def interleaved_medians_us(
+    rivals: Mapping[str, Callable[[], object]], *, rounds: int = 40, calls: int = 200
+) -> dict[str, float]:
+    """Median over rounds of the mean time of a call [us]. Each round times every rival, so all meet the same load."""
+    times: dict[str, list[float]] = {name: [] for name in rivals}
+    for call in rivals.values():
+        call()
+    for _ in range(rounds):
+        for name, call in rivals.items():
+            begin = time.perf_counter()
+            for _ in range(calls):
+                call()
+            times[name].append((time.perf_counter() - begin) / calls * 1e6)
+    return {name: statistics.median(samples) for name, samples in times.items()}
