@@ -25,6 +25,7 @@ def demo(
     """
     from rich.console import Console
 
+    from daemon import recordings
     from daemon.demo.play import play
     from daemon.demo.plot import plot_curve, write_curve
     from daemon.demo.scene import prepare
@@ -38,5 +39,5 @@ def demo(
         outcome = play(scene, first=pairs, second=pairs_after, seed=seed, show=show)
     write_curve(outcome.rows, scene.curve_file)
     plot_curve(outcome.rows, outcome.first_tool.pairs, scene.plot_file)
-    export_recording(scene)
+    recordings.write(recordings.from_store(scene.store_file), scene.recording_file)
     show_outcome(console, outcome, scene)

@@ -10,7 +10,8 @@ from pathlib import Path
 from daemon.wiring import demonstration_model
 from interfaces.errors import ConfigError
 
-OURS = ("robot.toml", "recording.csv", "learning_curve.csv", "learning_curve.png", "daemon.log", "state")
+STATE = "state"
+OURS = ("robot.toml", "recording.csv", "learning_curve.csv", "learning_curve.png", "daemon.log", STATE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,6 +29,11 @@ class Scene:
     def log_file(self) -> Path:
         """What the two processes logged."""
         return self.folder / "daemon.log"
+
+    @property
+    def store_file(self) -> Path:
+        """The sampler's pairs."""
+        return self.folder / STATE / "pairs.sqlite"
 
     @property
     def recording_file(self) -> Path:
@@ -80,7 +86,7 @@ sampler = "tcp/127.0.0.1:{sampler}"
 learner = "tcp/127.0.0.1:{learner}"
 
 [daemon]
-state_dir = "state"
+state_dir = "{STATE}"
 
 [sim]
 seed = {seed}
