@@ -59,6 +59,11 @@ class JointBuffer:
             self._expecting = False
             self._changed.notify_all()
 
+    def forget_before(self, t: float) -> None:
+        """No frame before `t` will be asked for: keep only the last reading at or before it, and what follows."""
+        with self._changed:
+            self._forget_before(t)
+
     def make_room(self) -> None:
         """Forget the older half of a full buffer: no frame has come for so long that none will ask for it."""
         with self._changed:
@@ -80,6 +85,7 @@ class JointBuffer:
         Waits up to `timeout_s` for a reading at or after `t`. NO_JOINTS when there is none on one side of `t`,
         STALE when the two are farther apart than `max_gap_s`.
         """
+        self.forget_before(t)
         with self._changed:
             self._changed.wait_for(lambda: not self._expecting or self._reaches(t), timeout_s)
             self._forget_before(t)

@@ -234,6 +234,10 @@ class PairStore:
     def _begin_session(self, connection: sqlite3.Connection) -> int:
         session = self._session
         with _transaction(connection):
+            # A sampler that is started again and again without seeing a pair must not fill the disk.
+            connection.execute(
+                "DELETE FROM sessions WHERE id > coalesce((SELECT session FROM pairs ORDER BY seq DESC LIMIT 1), 0)"
+            )
             done = connection.execute(
                 "INSERT INTO sessions (started_utc, robot_toml, urdf, config, version, host) VALUES (?, ?, ?, ?, ?, ?)",
                 (session.started_utc, session.robot_toml, session.urdf, session.config, session.version, session.host),
@@ -341,7 +345,7 @@ def _explanation(file: Path, error: sqlite3.Error) -> str:
     return f"{file}: {error} ({name or type(error).__name__}). Check the disk"
 
 
-def _unwritable(file: Path, number: int | None, what: str) -> str:
+def _unwritable(file: Path, number: int | None, what: str | None) -> str:
     if number == errno.ENOSPC:
         return f"the disk of {file} is full. Free some space, or give a --state-dir on another disk. {NOTHING_CHANGED}"
     why = "the disk is read-only" if number == errno.EROFS else what

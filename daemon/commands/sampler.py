@@ -1,0 +1,46 @@
+"""`bodyschema sampler`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+
+def sampler(
+    *,
+    robot: Annotated[Path, Parameter(env_var="BODYSCHEMA_ROBOT", help="The robot's description.")] = Path("robot.toml"),
+    sim: Annotated[bool, Parameter(negative="", help="The simulated robot in the place of the hardware.")] = False,
+    state_dir: Annotated[Path | None, Parameter(help="Where the store lives; else as robot.toml says.")] = None,
+    exit_at_end: Annotated[bool, Parameter(negative="", help="End when a recording is through.")] = False,
+    verbose: Annotated[bool, Parameter(negative="", help="Log more.")] = False,
+) -> None:
+    """Turn encoder readings and camera frames into pairs, keep and publish them. Ends with SIGTERM or Ctrl-C.
+
+    Needs robot.toml (`bodyschema config init`), and --sim or a recording named in its table [drivers]. The store takes
+    each pair before it is published; when it cannot (the disk is full), the sampler ends with exit code 1 and nothing
+    is lost. Next: `bodyschema learner`, `bodyschema status --watch`.
+    """
+    from daemon import logs
+    from daemon.bus import Bus
+    from daemon.config import Config
+    from daemon.sampler import Sampler
+    from daemon.session import session_of
+    from daemon.signals import on_termination
+    from daemon.store import PairStore
+    from daemon.wiring import open_sources
+    from interfaces.clock import SystemClock
+
+    logs.set_up(verbose=verbose)
+    config = Config.load(robot)
+    if state_dir is not None:
+        config = config.with_state_dir(state_dir)
+    with (
+        PairStore(config.store_file, session_of(config, SystemClock())) as store,
+        open_sources(config, sim=sim) as sources,
+        Bus(listen=config.tables.zenoh.sampler) as bus,
+    ):
+        process = Sampler(config, sources, bus, store, exit_at_end=exit_at_end)
+        with on_termination(process.stop):
+            process.run()

@@ -1,0 +1,96 @@
+"""Sources that are opened again after their device went away."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from types import TracebackType
+from typing import Generic, Protocol, Self, TypeVar
+
+from interfaces.errors import SourceError, SourceLost
+from interfaces.protocols import Clock, Source
+
+log = logging.getLogger(__name__)
+
+FIRST_WAIT_S = 0.5
+LONGEST_WAIT_S = 30.0
+
+R_co = TypeVar("R_co", covariant=True)
+
+
+class Readable(Source, Protocol[R_co]):
+    """A source of whatever kind."""
+
+    def read(self, timeout_s: float) -> R_co | None: ...
+
+
+class Reopening(Generic[R_co]):
+    """Reads a source; when it is lost says so once, and tries to open it again, less and less often.
+
+    The first opening has to succeed: what fails at the start needs a person.
+
+    Attributes:
+        trouble: what is wrong with the source, or None.
+        losses: how often it was lost.
+    """
+
+    def __init__(
+        self, source: Readable[R_co], name: str, wall: Clock, sleep: Callable[[float], None] = time.sleep
+    ) -> None:
+        """Nothing is opened yet.
+
+        Args:
+            name: what messages call the source.
+            wall: the clock for the waiting times.
+        """
+        self._source, self._name, self._wall, self._sleep = source, name, wall, sleep
+        self._opened = ExitStack()
+        self._wait_s = FIRST_WAIT_S
+        self._next_try = 0.0
+        self.trouble: str | None = None
+        self.losses = 0
+
+    def __enter__(self) -> Self:
+        self._opened.enter_context(self._source)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._opened.close()
+
+    def read(self, timeout_s: float) -> R_co | None:
+        """As the source's `read`; None also while the source is lost."""
+        if self.trouble is not None and not self._try_again(timeout_s):
+            return None
+        try:
+            return self._source.read(timeout_s)
+        except SourceLost as error:
+            self._opened.close()
+            self.losses += 1
+            self._wait_s = FIRST_WAIT_S
+            self._lost(error)
+            return None
+
+    def _try_again(self, timeout_s: float) -> bool:
+        left = self._next_try - self._wall.now()
+        if left > 0:
+            self._sleep(min(left, timeout_s))
+            return False
+        try:
+            self._opened.enter_context(self._source)
+        except SourceError as error:
+            self._wait_s = min(2 * self._wait_s, LONGEST_WAIT_S)
+            self._lost(error)
+            return False
+        log.info("%s are back", self._name)
+        self.trouble = None
+        return True
+
+    def _lost(self, error: SourceError) -> None:
+        if self.trouble is None:
+            log.warning("%s are lost: %s; trying to open them again", self._name, error)
+        self.trouble = f"{self._name} are lost ({error}); trying to open them again"
+        self._next_try = self._wall.now() + self._wait_s

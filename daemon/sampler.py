@@ -1,0 +1,295 @@
+"""The sampler: marker fixes and joint readings in, pairs into the store and onto zenoh."""
+
+from __future__ import annotations
+
+import logging
+import shutil
+import threading
+import time
+from contextlib import ExitStack
+from importlib.metadata import version
+
+import numpy as np
+
+from interfaces.clock import SystemClock
+from interfaces.errors import ConfigError, RequestError, SourceEnded, StoreError
+from interfaces.protocols import Clock
+from interfaces.records import FloatArray, JointReading, MarkerFix, MarkerMiss, Pair, Reason
+
+from .align import JointBuffer
+from .bus import Bus, Request
+from .config import Config
+from .gate import Accepted, Gate
+from .history import answer_pairs
+from .keys import Keys
+from .reopen import Reopening
+from .simulation import answer_simulation
+from .sources import Sources
+from .status import SamplerStatus
+from .store import PairStore
+from .tally import Tally
+from .wire import CommandReply, CommandRequest, decode, encode, pair_to_wire
+
+log = logging.getLogger(__name__)
+
+READ_TIMEOUT_S = 0.2
+JOINTS_TIMEOUT_S = 1.0  # how long a frame waits for the encoders to reach its time
+STATUS_EVERY_S = 1.0
+SILENT_AFTER_S = 2.0  # a source that has said nothing for so long is reported
+PAIR_CACHE = 1000
+LOW_DISK_BYTES = 200 * 2**20
+
+
+class Sampler:
+    """Turns measurements into pairs: aligned in time, gated, committed to the store, and only then published.
+
+    One thread reads the encoders, the thread that calls `run` does the rest, and zenoh's threads answer queries.
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        sources: Sources,
+        bus: Bus,
+        store: PairStore,
+        *,
+        exit_at_end: bool = False,
+        wall: Clock | None = None,
+    ) -> None:
+        """A sampler over an open bus and an open store; the sources are opened by `run`.
+
+        Args:
+            exit_at_end: return from `run` when the sources are through, instead of going on to serve the history.
+            wall: the machine's clock, for rates and UTC; all other times are the sources'.
+
+        Raises:
+            ConfigError: the encoders' joints are not robot.toml's.
+        """
+        if sources.joints.joints != config.robot.joints:
+            raise ConfigError(
+                f"the encoders give the joints {', '.join(sources.joints.joints)}, [robot] joints are "
+                f"{', '.join(config.robot.joints)}",
+                file=config.file,
+                remedy="Make both the same, in the same order",
+            )
+        self._config, self._bus, self._store, self._exit_at_end = config, bus, store, exit_at_end
+        self._wall = SystemClock() if wall is None else wall
+        self._keys = Keys(config.robot.name)
+        self._simulation, self._source_clock = sources.simulation, sources.clock
+        self._joints = Reopening(sources.joints, "the encoders", self._wall)
+        self._marker = Reopening(sources.marker, "the cameras", self._wall)
+        rules, prismatic = config.tables.daemon, config.robot.chain.prismatic
+        self._buffer = JointBuffer(prismatic, rules.max_reading_gap_s)
+        self._gate = Gate(rules, prismatic, store.last())
+        self._tally = Tally(config.robot, self._wall, store.reader.joint_ranges())
+        self._seq = store.reader.last_seq()
+        self._publish = bus.publisher(self._keys.pair, cache=PAIR_CACHE)
+        self._publish_status = bus.publisher(self._keys.status("sampler"))
+        self._stopping = False
+        self._paused = False
+        self._ended = False
+        self._failure: Exception | None = None
+        self._bad_readings = 0
+        self._losses = 0
+        self._last_reading = self._last_frame = self._next_status = self._wall.now()
+
+    def stop(self) -> None:
+        """Let `run` come to its end. Only sets a flag: a signal handler may call it."""
+        self._stopping = True
+
+    def run(self) -> None:
+        """Sample until `stop`, or with `exit_at_end` until the sources are through.
+
+        Raises:
+            StoreError: a pair could not be stored; it was not published either, and none came after it.
+            SourceError: a source could not be opened at the start.
+        """
+        with ExitStack() as stack:
+            stack.enter_context(self._joints)
+            stack.enter_context(self._marker)
+            reader = threading.Thread(target=self._read_encoders, name="encoders")
+            reader.start()
+            stack.callback(reader.join)
+            stack.callback(self._buffer.close)
+            stack.callback(self.stop)
+            self._serve()
+            try:
+                self._sample()
+                self._serve_history()
+            except Exception as error:
+                self._failure = error
+                self._tell()
+                raise
+
+    def status(self) -> SamplerStatus:
+        """What the sampler says of itself; from any thread."""
+        tally = self._tally
+        return SamplerStatus(
+            robot=self._config.robot.name,
+            store=self._store.identity,
+            state=self._state(),
+            pairs=self._seq,
+            segment=self._gate.segment,
+            uptime_s=tally.uptime_s,
+            frames=tally.frames,
+            frames_per_s=tally.frames_per_s,
+            readings_per_s=tally.readings_per_s,
+            pairs_per_s=tally.pairs_per_s,
+            rejected=tally.rejected,
+            coverage=tally.coverage,
+            disk_free_bytes=self._disk_free(),
+            health=self._health(),
+            version=version("bodyschema"),
+        )
+
+    def _serve(self) -> None:
+        bus, keys = self._bus, self._keys
+        bus.answer(keys.pairs, lambda request: answer_pairs(self._store.reader, request))
+        bus.answer(keys.status("sampler"), lambda request: encode(self.status(), request.encoding))
+        bus.answer(keys.command("sampler"), self._obey)
+        if self._simulation is not None:
+            world, clock = self._simulation, self._source_clock
+            bus.answer(keys.simulation, lambda request: answer_simulation(world, clock, request))
+        bus.token(keys.alive("sampler"))
+
+    def _sample(self) -> None:
+        while not self._stopping:
+            self._tell_when_due()
+            try:
+                seen = self._marker.read(READ_TIMEOUT_S)
+            except SourceEnded:
+                break
+            self._check_encoders()
+            if seen is None:
+                self._buffer.make_room()
+                continue
+            self._last_frame = self._wall.now()
+            self._tally.frames += 1
+            reason = self._take(seen)
+            if reason is not None:
+                self._tally.reject(reason)
+
+    def _serve_history(self) -> None:
+        self._check_encoders()
+        if self._stopping:
+            return
+        self._ended = True
+        log.info("the sources are through; %d pairs are in the store", self._seq)
+        self._tell()
+        while not (self._stopping or self._exit_at_end):
+            time.sleep(READ_TIMEOUT_S)
+            self._tell_when_due()
+
+    def _take(self, seen: MarkerFix | MarkerMiss) -> Reason | None:
+        """Make a pair of what was seen, or say why it is none."""
+        self._buffer.forget_before(seen.t)
+        if self._paused:
+            self._gate.break_segment()
+            return Reason.PAUSED
+        if isinstance(seen, MarkerMiss):
+            return seen.reason
+        q = self._buffer.at(seen.t, JOINTS_TIMEOUT_S)
+        if isinstance(q, Reason):
+            return q
+        verdict = self._gate.offer(seen.t, q, seen.x)
+        if isinstance(verdict, Reason):
+            return verdict
+        self._accept(verdict, q, seen)
+        return None
+
+    def _accept(self, verdict: Accepted, q: FloatArray, fix: MarkerFix) -> None:
+        pair: Pair = self._store.append(verdict.segment, self._wall.utc(), q, fix)
+        self._seq = pair.seq
+        self._tally.accept(q)
+        self._publish(encode(pair_to_wire(pair)))
+
+    def _check_encoders(self) -> None:
+        if self._failure is not None:
+            raise self._failure
+        losses = self._joints.losses + self._marker.losses
+        if losses != self._losses:
+            self._losses = losses
+            self._gate.break_segment()
+
+    def _read_encoders(self) -> None:
+        try:
+            while not self._stopping:
+                reading = self._joints.read(READ_TIMEOUT_S)
+                if reading is not None:
+                    self._take_reading(reading)
+                elif self._joints.trouble is not None:
+                    self._buffer.silence()
+        except SourceEnded:
+            self._buffer.silence()
+        except Exception as error:
+            log.exception("the encoders' thread failed")
+            self._failure = error
+            self._buffer.close()
+
+    def _take_reading(self, reading: JointReading) -> None:
+        self._last_reading = self._wall.now()
+        self._tally.readings += 1
+        if np.isfinite(reading.q).all():
+            self._buffer.put(reading)
+            return
+        self._bad_readings += 1
+        if self._bad_readings == 1:
+            joint = self._config.robot.joints[int(np.argmin(np.isfinite(reading.q)))]
+            log.warning("the encoder of joint %r gave a number that is not finite; such readings are not used", joint)
+
+    def _obey(self, request: Request) -> bytes:
+        command = decode(request.payload, CommandRequest, request.encoding).command
+        if command not in ("pause", "resume"):
+            raise RequestError(
+                f"the sampler knows pause and resume, not {command}. Send it to {self._keys.command('learner')}"
+            )
+        self._paused = command == "pause"
+        message = "no pairs are accepted until resume" if self._paused else "pairs are accepted, in a new segment"
+        log.info("%s: %s", command, message)
+        return encode(CommandReply(command, message), request.encoding)
+
+    def _tell_when_due(self) -> None:
+        self._tally.tick()
+        if self._wall.now() >= self._next_status:
+            self._tell()
+
+    def _tell(self) -> None:
+        self._next_status = self._wall.now() + STATUS_EVERY_S
+        self._publish_status(encode(self.status()))
+
+    def _state(self) -> str:
+        if self._failure is not None:
+            return "failed"
+        if self._ended:
+            return "ended"
+        return "paused" if self._paused else "running"
+
+    def _health(self) -> list[str]:
+        said: list[str] = [trouble for trouble in (self._joints.trouble, self._marker.trouble) if trouble]
+        if self._failure is not None:
+            said.append(str(self._failure))
+        elif not self._ended:
+            said += self._silences()
+        if self._bad_readings:
+            said.append(f"{self._bad_readings} encoder readings were not finite and were not used")
+        if self._disk_free() < LOW_DISK_BYTES:
+            said.append(f"the disk of {self._store.file} is nearly full")
+        return said
+
+    def _silences(self) -> list[str]:
+        now = self._wall.now()
+        silent = (
+            ("encoders", self._joints.trouble, self._last_reading),
+            ("cameras", self._marker.trouble, self._last_frame),
+        )
+        return [
+            f"the {name} have said nothing for {now - since:.0f} s"
+            for name, trouble, since in silent
+            if trouble is None and now - since > SILENT_AFTER_S
+        ]
+
+    def _disk_free(self) -> int:
+        try:
+            return shutil.disk_usage(self._store.file.parent).free
+        except OSError as error:
+            raise StoreError(f"the directory of {self._store.file} is gone: {error.strerror}") from error

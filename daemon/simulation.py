@@ -1,0 +1,57 @@
+"""The simulated world, answered over zenoh: its truth for judges, and its tool for whoever plays the user."""
+
+from __future__ import annotations
+
+import math
+
+import msgspec
+
+from interfaces.errors import RequestError
+from interfaces.protocols import Clock
+
+from .bus import Request
+from .sources import Simulation
+from .wire import SCHEMA, CommandReply, decode, encode
+
+# Farther than this from the hand is a mistake of units, not a tool.
+LONGEST_TOOL_M = 2.0
+
+
+class ToolRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """`{"tool": [x, y, z]}`: the marker of the new tool in the marker link [m]."""
+
+    tool: tuple[float, float, float]
+
+
+class TruthReply(msgspec.Struct, frozen=True):
+    """The true chain from measurement frame to marker, as `kbmaps.RigidChain`.
+
+    Attributes:
+        fixed: shape (d + 1, 4, 4).
+        axes: shape (d, 3).
+        prismatic: shape (d,).
+        t: simulated time [s].
+    """
+
+    fixed: list[list[list[float]]]
+    axes: list[list[float]]
+    prismatic: list[bool]
+    t: float
+    schema: int = SCHEMA
+
+
+def answer_simulation(world: Simulation, clock: Clock, request: Request) -> bytes:
+    """The truth to an empty request; another tool in the hand to a `ToolRequest`.
+
+    Raises:
+        RequestError: the tool is not three finite numbers, or is farther away than any tool is.
+    """
+    if not request.payload:
+        chain = world.true_chain()
+        truth = TruthReply(chain.fixed.tolist(), chain.axes.tolist(), chain.prismatic.tolist(), clock.now())
+        return encode(truth, request.encoding)
+    tool = decode(request.payload, ToolRequest, request.encoding).tool
+    if not math.dist(tool, (0.0, 0.0, 0.0)) <= LONGEST_TOOL_M:
+        raise RequestError(f"a tool at {list(tool)} m is not within {LONGEST_TOOL_M} m of the hand; units are metres")
+    changed_at = world.change_tool(tool)
+    return encode(CommandReply("tool", f"the tool in the hand changed at t = {changed_at:.3f} s"), request.encoding)

@@ -1,0 +1,76 @@
+"""The one place that chooses hardware, a recording or the simulation."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib.util import find_spec
+from pathlib import Path
+
+from interfaces.clock import SystemClock
+from interfaces.errors import ConfigError
+
+from .config import Config
+from .sources import Sources
+
+
+@contextmanager
+def open_sources(config: Config, *, sim: bool) -> Iterator[Sources]:
+    """The sources that robot.toml asks for; with `sim`, the simulation in their place.
+
+    Raises:
+        ConfigError: no driver is configured, or the simulation cannot be made of this description.
+        RecordingError: the configured recording cannot be read.
+    """
+    if sim:
+        with _simulated(config) as sources:
+            yield sources
+    elif config.tables.drivers.recording is not None:
+        yield _recorded(config, config.file.parent / config.tables.drivers.recording)
+    else:
+        raise ConfigError(
+            "no driver is configured",
+            file=config.file,
+            remedy="Give --sim for the simulated robot, or name a recording as recording in the table [drivers]",
+        )
+
+
+def require_simulation() -> None:
+    """ConfigError with the command to type when the simulation's packages are not installed."""
+    if find_spec("pybullet") is None:
+        raise ConfigError(
+            "the simulation needs pybullet, which is not installed", remedy="Type: pip install 'bodyschema[sim]'"
+        )
+
+
+def demonstration_model() -> Path:
+    """The robot.toml of the humanoid upper body that ships with the simulation, its URDF beside it."""
+    from sim_backend.models import model_file
+
+    return model_file("upper_body")
+
+
+@contextmanager
+def _simulated(config: Config) -> Iterator[Sources]:
+    require_simulation()
+    from sim_backend import SimWorld
+    from vision.tracked_camera import TrackedCamera
+    from vision.tracker import StereoTracker
+
+    with SimWorld(config.robot, config.tables.sim) as world:
+        marker = TrackedCamera(world.camera, StereoTracker(world.camera.calibration, config.tables.vision))
+        yield Sources(world.joints, marker, world.clock, world)
+
+
+def _recorded(config: Config, file: Path) -> Sources:
+    from drivers.replay import Replay
+    from interfaces.recording import Recording
+
+    drivers = config.tables.drivers
+    replay = Replay(
+        Recording.read(file, config.robot.joints),
+        speed=drivers.speed,
+        sigma_m=drivers.recording_sigma_m,
+        calibration=config.robot.calibration,
+    )
+    return Sources(replay.joints, replay.marker, SystemClock())
