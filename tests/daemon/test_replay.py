@@ -1,0 +1,146 @@
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from small_arm import JOINTS, write_small_arm
+
+from daemon.cli import app
+from daemon.config import DaemonConfig
+from daemon.evaluate import EvaluationError
+from daemon.replay.steps import Steps, require_path
+from interfaces.errors import ConfigError, RecordingError
+from interfaces.recording import Recording
+from interfaces.robot import RobotDescription
+
+REAL_DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
+
+
+@pytest.fixture
+def robot(tmp_path: Path) -> Path:
+    return write_small_arm(tmp_path)
+
+
+def guided(robot: Path, rows: int = 240) -> Recording:
+    """A walk of 2° steps of an arm whose joints and tool are a little off."""
+    rng = np.random.default_rng(11)
+    angle = np.cumsum(rng.normal(scale=0.2, size=rows))
+    q = np.cumsum(np.deg2rad(2.0) * np.column_stack([np.cos(angle), np.sin(angle)]), axis=0) * 0.9
+    truth = RobotDescription.load(robot).chain.with_tool([0.02, -0.01, 0.03])
+    x = truth.positions(q + np.array([0.03, -0.02])) + rng.normal(scale=1e-4, size=(rows, 3))
+    return Recording(JOINTS, q, x, t=np.arange(rows) * 0.1, cov=np.broadcast_to(np.eye(3) * 1e-8, (rows, 3, 3)))
+
+
+def poses(rows: int = 40) -> Recording:
+    rng = np.random.default_rng(3)
+    return Recording(JOINTS, rng.uniform(-1.5, 1.5, size=(rows, 2)), rng.normal(size=(rows, 3)))
+
+
+def replay(*arguments: object) -> None:
+    app(["replay", *map(str, arguments)], result_action="return_value")
+
+
+def command_line(*arguments: object) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "daemon", "replay", *map(str, arguments)]
+    environment = os.environ | {"OPENBLAS_NUM_THREADS": "1"}
+    return subprocess.run(command, capture_output=True, text=True, timeout=100, check=False, env=environment)
+
+
+def test_a_guided_path_is_one() -> None:
+    q = np.deg2rad(np.arange(20.0) * 2)[:, None] * [1, 0]
+    recording = Recording(JOINTS, q, np.zeros((20, 3)))
+    steps = Steps(count=19, too_far=0, median_deg=2.0, max_step_deg=3.0)
+    assert steps.is_path
+    require_path(steps, recording)
+
+
+def test_single_poses_ask_for_any_step(robot: Path) -> None:
+    recording = poses()
+    steps = Steps.of(recording, RobotDescription.load(robot), DaemonConfig())
+    with pytest.raises(RecordingError, match=r"single poses.*--any-step"):
+        require_path(steps, recording)
+
+
+def test_steps_count_the_shorter_way_round(robot: Path) -> None:
+    q = np.array([[3.13, 0.0], [-3.13, 0.0]])
+    steps = Steps.of(Recording(JOINTS, q, np.zeros((2, 3))), RobotDescription.load(robot), DaemonConfig())
+    assert steps.median_deg == pytest.approx(np.rad2deg(2 * np.pi - 6.26))
+
+
+def test_single_poses_are_refused_before_anything_starts(tmp_path: Path, robot: Path) -> None:
+    poses().write_csv(tmp_path / "a.csv")
+    with pytest.raises(RecordingError, match="--any-step"):
+        replay(tmp_path / "a.csv", "--keep", tmp_path / "kept")
+    assert not (tmp_path / "kept").exists()
+
+
+def test_a_share_that_leaves_nothing_is_refused(tmp_path: Path, robot: Path) -> None:
+    poses().write_csv(tmp_path / "a.csv")
+    with pytest.raises(EvaluationError, match="between 0 and 1"):
+        replay(tmp_path / "a.csv", "--held-out", 1.5)
+
+
+def test_a_folder_to_keep_is_never_overwritten(tmp_path: Path, robot: Path) -> None:
+    guided(robot).write_csv(tmp_path / "a.csv")
+    with pytest.raises(RecordingError, match="new folder"):
+        replay(tmp_path / "a.csv", "--keep", tmp_path)
+
+
+def test_without_robot_toml_the_remedy_is_named(tmp_path: Path) -> None:
+    poses().write_csv(tmp_path / "a.csv")
+    with pytest.raises(ConfigError, match="config init"):
+        replay(tmp_path / "a.csv", "--robot", tmp_path / "robot.toml")
+
+
+def test_an_unreadable_recording_ends_with_exit_code_1_and_one_line(tmp_path: Path, robot: Path) -> None:
+    source = tmp_path / "a.csv"
+    source.write_text("waist,shoulder,x,y,z\n0,0,1,2,3\n0,0,1,,3\n")
+    before = sorted(tmp_path.iterdir())
+    ended = command_line(source, "--robot", robot)
+    assert ended.returncode == 1
+    assert ended.stderr == (
+        f"bodyschema: {source}, line 3, column y: the field is empty. Write it like -0.5 or 1e-3, without quotes\n"
+    )
+    assert sorted(tmp_path.iterdir()) == before
+
+
+def test_a_guided_recording_is_learnt_by_the_two_processes(tmp_path: Path, robot: Path) -> None:
+    guided(robot).write_csv(tmp_path / "a.csv")
+    ended = command_line(tmp_path / "a.csv", "--json", "--keep", tmp_path / "kept")
+    assert ended.returncode == 0, ended.stderr
+    report = json.loads(ended.stdout)
+    assert (report["rows"], report["held_out"]) == (240, 72)
+    assert report["accepted"] + sum(report["rejected"].values()) == 168
+    assert report["accepted"] > 140
+    assert report["after"]["mean_mm"] < 0.3 * report["before"]["mean_mm"]
+    assert {"pairs.sqlite", "learner.ckpt", "sampler.log", "learner.log"} <= {
+        file.name for file in (tmp_path / "kept").iterdir()
+    }
+
+
+@pytest.mark.skipif(not REAL_DATA.is_dir(), reason="the measured recordings are not here")
+def test_a_real_eye_in_hand_recording_is_predicted_better_than_by_the_aligned_model() -> None:
+    folder = REAL_DATA / "panda_eyeinhand"
+    ended = command_line(folder / "measured.csv", "--any-step", "--json")
+    assert ended.returncode == 0, ended.stderr
+    report = json.loads(ended.stdout)
+    assert report["any_step"]
+    assert report["accepted"] == 80
+    assert report["after"]["mean_mm"] < report["before"]["mean_mm"]
+
+
+@pytest.mark.soak
+@pytest.mark.skipif(not REAL_DATA.is_dir(), reason="the measured recordings are not here")
+@pytest.mark.parametrize("name", ["ur5_laser", "wam_laser", "ur10_laser_a", "ur10_laser_b"])
+@pytest.mark.timeout(900)
+def test_real_laser_recordings_are_predicted_better_than_by_the_aligned_model(name: str) -> None:
+    command = [sys.executable, "-m", "daemon", "replay", str(REAL_DATA / name / "measured.csv"), "--any-step", "--json"]
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=800, check=False)
+    assert ended.returncode == 0, ended.stderr
+    report = json.loads(ended.stdout)
+    assert report["after"]["mean_mm"] < report["before"]["mean_mm"]
