@@ -22,17 +22,31 @@ def open_sources(config: Config, *, sim: bool) -> Iterator[Sources]:
         ConfigError: no driver is configured, or the simulation cannot be made of this description.
         RecordingError: the configured recording cannot be read.
     """
-    if sim:
+    recording = _chosen_recording(config, sim=sim)
+    if recording is not None:
+        yield _recorded(config, recording)
+    else:
         with _simulated(config) as sources:
             yield sources
-    elif config.tables.drivers.recording is not None:
-        yield _recorded(config, config.file.parent / config.tables.drivers.recording)
-    else:
+
+
+def check_sources(config: Config, *, sim: bool) -> None:
+    """ConfigError when `open_sources` would find nothing to open; opens nothing."""
+    if _chosen_recording(config, sim=sim) is None:
+        require_simulation()
+
+
+def _chosen_recording(config: Config, *, sim: bool) -> Path | None:
+    """The recording to play; None for the simulation."""
+    if sim:
+        return None
+    if config.tables.drivers.recording is None:
         raise ConfigError(
             "no driver is configured",
             file=config.file,
             remedy="Give --sim for the simulated robot, or name a recording as recording in the table [drivers]",
         )
+    return config.file.parent / config.tables.drivers.recording
 
 
 def require_simulation() -> None:

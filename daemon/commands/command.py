@@ -1,0 +1,44 @@
+"""`bodyschema command`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from cyclopts import Parameter
+
+Name = Literal["pause", "resume", "reset_to_prior", "tool_changed", "checkpoint"]
+Process = Literal["sampler", "learner"]
+
+SAMPLERS = ("pause", "resume")
+
+
+def command(
+    name: Annotated[Name, Parameter(help="What to do.")],
+    /,
+    *,
+    to: Annotated[
+        Process | None,
+        Parameter(help="Who is to do it; else pause and resume go to the sampler, others to the learner."),
+    ] = None,
+    robot: Annotated[Path, Parameter(env_var="BODYSCHEMA_ROBOT", help="The robot's description.")] = Path("robot.toml"),
+) -> None:
+    """Tell a running process to do something.
+
+    `pause` and `resume` accepting pairs (or, with --to learner, learning); `tool_changed` when another tool is in
+    the hand; `reset_to_prior` forgets what was learnt, not the stored pairs; `checkpoint` writes the learner's state
+    now. Needs that process running (`bodyschema run`). Next: `bodyschema status`.
+    """
+    from rich.console import Console
+
+    from daemon.bus import client
+    from daemon.config import Config
+    from daemon.keys import Keys
+    from daemon.wire import CommandReply, CommandRequest, decode, encode
+
+    process: Process = to or ("sampler" if name in SAMPLERS else "learner")
+    config = Config.load(robot)
+    with client(getattr(config.tables.zenoh, process)) as bus:
+        reply = bus.ask_one(Keys(config.robot.name).command(process), encode(CommandRequest(name)))
+    done = decode(reply, CommandReply)
+    Console(highlight=False, soft_wrap=True).print(f"{process}: {done.message}", markup=False)

@@ -1,0 +1,125 @@
+"""`bodyschema config`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import cyclopts
+from cyclopts import Parameter
+
+if TYPE_CHECKING:
+    from daemon.robot_template import Guess
+    from interfaces.urdf import UrdfTree
+
+config = cyclopts.App(name="config", help="Write, check or show robot.toml.")
+
+Robot = Annotated[Path, Parameter(env_var="BODYSCHEMA_ROBOT", help="The robot's description.")]
+HERE = Path("robot.toml")
+
+
+@config.command
+def init(
+    *,
+    robot: Annotated[Path, Parameter(help="The file to write.")] = HERE,
+    urdf: Annotated[Path | None, Parameter(help="Your robot's URDF: joints and links are taken from it.")] = None,
+    sim: Annotated[bool, Parameter(negative="", help="A whole example: the simulated upper body.")] = False,
+) -> None:
+    """Write a commented robot.toml. Never replaces a file.
+
+    With --urdf the longest chain of joints is filled in; without it, the names are examples. Next: mend what is
+    marked CHECK, then `bodyschema config check`. With --sim nothing is left to mend; next: `bodyschema run --sim`.
+    """
+    from interfaces.errors import ConfigError
+
+    try:
+        if sim:
+            _copy_model(robot)
+        else:
+            from daemon.robot_template import EXAMPLE, robot_toml
+
+            _write_new(robot, robot_toml(EXAMPLE if urdf is None else _guess(urdf, robot)))
+    except OSError as error:
+        raise ConfigError(f"cannot be written: {error.strerror}", file=robot, remedy="Give another --robot") from error
+    say(f"{robot} written. Next: `bodyschema {'run --sim' if sim else 'config check'} --robot {robot}`")
+
+
+@config.command
+def check(*, robot: Robot = HERE) -> None:
+    """Say what was understood, or which line to mend. Next: `bodyschema run`."""
+    from daemon.config import Config
+    from interfaces.urdf import REVOLUTE
+
+    checked = Config.load(robot)
+    description, zenoh = checked.robot, checked.tables.zenoh
+    say(f"{robot} is in order: robot {description.name}, {len(description.joints)} joints")
+    for name, lower, upper in zip(description.joints, description.lower, description.upper, strict=True):
+        unit, scale = ("°", 57.29577951) if description.tree.joint(name).kind in REVOLUTE else (" m", 1.0)
+        say(f"  {name}: {scale * lower:.4g}{unit} to {scale * upper:.4g}{unit}")
+    known = {True: "known", False: "only roughly known: fitted first"}
+    say(f"  marker on {description.robot.marker_link}, {known[description.robot.marker_known]}")
+    say(f"  camera on {description.camera.parent_link}, {known[description.camera.pose_known]}")
+    stereo = "described" if description.calibration else "not described: no images can be used, recordings can"
+    say(f"  stereo calibration {stereo}")
+    say(f"  sampler on {zenoh.sampler}, learner on {zenoh.learner}")
+    say(f"  state in {checked.state_dir}")
+
+
+@config.command
+def show(*, robot: Robot = HERE) -> None:
+    """Print all settings as they are in force, defaults and environment included, as JSON."""
+    import msgspec
+
+    from daemon.config import Config
+
+    checked = Config.load(robot)
+    tables = msgspec.to_builtins(checked.tables)
+    tables["robot"] = msgspec.to_builtins(checked.robot.robot)
+    tables["camera"] = msgspec.to_builtins(checked.robot.camera)
+    say(msgspec.json.format(msgspec.json.encode(tables)).decode())
+
+
+def say(text: str) -> None:
+    """Print a line as it is."""
+    from rich.console import Console
+
+    Console(highlight=False, soft_wrap=True).print(text, markup=False)
+
+
+def _write_new(file: Path, text: str) -> None:
+    from interfaces.errors import ConfigError
+
+    try:
+        with file.open("x", encoding="utf-8") as stream:
+            stream.write(text)
+    except FileExistsError as error:
+        raise ConfigError("is there already", file=file, remedy="Give another --robot, or move it away") from error
+
+
+def _copy_model(robot: Path) -> None:
+    from daemon.wiring import demonstration_model
+
+    model = demonstration_model()
+    _write_new(robot, model.read_text(encoding="utf-8"))
+    for urdf in model.parent.glob("*.urdf"):
+        _write_new(robot.parent / urdf.name, urdf.read_text(encoding="utf-8"))
+
+
+def _guess(urdf: Path, robot: Path) -> Guess:
+    """The longest chain of moving joints of `urdf`, from its root to the last link."""
+    import os
+
+    from daemon.robot_template import Guess
+    from interfaces.urdf import MOVING, UrdfTree
+
+    tree = UrdfTree.load(urdf)
+    root = _root(tree)
+    ways = {link: [joint.name for joint, _ in tree.path(root, link) if joint.kind in MOVING] for link in tree.links}
+    end = max(tree.links, key=lambda link: len(ways[link]))
+    name = "".join(c if c.isascii() and (c.isalnum() or c in "_.-") else "_" for c in tree.name).lstrip(".-") or "robot"
+    return Guess(name, os.path.relpath(urdf, robot.parent), ways[end], end, root)
+
+
+def _root(tree: UrdfTree) -> str:
+    children = {joint.child for joint in tree.joints.values()}
+    return next(link for link in tree.links if link not in children)

@@ -1,0 +1,40 @@
+"""`bodyschema run`."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+
+def run(
+    *,
+    robot: Annotated[Path, Parameter(env_var="BODYSCHEMA_ROBOT", help="The robot's description.")] = Path("robot.toml"),
+    sim: Annotated[bool, Parameter(negative="", help="The simulated robot in the place of the hardware.")] = False,
+    state_dir: Annotated[Path | None, Parameter(help="Where state lives; else as robot.toml says.")] = None,
+    verbose: Annotated[bool, Parameter(negative="", help="Log more.")] = False,
+) -> None:
+    """Start sampler and learner, each as a process of its own, and start again the one that dies. Ctrl-C ends both.
+
+    Needs robot.toml (`bodyschema config init`), and --sim or a recording named in its table [drivers]. Next, in
+    another terminal: `bodyschema status --watch`, `bodyschema predict`.
+    """
+    from daemon import logs
+    from daemon.config import Config
+    from daemon.signals import on_termination
+    from daemon.supervise import Child, Supervisor
+    from daemon.wiring import check_sources
+
+    logs.set_up(verbose=verbose)
+    config = Config.load(robot)
+    check_sources(config, sim=sim)
+    options = ["--robot", str(robot), *(["--state-dir", str(state_dir)] if state_dir else [])]
+    options += ["--verbose"] if verbose else []
+    python = [sys.executable, "-m", "daemon"]
+    sampler = Child("sampler", [*python, "sampler", *options, *(["--sim"] if sim else [])])
+    learner = Child("learner", [*python, "learner", *options])
+    supervisor = Supervisor([sampler, learner])
+    with on_termination(supervisor.stop):
+        supervisor.run()

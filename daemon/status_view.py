@@ -1,0 +1,147 @@
+"""The two processes' states, asked for and shown."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Self
+
+import msgspec
+from rich.console import Group, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from interfaces.errors import BusError, RequestError
+
+from .bus import Bus
+from .config import Config
+from .keys import Keys
+from .screen import coverage_table, mm, rejected_table
+from .status import LearnerStatus, SamplerStatus
+from .wire import decode
+
+ANSWER_LIMIT_S = 2.0
+EVERY_S = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """What the processes said; None where nobody answered."""
+
+    sampler: SamplerStatus | None
+    learner: LearnerStatus | None
+
+    @property
+    def nobody(self) -> bool:
+        """Whether neither answered."""
+        return self.sampler is None and self.learner is None
+
+
+class Watcher:
+    """Asks both processes for their states. Use as a context manager; the processes may come and go."""
+
+    def __init__(self, config: Config) -> None:
+        zenoh, self._keys = config.tables.zenoh, Keys(config.robot.name)
+        self._endpoints = {"sampler": zenoh.sampler, "learner": zenoh.learner}
+        self._sessions: dict[str, Bus] = {}
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        for process in list(self._sessions):
+            self._leave(process)
+
+    def look(self) -> Seen:
+        """Their states now."""
+        sampler, learner = self._ask("sampler"), self._ask("learner")
+        return Seen(
+            sampler=None if sampler is None else decode(sampler, SamplerStatus),
+            learner=None if learner is None else decode(learner, LearnerStatus),
+        )
+
+    def follow(self) -> Iterator[Seen]:
+        """Their states about once a second, without end."""
+        while True:
+            yield self.look()
+            time.sleep(EVERY_S)
+
+    def _ask(self, process: str) -> bytes | None:
+        try:
+            if process not in self._sessions:
+                self._sessions[process] = Bus(connect=self._endpoints[process], client=True).__enter__()
+            return self._sessions[process].ask_one(self._keys.status(process), timeout_s=ANSWER_LIMIT_S)
+        except (BusError, RequestError):
+            self._leave(process)
+            return None
+
+    def _leave(self, process: str) -> None:
+        session = self._sessions.pop(process, None)
+        if session is not None:
+            session.__exit__(None, None, None)
+
+
+def as_json(seen: Seen) -> str:
+    """Both states as one line of JSON."""
+    return msgspec.json.encode({"sampler": seen.sampler, "learner": seen.learner}).decode()
+
+
+def screen(seen: Seen, config: Config) -> RenderableType:
+    """Both states for a person."""
+    zenoh = config.tables.zenoh
+    parts: list[RenderableType] = []
+    parts += _absent("sampler", zenoh.sampler) if seen.sampler is None else _sampler(seen.sampler)
+    parts.append(Text())
+    parts += _absent("learner", zenoh.learner) if seen.learner is None else _learner(seen.learner)
+    return Group(*parts)
+
+
+def _absent(process: str, endpoint: str) -> list[RenderableType]:
+    said = f"does not answer on {endpoint}. Start it with `bodyschema {process}`, or both with `bodyschema run`."
+    return [Text.assemble((process, "bold"), " ", (said, "yellow"))]
+
+
+def _sampler(status: SamplerStatus) -> list[RenderableType]:
+    rates = (
+        f"{status.frames_per_s:.1f} frames/s, {status.readings_per_s:.0f} readings/s, {status.pairs_per_s:.1f} pairs/s"
+    )
+    facts = Table.grid(padding=(0, 2))
+    facts.add_row("rates", rates)
+    facts.add_row("store", f"{status.pairs} pairs in {status.segment} segments, {status.store}")
+    facts.add_row("disk", f"{status.disk_free_bytes / 1e9:.1f} GB free")
+    tables = Table.grid(padding=(0, 4))
+    tables.add_row(rejected_table(status), coverage_table(status))
+    return [_head("sampler", status), facts, *_health(status.health), tables]
+
+
+def _learner(status: LearnerStatus) -> list[RenderableType]:
+    errors = ", ".join(f"{name} {mm(error)}" for name, error in status.prequential_m.items()) or "-"
+    saved = "none yet" if status.checkpoint_age_s is None else f"{status.checkpoint_age_s:.0f} s ago"
+    facts = Table.grid(padding=(0, 2))
+    facts.add_row("pairs", f"{status.pairs} learnt, {status.replayed} replay steps, {status.refused} refused")
+    facts.add_row("error before learning", errors)
+    facts.add_row("claimed error", mm(status.claimed_error_m))
+    facts.add_row("answering", f"{status.answering}, model {status.model}")
+    facts.add_row("checkpoint", saved)
+    return [_head("learner", status), facts, *_health(status.health)]
+
+
+def _head(process: str, status: SamplerStatus | LearnerStatus) -> Text:
+    colour = "red" if status.state == "failed" else "yellow" if status.state == "paused" else "green"
+    return Text.assemble(
+        (process, "bold"), f" of {status.robot} is ", (status.state, colour), f", up for {_duration(status.uptime_s)}"
+    )
+
+
+def _health(sentences: list[str]) -> list[RenderableType]:
+    return [Text(f"! {sentence}", style="yellow") for sentence in sentences]
+
+
+def _duration(seconds: float) -> str:
+    minutes, seconds = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours} h {minutes:02d} min" if hours else f"{minutes} min {seconds:02d} s" if minutes else f"{seconds} s"
