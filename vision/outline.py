@@ -21,8 +21,12 @@ from interfaces.records import FloatArray
 
 from .colour import ColourGate, Float32Array
 
+BoolArray = NDArray[np.bool_]
+
 # Half-widths [px] of the ring in which the edge is looked for: about the rough circle, then about the outline.
 _WINDOWS_PX = (4.0, 2.0, 2.0)
+# The outline is found when a step in the narrow ring moved it less than this [px].
+_SETTLED_PX = 0.3
 _RING_STEP_PX = 0.5
 _BACKGROUND_PX = 2.0
 _INNER_COLUMNS = 6
@@ -32,14 +36,21 @@ _SHADING_SIGMA = 0.3
 _CHANNEL_SIGMA = 4.0
 # A ray tells the edge where ball and background are this many of these sigmas apart.
 _LEAST_SEPARATION = 3.0
+# A limb with less than this part of the usual level is hidden behind something.
+_LEAST_LEVEL = 0.2
 # Error of one edge point before an even background [px]; an uneven one adds to it.
 _EDGE_SIGMA_PX = 0.1
+# Where the background makes a larger one [px], an edge elsewhere hides nothing.
+_UNEVEN_PX = 0.4
 # Residuals beyond this are no longer edge noise [px], whatever the spread is.
 _LEAST_GATE_PX, _LARGEST_GATE_PX, _GATE_SIGMAS = 0.8, 2.0, 3.5
+# Power of the wave once round the outline over that of the next ones (measured, docs/vision.md): uneven backgrounds
+# make slow waves the larger.
+_SLOWEST_WAVE = 1.3
 # What is left when all noise has averaged out [px].
 _FLOOR_PX = 0.01
-# Beyond this the outline points do not determine centre and radius.
-_LARGEST_CONDITION = 1e6
+# Below this, relative to the cubed trace, the outline points do not determine centre and radius.
+_LEAST_DETERMINANT = 1e-5
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +61,7 @@ class Outline:
         centre_px: centre of the ellipse, shape (2,) [px].
         radius_px: radius of the circle of the same area [px].
         cov_px: covariance of the centre, shape (2, 2) [px²].
-        visible: share of the outline that was seen where the ellipse is.
+        visible: share of the outline that nothing hides.
     """
 
     centre_px: FloatArray
@@ -67,11 +78,15 @@ class _Edges:
         angles: directions of the rays, shape (n,) [rad].
         distance_px: distance of the edge from the rough centre, shape (n,) [px].
         weight: how much each counts, 0..1, shape (n,); 0 where the ray does not tell.
+        covered: where something else shows just inside the rough outline, shape (n,).
+        uneven: where the background is too uneven to say that an edge elsewhere is not the ball's, shape (n,).
     """
 
     angles: FloatArray
     distance_px: FloatArray
     weight: FloatArray
+    covered: BoolArray
+    uneven: BoolArray
 
 
 def fit_outline(
@@ -90,16 +105,15 @@ def fit_outline(
         half = min(window_px, 0.6 * radius_px)
         edges = _find_edges(image, gate, centre_px, radius_px, shape, half)
         outline = None if edges is None else _fit_circle(edges, centre_px, shape)
-        if outline is None or not _near(outline, centre_px, radius_px):
+        if outline is None:
+            return None
+        moved_px = float(np.linalg.norm(outline.centre_px - centre_px)) + abs(outline.radius_px - radius_px)
+        if moved_px > max(2.0, 0.5 * radius_px):
             return None
         centre_px, radius_px = outline.centre_px, outline.radius_px
+        if half <= _WINDOWS_PX[-1] and moved_px < _SETTLED_PX:
+            break
     return outline
-
-
-def _near(outline: Outline, centre_px: FloatArray, radius_px: float) -> bool:
-    """Whether one step of refinement stayed where its ring could see."""
-    moved = float(np.linalg.norm(outline.centre_px - centre_px))
-    return moved < max(2.0, 0.5 * radius_px) and 0.5 < outline.radius_px / radius_px < 2.0
 
 
 def _find_edges(
@@ -119,15 +133,17 @@ def _find_edges(
     if colour is None:
         return None
     level = np.maximum(_mean_of_three(gate.amount(inside[:, -2:]).mean(axis=1)), 0.0)
+    covered = level < _LEAST_LEVEL * _median(level)
     background = _mean_of_three(outside.mean(axis=1))
     towards, separation = _discriminant(level, colour, background)
-    told = separation > _LEAST_SEPARATION**2
+    told = (separation > _LEAST_SEPARATION**2) & ~covered
     scale = 1.0 / np.where(told, separation, 1.0)
     # The share of ball in each sample: 1 on the ball, 0 on the background.
-    covered = np.matmul(samples[:, len(inner) :] - background[:, None], towards[:, :, None])[..., 0] * scale[:, None]
-    distance = radius_px - half_px + covered[:, :cells].sum(axis=1) * step
-    unevenness_px = half_px * np.sqrt(np.mean(covered[:, cells:] ** 2, axis=1))
-    return _Edges(angles, distance, told / (1.0 + (unevenness_px / _EDGE_SIGMA_PX) ** 2))
+    share = np.matmul(samples[:, len(inner) :] - background[:, None], towards[:, :, None])[..., 0] * scale[:, None]
+    distance = radius_px - half_px + share[:, :cells].sum(axis=1) * step
+    unevenness_px = half_px * np.sqrt(np.mean(share[:, cells:] ** 2, axis=1))
+    weight = told / (1.0 + (unevenness_px / _EDGE_SIGMA_PX) ** 2)
+    return _Edges(angles, distance, weight, covered, ~told | (unevenness_px > _UNEVEN_PX))
 
 
 def _sample(
@@ -176,32 +192,38 @@ def _mean_of_three(values: NDArray[np.floating]) -> FloatArray:
     return (wrapped[:-2] + wrapped[1:-1] + wrapped[2:]) / 3.0
 
 
+def _median(values: FloatArray) -> float:
+    """The upper median; NumPy's own costs ten times as much for the few values here."""
+    middle = len(values) // 2
+    return float(np.partition(values, middle)[middle])
+
+
 def _fit_circle(edges: _Edges, centre_px: FloatArray, shape: FloatArray) -> Outline | None:
     """Least squares for the centre's shift and the radius; points too far off are left out in turn."""
     design = np.stack([np.cos(edges.angles), np.sin(edges.angles), np.ones_like(edges.angles)], axis=1)
     told = edges.weight > 0
     weight = edges.weight
-    solution, cov, residual = np.zeros(3), np.eye(3), edges.distance_px
+    solution, normal, residual, used = np.zeros(3), np.eye(3), edges.distance_px, weight
     for _ in range(3):
         if np.count_nonzero(weight) < len(weight) // 2:
             return None
         normal = (design * weight[:, None]).T @ design
-        if np.linalg.cond(normal) > _LARGEST_CONDITION:
+        if np.linalg.det(normal) < _LEAST_DETERMINANT * np.trace(normal) ** 3:
             return None
-        cov = np.linalg.inv(normal)
-        solution = cov @ (design.T @ (weight * edges.distance_px))
+        solution = np.linalg.solve(normal, design.T @ (weight * edges.distance_px))
         residual = edges.distance_px - design @ solution
-        spread = 1.4826 * float(np.median(np.abs(residual[told])))
-        gate = np.clip(_GATE_SIGMAS * spread, _LEAST_GATE_PX, _LARGEST_GATE_PX)
+        spread = 1.4826 * _median(np.abs(residual[told]))
+        gate = min(max(_GATE_SIGMAS * spread, _LEAST_GATE_PX), _LARGEST_GATE_PX)
         used, weight = weight, np.where(np.abs(residual) < gate, edges.weight, 0.0)
-        cov = _noise_density(edges.angles, np.sqrt(used) * residual, float(solution[2])) * cov
     if solution[2] <= 0:
         return None
+    density = _noise_density(edges.angles, np.sqrt(used) * residual, float(solution[2]))
+    hidden = edges.covered | ((weight == 0) & ~edges.uneven)
     return Outline(
         centre_px=centre_px + shape @ solution[:2],
         radius_px=float(solution[2]),
-        cov_px=shape @ cov[:2, :2] @ shape + _FLOOR_PX**2 * np.eye(2),
-        visible=float(np.count_nonzero(weight)) / len(weight),
+        cov_px=density * (shape @ np.linalg.inv(normal)[:2, :2] @ shape) + _FLOOR_PX**2 * np.eye(2),
+        visible=1.0 - float(np.mean(hidden)),
     )
 
 
@@ -211,6 +233,6 @@ def _noise_density(angles: FloatArray, residual: FloatArray, radius_px: float) -
     Neighbouring outline points share pixels and background, so their variance alone would claim too little. A
     shift of the centre is the wave that goes once round; it was fitted away, and the next ones tell its size.
     """
-    harmonics = np.arange(2, max(6, round(radius_px / 3)) + 1)
+    harmonics = np.arange(2, max(4, round(radius_px / 3)) + 1)
     waves = np.exp(-1j * harmonics[:, None] * angles) @ residual
-    return float(np.mean(np.abs(waves) ** 2)) / len(angles)
+    return _SLOWEST_WAVE * float(np.mean(np.abs(waves) ** 2)) / np.count_nonzero(residual)
