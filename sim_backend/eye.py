@@ -106,6 +106,8 @@ class StereoEyes:
 
     def _noise_fields(self, width: int, height: int) -> np.ndarray:
         """A stock of noise images: drawing one afresh for every frame would cost as much as rendering it."""
+        if self._config.noise == 0:
+            return np.zeros(0, dtype=np.int16)
         shape = (_NOISE_FIELDS, height + _NOISE_SHIFT_PX, width + _NOISE_SHIFT_PX, 3)
         rng = generator(self._seed, Stream.IMAGE_NOISE)
         return np.round(self._config.noise * rng.standard_normal(shape, dtype=np.float32)).astype(np.int16)

@@ -9,7 +9,8 @@ import numpy as np
 from interfaces.errors import ConfigError
 from interfaces.records import FloatArray
 
-POSTURES = 160
+# Postures of one tour. Few: the nearest of few is farther away, and the tour sees all of the range sooner.
+POSTURES = 50
 _BATCH = 1000
 _MOST_BATCHES = 40
 # Share of a joint's range left free at either end.
@@ -116,6 +117,7 @@ class GuidePath:
     def _choose(self, start: FloatArray) -> FloatArray:
         """The nearest unvisited posture with a free view along the way there, else the nearest of best view."""
         if not self._unvisited:
+            self._pool = self._visible_postures()
             self._unvisited = list(range(len(self._pool)))
         hops = self._pool[self._unvisited] - start
         nearest = np.argsort(np.linalg.norm(hops[:, self._guided], axis=1), kind="stable")[:_CANDIDATES]

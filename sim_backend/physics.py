@@ -67,27 +67,27 @@ class Physics:
     def __enter__(self) -> Self:
         robot, config = self._truth.robot, self._config
         with ExitStack() as stack:
-            self._body = stack.enter_context(Body(self.urdf, robot.joints, dt=1 / self.rate_hz))
+            self.body = stack.enter_context(Body(self.urdf, robot.joints, dt=1 / self.rate_hz))
             watched = stack.enter_context(Body(self.urdf, robot.joints))
             roles = JointRoles.of(robot)
             self._gazing = list(roles.gaze)
             self._gaze = Gaze(robot, self._calibration, roles.gaze, config.guide.gaze_speed_rad_s)
-            self._sight = Sight(self._truth, self._calibration, roles, self._gaze, watched, config.camera.ball_radius_m)
+            self.sight = Sight(self._truth, self._calibration, roles, self._gaze, watched, config.camera.ball_radius_m)
             self._path = GuidePath(
-                self._sight,
+                self.sight,
                 robot.lower,
                 robot.upper,
                 roles.guided,
                 config.guide.speed_rad_s / self.rate_hz,
                 generator(config.seed, Stream.WAYPOINTS),
             )
-            self._hand = VirtualHand(self._body, self._truth, roles, config.guide, self._path.waypoints)
+            self._hand = VirtualHand(self.body, self._truth, roles, config.guide, self._path.waypoints)
             start = self._path.waypoints[0]
-            self._body.set_angles(start - self._truth.offsets)
+            self.body.set_angles(start - self._truth.offsets)
             self._command = start[self._gazing]
             self._plan(start)
             self._arm = TorqueFreeArm(
-                self._body, roles, self._hand.friction, gravity_compensation=config.guide.gravity_compensation
+                self.body, roles, self._hand.friction, gravity_compensation=config.guide.gravity_compensation
             )
             self._exit = stack.pop_all()
         return self
@@ -108,18 +108,18 @@ class Physics:
 
     def read_encoders(self) -> FloatArray:
         """A reading (d,) of all encoders; the gaze follows it."""
-        q = self._encoders.read(self._body.angles())
+        q = self._encoders.read(self.body.angles())
         self._command = self._gaze.track(q, self._command, 1 / self._config.encoders.rate_hz)
         return q
 
     def scene(self) -> Scene:
         """What a frame taken now shows."""
         robot = self._truth.robot
-        T_world_hand = self._body.link_pose(robot.robot.marker_link)
+        T_world_hand = self.body.link_pose(robot.robot.marker_link)
         marker = self._truth.marker(self.marker_xyz)
         return Scene(
-            angles=self._body.angles(),
-            T_world_camera=self._body.link_pose(robot.camera.parent_link) @ self._truth.T_parent_camera,
+            angles=self.body.angles(),
+            T_world_camera=self.body.link_pose(robot.camera.parent_link) @ self._truth.T_parent_camera,
             x_world=T_world_hand[:3, :3] @ marker + T_world_hand[:3, 3],
         )
 
@@ -127,7 +127,7 @@ class Physics:
         """From now on the hand holds a tool with its marker at `marker_xyz` (3,) [m] in the marker link."""
         self.marker_xyz = marker_xyz
         self._gaze.hold_tool(marker_xyz)
-        self._sight.hold_tool(marker_xyz)
+        self.sight.hold_tool(marker_xyz)
         here = self._postures[self._next - 1]
         self._path.replan(here)
         self._plan(here)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import subprocess
 import threading
 import time
 from collections import deque
@@ -27,7 +28,7 @@ from .truth import TrueRobot
 
 # How far the world runs ahead of its readers: frames that were taken but not read, and seconds of joint readings.
 FRAMES_AHEAD = 2
-_READINGS_AHEAD_S = 4.0
+_READINGS_AHEAD_S = 1.0
 
 
 @dataclass(slots=True)
@@ -43,7 +44,7 @@ class SimWorld:
     """A robot that is guided by hand, its encoders and its stereo cameras.
 
     Whoever reads next moves the world on: nothing happens between reads, and simulated time passes as fast as the
-    readers take it. The world never runs more than two frames, or four seconds of joint readings, ahead of an
+    readers take it. The world never runs more than two frames, or a second of joint readings, ahead of an
     open source, so two threads may read joints and camera each at its own pace. The same description and
     configuration give the same readings and frames, bit by bit. Open both sources before the first read.
 
@@ -98,6 +99,11 @@ class SimWorld:
     def now(self) -> float:
         """Simulated time of the world's front [s]; a frame may be up to two frame intervals older."""
         return self._physics.steps / self._physics.rate_hz
+
+    @property
+    def renderer_process(self) -> subprocess.Popen[bytes]:
+        """The renderer's process."""
+        return self._renderer.process
 
     def change_tool(self, marker_xyz: tuple[float, float, float] | FloatArray) -> float:
         """Put another tool into the hand, its marker described to be at `marker_xyz` [m] in the marker link.

@@ -1,0 +1,96 @@
+"""A stretch of hand guiding without cameras, recorded, for tests to judge."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+
+from interfaces.records import FloatArray
+from interfaces.robot import RobotDescription
+from interfaces.toml_file import read_toml
+from sim_backend import SimConfig, model_file
+from sim_backend.physics import Physics, Scene
+from sim_backend.truth import TrueRobot
+
+
+@dataclass(frozen=True)
+class Run:
+    """What was recorded at 30 Hz.
+
+    Attributes:
+        q: readings (n, d).
+        x: true ball in the true left eye (n, 3) [m].
+        visible: whether both eyes see the ball, in view and not hidden (n,).
+    """
+
+    robot: RobotDescription
+    q: FloatArray
+    x: FloatArray
+    visible: np.ndarray
+
+
+def shipped() -> RobotDescription:
+    return RobotDescription.load(model_file("upper_body"))
+
+
+def learning(joints: tuple[str, ...]) -> RobotDescription:
+    """The shipped robot with other joints learnt."""
+    file = model_file("upper_body")
+    tables, text = read_toml(file)
+    tables["robot"]["joints"] = list(joints)
+    return RobotDescription.from_tables(tables, text, file)
+
+
+def described(folder: Path, urdf: str, toml: str) -> RobotDescription:
+    """A robot of one's own."""
+    (folder / "robot.urdf").write_text(urdf, encoding="utf-8")
+    (folder / "robot.toml").write_text(toml, encoding="utf-8")
+    return RobotDescription.load(folder / "robot.toml")
+
+
+def in_eye(scene: Scene) -> FloatArray:
+    """The ball (3,) in the left eye [m]."""
+    return (np.linalg.inv(scene.T_world_camera) @ np.append(scene.x_world, 1.0))[:3]
+
+
+def guide(
+    robot: RobotDescription,
+    config: SimConfig,
+    seconds: float,
+    tool: tuple[float, float, float] | None = None,
+    settle: float = 0.0,
+) -> Run:
+    """Guide the robot and record it, after a tool change and some time to settle where that is asked for."""
+    assert robot.calibration is not None
+    truth = TrueRobot.draw(robot, config)
+    readings, fixes, visible = [], [], []
+    with Physics(truth, robot.calibration, config) as physics:
+        if tool is not None:
+            physics.change_tool(np.array(tool))
+        reading_steps = physics.rate_hz // config.encoders.rate_hz
+        frame_steps = physics.rate_hz // config.camera.rate_hz
+        q = np.zeros(len(robot.joints))
+        while physics.steps < (seconds + settle) * physics.rate_hz:
+            physics.step()
+            if physics.steps % reading_steps == 0:
+                q = physics.read_encoders()
+            if physics.steps % frame_steps == 0 and physics.steps > settle * physics.rate_hz:
+                scene = physics.scene()
+                readings.append(q)
+                fixes.append(in_eye(scene))
+                visible.append(bool(physics.sight.visible((scene.angles + truth.offsets)[None])[0]))
+    return Run(robot, np.array(readings), np.array(fixes), np.array(visible))
+
+
+@cache
+def shipped_run(seed: int) -> Run:
+    """Twenty seconds of the shipped robot."""
+    return guide(shipped(), SimConfig(seed=seed), 20.0)
+
+
+def step_degrees(run: Run) -> FloatArray:
+    """Joint-space distance between neighbouring frames [deg]."""
+    return np.degrees(np.linalg.norm(np.diff(run.q, axis=0), axis=1))

@@ -1,0 +1,154 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from guided_run import shipped
+from scipy.spatial.transform import Rotation
+
+from interfaces.camera import StereoCalibration
+from sim_backend import CameraConfig
+from sim_backend.bullet import load_pybullet
+from sim_backend.eye import TO_LIGHT, StereoEyes
+from sim_backend.panorama import cluttered_room
+from sim_backend.raster import Grid, Raster
+
+PLAIN = CameraConfig(noise=0, clutter=0)
+CALIBRATION = StereoCalibration(600.0, (319.5, 239.5), 0.09, (640, 480))
+RADIUS = CameraConfig().ball_radius_m
+
+
+@pytest.fixture
+def bullet():
+    """An empty pybullet world and its module."""
+    module = load_pybullet()
+    client = module.connect(module.DIRECT)
+    yield module, client
+    module.disconnect(physicsClientId=client)
+
+
+def painted(bullet, x, config=PLAIN, seed=0, T_world_camera=None):
+    """Left and right image of a ball at `x` in the left eye."""
+    T = np.eye(4) if T_world_camera is None else T_world_camera
+    images = tuple(np.zeros((480, 640, 3), dtype=np.uint8) for _ in range(2))
+    eyes = StereoEyes(Raster(*bullet, CALIBRATION, TO_LIGHT), CALIBRATION, config, seed)
+    eyes.paint(0, T, T[:3, :3] @ x + T[:3, 3], images)
+    return images
+
+
+def ellipse_centre(x):
+    """Centre of the outline (u, v) of a ball at `x` in an eye: the projected centre, drawn outward by z²/(z²-r²)."""
+    stretch = x[2] ** 2 / (x[2] ** 2 - RADIUS**2)
+    return np.array([319.5, 239.5]) + CALIBRATION.focal_px * stretch * x[:2] / x[2]
+
+
+def weighted_centre(weight):
+    rows, columns = np.indices(weight.shape)
+    return np.array([(columns * weight).sum(), (rows * weight).sum()]) / weight.sum()
+
+
+def ball_centre(image):
+    """Centroid of the ball in an image with a plain light wall behind: clipped green contrast, free of shading."""
+    contrast = 1.0 - image[..., 1] / 120.0
+    return weighted_centre(np.clip(contrast, 0.0, 0.5))
+
+
+def random_places(count, seed):
+    rng = np.random.default_rng(seed)
+    depth = rng.uniform(0.35, 0.9, count)
+    return np.column_stack([rng.uniform(-0.3, 0.3, (count, 2)) * depth[:, None], depth])
+
+
+def test_the_rendered_balls_centre_is_where_the_calibration_projects_it(bullet):
+    misses = []
+    for x in random_places(25, 0):
+        for image, shift in zip(painted(bullet, x), (0.0, CALIBRATION.baseline_m), strict=True):
+            misses.append(ball_centre(image) - ellipse_centre(x - [shift, 0.0, 0.0]))
+    assert np.abs(np.mean(misses, axis=0)).max() < 0.03
+    assert np.std(misses, axis=0).max() < 0.06
+
+
+@pytest.mark.parametrize("per_pixel", [0.5, 1, 3])
+def test_tiny_renderer_draws_the_robot_on_the_same_pixels(bullet, per_pixel):
+    module, client = bullet
+    shape = module.createVisualShape(module.GEOM_SPHERE, radius=RADIUS, physicsClientId=client)
+    body = module.createMultiBody(0, -1, shape, physicsClientId=client)
+    raster = Raster(module, client, CALIBRATION, TO_LIGHT)
+    grid = Grid(0, 0, int(640 * per_pixel), int(480 * per_pixel), per_pixel)
+    misses = []
+    for x in random_places(12, 1):
+        module.resetBasePositionAndOrientation(body, x.tolist(), [0, 0, 0, 1], physicsClientId=client)
+        _, depth = raster.render(np.eye(4), grid)
+        sample = weighted_centre(np.isfinite(depth).astype(float))
+        misses.append((sample + 0.5) / per_pixel - 0.5 - ellipse_centre(x))
+    assert np.abs(np.mean(misses, axis=0)).max() < 0.1
+
+
+def test_depths_of_the_robot_are_metres_along_the_optical_axis(bullet):
+    module, client = bullet
+    shape = module.createVisualShape(module.GEOM_BOX, halfExtents=[1, 1, 0.1], physicsClientId=client)
+    module.createMultiBody(0, -1, shape, [0, 0, 0.9], physicsClientId=client)
+    _, depth = Raster(module, client, CALIBRATION, TO_LIGHT).render(np.eye(4), Grid(0, 0, 640, 480, 1))
+    np.testing.assert_allclose(depth, 0.8, atol=1e-4)
+
+
+def red_pixels(image):
+    blue, green, red = np.moveaxis(image.astype(int), -1, 0)
+    return int(((red > 90) & (red > 2 * green) & (red > 2 * blue)).sum())
+
+
+@pytest.mark.parametrize(("z", "hidden"), [(0.4, True), (0.8, False)])
+def test_what_stands_before_the_ball_hides_it_and_what_stands_behind_does_not(bullet, z, hidden):
+    module, client = bullet
+    shape = module.createVisualShape(
+        module.GEOM_BOX, halfExtents=[0.2, 0.2, 0.02], rgbaColor=[0.5, 0.5, 0.5, 1], physicsClientId=client
+    )
+    module.createMultiBody(0, -1, shape, [0, 0, z], physicsClientId=client)
+    left, right = painted(bullet, np.array([0.03, 0.0, 0.6]))
+    seen = [red_pixels(image) > 500 for image in (left, right)]
+    assert seen == [not hidden, not hidden]
+
+
+def test_an_edge_half_across_the_ball_hides_half_of_it(bullet):
+    module, client = bullet
+    shape = module.createVisualShape(
+        module.GEOM_BOX, halfExtents=[0.1, 0.2, 0.001], rgbaColor=[0.5, 0.5, 0.5, 1], physicsClientId=client
+    )
+    module.createMultiBody(0, -1, shape, [0.1, 0, 0.5], physicsClientId=client)  # its edge is the left eye's axis
+    x = np.array([0.0, 0.0, 0.6])
+    whole_area = np.pi * (CALIBRATION.focal_px * RADIUS) ** 2 / (0.6**2 - RADIUS**2)
+    assert red_pixels(painted(bullet, x)[0]) == pytest.approx(whole_area / 2, rel=0.1)
+
+
+def test_image_noise_has_the_stated_size_and_differs_between_the_eyes(bullet):
+    behind = np.array([0.0, 0.0, -1.0])
+    clean = painted(bullet, behind)
+    noisy = painted(bullet, behind, CameraConfig(noise=3.0, clutter=0))
+    left, right = (image.astype(float) - base for image, base in zip(noisy, clean, strict=True))
+    assert left.std() == pytest.approx(3.0, rel=0.05)
+    assert abs(np.corrcoef(left.ravel(), right.ravel())[0, 1]) < 0.02
+
+
+def test_the_background_moves_against_the_heads_turn(bullet):
+    config, away = CameraConfig(noise=0, clutter=1000), np.array([0.0, 0.0, -1.0])
+    forward = Rotation.from_euler("xyz", [-np.pi / 2, 0, -np.pi / 2]).as_matrix()
+    yaw, pictures = 0.1, []
+    for angle in (0.0, yaw):
+        T = np.eye(4)
+        T[:3, :3] = Rotation.from_euler("z", angle).as_matrix() @ forward
+        pictures.append(painted(bullet, away, config, T_world_camera=T)[0].astype(float))
+    # The head turns left, the room moves right; about the middle of the image by f·tan(yaw).
+    shift = round(CALIBRATION.focal_px * np.tan(yaw))
+    here, there = pictures[0][200:280, 250:350], pictures[1][200:280, 250 + shift : 350 + shift]
+    unmoved = pictures[1][200:280, 250:350]
+    assert np.abs(here - there).mean() < 0.5 * np.abs(here - unmoved).mean()
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_nothing_in_the_background_is_as_red_as_the_ball(seed):
+    assert red_pixels(cluttered_room(200, np.random.default_rng(seed))) == 0
+
+
+def test_the_shipped_calibration_has_its_axis_in_the_middle_of_the_image():
+    calibration = shipped().calibration
+    assert calibration is not None
+    assert calibration.principal_point_px == (319.5, 239.5)

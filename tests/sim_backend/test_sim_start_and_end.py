@@ -1,0 +1,118 @@
+from __future__ import annotations
+
+import os
+import select
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import msgspec
+import pytest
+from guided_run import described, shipped
+
+from interfaces.errors import ConfigError, RobotError
+from interfaces.robot import RobotDescription
+from interfaces.toml_file import read_toml
+from sim_backend import SimConfig, SimWorld, model_file
+
+ROOT = Path(__file__).resolve().parents[2]
+HOLD_OPEN = """
+import sys
+from interfaces.robot import RobotDescription
+from sim_backend import SimConfig, SimWorld, model_file
+with SimWorld(RobotDescription.load(model_file("upper_body")), SimConfig()) as world, world.joints, world.camera:
+    world.camera.read(20.0)
+    print(world.renderer_process.pid, flush=True)
+    {then}
+"""
+
+
+def run_python(code, **options):
+    return subprocess.Popen(
+        [sys.executable, "-W", "error", "-c", code],
+        cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **options,
+    )  # fmt: skip
+
+
+def test_a_killed_parent_leaves_no_renderer_behind():
+    with run_python(HOLD_OPEN.format(then="sys.stdin.read()"), stdin=subprocess.PIPE) as parent:
+        renderer = os.pidfd_open(int(parent.stdout.readline()))
+        parent.kill()
+    ended, _, _ = select.select([renderer], [], [], 20.0)
+    os.close(renderer)
+    assert ended
+
+
+def test_an_interrupted_parent_closes_its_renderer():
+    with run_python(HOLD_OPEN.format(then="sys.stdin.read()"), stdin=subprocess.PIPE) as parent:
+        renderer = os.pidfd_open(int(parent.stdout.readline()))
+        parent.send_signal(signal.SIGINT)
+    ended, _, _ = select.select([renderer], [], [], 20.0)
+    os.close(renderer)
+    assert ended
+
+
+def test_opening_and_closing_a_world_says_nothing_on_standard_error():
+    with run_python(HOLD_OPEN.format(then="pass")) as parent:
+        _, complaints = parent.communicate(timeout=60)
+    assert (parent.returncode, complaints) == (0, "")
+
+
+def test_importing_the_package_does_not_load_pybullet():
+    with run_python("import sys, sim_backend; sys.exit('pybullet' in sys.modules)") as python:
+        assert python.wait(60) == 0
+
+
+def test_without_pybullet_the_remedy_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "pybullet", None)
+    with pytest.raises(ConfigError, match=r"pip install 'bodyschema\[sim\]'"), SimWorld(shipped(), SimConfig()):
+        pass
+
+
+def test_a_robot_without_stereo_calibration_is_told_which_keys_are_missing():
+    file = model_file("upper_body")
+    tables, text = read_toml(file)
+    for key in ("focal_px", "principal_point_px", "baseline_m", "image_size_px"):
+        del tables["camera"][key]
+    robot = RobotDescription.from_tables(tables, text, file)
+    with pytest.raises(ConfigError, match="focal_px, principal_point_px, baseline_m"), SimWorld(robot, SimConfig()):
+        pass
+
+
+def test_a_missing_mesh_is_named(tmp_path):
+    urdf = """<robot name="r"><link name="base"/><link name="tip"><visual><geometry>
+        <mesh filename="package://robot/tip.stl"/></geometry></visual></link>
+        <joint name="turn" type="continuous"><parent link="base"/><child link="tip"/><axis xyz="0 0 1"/></joint>
+        </robot>"""
+    toml = """
+        [robot]
+        name = "r"
+        urdf = "robot.urdf"
+        joints = ["turn"]
+        marker_link = "tip"
+        [camera]
+        parent_link = "base"
+        focal_px = 600.0
+        principal_point_px = [319.5, 239.5]
+        baseline_m = 0.1
+        image_size_px = [640, 480]
+        """
+    robot = described(tmp_path, urdf, toml)
+    with pytest.raises(RobotError, match=r"robot\.urdf.*package://robot/tip\.stl"), SimWorld(robot, SimConfig()):
+        pass
+
+
+def test_an_unknown_model_is_answered_with_the_known_ones():
+    with pytest.raises(ConfigError, match="upper_body"):
+        model_file("upper_bodi")
+
+
+def test_unknown_keys_of_the_table_sim_are_refused():
+    with pytest.raises(msgspec.ValidationError, match="speed"):
+        msgspec.convert({"guide": {"speed": 1.0}}, SimConfig)
+
+
+def test_the_table_sim_reads_from_toml():
+    config = msgspec.toml.decode("seed = 4\n[camera]\nrate_hz = 25\n[errors]\ntool_m = 0.0\n", type=SimConfig)
+    assert (config.seed, config.camera.rate_hz, config.errors.tool_m) == (4, 25, 0.0)

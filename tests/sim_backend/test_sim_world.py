@@ -1,0 +1,192 @@
+from __future__ import annotations
+
+import threading
+from datetime import datetime
+
+import numpy as np
+import pytest
+from guided_run import shipped
+from test_sim_rendering import red_pixels
+
+from interfaces.errors import SourceEnded, SourceLost
+from interfaces.protocols import JointSource, StereoCamera
+from sim_backend import SimConfig, SimWorld, ToolChange
+
+WAIT_S = 20.0
+
+
+@pytest.fixture
+def world():
+    """An open world with both sources open."""
+    with SimWorld(shipped(), SimConfig(seed=2)) as world, world.joints, world.camera:
+        yield world
+
+
+def frames(world, count):
+    return [world.camera.read(WAIT_S) for _ in range(count)]
+
+
+def readings_until(world, t):
+    readings = []
+    while not readings or readings[-1].t < t:
+        readings.append(world.joints.read(WAIT_S))
+    return readings
+
+
+def red_centre(image):
+    blue, green, red = np.moveaxis(image.astype(int), -1, 0)
+    rows, columns = np.nonzero((red > 90) & (red > 2 * green) & (red > 2 * blue))
+    return np.array([columns.mean(), rows.mean()])
+
+
+def triangulated(calibration, frame):
+    left, right = red_centre(frame.left), red_centre(frame.right)
+    z = calibration.focal_px * calibration.baseline_m / (left[0] - right[0])
+    return np.append((left - calibration.principal_point_px) * z / calibration.focal_px, z)
+
+
+def test_the_sources_are_what_the_sampler_expects(world):
+    assert isinstance(world.joints, JointSource)
+    assert isinstance(world.camera, StereoCamera)
+
+
+def test_the_same_seed_gives_the_same_readings_and_frames_bit_by_bit():
+    runs = []
+    for _ in range(2):
+        with SimWorld(shipped(), SimConfig(seed=3)) as world, world.joints, world.camera:
+            taken = frames(world, 4)
+            runs.append((readings_until(world, taken[-1].t), taken))
+    for first, second in zip(runs[0][0], runs[1][0], strict=True):
+        assert first.t == second.t
+        np.testing.assert_array_equal(first.q, second.q)
+    for first, second in zip(runs[0][1], runs[1][1], strict=True):
+        assert first.t == second.t
+        np.testing.assert_array_equal(first.left, second.left)
+        np.testing.assert_array_equal(first.right, second.right)
+
+
+def test_readings_come_at_their_rate(world):
+    times = [world.joints.read(WAIT_S).t for _ in range(8)]
+    np.testing.assert_allclose(times, np.arange(1, 9) / 120, atol=1e-12)
+
+
+def test_frames_come_at_their_rate(world):
+    np.testing.assert_allclose([frame.t for frame in frames(world, 5)], np.arange(1, 6) / 30, atol=1e-12)
+
+
+def test_two_threads_get_all_readings_and_frames_in_strict_order(world):
+    times, seen = [], []
+
+    def read_joints():
+        while not times or times[-1] < 1.0:
+            reading = world.joints.read(WAIT_S)
+            times.append(reading.t)
+
+    reader = threading.Thread(target=read_joints)
+    reader.start()
+    while not seen or seen[-1] < 1.0:
+        seen.append(world.camera.read(WAIT_S).t)
+    reader.join(WAIT_S)
+    np.testing.assert_allclose(times, np.arange(1, 121) / 120, atol=1e-12)
+    np.testing.assert_allclose(seen, np.arange(1, 31) / 30, atol=1e-12)
+
+
+def test_encoders_do_not_run_more_than_two_frames_ahead_of_the_camera(world):
+    times = []
+    while (reading := world.joints.read(0.0)) is not None:
+        times.append(reading.t)
+    assert times[-1] == pytest.approx(2 / 30)
+
+
+def test_the_camera_waits_for_joints_that_nobody_reads(world):
+    frame = world.camera.read(WAIT_S)
+    while frame is not None:
+        last = frame.t
+        frame = world.camera.read(1.0)
+    assert last == pytest.approx(1.0)
+
+
+def test_joints_alone_run_on_when_no_camera_is_open():
+    with SimWorld(shipped(), SimConfig()) as world, world.joints:
+        assert readings_until(world, 0.5)[-1].t == pytest.approx(0.5)
+
+
+def test_the_triangulated_ball_is_where_the_true_chain_puts_it(world):
+    misses = []
+    for frame in frames(world, 12):
+        reading = readings_until(world, frame.t)[-1]
+        assert reading.t == pytest.approx(frame.t)
+        misses.append(triangulated(world.camera.calibration, frame) - world.true_chain().positions(reading.q))
+    # A crude threshold centroid: a third of a pixel, and 2 mm of encoder ticks and noise; depth is the worst.
+    assert np.abs(misses)[:, :2].max() < 2e-3
+    assert np.abs(misses)[:, 2].max() < 10e-3
+
+
+def test_a_tool_change_shows_in_the_next_frames_and_in_the_truth(world):
+    frame = frames(world, 3)[-1]
+    q = readings_until(world, frame.t)[-1].q
+    before = world.true_chain().positions(q)
+    changed_at = world.change_tool((0.23, 0.0, -0.37))
+    assert np.linalg.norm(world.true_chain().positions(q) - before) == pytest.approx(0.25, abs=1e-9)
+    while (frame := world.camera.read(WAIT_S)).t <= changed_at:
+        continue
+    q = readings_until(world, frame.t)[-1].q
+    miss = triangulated(world.camera.calibration, frame) - world.true_chain().positions(q)
+    assert np.linalg.norm(miss) < 15e-3
+
+
+def test_a_planned_tool_change_happens_at_its_time():
+    change = ToolChange(at_s=0.1, marker_xyz=(0.23, 0.0, -0.37))
+    with SimWorld(shipped(), SimConfig(tool_changes=(change,))) as world, world.joints:
+        readings_until(world, 0.09)
+        before = world.stats.tool_changes
+        readings_until(world, 0.11)
+        assert (before, world.stats.tool_changes) == (0, 1)
+
+
+def test_the_clock_shows_simulated_time(world):
+    opened = datetime.fromisoformat(world.clock.utc())
+    readings_until(world, 0.05)
+    assert world.clock.now() == pytest.approx(0.05)
+    assert (datetime.fromisoformat(world.clock.utc()) - opened).total_seconds() == pytest.approx(0.05, abs=2e-3)
+
+
+def test_frames_cannot_be_changed_by_their_readers(world):
+    frame = world.camera.read(WAIT_S)
+    with pytest.raises(ValueError, match="read-only"):
+        frame.left[0, 0, 0] = 1
+
+
+def test_a_closed_world_has_no_more_readings():
+    with SimWorld(shipped(), SimConfig()) as world, world.joints as joints:
+        joints.read(WAIT_S)
+    with pytest.raises(SourceEnded):
+        joints.read(WAIT_S)
+
+
+def test_a_reader_that_waits_is_told_when_the_world_closes():
+    told = threading.Event()
+    with SimWorld(shipped(), SimConfig()) as world, world.joints, world.camera:
+        while world.joints.read(0.0) is not None:
+            continue
+
+        def wait():
+            with pytest.raises(SourceEnded):
+                world.joints.read(WAIT_S)
+            told.set()
+
+        reader = threading.Thread(target=wait)
+        reader.start()
+    assert told.wait(WAIT_S)
+    reader.join(WAIT_S)
+
+
+def test_a_dead_renderer_is_a_lost_source(world):
+    world.renderer_process.kill()
+    with pytest.raises(SourceLost, match="renderer"):
+        frames(world, 10)
+
+
+def test_the_ball_is_red_in_both_images(world):
+    frame = frames(world, 1)[0]
+    assert min(red_pixels(frame.left), red_pixels(frame.right)) > 200
