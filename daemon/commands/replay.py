@@ -25,8 +25,13 @@ def replay(
     *,
     robot: Annotated[Path | None, Parameter(help="robot.toml; else the one beside the recording, or here.")] = None,
     speed: Annotated[
-        float, Parameter(help="1 as it was recorded, 0 as fast as the sampler takes it.", validator=Number(gte=0))
-    ] = 0.0,
+        float | None,
+        Parameter(help="1 as recorded, 0 as fast as pairs are stored; else 30 rows a second.", validator=Number(gte=0)),
+    ] = None,
+    sigma_mm: Annotated[
+        float | None,
+        Parameter(help="1-sigma of the positions where the recording has none [mm].", validator=Number(gt=0)),
+    ] = None,
     any_step: Annotated[
         bool, Parameter(help="Accept rows whatever their step and speed: single poses far apart.", negative="")
     ] = False,
@@ -63,7 +68,8 @@ def replay(
     if keep is not None:
         _make_folder(keep)
     with tempfile.TemporaryDirectory(prefix="bodyschema-replay-") as temporary:
-        job = Job(config, rows, split, speed, any_step, keep or Path(temporary))
+        sigma_m = None if sigma_mm is None else 1e-3 * sigma_mm
+        job = Job(config, rows, split, speed, sigma_m, any_step, keep or Path(temporary))
         with _progress(Console(stderr=True, highlight=False)) as show:
             report = run_replay(job, show)
     sys.stdout.write((encode(report).decode() if as_json else as_text(report)) + "\n")

@@ -101,7 +101,9 @@ def _row(figures: Figures) -> str:
 
 
 def _verdict(report: ReplayReport) -> str:
-    ratio = report.after.mean_mm / report.before.mean_mm
+    ratio = report.after.mean_mm / report.before.mean_mm if report.before.mean_mm else 1.0
+    if abs(ratio - 1.0) < 0.01:
+        return "Learning left the mean error as it was."
     return f"Learning {'lowered' if ratio < 1 else 'raised'} the mean error to {ratio:.0%}."
 
 

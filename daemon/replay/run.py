@@ -30,6 +30,8 @@ GLANCE_S = 0.25
 SETTLED_S = 2.0
 STALL_LIMIT_S = 120.0
 BATCH = 2000
+# Live pairs come at the rate of the frames at most; background learning is made to keep pace with that.
+LIVE_ROWS_PER_S = 30.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +39,8 @@ class Job:
     """What to replay.
 
     Attributes:
-        speed: 1 as recorded, 0 as fast as the sampler takes it.
+        speed: 1 as recorded, 0 as fast as the sampler takes it; None at `LIVE_ROWS_PER_S` on average.
+        sigma_m: 1-sigma of the positions where the recording has none [m]; None as robot.toml says.
         any_step: relax the sampler's step and speed rules.
         folder: for store, checkpoint, logs and the rows that are learnt.
     """
@@ -45,9 +48,18 @@ class Job:
     config: Config
     recording: Recording
     split: Split
-    speed: float
+    speed: float | None
+    sigma_m: float | None
     any_step: bool
     folder: Path
+
+    @property
+    def drivers(self) -> dict[str, float]:
+        """What the table [drivers] has to say for this job."""
+        times = self.learnt_rows.play_times
+        live = float(times[-1] - times[0]) / len(times) * LIVE_ROWS_PER_S
+        keys = {"speed": live if self.speed is None else self.speed}
+        return keys if self.sigma_m is None else keys | {"recording_sigma_m": self.sigma_m}
 
     @property
     def learnt_rows(self) -> Recording:
@@ -125,7 +137,8 @@ class _Live:
         self._keys = Keys(job.config.robot.name)
         (self._sampler, self._sampler_bus), (self._learner, self._learner_bus) = sampler, learner
         self._recording = job.recording
-        pauses_s = np.diff(job.learnt_rows.play_times) / job.speed if job.speed else np.zeros(1)
+        speed = job.drivers["speed"]
+        pauses_s = np.diff(job.learnt_rows.play_times) / speed if speed else np.zeros(1)
         self._stall_limit_s = STALL_LIMIT_S + float(pauses_s.max(initial=0.0))
 
     def until_learnt(self, report: Callable[[SamplerStatus, LearnerStatus], None]) -> Learnt:
@@ -189,7 +202,7 @@ def _running(job: Job) -> Iterator[_Live]:
         **override("zenoh", "sampler", sampler_endpoint),
         **override("zenoh", "learner", learner_endpoint),
         **override("drivers", "recording", str(fed.resolve())),
-        **override("drivers", "speed", float(job.speed)),
+        **{name: text for key, value in job.drivers.items() for name, text in override("drivers", key, value).items()},
         **override("daemon", "any_step", job.any_step),
     }
     arguments = ["--robot", os.fspath(job.config.file), "--state-dir", os.fspath(job.folder)]
