@@ -98,7 +98,7 @@ class ShiftedGram:
             corner = self._buffer[begin:end, begin:end]
             corner[:] = np.triu(corner, 1) + np.triu(corner, 1).T
         np.einsum("ii->i", self._buffer)[:] = self._diagonal + shift
-        positive = lapack.cholesky_lower_in_place(self._buffer)
+        self._buffer, positive = lapack.cholesky_lower(self._buffer)
         self.shift = shift if positive else None
         return positive
 

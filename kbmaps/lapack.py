@@ -60,15 +60,13 @@ def upper_times_transpose(upper: FloatArray) -> FloatArray:
     return cast(FloatArray, product)
 
 
-def cholesky_lower_in_place(symmetric: FloatArray) -> bool:
-    """Puts the Cholesky factor into the lower triangle; the part above the diagonal is neither read nor written.
+def cholesky_lower(symmetric: FloatArray) -> tuple[FloatArray, bool]:
+    """The matrix with its Cholesky factor in the lower triangle, and whether it was positive definite.
 
-    Returns:
-        False if the matrix is not positive definite.
+    Overwrites the matrix; the part above the diagonal is neither read nor written.
     """
-    result, info = _dpotrf(symmetric, lower=1, clean=0, overwrite_a=1)
-    assert result is symmetric, "dpotrf copied: the array is not Fortran-ordered float64"
-    return info == 0
+    factored, info = _dpotrf(symmetric, lower=1, clean=0, overwrite_a=1)
+    return cast(FloatArray, factored), info == 0
 
 
 def cholesky_solve(lower: FloatArray, rhs: FloatArray) -> FloatArray:
@@ -92,7 +90,8 @@ def smallest_solution(rows: FloatArray, rhs: FloatArray, smallest_rcond: float) 
     """
     count, unknowns = rows.shape
     factor, tau, _, _ = _dgeqrf(rows.T.copy(order="F"), lwork=64 * count, overwrite_a=1)
-    upper = np.asfortranarray(np.triu(factor[:count]))
+    # The reflectors below the diagonal are not read by the triangular routines.
+    upper = np.asfortranarray(factor[:count])
     rcond, _ = _dtrcon(upper, norm="1", uplo="U", diag="N")
     if not rcond > smallest_rcond:
         return None
