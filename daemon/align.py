@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from interfaces.records import FloatArray, JointReading, Reason, frozen_array
 
 CAPACITY = 8192
+ROUNDING_S = 1e-9  # times of day-long clocks, subtracted
 
 
 def joint_difference(q: FloatArray, other: FloatArray, prismatic: NDArray[np.bool_]) -> FloatArray:
@@ -94,7 +95,7 @@ class JointBuffer:
             before, after = self._around(t)
         if before.t == t:
             return before.q
-        if after.t - before.t > self._max_gap_s:
+        if after.t - before.t > self._max_gap_s + ROUNDING_S:
             return Reason.STALE
         fraction = (t - before.t) / (after.t - before.t)
         return frozen_array(before.q + fraction * joint_difference(after.q, before.q, self._prismatic))

@@ -1,0 +1,47 @@
+"""Fixtures of more than one folder."""
+
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+
+@pytest.fixture
+def free_endpoint() -> Callable[[], str]:
+    """A function that gives zenoh endpoints on this machine that nobody listens on."""
+
+    def endpoint() -> str:
+        with socket.create_server(("127.0.0.1", 0)) as server:
+            return f"tcp/127.0.0.1:{server.getsockname()[1]}"
+
+    return endpoint
+
+
+@pytest.fixture
+def endpoint(free_endpoint: Callable[[], str]) -> str:
+    """A zenoh endpoint on this machine that nobody listens on."""
+    return free_endpoint()
+
+
+@pytest.fixture
+def mount_small_disk(tmp_path: Path) -> Iterator[Callable[[str], Path]]:
+    """A function that mounts an empty tmpfs with the options given; needs root."""
+    if os.geteuid() != 0:
+        pytest.skip("mounting a small disk needs root")
+    folder = tmp_path / "disk"
+    folder.mkdir()
+
+    def mount(options: str) -> Path:
+        command = ["mount", "-t", "tmpfs", "-o", options, "tmpfs", str(folder)]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        if done.returncode:
+            pytest.skip(f"this machine mounts no tmpfs: {done.stderr.strip()}")
+        return folder
+
+    yield mount
+    subprocess.run(["umount", folder], capture_output=True, check=False)

@@ -1,0 +1,141 @@
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from daemon.align import JointBuffer, joint_difference
+from interfaces.records import JointReading, Reason, frozen_array
+
+LIMIT_S = 10.0
+REVOLUTE = np.array([False, False])
+
+
+def reading(t: float, *q: float) -> JointReading:
+    return JointReading(t, frozen_array(q))
+
+
+@pytest.fixture
+def buffer() -> JointBuffer:
+    return JointBuffer(REVOLUTE, max_gap_s=0.1)
+
+
+@given(fraction=st.floats(0.01, 0.99), start=st.floats(-3, 3), rate=st.floats(-5, 5))
+def test_a_joint_that_moves_evenly_is_met_exactly_between_its_readings(fraction, start, rate) -> None:
+    buffer = JointBuffer(REVOLUTE, max_gap_s=0.1)
+    for step in range(4):
+        t = 10 + 0.05 * step
+        buffer.put(reading(t, start + rate * t, 0.0))
+    t = 10.05 + 0.05 * fraction
+    assert buffer.at(t, 0.0)[0] == pytest.approx(start + rate * t, abs=1e-12)
+
+
+def test_a_frame_at_the_time_of_a_reading_gets_that_reading(buffer) -> None:
+    readings = [reading(0.0, 0.1, 0.2), reading(0.01, 0.3, 0.7), reading(0.02, 0.5, 0.9)]
+    for each in readings:
+        buffer.put(each)
+    assert [buffer.at(each.t, 0.0) is each.q for each in readings] == [True, True, True]
+
+
+def test_a_frame_at_the_time_of_a_reading_needs_no_other_reading_near_it(buffer) -> None:
+    buffer.put(reading(0.0, 1.0, 1.0))
+    buffer.put(reading(5.0, 2.0, 2.0))
+    assert buffer.at(5.0, 0.0).tolist() == [2.0, 2.0]
+
+
+def test_readings_too_far_apart_are_stale(buffer) -> None:
+    buffer.put(reading(0.0, 1.0, 1.0))
+    buffer.put(reading(0.11, 2.0, 2.0))
+    assert buffer.at(0.05, 0.0) is Reason.STALE
+
+
+def test_a_frame_before_all_readings_has_no_joints(buffer) -> None:
+    buffer.put(reading(1.0, 1.0, 1.0))
+    buffer.put(reading(1.01, 1.0, 1.0))
+    assert buffer.at(0.5, 0.0) is Reason.NO_JOINTS
+
+
+def test_a_frame_whose_reading_does_not_come_has_no_joints(buffer) -> None:
+    buffer.put(reading(1.0, 1.0, 1.0))
+    assert buffer.at(1.05, 0.01) is Reason.NO_JOINTS
+
+
+def test_a_frame_waits_for_the_reading_after_it(buffer) -> None:
+    buffer.put(reading(1.0, 1.0, 1.0))
+    with ThreadPoolExecutor() as pool:
+        waiting = pool.submit(buffer.at, 1.05, LIMIT_S)
+        buffer.put(reading(1.1, 3.0, 1.0))
+        assert waiting.result(LIMIT_S).tolist() == pytest.approx([2.0, 1.0])
+
+
+def test_lost_encoders_keep_no_frame_waiting(buffer) -> None:
+    buffer.put(reading(1.0, 1.0, 1.0))
+    buffer.silence()
+    assert buffer.at(1.05, 3600.0) is Reason.NO_JOINTS
+
+
+def test_the_first_reading_ends_the_silence(buffer) -> None:
+    buffer.silence()
+    buffer.put(reading(1.0, 1.0, 1.0))
+    with ThreadPoolExecutor() as pool:
+        waiting = pool.submit(buffer.at, 1.05, LIMIT_S)
+        buffer.put(reading(1.06, 1.0, 1.0))
+        assert not isinstance(waiting.result(LIMIT_S), Reason)
+
+
+def test_encoders_that_run_ahead_wait_for_the_frames() -> None:
+    buffer = JointBuffer(REVOLUTE, max_gap_s=1.0, capacity=4)
+    times = np.arange(200) * 0.01
+    with ThreadPoolExecutor() as pool:
+        done = pool.submit(lambda: [buffer.put(reading(t, t, 2 * t)) for t in times])
+        found = np.array([buffer.at(t, LIMIT_S) for t in times])
+        done.result(LIMIT_S)
+    assert np.array_equal(found[:, 0], times)
+
+
+def test_frames_that_ask_for_no_joints_make_room_for_the_encoders() -> None:
+    buffer = JointBuffer(REVOLUTE, max_gap_s=1.0, capacity=4)
+    for i in range(40):
+        buffer.put(reading(float(i), 0.0, 0.0))
+        buffer.forget_before(float(i))
+    assert buffer.at(39.0, 0.0).tolist() == [0.0, 0.0]
+
+
+def test_encoders_without_cameras_keep_the_newest_readings() -> None:
+    buffer = JointBuffer(REVOLUTE, max_gap_s=1.0, capacity=4)
+    for i in range(40):
+        buffer.make_room()
+        buffer.put(reading(float(i), float(i), 0.0))
+    assert buffer.at(39.0, 0.0)[0] == 39.0
+
+
+def test_closing_lets_waiting_encoders_go() -> None:
+    buffer = JointBuffer(REVOLUTE, max_gap_s=1.0, capacity=1)
+    buffer.put(reading(0.0, 0.0, 0.0))
+    with ThreadPoolExecutor() as pool:
+        waiting = pool.submit(buffer.put, reading(1.0, 0.0, 0.0))
+        buffer.close()
+        waiting.result(LIMIT_S)
+    assert buffer.at(1.0, 0.0) is Reason.NO_JOINTS
+
+
+def test_a_revolute_joint_is_interpolated_the_short_way_across_the_wrap() -> None:
+    buffer = JointBuffer(REVOLUTE, max_gap_s=0.1)
+    buffer.put(reading(0.0, np.pi - 0.01, 0.0))
+    buffer.put(reading(0.1, -np.pi + 0.01, 0.0))
+    angle = buffer.at(0.05, 0.0)[0]
+    assert np.cos(angle) == pytest.approx(-1.0, abs=1e-12)
+
+
+def test_a_prismatic_joint_knows_no_wrap() -> None:
+    far = joint_difference(np.array([4.0, 4.0]), np.array([0.0, 0.0]), np.array([True, False]))
+    assert far.tolist() == pytest.approx([4.0, 4.0 - 2 * np.pi])
+
+
+@given(st.lists(st.floats(-50, 50), min_size=2, max_size=2))
+def test_the_revolute_difference_is_never_more_than_half_a_turn(angles) -> None:
+    difference = joint_difference(np.array(angles), np.zeros(2), REVOLUTE)
+    assert (np.abs(difference) <= np.pi + 1e-12).all()

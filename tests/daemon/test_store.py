@@ -1,0 +1,270 @@
+from __future__ import annotations
+
+import sqlite3
+import subprocess
+import sys
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from daemon.store import APPLICATION_ID, PairReader, PairStore, Session, _pair, _row
+from interfaces.errors import StoreError
+from interfaces.records import MarkerFix, Pair, frozen_array
+
+JOINTS = ("waist", "shoulder")
+SESSION = Session(JOINTS, "2026-01-01T00:00:00+00:00", "[robot]", "<robot/>", "{}", "0", "host")
+COV = frozen_array(np.diag([1e-6, 2e-6, 9e-6]) + 1e-7)
+
+
+def fix(t: float) -> MarkerFix:
+    return MarkerFix(t, frozen_array([0.1 * t, 0.2, 1.0]), COV, (1.0, 2.0, 3.0, 4.5))
+
+
+def fill(store: PairStore, count: int) -> list[Pair]:
+    return [store.append(1, f"utc {i}", frozen_array([0.1 * i, -0.1]), fix(float(i))) for i in range(count)]
+
+
+def same(a: Pair, b: Pair) -> bool:
+    arrays = all(np.array_equal(getattr(a, name), getattr(b, name)) for name in ("q", "x", "cov"))
+    plain = ("store", "seq", "segment", "t", "utc", "centres_px")
+    return arrays and all(getattr(a, name) == getattr(b, name) for name in plain)
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    return tmp_path / "state" / "pairs.sqlite"
+
+
+@pytest.fixture
+def store(file: Path) -> Iterator[PairStore]:
+    with PairStore(file, SESSION) as store:
+        yield store
+
+
+def test_pairs_are_numbered_from_one_without_gaps(store) -> None:
+    assert [pair.seq for pair in fill(store, 5)] == [1, 2, 3, 4, 5]
+
+
+def test_numbering_goes_on_when_the_store_is_opened_again(file) -> None:
+    with PairStore(file, SESSION) as store:
+        fill(store, 3)
+        identity = store.identity
+    with PairStore(file, SESSION) as store:
+        assert (store.identity, [pair.seq for pair in fill(store, 2)]) == (identity, [4, 5])
+
+
+def test_what_is_read_is_what_was_appended_bit_by_bit(store) -> None:
+    appended = fill(store, 4)
+    assert all(map(same, appended, store.read()))
+
+
+@given(st.lists(st.floats(allow_nan=False, allow_infinity=False), min_size=14, max_size=14), st.booleans())
+def test_every_finite_number_survives_the_row_format(numbers, with_centres) -> None:
+    cov = np.reshape([*numbers[5:8], numbers[6], *numbers[8:10], numbers[7], *numbers[9:11]], (3, 3))
+    centres = tuple(numbers[10:14]) if with_centres else None
+    pair = Pair("id", 1, 2, numbers[0], "utc", frozen_array(numbers[:2]), frozen_array(numbers[2:5]), cov, centres)
+    assert same(pair, _pair("id", _row(pair)))
+
+
+def test_a_range_of_pairs_is_read_up_to_the_limit(store) -> None:
+    fill(store, 10)
+    assert [pair.seq for pair in store.read(3, 9, limit=4)] == [3, 4, 5, 6]
+
+
+def test_the_last_pair_of_an_empty_store_is_none(store) -> None:
+    assert store.last() is None
+
+
+def test_the_joints_ranges_are_over_all_pairs(store) -> None:
+    fill(store, 3)
+    low, high = store.reader.joint_ranges()
+    assert (low.tolist(), high.tolist()) == ([0.0, -0.1], [0.2, -0.1])
+
+
+def test_readers_see_each_pair_as_soon_as_it_is_appended(file, store) -> None:
+    with PairReader(file) as reader:
+        seen = []
+        for _ in range(3):
+            fill(store, 1)
+            seen.append(reader.last_seq())
+    assert seen == [1, 2, 3]
+
+
+def test_many_threads_read_while_pairs_come(file, store) -> None:
+    with PairReader(file) as reader, ThreadPoolExecutor(4) as pool:
+        reads = [pool.submit(reader.read) for _ in range(40)]
+        fill(store, 100)
+        for read in reads:
+            pairs = read.result(30)
+            assert [pair.seq for pair in pairs] == list(range(1, len(pairs) + 1))
+
+
+def test_a_reader_says_whose_pairs_they_are(file, store) -> None:
+    with PairReader(file) as reader:
+        assert (reader.identity, reader.joints) == (store.identity, JOINTS)
+
+
+def test_the_store_keeps_what_the_sampler_worked_with(file, store) -> None:
+    fill(store, 1)
+    with sqlite3.connect(file) as connection:
+        row = connection.execute("SELECT robot_toml, urdf, config, version, host FROM sessions").fetchone()
+    assert row == ("[robot]", "<robot/>", "{}", "0", "host")
+
+
+def test_runs_that_see_no_pair_leave_nothing_behind(file) -> None:
+    for _ in range(5):
+        with PairStore(file, SESSION):
+            pass
+    with sqlite3.connect(file) as connection:
+        assert connection.execute("SELECT count(*) FROM sessions").fetchone()[0] == 1
+
+
+def test_each_pair_is_committed_with_a_flush_to_the_disk(store, monkeypatch) -> None:
+    assert store._connection.execute("PRAGMA synchronous").fetchone()[0] == 2  # FULL
+    assert store._connection.execute("PRAGMA journal_mode").fetchone()[0] == "wal"
+
+
+def test_a_second_sampler_on_the_store_is_refused(file, store) -> None:
+    code = (
+        "import sys; from pathlib import Path; from daemon.store import PairStore, Session\n"
+        "with PairStore(Path(sys.argv[1]), Session(('waist', 'shoulder'), '', '', '', '', '', '')): pass"
+    )
+    done = subprocess.run([sys.executable, "-c", code, file], capture_output=True, text=True, timeout=60, check=False)
+    assert f"another sampler is writing {file}" in done.stderr
+
+
+def refused(file: Path) -> str:
+    """The message with which the store is refused; the file is the same before and after."""
+    before = file.read_bytes()
+    with pytest.raises(StoreError) as refusal, PairStore(file, SESSION):
+        pass
+    assert file.read_bytes() == before
+    message = str(refusal.value)
+    assert str(file) in message
+    return message
+
+
+@pytest.fixture
+def closed(file: Path) -> Path:
+    with PairStore(file, SESSION) as store:
+        fill(store, 200)
+    return file
+
+
+def alter(file: Path, statement: str) -> None:
+    connection = sqlite3.connect(file)
+    connection.execute(statement)
+    connection.commit()
+    connection.close()
+
+
+def test_a_file_that_is_no_database_is_refused(file) -> None:
+    file.parent.mkdir()
+    file.write_text("my diary, 2026 " * 100)
+    assert "is not a pair store. Move it away" in refused(file)
+
+
+def test_another_programs_database_is_refused(file) -> None:
+    file.parent.mkdir()
+    alter(file, "CREATE TABLE recipes (name)")
+    assert "another SQLite file" in refused(file)
+
+
+def test_a_store_of_a_newer_version_is_refused(closed) -> None:
+    alter(closed, "PRAGMA user_version = 99")
+    assert "written by a newer bodyschema (schema 99" in refused(closed)
+
+
+def test_a_damaged_store_is_refused(closed) -> None:
+    data = bytearray(closed.read_bytes())
+    data[3 * 4096 + 8 : 6 * 4096] = bytes(3 * 4096 - 8)
+    closed.write_bytes(data)
+    assert "is damaged" in refused(closed)
+
+
+def test_a_store_with_a_pair_missing_is_refused(closed) -> None:
+    alter(closed, "DELETE FROM pairs WHERE seq = 17")
+    assert "1 pairs are missing" in refused(closed)
+
+
+def test_another_robots_store_is_refused(closed) -> None:
+    alter(closed, """UPDATE meta SET value = '["hip","knee"]' WHERE key = 'joints'""")
+    assert "holds pairs of the joints hip, knee; robot.toml has waist, shoulder" in refused(closed)
+
+
+def test_a_state_dir_below_a_file_is_refused(tmp_path) -> None:
+    (tmp_path / "file").touch()
+    with (
+        pytest.raises(StoreError, match="cannot make the directory"),
+        PairStore(tmp_path / "file" / "x.sqlite", SESSION),
+    ):
+        pass
+
+
+def test_there_is_nothing_to_read_before_a_sampler_ran(file) -> None:
+    with pytest.raises(StoreError, match="there is no store"), PairReader(file):
+        pass
+
+
+def test_a_closed_store_takes_nothing(file) -> None:
+    store = PairStore(file, SESSION)
+    with pytest.raises(StoreError, match="use it in a with statement"):
+        fill(store, 1)
+
+
+def test_a_store_that_was_killed_while_it_was_made_is_made_anew(file) -> None:
+    file.parent.mkdir()
+    file.touch()
+    with PairStore(file, SESSION) as store:
+        assert fill(store, 1)[0].seq == 1
+
+
+def fill_until_refused(store: PairStore) -> tuple[str, int]:
+    """The message, and how many pairs were appended before it."""
+    for appended in range(100_000):
+        try:
+            fill(store, 1)
+        except StoreError as error:
+            return str(error), appended
+    raise AssertionError("the disk was never full")
+
+
+def test_a_full_disk_loses_no_pair_that_was_appended(mount_small_disk) -> None:
+    file = mount_small_disk("size=512k") / "pairs.sqlite"
+    with PairStore(file, SESSION) as store:
+        message, appended = fill_until_refused(store)
+    assert f"the disk of {file} is full" in message
+    with PairReader(file) as reader:
+        assert [pair.seq for pair in reader.read()] == list(range(1, appended + 1))
+
+
+def test_a_full_disk_that_has_room_again_goes_on_without_a_gap(mount_small_disk) -> None:
+    folder = mount_small_disk("size=512k")
+    with PairStore(folder / "pairs.sqlite", SESSION) as store:
+        (folder / "ballast").write_bytes(bytes(2**18))
+        _, appended = fill_until_refused(store)
+        (folder / "ballast").unlink()
+        assert fill(store, 1)[0].seq == appended + 1
+
+
+def test_a_disk_that_is_full_from_the_start_is_said_to_be_full(mount_small_disk) -> None:
+    folder = mount_small_disk("size=16k")
+    (folder / "ballast").write_bytes(bytes(2**14 - 4096))
+    with pytest.raises(StoreError, match="is full"), PairStore(folder / "pairs.sqlite", SESSION):
+        pass
+
+
+def test_a_read_only_disk_is_said_to_be_read_only(mount_small_disk) -> None:
+    folder = mount_small_disk("ro,size=512k")
+    store = PairStore(folder / "pairs.sqlite", SESSION)
+    with pytest.raises(StoreError, match=r"the disk is read-only. Give a --state-dir"), store:
+        pass
+
+
+def test_the_file_names_its_kind() -> None:
+    assert APPLICATION_ID.to_bytes(4) == b"BSCH"
