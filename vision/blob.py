@@ -18,6 +18,8 @@ from .sphere import Pinhole
 _LEAST_FILL = 0.45
 # Below this a patch may be the ball together with something of similar hue behind it.
 _WHOLE_DISC_FILL = 0.8
+# Parts of the strongest colour that tell the ball from what is behind it.
+_STRONG_SHARES = (0.5, 0.7)
 # Pixels around a patch that the outline may reach into.
 _APRON_PX = 12
 
@@ -86,7 +88,7 @@ def find_patches(image: ImageArray, region: Region, gate: ColourGate, config: Vi
     patches = _patches(gate.mask(pixels), region, config)
     for patch in list(patches):
         if patch.fill < _WHOLE_DISC_FILL:
-            patches += _brighter_part(image, patch, gate, config)
+            patches += _brighter_parts(image, patch, gate, config)
     return sorted(patches, key=lambda patch: -patch.fill)[: config.max_candidates]
 
 
@@ -151,10 +153,15 @@ def _patch(mask: ImageArray, stats: np.ndarray, region: Region) -> Patch | None:
     return Patch(whole, corner + np.array([x, y]), radius, fill)
 
 
-def _brighter_part(image: ImageArray, patch: Patch, gate: ColourGate, config: VisionConfig) -> list[Patch]:
-    """What is left of a patch when only pixels with at least half of its strongest colour count."""
+def _brighter_parts(image: ImageArray, patch: Patch, gate: ColourGate, config: VisionConfig) -> list[Patch]:
+    """What is left of a patch when only pixels with much of its strongest colour count: the ball before brick."""
     pixels = patch.box.crop(image)
     amount = gate.amount(pixels)
     own = gate.mask(pixels) > 0
-    strongest = float(np.percentile(amount[own], 95.0))
-    return _patches((own & (amount > 0.5 * strongest)).astype(np.uint8), patch.box, config)
+    # The ball may be a small part of the patch: the level that half of the least ball reaches.
+    strongest = float(np.sort(amount[own])[-config.min_pixels // 2])
+    return [
+        part
+        for share in _STRONG_SHARES
+        for part in _patches((own & (amount > share * strongest)).astype(np.uint8), patch.box, config)
+    ]
