@@ -78,11 +78,11 @@ def play(scene: Scene, *, first: int, second: int, seed: int, show: Callable[[Sn
         BusError: a process did not start, died, or stopped making progress; its log says why.
     """
     config = Config.load(scene.robot_file)
-    endpoints = config.tables.zenoh
+    endpoints, keys = config.tables.zenoh, Keys(config.robot.name)
     with ExitStack() as stack:
         daemon = stack.enter_context(started_daemon(scene))
-        daemon.wait_for(endpoints.sampler)
-        daemon.wait_for(endpoints.learner)
+        daemon.wait_for(endpoints.sampler, keys.alive("sampler"))
+        daemon.wait_for(endpoints.learner, keys.alive("learner"))
         sampler = stack.enter_context(Bus(connect=endpoints.sampler, client=True))
         learner = stack.enter_context(Bus(connect=endpoints.learner, client=True))
         asker = stack.enter_context(started_asker(scene, seed))

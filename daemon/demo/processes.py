@@ -35,18 +35,24 @@ class Daemon:
                 f"the daemon ended with exit code {self._process.returncode}; {self._scene.log_file} says why"
             )
 
-    def wait_for(self, endpoint: str) -> None:
-        """Return as soon as one of its processes listens on `endpoint`; BusError when it does not in time."""
+    def wait_for(self, endpoint: str, alive: str) -> None:
+        """Return as soon as the process that listens on `endpoint` is alive; BusError when it is not in time."""
         limit = time.monotonic() + START_LIMIT_S
-        while True:
+        while not _is_alive(endpoint, alive):
             self.check()
-            try:
-                with Bus(connect=endpoint, client=True):
-                    return
-            except BusError:
-                if time.monotonic() > limit:
-                    raise
+            if time.monotonic() > limit:
+                raise BusError(
+                    f"nobody is alive on {endpoint} after {START_LIMIT_S:.0f} s; {self._scene.log_file} says why"
+                )
             time.sleep(0.1)
+
+
+def _is_alive(endpoint: str, key: str) -> bool:
+    try:
+        with Bus(connect=endpoint, client=True) as bus:
+            return bus.alive(key)
+    except BusError:
+        return False
 
 
 @contextmanager

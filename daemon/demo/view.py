@@ -119,7 +119,9 @@ def show_outcome(console: Console, outcome: Outcome, scene: Scene) -> None:
     console.print()
     console.print(table)
     console.print(f"{outcome.answers} predictions were asked for meanwhile, {outcome.unanswered} went unanswered.")
-    console.print("Held-out poses lie within a few degrees of where the arm was guided with that tool; none was learnt.")
+    console.print(
+        "Held-out poses lie within a few degrees of where the arm was guided with that tool; none was learnt."
+    )
     console.print()
     for what, file in (("recording", scene.recording_file), ("curve", scene.curve_file), ("plot", scene.plot_file)):
         console.print(f"{what:10s}{_short(file)}", highlight=False, soft_wrap=True)
