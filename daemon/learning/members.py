@@ -56,10 +56,14 @@ class Members:
         self._learners[EXACT] = learner
         self._renew(EXACT)
 
-    def move_prior(self, prior: KBMap) -> None:
-        """Another prior: everything learnt on top of the old one moves along."""
-        change = prior.net - self.prior.net
-        self.restore({name: model.net + change for name, model in self._maps.items()})
+    def start_again(self, prior: KBMap, q: FloatArray, x: FloatArray) -> None:
+        """Another prior for the same pairs, q (n, d) and x (n, 3): the instant learner learns them on top of it.
+
+        The exact solution stays: it fits the pairs, and the solver's next one will have the new prior.
+        """
+        self._maps[PRIOR] = prior
+        self._learners[INSTANT] = NLMS(prior, self._step_size)
+        self.replay(q, x)
 
     def restore(self, nets: Mapping[str, FloatArray]) -> None:
         """The models that `nets` names."""

@@ -7,11 +7,14 @@ import math
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
 from interfaces.records import FloatArray, frozen_array
 from interfaces.robot import RobotDescription
-from kbmaps import JointBasis, KBMap, RigidChain, align, learning_bases
+from kbmaps import JointBasis, KBMap, RigidChain, align, learning_bases, with_refitted_marker
 
+# Pairs after a tool change with which the tool is first fitted; with as many more as there were, it is again.
+PAIRS_TO_REFIT = 5
 # Narrower ranges (a joint that hardly moves) would make the basis needlessly stiff, and equal limits impossible.
 NARROWEST_RANGE = 0.1
 LARGEST_FIT = 1000
@@ -89,12 +92,29 @@ class NominalModel:
         """The chain as a map in the learning bases."""
         return self.chain.to_kbmap(self.bases)
 
-    def aligned_prior(self, q: FloatArray, x: FloatArray) -> KBMap:
-        """The prior with what is not known fitted to pairs, q (n, d) [rad] and x (n, 3) [m].
+    def aligned(self, q: FloatArray, x: FloatArray) -> RigidChain:
+        """The chain with what is not known fitted to pairs, q (n, d) [rad] and x (n, 3) [m].
 
         Raises:
             DegenerateDataError: the pairs do not determine it.
         """
-        chosen = np.linspace(0, len(q) - 1, min(len(q), LARGEST_FIT)).round().astype(int)
+        chosen = _spread(len(q))
         fit = align(self.chain, q[chosen], x[chosen], pose_known=self.pose_known, marker_known=self.marker_known)
-        return fit.chain.to_kbmap(self.bases)
+        return fit.chain
+
+    def with_other_tool(self, kbmap: KBMap, chain: RigidChain, q: FloatArray, x: FloatArray) -> KBMap:
+        """A learnt map with its marker moved to where pairs since the tool change, q (n, d) and x (n, 3), see it.
+
+        Args:
+            chain: the nominal chain in the frame that the map was learnt in; it gives the hand's orientation.
+
+        Raises:
+            DegenerateDataError: there are no pairs.
+        """
+        chosen = _spread(len(q))
+        return with_refitted_marker(kbmap, chain, q[chosen], x[chosen])
+
+
+def _spread(pairs: int) -> NDArray[np.intp]:
+    """Places of at most `LARGEST_FIT` pairs out of so many, evenly spread."""
+    return np.linspace(0, pairs - 1, min(pairs, LARGEST_FIT)).round().astype(np.intp)

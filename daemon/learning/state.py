@@ -47,7 +47,7 @@ class LearningHeader(msgspec.Struct, kw_only=True):
         answering: the model that answers.
         errors: prequential errors by model.
         doubted_in_a_row: length of the present run of doubted pairs.
-        next_alignment: pairs at which what is not known is fitted again; None when it is not.
+        next_fit: pairs at which what is not known, or the tool after a change, is fitted again; None when nothing is.
         replays_due: replay steps that are still owed.
     """
 
@@ -58,13 +58,13 @@ class LearningHeader(msgspec.Struct, kw_only=True):
     curve: list[CurvePoint]
     curve_stride: int
     doubted_in_a_row: int
-    next_alignment: int | None
+    next_fit: int | None
     replays_due: float
 
 
 @dataclass(frozen=True)
 class LearningState:
-    """A learner's state: `arrays` holds the nets by model, and the kept and doubted pairs."""
+    """A learner's state; `arrays` are the nets by model, kept and doubted pairs, and what a tool is fitted to."""
 
     header: LearningHeader
     arrays: Mapping[str, FloatArray]
