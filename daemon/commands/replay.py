@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -26,7 +27,9 @@ def replay(
     robot: Annotated[Path | None, Parameter(help="robot.toml; else the one beside the recording, or here.")] = None,
     speed: Annotated[
         float | None,
-        Parameter(help="1 as recorded, 0 as fast as pairs are stored; else 30 rows a second.", validator=Number(gte=0)),
+        Parameter(
+            help="1 as recorded, 0 as fast as pairs are stored; else 30 rows/s or 20 s.", validator=Number(gte=0)
+        ),
     ] = None,
     sigma_mm: Annotated[
         float | None,
@@ -67,12 +70,22 @@ def replay(
         require_path(Steps.of(rows, config.robot, config.tables.daemon), rows)
     if keep is not None:
         _make_folder(keep)
-    with tempfile.TemporaryDirectory(prefix="bodyschema-replay-") as temporary:
+    with _ending_on_sigterm(), tempfile.TemporaryDirectory(prefix="bodyschema-replay-") as temporary:
         sigma_m = None if sigma_mm is None else 1e-3 * sigma_mm
         job = Job(config, rows, split, speed, sigma_m, any_step, keep or Path(temporary))
         with _progress(Console(stderr=True, highlight=False)) as show:
             report = run_replay(job, show)
     sys.stdout.write((encode(report).decode() if as_json else as_text(report)) + "\n")
+
+
+@contextmanager
+def _ending_on_sigterm() -> Iterator[None]:
+    """SIGTERM unwinds the stack, so that the two processes are ended too."""
+    before = signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def _robot_file(robot: Path | None, recording: Path) -> Path:

@@ -30,8 +30,9 @@ GLANCE_S = 0.25
 SETTLED_S = 2.0
 STALL_LIMIT_S = 120.0
 BATCH = 2000
-# Live pairs come at the rate of the frames at most; background learning is made to keep pace with that.
+# Live pairs come at the rate of the frames at most, and over some time: background learning is made for that.
 LIVE_ROWS_PER_S = 30.0
+SHORTEST_S = 20.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +40,8 @@ class Job:
     """What to replay.
 
     Attributes:
-        speed: 1 as recorded, 0 as fast as the sampler takes it; None at `LIVE_ROWS_PER_S` on average.
+        speed: 1 as recorded, 0 as fast as the sampler takes it; None at `LIVE_ROWS_PER_S` on average,
+            but in `SHORTEST_S` at least.
         sigma_m: 1-sigma of the positions where the recording has none [m]; None as robot.toml says.
         any_step: relax the sampler's step and speed rules.
         folder: for store, checkpoint, logs and the rows that are learnt.
@@ -57,7 +59,7 @@ class Job:
     def drivers(self) -> dict[str, float]:
         """What the table [drivers] has to say for this job."""
         times = self.learnt_rows.play_times
-        live = float(times[-1] - times[0]) / len(times) * LIVE_ROWS_PER_S
+        live = float(times[-1] - times[0]) / max(len(times) / LIVE_ROWS_PER_S, SHORTEST_S)
         keys = {"speed": live if self.speed is None else self.speed}
         return keys if self.sigma_m is None else keys | {"recording_sigma_m": self.sigma_m}
 

@@ -123,22 +123,47 @@ def test_a_guided_recording_is_learnt_by_the_two_processes(tmp_path: Path, robot
     }
 
 
+def processes_naming(text: str) -> list[str]:
+    found = []
+    for file in Path("/proc").glob("[0-9]*/cmdline"):
+        try:
+            found += [line for line in [file.read_bytes().replace(b"\0", b" ").decode()] if text in line]
+        except OSError:
+            continue  # it has just ended
+    return found
+
+
+def test_ending_the_replay_ends_its_two_processes(tmp_path: Path, robot: Path) -> None:
+    guided(robot).write_csv(tmp_path / "a.csv")
+    kept = str(tmp_path / "kept")
+    command = [sys.executable, "-m", "daemon", "replay", str(tmp_path / "a.csv"), "--keep", kept]
+    environment = os.environ | {"OPENBLAS_NUM_THREADS": "1"}
+    with subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, env=environment) as process:
+        assert process.stderr is not None
+        process.stderr.readline()
+        assert len(processes_naming(f"--state-dir {kept}")) >= 2
+        process.terminate()
+        assert process.wait(60) == 143
+    assert processes_naming(f"--state-dir {kept}") == []
+
+
 @pytest.mark.skipif(not REAL_DATA.is_dir(), reason="the measured recordings are not here")
-def test_a_real_eye_in_hand_recording_is_predicted_no_worse_than_by_the_aligned_model() -> None:
+def test_a_real_eye_in_hand_recording_is_learnt_in_a_frame_that_nobody_knew() -> None:
     folder = REAL_DATA / "panda_eyeinhand"
-    ended = command_line(folder / "measured.csv", "--any-step", "--json", "--sigma-mm", 1)
+    ended = command_line(folder / "measured.csv", "--any-step", "--json", "--sigma-mm", 1, "--speed", 1)
     assert ended.returncode == 0, ended.stderr
     report = json.loads(ended.stdout)
     assert report["any_step"]
     assert report["accepted"] == 80
-    assert report["after"]["mean_mm"] < 1.05 * report["before"]["mean_mm"]
+    assert report["fitted"] == ["pose_known = false", "marker_known = false"]
+    assert report["after"]["mean_mm"] < 1.5 * report["before"]["mean_mm"]
 
 
 @pytest.mark.soak
 @pytest.mark.skipif(not REAL_DATA.is_dir(), reason="the measured recordings are not here")
-@pytest.mark.parametrize("name", ["ur5_laser", "wam_laser", "ur10_laser_a", "ur10_laser_b"])
+@pytest.mark.parametrize("name", ["panda_eyeinhand", "ur5_laser", "wam_laser", "ur10_laser_a", "ur10_laser_b"])
 @pytest.mark.timeout(900)
-def test_real_laser_recordings_are_predicted_better_than_by_the_aligned_model(name: str) -> None:
+def test_real_recordings_are_predicted_better_than_by_the_aligned_model(name: str) -> None:
     command = [sys.executable, "-m", "daemon", "replay", str(REAL_DATA / name / "measured.csv"), "--any-step", "--json"]
     ended = subprocess.run(command, capture_output=True, text=True, timeout=800, check=False)
     assert ended.returncode == 0, ended.stderr
