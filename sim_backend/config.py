@@ -103,7 +103,7 @@ class SimConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
         tool_changes: tool changes at given simulated times, besides those that `SimWorld.change_tool` asks for.
     """
 
-    seed: Annotated[int, Meta(ge=0)] = 1
+    seed: Annotated[int, Meta(ge=0)] = 2
     encoders: EncoderConfig = EncoderConfig()
     camera: CameraConfig = CameraConfig()
     errors: ErrorConfig = ErrorConfig()

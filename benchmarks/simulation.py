@@ -1,0 +1,104 @@
+"""The simulation's figures: `python -m benchmarks.simulation [--seeds N] [--seconds S] [--frames F]`.
+
+Over seeds, on the shipped upper body: share of frames 1..3 degrees after their predecessor, share in which both eyes
+see the ball, how much of each joint's range is covered, how far the nominal model is from the truth, and how much
+faster than real time the mechanics alone run. Then stereo frames a second with the renderer beside it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+
+import numpy as np
+
+from interfaces.camera import StereoCalibration
+from interfaces.records import FloatArray
+from interfaces.robot import RobotDescription
+from sim_backend import SimConfig, SimWorld, model_file, true_chain
+from sim_backend.physics import Physics
+from sim_backend.truth import TrueRobot
+
+# The longer tool: the shipped one's ball moved by 250 mm.
+LONG_TOOL = (0.23, 0.0, -0.37)
+
+
+def guide(
+    robot: RobotDescription, calibration: StereoCalibration, config: SimConfig, seconds: float, tool: FloatArray
+) -> tuple[FloatArray, float, float]:
+    """Readings (n, d) at the frames' times, the share of visible frames, and how many times real time it ran."""
+    truth = TrueRobot.draw(robot, config)
+    q, readings, visible = np.zeros(len(robot.joints)), [], []
+    spent = 0.0
+    with Physics(truth, calibration, config) as physics:
+        if not np.array_equal(tool, physics.marker_xyz):
+            physics.change_tool(tool)
+        while physics.steps < seconds * physics.rate_hz:
+            start = time.perf_counter()
+            physics.step()
+            if physics.steps % (physics.rate_hz // config.encoders.rate_hz) == 0:
+                q = physics.read_encoders()
+            spent += time.perf_counter() - start
+            if physics.steps % (physics.rate_hz // config.camera.rate_hz) == 0:
+                readings.append(q)
+                seen = physics.sight.visible((physics.scene().angles + truth.offsets)[None])
+                visible.append(bool(seen[0]))
+    return np.array(readings), float(np.mean(visible)), seconds / spent
+
+
+def report_guiding(
+    robot: RobotDescription, calibration: StereoCalibration, seeds: int, seconds: float, tool: FloatArray
+) -> None:
+    """Print one line a seed, and the mean."""
+    print("seed   1..3 deg   < 1 deg   > 3 deg   visible   least covered   nominal error   times real time")
+    rows = []
+    for seed in range(1, seeds + 1):
+        config = SimConfig(seed=seed)
+        q, visible, speed = guide(robot, calibration, config, seconds, tool)
+        steps = np.degrees(np.linalg.norm(np.diff(q, axis=0), axis=1))
+        nominal = robot.chain.with_tool(tool - np.array(robot.robot.marker_xyz))
+        error_mm = 1e3 * np.linalg.norm(nominal.positions(q) - true_chain(robot, config, tool).positions(q), axis=1)
+        covered = np.ptp(q, axis=0) / (robot.upper - robot.lower)
+        good, short, far = ((steps >= 1) & (steps <= 3)).mean(), (steps < 1).mean(), (steps > 3).mean()
+        rows.append([good, short, far, visible, covered.min(), error_mm.mean(), speed])
+        _print_row(f"{seed:4}", rows[-1])
+    _print_row("mean", list(np.mean(rows, axis=0)))
+
+
+def report_frames(robot: RobotDescription, frames: int) -> None:
+    """Print stereo frames a second with the renderer's process beside the mechanics and nobody tracking."""
+    with SimWorld(robot, SimConfig()) as world, world.joints, world.camera:
+        world.camera.read(30.0)
+        start, simulated = time.perf_counter(), world.now()
+        for _ in range(frames):
+            frame = world.camera.read(30.0)
+            while (reading := world.joints.read(0.0)) is not None and frame is not None and reading.t < frame.t:
+                continue
+        seconds = time.perf_counter() - start
+        print(f"{frames / seconds:.1f} stereo frames/s, {(world.now() - simulated) / seconds:.2f} times real time")
+
+
+def _print_row(label: str, row: list[float]) -> None:
+    good, short, far, visible, covered, error_mm, speed = row
+    print(
+        f"{label}   {good:8.1%}   {short:7.1%}   {far:7.1%}   {visible:7.1%}   {covered:13.0%}"
+        f"   {error_mm:10.1f} mm   {speed:15.1f}"
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seeds", type=int, default=10, help="number of seeds, from 1")
+    parser.add_argument("--seconds", type=float, default=60.0, help="simulated seconds of each")
+    parser.add_argument("--frames", type=int, default=200, help="stereo frames to time")
+    arguments = parser.parse_args()
+    robot = RobotDescription.load(model_file("upper_body"))
+    assert robot.calibration is not None
+    for name, tool in (("the shipped tool", robot.robot.marker_xyz), ("a tool 250 mm longer", LONG_TOOL)):
+        print(f"guided with {name} for {arguments.seconds:g} s")
+        report_guiding(robot, robot.calibration, arguments.seeds, arguments.seconds, np.array(tool))
+    report_frames(robot, arguments.frames)
+
+
+if __name__ == "__main__":
+    main()
