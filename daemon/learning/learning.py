@@ -22,7 +22,7 @@ from .gate import CHANGE, DOUBT, Gate, limit_m
 from .members import EXACT, INSTANT, PRIOR, Members
 from .memory import PairMemory, Permutations
 from .nominal import PAIRS_TO_REFIT, NominalModel
-from .scores import FEWEST_TO_ANSWER, ErrorMemory, choose
+from .scores import FEWEST_TO_ANSWER, ErrorMemory, choose, trusted_share
 from .snapshot import Snapshot
 from .solver import LARGEST_NET, ExactSolver
 from .state import Counters, LearningHeader, LearningState, StateError
@@ -326,7 +326,7 @@ class Learning:
             if task != self._task:
                 return True
             if prior is None:
-                self._next_fit = count + self._nominal.pairs_to_align
+                self._next_fit = count + max(self._nominal.pairs_to_align, PAIRS_TO_REFIT)
                 return True
             self._next_fit, self._chain = 2 * count, chain
             if self._members is None:
@@ -402,8 +402,8 @@ class Learning:
         with self._lock:
             if task == self._task and solved.map is not None:
                 q, x, _ = self._memory.since(self._asked_at)
-                self._members_now.take(solved.map, q, x)
-                self._errors.setdefault(EXACT, ErrorMemory(EXPECTED_M))
+                memory = self._errors.setdefault(EXACT, ErrorMemory(EXPECTED_M))
+                self._members_now.take(solved.map, q, x, trusted_share(memory))
                 self._publish()
         return True
 

@@ -10,6 +10,7 @@ from interfaces.records import FloatArray
 from kbmaps import NLMS, KBMap, NonFiniteError
 
 PRIOR, INSTANT, EXACT = "prior", "nlms", "exact"
+SMALLEST_STEP = 0.01
 
 
 class Members:
@@ -49,9 +50,13 @@ class Members:
         self._learners[INSTANT].replay(q, x)
         self._renew(INSTANT)
 
-    def take(self, solution: KBMap, q: FloatArray, x: FloatArray) -> None:
-        """A new solution of the exact solver, and the pairs q (n, d), x (n, 3) that it does not know yet."""
-        learner = NLMS(solution, self._step_size)
+    def take(self, solution: KBMap, q: FloatArray, x: FloatArray, share: float) -> None:
+        """A new solution of the exact solver, and the pairs q (n, d), x (n, 3) that it does not know yet.
+
+        Args:
+            share: of each error that steps shall mend until the next solution; more would follow the noise.
+        """
+        learner = NLMS(solution, min(max(share, SMALLEST_STEP), self._step_size))
         learner.replay(q, x)
         self._learners[EXACT] = learner
         self._renew(EXACT)

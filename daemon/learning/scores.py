@@ -65,6 +65,14 @@ class ErrorMemory(msgspec.Struct):
         return np.sqrt(np.maximum(square - noise, noise * _resolution(self.weight)))
 
 
+def trusted_share(memory: ErrorMemory) -> float:
+    """The share of a new error that is the model's own and not the measurement's noise: the step to take, 0 to 1."""
+    if not memory.weight:
+        return 1.0
+    own, noise = float(np.square(memory.sigma).sum()), sum(memory.noise) / memory.weight
+    return own / (own + noise) if own > 0.0 else 0.0
+
+
 def choose(errors: Mapping[str, ErrorMemory], present: str, handicap: Mapping[str, float]) -> str:
     """The model that shall answer: the best on recent pairs; the present one while nobody is clearly better.
 

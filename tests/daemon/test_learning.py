@@ -1,0 +1,251 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from guided_arm import (
+    JOINTS,
+    Scene,
+    built_chain,
+    make_pair,
+    measured,
+    near,
+    new_learning,
+    nominal_chain,
+    nominal_model,
+    path,
+    teach,
+)
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from daemon.config import LearnerConfig
+from daemon.learning import Learning
+from interfaces.errors import RequestError
+from interfaces.records import Pair
+from kbmaps import NLMS
+
+SEEDS = range(4)
+
+
+def fingerprint(learning: Learning) -> tuple[object, ...]:
+    """Everything that a refused pair must not change."""
+    state = learning.state()
+    return (state.header, {name: array.tobytes() for name, array in state.arrays.items()})
+
+
+def test_before_any_pair_the_nominal_model_answers_and_claims_no_support() -> None:
+    learning = new_learning()
+    q = path(np.random.default_rng(0), 20)
+    prediction = learning.snapshot.predict(q)
+    np.testing.assert_allclose(prediction.x, nominal_chain().positions(q), atol=1e-9)
+    assert not prediction.in_support.any()
+
+
+def test_the_online_pass_takes_one_step_for_each_pair() -> None:
+    scene = Scene.draw(0, 60)
+    learning = new_learning()
+    teach(learning, scene.pairs, background=False)
+    reference = NLMS(nominal_model().prior(), LearnerConfig().step_size)
+    for pair in scene.pairs:
+        reference.learn(pair.q, pair.x)
+    np.testing.assert_allclose(learning.state().arrays["net_nlms"], reference.map.net, atol=1e-10)
+
+
+def test_a_pair_that_was_learnt_is_not_learnt_again() -> None:
+    scene = Scene.draw(0, 10)
+    learning = new_learning()
+    teach(learning, scene.pairs)
+    before = fingerprint(learning)
+    with pytest.raises(RequestError, match="learnt already"):
+        learning.learn(scene.pairs[4], 1.0)
+    assert fingerprint(learning) == before
+
+
+@pytest.mark.parametrize(
+    ("pair", "said"),
+    [
+        (make_pair(11, np.full(JOINTS, np.nan), np.zeros(3)), "pair 11 has a number that is not finite"),
+        (make_pair(11, np.zeros(JOINTS), np.array([0.0, np.inf, 0.0])), "pair 11 has a number that is not finite"),
+        (make_pair(11, np.zeros(JOINTS - 1), np.zeros(3)), "pair 11 has 3 joint angles, this robot has 4"),
+        (make_pair(11, np.zeros(JOINTS), np.zeros(3), store="two"), "comes from the store two"),
+        (make_pair(11, np.zeros(JOINTS), np.array([0.0, 0.0, 1500.0])), "positions are in metres"),
+    ],
+    ids=["NaN angle", "infinite position", "wrong length", "other store", "not in metres"],
+)
+def test_a_bad_pair_is_refused_and_changes_nothing(pair: Pair, said: str) -> None:
+    learning = new_learning()
+    teach(learning, Scene.draw(0, 10).pairs)
+    before = fingerprint(learning)
+    with pytest.raises(RequestError, match=said):
+        learning.learn(pair, 1.0)
+    assert fingerprint(learning) == before
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_three_hundred_pairs_take_most_of_the_nominal_error_away(seed: int) -> None:
+    scene = Scene.draw(seed, 300)
+    learning = new_learning()
+    nominal_error = scene.error_m(learning)
+    teach(learning, scene.pairs)
+    assert scene.error_m(learning) < 0.2 * nominal_error
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_the_claimed_error_is_of_the_size_of_the_true_one(seed: int) -> None:
+    scene = Scene.draw(seed, 300)
+    learning = new_learning()
+    teach(learning, scene.pairs)
+    claimed = learning.claimed_error_m()
+    assert claimed is not None
+    assert 0.5 < claimed / scene.error_m(learning) < 3.5
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_the_claimed_sigma_covers_most_coordinates(seed: int) -> None:
+    scene = Scene.draw(seed, 300)
+    learning = new_learning()
+    teach(learning, scene.pairs)
+    q = near(np.random.default_rng(seed), scene.q)
+    prediction = learning.snapshot.predict(q)
+    covered = np.abs(prediction.x - scene.chain.positions(q)) <= prediction.sigma
+    assert covered.mean() > 0.6
+
+
+def test_the_claimed_sigma_grows_away_from_the_data() -> None:
+    scene = Scene.draw(1, 60)
+    learning = new_learning()
+    teach(learning, scene.pairs)
+    here, far = learning.snapshot.predict(scene.q), learning.snapshot.predict(scene.q + np.radians(70.0))
+    assert here.sigma.mean() < 0.5 * far.sigma.mean()
+
+
+def test_where_data_was_is_in_support_and_far_away_is_not() -> None:
+    scene = Scene.draw(1, 60)
+    learning = new_learning()
+    teach(learning, scene.pairs)
+    assert learning.snapshot.predict(scene.q).in_support.all()
+    assert not learning.snapshot.predict(scene.q + np.radians(70.0)).in_support.any()
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_one_gross_outlier_does_not_spoil_the_map(seed: int) -> None:
+    scene = Scene.draw(seed, 200)
+    outlier = scene.pairs[150]
+    wrong = make_pair(outlier.seq, outlier.q, outlier.x + np.array([1.0, 0.0, 0.0]))
+    learning, without = new_learning(), new_learning()
+    teach(learning, [*scene.pairs[:150], wrong, *scene.pairs[151:]])
+    teach(without, [*scene.pairs[:150], *scene.pairs[151:]])
+    assert scene.error_m(learning) < 1.2 * scene.error_m(without)
+
+
+def test_a_gross_outlier_is_counted_as_doubted_and_as_learnt() -> None:
+    scene = Scene.draw(2, 100)
+    learning = new_learning()
+    wrong = make_pair(100, scene.q[99], scene.pairs[99].x + np.array([0.0, 1.0, 0.0]))
+    teach(learning, [*scene.pairs[:99], wrong])
+    assert (learning.counters.doubted, learning.counters.pairs) == (1, 100)
+
+
+@pytest.mark.parametrize("told", [True, False], ids=["told", "not told"])
+@pytest.mark.parametrize("seed", SEEDS)
+def test_a_tool_change_is_followed_within_tens_of_pairs(seed: int, told: bool) -> None:
+    scene = Scene.draw(seed, 200)
+    rng = np.random.default_rng(seed)
+    learning = new_learning()
+    teach(learning, scene.pairs)
+    changed = scene.chain.with_tool([0.0, 0.15, 0.2])
+    if told:
+        learning.tool_changed()
+    q = scene.q[-1] + path(rng, 50)
+    teach(learning, measured(changed, q, rng, first=201))
+    after = Scene(changed, q, [])
+    assert after.error_m(learning) < 0.025
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_an_untold_tool_change_is_found_once(seed: int) -> None:
+    scene = Scene.draw(seed, 300)
+    rng = np.random.default_rng(seed)
+    learning = new_learning()
+    teach(learning, scene.pairs)
+    q = scene.q[-1] + path(rng, 100)
+    teach(learning, measured(scene.chain.with_tool([0.0, 0.15, 0.2]), q, rng, first=301))
+    assert learning.counters.changes == 1
+
+
+def test_a_told_tool_change_keeps_what_was_learnt_and_drops_the_pairs() -> None:
+    scene = Scene.draw(0, 100)
+    learning = new_learning()
+    teach(learning, scene.pairs)
+    before = learning.snapshot.predict(scene.q).x
+    learning.tool_changed()
+    state = learning.state()
+    np.testing.assert_array_equal(learning.snapshot.predict(scene.q).x, before)
+    assert (len(state.arrays["q"]), state.header.counters.since_change, state.header.counters.pairs) == (0, 0, 100)
+
+
+def test_reset_to_prior_answers_as_before_any_pair() -> None:
+    scene = Scene.draw(0, 100)
+    learning, fresh = new_learning(), new_learning()
+    teach(learning, scene.pairs)
+    learning.reset_to_prior()
+    np.testing.assert_array_equal(learning.snapshot.predict(scene.q).x, fresh.snapshot.predict(scene.q).x)
+    assert learning.counters.last_seq == 100
+
+
+def test_the_prior_answers_while_there_are_few_pairs() -> None:
+    learning = new_learning()
+    teach(learning, Scene.draw(0, 3).pairs)
+    assert learning.snapshot.answering == "prior"
+
+
+def test_the_exact_solution_answers_in_the_end() -> None:
+    learning = new_learning()
+    teach(learning, Scene.draw(0, 200).pairs)
+    assert learning.snapshot.answering == "exact"
+
+
+def test_a_snapshot_does_not_change_when_learning_goes_on() -> None:
+    scene = Scene.draw(0, 60)
+    learning = new_learning()
+    teach(learning, scene.pairs[:30])
+    snapshot = learning.snapshot
+    before = snapshot.predict(scene.q)
+    teach(learning, scene.pairs[30:])
+    after = snapshot.predict(scene.q)
+    np.testing.assert_array_equal(before.x, after.x)
+    np.testing.assert_array_equal(before.sigma, after.sigma)
+
+
+def test_replay_takes_as_many_steps_as_configured() -> None:
+    learning = new_learning(settings=LearnerConfig(replays_per_pair=3.0))
+    teach(learning, Scene.draw(0, 50).pairs)
+    assert learning.counters.replayed == 150
+
+
+def test_the_same_pairs_and_seed_give_the_same_model() -> None:
+    scene = Scene.draw(0, 60)
+    one, two = new_learning(), new_learning()
+    teach(one, scene.pairs)
+    teach(two, scene.pairs)
+    assert one.snapshot.digest == two.snapshot.digest
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    wild=st.dictionaries(st.integers(0, 39), st.floats(-900.0, 900.0), max_size=12),
+    told=st.integers(0, 40),
+)
+def test_predictions_are_finite_whatever_is_measured(seed: int, wild: dict[int, float], told: int) -> None:
+    rng = np.random.default_rng(seed)
+    learning = new_learning()
+    pairs = measured(built_chain(rng), path(rng, 40), rng)
+    for number, pair in enumerate(pairs):
+        if number == told:
+            learning.tool_changed()
+        shifted = np.clip(pair.x + wild.get(number, 0.0), -1000.0, 1000.0)
+        teach(learning, [make_pair(pair.seq, pair.q, shifted)])
+    prediction = learning.snapshot.predict(rng.uniform(-np.pi, np.pi, (50, JOINTS)))
+    assert np.isfinite(prediction.x).all()
+    assert np.isfinite(prediction.sigma).all()
