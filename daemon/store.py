@@ -138,7 +138,7 @@ class PairReader:
 
 
 class PairStore:
-    """Writes a pair store, which it makes when there is none. Use as a context manager, from one thread.
+    """Writes a pair store, which it makes when there is none. Use as a context manager; append from one thread at a time.
 
     A pair that `append` returned is on the disk (`synchronous=FULL`). Sequence numbers run from 1 without gaps. Only
     one process can have a store open for writing; its death, whatever its kind, frees it.
@@ -264,7 +264,7 @@ class PairStore:
 
 def _connect(file: Path, *, readonly: bool = False) -> sqlite3.Connection:
     uri = f"{file.absolute().as_uri()}?mode={'ro' if readonly else 'rwc'}"
-    return sqlite3.connect(uri, uri=True, isolation_level=None, check_same_thread=not readonly)
+    return sqlite3.connect(uri, uri=True, isolation_level=None, check_same_thread=False)
 
 
 @contextmanager

@@ -1,0 +1,375 @@
+from __future__ import annotations
+
+import json
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from queue import Queue
+
+import msgspec
+import numpy as np
+import pytest
+from scripted_sources import COV, FRAME_S, Scripted, Walk, World, simulated
+from small_arm import write_small_arm
+
+from daemon.bus import Bus, client
+from daemon.config import Config
+from daemon.keys import Keys
+from daemon.sampler import Sampler
+from daemon.session import session_of
+from daemon.sources import Sources
+from daemon.status import SamplerStatus
+from daemon.store import PairStore
+from daemon.wire import MSGPACK, CommandRequest, PairMessage, PairsReply, decode, encode
+from interfaces.clock import SystemClock
+from interfaces.errors import BusError, ConfigError, RequestError, SourceError, SourceLost, StoreError
+from interfaces.records import JointReading, MarkerFix, MarkerMiss, Pair, Reason, frozen_array
+
+LIMIT_S = 20.0
+KEYS = Keys("arm")
+
+
+@pytest.fixture
+def config(tmp_path: Path, endpoint: str) -> Config:
+    return Config.load(
+        write_small_arm(tmp_path, f'[zenoh]\nsampler = "{endpoint}"\n[daemon]\nstate_dir = "state"\n'), {}
+    )
+
+
+@contextmanager
+def sampling(config: Config, sources: Sources, *, exit_at_end: bool = False) -> Iterator[Sampler]:
+    with (
+        PairStore(config.store_file, session_of(config, SystemClock())) as store,
+        Bus(listen=config.tables.zenoh.sampler) as bus,
+    ):
+        yield Sampler(config, sources, bus, store, exit_at_end=exit_at_end)
+
+
+def sample(config: Config, sources: Sources) -> tuple[list[Pair], SamplerStatus]:
+    """Sample to the end of the sources: the pairs in the store, and the last status."""
+    with sampling(config, sources, exit_at_end=True) as sampler:
+        sampler.run()
+        return sampler._store.read(), sampler.status()
+
+
+@contextmanager
+def running(config: Config, sources: Sources) -> Iterator[Bus]:
+    """A client of a sampler that runs in a thread until the block ends."""
+    with sampling(config, sources) as sampler:
+        thread = threading.Thread(target=sampler.run)
+        with client(config.tables.zenoh.sampler) as asking:
+            watched = threading.Event()
+            asking.watch(KEYS.alive("sampler"), lambda alive: watched.set() if alive else None)
+            thread.start()
+            try:
+                assert watched.wait(LIMIT_S)
+                yield asking
+            finally:
+                sampler.stop()
+                thread.join(LIMIT_S)
+    assert not thread.is_alive()
+
+
+def status_when(bus: Bus, true: Callable[[SamplerStatus], bool]) -> SamplerStatus:
+    """The first published status for which `true` holds."""
+    published: Queue[bytes] = Queue()
+    bus.subscribe(KEYS.status("sampler"), published.put)
+    status = decode(bus.ask_one(KEYS.status("sampler")), SamplerStatus)
+    while not true(status):
+        status = decode(published.get(timeout=LIMIT_S), SamplerStatus)
+    return status
+
+
+def command(bus: Bus, name: str) -> str:
+    return json.loads(bus.ask_one(KEYS.command("sampler"), encode(CommandRequest(name))))["message"]
+
+
+# --- the way of a pair
+
+
+def test_each_frame_of_a_walk_becomes_a_pair_with_the_angles_of_its_time(config) -> None:
+    walk = Walk(config.robot, 20)
+    pairs, _ = sample(config, walk.sources())
+    assert np.array_equal([pair.q for pair in pairs], walk.q)
+
+
+def test_frames_between_readings_get_interpolated_angles(config) -> None:
+    walk = Walk(config.robot, 20)
+    between = [MarkerFix(fix.t - FRAME_S / 3, fix.x, fix.cov) for fix in walk.fixes[1:]]
+    pairs, _ = sample(config, walk.sources(fixes=between))
+    expected = (walk.q[:-1] + 2 * walk.q[1:]) / 3
+    assert np.abs(expected - [pair.q for pair in pairs]).max() < 1e-12
+
+
+def test_a_pair_keeps_the_fix_as_it_came(config) -> None:
+    walk = Walk(config.robot, 2)
+    fix = MarkerFix(walk.fixes[0].t, walk.fixes[0].x, COV, (1.0, 2.0, 3.0, 4.0))
+    pairs, _ = sample(config, walk.sources(fixes=[fix]))
+    pair = pairs[0]
+    assert (pair.t, pair.x.tolist(), pair.centres_px) == (fix.t, fix.x.tolist(), fix.centres_px)
+
+
+def test_every_frame_is_counted_as_a_pair_or_under_its_reason(config) -> None:
+    walk = Walk(config.robot, 20, step_deg=0.6)
+    fixes = walk.fixes
+    fixes[5] = MarkerMiss(fixes[5].t, Reason.AT_BORDER)
+    fixes[6] = MarkerMiss(fixes[6].t, Reason.AT_BORDER)
+    pairs, status = sample(config, walk.sources(fixes=fixes))
+    assert status.rejected["at_border"] == 2
+    assert len(pairs) + sum(status.rejected.values()) == status.frames == 20
+
+
+def test_a_pair_is_in_the_store_before_it_is_published(config) -> None:
+    walk, found = Walk(config.robot, 10), []
+    with sampling(config, walk.sources(), exit_at_end=True) as sampler:
+        publish = sampler._publish
+
+        def check(payload: bytes) -> None:
+            found.append(sampler._store.last().seq == decode(payload, PairMessage).seq)
+            publish(payload)
+
+        sampler._publish = check
+        sampler.run()
+    assert found == [True] * 10
+
+
+def test_a_restart_goes_on_with_the_numbers_in_a_new_segment(config) -> None:
+    walk = Walk(config.robot, 10)
+    sample(config, walk.sources())
+    pairs, _ = sample(config, walk.sources())
+    assert [(pair.seq, pair.segment) for pair in pairs[8:12]] == [(9, 1), (10, 1), (11, 2), (12, 2)]
+
+
+def test_the_coverage_after_a_restart_includes_the_pairs_before_it(config) -> None:
+    walk = Walk(config.robot, 10)
+    sample(config, walk.sources())
+    _, status = sample(config, Sources(Scripted([], config.robot.joints), Scripted([]), SystemClock()))
+    waist = status.coverage["waist"]
+    assert (waist.low, waist.high, waist.lower_limit) == (walk.q[0, 0], walk.q[-1, 0], -3.0)
+
+
+def test_readings_that_are_not_finite_are_not_used_and_reported(config) -> None:
+    walk = Walk(config.robot, 10)
+    readings = walk.readings
+    readings[4] = JointReading(readings[4].t, frozen_array([np.nan, 0.0]))
+    pairs, status = sample(config, walk.sources(readings=readings))
+    assert np.isfinite([pair.q for pair in pairs]).all()
+    assert status.health == ["1 encoder readings were not finite and were not used"]
+
+
+def test_encoders_of_other_joints_are_refused(config) -> None:
+    sources = Sources(Scripted([], ("hip", "knee")), Scripted([]), SystemClock())
+    with pytest.raises(ConfigError, match="the encoders give the joints hip, knee"), sampling(config, sources):
+        pass
+
+
+# --- sources that fail
+
+
+@pytest.fixture
+def impatient(monkeypatch) -> None:
+    """Lost sources are opened again at once."""
+    monkeypatch.setattr("daemon.reopen.FIRST_WAIT_S", 0.0)
+
+
+def test_a_lost_camera_is_opened_again_and_the_segment_ends(config, impatient) -> None:
+    walk = Walk(config.robot, 6)
+    fixes = [*walk.fixes[:3], SourceLost("unplugged"), *walk.fixes[3:]]
+    pairs, _ = sample(config, walk.sources(fixes=fixes))
+    assert [pair.segment for pair in pairs] == [1, 1, 1, 2, 2, 2]
+
+
+def test_lost_encoders_are_opened_again(config, impatient) -> None:
+    walk = Walk(config.robot, 6)
+    joints = Scripted([SourceLost("no power"), *walk.readings], config.robot.joints)
+    pairs, _ = sample(config, Sources(joints, Scripted(walk.fixes), SystemClock()))
+    assert (joints.opened, joints.closed, len(pairs)) == (2, 2, 6)
+
+
+def test_a_lost_source_is_told_of_while_it_is_lost(config) -> None:
+    marker = Scripted([SourceLost("unplugged")], openings=[None, *[SourceLost("still unplugged")] * 100])
+    held = threading.Event()
+    sources = Sources(Scripted([held], config.robot.joints), marker, SystemClock())
+    with running(config, sources) as bus:
+        status = status_when(bus, lambda status: bool(status.health))
+    assert status.health[0].startswith("the cameras are lost (unplugged)")
+
+
+def test_a_source_that_cannot_be_opened_at_the_start_is_an_error(config) -> None:
+    sources = Sources(Scripted([], config.robot.joints, [SourceError("no such port")]), Scripted([]), SystemClock())
+    with sampling(config, sources) as sampler, pytest.raises(SourceError, match="no such port"):
+        sampler.run()
+
+
+def test_a_failure_of_the_encoders_ends_the_sampler(config) -> None:
+    held = threading.Event()
+    sources = Sources(Scripted([RuntimeError("a bug")], config.robot.joints), Scripted([held]), SystemClock())
+    with sampling(config, sources) as sampler, pytest.raises(RuntimeError, match="a bug"):
+        sampler.run()
+
+
+def test_all_sources_are_closed_in_the_end(config) -> None:
+    sources = Walk(config.robot, 3).sources()
+    sample(config, sources)
+    assert (sources.joints.closed, sources.marker.closed) == (1, 1)
+
+
+# --- a store that fails
+
+
+def test_a_pair_that_cannot_be_stored_is_not_published_and_ends_the_sampler(config, mount_small_disk) -> None:
+    file = mount_small_disk("size=256k") / "pairs.sqlite"
+    walk, published = Walk(config.robot, 3000, step_deg=1.0005), []
+    with (
+        PairStore(file, session_of(config, SystemClock())) as store,
+        Bus(listen=config.tables.zenoh.sampler) as bus,
+    ):
+        sampler = Sampler(config, walk.sources(), bus, store)
+        sampler._publish = published.append
+        with pytest.raises(StoreError, match="is full"):
+            sampler.run()
+        assert len(published) == store.last().seq
+        status = sampler.status()
+    assert (status.state, status.health[0]) == (
+        "failed",
+        f"the disk of {file} is full. Free some space, or give a --state-dir on another disk. Nothing was changed",
+    )
+
+
+# --- what others see
+
+
+def test_pairs_are_published_in_order(config) -> None:
+    walk, start = Walk(config.robot, 30), threading.Event()
+    received: Queue[bytes] = Queue()
+    with running(config, walk.sources(fixes=[start, *walk.fixes])) as bus:
+        bus.subscribe(KEYS.pair, received.put)
+        # The subscription is known to the sampler once it has answered something that was asked after it.
+        bus.ask_one(KEYS.status("sampler"))
+        start.set()
+        messages = [decode(received.get(timeout=LIMIT_S), PairMessage) for _ in range(30)]
+    assert [message.seq for message in messages] == list(range(1, 31))
+    assert np.array_equal([message.q for message in messages], walk.q)
+
+
+@pytest.fixture
+def ended(config) -> Iterator[Bus]:
+    """A client of a sampler whose 1,200 pairs are all stored."""
+    walk = Walk(config.robot, 1200, step_deg=1.01)
+    with running(config, walk.sources()) as bus:
+        status_when(bus, lambda status: status.state == "ended")
+        yield bus
+
+
+def test_the_history_is_served_after_the_sources_ended(ended) -> None:
+    pairs: list[PairMessage] = []
+    while True:
+        reply = decode(ended.ask_one(f"{KEYS.pairs}?from={len(pairs) + 1}"), PairsReply)
+        pairs += reply.pairs
+        if len(pairs) == reply.last_seq:
+            break
+        assert len(reply.pairs) == 1000
+    assert [pair.seq for pair in pairs] == list(range(1, 1201))
+
+
+def test_a_range_of_the_history_includes_both_bounds(ended) -> None:
+    reply = decode(ended.ask_one(f"{KEYS.pairs}?from=7;to=9"), PairsReply)
+    assert ([pair.seq for pair in reply.pairs], reply.last_seq) == ([7, 8, 9], 1200)
+
+
+def test_who_asks_for_more_than_there_is_gets_no_pairs(ended) -> None:
+    reply = decode(ended.ask_one(f"{KEYS.pairs}?from=1201"), PairsReply)
+    assert (reply.pairs, reply.last_seq) == ([], 1200)
+
+
+def test_the_history_comes_as_messagepack_to_who_asks_in_messagepack(ended) -> None:
+    payload = ended.ask_one(f"{KEYS.pairs}?from=3;to=3", encoding=MSGPACK)
+    assert msgspec.msgpack.decode(payload)["pairs"][0]["seq"] == 3
+
+
+@pytest.mark.parametrize(
+    ("parameters", "message"),
+    [
+        ("from=0", "from='0' is not a sequence number"),
+        ("from=first", "from='first' is not a sequence number"),
+        ("to=-3", "to='-3' is not a sequence number"),
+        (f"from={10**30}", "is not a sequence number"),
+        ("from=9;to=3", "from=9 is after to=3"),
+        ("since=3", "unknown parameter 'since'. Known are: from, to"),
+    ],
+)
+def test_a_bad_range_is_refused(ended, parameters, message) -> None:
+    with pytest.raises(RequestError, match=message):
+        ended.ask_one(f"{KEYS.pairs}?{parameters}")
+
+
+def test_a_paused_sampler_accepts_nothing_and_goes_on_in_a_new_segment(config) -> None:
+    walk = Walk(config.robot, 12)
+    gates = [threading.Event() for _ in range(2)]
+    fixes = [*walk.fixes[:4], gates[0], *walk.fixes[4:8], gates[1], *walk.fixes[8:]]
+    with running(config, walk.sources(fixes=fixes)) as bus:
+        status_when(bus, lambda status: status.frames == 4)
+        command(bus, "pause")
+        gates[0].set()
+        paused = status_when(bus, lambda status: status.frames == 8)
+        command(bus, "resume")
+        gates[1].set()
+        status_when(bus, lambda status: status.state == "ended")
+        pairs = decode(bus.ask_one(KEYS.pairs), PairsReply).pairs
+    assert (paused.state, paused.rejected) == ("paused", {"paused": 4})
+    assert [pair.segment for pair in pairs] == [1] * 4 + [2] * 4
+
+
+def test_a_command_for_the_learner_is_refused_with_its_address(ended) -> None:
+    with pytest.raises(RequestError, match=r"the sampler knows pause and resume, not checkpoint.*/command/learner"):
+        command(ended, "checkpoint")
+
+
+def test_a_command_that_nobody_knows_is_refused(ended) -> None:
+    with pytest.raises(RequestError, match="Invalid enum value 'dance'"):
+        ended.ask_one(KEYS.command("sampler"), b'{"command": "dance"}')
+
+
+def test_what_is_no_json_is_refused(ended) -> None:
+    with pytest.raises(RequestError, match="not a CommandRequest"):
+        ended.ask_one(KEYS.command("sampler"), b"{")
+
+
+def test_the_simulations_tool_is_changed_on_request(config) -> None:
+    world = World(config.robot.chain)
+    with running(config, simulated(Walk(config.robot, 1).sources(), world)) as bus:
+        bus.ask_one(KEYS.simulation, b'{"tool": [0.1, 0, 0.35]}')
+    assert world.tools == [(0.1, 0.0, 0.35)]
+
+
+def test_the_simulation_tells_its_truth_to_an_empty_request(config) -> None:
+    with running(config, simulated(Walk(config.robot, 1).sources(), World(config.robot.chain))) as bus:
+        truth = json.loads(bus.ask_one(KEYS.simulation))
+    assert np.array_equal(truth["fixed"], config.robot.chain.fixed)
+    assert np.array_equal(truth["axes"], config.robot.chain.axes)
+
+
+@pytest.mark.parametrize("request_", [b'{"tool": [0, 0, 80]}', b'{"tool": [0, 1]}', b'{"tol": [0, 0, 0]}', b"?"])
+def test_a_tool_that_cannot_be_is_refused(config, request_) -> None:
+    world = World(config.robot.chain)
+    with running(config, simulated(Walk(config.robot, 1).sources(), world)) as bus, pytest.raises(RequestError):
+        bus.ask_one(KEYS.simulation, request_)
+    assert world.tools == []
+
+
+def test_nobody_tells_the_truth_where_there_is_no_simulation(ended) -> None:
+    with pytest.raises(BusError, match="nobody answers under bodyschema/arm/simulation"):
+        ended.ask_one(KEYS.simulation)
+
+
+def test_silent_sources_are_reported(config, monkeypatch) -> None:
+    monkeypatch.setattr("daemon.sampler.SILENT_AFTER_S", 0.0)
+    held = threading.Event()
+    sources = Sources(Scripted([held], config.robot.joints), Scripted([held]), SystemClock())
+    with running(config, sources) as bus:
+        status = status_when(bus, lambda status: bool(status.health))
+    assert [sentence.split(" for ")[0] for sentence in status.health] == [
+        "the encoders have said nothing",
+        "the cameras have said nothing",
+    ]
