@@ -5,6 +5,7 @@ Numpy and scipy only; no I/O, no clock, no logging. Angles [rad], lengths [m], f
 
 from kbmaps.align import Alignment, align
 from kbmaps.basis import JointBasis, learning_bases
+from kbmaps.block_choice import blockwise_precision, follow_a_path
 from kbmaps.chain import RigidChain
 from kbmaps.errors import (
     BasisError,
@@ -43,6 +44,8 @@ __all__ = [
     "SingularAlphaError",
     "SupportSet",
     "align",
+    "blockwise_precision",
+    "follow_a_path",
     "learning_bases",
     "prediction_errors",
     "with_refitted_marker",

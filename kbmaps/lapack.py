@@ -20,7 +20,7 @@ def _routine(name: str, library: object = lapack) -> Callable[..., Any]:
 _dger = _routine("dger", blas)
 _dgeqrf, _dormqr = _routine("dgeqrf"), _routine("dormqr")
 _dtpqrt, _dtpmqrt = _routine("dtpqrt"), _routine("dtpmqrt")
-_dlauum, _dpotrf, _dpotrs = _routine("dlauum"), _routine("dpotrf"), _routine("dpotrs")
+_dlauum, _dpotrf, _dpotri, _dpotrs = _routine("dlauum"), _routine("dpotrf"), _routine("dpotri"), _routine("dpotrs")
 _dtrcon, _dtrtrs = _routine("dtrcon"), _routine("dtrtrs")
 
 
@@ -99,3 +99,12 @@ def smallest_solution(rows: FloatArray, rhs: FloatArray, smallest_rcond: float) 
     solution[:count] = _dtrtrs(upper, rhs, lower=0, trans=1)[0]
     rotated, _, _ = _dormqr("L", "N", factor, tau, solution, lwork=64 * count, overwrite_c=1)
     return cast(FloatArray, rotated)
+
+
+def inverse_of_positive(symmetric: FloatArray) -> FloatArray | None:
+    """The inverse of a symmetric matrix; None when it is not positive definite to rounding."""
+    factor, info = _dpotrf(symmetric, lower=1)
+    if info:
+        return None
+    inverse, info = _dpotri(factor, lower=1, overwrite_c=1)
+    return None if info else cast(FloatArray, np.tril(inverse) + np.tril(inverse, -1).T)

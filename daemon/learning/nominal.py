@@ -15,8 +15,8 @@ from kbmaps import JointBasis, KBMap, RigidChain, align, learning_bases, with_re
 
 # Pairs after a tool change with which the tool is first fitted; with as many more as there were, it is again.
 PAIRS_TO_REFIT = 5
-# Narrower ranges (a joint that hardly moves) would make the basis needlessly stiff, and equal limits impossible.
-NARROWEST_RANGE = 0.1
+# A narrower stroke would make the basis needlessly stiff, and equal limits impossible.
+NARROWEST_STROKE_M = 0.1
 LARGEST_FIT = 1000
 
 
@@ -28,7 +28,7 @@ class NominalModel:
         chain: measurement frame to marker.
         lower, upper: joint limits, shape (d,) [rad or m].
         pose_known, marker_known: as in robot.toml.
-        bases: what is learnt in: scaled orthonormal bases over the joints' ranges, at most one turn wide.
+        bases: what is learnt in: scaled orthonormal bases over the whole turn, or the stroke of a joint that slides.
     """
 
     chain: RigidChain
@@ -39,10 +39,9 @@ class NominalModel:
     bases: tuple[JointBasis, ...] = field(init=False)
 
     def __post_init__(self) -> None:
-        low, high = np.array(self.lower), np.array(self.upper)
-        turning = ~self.chain.prismatic
-        low[turning], high[turning] = low[turning].clip(-np.pi, np.pi), high[turning].clip(-np.pi, np.pi)
-        missing = np.maximum(NARROWEST_RANGE - (high - low), 0.0) / 2.0
+        slides = self.chain.prismatic
+        low, high = np.where(slides, self.lower, -np.pi), np.where(slides, self.upper, np.pi)
+        missing = np.maximum(NARROWEST_STROKE_M - (high - low), 0.0) / 2.0
         object.__setattr__(self, "lower", frozen_array(self.lower))
         object.__setattr__(self, "upper", frozen_array(self.upper))
         object.__setattr__(self, "bases", learning_bases(low - missing, high + missing, self.chain.prismatic.tolist()))
