@@ -111,11 +111,15 @@ def _sampler(status: SamplerStatus) -> list[RenderableType]:
     )
     facts = Table.grid(padding=(0, 2))
     facts.add_row("rates", rates)
-    facts.add_row("store", f"{status.pairs} pairs in {status.segment} segments, {status.store}")
+    facts.add_row("store", f"{status.pairs} pairs in {status.segment} segments; {status.store}")
     facts.add_row("disk", f"{status.disk_free_bytes / 1e9:.1f} GB free")
-    tables = Table.grid(padding=(0, 4))
-    tables.add_row(rejected_table(status), coverage_table(status))
-    return [_head("sampler", status), facts, *_health(status.health), tables]
+    return [_head("sampler", status), facts, *_health(status.health), *_tables(status)]
+
+
+def _tables(status: SamplerStatus) -> list[RenderableType]:
+    if not status.coverage:
+        return [rejected_table(status)]
+    return [rejected_table(status), coverage_table(status)]
 
 
 def _learner(status: LearnerStatus) -> list[RenderableType]:

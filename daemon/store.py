@@ -138,10 +138,11 @@ class PairReader:
 
 
 class PairStore:
-    """Writes a pair store, which it makes when there is none. Use as a context manager; append from one thread at a time.
+    """Writes a pair store, which it makes when there is none.
 
-    A pair that `append` returned is on the disk (`synchronous=FULL`). Sequence numbers run from 1 without gaps. Only
-    one process can have a store open for writing; its death, whatever its kind, frees it.
+    Use as a context manager, and append from one thread at a time. A pair that `append` returned is on the disk
+    (`synchronous=FULL`). Sequence numbers run from 1 without gaps. Only one process can have a store open for
+    writing; its death, whatever its kind, frees it.
     """
 
     def __init__(self, file: Path, session: Session) -> None:
