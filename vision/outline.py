@@ -47,6 +47,8 @@ _LEAST_GATE_PX, _LARGEST_GATE_PX, _GATE_SIGMAS = 0.8, 2.0, 3.5
 # Power of the wave once round the outline over that of the next ones (measured, docs/vision.md): uneven backgrounds
 # make slow waves the larger.
 _SLOWEST_WAVE = 1.3
+# Lens and interpolation smooth along the outline too, which takes power from the quicker waves (1-sigma) [px].
+_SMOOTHING_PX = 1.0
 # What is left when all noise has averaged out [px].
 _FLOOR_PX = 0.01
 # Below this, relative to the cubed trace, the outline points do not determine centre and radius.
@@ -235,4 +237,8 @@ def _noise_density(angles: FloatArray, residual: FloatArray, radius_px: float) -
     """
     harmonics = np.arange(2, max(4, round(radius_px / 3)) + 1)
     waves = np.exp(-1j * harmonics[:, None] * angles) @ residual
-    return _SLOWEST_WAVE * float(np.mean(np.abs(waves) ** 2)) / np.count_nonzero(residual)
+    unsmoothed = np.exp((harmonics * _SMOOTHING_PX / radius_px) ** 2)
+    density = float(np.mean(np.abs(waves) ** 2 * unsmoothed)) / np.count_nonzero(residual)
+    # Student's t with two degrees of freedom per wave: 1-sigma of a spread that is itself estimated.
+    student = 1.0 + 1.0 / (4.0 * len(harmonics))
+    return _SLOWEST_WAVE * student**2 * density

@@ -14,12 +14,16 @@ import numpy as np
 from interfaces.camera import StereoCalibration
 from interfaces.records import FloatArray, ImageArray, StereoFrame
 
-CALIBRATION = StereoCalibration(
+VGA = StereoCalibration(
     focal_px=600.0,
     principal_point_px=(319.5, 239.5),
     baseline_m=0.12,
     image_size_px=(640, 480),
     pixel_sigma=1e-6,
+)
+# The same eyes with a smaller picture: quicker to render.
+SMALL = StereoCalibration(
+    focal_px=600.0, principal_point_px=(159.5, 119.5), baseline_m=0.06, image_size_px=(320, 240), pixel_sigma=1e-6
 )
 
 
@@ -42,7 +46,7 @@ class Look:
     specular: float = 0.35
     shininess: float = 30.0
     exposure: float = 1.0
-    samples: int = 6
+    samples: int = 4
     blur_px: float = 0.7
     noise_sd: float = 3.0
 
@@ -72,7 +76,7 @@ def render_pair(
     look: Look,
     pictures: tuple[FloatArray, FloatArray],
     rng: np.random.Generator,
-    calibration: StereoCalibration = CALIBRATION,
+    calibration: StereoCalibration,
     t: float = 0.0,
 ) -> StereoFrame:
     """Both eyes' view of a ball around `x` (3,) [m] in the left optical frame, before the two pictures."""
@@ -90,7 +94,7 @@ def paint_ball(
     """`picture` with the ball before it; both RGB of 0..1, shape (height, width, 3)."""
     height, width = picture.shape[:2]
     centre = calibration.project(x_eye)[:2]
-    reach = 2.0 * calibration.focal_px * radius_m / x_eye[2] + 8.0
+    reach = 1.4 * calibration.focal_px * radius_m / x_eye[2] + 3.0
     first = np.maximum(np.floor(centre - reach), 0).astype(int)
     last = np.minimum(np.ceil(centre + reach) + 1, (width, height)).astype(int)
     painted = picture.copy()

@@ -1,0 +1,158 @@
+from __future__ import annotations
+
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from queue import Queue
+
+import pytest
+
+from daemon.bus import Bus, Request, client
+from daemon.wire import JSON, MSGPACK, ErrorReply, decode
+from interfaces.errors import BusError, RequestError
+
+LIMIT_S = 10.0
+KEY = "bodyschema/arm/status/sampler"
+
+
+@pytest.fixture
+def server(endpoint: str) -> Iterator[Bus]:
+    with Bus(listen=endpoint) as bus:
+        yield bus
+
+
+@pytest.fixture
+def asking(server: Bus, endpoint: str) -> Iterator[Bus]:
+    with client(endpoint) as bus:
+        yield bus
+
+
+def test_a_query_is_answered_with_what_the_handler_returns(server, asking) -> None:
+    server.answer(KEY, lambda request: b"<" + request.payload + b">")
+    assert asking.ask_one(KEY, b"hello") == b"<hello>"
+
+
+def test_a_handler_sees_parameters_and_encoding(server, asking) -> None:
+    seen: list[Request] = []
+    server.answer(KEY, lambda request: seen.append(request) or b"")
+    asking.ask_one(f"{KEY}?from=1;to=20", encoding=MSGPACK)
+    assert seen == [Request({"from": "1", "to": "20"}, b"", MSGPACK)]
+
+
+def test_json_is_spoken_unless_asked_otherwise(server, asking) -> None:
+    seen: list[str] = []
+    server.answer(KEY, lambda request: seen.append(request.encoding) or b"")
+    asking.ask_one(KEY)
+    assert seen == [JSON]
+
+
+def refuse(_request: Request) -> bytes:
+    raise RequestError("q has 3 numbers; this robot has 7 joints")
+
+
+def break_down(_request: Request) -> bytes:
+    raise ZeroDivisionError("a bug")
+
+
+def test_a_refused_request_gets_the_reason_as_an_error(server, asking) -> None:
+    server.answer(KEY, refuse)
+    with pytest.raises(RequestError, match="q has 3 numbers; this robot has 7 joints"):
+        asking.ask_one(KEY)
+
+
+def test_an_error_comes_in_the_encoding_of_the_request(server, asking) -> None:
+    server.answer(KEY, refuse)
+    reply = next(iter(asking._open.get(KEY, encoding=MSGPACK)))
+    assert decode(reply.err.payload.to_bytes(), ErrorReply, MSGPACK).error.startswith("q has 3 numbers")
+
+
+def test_a_handler_with_a_bug_answers_all_the_same(server, asking) -> None:
+    server.answer(KEY, break_down)
+    with pytest.raises(RequestError, match="please report it: ZeroDivisionError: a bug"):
+        asking.ask_one(KEY)
+
+
+def test_a_subscriber_with_a_bug_goes_on_receiving(server, asking) -> None:
+    received: Queue[bytes] = Queue()
+
+    def take(payload: bytes) -> None:
+        received.put(payload)
+        raise ZeroDivisionError("a bug")
+
+    asking.subscribe(KEY, take)
+    server.answer("bodyschema/arm/ready", lambda _request: b"")
+    publish = server.publisher(KEY)
+    asking.ask_one("bodyschema/arm/ready")  # the subscription has arrived before this
+    publish(b"1")
+    publish(b"2")
+    assert [received.get(timeout=LIMIT_S), received.get(timeout=LIMIT_S)] == [b"1", b"2"]
+
+
+def test_where_nobody_answers_the_process_to_start_is_named(asking) -> None:
+    with pytest.raises(BusError, match="Is the sampler running. Start it with `bodyschema sampler`"):
+        asking.ask_one(KEY)
+
+
+def test_the_learners_keys_name_the_learner(asking) -> None:
+    with pytest.raises(BusError, match="Start it with `bodyschema learner`"):
+        asking.ask_one("bodyschema/arm/predict")
+
+
+def test_an_answer_that_does_not_come_in_time_is_an_error(server, asking) -> None:
+    done = threading.Event()
+    server.answer(KEY, lambda _request: b"" if done.wait(LIMIT_S) else b"late")
+    with pytest.raises(RequestError, match="no answer in time"):
+        asking.ask_one(KEY, timeout_s=0.1)
+    done.set()
+
+
+def test_a_client_without_a_server_is_told_at_once(endpoint) -> None:
+    with pytest.raises(BusError, match=f"nobody listens on {endpoint}. Start the daemon"), client(endpoint):
+        pass
+
+
+def test_a_port_in_use_is_named_with_the_remedy(server, endpoint) -> None:
+    second = Bus(listen=endpoint)
+    with pytest.raises(BusError, match=f"the port of {endpoint} is in use.*another endpoint in the table"), second:
+        pass
+
+
+def test_an_endpoint_that_cannot_be_is_named() -> None:
+    with pytest.raises(BusError, match=r"cannot open zenoh on carrier/pigeon.*Mend the table \[zenoh\]"):
+        Bus(listen="carrier/pigeon").__enter__()
+
+
+def test_who_is_alive_is_seen(server, asking) -> None:
+    server.token("bodyschema/arm/alive/sampler")
+    changes: Queue[bool] = Queue()
+    asking.watch("bodyschema/arm/alive/sampler", changes.put)
+    assert changes.get(timeout=LIMIT_S)
+    assert asking.alive("bodyschema/arm/alive/sampler")
+
+
+def test_who_ends_is_no_longer_alive(endpoint) -> None:
+    changes: Queue[bool] = Queue()
+    with Bus(listen=endpoint) as server:
+        server.token("bodyschema/arm/alive/sampler")
+        with client(endpoint) as asking:
+            asking.watch("bodyschema/arm/alive/sampler", changes.put)
+            assert changes.get(timeout=LIMIT_S)
+            server.__exit__(None, None, None)
+            assert not changes.get(timeout=LIMIT_S)
+
+
+def test_a_closed_session_says_so(endpoint) -> None:
+    with pytest.raises(BusError, match="not open"):
+        Bus(listen=endpoint).publisher(KEY)
+
+
+def test_a_process_ends_although_its_handlers_are_still_declared(endpoint) -> None:
+    code = (
+        "import sys; from daemon.bus import Bus\n"
+        "with Bus(listen=sys.argv[1]) as bus:\n"
+        "    bus.answer('a/b', lambda r: b''); bus.subscribe('a/c', print); bus.watch('a/d', print)\n"
+        "    raise SystemExit(7)"
+    )
+    done = subprocess.run([sys.executable, "-c", code, endpoint], timeout=LIMIT_S, check=False)
+    assert done.returncode == 7

@@ -1,0 +1,111 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from daemon.wire import (
+    JSON,
+    LARGEST_BATCH,
+    MSGPACK,
+    CommandRequest,
+    JointsRequest,
+    PairMessage,
+    decode,
+    encode,
+    joint_angles,
+    pair_from_wire,
+    pair_to_wire,
+)
+from interfaces.errors import RequestError
+from interfaces.records import Pair, frozen_array
+
+JOINTS = ("waist", "shoulder", "elbow")
+finite = st.floats(allow_nan=False, allow_infinity=False)
+
+
+@given(st.lists(finite, min_size=12, max_size=12), st.sampled_from([JSON, MSGPACK]))
+def test_a_pair_comes_out_of_the_wire_as_it_went_in(numbers, encoding) -> None:
+    a, b, c, d, e, f = numbers[6:]
+    cov = frozen_array([[a, b, c], [b, d, e], [c, e, f]])
+    pair = Pair("id", 3, 2, 1.5, "utc", frozen_array(numbers[:3]), frozen_array(numbers[3:6]), cov)
+    message = decode(encode(pair_to_wire(pair), encoding), PairMessage, encoding)
+    back = pair_from_wire(message, 3)
+    assert all(np.array_equal(getattr(pair, name), getattr(back, name)) for name in ("q", "x", "cov"))
+    assert (back.store, back.seq, back.segment, back.t, back.utc) == ("id", 3, 2, 1.5, "utc")
+
+
+def message(**changed: object) -> bytes:
+    fields = {
+        "store": "id",
+        "seq": 1,
+        "segment": 1,
+        "t": 0.0,
+        "utc": "",
+        "q": [0, 0, 0],
+        "x": [0, 0, 0],
+        "cov": [0] * 6,
+    }
+    return encode(fields | changed)
+
+
+def test_a_message_of_a_later_version_with_more_keys_is_read() -> None:
+    assert decode(message(colour="red"), PairMessage).seq == 1
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({"seq": 0}, r"`\$.seq`"),
+        ({"x": [0, 0]}, r"`\$.x`"),
+        ({"q": ["a"]}, r"`\$.q"),
+        ({"cov": [0, 0, None, 0, 0, 0]}, r"`\$.cov"),
+    ],
+)
+def test_a_message_that_is_no_pair_is_refused_with_its_place(changed, said) -> None:
+    with pytest.raises(RequestError, match=said):
+        decode(message(**changed), PairMessage)
+
+
+def test_a_pair_of_another_number_of_joints_is_refused() -> None:
+    with pytest.raises(RequestError, match="pair 1 has 3 joint angles, this robot has 7"):
+        pair_from_wire(decode(message(), PairMessage), 7)
+
+
+def test_a_pair_with_an_infinite_number_is_refused() -> None:
+    with pytest.raises(RequestError, match="pair 1 has a number that is not finite"):
+        pair_from_wire(PairMessage("id", 1, 1, 0.0, "", [0, 0, float("inf")], (0, 0, 0), (0,) * 6), 3)
+
+
+def test_a_request_with_an_unknown_key_is_refused() -> None:
+    with pytest.raises(RequestError, match="unknown field `angles`"):
+        decode(b'{"angles": [1]}', JointsRequest)
+
+
+@pytest.mark.parametrize("payload", [b"", b"{", b"[]", b"\xff\xfe", b"null", b"[" * 100_000])
+@pytest.mark.parametrize("encoding", [JSON, MSGPACK])
+def test_bytes_that_are_no_request_are_refused(payload, encoding) -> None:
+    with pytest.raises(RequestError, match="not a CommandRequest"):
+        decode(payload, CommandRequest, encoding)
+
+
+def test_one_vector_is_a_batch_of_one() -> None:
+    assert joint_angles(JointsRequest([1, 2, 3]), JOINTS).tolist() == [[1.0, 2.0, 3.0]]
+
+
+@pytest.mark.parametrize(
+    ("q", "said"),
+    [
+        ([], "q is empty"),
+        ([[]], "row 0 of q has 0 numbers; this robot has 3 joints: waist, shoulder, elbow"),
+        ([1.0, 2.0], "row 0 of q has 2 numbers"),
+        ([[1, 2, 3], [1, 2]], "row 1 of q has 2 numbers"),
+        ([[1, 2, 3], 4.0], "row 1 of q has 1 numbers"),
+        ([[0, 0, 0], [0, float("nan"), 0]], "row 1 of q is not finite at joint 'shoulder'"),
+        ([[0.0] * 3] * (LARGEST_BATCH + 1), f"send at most {LARGEST_BATCH} at once"),
+    ],
+)
+def test_joint_angles_that_do_not_fit_the_robot_are_refused(q, said) -> None:
+    with pytest.raises(RequestError, match=said):
+        joint_angles(JointsRequest(q), JOINTS)
