@@ -156,7 +156,7 @@ def chain_between(
             f"joints are not in the order in which they follow from {start!r} to {end!r}",
             remedy=f"Write joints = {list(on_way)}",
         )
-    return _assemble(way, joints, held_at, np.linalg.inv(T_start_camera), marker_xyz)
+    return _assemble(way, joints, held_at, _inverse(T_start_camera), marker_xyz)
 
 
 def _assemble(
@@ -168,7 +168,7 @@ def _assemble(
 ) -> RigidChain:
     fixed, axes, prismatic = [T_camera_start], [], []
     for joint, upward in way:
-        T_joint_parent = np.linalg.inv(joint.T_parent_joint)
+        T_joint_parent = _inverse(joint.T_parent_joint)
         if joint.name in joints:
             if not upward:
                 fixed[-1] = fixed[-1] @ joint.T_parent_joint
@@ -177,7 +177,7 @@ def _assemble(
             prismatic.append(joint.kind == "prismatic")
             continue
         motion = _motion(joint, held_at.get(joint.name, 0.0))
-        fixed[-1] = fixed[-1] @ (np.linalg.inv(motion) @ T_joint_parent if upward else joint.T_parent_joint @ motion)
+        fixed[-1] = fixed[-1] @ (_inverse(motion) @ T_joint_parent if upward else joint.T_parent_joint @ motion)
     tool = np.eye(4)
     tool[:3, 3] = marker_xyz
     fixed[-1] = fixed[-1] @ tool
@@ -195,6 +195,10 @@ def _motion(joint: UrdfJoint, position: float) -> FloatArray:
     elif joint.kind == "prismatic":
         T[:3, 3] = joint.axis * position
     return T
+
+
+def _inverse(T: FloatArray) -> FloatArray:
+    return np.linalg.inv(T).astype(np.float64)
 
 
 def _movable(way: list[tuple[UrdfJoint, bool]]) -> str:
@@ -242,7 +246,7 @@ def _limits(joint: Any) -> tuple[float, float]:
 
 
 def _parse(file: Path) -> Any:
-    from lxml import etree
+    from lxml import etree  # pyright: ignore[reportAttributeAccessIssue]
 
     try:
         if file.stat().st_size > LARGEST_FILE_BYTES:

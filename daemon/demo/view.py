@@ -46,8 +46,9 @@ class _Lines:
         self._next = time.monotonic() + PLAIN_EVERY_S
         learner, verdict = snapshot.learner, snapshot.verdict
         truth = mm(verdict.error_m) if verdict else "-"
+        rejected = sum(snapshot.sampler.rejected.values())
         self._console.print(
-            f"{learner.pairs:5d} of {snapshot.target} pairs, {sum(snapshot.sampler.rejected.values())} frames rejected; "
+            f"{learner.pairs:5d} of {snapshot.target} pairs, {rejected} frames rejected; "
             f"error before learning each {mm(learner.prequential_m.get(learner.answering))}, "
             f"claimed {mm(learner.claimed_error_m)}, truth on held-out poses {truth}; "
             f"{snapshot.asker.answers} answers",

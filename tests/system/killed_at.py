@@ -1,6 +1,6 @@
 """Runs `bodyschema` and kills it, as by SIGKILL from outside, at a named point.
 
-    python killed_at.py POINT NTH sampler --robot robot.toml
+python killed_at.py POINT NTH sampler --robot robot.toml
 """
 
 from __future__ import annotations

@@ -26,7 +26,7 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> Demo:
     folder = tmp_path_factory.mktemp("demo") / "out"
     command = [sys.executable, "-m", "daemon", "demo", "--out", str(folder), "--seed", "3"]
     command += ["--pairs", str(FIRST), "--pairs-after", str(SECOND)]
-    return Demo(folder, subprocess.run(command, capture_output=True, text=True, timeout=110))
+    return Demo(folder, subprocess.run(command, check=False, capture_output=True, text=True, timeout=110))
 
 
 def test_the_demo_ends_well(demo: Demo) -> None:
@@ -63,7 +63,7 @@ def test_the_demo_refuses_a_folder_that_is_not_its_own(tmp_path: Path) -> None:
     precious = tmp_path / "thesis.tex"
     precious.write_text("years of work")
     command = [sys.executable, "-m", "daemon", "demo", "--out", str(tmp_path)]
-    result = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    result = subprocess.run(command, check=False, capture_output=True, text=True, timeout=60)
     assert result.returncode == 1
     assert "thesis.tex" in result.stderr
     assert precious.read_text() == "years of work"

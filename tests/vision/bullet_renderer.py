@@ -31,9 +31,13 @@ class BulletScene:
         self._ball = self._body(pybullet.GEOM_SPHERE, (0.9, 0.05, 0.05, 1.0), radius=self.radius_m)
         for number, colour in enumerate((GREY, BLUE, BROWN, DARK, GREY)):
             at = (-0.5 + 0.25 * number, 0.15 * (-1) ** number, 1.7)
-            self._place(self._body(pybullet.GEOM_CAPSULE, colour, radius=0.06, length=0.5), at, (0.4 * number, 0.9, 0.2))
+            self._place(
+                self._body(pybullet.GEOM_CAPSULE, colour, radius=0.06, length=0.5), at, (0.4 * number, 0.9, 0.2)
+            )
         for number, colour in enumerate((BRICK, GREY, BROWN)):
-            self._place(self._body(pybullet.GEOM_BOX, colour, halfExtents=(0.25, 0.2, 0.05)), (-0.7 + 0.7 * number, -0.3, 2.1))
+            self._place(
+                self._body(pybullet.GEOM_BOX, colour, halfExtents=(0.25, 0.2, 0.05)), (-0.7 + 0.7 * number, -0.3, 2.1)
+            )
         return self
 
     def __exit__(

@@ -36,7 +36,7 @@ class Errors:
 
 
 def place(calibration: StereoCalibration, radius_px: float, rng: np.random.Generator) -> FloatArray:
-    """A random point (3,) [m] where a ball of RADIUS_M has about this radius and is in both images with room to spare."""
+    """A random point (3,) [m] where a ball of RADIUS_M has about this radius and is well inside both images."""
     z = calibration.focal_px * RADIUS_M / radius_px
     disparity = calibration.focal_px * calibration.baseline_m / z
     width, height = calibration.image_size_px

@@ -67,9 +67,7 @@ def test_the_pixel_sigma_of_the_calibration_adds_to_the_covariance():
     rng = np.random.default_rng(3)
     pictures = clutter(rng, SMALL.image_size_px), clutter(rng, SMALL.image_size_px)
     frame = render_pair(np.array([0.02, 0.0, 0.8]), RADIUS_M, Look(), pictures, rng, SMALL)
-    exact, rough = (
-        StereoTracker(replace(SMALL, pixel_sigma=sigma)).track(frame) for sigma in (1e-6, 0.3)
-    )
+    exact, rough = (StereoTracker(replace(SMALL, pixel_sigma=sigma)).track(frame) for sigma in (1e-6, 0.3))
     assert isinstance(exact, MarkerFix)
     assert isinstance(rough, MarkerFix)
     added = rough.cov[1, 1] - exact.cov[1, 1]
