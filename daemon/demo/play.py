@@ -139,7 +139,7 @@ class _Stage:
             self.daemon.check()
             time.sleep(0.05)
         marker = np.array(self.config.robot.robot.marker_xyz)
-        self._judge.change_tool(marker * (1.0 + TOOL_LENGTH_M / np.linalg.norm(marker)))
+        self._judge.change_tool(marker * (1.0 + TOOL_LENGTH_M / float(np.linalg.norm(marker))))
         self._judge.new_region()
         self._command("learner", "tool_changed")
         self._command("sampler", "resume")
