@@ -9,17 +9,6 @@ import cyclopts
 
 from interfaces.errors import BodyschemaError
 
-app = cyclopts.App(
-    name="bodyschema",
-    help="""Robot kinematics that calibrates itself.
-
-    Guide the arm by hand: encoders and a stereo camera give pairs, a learner turns them into the forward
-    kinematics that the cameras see. New here? Try `bodyschema demo`: it needs no hardware.
-    """,
-    version=lambda: version("bodyschema"),
-    help_format="markdown",
-)
-
 COMMANDS = {
     "demo": "Watch the whole thing learn, in simulation, in about a minute.",
     "run": "Start sampler and learner for a robot. Needs robot.toml; next: `status --watch`.",
@@ -33,14 +22,38 @@ COMMANDS = {
     "export": "Turn a store or a recording into CSV, Parquet or MCAP.",
     "config": "Write, check or show robot.toml.",
 }
-for name, summary in COMMANDS.items():
-    app.command(f"daemon.commands.{name}:{name}", name=name, help=summary)
+
+
+def command_line(called: str | None = None) -> cyclopts.App:
+    """The command line.
+
+    Args:
+        called: the command whose own page may be asked for. A summary given here is all that such a page would show,
+            so this command is registered without one and shows what its function says of itself.
+    """
+    line = cyclopts.App(
+        name="bodyschema",
+        help="""Robot kinematics that calibrates itself.
+
+        Guide the arm by hand: encoders and a stereo camera give pairs, a learner turns them into the forward
+        kinematics that the cameras see. New here? Try `bodyschema demo`: it needs no hardware.
+        """,
+        version=lambda: version("bodyschema"),
+        help_format="markdown",
+    )
+    for place, (name, summary) in enumerate(COMMANDS.items()):
+        own = None if name == called else summary
+        line.command(f"daemon.commands.{name}:{name}", name=name, help=own, sort_key=place)
+    return line
+
+
+app = command_line()
 
 
 def main() -> None:
     """Run the command line; errors of ours become one line and exit code 1."""
     try:
-        app()
+        command_line(sys.argv[1] if len(sys.argv) > 1 else None)()
     except BodyschemaError as error:
         print(f"bodyschema: {error}", file=sys.stderr)  # noqa: T201
         sys.exit(1)

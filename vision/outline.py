@@ -39,14 +39,14 @@ _LEAST_SEPARATION = 3.0
 # A limb with less than this part of the usual level is hidden behind something.
 _LEAST_LEVEL = 0.2
 # Error of one edge point before an even background [px]; an uneven one adds to it.
-_EDGE_SIGMA_PX = 0.1
+_EDGE_SIGMA_PX = 0.06
 # Where the background makes a larger one [px], an edge elsewhere hides nothing.
 _UNEVEN_PX = 0.4
 # Residuals beyond this are no longer edge noise [px], whatever the spread is.
 _LEAST_GATE_PX, _LARGEST_GATE_PX, _GATE_SIGMAS = 0.8, 2.0, 3.5
 # Power of the wave once round the outline over that of the next ones (measured, docs/vision.md): uneven backgrounds
 # make slow waves the larger.
-_SLOWEST_WAVE = 1.3
+_SLOWEST_WAVE = 1.2
 # Lens and interpolation smooth along the outline too, which takes power from the quicker waves (1-sigma) [px].
 _SMOOTHING_PX = 1.0
 # What is left when all noise has averaged out [px].

@@ -12,7 +12,9 @@ if TYPE_CHECKING:
     from daemon.robot_template import Guess
     from interfaces.urdf import UrdfTree
 
-config = cyclopts.App(name="config", help="Write, check or show robot.toml.")
+config = cyclopts.App(
+    name="config", help="Write, check or show robot.toml. Begin with `config init`; next: `config check`."
+)
 
 Robot = Annotated[Path, Parameter(env_var="BODYSCHEMA_ROBOT", help="The robot's description.")]
 HERE = Path("robot.toml")

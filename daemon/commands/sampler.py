@@ -36,10 +36,10 @@ def sampler(
     config = Config.load(robot)
     if state_dir is not None:
         config = config.with_state_dir(state_dir)
-    with (
-        PairStore(config.store_file, session_of(config, SystemClock())) as store,
+    with (  # the store comes last: what goes wrong before leaves no trace
         open_sources(config, sim=sim) as sources,
         Bus(listen=config.tables.zenoh.sampler) as bus,
+        PairStore(config.store_file, session_of(config, SystemClock())) as store,
     ):
         process = Sampler(config, sources, bus, store, exit_at_end=exit_at_end)
         with on_termination(process.stop):

@@ -33,7 +33,7 @@ EXPECTED_M = 0.1
 FARTHEST_M = 1000.0
 # What the support leaves open counts with errors of all shapes; those of real arms are smoother. Measured: with this
 # share of the prior's error, 60 to 80 % of the coordinates lie within the claimed sigma.
-OPEN_SHARE = 0.7
+OPEN_SHARE = 1.4
 # Measured in the demo: on the path the instant learner is as good as the exact one, a few degrees beside it its error
 # is four times as large.
 HANDICAP = {INSTANT: 3.0}

@@ -90,7 +90,7 @@ def test_a_subscriber_with_a_bug_goes_on_receiving(server, asking) -> None:
 
 
 def test_where_nobody_answers_the_process_to_start_is_named(asking) -> None:
-    with pytest.raises(BusError, match=r"Is the sampler running. Start it with `bodyschema sampler`"):
+    with pytest.raises(BusError, match=r"Is the sampler running\? Start it with `bodyschema sampler`"):
         asking.ask_one(KEY)
 
 

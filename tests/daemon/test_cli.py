@@ -1,0 +1,149 @@
+from __future__ import annotations
+
+import json
+import os
+import resource
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+from small_arm import URDF, write_small_arm
+
+from daemon.cli import COMMANDS, app, command_line
+from daemon.config import Config
+from interfaces.errors import BusError, ConfigError
+
+LIMIT_S = 60.0
+
+
+def run(*arguments: object, cwd: Path, environment: dict[str, str] | None = None) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "daemon", *map(str, arguments)],
+        capture_output=True, text=True, timeout=LIMIT_S, check=False, cwd=cwd, env=os.environ | (environment or {}),
+    )  # fmt: skip
+
+
+def called(*arguments: object) -> None:
+    app(list(map(str, arguments)), exit_on_error=False, result_action="return_value")
+
+
+@pytest.fixture
+def robot(tmp_path: Path, free_endpoint) -> Path:
+    return write_small_arm(
+        tmp_path,
+        f'[zenoh]\nsampler = "{free_endpoint()}"\nlearner = "{free_endpoint()}"\n[daemon]\nstate_dir = "state"\n',
+    )
+
+
+def test_help_takes_less_than_a_third_of_a_second(tmp_path) -> None:
+    run("--help", cwd=tmp_path)  # the first run may have to compile
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    run("--help", cwd=tmp_path)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    assert after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime < 0.3
+
+
+def test_help_names_every_command(tmp_path) -> None:
+    text = run("--help", cwd=tmp_path).stdout
+    assert [name for name in COMMANDS if f" {name} " not in text] == []
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_each_command_says_what_it_needs_and_what_is_next(command, capsys) -> None:
+    command_line(command)([command, "--help"], exit_on_error=False, result_action="return_value")
+    text = capsys.readouterr().out
+    assert "Next:" in text or "next:" in text or "Example:" in text
+
+
+def test_a_mistake_of_the_user_is_one_line_and_exit_code_1(tmp_path) -> None:
+    done = run("sampler", cwd=tmp_path)
+    assert (done.returncode, done.stdout) == (1, "")
+    assert done.stderr == "bodyschema: robot.toml: there is no such file. `bodyschema config init` writes one\n"
+
+
+def test_robot_toml_may_be_named_in_the_environment(tmp_path, robot) -> None:
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    done = run("config", "check", cwd=elsewhere, environment={"BODYSCHEMA_ROBOT": str(robot)})
+    assert done.returncode == 0, done.stderr
+
+
+# --- config
+
+
+def test_the_example_that_init_writes_is_in_order_once_the_urdf_fits(tmp_path, capsys) -> None:
+    called("config", "init", "--robot", tmp_path / "robot.toml")
+    urdf = URDF.replace("waist", "joint_1").replace("shoulder", "joint_2").replace('"base"', '"base_link"')
+    (tmp_path / "my_robot.urdf").write_text(urdf)
+    called("config", "check", "--robot", tmp_path / "robot.toml")
+    assert "is in order: robot my_robot, 2 joints" in capsys.readouterr().out
+
+
+def test_init_with_a_urdf_fills_in_what_the_urdf_says(tmp_path) -> None:
+    write_small_arm(tmp_path)
+    called("config", "init", "--robot", tmp_path / "new.toml", "--urdf", tmp_path / "arm.urdf")
+    robot = Config.load(tmp_path / "new.toml", {}).robot
+    assert (robot.name, robot.joints, robot.robot.marker_link) == ("arm", ("waist", "shoulder"), "hand")
+
+
+def test_init_with_sim_leaves_nothing_to_mend(tmp_path) -> None:
+    called("config", "init", "--sim", "--robot", tmp_path / "robot.toml")
+    assert Config.load(tmp_path / "robot.toml", {}).robot.calibration is not None
+
+
+def test_init_replaces_no_file(robot) -> None:
+    before = robot.read_text()
+    with pytest.raises(ConfigError, match=r"is there already\. Give another --robot"):
+        called("config", "init", "--robot", robot)
+    assert robot.read_text() == before
+
+
+def test_init_says_when_it_cannot_write(tmp_path) -> None:
+    with pytest.raises(ConfigError, match="cannot be written: No such file or directory"):
+        called("config", "init", "--robot", tmp_path / "nowhere" / "robot.toml")
+
+
+def test_check_says_what_was_understood(robot, capsys) -> None:
+    called("config", "check", "--robot", robot)
+    text = capsys.readouterr().out
+    assert "waist: -171.9° to 171.9°" in text
+    assert "stereo calibration not described" in text
+
+
+def test_show_prints_the_settings_in_force(tmp_path, robot, capsys, monkeypatch) -> None:
+    monkeypatch.setenv("BODYSCHEMA_DAEMON_MAX_STEP_DEG", "8")
+    called("config", "show", "--robot", robot)
+    shown = json.loads(capsys.readouterr().out)
+    assert shown["daemon"]["max_step_deg"] == 8.0
+    assert shown["robot"]["marker_xyz"] == [0.0, 0.0, 0.0]
+
+
+def test_the_written_example_explains_every_key_in_place(tmp_path) -> None:
+    called("config", "init", "--robot", tmp_path / "robot.toml")
+    text = (tmp_path / "robot.toml").read_text()
+    assert tomllib.loads(text)["robot"]["marker_known"] is False
+    assert text.count("CHECK") >= 4
+
+
+# --- processes that are not there
+
+
+def test_a_command_to_nobody_says_what_to_start(robot) -> None:
+    with pytest.raises(
+        BusError, match="nobody listens on tcp/127.0.0.1:[0-9]+. Start the daemon with `bodyschema run`"
+    ):
+        called("command", "pause", "--robot", robot)
+
+
+def test_an_unknown_command_lists_the_known_ones(tmp_path, robot) -> None:
+    done = run("command", "dance", "--robot", robot, cwd=tmp_path)
+    assert done.returncode > 0
+    assert "tool_changed" in done.stdout + done.stderr
+
+
+def test_a_sampler_without_a_driver_says_so_and_leaves_no_store(tmp_path, robot) -> None:
+    done = run("sampler", "--robot", robot, cwd=tmp_path)
+    assert (done.returncode, "no driver is configured" in done.stderr) == (1, True)
+    assert not (tmp_path / "state").exists()

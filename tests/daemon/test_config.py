@@ -1,0 +1,97 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from small_arm import ROBOT, write_small_arm
+
+from daemon.config import Config, ZenohConfig
+from interfaces.errors import ConfigError
+
+
+def load(folder: Path, tables: str = "", environment: dict[str, str] | None = None) -> Config:
+    return Config.load(write_small_arm(folder, tables), environment or {})
+
+
+def test_a_table_that_is_not_there_has_its_defaults(tmp_path) -> None:
+    assert load(tmp_path).tables.zenoh == ZenohConfig()
+
+
+def test_the_file_overrides_the_defaults(tmp_path) -> None:
+    assert load(tmp_path, "[daemon]\nmax_step_deg = 5\n").tables.daemon.max_step_deg == 5.0
+
+
+def test_the_environment_overrides_the_file(tmp_path) -> None:
+    environment = {"BODYSCHEMA_DAEMON_MAX_STEP_DEG": "7.5", "BODYSCHEMA_ZENOH_SAMPLER": "tcp/127.0.0.1:9"}
+    tables = load(tmp_path, "[daemon]\nmax_step_deg = 5\n", environment).tables
+    assert (tables.daemon.max_step_deg, tables.zenoh.sampler) == (7.5, "tcp/127.0.0.1:9")
+
+
+def test_the_environment_reaches_the_robot(tmp_path) -> None:
+    assert load(tmp_path, environment={"BODYSCHEMA_ROBOT_NAME": "twin"}).robot.name == "twin"
+
+
+def test_the_path_of_robot_toml_in_the_environment_is_no_setting(tmp_path) -> None:
+    assert load(tmp_path, environment={"BODYSCHEMA_ROBOT": "elsewhere.toml"}).robot.name == "arm"
+
+
+def test_state_dir_is_relative_to_robot_toml(tmp_path) -> None:
+    assert load(tmp_path, '[daemon]\nstate_dir = "state"\n').store_file == tmp_path / "state" / "pairs.sqlite"
+
+
+def test_without_state_dir_state_is_kept_where_the_system_wants_it(tmp_path, monkeypatch) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "xdg"))
+    assert load(tmp_path).state_dir == tmp_path / "xdg" / "bodyschema" / "arm"
+
+
+def test_the_command_lines_state_dir_comes_first(tmp_path) -> None:
+    config = load(tmp_path, '[daemon]\nstate_dir = "state"\n').with_state_dir(tmp_path / "other")
+    assert config.state_dir == tmp_path / "other"
+
+
+LINE = ROBOT.count("\n")  # the tables appended begin on the next line
+
+
+@pytest.mark.parametrize(
+    ("tables", "line", "said"),
+    [
+        ("[daemn]\n", 1, "unknown table [daemn]. Did you mean 'daemon'?"),
+        ("[daemon]\nmin_stepdeg = 1\n", 2, "unknown key 'min_stepdeg' in [daemon]. Did you mean 'min_step_deg'?"),
+        ("[learner]\n\nsteps = 3\n", 3, "unknown key 'steps' in [learner]"),
+        ("[drivers]\nport = 1\n", 2, "unknown key 'port' in [drivers]"),
+        ("[vision]\ncolor = 'red'\n", 2, "unknown key 'color' in [vision]. Did you mean 'colour'?"),
+        ("[sim]\nsede = 1\n", 2, "unknown key 'sede' in [sim]. Did you mean 'seed'?"),
+        ("[vision.colour]\nhue_deg = 3\nhues = 1\n", 3, "unknown key 'hues' in [vision.colour]"),
+        ("[daemon]\nmin_step_deg = 'one'\n", 2, "daemon.min_step_deg: expected `float`, got `str`"),
+        ("[daemon]\nmin_step_deg = -1\n", 2, "daemon.min_step_deg: expected `float` > 0"),
+        ("[daemon]\nmin_step_deg = 4\n", 2, "min_step_deg is not below max_step_deg"),
+        ("[zenoh]\nsampler = '7447'\n", 2, "zenoh.sampler: expected `str` matching regex"),
+        ("[daemon]\nmin_step_deg = = 1\n", 2, "not TOML"),
+    ],
+)
+def test_a_mistake_is_named_with_its_line(tmp_path, tables, line, said) -> None:
+    with pytest.raises(ConfigError) as refusal:
+        load(tmp_path, tables)
+    assert str(refusal.value).startswith(f"{tmp_path / 'robot.toml'}, line {LINE + line}: ")
+    assert said in str(refusal.value)
+
+
+def test_a_mistake_in_the_environment_is_named(tmp_path) -> None:
+    with pytest.raises(ConfigError, match="daemon.min_step_deg: expected `float`, got `str`"):
+        load(tmp_path, environment={"BODYSCHEMA_DAEMON_MIN_STEP_DEG": "little"})
+
+
+def test_an_unknown_key_in_the_environment_is_refused(tmp_path) -> None:
+    with pytest.raises(ConfigError, match=r"unknown key 'min_step' in \[daemon\]"):
+        load(tmp_path, environment={"BODYSCHEMA_DAEMON_MIN_STEP": "1"})
+
+
+def test_a_missing_file_names_the_command_that_writes_one(tmp_path) -> None:
+    with pytest.raises(ConfigError, match="there is no such file. `bodyschema config init` writes one"):
+        Config.load(tmp_path / "robot.toml", {})
+
+
+def test_a_missing_table_is_named(tmp_path) -> None:
+    (tmp_path / "robot.toml").write_text("[camera]\n")
+    with pytest.raises(ConfigError, match=r"the table \[robot\] is missing"):
+        Config.load(tmp_path / "robot.toml", {})

@@ -1,0 +1,162 @@
+from __future__ import annotations
+
+import io
+import json
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+from scripted_sources import Walk
+from small_arm import write_small_arm
+
+from daemon.bus import Bus
+from daemon.cli import app
+from daemon.config import Config
+from daemon.keys import Keys
+from daemon.sampler import Sampler
+from daemon.session import session_of
+from daemon.status import JointRange, LearnerStatus, SamplerStatus
+from daemon.status_view import Seen, Watcher, as_json, screen
+from daemon.store import PairStore
+from interfaces.clock import SystemClock
+
+LIMIT_S = 20.0
+SAMPLER = SamplerStatus(
+    robot="arm",
+    store="2f9a",
+    state="paused",
+    pairs=612,
+    segment=3,
+    uptime_s=75.2,
+    frames=700,
+    frames_per_s=29.9,
+    readings_per_s=119.6,
+    pairs_per_s=12.3,
+    rejected={"too_near": 80, "at_border": 8},
+    coverage={"waist": JointRange(-0.5, 0.5, -3.0, 3.0)},
+    disk_free_bytes=12_300_000_000,
+    health=["the disk is nearly full"],
+    version="0.1.0",
+)
+LEARNER = LearnerStatus(
+    robot="arm",
+    store="2f9a",
+    state="learning",
+    pairs=612,
+    last_seq=612,
+    pairs_since_change=12,
+    sampler_alive=True,
+    replayed=4896,
+    answering="exact",
+    prequential_m={"prior": 0.0401, "exact": 0.002},
+    claimed_error_m=0.0066,
+    curve=[],
+    model="6b6f",
+    gaps_recovered=0,
+    refused=0,
+    doubted=0,
+    changes=1,
+    checkpoint_age_s=None,
+    uptime_s=4000.0,
+    health=[],
+    version="0.1.0",
+)
+
+
+@pytest.fixture
+def config(tmp_path: Path, free_endpoint) -> Config:
+    tables = f'[zenoh]\nsampler = "{free_endpoint()}"\nlearner = "{free_endpoint()}"\n[daemon]\nstate_dir = "state"\n'
+    return Config.load(write_small_arm(tmp_path, tables), {})
+
+
+def shown(seen: Seen, config: Config) -> str:
+    console = Console(file=io.StringIO(), width=80)
+    console.print(screen(seen, config))
+    return console.file.getvalue()
+
+
+@contextmanager
+def sampler_running(config: Config) -> Iterator[None]:
+    with (
+        PairStore(config.store_file, session_of(config, SystemClock())) as store,
+        Bus(listen=config.tables.zenoh.sampler) as bus,
+    ):
+        sampler = Sampler(config, Walk(config.robot, 20).sources(), bus, store)
+        thread = threading.Thread(target=sampler.run)
+        thread.start()
+        with Bus(connect=config.tables.zenoh.sampler, client=True) as waiting:
+            up = threading.Event()
+            waiting.watch(Keys("arm").alive("sampler"), lambda _alive: up.set())
+            assert up.wait(LIMIT_S)
+        try:
+            yield
+        finally:
+            sampler.stop()
+            thread.join(LIMIT_S)
+
+
+@pytest.mark.parametrize(
+    "said",
+    [
+        "sampler of arm is paused, up for 1 min 15 s",
+        "29.9 frames/s, 120 readings/s, 12.3 pairs/s",
+        "612 pairs in 3 segments",
+        "rejected: too near  80",
+        "! the disk is nearly full",
+        "-29° … +29°",
+        "learner of arm is learning, up for 1 h 07 min",
+        "prior 40.1 mm, exact 2.0 mm",
+        "exact, model 6b6f",
+        "none yet",
+    ],
+)
+def test_the_screen_shows_both_processes(config, said) -> None:
+    assert said in " ".join(shown(Seen(SAMPLER, LEARNER), config).split()) or said in shown(
+        Seen(SAMPLER, LEARNER), config
+    )
+
+
+def test_a_process_that_does_not_answer_is_named_with_the_command_that_starts_it(config) -> None:
+    text = " ".join(shown(Seen(SAMPLER, None), config).split())
+    assert f"learner does not answer on {config.tables.zenoh.learner}. Start it with `bodyschema learner`" in text
+
+
+def test_json_has_both_processes_and_null_for_who_is_not_there() -> None:
+    seen = json.loads(as_json(Seen(SAMPLER, None)))
+    assert (seen["sampler"]["pairs"], seen["learner"]) == (612, None)
+
+
+def test_the_watcher_finds_a_process_that_comes_later(config) -> None:
+    with Watcher(config) as watcher:
+        assert watcher.look().nobody
+        with sampler_running(config):
+            seen = watcher.look()
+        assert seen.sampler is not None
+        assert seen.learner is None
+
+
+def test_the_watcher_sees_a_process_go(config) -> None:
+    with Watcher(config) as watcher:
+        with sampler_running(config):
+            assert not watcher.look().nobody
+        assert watcher.look().nobody
+
+
+def status(config: Config, *options: str) -> None:
+    app(["status", "--robot", str(config.file), *options], exit_on_error=False, result_action="return_value")
+
+
+def test_the_command_ends_with_exit_code_1_when_nobody_answers(config) -> None:
+    with pytest.raises(SystemExit) as ended:
+        status(config)
+    assert ended.value.code == 1
+
+
+def test_the_command_prints_json_of_a_sampler_without_a_learner(config, capsys) -> None:
+    with sampler_running(config):
+        status(config, "--json")
+    seen = json.loads(capsys.readouterr().out)
+    assert (seen["sampler"]["robot"], seen["learner"]) == ("arm", None)

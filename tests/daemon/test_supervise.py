@@ -1,0 +1,138 @@
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from daemon.supervise import Child, Supervisor
+from interfaces.errors import BodyschemaError
+
+LIMIT_S = 20.0
+# Writes its process id, then waits for SIGTERM to end it.
+WAITING = "import os, signal, sys; print(os.getpid(), file=open(sys.argv[1], 'a'), flush=True); signal.pause()"
+STUBBORN = "import signal; signal.signal(signal.SIGTERM, signal.SIG_IGN); " + WAITING
+
+
+def child(code: str, *arguments: object) -> Child:
+    return Child("sampler", [sys.executable, "-c", code, *map(str, arguments)])
+
+
+def wait_until(true: Callable[[], bool]) -> None:
+    limit = time.monotonic() + LIMIT_S
+    while not true():
+        assert time.monotonic() < limit
+        threading.Event().wait(0.02)
+
+
+def started(file: Path) -> list[int]:
+    """The process ids that were written so far."""
+    return [int(line) for line in file.read_text().splitlines()] if file.exists() else []
+
+
+def gone(pid: int) -> bool:
+    return not Path(f"/proc/{pid}").exists()
+
+
+@pytest.fixture
+def supervise():
+    """A function that supervises children in a thread until the test ends."""
+    running: list[tuple[Supervisor, threading.Thread]] = []
+
+    def start(*children: Child) -> Supervisor:
+        supervisor = Supervisor(children)
+        running.append((supervisor, threading.Thread(target=supervisor.run)))
+        running[-1][1].start()
+        return supervisor
+
+    yield start
+    for supervisor, thread in running:
+        supervisor.stop()
+        thread.join(LIMIT_S)
+
+
+def test_a_killed_child_is_started_again(tmp_path, supervise) -> None:
+    supervise(child(WAITING, tmp_path / "pids"))
+    wait_until(lambda: len(started(tmp_path / "pids")) == 1)
+    os.kill(started(tmp_path / "pids")[0], signal.SIGKILL)
+    wait_until(lambda: len(started(tmp_path / "pids")) == 2)
+
+
+def test_stopping_ends_every_child(tmp_path) -> None:
+    supervisor = Supervisor([child(WAITING, tmp_path / "a"), child(WAITING, tmp_path / "b")])
+    thread = threading.Thread(target=supervisor.run)
+    thread.start()
+    wait_until(lambda: bool(started(tmp_path / "a") and started(tmp_path / "b")))
+    supervisor.stop()
+    thread.join(LIMIT_S)
+    assert gone(started(tmp_path / "a")[0])
+    assert gone(started(tmp_path / "b")[0])
+
+
+def test_a_child_that_does_not_end_is_killed(tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr("daemon.supervise.END_LIMIT_S", 0.1)
+    supervisor = Supervisor([child(STUBBORN, tmp_path / "pids")])
+    thread = threading.Thread(target=supervisor.run)
+    thread.start()
+    wait_until(lambda: bool(started(tmp_path / "pids")))
+    supervisor.stop()
+    thread.join(LIMIT_S)
+    assert gone(started(tmp_path / "pids")[0])
+
+
+def test_a_child_that_refuses_to_start_ends_the_others(tmp_path) -> None:
+    supervisor = Supervisor([child(WAITING, tmp_path / "pids"), child("raise SystemExit(3)")])
+    with pytest.raises(BodyschemaError, match=r"could not start \(exit code 3\); its message is above"):
+        supervisor.run()
+    assert all(map(gone, started(tmp_path / "pids")))
+
+
+def test_a_child_that_fails_after_it_had_settled_is_started_again(tmp_path, monkeypatch, supervise) -> None:
+    monkeypatch.setattr("daemon.supervise.SETTLED_AFTER_S", 0.0)
+    code = WAITING.replace("signal.pause()", "sys.stdin.read(); __import__('time').sleep(0.3); raise SystemExit(1)")
+    supervise(child(code, tmp_path / "pids"))
+    wait_until(lambda: len(started(tmp_path / "pids")) == 2)
+
+
+def test_the_command_run_ends_both_processes_on_sigterm(tmp_path, free_endpoint) -> None:
+    robot, log = _robot(tmp_path, free_endpoint), tmp_path / "log"
+    with log.open("wb") as stream:
+        run = subprocess.Popen([sys.executable, "-m", "daemon", "run", "--robot", robot], stderr=stream)
+    try:
+        wait_until(lambda: (tmp_path / "state" / "pairs.sqlite").exists() and b"answers on" in log.read_bytes())
+        children = _children(run.pid)
+        run.send_signal(signal.SIGTERM)
+        assert run.wait(LIMIT_S) == 0, log.read_text()
+    finally:
+        run.kill()
+    assert len(children) == 2
+    assert all(map(gone, children))
+
+
+def test_the_command_run_with_a_port_in_use_ends_with_its_message(tmp_path, free_endpoint) -> None:
+    robot = _robot(tmp_path, lambda endpoint=free_endpoint(): endpoint)  # one endpoint for both processes
+    command = [sys.executable, "-m", "daemon", "run", "--robot", robot]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=LIMIT_S, check=False)
+    assert done.returncode == 1
+    assert "is in use. Stop the other bodyschema" in done.stderr
+
+
+def _children(pid: int) -> list[int]:
+    return [int(child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+
+
+def _robot(folder: Path, endpoint: Callable[[], str]) -> Path:
+    from small_arm import write_small_arm
+
+    (folder / "walk.csv").write_text("waist,shoulder,x,y,z\n0.1,0.2,0.3,0.4,0.5\n")
+    return write_small_arm(
+        folder,
+        f'[zenoh]\nsampler = "{endpoint()}"\nlearner = "{endpoint()}"\n[daemon]\nstate_dir = "state"\n'
+        '[drivers]\nrecording = "walk.csv"\nspeed = 0\n',
+    )
