@@ -80,36 +80,73 @@ def render_pair(
     t: float = 0.0,
 ) -> StereoFrame:
     """Both eyes' view of a ball around `x` (3,) [m] in the left optical frame, before the two pictures."""
-    x_right = x - np.array([calibration.baseline_m, 0.0, 0.0])
     left, right = (
         take(paint_ball(picture, x_eye, radius_m, look, calibration), look, rng)
-        for picture, x_eye in zip(pictures, (x, x_right), strict=True)
+        for picture, x_eye in zip(pictures, in_eyes(x, calibration), strict=True)
     )
     return StereoFrame(t, left, right)
+
+
+def in_eyes(x: FloatArray, calibration: StereoCalibration) -> tuple[FloatArray, FloatArray]:
+    """A point (3,) [m] of the left optical frame, in the left and in the right one."""
+    return x, x - np.array([calibration.baseline_m, 0.0, 0.0])
+
+
+class Room:
+    """Two pictures, photographed once; only a ball's neighbourhood is rendered and taken anew for each frame."""
+
+    def __init__(self, calibration: StereoCalibration, look: Look, rng: np.random.Generator) -> None:
+        """Draw the pictures and an exposure; `look` says how they are taken."""
+        self._calibration, self._rng = calibration, rng
+        self._look = replace(look, exposure=float(rng.uniform(0.6, 1.2)))
+        self._pictures = [clutter(rng, calibration.image_size_px) for _ in range(2)]
+        self._images = [take(picture, self._look, rng) for picture in self._pictures]
+
+    def photograph(self, x: FloatArray, radius_m: float, t: float) -> StereoFrame:
+        """Both eyes' view of a ball around `x` (3,) [m] in the left optical frame, in a random light."""
+        look = random_light(self._rng, self._look)
+        eyes = zip(self._pictures, self._images, in_eyes(x, self._calibration), strict=True)
+        return StereoFrame(t, *(self._eye(*eye, radius_m, look) for eye in eyes))
+
+    def _eye(
+        self, picture: FloatArray, image: ImageArray, x_eye: FloatArray, radius_m: float, look: Look
+    ) -> ImageArray:
+        # Blur reaches four sigmas; the tracker looks at a few pixels around the ball.
+        rows, columns = _neighbourhood(x_eye, radius_m, self._calibration, 14.0 + 8.0 * look.blur_px)
+        shown = image.copy()
+        painted = paint_ball(picture, x_eye, radius_m, look, self._calibration)
+        shown[rows, columns] = take(painted[rows, columns], look, self._rng)
+        return shown
 
 
 def paint_ball(
     picture: FloatArray, x_eye: FloatArray, radius_m: float, look: Look, calibration: StereoCalibration
 ) -> FloatArray:
     """`picture` with the ball before it; both RGB of 0..1, shape (height, width, 3)."""
-    height, width = picture.shape[:2]
-    centre = calibration.project(x_eye)[:2]
-    reach = 1.4 * calibration.focal_px * radius_m / x_eye[2] + 3.0
-    first = np.maximum(np.floor(centre - reach), 0).astype(int)
-    last = np.minimum(np.ceil(centre + reach) + 1, (width, height)).astype(int)
     painted = picture.copy()
-    if (last <= first).any():
-        return painted
-    n = look.samples
-    sub = (np.arange(n) + 0.5) / n - 0.5
-    u = (np.arange(first[0], last[0])[:, None] + sub).ravel()
-    v = (np.arange(first[1], last[1])[:, None] + sub).ravel()
-    rays = _rays(u, v, calibration)
-    window = painted[first[1] : last[1], first[0] : last[0]]
-    behind = np.repeat(np.repeat(window, n, axis=0), n, axis=1)
-    shown = _lit(rays, x_eye, radius_m, look, behind)
-    window[:] = shown.reshape(len(v) // n, n, len(u) // n, n, 3).mean(axis=(1, 3))
+    rows, columns = _neighbourhood(x_eye, radius_m, calibration, 1.0)
+    window = painted[rows, columns]
+    if window.size:
+        n = look.samples
+        sub = (np.arange(n) + 0.5) / n - 0.5
+        u = (np.arange(columns.start, columns.stop)[:, None] + sub).ravel()
+        v = (np.arange(rows.start, rows.stop)[:, None] + sub).ravel()
+        behind = np.repeat(np.repeat(window, n, axis=0), n, axis=1)
+        shown = _lit(_rays(u, v, calibration), x_eye, radius_m, look, behind)
+        window[:] = shown.reshape(len(v) // n, n, len(u) // n, n, 3).mean(axis=(1, 3))
     return painted
+
+
+def _neighbourhood(
+    x_eye: FloatArray, radius_m: float, calibration: StereoCalibration, margin_px: float
+) -> tuple[slice, slice]:
+    """Rows and columns of the image that hold the ball and a margin."""
+    size = np.array(calibration.image_size_px)
+    centre = calibration.project(x_eye)[:2]
+    reach = 1.3 * calibration.focal_px * radius_m / x_eye[2] + margin_px
+    first = np.clip(np.floor(centre - reach), 0, size).astype(int)
+    last = np.clip(np.ceil(centre + reach) + 1, 0, size).astype(int)
+    return slice(first[1], last[1]), slice(first[0], last[0])
 
 
 def take(picture: FloatArray, look: Look, rng: np.random.Generator) -> ImageArray:
@@ -121,8 +158,8 @@ def take(picture: FloatArray, look: Look, rng: np.random.Generator) -> ImageArra
     return np.clip(np.rint(grey_levels + noise), 0, 255).astype(np.uint8)
 
 
-def random_look(rng: np.random.Generator, look: Look = Look()) -> Look:
-    """`look` with light, exposure and gloss of its own."""
+def random_light(rng: np.random.Generator, look: Look) -> Look:
+    """`look` with a light and gloss of its own."""
     light = (float(rng.uniform(-1.5, 1.5)), float(rng.uniform(-1.5, 0.3)), -1.0)
     return replace(
         look,
@@ -130,7 +167,6 @@ def random_look(rng: np.random.Generator, look: Look = Look()) -> Look:
         ambient=float(rng.uniform(0.3, 0.5)),
         diffuse=float(rng.uniform(0.4, 0.7)),
         specular=float(rng.uniform(0.0, 0.5)),
-        exposure=float(rng.uniform(0.6, 1.2)),
     )
 
 
@@ -138,7 +174,7 @@ def _rays(u: FloatArray, v: FloatArray, calibration: StereoCalibration) -> Float
     cx, cy = calibration.principal_point_px
     grid_u, grid_v = np.meshgrid((u - cx) / calibration.focal_px, (v - cy) / calibration.focal_px)
     rays = np.stack([grid_u, grid_v, np.ones_like(grid_u)], axis=-1)
-    return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
+    return rays / np.sqrt(np.einsum("vuc,vuc->vu", rays, rays))[..., None]
 
 
 def _lit(rays: FloatArray, x_eye: FloatArray, radius_m: float, look: Look, behind: FloatArray) -> FloatArray:
@@ -151,8 +187,7 @@ def _lit(rays: FloatArray, x_eye: FloatArray, radius_m: float, look: Look, behin
     light = np.array(look.light) / np.linalg.norm(look.light)
     facing = normals @ light
     mirrored = 2.0 * facing[:, None] * normals - light
-    gloss = np.clip(-(mirrored * rays[hit]).sum(axis=-1), 0.0, None) ** look.shininess * (facing > 0)
+    gloss = np.clip(-np.einsum("nc,nc->n", mirrored, rays[hit]), 0.0, None) ** look.shininess * (facing > 0)
     diffuse = look.ambient + look.diffuse * np.clip(facing, 0.0, None)
-    shown = behind.copy()
-    shown[hit] = diffuse[:, None] * np.array(look.ball_rgb) + (look.specular * gloss)[:, None]
-    return shown
+    behind[hit] = diffuse[:, None] * np.array(look.ball_rgb) + (look.specular * gloss)[:, None]
+    return behind

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from ball_renderer import Look, clutter, random_look, render_pair
+from ball_renderer import Look, Room
 
 from interfaces.camera import StereoCalibration
 from interfaces.records import FloatArray, MarkerFix, Reason
@@ -49,15 +49,14 @@ def place(calibration: StereoCalibration, radius_px: float, rng: np.random.Gener
 def measure_errors(
     calibration: StereoCalibration, look: Look, frames: int, seed: int, radii_px: tuple[float, float] = (5.0, 30.0)
 ) -> Errors:
-    """Track `frames` unrelated frames: every place, size, light and exposure is drawn anew."""
+    """Track `frames` unrelated frames: every place, size and light is drawn anew, each of 16 rooms has its exposure."""
     rng = np.random.default_rng(seed)
-    pictures = [clutter(rng, calibration.image_size_px) for _ in range(16)]
+    rooms = [Room(calibration, look, rng) for _ in range(min(16, frames))]
     tracker = StereoTracker(calibration)
     found, misses = [], []
     for number in range(frames):
         x = place(calibration, float(np.exp(rng.uniform(*np.log(radii_px)))), rng)
-        behind = pictures[number % 16], pictures[(number + 1) % 16]
-        frame = render_pair(x, RADIUS_M, random_look(rng, look), behind, rng, calibration, t=float(number))
+        frame = rooms[number % len(rooms)].photograph(x, RADIUS_M, t=float(number))
         answer = tracker.track(frame)
         if isinstance(answer, MarkerFix):
             centres = np.array(answer.centres_px) - calibration.project(x)
