@@ -10,17 +10,17 @@ import cyclopts
 from interfaces.errors import BodyschemaError
 
 COMMANDS = {
-    "demo": "Watch the whole thing learn, in simulation, in about a minute.",
-    "run": "Start sampler and learner for a robot. Needs robot.toml; next: `status --watch`.",
-    "sampler": "Only the process beside the hardware: encoders and camera in, pairs out.",
-    "learner": "Only the process that learns and answers; it may run on another machine.",
-    "predict": "Ask the learner where the marker is at given joint angles.",
-    "status": "What the two processes are doing. Needs one of them running.",
-    "command": "Pause, resume, tell of a changed tool, reset, or write a checkpoint.",
-    "replay": "Feed a recording through sampler and learner; prints the error before and after.",
-    "record": "Copy the running sampler's pairs into a file. Needs a running sampler.",
+    "demo": "Watch it all in simulation, about a minute. No hardware needed.",
+    "config": "Write, check or show robot.toml: begin here with your robot.",
+    "replay": "Learn a recording; prints the error before and after.",
+    "run": "Start sampler and learner, and keep them running.",
+    "sampler": "Only the sampler: encoders and cameras in, pairs out.",
+    "learner": "Only the learner: pairs in, answers out. On any machine.",
+    "status": "What the two processes are doing.",
+    "predict": "Ask where the marker is at given joint angles.",
+    "command": "Pause, resume, tell of a changed tool, reset, checkpoint.",
+    "record": "Copy the running sampler's pairs into a file.",
     "export": "Turn a store or a recording into CSV, Parquet or MCAP.",
-    "config": "Write, check or show robot.toml.",
 }
 
 
@@ -36,7 +36,8 @@ def command_line(called: str | None = None) -> cyclopts.App:
         help="""Robot kinematics that calibrates itself.
 
         Guide the arm by hand: encoders and a stereo camera give pairs, a learner turns them into the forward
-        kinematics that the cameras see. New here? Try `bodyschema demo`: it needs no hardware.
+        kinematics that the cameras see. New here? `bodyschema demo`. Then each command's --help says what it needs
+        and what comes next.
         """,
         version=lambda: version("bodyschema"),
         help_format="markdown",

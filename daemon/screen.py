@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Collection
 
 from rich.table import Table
 from rich.text import Text
@@ -20,28 +21,43 @@ def mm(metres: float | None, unit: str = " mm") -> str:
     return f"{value:.{0 if value >= 100 else 1 if value >= 1 else 2}f}{unit}"
 
 
-def rejected_table(status: SamplerStatus) -> Table:
-    """Frames, accepted pairs, and rejected frames by reason."""
-    table = Table(box=None, pad_edge=False, title="frames", title_justify="left", title_style="bold")
-    table.add_column("", no_wrap=True)
-    table.add_column("", justify="right", no_wrap=True)
-    table.add_row("seen", str(status.frames))
-    table.add_row("accepted as pairs", Text(str(status.pairs), style="bold green"))
-    for reason, count in sorted(status.rejected.items(), key=lambda item: -item[1]):
-        table.add_row(f"rejected: {reason.replace('_', ' ')}", str(count))
+def titled_table(title: str, *, numbers: bool = True) -> Table:
+    """An empty table without lines: names on the left and, unless told otherwise, numbers on the right."""
+    table = Table(box=None, pad_edge=False, show_header=False, title=title, title_justify="left", title_style="bold")
+    table.add_column(no_wrap=True)
+    if numbers:
+        table.add_column(justify="right", no_wrap=True)
     return table
 
 
-def coverage_table(status: SamplerStatus) -> Table:
-    """For each joint, which part of its range accepted pairs have covered."""
-    table = Table(box=None, pad_edge=False, title="joint coverage", title_justify="left", title_style="bold")
-    table.add_column("", no_wrap=True)
-    table.add_column("", no_wrap=True)
-    table.add_column("", justify="right", no_wrap=True)
+def rejected(status: SamplerStatus) -> list[tuple[str, int]]:
+    """Rejected frames by reason in words, the most frequent first."""
+    return [
+        (reason.replace("_", " "), count)
+        for reason, count in sorted(status.rejected.items(), key=lambda item: -item[1])
+    ]
+
+
+def coverage_table(status: SamplerStatus, slides: Collection[str] = ()) -> Table:
+    """For each joint, which part of its range accepted pairs have covered.
+
+    Args:
+        slides: names of the prismatic joints.
+    """
+    table = titled_table("joint coverage", numbers=False)
+    table.add_column(no_wrap=True)
+    table.add_column(justify="right", no_wrap=True)
     for name, joint in status.coverage.items():
-        covered = f"{math.degrees(joint.low):+.0f}° … {math.degrees(joint.high):+.0f}°"
-        table.add_row(name, _bar(joint), covered)
+        table.add_row(name, _bar(joint), _metres(joint) if name in slides else _degrees(joint))
     return table
+
+
+def _degrees(joint: JointRange) -> str:
+    return f"{math.degrees(joint.low):+.0f}° … {math.degrees(joint.high):+.0f}°"
+
+
+def _metres(joint: JointRange) -> str:
+    return f"{joint.low:+.3f} m … {joint.high:+.3f} m"
 
 
 def _bar(joint: JointRange) -> Text:

@@ -18,7 +18,7 @@ from interfaces.errors import BusError, RequestError
 from .bus import Bus
 from .config import Config
 from .keys import Keys
-from .screen import coverage_table, mm, rejected_table
+from .screen import coverage_table, mm, rejected
 from .status import LearnerStatus, SamplerStatus
 from .wire import decode
 
@@ -91,12 +91,15 @@ def as_json(seen: Seen) -> str:
 
 
 def screen(seen: Seen, config: Config) -> RenderableType:
-    """Both states for a person."""
-    zenoh = config.tables.zenoh
+    """Both states for a person; what a small terminal cuts off is the end of the joints' coverage."""
+    zenoh, chain = config.tables.zenoh, config.robot.chain
     parts: list[RenderableType] = []
     parts += _absent("sampler", zenoh.sampler) if seen.sampler is None else _sampler(seen.sampler)
     parts.append(Text())
     parts += _absent("learner", zenoh.learner) if seen.learner is None else _learner(seen.learner)
+    if seen.sampler is not None and seen.sampler.coverage:
+        slides = {name for name, slides in zip(config.robot.joints, chain.prismatic, strict=True) if slides}
+        parts += [Text(), coverage_table(seen.sampler, slides)]
     return Group(*parts)
 
 
@@ -106,32 +109,33 @@ def _absent(process: str, endpoint: str) -> list[RenderableType]:
 
 
 def _sampler(status: SamplerStatus) -> list[RenderableType]:
-    rates = (
-        f"{status.frames_per_s:.1f} frames/s, {status.readings_per_s:.0f} readings/s, {status.pairs_per_s:.1f} pairs/s"
-    )
-    facts = Table.grid(padding=(0, 2))
-    facts.add_row("rates", rates)
-    facts.add_row("store", f"{status.pairs} pairs in {status.segment} segments; {status.store}")
-    facts.add_row("disk", f"{status.disk_free_bytes / 1e9:.1f} GB free")
-    return [_head("sampler", status), facts, *_health(status.health), *_tables(status)]
-
-
-def _tables(status: SamplerStatus) -> list[RenderableType]:
-    if not status.coverage:
-        return [rejected_table(status)]
-    return [rejected_table(status), coverage_table(status)]
+    reasons = ", ".join(f"{count} {reason}" for reason, count in rejected(status)) or "none"
+    facts = _facts()
+    facts.add_row("pairs", f"{status.pairs} in {status.segment} segments, {status.pairs_per_s:.1f}/s")
+    facts.add_row("frames", f"{status.frames}, {status.frames_per_s:.1f}/s; readings {status.readings_per_s:.0f}/s")
+    facts.add_row("rejected", reasons)
+    facts.add_row("store", f"{status.store}, {status.disk_free_bytes / 1e9:.1f} GB free")
+    return [_head("sampler", status), facts, *_health(status.health)]
 
 
 def _learner(status: LearnerStatus) -> list[RenderableType]:
     errors = ", ".join(f"{name} {mm(error)}" for name, error in status.prequential_m.items()) or "-"
     saved = "none yet" if status.checkpoint_age_s is None else f"{status.checkpoint_age_s:.0f} s ago"
-    facts = Table.grid(padding=(0, 2))
-    facts.add_row("pairs", f"{status.pairs} learnt, {status.replayed} replay steps, {status.refused} refused")
-    facts.add_row("error before learning", errors)
-    facts.add_row("claimed error", mm(status.claimed_error_m))
-    facts.add_row("answering", f"{status.answering}, model {status.model}")
+    doubted = f", {status.doubted} doubted" if status.doubted else ""
+    refused = f", {status.refused} refused" if status.refused else ""
+    facts = _facts()
+    facts.add_row("pairs", f"{status.pairs} learnt, {status.replayed} replay steps{doubted}{refused}")
+    facts.add_row("next pair", f"missed by: {errors}")
+    facts.add_row("claimed", f"{mm(status.claimed_error_m)} mean error where data is")
+    facts.add_row("answering", f"{status.answering}, model {status.model or 'none yet'}")
     facts.add_row("checkpoint", saved)
     return [_head("learner", status), facts, *_health(status.health)]
+
+
+def _facts() -> Table:
+    facts = Table.grid(padding=(0, 2))
+    facts.add_column(no_wrap=True, min_width=len("checkpoint"), style="dim")
+    return facts
 
 
 def _head(process: str, status: SamplerStatus | LearnerStatus) -> Text:

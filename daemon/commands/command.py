@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated, Literal
 
 from cyclopts import Parameter
+
+from daemon.commands.options import HERE, RobotFile
 
 Name = Literal["pause", "resume", "reset_to_prior", "tool_changed", "checkpoint"]
 Process = Literal["sampler", "learner"]
@@ -21,13 +22,17 @@ def command(
         Process | None,
         Parameter(help="Who is to do it; else pause and resume go to the sampler, others to the learner."),
     ] = None,
-    robot: Annotated[Path, Parameter(env_var="BODYSCHEMA_ROBOT", help="The robot's description.")] = Path("robot.toml"),
+    robot: RobotFile = HERE,
 ) -> None:
     """Tell a running process to do something.
 
     `pause` and `resume` accepting pairs (or, with --to learner, learning); `tool_changed` when another tool is in
     the hand; `reset_to_prior` forgets what was learnt, not the stored pairs; `checkpoint` writes the learner's state
-    now. Needs that process running (`bodyschema run`). Next: `bodyschema status`.
+    now.
+
+    Needs: that process running (`bodyschema run`).
+
+    Next: `bodyschema status`.
     """
     from rich.console import Console
 

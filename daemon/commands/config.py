@@ -8,29 +8,38 @@ from typing import TYPE_CHECKING, Annotated
 import cyclopts
 from cyclopts import Parameter
 
+from daemon.commands.options import HERE, RobotFile, flag
+
 if TYPE_CHECKING:
     from daemon.robot_template import Guess
     from interfaces.urdf import UrdfTree
 
 config = cyclopts.App(
-    name="config", help="Write, check or show robot.toml. Begin with `config init`; next: `config check`."
+    name="config",
+    help="""Write, check or show robot.toml.
+
+    Needs: the URDF of your robot; `config init --sim` needs nothing.
+
+    Next: `bodyschema config init`, then `bodyschema config check`.
+    """,
 )
 
-Robot = Annotated[Path, Parameter(env_var="BODYSCHEMA_ROBOT", help="The robot's description.")]
-HERE = Path("robot.toml")
 
-
-@config.command
+@config.command(sort_key=1)
 def init(
     *,
     robot: Annotated[Path, Parameter(help="The file to write.")] = HERE,
     urdf: Annotated[Path | None, Parameter(help="Your robot's URDF: joints and links are taken from it.")] = None,
-    sim: Annotated[bool, Parameter(negative="", help="A whole example: the simulated upper body.")] = False,
+    sim: Annotated[bool, flag("A whole example: the simulated upper body.")] = False,
 ) -> None:
     """Write a commented robot.toml. Never replaces a file.
 
-    With --urdf the longest chain of joints is filled in; without it, the names are examples. Next: mend what is
-    marked CHECK, then `bodyschema config check`. With --sim nothing is left to mend; next: `bodyschema run --sim`.
+    With --urdf the longest chain of joints is filled in; without it, the names are examples.
+
+    Needs: your robot's URDF; with --sim nothing at all.
+
+    Next: mend what is marked CHECK, then `bodyschema config check`. With --sim nothing is left to mend:
+    `bodyschema run --sim`.
     """
     from interfaces.errors import ConfigError
 
@@ -46,9 +55,14 @@ def init(
     say(f"{robot} written. Next: `bodyschema {'run --sim' if sim else 'config check'} --robot {robot}`")
 
 
-@config.command
-def check(*, robot: Robot = HERE) -> None:
-    """Say what was understood, or which line to mend. Next: `bodyschema run`."""
+@config.command(sort_key=2)
+def check(*, robot: RobotFile = HERE) -> None:
+    """Say what was understood, or which line to mend.
+
+    Needs: robot.toml (`bodyschema config init`) and the URDF that it names.
+
+    Next: `bodyschema replay` for a recording that you have; `bodyschema run`.
+    """
     from daemon.config import Config
     from interfaces.urdf import REVOLUTE
 
@@ -67,9 +81,14 @@ def check(*, robot: Robot = HERE) -> None:
     say(f"  state in {checked.state_dir}")
 
 
-@config.command
-def show(*, robot: Robot = HERE) -> None:
-    """Print all settings as they are in force, defaults and environment included, as JSON."""
+@config.command(sort_key=3)
+def show(*, robot: RobotFile = HERE) -> None:
+    """Print all settings as they are in force, defaults and environment included, as JSON.
+
+    Needs: robot.toml (`bodyschema config init`) and the URDF that it names.
+
+    Next: change a setting in the file, or for once as `BODYSCHEMA_TABLE_KEY=value bodyschema COMMAND`.
+    """
     import msgspec
 
     from daemon.config import Config

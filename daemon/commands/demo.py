@@ -20,8 +20,11 @@ def demo(
     """Watch the whole thing learn, in simulation, in about a minute.
 
     A humanoid's arm is guided by a virtual hand, its head cameras see a red ball on the tool. The sampler and the
-    learner run as the two real processes; half-way the tool becomes 250 mm longer. Needs the extra `sim`
-    (`pip install 'bodyschema[sim]'`) and no hardware. Next: `bodyschema replay` on the recording it leaves.
+    learner run as the two real processes; half-way the tool becomes 250 mm longer.
+
+    Needs: the extra `sim` (`pip install 'bodyschema[sim]'`), and no hardware.
+
+    Next: `bodyschema replay` on the recording it leaves; `bodyschema config init` for a robot of your own.
     """
     from rich.console import Console
 
@@ -33,7 +36,7 @@ def demo(
     from daemon.wiring import require_simulation
 
     require_simulation()
-    console = Console()
+    console = Console(highlight=False)
     scene = prepare(out, seed)
     with shown_on(console) as show:
         outcome = play(scene, first=pairs, second=pairs_after, seed=seed, show=show)

@@ -7,20 +7,26 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
+from daemon.commands.options import HERE, RobotFile, flag
+
 
 def export(
     source: Annotated[Path, Parameter(help="A pair store (.sqlite) or a recording (.csv, .parquet).")],
     out: Annotated[Path, Parameter(help="The file to write; its ending .csv, .parquet or .mcap says the format.")],
     /,
     *,
-    robot: Annotated[Path, Parameter(help="robot.toml; names the joints of a recording.")] = Path("robot.toml"),
-    force: Annotated[bool, Parameter(help="Replace OUT when it is there.", negative="")] = False,
+    robot: RobotFile = HERE,
+    force: Annotated[bool, flag("Replace OUT when it is there.")] = False,
 ) -> None:
     """Turn a store or a recording into CSV, Parquet or MCAP.
 
-    A store knows its joints and may be in use by a running sampler; a recording needs robot.toml. Parquet and MCAP
-    need the extra `export` (`pip install 'bodyschema[export]'`). MCAP opens in Foxglove: joints and positions under
-    `/pair`, the marker under `/marker`. Next: `bodyschema replay` on a CSV or Parquet file.
+    A store may be in use by a running sampler. MCAP opens in Foxglove: joints and positions under `/pair`, the marker
+    under `/marker`.
+
+    Needs: for a recording robot.toml, which names its joints; for Parquet and MCAP the extra `export`
+    (`pip install 'bodyschema[export]'`).
+
+    Next: `bodyschema replay` on a CSV or Parquet file.
     """
     from rich.console import Console
 

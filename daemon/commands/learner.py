@@ -8,17 +8,22 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
+from daemon.commands.options import HERE, RobotFile, flag
+
 
 def learner(
     *,
-    robot: Annotated[Path, Parameter(help="The robot's description.")] = Path("robot.toml"),
+    robot: RobotFile = HERE,
     state_dir: Annotated[Path | None, Parameter(help="Where the checkpoint lives; else as robot.toml says.")] = None,
-    verbose: Annotated[bool, Parameter(negative="", help="Log more.")] = False,
+    verbose: Annotated[bool, flag("Log more.")] = False,
 ) -> None:
     """Learn the robot's kinematics and answer queries. Ends with SIGTERM or Ctrl-C.
 
-    Needs robot.toml (`bodyschema config init`). New pairs come from `bodyschema sampler`, on this machine or another;
-    without one the learner answers from what it knows. Next: `bodyschema predict`, `bodyschema status`.
+    New pairs come from the sampler, on this machine or another; without one the learner answers from what it knows.
+
+    Needs: robot.toml (`bodyschema config init`), and for new pairs `bodyschema sampler`.
+
+    Next: `bodyschema predict`, `bodyschema status`.
     """
     # Before numpy is loaded: its threads would fight with each other and with the answers for the cores.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import sys
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
+
+from daemon.commands.options import HERE, RobotFile, flag
 
 if TYPE_CHECKING:
     from daemon.config import Config
@@ -15,16 +16,18 @@ if TYPE_CHECKING:
 
 def predict(
     *q: Annotated[float, Parameter(help="One value for each joint, in robot.toml's order [rad; m if it slides].")],
-    robot: Annotated[Path, Parameter(help="The robot's description.")] = Path("robot.toml"),
-    deg: Annotated[bool, Parameter(negative="", help="Angles are in degrees.")] = False,
-    as_json: Annotated[bool, Parameter(name="--json", negative="", help="Print the learner's reply as it is.")] = False,
+    robot: RobotFile = HERE,
+    deg: Annotated[bool, flag("Angles are in degrees.")] = False,
+    as_json: Annotated[bool, flag("Print the learner's reply as it is.", name="--json")] = False,
 ) -> None:
     """Ask the learner where the marker is, in the measurement frame.
 
     Without values, reads them from standard input as JSON: one vector, or a list of them. Write negative values
-    after `--`. Needs a running learner (`bodyschema run` or `bodyschema learner`).
+    after `--`, as in `bodyschema predict --deg -- 10 -20 30 40 0 15 5`.
 
-    Example: `bodyschema predict --deg -- 10 -20 30 40 0 15 5`
+    Needs: a running learner (`bodyschema run` or `bodyschema learner`).
+
+    Next: the same from a program of yours, over zenoh: docs/zenoh.md.
     """
     from daemon.bus import client
     from daemon.config import Config

@@ -8,22 +8,27 @@ from typing import Annotated
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
+from daemon.commands.options import HERE, RobotFile, flag
+
 
 def record(
     out: Annotated[Path, Parameter(help="The file to write; its ending .csv, .parquet or .mcap says the format.")],
     /,
     *,
-    robot: Annotated[Path, Parameter(help="robot.toml of the running sampler.")] = Path("robot.toml"),
+    robot: RobotFile = HERE,
     from_seq: Annotated[
         int, Parameter(name="--from", help="Sequence number of the first pair.", validator=Number(gte=1))
     ] = 1,
-    follow: Annotated[bool, Parameter(help="Go on with the pairs to come, until Ctrl-C.", negative="")] = False,
-    force: Annotated[bool, Parameter(help="Replace OUT when it is there.", negative="")] = False,
+    follow: Annotated[bool, flag("Go on with the pairs to come, until Ctrl-C.")] = False,
+    force: Annotated[bool, flag("Replace OUT when it is there.")] = False,
 ) -> None:
     """Copy the running sampler's pairs into a file.
 
-    Needs a running sampler (`bodyschema run` or `bodyschema sampler`); for the store of one that is not running take
-    `bodyschema export`. Next: `bodyschema replay` on a CSV or Parquet file.
+    For the store of a sampler that is not running take `bodyschema export`.
+
+    Needs: a running sampler (`bodyschema run` or `bodyschema sampler`).
+
+    Next: `bodyschema replay` on a CSV or Parquet file.
     """
     from rich.console import Console
 

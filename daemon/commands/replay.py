@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
+from daemon.commands.options import flag
+
 if TYPE_CHECKING:
     from rich.console import Console
 
@@ -35,19 +37,20 @@ def replay(
         float | None,
         Parameter(help="1-sigma of the positions where the recording has none [mm].", validator=Number(gt=0)),
     ] = None,
-    any_step: Annotated[
-        bool, Parameter(help="Accept rows whatever their step and speed: single poses far apart.", negative="")
-    ] = False,
+    any_step: Annotated[bool, flag("Accept rows whatever their step and speed: single poses far apart.")] = False,
     held_out: Annotated[float, Parameter(help="Share of the rows to leave out and judge by.")] = 0.3,
-    as_json: Annotated[bool, Parameter(name="--json", help="Print the figures as JSON.", negative="")] = False,
+    as_json: Annotated[bool, flag("Print the figures as JSON.", name="--json")] = False,
     keep: Annotated[Path | None, Parameter(help="Keep store, checkpoint and logs in this new folder.")] = None,
 ) -> None:
     """Feed a recording through sampler and learner; prints the error before and after on rows left out.
 
     The two processes run as they do live, on ports and with a store of their own, so a running daemon is not
     disturbed. Contiguous blocks of rows are held out. "Before" is the nominal model with what robot.toml calls not
-    known fitted to the other rows; "after" is what the learner answers when it has learnt them. Needs robot.toml and
-    nothing else. Next: `bodyschema run` with the real arm.
+    known fitted to the other rows; "after" is what the learner answers when it has learnt them.
+
+    Needs: a recording and its robot.toml; neither hardware nor a running daemon.
+
+    Next: `bodyschema run` with the arm.
     """
     import tempfile
 

@@ -8,18 +8,21 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
+from daemon.commands.options import HERE, RobotFile, flag
+
 
 def run(
     *,
-    robot: Annotated[Path, Parameter(env_var="BODYSCHEMA_ROBOT", help="The robot's description.")] = Path("robot.toml"),
-    sim: Annotated[bool, Parameter(negative="", help="The simulated robot in the place of the hardware.")] = False,
+    robot: RobotFile = HERE,
+    sim: Annotated[bool, flag("The simulated robot in the place of the hardware.")] = False,
     state_dir: Annotated[Path | None, Parameter(help="Where state lives; else as robot.toml says.")] = None,
-    verbose: Annotated[bool, Parameter(negative="", help="Log more.")] = False,
+    verbose: Annotated[bool, flag("Log more.")] = False,
 ) -> None:
     """Start sampler and learner, each as a process of its own, and start again the one that dies. Ctrl-C ends both.
 
-    Needs robot.toml (`bodyschema config init`), and --sim or a recording named in its table [drivers]. Next, in
-    another terminal: `bodyschema status --watch`, `bodyschema predict`.
+    Needs: robot.toml (`bodyschema config init`), and --sim or a recording named in its table [drivers].
+
+    Next: in another terminal, `bodyschema status --watch` and `bodyschema predict`.
     """
     from daemon import logs
     from daemon.config import Config

@@ -7,20 +7,25 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
+from daemon.commands.options import HERE, RobotFile, flag
+
 
 def sampler(
     *,
-    robot: Annotated[Path, Parameter(env_var="BODYSCHEMA_ROBOT", help="The robot's description.")] = Path("robot.toml"),
-    sim: Annotated[bool, Parameter(negative="", help="The simulated robot in the place of the hardware.")] = False,
+    robot: RobotFile = HERE,
+    sim: Annotated[bool, flag("The simulated robot in the place of the hardware.")] = False,
     state_dir: Annotated[Path | None, Parameter(help="Where the store lives; else as robot.toml says.")] = None,
-    exit_at_end: Annotated[bool, Parameter(negative="", help="End when a recording is through.")] = False,
-    verbose: Annotated[bool, Parameter(negative="", help="Log more.")] = False,
+    exit_at_end: Annotated[bool, flag("End when a recording is through.")] = False,
+    verbose: Annotated[bool, flag("Log more.")] = False,
 ) -> None:
     """Turn encoder readings and camera frames into pairs, keep and publish them. Ends with SIGTERM or Ctrl-C.
 
-    Needs robot.toml (`bodyschema config init`), and --sim or a recording named in its table [drivers]. The store takes
-    each pair before it is published; when it cannot (the disk is full), the sampler ends with exit code 1 and nothing
-    is lost. Next: `bodyschema learner`, `bodyschema status --watch`.
+    The store takes each pair before it is published; when it cannot (the disk is full), the sampler ends with exit
+    code 1 and nothing is lost.
+
+    Needs: robot.toml (`bodyschema config init`), and --sim or a recording named in its table [drivers].
+
+    Next: `bodyschema learner`, `bodyschema status --watch`.
     """
     from daemon import logs
     from daemon.bus import Bus

@@ -3,22 +3,24 @@
 from __future__ import annotations
 
 import sys
-from pathlib import Path
 from typing import Annotated
 
-from cyclopts import Parameter
+from daemon.commands.options import HERE, RobotFile, flag
 
 
 def status(
     *,
-    robot: Annotated[Path, Parameter(env_var="BODYSCHEMA_ROBOT", help="The robot's description.")] = Path("robot.toml"),
-    watch: Annotated[bool, Parameter(negative="", help="Go on showing it, until Ctrl-C.")] = False,
-    json: Annotated[bool, Parameter(negative="", help="As JSON; null for a process that does not answer.")] = False,
+    robot: RobotFile = HERE,
+    watch: Annotated[bool, flag("Go on showing it, until Ctrl-C.")] = False,
+    json: Annotated[bool, flag("As JSON; null for a process that does not answer.")] = False,
 ) -> None:
     """Show what sampler and learner are doing: rates, rejected frames, joint coverage, errors, health.
 
-    Needs one of them running (`bodyschema run`); exit code 1 when neither answers. With --watch --json there is one
-    line about every second.
+    With --watch --json there is one line about every second. Exit code 1 when neither answers.
+
+    Needs: one of them running (`bodyschema run`).
+
+    Next: `bodyschema command` to pause, or to tell of a changed tool; `bodyschema predict`.
     """
     from rich.console import Console
     from rich.live import Live

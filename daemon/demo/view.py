@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 from rich.console import Console, Group, RenderableType
 from rich.live import Live
@@ -13,7 +14,8 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from daemon.screen import coverage_table, mm, rejected_table
+from daemon.screen import coverage_table, mm, rejected, titled_table
+from daemon.status import SamplerStatus
 
 from .play import Outcome, Snapshot
 from .scene import Scene
@@ -40,7 +42,7 @@ class _Lines:
     def __call__(self, snapshot: Snapshot) -> None:
         if snapshot.phase != self._phase:
             self._phase, self._next = snapshot.phase, 0.0
-            self._console.print(f"-- {self._phase}", highlight=False)
+            self._console.print(f"-- {self._phase}", soft_wrap=True)
         if time.monotonic() < self._next:
             return
         self._next = time.monotonic() + PLAIN_EVERY_S
@@ -52,11 +54,12 @@ class _Lines:
             f"error before learning each {mm(learner.prequential_m.get(learner.answering))}, "
             f"claimed {mm(learner.claimed_error_m)}, truth on held-out poses {truth}; "
             f"{snapshot.asker.answers} answers",
-            highlight=False,
+            soft_wrap=True,
         )
 
 
 def _screen(snapshot: Snapshot) -> RenderableType:
+    """Not higher than 23 lines with the demo's seven joints, so that a terminal of 24 holds it."""
     sampler, learner = snapshot.sampler, snapshot.learner
     head = Table.grid(padding=(0, 1), expand=True)
     head.add_column(ratio=1)
@@ -65,36 +68,43 @@ def _screen(snapshot: Snapshot) -> RenderableType:
         ProgressBar(total=snapshot.target, completed=min(learner.pairs, snapshot.target)),
         f"{learner.pairs} of {snapshot.target} pairs, {sampler.pairs_per_s:.0f}/s",
     )
-    body = Table.grid(padding=(0, 3), expand=True)
-    body.add_column(ratio=1)
-    body.add_column(ratio=1)
-    body.add_row(Group(_errors(snapshot), Text(), _asker(snapshot)), rejected_table(sampler))
-    body.add_row(coverage_table(sampler), Text())
-    title = f"bodyschema demo: {snapshot.phase}"
-    return Panel(Group(head, Text(), body), title=title, title_align="left", border_style="blue")
+    body = Table.grid(padding=(0, 4))
+    body.add_row(_errors(snapshot), _frames(sampler))
+    return Panel(
+        Group(head, Text(), body, Text(), coverage_table(sampler), Text(), _asker(snapshot)),
+        title=f"bodyschema demo: {snapshot.phase}",
+        title_align="left",
+        border_style="blue",
+    )
 
 
 def _errors(snapshot: Snapshot) -> Table:
     learner, verdict = snapshot.learner, snapshot.verdict
-    table = Table(box=None, pad_edge=False, title="mean error", title_justify="left", title_style="bold")
-    table.add_column("", no_wrap=True)
-    table.add_column("mm", justify="right", no_wrap=True)
-    table.add_row("nominal model, held-out poses", mm(verdict.nominal_m if verdict else None, unit=""))
+    table = titled_table("mean error [mm]")
+    table.add_row("held-out poses, nominal model", mm(verdict.nominal_m if verdict else None, unit=""))
     table.add_row(
-        "learnt model, held-out poses", Text(mm(verdict.error_m if verdict else None, unit=""), style="bold green")
+        "held-out poses, learnt model", Text(mm(verdict.error_m if verdict else None, unit=""), style="bold green")
     )
-    table.add_row("the learner's own claim", mm(learner.claimed_error_m, unit=""))
+    table.add_row("the same, as the learner claims", mm(learner.claimed_error_m, unit=""))
     for name, error in learner.prequential_m.items():
         mark = " (answers)" if name == learner.answering else ""
         table.add_row(f"next pair, {name}{mark}", mm(error, unit=""))
     return table
 
 
+def _frames(status: SamplerStatus) -> Table:
+    table = titled_table("frames")
+    table.add_row("seen", str(status.frames))
+    table.add_row("accepted as pairs", Text(str(status.pairs), style="bold green"))
+    for reason, count in rejected(status):
+        table.add_row(f"rejected: {reason}", str(count))
+    return table
+
+
 def _asker(snapshot: Snapshot) -> Text:
     asker = snapshot.asker
     return Text(
-        f"a third process asks all the while: {asker.answers} answers, "
-        f"half within {asker.p50_ms:.1f} ms, slowest of the last second {asker.worst_ms:.0f} ms"
+        f"{asker.answers} answers to a third process, half in {asker.p50_ms:.1f} ms, slowest {asker.worst_ms:.0f} ms"
     )
 
 
@@ -102,13 +112,10 @@ def show_outcome(console: Console, outcome: Outcome, scene: Scene) -> None:
     """The summary at the end."""
     first, second = outcome.first_tool, outcome.second_tool
     table = Table(title="Mean error on held-out poses, against the simulated truth", title_justify="left")
-    table.add_column("")
-    table.add_column("pairs", justify="right")
-    table.add_column("nominal model", justify="right")
-    table.add_column("learnt model", justify="right")
-    table.add_column("the learner claims", justify="right")
-    table.add_column("within 1 sigma", justify="right")
-    for name, chapter in (("first tool", first), ("250 mm longer tool", second)):
+    table.add_column("", no_wrap=True)
+    for heading in ("pairs", "nominal", "learnt", "claimed", "within 1σ"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    for name, chapter in (("first tool", first), ("tool 250 mm longer", second)):
         table.add_row(
             name,
             str(chapter.pairs),
@@ -119,27 +126,22 @@ def show_outcome(console: Console, outcome: Outcome, scene: Scene) -> None:
         )
     console.print()
     console.print(table)
-    console.print(f"{outcome.answers} predictions were asked for meanwhile, {outcome.unanswered} went unanswered.")
     console.print(
-        "Held-out poses lie within a few degrees of where the arm was guided with that tool; none was learnt."
+        "Held-out poses lie within a few degrees of where the arm was guided with that tool;\n"
+        "none was learnt. The learner does not know the truth that its claim is held against.\n"
+        f"Meanwhile a third process asked for {outcome.answers + outcome.unanswered} predictions; "
+        f"{outcome.unanswered} went unanswered."
     )
     console.print()
     for what, file in (("recording", scene.recording_file), ("curve", scene.curve_file), ("plot", scene.plot_file)):
-        console.print(f"{what:10s}{_short(file)}", highlight=False, soft_wrap=True)
+        console.print(f"{what:10s}{_short(file)}", soft_wrap=True)
     console.print()
     console.print(
-        f"Next: `bodyschema replay {_short(scene.recording_file)} --robot {_short(scene.robot_file)}` learns it again; "
+        f"Next: `bodyschema replay {_short(scene.recording_file)}` learns it again;\n"
         "`bodyschema config init` begins with a robot of your own.",
-        highlight=False,
         soft_wrap=True,
     )
 
 
-def _short(file: object) -> str:
-    from pathlib import Path
-
-    path = Path(str(file))
-    try:
-        return str(path.relative_to(Path.cwd()))
-    except ValueError:
-        return str(path)
+def _short(file: Path) -> str:
+    return str(file.relative_to(Path.cwd())) if file.is_relative_to(Path.cwd()) else str(file)

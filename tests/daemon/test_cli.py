@@ -50,11 +50,17 @@ def test_help_names_every_command(tmp_path) -> None:
     assert [name for name in COMMANDS if f" {name} " not in text] == []
 
 
-@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize("command", [*COMMANDS, "config init", "config check", "config show"])
 def test_each_command_says_what_it_needs_and_what_is_next(command, capsys) -> None:
-    command_line(command)([command, "--help"], exit_on_error=False, result_action="return_value")
-    text = capsys.readouterr().out
-    assert "Next:" in text or "next:" in text or "Example:" in text
+    command_line(command.split()[0])([*command.split(), "--help"], exit_on_error=False, result_action="return_value")
+    beginnings = [line.split(" ")[0] for line in capsys.readouterr().out.splitlines()]
+    assert ("Needs:" in beginnings, "Next:" in beginnings) == (True, True)
+
+
+def test_help_fits_a_terminal_of_80_columns(tmp_path) -> None:
+    lines = run("--help", cwd=tmp_path, environment={"COLUMNS": "80"}).stdout.splitlines()
+    assert max(map(len, lines)) <= 80
+    assert len([line for line in lines if line.startswith("│")]) == len(COMMANDS) + len(("--help", "--version"))
 
 
 def test_a_mistake_of_the_user_is_one_line_and_exit_code_1(tmp_path) -> None:
@@ -132,7 +138,7 @@ def test_the_written_example_explains_every_key_in_place(tmp_path) -> None:
 
 def test_a_command_to_nobody_says_what_to_start(robot) -> None:
     with pytest.raises(
-        BusError, match="nobody listens on tcp/127.0.0.1:[0-9]+. Start the daemon with `bodyschema run`"
+        BusError, match=r"nobody listens on tcp/127\.0\.0\.1:[0-9]+\. Start the daemon with `bodyschema run`"
     ):
         called("command", "pause", "--robot", robot)
 

@@ -77,7 +77,7 @@ def test_a_mistake_is_named_with_its_line(tmp_path, tables, line, said) -> None:
 
 
 def test_a_mistake_in_the_environment_is_named(tmp_path) -> None:
-    with pytest.raises(ConfigError, match="daemon.min_step_deg: expected `float`, got `str`"):
+    with pytest.raises(ConfigError, match=r"daemon\.min_step_deg: expected `float`, got `str`"):
         load(tmp_path, environment={"BODYSCHEMA_DAEMON_MIN_STEP_DEG": "little"})
 
 
@@ -87,7 +87,7 @@ def test_an_unknown_key_in_the_environment_is_refused(tmp_path) -> None:
 
 
 def test_a_missing_file_names_the_command_that_writes_one(tmp_path) -> None:
-    with pytest.raises(ConfigError, match="there is no such file. `bodyschema config init` writes one"):
+    with pytest.raises(ConfigError, match=r"there is no such file\. `bodyschema config init` writes one"):
         Config.load(tmp_path / "robot.toml", {})
 
 

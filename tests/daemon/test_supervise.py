@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import itertools
 import os
 import signal
 import subprocess
@@ -116,7 +117,7 @@ def test_the_command_run_ends_both_processes_on_sigterm(tmp_path, free_endpoint)
 
 
 def test_the_command_run_with_a_port_in_use_ends_with_its_message(tmp_path, free_endpoint) -> None:
-    robot = _robot(tmp_path, lambda endpoint=free_endpoint(): endpoint)  # one endpoint for both processes
+    robot = _robot(tmp_path, itertools.repeat(free_endpoint()).__next__)  # one endpoint for both processes
     command = [sys.executable, "-m", "daemon", "run", "--robot", robot]
     done = subprocess.run(command, capture_output=True, text=True, timeout=LIMIT_S, check=False)
     assert done.returncode == 1
