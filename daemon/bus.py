@@ -23,6 +23,8 @@ from .wire import JSON, MSGPACK, ErrorReply, decode, encode
 log = logging.getLogger(__name__)
 
 LEASE_MS = 2000
+FIRST_TRY_MS = 100  # how long opening waits for a peer that is not there; trying goes on in the background
+RETRY_MS = {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 2}
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,7 +169,9 @@ class Bus:
             "scouting/multicast/enabled": False,
             "scouting/gossip/enabled": False,
             "listen/endpoints": [self._listen] if self._listen else [],
+            "scouting/delay": FIRST_TRY_MS,
             "connect/endpoints": [self._connect] if self._connect else [],
+            "connect/retry": RETRY_MS,
             "timestamping/enabled": True,
             "transport/link/tx/lease": LEASE_MS,
         }
