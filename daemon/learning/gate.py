@@ -28,12 +28,11 @@ class Gate:
         return self.in_a_row >= CHANGE
 
 
-def limit_m(inside_m: float, outside_m: float, unexplained: float) -> float:
+def limit_m(inside_m: float, open_m: float) -> float:
     """How far from its prediction a pair may lie [m].
 
     Args:
         inside_m: RMS distance of recent pairs from their predictions.
-        outside_m: the same of the prior, which is what is left where no data was.
-        unexplained: how far from all data the pair lies, 0 to 1.
+        open_m: RMS distance that the data so far leave open where the pair lies.
     """
-    return DOUBT * math.sqrt(inside_m**2 + unexplained * outside_m**2)
+    return DOUBT * math.hypot(inside_m, open_m)

@@ -48,6 +48,12 @@ class PairMemory:
         q, x, _ = self.since(0)
         return q, x
 
+    def some(self, end: int, limit: int) -> tuple[FloatArray, FloatArray]:
+        """At most `limit` of the kept pairs before the one numbered `end`, evenly spread: q (n, d), x (n, 3)."""
+        begin = max(self._count - len(self._q), 0)
+        places = np.linspace(begin, end - 1, min(limit, max(end - begin, 0))).astype(np.intp) % len(self._q)
+        return self._q[places], self._x[places]
+
     def at(self, places: IntArray) -> tuple[FloatArray, FloatArray]:
         """The pairs at places 0 ... len − 1, in no particular order: q (n, d), x (n, 3)."""
         return self._q[places], self._x[places]

@@ -29,21 +29,32 @@ class ErrorMemory(msgspec.Struct):
         distance: sum of their lengths [m].
         square: sums of their squares per axis [m²].
         noise: sums of the measurements' variances per axis [m²].
+        ratio: sum of their squares over what was claimed.
+        discount: weight of the error one pair back.
     """
 
     expected_m: float
+    discount: float = DISCOUNT
     weight: float = 0.0
     distance: float = 0.0
     square: tuple[float, float, float] = (0.0, 0.0, 0.0)
     noise: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    ratio: float = 0.0
 
-    def add(self, error: FloatArray, variance: FloatArray) -> None:
-        """One more error (3,) [m] against a measurement with the given variance per axis (3,) [m²]."""
-        square, noise = np.square(error), variance
-        self.weight = DISCOUNT * self.weight + 1.0
-        self.distance = DISCOUNT * self.distance + math.sqrt(float(square.sum()))
-        self.square = _triple(DISCOUNT * np.array(self.square) + square)
-        self.noise = _triple(DISCOUNT * np.array(self.noise) + noise)
+    def add(self, error: FloatArray, variance: FloatArray, ratio: float = 1.0) -> None:
+        """One more error.
+
+        Args:
+            error: prediction against measurement (3,) [m].
+            variance: the measurement's, per axis (3,) [m²].
+            ratio: the error's square over what was claimed for prediction and measurement together.
+        """
+        square = np.square(error)
+        self.weight = self.discount * self.weight + 1.0
+        self.distance = self.discount * self.distance + math.sqrt(float(square.sum()))
+        self.square = _triple(self.discount * np.array(self.square) + square)
+        self.noise = _triple(self.discount * np.array(self.noise) + variance)
+        self.ratio = self.discount * self.ratio + ratio
 
     @property
     def mean_m(self) -> float | None:
@@ -61,16 +72,19 @@ class ErrorMemory(msgspec.Struct):
         """1-sigma per axis of the prediction against the truth (3,) [m]: the measurement's noise is taken out."""
         missing = max(WARM - self.weight, 0.0)
         square = (np.array(self.square) + missing * self.expected_m**2 / 3.0) / max(self.weight, WARM)
-        noise = np.array(self.noise) / max(self.weight, 1.0)
+        noise = self.noise_variance
         return np.sqrt(np.maximum(square - noise, noise * _resolution(self.weight)))
 
+    @property
+    def noise_variance(self) -> FloatArray:
+        """Mean variance of the measurements per axis (3,) [m²]."""
+        return np.array(self.noise) / max(self.weight, 1.0)
 
-def trusted_share(memory: ErrorMemory) -> float:
-    """The share of a new error that is the model's own and not the measurement's noise: the step to take, 0 to 1."""
-    if not memory.weight:
-        return 1.0
-    own, noise = float(np.square(memory.sigma).sum()), sum(memory.noise) / memory.weight
-    return own / (own + noise) if own > 0.0 else 0.0
+    @property
+    def surprise(self) -> float:
+        """How many times larger than claimed the errors were, at least 1."""
+        missing = max(WARM - self.weight, 0.0)
+        return math.sqrt(max((self.ratio + missing) / max(self.weight, WARM), 1.0))
 
 
 def choose(errors: Mapping[str, ErrorMemory], present: str, handicap: Mapping[str, float]) -> str:

@@ -12,6 +12,9 @@ from interfaces.errors import RequestError
 from interfaces.records import FloatArray
 from kbmaps import KBMap, SupportSet
 
+from .claims import Claim
+from .unknowns import unexplained
+
 # Beyond this share of the prior's variance left open, joint angles do not lie where data was.
 IN_SUPPORT = 0.25
 # Mean length of a Gaussian error over its RMS length, three equal axes: sqrt(8 / π) / sqrt(3).
@@ -44,9 +47,8 @@ class Snapshot:
     Attributes:
         answering: which one it is.
         map: None while the frame is not known.
-        support: where data was; None before any.
-        sigma_inside: 1-sigma per axis where data was (3,) [m].
-        sigma_outside: 1-sigma per axis that is left open far from all data (3,) [m].
+        claim: what is claimed of its error.
+        support: where data with the present tool was; None before any.
         pairs: how many pairs it had learnt.
         learnt_at: time of the last of them [s], or None.
         waiting_for: what is missing while there is no map.
@@ -54,9 +56,8 @@ class Snapshot:
 
     answering: str
     map: KBMap | None
+    claim: Claim
     support: SupportSet | None
-    sigma_inside: FloatArray
-    sigma_outside: FloatArray
     pairs: int
     learnt_at: float | None
     waiting_for: str
@@ -75,9 +76,7 @@ class Snapshot:
     def predict(self, q: FloatArray) -> Prediction:
         """Predictions for joint angles q (n, d) [rad]; NoFrameError while there is no map."""
         x = self.require_map().predict(q)
-        unexplained = np.ones(len(q)) if self.support is None else np.asarray(self.support.unexplained(q))
-        variance = self.sigma_inside**2 + unexplained[:, None] * self.sigma_outside**2
-        return Prediction(x, np.sqrt(variance), unexplained < IN_SUPPORT)
+        return Prediction(x, np.sqrt(self.claim.variance(q)), unexplained(self.support, q) < IN_SUPPORT)
 
     def expected_error_m(self, q: FloatArray) -> float:
         """Mean distance to the truth [m] that the sigmas of predictions at q (n, d) [rad] claim."""

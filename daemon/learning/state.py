@@ -11,7 +11,7 @@ from daemon.status import CurvePoint
 from interfaces.errors import BodyschemaError
 from interfaces.records import FloatArray
 
-from .scores import ErrorMemory
+from .claims import ClaimsState
 
 
 class StateError(BodyschemaError):
@@ -45,7 +45,7 @@ class LearningHeader(msgspec.Struct, kw_only=True):
     Attributes:
         fingerprint: of the nominal model it started from.
         answering: the model that answers.
-        errors: prequential errors by model.
+        claims: what is known of each model's errors.
         doubted_in_a_row: length of the present run of doubted pairs.
         next_fit: pairs at which what is not known, or the tool after a change, is fitted again; None when nothing is.
         replays_due: replay steps that are still owed.
@@ -54,7 +54,7 @@ class LearningHeader(msgspec.Struct, kw_only=True):
     fingerprint: str
     counters: Counters
     answering: str
-    errors: dict[str, ErrorMemory]
+    claims: ClaimsState
     curve: list[CurvePoint]
     curve_stride: int
     doubted_in_a_row: int
