@@ -44,13 +44,15 @@ _EDGE_SIGMA_PX = 0.06
 _UNEVEN_PX = 0.4
 # Residuals beyond this are no longer edge noise [px], whatever the spread is.
 _LEAST_GATE_PX, _LARGEST_GATE_PX, _GATE_SIGMAS = 0.8, 2.0, 3.5
-# Power of the wave once round the outline over that of the next ones (measured, docs/vision.md): uneven backgrounds
-# make slow waves the larger.
-_SLOWEST_WAVE = 1.2
+# Power of the wave once round the outline over that of the next ones (measured, docs/vision.md): what is behind the
+# ball disturbs whole arcs of the outline, so slow waves are the larger ones.
+_SLOWEST_WAVE = 1.5
+# The waves looked at: up to this one, or up to radius / _WAVE_RADIUS_PX if that is more.
+_LEAST_WAVES, _WAVE_RADIUS_PX = 4, 3.0
 # Lens and interpolation smooth along the outline too, which takes power from the quicker waves (1-sigma) [px].
 _SMOOTHING_PX = 1.0
 # What is left when all noise has averaged out [px].
-_FLOOR_PX = 0.01
+_FLOOR_PX = 0.005
 # Below this, relative to the cubed trace, the outline points do not determine centre and radius.
 _LEAST_DETERMINANT = 1e-5
 
@@ -233,12 +235,14 @@ def _noise_density(angles: FloatArray, residual: FloatArray, radius_px: float) -
     """Variance [px²] of one outline point in the slow waves round the outline, of which the centre's error is one.
 
     Neighbouring outline points share pixels and background, so their variance alone would claim too little. A
-    shift of the centre is the wave that goes once round; it was fitted away, and the next ones tell its size.
+    shift of the centre is the wave that goes once round; it was fitted away, and the next ones tell its size, the
+    nearer the better.
     """
-    harmonics = np.arange(2, max(4, round(radius_px / 3)) + 1)
+    harmonics = np.arange(2, max(_LEAST_WAVES, round(radius_px / _WAVE_RADIUS_PX)) + 1)
     waves = np.exp(-1j * harmonics[:, None] * angles) @ residual
     unsmoothed = np.exp((harmonics * _SMOOTHING_PX / radius_px) ** 2)
-    density = float(np.mean(np.abs(waves) ** 2 * unsmoothed)) / np.count_nonzero(residual)
+    share = harmonics**-2.0 / np.sum(harmonics**-2.0)
+    density = float(share @ (np.abs(waves) ** 2 * unsmoothed)) / np.count_nonzero(residual)
     # Student's t with two degrees of freedom per wave: 1-sigma of a spread that is itself estimated.
-    student = 1.0 + 1.0 / (4.0 * len(harmonics))
+    student = 1.0 + 0.25 * float(share @ share)
     return _SLOWEST_WAVE * student**2 * density
