@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def free_endpoint() -> Callable[[], str]:
     """A function that gives zenoh endpoints on this machine that nobody listens on."""
 

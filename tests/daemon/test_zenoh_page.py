@@ -1,0 +1,209 @@
+"""docs/zenoh.md and the clients in examples/ are held to the code, and to a running sampler and learner."""
+
+from __future__ import annotations
+
+import inspect
+import json
+import os
+import re
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import msgspec
+import pytest
+from scripted_sources import Walk
+from small_arm import write_small_arm
+
+from daemon import history, simulation, status, wire
+from daemon.bus import Bus, client
+from daemon.config import Config
+from daemon.keys import Keys
+from daemon.learning import curve, learning
+from daemon.sampler import Sampler
+from daemon.session import session_of
+from daemon.sources import Sources
+from daemon.store import PairStore
+from daemon.wire import MSGPACK, JointsRequest, PredictReply, decode, encode
+from interfaces.clock import SystemClock
+from interfaces.errors import RequestError
+from interfaces.records import Reason
+
+ROOT = Path(__file__).parents[2]
+PAGE = (ROOT / "docs" / "zenoh.md").read_text(encoding="utf-8")
+LIMIT_S = 30.0
+MESSAGES = {
+    name: kind
+    for module in (wire, status, simulation)
+    for name, kind in inspect.getmembers(module, inspect.isclass)
+    if issubclass(kind, msgspec.Struct) and kind.__module__ == module.__name__
+}
+KEYS = Keys("arm")
+
+
+def section(heading: str) -> str:
+    return re.search(rf"^##+ {heading}\n(.*?)(?=^##+ |\Z)", PAGE, re.MULTILINE | re.DOTALL)[1]
+
+
+def rows(text: str) -> list[list[str]]:
+    return [[cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines() if line.startswith("| `")]
+
+
+def code(cell: str) -> str:
+    return cell.strip("`").strip()
+
+
+def test_the_page_documents_every_message() -> None:
+    assert [name for name in MESSAGES if f"\n### {name}\n" not in PAGE] == []
+
+
+@pytest.mark.parametrize("name", MESSAGES)
+def test_the_page_has_the_fields_of_each_message(name: str) -> None:
+    documented = [code(row[0]) for row in rows(section(name).split("```json")[0])]
+    assert documented == [field.encode_name for field in msgspec.structs.fields(MESSAGES[name])]
+
+
+@pytest.mark.parametrize("name", MESSAGES)
+def test_the_page_s_examples_are_such_messages_with_all_their_fields(name: str) -> None:
+    example = re.search(r"```json\n(.*?)```", section(name), re.DOTALL)[1]
+    assert msgspec.to_builtins(msgspec.json.decode(example, type=MESSAGES[name])) == json.loads(example)
+
+
+def test_the_page_has_every_key() -> None:
+    whole = [KEYS.pair, KEYS.pairs, KEYS.predict, KEYS.jacobian, KEYS.model, KEYS.simulation]
+    whole += [key(process) for key in (KEYS.status, KEYS.command, KEYS.alive) for process in ("sampler", "learner")]
+    assert {code(row[0]) for row in rows(section("Keys"))} == {key.removeprefix("bodyschema/arm/") for key in whole}
+
+
+def test_the_page_has_every_reason() -> None:
+    assert [code(row[0]) for row in rows(section("Why a frame is rejected"))] == [reason.value for reason in Reason]
+
+
+def test_the_page_s_limits_are_the_code_s() -> None:
+    limits = section("Limits")
+    assert f"| rows in a request | {wire.LARGEST_BATCH:,} |" in limits
+    assert f"| pairs in a reply | {history.LARGEST_REPLY} |" in limits
+    assert f"| points of the learning curve | {curve.LARGEST} |" in limits
+    assert f"| within {learning.FARTHEST_M:.0f} m, else" in limits
+
+
+def test_the_page_shows_the_example_as_it_is() -> None:
+    example = (ROOT / "examples" / "ask_predictions.py").read_text(encoding="utf-8")
+    assert re.search(r"```python\n(.*?)```", PAGE, re.DOTALL)[1] == example
+
+
+# --- against a running learner
+
+
+@pytest.fixture(scope="module")
+def learner(tmp_path_factory, free_endpoint) -> Iterator[Config]:
+    """robot.toml of a learner that answers, without a sampler."""
+    folder = tmp_path_factory.mktemp("robot")
+    zenoh = f'[zenoh]\nsampler = "{free_endpoint()}"\nlearner = "{free_endpoint()}"\n'
+    robot = write_small_arm(folder, zenoh + '[daemon]\nstate_dir = "state"\n')
+    config, up = Config.load(robot, {}), threading.Event()
+    with (folder / "log").open("wb") as log, Bus(connect=config.tables.zenoh.learner) as bus:
+        process = subprocess.Popen([sys.executable, "-m", "daemon", "learner", "--robot", robot], stderr=log)
+        try:
+            bus.watch(KEYS.alive("learner"), lambda _: up.set())
+            assert up.wait(LIMIT_S), (folder / "log").read_text()
+            yield config
+        finally:
+            process.terminate()
+            process.wait(LIMIT_S)
+
+
+def run_example(name: str, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """The example as a program of its own that cannot import ours."""
+    command = [sys.executable, "-I", str(ROOT / "examples" / name), *arguments]
+    return subprocess.run(command, capture_output=True, text=True, timeout=LIMIT_S, check=False, cwd=os.sep)
+
+
+def test_the_example_prints_what_the_learner_answers(learner: Config) -> None:
+    done = run_example("ask_predictions.py", "arm", learner.tables.zenoh.learner, "0.0", "0.0")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert re.match(
+        r"x = \[0\.3, 0\.0, 0\.0\] m, 1-sigma \[.*\] m, away from all data\nmodel \w+ of 0 pairs", done.stdout
+    )
+
+
+def test_the_example_ends_with_what_the_learner_says_is_wrong(learner: Config) -> None:
+    done = run_example("ask_predictions.py", "arm", learner.tables.zenoh.learner, "0.0")
+    assert (done.returncode, "this robot has 2 joints: waist, shoulder" in done.stderr) == (1, True)
+
+
+def test_the_command_predict_prints_the_same(learner: Config) -> None:
+    command = [sys.executable, "-m", "daemon", "predict", "--robot", str(learner.file), "--", "0.0", "0.0"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=LIMIT_S, check=True)
+    assert done.stdout.splitlines()[0].split("]")[:3] == ["x [mm", "  y [mm", "  z [mm"]
+    assert done.stdout.splitlines()[1].split()[:3] == ["300.0", "0.0", "0.0"]
+
+
+@pytest.mark.parametrize(("key", "request_", "error"), [row for row in rows(section("ErrorReply")) if len(row) == 3])
+def test_the_page_s_error_replies_are_the_learner_s(learner: Config, key: str, request_: str, error: str) -> None:
+    with client(learner.tables.zenoh.learner) as bus, pytest.raises(RequestError) as refused:
+        bus.ask_one(f"bodyschema/arm/{code(key)}", code(request_).encode())
+    assert str(refused.value) == code(error)
+
+
+def test_the_page_s_word_on_nan_in_messagepack_is_true(learner: Config) -> None:
+    request = encode(JointsRequest([0.1, float("nan")]), MSGPACK)
+    with client(learner.tables.zenoh.learner) as bus, pytest.raises(RequestError) as refused:
+        bus.ask_one(KEYS.predict, request, encoding=MSGPACK)
+    assert f"`{refused.value}`" in PAGE
+
+
+def test_a_request_in_messagepack_is_answered_in_messagepack(learner: Config) -> None:
+    request = encode(JointsRequest([0.0, 0.0]), MSGPACK)
+    with client(learner.tables.zenoh.learner) as bus:
+        reply = decode(bus.ask_one(KEYS.predict, request, encoding=MSGPACK), PredictReply, MSGPACK)
+    assert reply.x == [[0.3, 0.0, 0.0]]
+
+
+# --- against a running sampler
+
+
+@contextmanager
+def sampler_running(config: Config, sources: Sources) -> Iterator[None]:
+    endpoint, up = config.tables.zenoh.sampler, threading.Event()
+    with (
+        PairStore(config.store_file, session_of(config, SystemClock())) as store,
+        Bus(listen=endpoint) as bus,
+        Bus(connect=endpoint, client=True) as watching,
+    ):
+        sampler = Sampler(config, sources, bus, store)
+        thread = threading.Thread(target=sampler.run)
+        thread.start()
+        try:
+            watching.watch(KEYS.alive("sampler"), lambda _: up.set())
+            assert up.wait(LIMIT_S)
+            yield
+        finally:
+            sampler.stop()
+            thread.join(LIMIT_S)
+
+
+def test_the_example_follows_stored_and_new_pairs_in_order(tmp_path, endpoint) -> None:
+    tables = f'[zenoh]\nsampler = "{endpoint}"\n[daemon]\nstate_dir = "state"\n'
+    config = Config.load(write_small_arm(tmp_path, tables), {})
+    walk, go_on = Walk(config.robot, 40), threading.Event()
+    sources = walk.sources(fixes=[*walk.fixes[:20], go_on, *walk.fixes[20:]])
+    command = [sys.executable, "-I", str(ROOT / "examples" / "follow_pairs.py"), "arm", endpoint, "3", "40"]
+    with sampler_running(config, sources):
+        follower = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=os.sep)
+        try:
+            lines = [follower.stdout.readline() for _ in range(10)]  # it has begun with what is stored
+            go_on.set()
+            lines += follower.communicate(timeout=LIMIT_S)[0].splitlines()
+        finally:
+            follower.kill()
+    assert [int(line.split(" ")[0]) for line in lines] == list(range(3, 41))
+
+
+def test_the_example_ends_with_a_line_when_nobody_listens(endpoint) -> None:
+    done = run_example("follow_pairs.py", "arm", endpoint)
+    assert done.returncode == 1
+    assert done.stderr.startswith("follow_pairs: ")
