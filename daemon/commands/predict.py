@@ -69,15 +69,15 @@ def _request(values: tuple[float, ...], config: Config, deg: bool) -> JointsRequ
 def _show(reply: PredictReply) -> None:
     from rich.console import Console
     from rich.table import Table
+    from rich.text import Text
 
     table = Table(box=None, pad_edge=False, header_style="bold")
-    for name in ("x", "y", "z"):
-        table.add_column(f"{name} [mm]", justify="right", no_wrap=True)
-    table.add_column("1-sigma [mm]", justify="right", no_wrap=True)
+    for name in ("x", "y", "z", "1-sigma of x, y, z"):
+        table.add_column(Text(f"{name} [mm]"), justify="right", no_wrap=True)
     table.add_column("", no_wrap=True)
     for x, sigma, inside in zip(reply.x, reply.sigma, reply.in_support, strict=True):
-        spread = " ".join(f"{1e3 * value:.1f}" for value in sigma)
-        where = "where data was" if inside else "away from all data: an extrapolation"
+        spread = ", ".join(f"{1e3 * value:.1f}" for value in sigma)
+        where = "where data was" if inside else "away from all data"
         table.add_row(*(f"{1e3 * value:.1f}" for value in x), spread, where)
     console = Console(highlight=False)
     console.print(table)

@@ -127,10 +127,9 @@ def show_outcome(console: Console, outcome: Outcome, scene: Scene) -> None:
     console.print()
     console.print(table)
     console.print(
-        "Held-out poses lie within a few degrees of where the arm was guided with that tool;\n"
-        "none was learnt. The learner does not know the truth that its claim is held against.\n"
-        f"Meanwhile a third process asked for {outcome.answers + outcome.unanswered} predictions; "
-        f"{outcome.unanswered} went unanswered."
+        "Held-out poses lie within a few degrees of where the arm was guided with that tool; none was learnt. "
+        "What the learner claims, it claims without knowing the truth. Meanwhile a third process asked for "
+        f"{outcome.answers + outcome.unanswered} predictions; {outcome.unanswered} went unanswered."
     )
     console.print()
     for what, file in (("recording", scene.recording_file), ("curve", scene.curve_file), ("plot", scene.plot_file)):
