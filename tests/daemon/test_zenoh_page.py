@@ -69,7 +69,7 @@ def test_the_page_has_the_fields_of_each_message(name: str) -> None:
 @pytest.mark.parametrize("name", MESSAGES)
 def test_the_page_s_examples_are_such_messages_with_all_their_fields(name: str) -> None:
     example = re.search(r"```json\n(.*?)```", section(name), re.DOTALL)[1]
-    assert msgspec.to_builtins(msgspec.json.decode(example, type=MESSAGES[name])) == json.loads(example)
+    assert json.loads(encode(decode(example.encode(), MESSAGES[name]))) == json.loads(example)
 
 
 def test_the_page_has_every_key() -> None:
@@ -125,9 +125,7 @@ def run_example(name: str, *arguments: str) -> subprocess.CompletedProcess[str]:
 def test_the_example_prints_what_the_learner_answers(learner: Config) -> None:
     done = run_example("ask_predictions.py", "arm", learner.tables.zenoh.learner, "0.0", "0.0")
     assert (done.returncode, done.stderr) == (0, "")
-    assert re.match(
-        r"x = \[0\.3, 0\.0, 0\.0\] m, 1-sigma \[.*\] m, away from all data\nmodel \w+ of 0 pairs", done.stdout
-    )
+    assert re.match(r"x = \[0\.3, .*\] m, 1-sigma \[.*\] m, away from all data\nmodel \w+ of 0 pairs", done.stdout)
 
 
 def test_the_example_ends_with_what_the_learner_says_is_wrong(learner: Config) -> None:
@@ -160,7 +158,7 @@ def test_a_request_in_messagepack_is_answered_in_messagepack(learner: Config) ->
     request = encode(JointsRequest([0.0, 0.0]), MSGPACK)
     with client(learner.tables.zenoh.learner) as bus:
         reply = decode(bus.ask_one(KEYS.predict, request, encoding=MSGPACK), PredictReply, MSGPACK)
-    assert reply.x == [[0.3, 0.0, 0.0]]
+    assert reply.x[0] == pytest.approx([0.3, 0.0, 0.0])
 
 
 # --- against a running sampler
@@ -197,7 +195,8 @@ def test_the_example_follows_stored_and_new_pairs_in_order(tmp_path, endpoint) -
         try:
             lines = [follower.stdout.readline() for _ in range(10)]  # it has begun with what is stored
             go_on.set()
-            lines += follower.communicate(timeout=LIMIT_S)[0].splitlines()
+            lines += follower.stdout.readlines()
+            follower.wait(LIMIT_S)
         finally:
             follower.kill()
     assert [int(line.split(" ")[0]) for line in lines] == list(range(3, 41))
