@@ -190,13 +190,14 @@ def test_the_example_follows_stored_and_new_pairs_in_order(tmp_path, endpoint) -
     walk, go_on = Walk(config.robot, 40), threading.Event()
     sources = walk.sources(fixes=[*walk.fixes[:20], go_on, *walk.fixes[20:]])
     command = [sys.executable, "-I", str(ROOT / "examples" / "follow_pairs.py"), "arm", endpoint, "3", "40"]
-    with sampler_running(config, sources):
-        follower = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=os.sep)
+    with (
+        sampler_running(config, sources),
+        subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=os.sep) as follower,
+    ):
         try:
             lines = [follower.stdout.readline() for _ in range(10)]  # it has begun with what is stored
             go_on.set()
             lines += follower.stdout.readlines()
-            follower.wait(LIMIT_S)
         finally:
             follower.kill()
     assert [int(line.split(" ")[0]) for line in lines] == list(range(3, 41))
