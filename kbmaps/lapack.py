@@ -99,12 +99,3 @@ def smallest_solution(rows: FloatArray, rhs: FloatArray, smallest_rcond: float) 
     solution[:count] = _dtrtrs(upper, rhs, lower=0, trans=1)[0]
     rotated, _, _ = _dormqr("L", "N", factor, tau, solution, lwork=64 * count, overwrite_c=1)
     return cast(FloatArray, rotated)
-
-
-def inverse_of_positive(symmetric: FloatArray) -> FloatArray | None:
-    """The inverse of a symmetric matrix; None when it is not positive definite to rounding."""
-    factor, info = _dpotrf(symmetric, lower=1)
-    if info:
-        return None
-    inverse, info = _dpotri(factor, lower=1, overwrite_c=1)
-    return None if info else cast(FloatArray, np.tril(inverse) + np.tril(inverse, -1).T)

@@ -26,6 +26,7 @@ from .nominal import PAIRS_TO_REFIT, NominalModel
 from .scores import FEWEST_TO_ANSWER, choose
 from .snapshot import Snapshot
 from .solver import LARGEST_NET, ExactSolver
+from .solving import Solving
 from .state import Counters, LearningHeader, LearningState, StateError
 
 # RMS distance between a nominal model and reality that surprises nobody [m].
@@ -51,16 +52,14 @@ class Learning:
     """Learns the forward kinematics of one robot from pairs."""
 
     def __init__(self, nominal: NominalModel, settings: LearnerConfig, solver: ExactSolver) -> None:
-        self._nominal, self._settings, self._solver = nominal, settings, solver
+        self._nominal, self._settings = nominal, settings
+        self._solving = Solving(solver, settings.solve_every)
         self._lock = threading.Lock()
         self._counters, self._curve = Counters(), Curve()
         self._memory = PairMemory(nominal.joints, settings.replay_capacity)
         self._doubts = PairMemory(nominal.joints, KEPT_DOUBTS)
         self._learnt_at: float | None = None
         self._task = 0
-        # The background thread's own: what the solver has been given.
-        self._solver_task, self._fed, self._asked_at, self._asked = 0, 0, 0, False
-        self._solve_soon = False
         self._begin_at_nominal()
         self._publish()
 
@@ -156,11 +155,11 @@ class Learning:
 
     def restart_solver(self) -> None:
         """The exact solver has lost its pairs: give it all of them again. For the thread that calls `work`."""
-        self._solver_task = 0
+        self._solving.restart()
 
     def solve_soon(self) -> None:
-        """Let the exact solver catch up although fewer than `solve_every` pairs are new."""
-        self._solve_soon = True
+        """Let the exact solver catch up although fewer than `solve_every` pairs are new. For that thread too."""
+        self._solving.solve_soon()
 
     def work(self) -> bool:
         """One small piece of background work; False when there is none."""
@@ -333,9 +332,6 @@ class Learning:
                 self._start_members(prior)
             else:
                 self._change_prior(self._members, prior)
-                if self._solver_task == task:
-                    self._solver.rebase(prior)
-                    self._asked_at, self._solve_soon = 0, True
             self._publish()
         return True
 
@@ -366,43 +362,37 @@ class Learning:
 
     def _serve_solver(self) -> bool:
         """Give the exact solver its pairs, ask it from time to time, take what it found."""
+        solving = self._solving
         with self._lock:
             if self._members is None or self._members.prior.size > LARGEST_NET:
                 return False
             task, prior = self._task, self._members.prior
-            if task != self._solver_task:
-                self._fed, self._asked_at, self._asked = 0, 0, False
-            q, x, fed = self._memory.since(self._fed, FEED_PAIRS)
-        if task != self._solver_task:
-            self._solver.start(task, prior)
-            self._solver_task = task
+        if solving.busy:
+            return self._take_solution()
+        if solving.begin(task, prior):
             return True
-        if self._take_solution(task):
-            return True
-        if len(q):
-            self._solver.learn(q, x)
-            self._fed = fed
-            return True
-        new = self._fed - self._asked_at
-        if self._asked or new == 0 or (new < self._settings.solve_every and not self._solve_soon):
-            return False
         with self._lock:
-            self._claims.solution_asked()
-        self._solver.solve()
-        self._asked, self._asked_at, self._solve_soon = True, self._fed, False
+            if task != self._task:
+                return True
+            q, x, fed = self._memory.since(solving.fed, FEED_PAIRS)
+            if not len(q) and solving.due:
+                self._claims.solution_asked()
+        if len(q):
+            solving.feed(q, x, fed)
+        elif solving.due:
+            solving.ask()
+        else:
+            return False
         return True
 
-    def _take_solution(self, task: int) -> bool:
-        solved = self._solver.poll()
+    def _take_solution(self) -> bool:
+        solved = self._solving.poll()
         if solved is None:
             return False
-        if solved.task != task:
-            return True
-        self._asked = False
         with self._lock:
-            if task == self._task and solved.map is not None:
+            if solved.task == self._task and solved.map is not None:
                 self._members_now.take(solved.map)
-                q, x = self._memory.some(self._asked_at, LOOKED_BACK)
+                q, x = self._memory.some(self._solving.fed, LOOKED_BACK)
                 self._claims.solution_taken(x - solved.map.predict(q))
                 self._publish()
         return True

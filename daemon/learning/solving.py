@@ -1,0 +1,76 @@
+"""What an exact solver is given, and when it is asked."""
+
+from __future__ import annotations
+
+from interfaces.records import FloatArray
+from kbmaps import KBMap
+
+from .solver import ExactSolver, Solved
+
+
+class Solving:
+    """Keeps one exact solver up to date. For the background thread alone.
+
+    Nothing is sent while the solver works: in a process of its own it does not listen meanwhile, and the sender would
+    wait for it with everything else that the thread has to do.
+    """
+
+    def __init__(self, solver: ExactSolver, solve_every: int) -> None:
+        self._solver, self._every = solver, solve_every
+        self.restart()
+
+    @property
+    def fed(self) -> int:
+        """How many pairs of the present task the solver has."""
+        return self._fed
+
+    @property
+    def busy(self) -> bool:
+        """Whether it was asked and has not answered."""
+        return self._busy
+
+    @property
+    def due(self) -> bool:
+        """Whether it is time to ask."""
+        return self._fed > 0 and (self._soon or self._fed - self._solved_at >= self._every)
+
+    def restart(self) -> None:
+        """The solver has lost everything."""
+        self._task: int | None = None
+        self._prior: KBMap | None = None
+        self._fed = self._solved_at = 0
+        self._busy = self._soon = False
+
+    def solve_soon(self) -> None:
+        """Ask although fewer pairs than usual are new."""
+        self._soon = self._soon or self._fed > self._solved_at or self._task is None
+
+    def begin(self, task: int, prior: KBMap) -> bool:
+        """Tell the solver of a new task, or of another prior for the same pairs; False when it knows both."""
+        if task != self._task:
+            self._solver.start(task, prior)
+            self._fed = self._solved_at = 0
+        elif prior is not self._prior:
+            self._solver.rebase(prior)
+            self._soon = True
+        else:
+            return False
+        self._task, self._prior = task, prior
+        return True
+
+    def feed(self, q: FloatArray, x: FloatArray, fed: int) -> None:
+        """More pairs, q (n, d) [rad] and x (n, 3) [m]; with them the solver has `fed`."""
+        self._solver.learn(q, x)
+        self._fed = fed
+
+    def ask(self) -> None:
+        """Ask for the solution of all pairs so far."""
+        self._solver.solve()
+        self._busy, self._soon, self._solved_at = True, False, self._fed
+
+    def poll(self) -> Solved | None:
+        """The answer when it has come, without waiting."""
+        solved = self._solver.poll()
+        if solved is not None:
+            self._busy = False
+        return solved
