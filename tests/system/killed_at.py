@@ -1,74 +1,138 @@
-"""Runs `bodyschema` and kills it, as by SIGKILL from outside, at a named point.
+"""Runs `bodyschema` and kills it, as by SIGKILL from outside, at a named point of its work.
 
-python killed_at.py POINT NTH sampler --robot robot.toml
+python killed_at.py POINT NTH JOURNAL sampler --robot robot.toml
+
+Whatever the point, the sequence number of each pair that was accepted stands in JOURNAL, a line each.
 """
 
 from __future__ import annotations
 
 import os
 import signal
+import sqlite3
 import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from daemon import checkpoint
+from daemon.bus import Bus
 from daemon.cli import main
-from daemon.sampler import Sampler
 from daemon.store import PairStore
 
-
-def die() -> None:
-    os.kill(os.getpid(), signal.SIGKILL)
+NOWHERE = "at a random moment"  # from outside
 
 
-def around(owner: Any, name: str, nth: int, *, before: bool, only: Callable[..., bool] = lambda *_: True) -> None:
-    """Die at the nth call of `owner.name`, before it or after it."""
-    original = getattr(owner, name)
-    calls = 0
+class Countdown:
+    """Kills the process when it is called for the nth time."""
 
-    def wrapped(*args: Any, **kwargs: Any) -> Any:
-        nonlocal calls
-        calls += only(*args)
-        if before and calls == nth:
-            die()
-        result = original(*args, **kwargs)
-        if calls == nth:
-            die()
-        return result
+    def __init__(self, nth: int) -> None:
+        self._left = nth
 
-    setattr(owner, name, wrapped)
+    @property
+    def last(self) -> bool:
+        """Whether the next call kills."""
+        return self._left == 1
 
-
-def half_written(nth: int) -> None:
-    """Die when half of the nth checkpoint is on the disk."""
-    calls = 0
-    original = checkpoint._write_through
-
-    def write(file: Path, data: bytes) -> None:
-        nonlocal calls
-        calls += 1
-        original(file, data[: len(data) // 2] if calls == nth else data)
-        if calls == nth:
-            die()
-
-    checkpoint._write_through = write
+    def __call__(self) -> None:
+        self._left -= 1
+        if self._left == 0:
+            os.kill(os.getpid(), signal.SIGKILL)
 
 
-def to_checkpoint(_source: Path, target: Path) -> bool:
-    return Path(target).name == "learner.ckpt"
+def at_the_commit(kill: Countdown) -> None:
+    """Die when SQLite is about to run the COMMIT of a pair's transaction."""
+    connect = sqlite3.connect
+    inserted = False
+
+    def trace(statement: str) -> None:
+        nonlocal inserted
+        if inserted and statement == "COMMIT":
+            kill()
+        inserted = statement.startswith("INSERT INTO pairs")
+
+    def traced(*args: Any, **kwargs: Any) -> sqlite3.Connection:
+        connection = connect(*args, **kwargs)
+        connection.set_trace_callback(trace)
+        return connection
+
+    sqlite3.connect = traced
 
 
-POINTS: dict[str, Callable[[int], None]] = {
-    "before the commit": lambda nth: around(PairStore, "append", nth, before=True),
-    "between commit and publication": lambda nth: around(PairStore, "append", nth, before=False),
-    "after the publication": lambda nth: around(Sampler, "_accept", nth, before=False),
-    "in the middle of a checkpoint": half_written,
-    "before the checkpoint's rename": lambda nth: around(os, "replace", nth, before=True, only=to_checkpoint),
-    "after the checkpoint's rename": lambda nth: around(os, "replace", nth, before=False, only=to_checkpoint),
+def at_the_publication(kill: Countdown, *, before: bool) -> None:
+    """Die before or after a pair, which is in the store, is handed to zenoh."""
+    declare = Bus.publisher
+
+    def publisher(bus: Bus, key: str, *, cache: int = 0) -> Callable[[bytes], None]:
+        publish = declare(bus, key, cache=cache)
+
+        def doomed(payload: bytes) -> None:
+            if before:
+                kill()
+            publish(payload)
+            if not before:
+                kill()
+
+        return doomed if key.endswith("/pair") else publish
+
+    Bus.publisher = publisher
+
+
+def in_the_middle_of_a_checkpoint(kill: Countdown) -> None:
+    """Die when half of a checkpoint is on the disk."""
+    write = checkpoint._write_through
+
+    def half(file: Path, data: bytes) -> None:
+        write(file, data[: len(data) // 2] if kill.last else data)
+        kill()
+
+    checkpoint._write_through = half
+
+
+def at_the_rename(kill: Countdown, *, before: bool) -> None:
+    """Die before or after a whole checkpoint takes the place of the old one."""
+    replace = os.replace
+
+    def doomed(source: Path, target: Path) -> None:
+        ours = Path(target).suffix == ".ckpt"
+        if ours and before:
+            kill()
+        replace(source, target)
+        if ours and not before:
+            kill()
+
+    os.replace = doomed
+
+
+SAMPLER_POINTS: dict[str, Callable[[Countdown], None]] = {
+    "at the commit": at_the_commit,
+    "before the publication": lambda kill: at_the_publication(kill, before=True),
+    "after the publication": lambda kill: at_the_publication(kill, before=False),
+}
+LEARNER_POINTS: dict[str, Callable[[Countdown], None]] = {
+    "in the middle of a checkpoint": in_the_middle_of_a_checkpoint,
+    "before the checkpoint's rename": lambda kill: at_the_rename(kill, before=True),
+    "after the checkpoint's rename": lambda kill: at_the_rename(kill, before=False),
 }
 
+
+def keep_journal(file: Path) -> None:
+    """Write down each number that the store gave for good; a line that was written survives the process."""
+    append = PairStore.append
+    journal = os.open(file, os.O_WRONLY | os.O_APPEND | os.O_CREAT)
+
+    def noted(store: PairStore, *args: Any) -> Any:
+        pair = append(store, *args)
+        os.write(journal, f"{pair.seq}\n".encode())
+        return pair
+
+    PairStore.append = noted
+
+
 if __name__ == "__main__":
-    POINTS[sys.argv[1]](int(sys.argv[2]))
-    sys.argv[:] = ["bodyschema", *sys.argv[3:]]
+    point, nth, journal_file = sys.argv[1:4]
+    keep_journal(Path(journal_file))
+    if point != NOWHERE:
+        (SAMPLER_POINTS | LEARNER_POINTS)[point](Countdown(int(nth)))
+    sys.argv[:] = ["bodyschema", *sys.argv[4:]]
     main()
