@@ -127,7 +127,7 @@ def _copy_model(robot: Path) -> None:
 
 
 def _guess(urdf: Path, robot: Path) -> Guess:
-    """The longest chain of moving joints of `urdf`, from its root to the last link."""
+    """The longest chain of moving joints of `urdf`, from its root to the last link that is fixed to its end."""
     import os
 
     from daemon.robot_template import Guess
@@ -135,10 +135,11 @@ def _guess(urdf: Path, robot: Path) -> Guess:
 
     tree = UrdfTree.load(urdf)
     root = _root(tree)
-    ways = {link: [joint.name for joint, _ in tree.path(root, link) if joint.kind in MOVING] for link in tree.links}
-    end = max(tree.links, key=lambda link: len(ways[link]))
+    paths = {link: [joint for joint, _ in tree.path(root, link)] for link in tree.links}
+    moving = {link: [joint.name for joint in path if joint.kind in MOVING] for link, path in paths.items()}
+    end = max(tree.links, key=lambda link: (len(moving[link]), len(paths[link])))
     name = "".join(c if c.isascii() and (c.isalnum() or c in "_.-") else "_" for c in tree.name).lstrip(".-") or "robot"
-    return Guess(name, os.path.relpath(urdf, robot.parent), ways[end], end, root)
+    return Guess(name, os.path.relpath(urdf, robot.parent), moving[end], end, root)
 
 
 def _root(tree: UrdfTree) -> str:
