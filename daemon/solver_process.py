@@ -26,7 +26,7 @@ from interfaces.errors import BodyschemaError
 from interfaces.records import FloatArray
 from kbmaps import KBMap
 
-NICENESS = 10
+NICENESS = 5
 LONGEST_REST_S = 5.0
 END_LIMIT_S = 5.0
 _LENGTH = struct.Struct("<I")
@@ -172,11 +172,12 @@ class SolverProcess:
 
 
 def serve(orders: IO[bytes], solutions: IO[bytes]) -> None:
-    """Carry out orders until they end; rest after each solve for as long as it took."""
-    solver = DirectSolver()
+    """Carry out orders until they end; before another solve, rest for as long as the last one took."""
+    solver, rested_at = DirectSolver(), 0.0
     while (order := _read(orders)) is not None:
         if isinstance(order, StartTask):
             solver.start(order.task, KBMap.from_bytes(order.prior))
+            rested_at = 0.0  # a new task begins with few pairs, and somebody waits for it
         elif isinstance(order, Rebase):
             solver.rebase(KBMap.from_bytes(order.prior))
         elif isinstance(order, Learn):
@@ -185,17 +186,19 @@ def serve(orders: IO[bytes], solutions: IO[bytes]) -> None:
                 np.frombuffer(order.x, dtype="<f8").reshape(-1, 3),
             )
         else:
-            _solve(solver, solutions)
+            time.sleep(max(rested_at - time.monotonic(), 0.0))
+            rested_at = time.monotonic() + min(_solve(solver, solutions), LONGEST_REST_S)
 
 
-def _solve(solver: DirectSolver, solutions: IO[bytes]) -> None:
+def _solve(solver: DirectSolver, solutions: IO[bytes]) -> float:
+    """Solve and answer; how long it took [s]."""
     begin = time.monotonic()
     solver.solve()
     solved = solver.poll()
     if solved is not None:
         learnt = None if solved.map is None else solved.map.to_bytes()
         _write(solutions, Solution(solved.task, solved.pairs, learnt))
-    time.sleep(min(time.monotonic() - begin, LONGEST_REST_S))
+    return time.monotonic() - begin
 
 
 def _write(stream: IO[bytes], message: msgspec.Struct) -> None:

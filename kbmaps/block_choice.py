@@ -8,6 +8,7 @@ shares none of its errors with the others.
 from __future__ import annotations
 
 import math
+from typing import cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -100,5 +101,6 @@ def _left_out_errors(kernel: FloatArray, errors: FloatArray, blocks: int, precis
         inverses = 1.0 / (variances + precision)
         multipliers = parts @ (inverses[:, None] * components)
         corners = (parts * inverses) @ parts.transpose(0, 2, 1)
-        means[row] = np.linalg.norm(np.linalg.solve(corners, multipliers), axis=2).mean(axis=1)
+        left_out = cast(FloatArray, np.linalg.solve(corners, multipliers))
+        means[row] = np.linalg.norm(left_out, axis=2).mean(axis=1)
     return means
