@@ -123,7 +123,7 @@ class Recording:
         except Fault as fault:
             raise _located(fault, file) from None
         except OSError as error:
-            raise RecordingError(f"cannot be read: {error.strerror or error}", file=file) from error
+            raise _unreadable(file, error) from error
         return cls.from_table(table, joints, file)
 
     @classmethod
@@ -236,6 +236,14 @@ class Recording:
         check_header(table.names, self.joints)
         check_finite(table)
         check_values(table)
+
+
+def _unreadable(file: Path, error: OSError) -> RecordingError:
+    if isinstance(error, FileNotFoundError):
+        return RecordingError("there is no such file", file=file, remedy="Name a recording that is there")
+    if isinstance(error, IsADirectoryError):
+        return RecordingError("a folder, not a file", file=file, remedy="Name the recording in it")
+    return RecordingError(f"cannot be read: {error.strerror or error}", file=file, remedy="Mend its permissions")
 
 
 def _located(fault: Fault, file: Path | None) -> RecordingError:

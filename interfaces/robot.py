@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -17,7 +20,7 @@ from .camera import StereoCalibration
 from .errors import ConfigError, RobotError
 from .records import FloatArray, frozen_array
 from .toml_file import convert, line_of, read_toml
-from .urdf import MOVING, UrdfTree, chain_between
+from .urdf import MOVING, UrdfJoint, UrdfTree, chain_between
 
 Vector3 = tuple[float, float, float]
 Positive = Annotated[float, Meta(gt=0)]
@@ -121,38 +124,38 @@ class RobotDescription:
                 )
         robot = convert(tables["robot"], RobotSection, file=file, text=text, prefix=("robot",))
         camera = convert(tables["camera"], CameraSection, file=file, text=text, prefix=("camera",))
-        try:
-            return cls._assemble(robot, camera, file)
-        except RobotError as error:
-            if error.file is not None:
-                raise
-            line = line_of(text, ("camera" if "camera" in error.what else "robot",))
-            raise RobotError(
-                error.what, file=file, line=_line_naming(text, error.what) or line, remedy=error.remedy
-            ) from None
+        return cls._assemble(robot, camera, text, file)
 
     @classmethod
-    def _assemble(cls, robot: RobotSection, camera: CameraSection, file: Path) -> RobotDescription:
-        if len(set(robot.joints)) != len(robot.joints):
-            raise RobotError("joints names a joint twice")
+    def _assemble(cls, robot: RobotSection, camera: CameraSection, text: str, file: Path) -> RobotDescription:
+        blamed_on = partial(_blamed_on, file, text)
+        with blamed_on("robot", "joints"):
+            if len(set(robot.joints)) != len(robot.joints):
+                raise RobotError("joints names a joint twice", remedy="Name each once")
         tree = UrdfTree.load(file.parent / robot.urdf)
-        limits = [tree.joint(name) for name in robot.joints]
-        for joint in limits:
-            if joint.kind not in MOVING:
-                raise RobotError(f"joint {joint.name!r} is fixed", remedy="Take it out of joints")
+        limits = []
+        for name in robot.joints:
+            with blamed_on("robot", "joints", naming=name):
+                limits.append(_moving(tree, name))
         for name in robot.held_at:
-            tree.joint(name)
-        tree.require_link(camera.parent_link)
-        tree.require_link(robot.marker_link)
-        chain = chain_between(
-            tree,
-            robot.joints,
-            robot.held_at,
-            start=camera.parent_link,
-            end=robot.marker_link,
-            T_start_camera=camera.pose,
-            marker_xyz=np.array(robot.marker_xyz),
-        )
+            with blamed_on("robot", "held_at", name):
+                tree.joint(name)
+        with blamed_on("camera", "parent_link"):
+            tree.require_link(camera.parent_link)
+        with blamed_on("robot", "marker_link"):
+            tree.require_link(robot.marker_link)
+        with blamed_on("robot", "joints"):
+            chain = chain_between(
+                tree,
+                robot.joints,
+                robot.held_at,
+                start=camera.parent_link,
+                end=robot.marker_link,
+                T_start_camera=camera.pose,
+                marker_xyz=np.array(robot.marker_xyz),
+            )
+        with blamed_on("camera"):
+            calibration = _calibration(camera)
         return cls(
             file=file,
             robot=robot,
@@ -161,7 +164,7 @@ class RobotDescription:
             chain=chain,
             lower=frozen_array([joint.lower for joint in limits]),
             upper=frozen_array([joint.upper for joint in limits]),
-            calibration=_calibration(camera),
+            calibration=calibration,
         )
 
     @property
@@ -192,9 +195,30 @@ def _calibration(camera: CameraSection) -> StereoCalibration | None:
     return StereoCalibration(**parts, pixel_sigma=camera.pixel_sigma)  # pyright: ignore[reportArgumentType]
 
 
-def _line_naming(text: str, message: str) -> int | None:
-    names = [part for part in message.split("'")[1::2] if part]
-    for number, line in enumerate(text.splitlines(), 1):
-        if any(f'"{name}"' in line or f"'{name}'" in line for name in names):
+def _moving(tree: UrdfTree, name: str) -> UrdfJoint:
+    joint = tree.joint(name)
+    if joint.kind not in MOVING:
+        raise RobotError(f"joint {name!r} is fixed", remedy="Take it out of joints")
+    return joint
+
+
+@contextmanager
+def _blamed_on(file: Path, text: str, *keys: str, naming: str | None = None) -> Iterator[None]:
+    """RobotErrors that name no file get this one, and the line of the key; with `naming`, of that name in its value."""
+    try:
+        yield
+    except RobotError as error:
+        if error.file is not None:
+            raise
+        line = line_of(text, keys)
+        if line is not None and naming is not None:
+            line = _line_naming(text, naming, line)
+        raise RobotError(error.what, file=file, line=line, remedy=error.remedy) from None
+
+
+def _line_naming(text: str, name: str, first: int) -> int:
+    """The first line from `first` on that has `name` in quotes; `first` when none has."""
+    for number, line in enumerate(text.splitlines()[first - 1 :], first):
+        if f'"{name}"' in line or f"'{name}'" in line:
             return number
-    return None
+    return first

@@ -23,16 +23,31 @@ _PLACE = re.compile(r"(?P<what>.*?) - at `\$(?P<path>[^`]*)`$", re.DOTALL)
 def read_toml(file: Path) -> tuple[dict[str, Any], str]:
     """The tables of `file` and its text; ConfigError with the line when it cannot be read."""
     try:
-        text = file.read_text(encoding="utf-8")
+        data = file.read_bytes()
     except FileNotFoundError as error:
         raise ConfigError("there is no such file", file=file, remedy="`bodyschema config init` writes one") from error
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"cannot be read: {error}", file=file) from error
+    except IsADirectoryError as error:
+        raise ConfigError("a folder, not a file", file=file, remedy="Name the robot.toml in it") from error
+    except OSError as error:
+        raise ConfigError(f"cannot be read: {error.strerror}", file=file, remedy="Mend its permissions") from error
+    text = _decoded(data, file)
     try:
         return tomllib.loads(text), text
     except tomllib.TOMLDecodeError as error:
         line = re.search(r"line (\d+)", str(error))
         raise ConfigError(f"not TOML: {error}", file=file, line=int(line[1]) if line else None) from error
+
+
+def _decoded(data: bytes, file: Path) -> str:
+    try:
+        return data.decode("utf-8-sig").replace("\r\n", "\n")
+    except UnicodeDecodeError as error:
+        raise ConfigError(
+            f"the byte 0x{data[error.start]:02x} is not UTF-8 text",
+            file=file,
+            line=data.count(b"\n", 0, error.start) + 1,
+            remedy="Name a robot.toml, or save it as UTF-8",
+        ) from error
 
 
 def convert(tables: object, kind: type[T], *, file: Path, text: str, prefix: tuple[str, ...] = ()) -> T:

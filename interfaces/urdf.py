@@ -148,7 +148,6 @@ def chain_between(
         if name not in on_way:
             raise RobotError(
                 f"joint {name!r} does not move the marker: it is not between the links {start!r} and {end!r}",
-                file=tree.file,
                 remedy=f"Take it out of joints (between them are: {_movable(way)})",
             )
     if tuple(on_way) != joints:
@@ -258,7 +257,8 @@ def _parse(file: Path) -> Any:
     try:
         root = etree.fromstring(data, parser)
     except etree.XMLSyntaxError as error:
-        raise RobotError(f"not XML: {error.msg}", file=file, line=error.lineno) from error
+        what = error.msg.removesuffix(f", line {error.lineno}, column {error.offset}")
+        raise RobotError(f"not XML: {what}", file=file, line=error.lineno) from error
     if root.getroottree().docinfo.doctype:
         raise RobotError("a URDF with a DOCTYPE is not accepted", file=file, line=1, remedy="Delete the DOCTYPE")
     if root.tag != "robot":

@@ -48,7 +48,7 @@ def _request(values: tuple[float, ...], config: Config, deg: bool) -> JointsRequ
     """What to ask; RequestError when it is no vector of joint angles."""
     import numpy as np
 
-    from daemon.wire import JointsRequest, decode, joint_angles
+    from daemon.wire import JointsRequest, joint_angles
     from interfaces.errors import RequestError
 
     if values:
@@ -58,12 +58,27 @@ def _request(values: tuple[float, ...], config: Config, deg: bool) -> JointsRequ
             f"no joint angles; give {len(config.robot.joints)} ({', '.join(config.robot.joints)}), or JSON on stdin"
         )
     else:
-        request = decode(b'{"q":' + sys.stdin.buffer.read() + b"}", JointsRequest)
+        request = _from_standard_input(config)
     angles = joint_angles(request, config.robot.joints)
     if deg:
         turns = ~config.robot.chain.prismatic
         angles[:, turns] = np.radians(angles[:, turns])
     return JointsRequest(angles.tolist())
+
+
+def _from_standard_input(config: Config) -> JointsRequest:
+    from daemon.wire import JointsRequest, decode
+    from interfaces.errors import RequestError
+
+    text = sys.stdin.buffer.read()
+    names = ", ".join(config.robot.joints)
+    if not text.strip():
+        raise RequestError(f"no joint angles, and standard input is empty; give {len(config.robot.joints)} ({names})")
+    try:
+        return decode(b'{"q":' + text + b"}", JointsRequest)
+    except RequestError as error:
+        wanted = f"a JSON list of {len(config.robot.joints)} numbers ({names}), or a list of such lists"
+        raise RequestError(f"standard input is not {wanted}") from error
 
 
 def _show(reply: PredictReply) -> None:

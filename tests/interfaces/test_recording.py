@@ -142,7 +142,7 @@ def test_sigmas_beside_covariances_are_refused(write) -> None:
 
 
 def test_a_missing_file_is_named(tmp_path: Path) -> None:
-    assert "No such file" in fault(tmp_path / "nowhere.csv").what
+    assert "there is no such file" in fault(tmp_path / "nowhere.csv").what
 
 
 def test_a_folder_is_not_a_recording(tmp_path: Path) -> None:
