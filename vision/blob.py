@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import cv2
@@ -11,7 +12,7 @@ from interfaces.records import FloatArray, ImageArray, Reason
 
 from .colour import ColourGate
 from .config import VisionConfig
-from .outline import fit_outline
+from .outline import Outline, fit_outline
 from .sphere import Pinhole
 
 # A patch that fills less of its enclosing circle is not the image of a ball.
@@ -20,6 +21,8 @@ _LEAST_FILL = 0.45
 _WHOLE_DISC_FILL = 0.8
 # Parts of the strongest colour that tell the ball from what is behind it.
 _STRONG_SHARES = (0.5, 0.7)
+# A part of the ball or of a brick has an edge on some sides only; on the others its surroundings are as colourful.
+_MOST_UNEVEN = 0.3
 # Pixels around a patch that the outline may reach into.
 _APRON_PX = 12
 
@@ -108,13 +111,22 @@ def measure(image: ImageArray, patch: Patch, eye: Pinhole, gate: ColourGate, con
         patch.radius_px,
         eye.shape(patch.centre_px),
     )
-    if outline is None or outline.visible < config.min_visible:
+    if outline is None or not _is_whole(outline, config):
         return Reason.OCCLUDED
     centre_px = outline.centre_px + corner
     reach = outline.radius_px + config.border_margin_px
     if (centre_px - reach < 0).any() or (centre_px + reach > (width - 1, height - 1)).any():
         return Reason.AT_BORDER
     return Disc(centre_px, outline.radius_px, outline.cov_px)
+
+
+def _is_whole(outline: Outline, config: VisionConfig) -> bool:
+    sigma_px = math.sqrt(float(outline.cov_px.diagonal().max()))
+    return (
+        outline.visible >= config.min_visible
+        and outline.uneven <= _MOST_UNEVEN
+        and sigma_px <= config.max_centre_sigma_px
+    )
 
 
 def _clear_of_border(box: Region, margin_px: float, size: tuple[int, int]) -> bool:

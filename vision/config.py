@@ -50,6 +50,7 @@ class VisionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         min_pixels: a patch of the marker's colour smaller than this is no candidate [px²].
         border_margin_px: how far the ball's outline has to stay from the image border [px].
         min_visible: share of the outline that has to be seen where the fitted ellipse says.
+        max_centre_sigma_px: a centre less certain than this is doubtful: what was fitted is no ellipse [px].
         epipolar_px: largest difference of the eyes' rows [px], on top of the noise of the two centres ...
         epipolar_sigmas: ... which counts this many times.
         eye_size_ratio: largest ratio of the sizes the two eyes claim for the ball.
@@ -62,6 +63,7 @@ class VisionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     min_pixels: Annotated[int, Meta(ge=12)] = 30
     border_margin_px: Annotated[float, Meta(ge=0)] = 3.0
     min_visible: Annotated[float, Meta(ge=0.5, le=1)] = 0.85
+    max_centre_sigma_px: Positive = 0.4
     epipolar_px: Annotated[float, Meta(ge=0)] = 0.5
     epipolar_sigmas: Annotated[float, Meta(ge=0)] = 4.0
     eye_size_ratio: Ratio = 1.2

@@ -44,10 +44,9 @@ _EDGE_SIGMA_PX = 0.06
 _UNEVEN_PX = 0.4
 # Residuals beyond this are no longer edge noise [px], whatever the spread is.
 _LEAST_GATE_PX, _LARGEST_GATE_PX, _GATE_SIGMAS = 0.8, 2.0, 3.5
-# Power of the wave once round the outline over that of the next ones (measured, docs/vision.md): what is behind the
-# ball disturbs whole arcs of the outline, so slow waves are the larger ones.
-_SLOWEST_WAVE = 1.5
-# The waves looked at: up to this one, or up to radius / _WAVE_RADIUS_PX if that is more.
+# Power of the wave once round the outline over what the next ones let expect (measured, docs/vision.md).
+_SLOWEST_WAVE = 1.1
+# The waves that tell it go up to this one, or up to radius / _WAVE_RADIUS_PX if that is more.
 _LEAST_WAVES, _WAVE_RADIUS_PX = 4, 3.0
 # Lens and interpolation smooth along the outline too, which takes power from the quicker waves (1-sigma) [px].
 _SMOOTHING_PX = 1.0
@@ -66,12 +65,14 @@ class Outline:
         radius_px: radius of the circle of the same area [px].
         cov_px: covariance of the centre, shape (2, 2) [px²].
         visible: share of the outline that nothing hides.
+        uneven: share of the outline at which the background is too uneven to tell.
     """
 
     centre_px: FloatArray
     radius_px: float
     cov_px: FloatArray
     visible: float
+    uneven: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -228,6 +229,7 @@ def _fit_circle(edges: _Edges, centre_px: FloatArray, shape: FloatArray) -> Outl
         radius_px=float(solution[2]),
         cov_px=density * (shape @ np.linalg.inv(normal)[:2, :2] @ shape) + _FLOOR_PX**2 * np.eye(2),
         visible=1.0 - float(np.mean(hidden)),
+        uneven=float(np.mean(edges.uneven)),
     )
 
 
@@ -235,14 +237,18 @@ def _noise_density(angles: FloatArray, residual: FloatArray, radius_px: float) -
     """Variance [px²] of one outline point in the slow waves round the outline, of which the centre's error is one.
 
     Neighbouring outline points share pixels and background, so their variance alone would claim too little. A
-    shift of the centre is the wave that goes once round; it was fitted away, and the next ones tell its size, the
-    nearer the better.
+    shift of the centre is the wave that goes once round. It was fitted away, and the next ones tell its size, the
+    nearer the better. Pixel noise gives all waves the same power; what is behind the ball disturbs whole arcs and
+    makes the slow ones larger. So their excess over the quick ones counts once more.
     """
-    harmonics = np.arange(2, max(_LEAST_WAVES, round(radius_px / _WAVE_RADIUS_PX)) + 1)
+    last_slow = max(_LEAST_WAVES, round(radius_px / _WAVE_RADIUS_PX))
+    last_quick = max(last_slow + 1, min(2 * last_slow, round(radius_px)))
+    harmonics = np.arange(2, last_quick + 1)
     waves = np.exp(-1j * harmonics[:, None] * angles) @ residual
-    unsmoothed = np.exp((harmonics * _SMOOTHING_PX / radius_px) ** 2)
-    share = harmonics**-2.0 / np.sum(harmonics**-2.0)
-    density = float(share @ (np.abs(waves) ** 2 * unsmoothed)) / np.count_nonzero(residual)
+    power = np.abs(waves) ** 2 * np.exp((harmonics * _SMOOTHING_PX / radius_px) ** 2) / np.count_nonzero(residual)
+    is_slow = harmonics <= last_slow
+    share = harmonics[is_slow] ** -2.0 / np.sum(harmonics[is_slow] ** -2.0)
+    slow, quick = float(share @ power[is_slow]), float(np.mean(power[~is_slow]))
     # Student's t with two degrees of freedom per wave: 1-sigma of a spread that is itself estimated.
     student = 1.0 + 0.25 * float(share @ share)
-    return _SLOWEST_WAVE * student**2 * density
+    return _SLOWEST_WAVE * student**2 * (slow + max(0.0, slow - quick))

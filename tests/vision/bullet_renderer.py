@@ -45,11 +45,13 @@ class BulletScene:
     ) -> None:
         self._bullet.disconnect(self._client)
 
-    def render(self, x: FloatArray, light: FloatArray, noise_sd: float, rng: np.random.Generator) -> StereoFrame:
+    def render(
+        self, x: FloatArray, light: FloatArray, noise_sd: float, rng: np.random.Generator, t: float = 0.0
+    ) -> StereoFrame:
         """Both eyes' view with the ball at `x` (3,) [m], lit from the direction `light` (3,)."""
         self._place(self._ball, x)
         left, right = (self._eye(shift, light) for shift in (0.0, self.calibration.baseline_m))
-        return StereoFrame(0.0, *(_noisy(image, noise_sd, rng) for image in (left, right)))
+        return StereoFrame(t, *(_noisy(image, noise_sd, rng) for image in (left, right)))
 
     def _body(self, kind: int, colour: tuple[float, ...], **shape: object) -> int:
         visual = self._bullet.createVisualShape(

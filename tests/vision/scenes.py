@@ -2,16 +2,80 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
-from ball_renderer import Look, Room
+from ball_renderer import SMALL, Look, Room, in_eyes, paint_ball, take
 
 from interfaces.camera import StereoCalibration
-from interfaces.records import FloatArray, MarkerFix, Reason
+from interfaces.records import FloatArray, MarkerFix, MarkerMiss, Reason, StereoFrame
 from vision.tracker import StereoTracker
 
 RADIUS_M = 0.020
+PLAIN = Look(noise_sd=2.0)
+
+
+@dataclass(frozen=True)
+class Ball:
+    """A ball in the left optical frame: centre (3,) and radius [m], reflectance RGB."""
+
+    x: tuple[float, float, float]
+    radius_m: float = RADIUS_M
+    rgb: tuple[float, float, float] = (0.85, 0.08, 0.08)
+
+
+@dataclass(frozen=True)
+class Slab:
+    """A grey board that faces the eyes: corners (x, y) and depth z [m] in the left optical frame."""
+
+    low: tuple[float, float]
+    high: tuple[float, float]
+    z: float
+    rgb: tuple[float, float, float] = (0.35, 0.35, 0.37)
+
+
+def stage(
+    *things: Ball | Slab,
+    calibration: StereoCalibration = SMALL,
+    look: Look = PLAIN,
+    t: float = 0.0,
+    seed: int = 0,
+) -> StereoFrame:
+    """Both eyes' view of `things`, the farthest first, before a grey wall."""
+    rng = np.random.default_rng(seed)
+    width, height = calibration.image_size_px
+    images = []
+    for eye in (0, 1):
+        picture = np.full((height, width, 3), 0.5)
+        for thing in things:
+            if isinstance(thing, Ball):
+                x_eye = in_eyes(np.array(thing.x), calibration)[eye]
+                lit = replace(look, ball_rgb=thing.rgb)
+                picture = paint_ball(picture, x_eye, thing.radius_m, lit, calibration)
+            else:
+                _paint_slab(picture, thing, eye, calibration)
+        images.append(take(picture, look, rng))
+    return StereoFrame(t, images[0], images[1])
+
+
+def reason(answer: MarkerFix | MarkerMiss) -> Reason | None:
+    """Why there is no fix; None when there is one."""
+    return answer.reason if isinstance(answer, MarkerMiss) else None
+
+
+def sigmas_off(answer: MarkerFix | MarkerMiss, ball: Ball) -> float:
+    """How far a fix is from the ball in the metric of its own covariance; infinite for a miss."""
+    if isinstance(answer, MarkerMiss):
+        return np.inf
+    error = answer.x - np.array(ball.x)
+    return float(np.sqrt(error @ np.linalg.solve(answer.cov, error)))
+
+
+def _paint_slab(picture: FloatArray, slab: Slab, eye: int, calibration: StereoCalibration) -> None:
+    corners = [calibration.project(np.array([*corner, slab.z])) for corner in (slab.low, slab.high)]
+    first, last = (np.maximum(np.rint(corner[2 * eye : 2 * eye + 2]), 0).astype(int) for corner in corners)
+    picture[first[1] : last[1], first[0] : last[0]] = slab.rgb
 
 
 @dataclass(frozen=True)
@@ -49,19 +113,25 @@ def place(calibration: StereoCalibration, radius_px: float, rng: np.random.Gener
 def measure_errors(
     calibration: StereoCalibration, look: Look, frames: int, seed: int, radii_px: tuple[float, float] = (5.0, 30.0)
 ) -> Errors:
-    """Track `frames` unrelated frames: every place, size and light is drawn anew, each of 16 rooms has its exposure."""
+    """Track `frames` unrelated frames: every place, size and light is drawn anew, rooms and exposures change."""
     rng = np.random.default_rng(seed)
-    rooms = [Room(calibration, look, rng) for _ in range(min(16, frames))]
+    rooms = [Room(calibration, look, rng) for _ in range(min(frames, max(16, frames // 8)))]
     tracker = StereoTracker(calibration)
-    found, misses = [], []
+    answers = []
     for number in range(frames):
         x = place(calibration, float(np.exp(rng.uniform(*np.log(radii_px)))), rng)
         frame = rooms[number % len(rooms)].photograph(x, RADIUS_M, t=float(number))
-        answer = tracker.track(frame)
-        if isinstance(answer, MarkerFix):
-            centres = np.array(answer.centres_px) - calibration.project(x)
-            found.append(np.concatenate([answer.x - x, np.sqrt(np.diag(answer.cov)), centres]))
-        else:
-            misses.append(answer.reason)
-    table = np.array(found).reshape(-1, 10)
-    return Errors(table[:, :3], table[:, 3:6], table[:, 6:], tuple(misses))
+        answers.append((x, tracker.track(frame)))
+    return compare(answers, calibration)
+
+
+def compare(answers: Sequence[tuple[FloatArray, MarkerFix | MarkerMiss]], calibration: StereoCalibration) -> Errors:
+    """True places (3,) [m] and what the tracker said to each."""
+    fixes = [(x, answer) for x, answer in answers if isinstance(answer, MarkerFix)]
+    true = np.array([x for x, _ in fixes])
+    return Errors(
+        x=np.array([fix.x for _, fix in fixes]) - true,
+        sigma=np.sqrt([np.diag(fix.cov) for _, fix in fixes]),
+        centres_px=np.array([fix.centres_px for _, fix in fixes]) - calibration.project(true),
+        misses=tuple(answer.reason for _, answer in answers if isinstance(answer, MarkerMiss)),
+    )

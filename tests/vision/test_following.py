@@ -1,0 +1,147 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from ball_renderer import SMALL
+from scenes import Ball, Slab, reason, sigmas_off, stage
+
+from interfaces.errors import SourceLost
+from interfaces.records import MarkerFix, Reason
+from vision.tracked_camera import TrackedCamera
+from vision.tracker import StereoTracker
+
+FRAME_S = 1 / 30
+FAR_SIGMAS = 5.0
+NEAR = Ball((0.05, 0.0, 0.8))
+ELSEWHERE = Ball((0.02, 0.1, 0.8))
+
+
+def tracker_that_saw(ball: Ball, t: float = 0.0) -> StereoTracker:
+    tracker = StereoTracker(SMALL)
+    assert isinstance(tracker.track(stage(ball, t=t)), MarkerFix)
+    return tracker
+
+
+def walk(frames: int) -> list[Ball]:
+    """A ball that goes to and fro at up to 0.6 m/s, 14 px a frame."""
+    phase = 2 * np.pi * np.arange(frames) / 20
+    return [Ball((0.05 + 0.06 * np.sin(p), 0.06 * np.cos(p), 0.8 + 0.1 * np.sin(2 * p))) for p in phase.tolist()]
+
+
+def test_a_moving_ball_is_followed():
+    tracker = StereoTracker(SMALL)
+    for number, ball in enumerate(walk(20)):
+        assert sigmas_off(tracker.track(stage(ball, t=number * FRAME_S, seed=number)), ball) < FAR_SIGMAS
+
+
+def test_following_gives_the_same_fixes_as_searching_the_whole_images():
+    following, searching = StereoTracker(SMALL), StereoTracker(SMALL)
+    for number, ball in enumerate(walk(10)):
+        frame = stage(ball, t=number * FRAME_S, seed=number)
+        searching.forget()
+        followed, searched = following.track(frame), searching.track(frame)
+        assert isinstance(followed, MarkerFix)
+        assert isinstance(searched, MarkerFix)
+        # Both start from a rough circle of their own and stop when it has settled.
+        assert np.abs(np.array(followed.centres_px) - np.array(searched.centres_px)).max() < 0.01
+
+
+def test_a_followed_ball_is_not_confused_with_another_one_farther_off():
+    tracker = tracker_that_saw(NEAR)
+    assert sigmas_off(tracker.track(stage(NEAR, ELSEWHERE, t=FRAME_S)), NEAR) < FAR_SIGMAS
+
+
+def test_a_tracker_told_to_forget_searches_the_whole_images():
+    tracker = tracker_that_saw(NEAR)
+    tracker.forget()
+    assert reason(tracker.track(stage(NEAR, ELSEWHERE, t=FRAME_S))) is Reason.AMBIGUOUS
+
+
+def test_after_a_long_pause_the_whole_images_are_searched():
+    tracker = tracker_that_saw(NEAR)
+    assert reason(tracker.track(stage(NEAR, ELSEWHERE, t=0.6))) is Reason.AMBIGUOUS
+
+
+def test_time_that_steps_back_makes_the_whole_images_be_searched():
+    tracker = tracker_that_saw(NEAR, t=9.0)
+    assert reason(tracker.track(stage(NEAR, ELSEWHERE, t=8.9))) is Reason.AMBIGUOUS
+
+
+def test_after_a_miss_the_whole_images_are_searched():
+    tracker = tracker_that_saw(NEAR)
+    assert reason(tracker.track(stage(t=FRAME_S))) is Reason.NO_MARKER
+    assert reason(tracker.track(stage(NEAR, ELSEWHERE, t=2 * FRAME_S))) is Reason.AMBIGUOUS
+
+
+def test_a_ball_that_jumps_is_found_in_the_same_frame():
+    tracker = tracker_that_saw(NEAR)
+    assert sigmas_off(tracker.track(stage(ELSEWHERE, t=FRAME_S)), ELSEWHERE) < FAR_SIGMAS
+
+
+def test_after_a_jump_the_ball_is_followed_at_its_new_place():
+    tracker = tracker_that_saw(NEAR)
+    tracker.track(stage(ELSEWHERE, t=FRAME_S))
+    assert sigmas_off(tracker.track(stage(NEAR, ELSEWHERE, t=2 * FRAME_S)), ELSEWHERE) < FAR_SIGMAS
+
+
+def test_a_ball_that_comes_out_from_behind_a_hand_is_found_at_once():
+    tracker = tracker_that_saw(NEAR)
+    hand = Slab((-0.1, 0.0), (0.2, 0.2), 0.7)
+    assert reason(tracker.track(stage(NEAR, hand, t=FRAME_S))) is Reason.OCCLUDED
+    assert sigmas_off(tracker.track(stage(NEAR, t=2 * FRAME_S)), NEAR) < FAR_SIGMAS
+
+
+def test_a_ball_followed_out_of_the_image_is_at_border_then_gone():
+    tracker = StereoTracker(SMALL)
+    # 15 px a frame; the centre leaves the left image at the fourth.
+    answers = [reason(tracker.track(stage(Ball((0.14 + 0.02 * n, 0.0, 0.8)), t=n * FRAME_S))) for n in range(6)]
+    assert answers[0] is None
+    assert Reason.AT_BORDER in answers
+    assert answers[-1] is Reason.NO_MARKER
+
+
+class Camera:
+    """Gives the frames it was given, one a read."""
+
+    calibration = SMALL
+
+    def __init__(self, *frames):
+        self.frames, self.entered = list(frames), 0
+
+    def __enter__(self):
+        self.entered += 1
+        return self
+
+    def __exit__(self, *error):
+        self.entered -= 1
+
+    def read(self, timeout_s):
+        frame = self.frames.pop(0)
+        if isinstance(frame, Exception):
+            raise frame
+        return frame
+
+
+def test_a_tracked_camera_answers_every_frame_with_its_time():
+    with TrackedCamera(Camera(stage(NEAR, t=1.0), stage(t=1.1)), StereoTracker(SMALL)) as source:
+        found, lost = source.read(0.1), source.read(0.1)
+    assert found is not None
+    assert lost is not None
+    assert (found.t, lost.t) == (1.0, 1.1)
+
+
+def test_a_tracked_camera_has_nothing_while_no_frame_comes():
+    with TrackedCamera(Camera(None), StereoTracker(SMALL)) as source:
+        assert source.read(0.1) is None
+
+
+def test_a_camera_opened_again_is_searched_from_scratch():
+    camera = Camera(stage(NEAR, t=1.0), SourceLost("unplugged"), stage(NEAR, ELSEWHERE, t=1.0 + FRAME_S))
+    source = TrackedCamera(camera, StereoTracker(SMALL))
+    with source:
+        source.read(0.1)
+        with pytest.raises(SourceLost):
+            source.read(0.1)
+    assert camera.entered == 0
+    with source:
+        assert reason(source.read(0.1)) is Reason.AMBIGUOUS

@@ -1,0 +1,205 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from ball_renderer import SMALL, VGA, Look
+from scenes import Ball, Slab, reason, sigmas_off, stage
+
+from interfaces.errors import SourceError
+from interfaces.records import MarkerFix, Reason, StereoFrame
+from vision.config import VisionConfig
+from vision.tracker import StereoTracker
+
+BALL = Ball((0.02, 0.01, 0.8))
+FAR_SIGMAS = 5.0
+
+
+def answer(*things, config=None, **staging):
+    return StereoTracker(SMALL, config).track(stage(*things, **staging))
+
+
+def at_pixel(u: float, v: float, z: float = 0.8) -> Ball:
+    """A ball whose centre the left eye sees at (u, v) [px]."""
+    cx, cy = SMALL.principal_point_px
+    return Ball(((u - cx) * z / SMALL.focal_px, (v - cy) * z / SMALL.focal_px, z))
+
+
+def test_a_ball_before_a_wall_is_found():
+    assert sigmas_off(answer(BALL), BALL) < FAR_SIGMAS
+
+
+def test_no_ball_is_no_marker():
+    assert reason(answer()) is Reason.NO_MARKER
+
+
+def test_a_ball_of_another_colour_is_no_marker():
+    assert reason(answer(replace(BALL, rgb=(0.1, 0.2, 0.8)))) is Reason.NO_MARKER
+
+
+def test_a_ball_too_far_away_to_be_measured_is_no_marker():
+    # Radius 2.4 px: 18 pixels.
+    assert reason(answer(Ball((0.1, 0.0, 5.0)))) is Reason.NO_MARKER
+
+
+# The ball's radius is 15 px, the image 320x240; the right eye sees it 45 px farther left.
+@pytest.mark.parametrize(
+    ("u", "v"), [(200, 8), (200, 16), (200, 230), (310, 120), (302, 120), (62, 120), (50, 120), (200, -5)]
+)
+def test_a_ball_that_reaches_the_border_of_either_image_is_at_border(u, v):
+    assert reason(answer(at_pixel(u, v))) is Reason.AT_BORDER
+
+
+@pytest.mark.parametrize(("u", "v"), [(200, 21), (200, 218), (298, 120), (67, 120)])
+def test_a_ball_just_clear_of_the_borders_is_found(u, v):
+    ball = at_pixel(u, v)
+    assert sigmas_off(answer(ball), ball) < FAR_SIGMAS
+
+
+def test_the_margin_to_the_border_is_configured():
+    assert reason(answer(at_pixel(200, 25))) is None
+    assert reason(answer(at_pixel(200, 25), config=VisionConfig(border_margin_px=12.0))) is Reason.AT_BORDER
+
+
+@pytest.mark.parametrize(
+    "slab",
+    [
+        pytest.param(Slab((0.016, -0.1), (0.024, 0.1), 0.7), id="bar down the middle"),
+        pytest.param(Slab((-0.1, 0.006), (0.1, 0.013), 0.7), id="bar across"),
+        pytest.param(Slab((-0.1, 0.012), (0.1, 0.1), 0.75), id="hand over the lower half"),
+        pytest.param(Slab((0.025, -0.1), (0.1, 0.1), 0.78), id="board over the right third"),
+        pytest.param(Slab((-0.1, -0.1), (0.012, 0.1), 0.75), id="board over the left third"),
+    ],
+)
+def test_a_ball_partly_behind_something_is_occluded(slab):
+    assert reason(answer(BALL, slab)) is Reason.OCCLUDED
+
+
+def test_a_ball_hidden_from_one_eye_only_is_occluded():
+    # At half the depth a board that covers half of the ball for the left eye is beside it for the right one.
+    assert reason(answer(BALL, Slab((0.012, -0.1), (0.03, 0.1), 0.4))) is Reason.OCCLUDED
+
+
+def test_a_ball_wholly_hidden_is_no_marker():
+    assert reason(answer(BALL, Slab((-0.1, -0.1), (0.1, 0.1), 0.7))) is Reason.NO_MARKER
+
+
+@pytest.mark.parametrize("covered", [0.02, 0.06, 0.10, 0.15, 0.2, 0.3, 0.4])
+def test_however_much_of_the_ball_is_covered_a_fix_is_right_or_there_is_none(covered):
+    limb = BALL.x[0] + BALL.radius_m * (1 - 2 * covered)
+    found = answer(BALL, Slab((limb, -0.1), (0.2, 0.1), BALL.x[2]))
+    assert reason(found) is Reason.OCCLUDED or sigmas_off(found, BALL) < FAR_SIGMAS
+
+
+def test_an_arm_that_touches_the_ball_s_outline_does_not_pull_the_centre():
+    beside = Slab((BALL.x[0] + 1.02 * BALL.radius_m, -0.1), (0.2, 0.1), BALL.x[2], rgb=(0.15, 0.15, 0.2))
+    assert sigmas_off(answer(beside, BALL), BALL) < FAR_SIGMAS
+
+
+def test_a_red_box_is_no_ball():
+    assert reason(answer(Slab((-0.02, -0.1), (0.05, 0.0), 0.8, rgb=(0.7, 0.1, 0.1)))) is Reason.OCCLUDED
+
+
+def test_a_ball_before_a_red_box_of_its_hue_is_found_or_occluded_but_never_misplaced():
+    box = Slab((0.0, -0.05), (0.15, 0.1), 0.9, rgb=(0.45, 0.12, 0.1))
+    found = answer(box, BALL)
+    assert reason(found) is Reason.OCCLUDED or sigmas_off(found, BALL) < FAR_SIGMAS
+
+
+def test_a_ball_beside_a_red_box_is_found():
+    box = Slab((-0.11, -0.05), (-0.05, 0.1), 0.9, rgb=(0.7, 0.1, 0.1))
+    assert sigmas_off(answer(box, BALL), BALL) < FAR_SIGMAS
+
+
+@pytest.mark.parametrize("other", [(0.1, 0.01, 0.8), (0.02, 0.1, 0.8), (0.08, -0.06, 0.7)])
+def test_two_balls_are_ambiguous(other):
+    assert reason(answer(BALL, Ball(other))) is Reason.AMBIGUOUS
+
+
+def test_a_second_ball_of_another_size_is_not_taken_for_the_marker():
+    assert sigmas_off(answer(BALL, Ball((0.08, -0.06, 0.8), radius_m=0.012)), BALL) < FAR_SIGMAS
+
+
+def test_a_larger_ball_farther_away_fails_the_size_check():
+    # It looks just as large as the marker at half the distance.
+    assert reason(answer(Ball((0.05, 0.0, 1.6), radius_m=0.04))) is Reason.SIZE_MISMATCH
+
+
+def test_a_smaller_ball_nearer_by_fails_the_size_check():
+    assert reason(answer(Ball((0.02, 0.0, 0.4), radius_m=0.01))) is Reason.SIZE_MISMATCH
+
+
+def test_a_wrong_radius_in_the_configuration_fails_the_size_check():
+    assert reason(answer(BALL, config=VisionConfig(radius_m=0.03))) is Reason.SIZE_MISMATCH
+
+
+def test_eyes_that_see_balls_of_different_sizes_fail_the_size_check():
+    left, right = stage(BALL), stage(replace(BALL, radius_m=0.026))
+    # Within the limit against depth, so that only the comparison of the eyes can tell.
+    tracker = StereoTracker(SMALL, VisionConfig(radius_m=0.023))
+    assert reason(tracker.track(StereoFrame(0.0, left.left, right.right))) is Reason.SIZE_MISMATCH
+
+
+@pytest.mark.parametrize("rows", [-8, -2, 2, 8])
+def test_eyes_whose_rows_disagree_fail_the_epipolar_check(rows):
+    frame = stage(BALL)
+    tilted = StereoFrame(0.0, frame.left, np.roll(frame.right, rows, axis=0))
+    assert reason(StereoTracker(SMALL).track(tilted)) is Reason.EPIPOLAR
+
+
+def test_the_epipolar_limit_is_configured():
+    frame = stage(BALL)
+    tilted = StereoFrame(0.0, frame.left, np.roll(frame.right, 2, axis=0))
+    assert isinstance(StereoTracker(SMALL, VisionConfig(epipolar_px=2.5)).track(tilted), MarkerFix)
+
+
+def test_interchanged_eyes_fail_the_epipolar_check():
+    frame = stage(BALL)
+    assert reason(StereoTracker(SMALL).track(StereoFrame(0.0, frame.right, frame.left))) is Reason.EPIPOLAR
+
+
+@pytest.mark.parametrize("level", [0, 255])
+def test_a_dead_camera_is_no_marker(level):
+    frame = stage(BALL)
+    dead = np.full_like(frame.right, level)
+    assert reason(StereoTracker(SMALL).track(StereoFrame(0.0, frame.left, dead))) is Reason.NO_MARKER
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_an_image_of_noise_gives_a_reason(seed):
+    rng = np.random.default_rng(seed)
+    images = rng.integers(0, 256, (2, 240, 320, 3), dtype=np.uint8)
+    assert isinstance(reason(StereoTracker(SMALL).track(StereoFrame(0.0, *images))), Reason)
+
+
+def test_an_all_red_image_gives_a_reason():
+    red = np.zeros((240, 320, 3), np.uint8)
+    red[..., 2] = 200
+    assert reason(StereoTracker(SMALL).track(StereoFrame(0.0, red, red))) is Reason.AT_BORDER
+
+
+@pytest.mark.parametrize(
+    ("image", "said"),
+    [
+        (np.zeros((240, 320), np.uint8), "320x240 pixels of grey"),
+        (np.zeros((480, 640, 3), np.uint8), "640x480 pixels of 3 channels"),
+        (np.zeros((240, 320, 3), np.float32), r"320x240 pixels of 3 channels \(float32\)"),
+        (np.zeros(7, np.uint8), "an array of shape"),
+    ],
+)
+def test_an_image_that_does_not_fit_the_calibration_is_refused_with_its_eye_named(image, said):
+    frame = StereoFrame(0.0, stage(BALL).left, image)
+    with pytest.raises(SourceError, match=f"the right image is {said}"):
+        StereoTracker(SMALL).track(frame)
+
+
+def test_a_ball_over_exposed_to_white_in_part_is_still_found():
+    found = answer(BALL, look=Look(specular=1.5, shininess=12.0, noise_sd=2.0))
+    assert sigmas_off(found, BALL) < FAR_SIGMAS
+
+
+def test_the_largest_ball_that_both_eyes_hold_is_found():
+    ball = Ball((0.06, 0.0, 0.2))
+    tracker = StereoTracker(VGA)
+    assert sigmas_off(tracker.track(stage(ball, calibration=VGA)), ball) < FAR_SIGMAS
