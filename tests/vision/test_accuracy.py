@@ -41,7 +41,7 @@ def report(name: str, found: Errors) -> None:
 
 @pytest.fixture(scope="module")
 def errors() -> Errors:
-    return pooled(frames=60, seed=1)
+    return pooled(frames=50, seed=1)
 
 
 def test_the_claimed_sigma_covers_60_to_75_percent_of_the_errors_on_each_axis(errors):
@@ -107,7 +107,7 @@ def test_the_claimed_sigma_covers_60_to_75_percent_in_every_kind_of_image(name):
 
 @pytest.fixture(scope="module")
 def bullet_errors() -> Errors:
-    return errors_on_bullet_images(SMALL, frames=60, seed=2)
+    return errors_on_bullet_images(SMALL, frames=50, seed=2)
 
 
 def errors_on_bullet_images(calibration: StereoCalibration, frames: int, seed: int) -> Errors:
@@ -128,9 +128,9 @@ def errors_on_bullet_images(calibration: StereoCalibration, frames: int, seed: i
 
 def test_the_claimed_sigma_covers_60_to_75_percent_on_images_of_the_simulator_s_renderer(bullet_errors):
     covered = bullet_errors.covered()
-    # 60 frames: two standard errors are 0.12.
-    assert (covered >= 0.60 - 0.12).all(), covered
-    assert (covered <= 0.75 + 0.12).all(), covered
+    # 50 frames: two standard errors are 0.13.
+    assert (covered >= 0.60 - 0.13).all(), covered
+    assert (covered <= 0.75 + 0.13).all(), covered
 
 
 def test_the_simulator_s_pixels_are_where_the_tracker_expects_them(bullet_errors):
