@@ -12,6 +12,7 @@ from daemon.commands.options import HERE, RobotFile, flag
 
 if TYPE_CHECKING:
     from daemon.robot_template import Guess
+    from interfaces.robot import RobotDescription
     from interfaces.urdf import UrdfTree
 
 config = cyclopts.App(
@@ -72,6 +73,10 @@ def check(*, robot: RobotFile = HERE) -> None:
     for name, lower, upper in zip(description.joints, description.lower, description.upper, strict=True):
         unit, scale = ("°", 57.29577951) if description.tree.joint(name).kind in REVOLUTE else (" m", 1.0)
         say(f"  {name}: {scale * lower:.4g}{unit} to {scale * upper:.4g}{unit}")
+    for joint in _standing_still(description):
+        say(
+            f"  {joint}: on the way, but not in joints: stands still at {description.robot.held_at.get(joint, 0.0):.4g}"
+        )
     known = {True: "known", False: "only roughly known: fitted first"}
     say(f"  marker on {description.robot.marker_link}, {known[description.robot.marker_known]}")
     say(f"  camera on {description.camera.parent_link}, {known[description.camera.pose_known]}")
@@ -98,6 +103,14 @@ def show(*, robot: RobotFile = HERE) -> None:
     tables["robot"] = msgspec.to_builtins(checked.robot.robot)
     tables["camera"] = msgspec.to_builtins(checked.robot.camera)
     say(msgspec.json.format(msgspec.json.encode(tables)).decode())
+
+
+def _standing_still(description: RobotDescription) -> list[str]:
+    """Moving joints between camera and marker that are not learnt."""
+    from interfaces.urdf import MOVING
+
+    path = description.tree.path(description.camera.parent_link, description.robot.marker_link)
+    return [joint.name for joint, _ in path if joint.kind in MOVING and joint.name not in description.joints]
 
 
 def say(text: str) -> None:

@@ -1,0 +1,46 @@
+"""docs/learner.md is held to the code."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from daemon.config import DaemonConfig, LearnerConfig
+from daemon.learning.gate import CHANGE, DOUBT
+from daemon.learning.learning import REGION_RAD
+from daemon.learning.members import EXACT, INSTANT, PRIOR
+from daemon.learning.nominal import PAIRS_TO_REFIT
+from daemon.learning.scores import CHALLENGE
+from daemon.learning.snapshot import IN_SUPPORT
+from daemon.learning.solver import LARGEST_NET
+
+PAGE = (Path(__file__).parents[2] / "docs" / "learner.md").read_text(encoding="utf-8")
+SETTINGS = re.search(r"```toml\n(.*?)```", PAGE, re.DOTALL)[1]
+WITHOUT_DEFAULT = {"state_dir"}
+
+
+@pytest.mark.parametrize(("table", "kind"), [("learner", LearnerConfig), ("daemon", DaemonConfig)])
+def test_the_page_s_settings_are_the_defaults_and_all_of_them(table: str, kind: type) -> None:
+    shown = msgspec.toml.decode(SETTINGS)[table]
+    assert msgspec.convert(shown, kind) == kind()
+    assert set(kind.__struct_fields__) - set(shown) <= WITHOUT_DEFAULT
+    assert all(f"# {name} = " in SETTINGS for name in set(kind.__struct_fields__) - set(shown))
+
+
+def test_the_page_has_every_model() -> None:
+    assert re.findall(r"^\| `(\w+)` \|", PAGE, re.MULTILINE) == [PRIOR, INSTANT, EXACT]
+
+
+def test_the_page_s_numbers_are_the_code_s() -> None:
+    words = {5: "five", 6: "six", 3: "three"}
+    text = " ".join(PAGE.split())
+    assert f"more than {words[round(DOUBT)]} times as far" in text
+    assert f"{words[CHANGE]} doubted pairs in a row" in text
+    assert f"after {words[PAIRS_TO_REFIT]} pairs the tool's three numbers" in text
+    assert f"at {LARGEST_NET:,} control points" in text
+    assert f"within {words[round(57.29578 * REGION_RAD)]} degrees a joint" in text
+    assert ("less than a quarter of the prior's variance" in text) == (IN_SUPPORT == 0.25)
+    assert ("better by a tenth" in text) == (CHALLENGE == 0.9)

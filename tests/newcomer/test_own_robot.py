@@ -1,0 +1,153 @@
+"""The way of docs/own_robot.md, typed as it stands there."""
+
+from __future__ import annotations
+
+import json
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from daemon.cli import command_line
+from daemon.config import Config
+from interfaces.errors import BodyschemaError
+from interfaces.recording import Recording
+from interfaces.robot import CameraSection, RobotDescription, RobotSection
+from kbmaps import RigidChain
+
+ROOT = Path(__file__).parents[2]
+PAGE = (ROOT / "docs" / "own_robot.md").read_text(encoding="utf-8")
+EXAMPLE = ROOT / "examples" / "desk_arm"
+LIMIT_S = 60.0
+STEP_RAD = np.radians(2.0)
+COMMANDS = re.findall(r"^\$ (bodyschema .*)$", PAGE, re.MULTILINE)
+
+
+def output_of(command: str) -> str:
+    """What the page shows under a command."""
+    return re.search(rf"```console\n\$ {re.escape(command)}\n(.*?)```", PAGE, re.DOTALL)[1]
+
+
+def table(heading: str) -> list[list[str]]:
+    """Rows of the table whose first column has this heading."""
+    body = re.search(rf"^\| {re.escape(heading)} \|.*\n\| ---.*\n((?:\|.*\n)+)", PAGE, re.MULTILINE)[1]
+    return [[cell.strip() for cell in line.split(" | ")] for line in re.findall(r"^\| (.*) \|$", body, re.MULTILINE)]
+
+
+def code(cell: str) -> str:
+    return cell.strip("`")
+
+
+@pytest.fixture
+def desk(tmp_path: Path) -> Path:
+    """A folder of one's own with the example in it."""
+    return Path(shutil.copytree(EXAMPLE, tmp_path / "desk_arm"))
+
+
+def typed(command: str, folder: Path) -> subprocess.CompletedProcess[str]:
+    line = [sys.executable, "-m", "daemon", *shlex.split(command)[1:]]
+    environment = {"XDG_STATE_HOME": "/home/you/.local/state", "PATH": "/usr/bin:/bin", "OPENBLAS_NUM_THREADS": "1"}
+    return subprocess.run(
+        line, capture_output=True, text=True, timeout=LIMIT_S, check=False, cwd=folder, env=environment
+    )
+
+
+def test_the_page_shows_the_example_s_robot_toml() -> None:
+    shown = re.search(r"```toml\n(.*?)```", PAGE, re.DOTALL)[1]
+    assert shown == (EXAMPLE / "robot.toml").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_on_the_page_is_understood(command: str) -> None:
+    words = shlex.split(command)[1:]
+    command_line(words[0]).parse_args(words, exit_on_error=False, print_error=False)
+
+
+def test_init_writes_what_the_page_says_and_guesses_what_the_example_has(desk) -> None:
+    (desk / "robot.toml").unlink()
+    command = "bodyschema config init --urdf desk_arm.urdf"
+    assert typed(command, desk).stdout == output_of(command)
+    guessed, example = Config.load(desk / "robot.toml", {}).robot, Config.load(EXAMPLE / "robot.toml", {}).robot
+    assert (guessed.joints, guessed.robot.marker_link) == (example.joints, example.robot.marker_link)
+
+
+def test_check_prints_what_the_page_says(desk) -> None:
+    assert typed("bodyschema config check", desk).stdout == output_of("bodyschema config check")
+
+
+def test_check_names_a_joint_that_was_forgotten(desk) -> None:
+    text = (desk / "robot.toml").read_text(encoding="utf-8")
+    (desk / "robot.toml").write_text(text.replace('"base_yaw", ', ""), encoding="utf-8")
+    assert "base_yaw: on the way, but not in joints: stands still at 0" in typed("bodyschema config check", desk).stdout
+
+
+@pytest.mark.parametrize(("right", "wrong", "message"), table("instead of"))
+def test_a_mistake_in_robot_toml_gets_the_page_s_message(desk, right: str, wrong: str, message: str) -> None:
+    file = desk / "robot.toml"
+    text = file.read_text(encoding="utf-8")
+    assert code(right) in text
+    file.write_text(text.replace(code(right), code(wrong), 1), encoding="utf-8")
+    with pytest.raises(BodyschemaError) as refused:
+        Config.load(file, {})
+    assert str(refused.value).replace(f"{desk}/", "").replace("`", "") == code(message)
+
+
+@pytest.mark.parametrize(("line", "message"), table("row or heading"))
+def test_a_mistake_in_a_recording_gets_the_page_s_message(desk, line: str, message: str) -> None:
+    robot = RobotDescription.load(desk / "robot.toml")
+    heading = ",".join([*robot.joints, "x", "y", "z"])
+    rows = [code(line), ""] if code(line)[0].isalpha() else [heading, code(line), ""]
+    (desk / "mine.csv").write_text("\n".join(rows), encoding="utf-8")
+    with pytest.raises(BodyschemaError) as refused:
+        Recording.read(desk / "mine.csv", robot.joints)
+    assert str(refused.value).replace(f"{desk}/mine.csv, ", "") == code(message)
+
+
+AXES = {"+x": (1, 0, 0), "-x": (-1, 0, 0), "+y": (0, 1, 0), "-y": (0, -1, 0), "-z": (0, 0, -1)}
+
+
+@pytest.mark.parametrize(("forward", "down", "rpy"), table("the camera looks along its link's"))
+def test_the_page_s_orientations_look_where_it_says(forward: str, down: str, rpy: str) -> None:
+    pose = CameraSection(parent_link="base", rpy=tuple(json.loads(code(rpy)))).pose
+    assert pose[:3, 2] == pytest.approx(AXES[forward], abs=1e-4)
+    assert pose[:3, 1] == pytest.approx(AXES[down], abs=1e-4)
+
+
+@pytest.mark.parametrize(("section", "heading"), [(RobotSection, "**`[robot]`**"), (CameraSection, "**`[camera]`**")])
+def test_the_page_has_every_key_of_the_description(section, heading: str) -> None:
+    body = PAGE.split(heading)[1].split("\n\n")[1]
+    assert re.findall(r"^\| `(\w+)` \|", body, re.MULTILINE) == list(section.__struct_fields__)
+
+
+def guided_recording(robot: RobotDescription, rows: int) -> str:
+    """CSV of a guided path of an arm that is not quite as `robot` describes it, seen with 0.5 mm noise."""
+    rng = np.random.default_rng(0)
+    fixed = robot.chain.fixed.copy()
+    for transform in fixed:
+        transform[:3, :3] = transform[:3, :3] @ Rotation.from_rotvec(0.03 * rng.normal(size=3)).as_matrix()
+        transform[:3, 3] += 0.01 * rng.normal(size=3)
+    built = RigidChain(fixed, robot.chain.axes, robot.chain.prismatic)
+    q, goal = [np.zeros(len(robot.joints))], rng.uniform(-1.2, 1.2, len(robot.joints))
+    while len(q) < rows:
+        way = goal - q[-1]
+        q.append(q[-1] + STEP_RAD * way / np.linalg.norm(way))
+        if np.linalg.norm(way) < 2 * STEP_RAD:
+            goal = rng.uniform(-1.2, 1.2, len(robot.joints))
+    x = built.positions(np.array(q)) + 5e-4 * rng.normal(size=(rows, 3))
+    lines = [",".join(f"{value:.6f}" for value in row) for row in np.hstack([q, x])]
+    return "\n".join([",".join([*robot.joints, "x", "y", "z"]), *lines, ""])
+
+
+def test_a_recording_of_one_s_own_is_replayed_as_on_the_page(desk) -> None:
+    recording = guided_recording(RobotDescription.load(desk / "robot.toml"), 100)
+    (desk / "guided.csv").write_text(recording, encoding="utf-8")
+    done = typed("bodyschema replay guided.csv --speed 1", desk)
+    assert done.returncode == 0, done.stderr
+    shown, printed = output_of("bodyschema replay guided.csv").splitlines(), done.stdout.splitlines()
+    assert [line.split("  ")[0] for line in printed[2:6]] == [line.split("  ")[0] for line in shown[2:6]]
