@@ -67,7 +67,7 @@ def clutter(rng: np.random.Generator, size_px: tuple[int, int]) -> FloatArray:
     for _ in range(6):
         ends = rng.integers((0, 0), (width, height), (2, 2))
         cv2.line(picture, ends[0].tolist(), ends[1].tolist(), (0.1, 0.1, 0.12), int(rng.integers(1, 6)), cv2.LINE_AA)
-    return picture
+    return np.asarray(picture, dtype=np.float64)
 
 
 def render_pair(

@@ -14,7 +14,7 @@ NEAR_M, FAR_M = 0.05, 5.0
 BROWN, BRICK = (0.45, 0.28, 0.18, 1.0), (0.55, 0.22, 0.16, 1.0)
 GREY, BLUE, DARK = (0.75, 0.75, 0.78, 1.0), (0.2, 0.3, 0.6, 1.0), (0.12, 0.12, 0.13, 1.0)
 # Optical frame (x right, y down, z forward) to the renderer's eye frame (x right, y up, z backward), column-major.
-VIEW = [1, 0, 0, 0, 0, -1, 0, 0, 0, 0, -1, 0, 0, 0, 0, 1]
+VIEW = (1, 0, 0, 0, 0, -1, 0, 0, 0, 0, -1, 0, 0, 0, 0, 1)
 
 
 class BulletScene:
@@ -66,7 +66,7 @@ class BulletScene:
     def _eye(self, shift_m: float, light: FloatArray) -> ImageArray:
         width, height = self.calibration.image_size_px
         n = self.supersampling
-        view = list(VIEW)
+        view: list[float] = list(VIEW)
         view[12] = -shift_m
         _, _, rgba, _, _ = self._bullet.getCameraImage(
             width * n,

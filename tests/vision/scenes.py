@@ -59,7 +59,7 @@ def stage(
     return StereoFrame(t, images[0], images[1])
 
 
-def reason(answer: MarkerFix | MarkerMiss) -> Reason | None:
+def reason(answer: MarkerFix | MarkerMiss | None) -> Reason | None:
     """Why there is no fix; None when there is one."""
     return answer.reason if isinstance(answer, MarkerMiss) else None
 

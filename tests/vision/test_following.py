@@ -112,7 +112,7 @@ class Camera:
         self.entered += 1
         return self
 
-    def __exit__(self, *error):
+    def __exit__(self, kind=None, error=None, trace=None):
         self.entered -= 1
 
     def read(self, timeout_s):
