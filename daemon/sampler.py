@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import shutil
 import threading
 import time
@@ -87,6 +88,7 @@ class Sampler:
         self._publish_status = bus.publisher(self._keys.status("sampler"))
         self._stopping = False
         self._paused = False
+        self._resumed_at = -math.inf
         self._ended = False
         self._failure: Exception | None = None
         self._bad_readings = 0
@@ -183,7 +185,7 @@ class Sampler:
     def _take(self, seen: MarkerFix | MarkerMiss) -> Reason | None:
         """Make a pair of what was seen, or say why it is none."""
         self._buffer.forget_before(seen.t)
-        if self._paused:
+        if self._paused or seen.t <= self._resumed_at:
             self._gate.break_segment()
             return Reason.PAUSED
         if isinstance(seen, MarkerMiss):
@@ -243,6 +245,9 @@ class Sampler:
             raise RequestError(
                 f"the sampler knows pause and resume, not {command}. Send it to {self._keys.command('learner')}"
             )
+        if command == "resume" and self._paused:
+            # A frame that is still under way shows the arm as it was during the pause.
+            self._resumed_at = self._source_clock.now()
         self._paused = command == "pause"
         message = "no pairs are accepted until resume" if self._paused else "pairs are accepted, in a new segment"
         log.info("%s: %s", command, message)

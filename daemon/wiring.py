@@ -7,7 +7,6 @@ from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
 
-from interfaces.clock import SystemClock
 from interfaces.errors import ConfigError
 
 from .config import Config
@@ -87,4 +86,4 @@ def _recorded(config: Config, file: Path) -> Sources:
         sigma_m=drivers.recording_sigma_m,
         calibration=config.robot.calibration,
     )
-    return Sources(replay.joints, replay.marker, SystemClock())
+    return Sources(replay.joints, replay.marker, replay.clock)

@@ -11,6 +11,7 @@ from typing import Self
 import numpy as np
 
 from interfaces.camera import StereoCalibration
+from interfaces.clock import SystemClock
 from interfaces.errors import SourceEnded, SourceError
 from interfaces.recording import Recording
 from interfaces.records import FloatArray, JointReading, MarkerFix, frozen_array
@@ -28,6 +29,7 @@ class Replay:
     Attributes:
         joints: the encoders' side.
         marker: the camera's side.
+        clock: shows the recording's time.
         t: times of the rows [s], shape (n,): `Recording.play_times`.
     """
 
@@ -53,6 +55,7 @@ class Replay:
         self._pace = _Pace(self.t, speed, now)
         self.joints = ReplayJoints(recording, self.t, self._pace)
         self.marker = ReplayMarker(recording, self.t, cov, self._pace)
+        self.clock = ReplayClock(self._pace)
 
 
 class ReplayJoints:
@@ -107,6 +110,17 @@ class ReplayMarker:
             centres = (ul, vl, ur, vr)
         x, cov = frozen_array(self._recording.x[row]), frozen_array(self._cov[row])
         return MarkerFix(float(self._t[row]), x, cov, centres)
+
+
+class ReplayClock(SystemClock):
+    """The recording's time; as wall-clock time it shows the machine's."""
+
+    def __init__(self, pace: _Pace) -> None:
+        self._pace = pace
+
+    def now(self) -> float:
+        """Time of the newest fix that was played, or of the first one to come [s]."""
+        return self._pace.played_until(_MARKER)
 
 
 def default_covariances(
@@ -172,6 +186,11 @@ class _Pace:
             self._next[reader] = row + 1
             self._turn.notify_all()
             return row
+
+    def played_until(self, reader: int) -> float:
+        """Time of the newest row that the reader was given, or of the first one to come [s]."""
+        with self._turn:
+            return float(self._t[max(self._next[reader] - 1, 0)])
 
     def _wait(self, reader: int, row: int, timeout_s: float) -> bool:
         deadline = time.monotonic() + timeout_s

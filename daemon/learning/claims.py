@@ -84,6 +84,11 @@ class Claims:
         return self._unknowns.support
 
     @property
+    def noise_m(self) -> float:
+        """RMS distance between measurement and truth [m], as the measurements say."""
+        return float(np.sqrt(self.errors[PRIOR].noise_variance.sum()))
+
+    @property
     def arm_configurations(self) -> FloatArray:
         """The configurations (n, d) [rad] that stand for all data, with any tool."""
         return self._unknowns.arm_configurations

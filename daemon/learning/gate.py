@@ -4,8 +4,17 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+from numpy.typing import NDArray
+
+from interfaces.records import FloatArray
+
 # A pair this many times farther from the prediction than expected is doubted.
 DOUBT = 5.0
+# Median length of errors to their 1-sigma per axis, three equal axes: 1 / sqrt(2.366).
+MEDIAN_TO_SIGMA = 0.6501
+# No robot is that exact: distances below are never doubted for what they are [m].
+SMALLEST_M = 1e-3
 # So many doubted pairs in a row are no outliers: the world has changed.
 CHANGE = 6
 
@@ -28,6 +37,16 @@ class Gate:
         return self.in_a_row >= CHANGE
 
 
+def sound(distances_m: FloatArray, noise_m: float) -> NDArray[np.bool_]:
+    """Which of a few pairs belong together, by their distances (n,) [m] from a robust fit to them, shape (n,).
+
+    Args:
+        noise_m: RMS distance between measurement and truth.
+    """
+    rms = math.sqrt(3.0) * MEDIAN_TO_SIGMA * float(np.median(distances_m))
+    return np.asarray(distances_m <= DOUBT * max(math.hypot(rms, noise_m), SMALLEST_M))
+
+
 def limit_m(inside_m: float, open_m: float) -> float:
     """How far from its prediction a pair may lie [m].
 
@@ -35,4 +54,4 @@ def limit_m(inside_m: float, open_m: float) -> float:
         inside_m: RMS distance of recent pairs from their predictions.
         open_m: RMS distance that the data so far leave open where the pair lies.
     """
-    return DOUBT * math.hypot(inside_m, open_m)
+    return DOUBT * max(math.hypot(inside_m, open_m), SMALLEST_M)

@@ -19,7 +19,7 @@ from kbmaps import DegenerateDataError, KBMap, RigidChain
 
 from .claims import Claims
 from .curve import Curve
-from .gate import CHANGE, DOUBT, Gate, limit_m
+from .gate import CHANGE, DOUBT, Gate, limit_m, sound
 from .members import INSTANT, PRIOR, Members
 from .memory import PairMemory, Permutations
 from .nominal import PAIRS_TO_REFIT, NominalModel
@@ -282,7 +282,7 @@ class Learning:
 
     def _limit_m(self, q: FloatArray, variance: FloatArray) -> float:
         claimed = float(np.sqrt(self._claims.of(self._answering).variance(q[None]).sum()))
-        recent = max(self._claims.errors[self._answering].rms_m, float(np.sqrt(variance.sum())), 1e-3)
+        recent = max(self._claims.errors[self._answering].rms_m, float(np.sqrt(variance.sum())))
         return limit_m(recent, claimed)
 
     def _keep(self, q: FloatArray, x: FloatArray) -> None:
@@ -327,6 +327,8 @@ class Learning:
             if prior is None:
                 self._next_fit = count + max(self._nominal.pairs_to_align, PAIRS_TO_REFIT)
                 return True
+            if self._next_fit == self._first_fit:
+                self._set_aside(prior)
             self._next_fit, self._chain = 2 * count, chain
             if self._members is None:
                 self._start_members(prior)
@@ -334,6 +336,22 @@ class Learning:
                 self._change_prior(self._members, prior)
             self._publish()
         return True
+
+    def _set_aside(self, prior: KBMap) -> None:
+        """Doubt those of the first pairs that a robust fit to them contradicts: perhaps still the old tool."""
+        q, x = self._memory.all()
+        belongs = sound(np.linalg.norm(x - prior.predict(q), axis=1), self._claims.noise_m)
+        if belongs.all():
+            return
+        self._counters.doubted += int((~belongs).sum())
+        self._memory.clear()
+        for row_q, row_x, belonging in zip(q, x, belongs, strict=True):
+            (self._memory if belonging else self._doubts).append(row_q, row_x)
+        self._task += 1
+
+    @property
+    def _first_fit(self) -> int:
+        return PAIRS_TO_REFIT if self._before_change is not None else self._nominal.pairs_to_align
 
     def _fitted(
         self, before: KBMap | None, chain: RigidChain, q: FloatArray, x: FloatArray

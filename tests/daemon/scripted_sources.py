@@ -30,6 +30,7 @@ class Scripted:
         self._script = list(script)
         self._openings = list(openings)
         self.opened = self.closed = 0
+        self.newest_s = 0.0
 
     def __enter__(self) -> Self:
         failure = self._openings[self.opened] if self.opened < len(self._openings) else None
@@ -53,7 +54,18 @@ class Scripted:
         self._script.pop(0)
         if isinstance(step, Exception):
             raise step
+        self.newest_s = step.t
         return step
+
+
+class ScriptClock(SystemClock):
+    """Shows the time of the newest fix of a script."""
+
+    def __init__(self, marker: Scripted) -> None:
+        self._marker = marker
+
+    def now(self) -> float:
+        return self._marker.newest_s
 
 
 class Walk:
@@ -77,7 +89,7 @@ class Walk:
     def sources(self, *, readings: list[Step] | None = None, fixes: list[Step] | None = None) -> Sources:
         joints = Scripted(self.readings if readings is None else readings, self.robot.joints)
         marker = Scripted(self.fixes if fixes is None else fixes)
-        return Sources(joints, marker, SystemClock())
+        return Sources(joints, marker, ScriptClock(marker))
 
 
 class World:

@@ -163,6 +163,20 @@ def test_a_tool_change_is_followed_within_tens_of_pairs(seed: int, told: bool) -
 
 
 @pytest.mark.parametrize("seed", SEEDS)
+def test_a_pair_of_the_old_tool_after_a_told_change_is_doubted_and_spoils_nothing(seed: int) -> None:
+    scene = Scene.draw(seed, 200)
+    rng = np.random.default_rng(seed)
+    learning = new_learning()
+    teach(learning, scene.pairs[:199])
+    changed = scene.chain.with_tool([0.0, 0.15, 0.2])
+    learning.tool_changed()
+    q = scene.q[-1] + path(rng, 50)
+    teach(learning, [scene.pairs[199], *measured(changed, q, rng, first=201)])
+    assert learning.counters.doubted == 1
+    assert Scene(changed, q, []).error_m(learning) < 0.025
+
+
+@pytest.mark.parametrize("seed", SEEDS)
 def test_an_untold_tool_change_is_found_once(seed: int) -> None:
     scene = Scene.draw(seed, 300)
     rng = np.random.default_rng(seed)

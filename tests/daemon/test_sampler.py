@@ -4,6 +4,7 @@ import json
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from queue import Queue
 
@@ -319,6 +320,27 @@ def test_a_paused_sampler_accepts_nothing_and_goes_on_in_a_new_segment(config) -
         pairs = decode(bus.ask_one(KEYS.pairs), PairsReply).pairs
     assert (paused.state, paused.rejected) == ("paused", {"paused": 4})
     assert [pair.segment for pair in pairs] == [1] * 4 + [2] * 4
+
+
+class StoppedClock(SystemClock):
+    def __init__(self, t: float) -> None:
+        self._t = t
+
+    def now(self) -> float:
+        return self._t
+
+
+def test_a_frame_that_was_under_way_when_the_sampler_resumed_gives_no_pair(config) -> None:
+    walk = Walk(config.robot, 12)
+    gate = threading.Event()
+    scripted = walk.sources(fixes=[*walk.fixes[:4], gate, *walk.fixes[4:]])
+    with running(config, replace(scripted, clock=StoppedClock(walk.t[7]))) as bus:
+        status_when(bus, lambda status: status.frames == 4)
+        command(bus, "pause")
+        command(bus, "resume")
+        gate.set()
+        ended = status_when(bus, lambda status: status.state == "ended")
+    assert (ended.pairs, ended.rejected) == (8, {"paused": 4})
 
 
 def test_a_command_for_the_learner_is_refused_with_its_address(ended) -> None:
