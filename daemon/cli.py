@@ -53,8 +53,9 @@ app = command_line()
 
 def main() -> None:
     """Run the command line; errors of ours become one line and exit code 1."""
+    arguments = sys.argv[1:]
     try:
-        command_line(sys.argv[1] if len(sys.argv) > 1 else None)()
+        command_line(arguments[0] if arguments else None)(arguments)
     except BodyschemaError as error:
         print(f"bodyschema: {error}", file=sys.stderr)  # noqa: T201
         sys.exit(1)

@@ -1,0 +1,335 @@
+"""What a user does wrong, at the command line and over zenoh, and what he is told."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from queue import Queue
+from unittest import mock
+
+import pytest
+from small_arm import ROBOT, URDF, write_small_arm
+
+from daemon.bus import Bus, client
+from daemon.cli import main
+from daemon.config import Config
+from daemon.keys import Keys
+from daemon.status import LearnerStatus
+from daemon.store import PairReader
+from daemon.wire import decode
+from interfaces.errors import RequestError
+
+LIMIT_S = 60.0
+PROCESSES = ("sampler", "learner", "run")
+KEYS = Keys("arm")
+RECORDING = "waist,shoulder,x,y,z\n" + "".join(f"{0.03 * k},0.1,0.3,0.0{k},0.5\n" for k in range(1, 9))
+# Root may write wherever it likes; without this capability it is as everybody.
+WITHOUT_ROOTS_RIGHTS = """import ctypes, os, sys
+PR_CAPBSET_DROP, CAP_DAC_OVERRIDE = 24, 1
+ctypes.CDLL(None).prctl(PR_CAPBSET_DROP, CAP_DAC_OVERRIDE, 0, 0, 0)
+os.execv(sys.executable, [sys.executable, "-m", "daemon", *sys.argv[1:]])"""
+# SQLite says of a file that may not grow what it says of a disk that is full.
+ON_A_SMALL_DISK = """import sqlite3
+from daemon.cli import main
+connect = sqlite3.connect
+def small(*args, **kwargs):
+    connection = connect(*args, **kwargs)
+    connection.execute("PRAGMA max_page_count = 12")
+    return connection
+sqlite3.connect = small
+main()"""
+
+
+def run(*arguments: object, cwd: Path, by: tuple[str, ...] = ("-m", "daemon")) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, *by, *map(str, arguments)]
+    environment = os.environ | {"OPENBLAS_NUM_THREADS": "1"}
+    return subprocess.run(
+        command, capture_output=True, text=True, timeout=LIMIT_S, check=False, cwd=cwd, env=environment
+    )
+
+
+def run_here(*arguments: object, cwd: Path, stdin: str = "") -> subprocess.CompletedProcess[str]:
+    """As `run`, for commands that leave no mark on their process; a second sooner."""
+    command, out, err = ["bodyschema", *map(str, arguments)], io.StringIO(), io.StringIO()
+    typed = io.TextIOWrapper(io.BytesIO(stdin.encode()))
+    with (
+        mock.patch.multiple(sys, argv=command, stdin=typed),
+        contextlib.chdir(cwd),
+        contextlib.redirect_stdout(out),
+        contextlib.redirect_stderr(err),
+        pytest.raises(SystemExit) as ended,
+    ):
+        main()
+    return subprocess.CompletedProcess(command, ended.value.code, out.getvalue(), err.getvalue())
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(file): file.read_bytes() for file in sorted(folder.rglob("*")) if file.is_file()}
+
+
+def refused(*arguments: object, cwd: Path, stdin: str = "") -> str:
+    """The one line with which the command ends, having changed nothing."""
+    before = contents(cwd)
+    done = run(*arguments, cwd=cwd) if arguments[0] in PROCESSES else run_here(*arguments, cwd=cwd, stdin=stdin)
+    assert contents(cwd) == before
+    assert (done.returncode, done.stdout) == (1, "")
+    assert done.stderr.count("\n") == 1
+    assert done.stderr.startswith("bodyschema: ")
+    return done.stderr.removeprefix("bodyschema: ").rstrip()
+
+
+@pytest.fixture
+def robot(tmp_path: Path, free_endpoint: Callable[[], str]) -> Path:
+    """robot.toml of an arm whose encoders and camera are the recording walk.csv; the working directory of `run`."""
+    (tmp_path / "walk.csv").write_text(RECORDING)
+    tables = f'[zenoh]\nsampler = "{free_endpoint()}"\nlearner = "{free_endpoint()}"\n[daemon]\nstate_dir = "state"\n'
+    return write_small_arm(tmp_path, tables + '[drivers]\nrecording = "walk.csv"\nspeed = 0\n')
+
+
+def mend(file: Path, right: str, wrong: str) -> None:
+    text = file.read_text()
+    assert right in text
+    file.write_text(text.replace(right, wrong))
+
+
+# --- files
+
+
+@pytest.mark.parametrize(
+    ("command", "right", "wrong", "line", "said"),
+    [
+        ("sampler", '"arm.urdf"', '"leg.urdf"', None, "cannot read the URDF: No such file or directory. Mend [robot]"),
+        ("learner", '"arm.urdf"', '"leg.urdf"', None, "cannot read the URDF: No such file or directory. Mend [robot]"),
+        ("sampler", '"waist", ', '"wrist", ', 4, "there is no joint 'wrist' in arm.urdf. Did you mean 'waist'?"),
+        ("run", '"waist", ', '"wrist", ', 4, "there is no joint 'wrist' in arm.urdf. Did you mean 'waist'?"),
+        ("learner", '"hand"', '"hnd"', 5, "there is no link 'hnd' in arm.urdf. Did you mean 'hand'?"),
+        ("sampler", "state_dir", "statedir", 12, "unknown key 'statedir' in [daemon]. Did you mean 'state_dir'?"),
+        ("learner", "state_dir", "statedir", 12, "unknown key 'statedir' in [daemon]. Did you mean 'state_dir'?"),
+        ("replay", '"arm.urdf"', '"leg.urdf"', None, "cannot read the URDF: No such file or directory. Mend [robot]"),
+        ("predict", '"waist", ', '"wrist", ', 4, "there is no joint 'wrist' in arm.urdf. Did you mean 'waist'?"),
+        ("status", "state_dir", "statedir", 12, "unknown key 'statedir' in [daemon]. Did you mean 'state_dir'?"),
+    ],
+)
+def test_nothing_starts_with_a_wrong_description(robot, command, right, wrong, line, said) -> None:
+    mend(robot, right, wrong)
+    message = refused(command, *(["walk.csv"] if command == "replay" else []), cwd=robot.parent)
+    assert message.startswith("leg.urdf: " if line is None else f"robot.toml, line {line}: ")
+    assert said in message
+
+
+def test_a_folder_for_robot_toml_is_refused(robot) -> None:
+    assert refused("sampler", "--robot", ".", cwd=robot.parent) == ".: a folder, not a file. Name the robot.toml in it"
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "said"),
+    [
+        ("a.csv", b"hello\n", "a.csv, line 1, column waist: there is no column for the joint 'waist'"),
+        ("a.csv", b"", "a.csv: the file is empty"),
+        ("a.csv", b"waist,shoulder\n\xff\xfe\x00\x01\n", "a.csv, line 2: the byte 0xff is not UTF-8 text"),
+        ("a.csv", b"waist,shoulder,x,y,z\n0,0,1,2,3\n0,nan,1,2,3\n", "a.csv, line 3, column shoulder: nan is not"),
+        ("a.csv", b"waist,shoulder,x,y,z\n0,0,1,2,3\n0,0,1,2\n", "a.csv, line 3, column z: 4 fields where the header"),
+        ("a.parquet", b"PAR1" + bytes(100), "a.parquet: not a whole Parquet file"),
+        ("a.txt", b"waist", "a.txt: recordings end in .csv or .parquet"),
+    ],
+)
+def test_a_recording_that_cannot_be_read_is_refused_with_its_place(robot, name, content, said) -> None:
+    (robot.parent / name).write_bytes(content)
+    assert refused("replay", name, cwd=robot.parent).startswith(said)
+
+
+def test_a_folder_for_a_recording_is_refused(robot) -> None:
+    (robot.parent / "a.csv").mkdir()
+    assert refused("replay", "a.csv", cwd=robot.parent) == "a.csv: a folder, not a file. Name the recording in it"
+
+
+def test_a_recording_that_is_not_there_is_refused(robot) -> None:
+    assert refused("replay", "a.csv", cwd=robot.parent).startswith("a.csv: there is no such file")
+
+
+def test_a_sampler_of_an_unreadable_recording_leaves_no_store(robot) -> None:
+    mend(robot.parent / "walk.csv", "0.03,", "0.03x,")
+    assert "walk.csv, line 2, column waist: '0.03x' is not a number" in refused("sampler", cwd=robot.parent)
+
+
+# --- joint angles at the command line
+
+
+@pytest.mark.parametrize(
+    ("values", "stdin", "said"),
+    [
+        (["0.1"], "", "row 0 of q has 1 numbers; this robot has 2 joints: waist, shoulder"),
+        (["0.1", "nan"], "", "row 0 of q is not finite at joint 'shoulder'"),
+        ([], "", "no joint angles, and standard input is empty; give 2 (waist, shoulder)"),
+        ([], "0.1 0.2", "standard input is not a JSON list of 2 numbers (waist, shoulder), or a list of such lists"),
+        ([], "[[0.1, 0.2], [0.3]]", "row 1 of q has 1 numbers; this robot has 2 joints: waist, shoulder"),
+    ],
+)
+def test_joint_angles_that_are_none_are_refused(robot, values, stdin, said) -> None:
+    assert refused("predict", *values, cwd=robot.parent, stdin=stdin) == said
+
+
+def test_a_letter_among_the_joint_angles_is_named(robot) -> None:
+    done = run_here("predict", "0.1", "o.2", cwd=robot.parent)
+    assert (done.returncode, 'unable to convert "o.2" into float' in done.stderr) == (2, True)
+
+
+# --- ports and disks
+
+
+@pytest.mark.parametrize("process", ["sampler", "learner"])
+def test_a_port_in_use_is_named_and_leaves_no_trace(robot, process) -> None:
+    endpoint = getattr(Config.load(robot, {}).tables.zenoh, process)
+    with Bus(listen=endpoint):
+        said = refused(process, cwd=robot.parent)
+    assert said == (
+        f"the port of {endpoint} is in use. Stop the other bodyschema, "
+        "or give another endpoint in the table [zenoh] of robot.toml"
+    )
+
+
+def test_a_full_disk_ends_the_sampler_with_all_accepted_pairs_in_the_store(robot) -> None:
+    rows = "".join(f"{0.0003 * k - 1.5},0.1,0.3,0.4,0.5\n" for k in range(2000))
+    (robot.parent / "walk.csv").write_text("waist,shoulder,x,y,z\n" + rows)
+    mend(robot, "[daemon]", "[daemon]\nany_step = true")
+    done = run("sampler", cwd=robot.parent, by=("-c", ON_A_SMALL_DISK))
+    file = robot.parent / "state" / "pairs.sqlite"
+    assert done.returncode == 1
+    assert f"bodyschema: the disk of {file} is full. Free some space, or give a --state-dir on another" in done.stderr
+    with PairReader(file) as reader:
+        stored = [pair.seq for pair in reader.read()]
+    assert 0 < len(stored) < 2000
+    assert stored == list(range(1, len(stored) + 1))
+
+
+@pytest.mark.parametrize(
+    ("state_dir", "said"),
+    [
+        ("locked", "cannot write {}: Permission denied. Give a --state-dir that can be written"),
+        ("locked/new", "cannot make the directory {}: Permission denied. Give another one with --state-dir"),
+    ],
+)
+def test_a_folder_that_cannot_be_written_ends_the_sampler(robot, state_dir, said) -> None:
+    folder = robot.parent / state_dir
+    (robot.parent / "locked").mkdir(mode=0o555)
+    done = run("sampler", "--state-dir", folder, cwd=robot.parent, by=("-c", WITHOUT_ROOTS_RIGHTS))
+    assert done.returncode == 1
+    assert said.format(folder if "new" in state_dir else folder / "pairs.sqlite") in done.stderr
+    assert list((robot.parent / "locked").iterdir()) == []
+
+
+# --- one process without the other
+
+
+@contextlib.contextmanager
+def process_running(config: Config, process: str, by: tuple[str, ...] = ("-m", "daemon")) -> Iterator[None]:
+    """A process that is alive; it is ended in the end."""
+    up = threading.Event()
+    with tempfile.TemporaryFile() as log, Bus(connect=getattr(config.tables.zenoh, process)) as bus:
+        child = subprocess.Popen([sys.executable, *by, process, "--robot", config.file], stderr=log)
+        try:
+            bus.watch(KEYS.alive(process), lambda _alive: up.set())
+            assert up.wait(LIMIT_S), (log.seek(0), log.read())
+            yield
+        finally:
+            child.terminate()
+            child.wait(LIMIT_S)
+
+
+@pytest.fixture(scope="module")
+def lonely_learner(tmp_path_factory, free_endpoint) -> Iterator[Config]:
+    """A learner without a sampler that does not know where the camera stands, and may write nothing."""
+    folder: Path = tmp_path_factory.mktemp("lonely")
+    (folder / "arm.urdf").write_text(URDF)
+    (folder / "state").mkdir(mode=0o555)
+    zenoh = f'[zenoh]\nsampler = "{free_endpoint()}"\nlearner = "{free_endpoint()}"\n'
+    (folder / "robot.toml").write_text(f'{ROBOT}pose_known = false\n{zenoh}[daemon]\nstate_dir = "state"\n')
+    config = Config.load(folder / "robot.toml", {})
+    with process_running(config, "learner", ("-c", WITHOUT_ROOTS_RIGHTS)):
+        yield config
+
+
+def learner_status(config: Config) -> LearnerStatus:
+    with client(config.tables.zenoh.learner) as bus:
+        return decode(bus.ask_one(KEYS.status("learner")), LearnerStatus)
+
+
+def test_a_prediction_before_any_pair_is_refused_where_the_camera_stands_anywhere(lonely_learner) -> None:
+    said = refused("predict", "--", "0.1", "-0.2", cwd=lonely_learner.file.parent)
+    assert said == (
+        "there is no model yet: robot.toml says [camera] pose_known = false, so positions have no frame until about "
+        "10 pairs have come (0 so far). Start the sampler with `bodyschema sampler` and guide the arm"
+    )
+
+
+@pytest.mark.parametrize(
+    ("key", "payload"), [(KEYS.predict, b'{"q": [0.1, 0.2]}'), (KEYS.jacobian, b'{"q": [0.1, 0.2]}'), (KEYS.model, b"")]
+)
+def test_every_query_for_the_model_before_any_pair_gets_an_error_reply(lonely_learner, key, payload) -> None:
+    with client(lonely_learner.tables.zenoh.learner) as bus, pytest.raises(RequestError, match="no frame"):
+        bus.ask_one(key, payload)
+
+
+def test_refused_requests_change_nothing_of_the_learner(lonely_learner) -> None:
+    def unchanged() -> tuple[object, ...]:
+        status = learner_status(lonely_learner)
+        return status.pairs, status.last_seq, status.replayed, status.changes, status.model, status.refused
+
+    before = unchanged()
+    with client(lonely_learner.tables.zenoh.learner) as bus:
+        for payload in (b"", b"{", b'{"q": []}', b'{"q": [1]}', b'{"q": ["a", 1]}', b'{"command": "dance"}', b"\xff"):
+            for key in (KEYS.predict, KEYS.jacobian, KEYS.command("learner")):
+                with pytest.raises(RequestError):
+                    bus.ask_one(key, payload)
+    assert unchanged() == before
+
+
+def test_a_learner_without_a_sampler_says_where_it_looks_and_how_to_start_one(lonely_learner) -> None:
+    status = learner_status(lonely_learner)
+    assert (status.state, status.sampler_alive) == ("waiting", False)
+    assert status.health[0] == (
+        f"no sampler on {lonely_learner.tables.zenoh.sampler}, so no new pairs; start it with `bodyschema sampler`. "
+        "Predictions go on"
+    )
+
+
+def test_the_status_of_a_learner_alone_names_the_command_that_starts_a_sampler(lonely_learner) -> None:
+    done = run_here("status", cwd=lonely_learner.file.parent)
+    text = " ".join(done.stdout.split())
+    assert done.returncode == 0
+    assert f"sampler does not answer on {lonely_learner.tables.zenoh.sampler}. Start it with `bodyschema s" in text
+
+
+def test_recording_without_a_sampler_is_refused(lonely_learner) -> None:
+    said = refused("record", "a.csv", cwd=lonely_learner.file.parent)
+    assert said.startswith(f"nobody listens on {lonely_learner.tables.zenoh.sampler}. Start")
+
+
+def test_a_checkpoint_that_cannot_be_written_is_an_error_reply_and_learning_goes_on(lonely_learner) -> None:
+    said = refused("command", "checkpoint", cwd=lonely_learner.file.parent)
+    assert said == (
+        f"the checkpoint {lonely_learner.checkpoint_file} could not be written: Permission denied. "
+        "Learning goes on; give a --state-dir that can be written"
+    )
+    assert said in learner_status(lonely_learner).health
+
+
+def test_a_sampler_without_a_learner_goes_on_and_predictions_name_what_to_start(robot) -> None:
+    config, published = Config.load(robot, {}), Queue()
+    with process_running(config, "sampler"), client(config.tables.zenoh.sampler) as bus:
+        bus.subscribe(KEYS.status("sampler"), published.put)
+        while json.loads(published.get(timeout=LIMIT_S))["state"] != "ended":
+            continue
+        done = run_here("predict", "0.1", "0.2", cwd=robot.parent)
+        pairs = json.loads(bus.ask_one(KEYS.status("sampler")))["pairs"]
+    assert done.returncode == 1
+    assert f"nobody listens on {config.tables.zenoh.learner}. Start the daemon with `bodyschema run`" in done.stderr
+    assert pairs == 8
