@@ -23,9 +23,7 @@ def mm(metres: float | None, unit: str = " mm") -> str:
 
 def titled_table(title: str, *, numbers: bool = True) -> Table:
     """An empty table without lines: names on the left and, unless told otherwise, numbers on the right."""
-    table = Table(
-        box=None, pad_edge=False, show_header=False, title=Text(title), title_justify="left", title_style="bold"
-    )
+    table = Table(box=None, pad_edge=False, show_header=False, title=Text(title, style="bold"), title_justify="left")
     table.add_column(no_wrap=True)
     if numbers:
         table.add_column(justify="right", no_wrap=True)

@@ -33,6 +33,7 @@ def plot_curve(rows: Sequence[CurveRow], change_at: int | None, file: Path) -> N
     """The curve as a PNG."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
+    from matplotlib.ticker import LogLocator
 
     figure = Figure(figsize=(9, 5), layout="constrained")
     FigureCanvasAgg(figure)
@@ -67,11 +68,12 @@ def plot_curve(rows: Sequence[CurveRow], change_at: int | None, file: Path) -> N
         )
     axes.set_yscale("log")
     axes.yaxis.set_major_formatter("{x:g}")
+    axes.yaxis.set_minor_locator(LogLocator(subs=(2.0, 3.0, 5.0)))
     axes.yaxis.set_minor_formatter("{x:g}")
     axes.tick_params(axis="y", which="minor", labelsize=7)
     axes.grid(which="both", alpha=0.3)
     axes.set_xlabel("accepted pairs")
     axes.set_ylabel("mean error [mm]")
     axes.set_title("Learning the arm's forward kinematics while it is guided by hand (simulation)")
-    axes.legend(loc="upper right")
+    figure.legend(loc="outside lower center", ncols=4, fontsize=9)
     figure.savefig(file, dpi=120)

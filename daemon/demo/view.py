@@ -128,8 +128,8 @@ def show_outcome(console: Console, outcome: Outcome, scene: Scene) -> None:
     console.print(table)
     console.print(
         "Held-out poses lie within a few degrees of where the arm was guided with that tool; none was learnt. "
-        "What the learner claims, it claims without knowing the truth. Meanwhile a third process asked for "
-        f"{outcome.answers + outcome.unanswered} predictions; {outcome.unanswered} went unanswered."
+        "The claim is the learner's own, who does not know the truth. A third process asked for "
+        f"{outcome.answers + outcome.unanswered} predictions meanwhile; {outcome.unanswered} went unanswered."
     )
     console.print()
     for what, file in (("recording", scene.recording_file), ("curve", scene.curve_file), ("plot", scene.plot_file)):
