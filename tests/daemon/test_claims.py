@@ -1,0 +1,99 @@
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+import pytest
+from guided_arm import JOINTS, nominal_model, path
+
+from daemon.learning.claims import Claims, ClaimsState
+from daemon.learning.members import EXACT, INSTANT, PRIOR
+from interfaces.records import FloatArray
+
+NOISE = np.full(3, 1e-6)
+FAR = np.full((1, JOINTS), 2.5)
+
+
+def learnt(claims: Claims, q: FloatArray, prior_error_m: float, error_m: float = 0.0) -> None:
+    """Pairs at q: there the prior is wrong by the first, the instant learner by the second error on each axis."""
+    for row in q:
+        claims.predicted(row, {PRIOR: np.full(3, prior_error_m), INSTANT: np.full(3, error_m)}, NOISE)
+        claims.learnt(row)
+
+
+def sigma(claims: Claims, name: str, q: FloatArray) -> float:
+    return float(np.sqrt(claims.of(name).variance(q)).mean())
+
+
+@pytest.fixture
+def walk() -> FloatArray:
+    return path(np.random.default_rng(0), 100)
+
+
+def test_far_from_all_data_the_claim_is_of_the_size_of_the_priors_error(walk: FloatArray) -> None:
+    claims = Claims(nominal_model().bases, 0.1)
+    learnt(claims, walk, prior_error_m=0.04)
+    assert sigma(claims, INSTANT, FAR) == pytest.approx(0.04, rel=0.5)
+
+
+def test_at_the_data_the_claim_is_far_below_the_priors_error(walk: FloatArray) -> None:
+    claims = Claims(nominal_model().bases, 0.1)
+    learnt(claims, walk, prior_error_m=0.04)
+    assert sigma(claims, INSTANT, walk) < 0.1 * 0.04
+
+
+def test_the_priors_own_claim_is_its_error_everywhere(walk: FloatArray) -> None:
+    claims = Claims(nominal_model().bases, 0.1)
+    learnt(claims, walk, prior_error_m=0.04)
+    assert sigma(claims, PRIOR, walk) == sigma(claims, PRIOR, FAR) == pytest.approx(0.04, rel=0.05)
+
+
+def test_errors_larger_than_claimed_raise_the_claim(walk: FloatArray) -> None:
+    quiet, surprised = Claims(nominal_model().bases, 0.1), Claims(nominal_model().bases, 0.1)
+    learnt(quiet, walk, prior_error_m=0.02)
+    learnt(surprised, walk, prior_error_m=0.02, error_m=0.03)
+    assert sigma(surprised, INSTANT, FAR) > 1.5 * sigma(quiet, INSTANT, FAR)
+
+
+def test_residuals_at_learnt_pairs_raise_the_claim_at_the_data(walk: FloatArray) -> None:
+    claims = Claims(nominal_model().bases, 0.1)
+    learnt(claims, walk, prior_error_m=0.02)
+    claims.replayed(INSTANT, np.full((50, 3), 0.005))
+    assert sigma(claims, INSTANT, walk) == pytest.approx(0.005, rel=0.2)
+
+
+def test_a_tool_that_was_fitted_anew_does_not_hide_what_is_unknown_of_the_arm(walk: FloatArray) -> None:
+    claims = Claims(nominal_model().bases, 0.1)
+    learnt(claims, walk, prior_error_m=0.04)
+    claims.change_tool(0.1)
+    learnt(claims, walk[:20], prior_error_m=0.001)
+    assert sigma(claims, INSTANT, FAR) == pytest.approx(0.04, rel=0.5)
+
+
+def test_where_the_arm_was_seen_with_the_old_tool_only_the_new_tool_is_unknown(walk: FloatArray) -> None:
+    claims = Claims(nominal_model().bases, 0.1)
+    learnt(claims, walk, prior_error_m=0.04)
+    claims.change_tool(0.1)
+    learnt(claims, walk[:1].repeat(20, axis=0), prior_error_m=0.005)
+    assert sigma(claims, INSTANT, walk[-1:]) < 0.008
+
+
+def test_an_exact_solution_is_not_credited_with_pairs_that_it_does_not_know(walk: FloatArray) -> None:
+    claims = Claims(nominal_model().bases, 0.1)
+    learnt(claims, walk[:20], prior_error_m=0.04)
+    claims.solution_asked()
+    learnt(claims, walk[20:], prior_error_m=0.04)
+    claims.solution_taken(np.zeros((20, 3)))
+    there = walk[-1:]
+    assert sigma(claims, EXACT, there) > 3.0 * sigma(claims, INSTANT, there)
+
+
+def test_claims_are_the_same_after_a_restart(walk: FloatArray) -> None:
+    claims, again = Claims(nominal_model().bases, 0.1), Claims(nominal_model().bases, 0.1)
+    learnt(claims, walk, prior_error_m=0.04)
+    claims.change_tool(0.1)
+    learnt(claims, walk[:30], prior_error_m=0.01, error_m=0.02)
+    state = msgspec.msgpack.decode(msgspec.msgpack.encode(claims.state()), type=ClaimsState)
+    again.restore(state, claims.arm_configurations, walk[:30])
+    anywhere = np.vstack([walk, FAR])
+    for name in (PRIOR, INSTANT):
+        np.testing.assert_allclose(again.of(name).variance(anywhere), claims.of(name).variance(anywhere), rtol=0.05)

@@ -1,0 +1,94 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from guided_arm import JOINTS, nominal_model
+
+from daemon.learning.solver import Solved
+from daemon.learning.solving import Solving
+from interfaces.records import FloatArray
+from kbmaps import KBMap
+
+PRIOR = nominal_model().prior()
+OTHER = KBMap(PRIOR.bases, 2.0 * PRIOR.net)
+Q, X = np.zeros((10, JOINTS)), np.zeros((10, 3))
+
+
+class ScriptedSolver:
+    """Remembers what it was told; answers when the test says so."""
+
+    def __init__(self) -> None:
+        self.told: list[object] = []
+        self.answer: Solved | None = None
+
+    def start(self, task: int, prior: KBMap) -> None:
+        self.told.append(("start", task))
+
+    def rebase(self, prior: KBMap) -> None:
+        self.told.append("rebase")
+
+    def learn(self, q: FloatArray, x: FloatArray) -> None:
+        self.told.append(("learn", len(q)))
+
+    def solve(self) -> None:
+        self.told.append("solve")
+
+    def poll(self) -> Solved | None:
+        answer, self.answer = self.answer, None
+        return answer
+
+
+@pytest.fixture
+def solver() -> ScriptedSolver:
+    return ScriptedSolver()
+
+
+@pytest.fixture
+def solving(solver: ScriptedSolver) -> Solving:
+    solving = Solving(solver, solve_every=25)
+    solving.begin(1, PRIOR)
+    return solving
+
+
+def test_a_new_task_is_told_once(solver: ScriptedSolver, solving: Solving) -> None:
+    assert not solving.begin(1, PRIOR)
+    assert solver.told == [("start", 1)]
+
+
+def test_a_solution_is_due_after_so_many_pairs(solving: Solving) -> None:
+    solving.feed(Q, X, 10)
+    early = solving.due
+    solving.feed(Q, X, 25)
+    assert (early, solving.due) == (False, True)
+
+
+def test_no_solution_is_due_without_new_pairs(solver: ScriptedSolver, solving: Solving) -> None:
+    solving.feed(Q, X, 25)
+    solving.ask()
+    solver.answer = Solved(1, 25, PRIOR)
+    solving.poll()
+    solving.solve_soon()
+    assert not solving.due
+
+
+def test_another_prior_for_the_same_pairs_is_solved_for_at_once(solver: ScriptedSolver, solving: Solving) -> None:
+    solving.feed(Q, X, 10)
+    assert solving.begin(1, OTHER)
+    assert solver.told[-1] == "rebase"
+    assert solving.due
+
+
+def test_it_is_busy_from_the_question_to_the_answer(solver: ScriptedSolver, solving: Solving) -> None:
+    solving.feed(Q, X, 25)
+    solving.ask()
+    waiting = solving.busy, solving.poll(), solving.busy
+    solver.answer = Solved(1, 25, PRIOR)
+    assert solving.poll() is not None
+    assert (waiting, solving.busy) == ((True, None, True), False)
+
+
+def test_a_solver_that_lost_everything_is_given_everything_again(solver: ScriptedSolver, solving: Solving) -> None:
+    solving.feed(Q, X, 10)
+    solving.restart()
+    assert solving.begin(1, PRIOR)
+    assert (solver.told[-1], solving.fed) == (("start", 1), 0)
