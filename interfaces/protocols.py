@@ -22,7 +22,11 @@ class Clock(Protocol):
 
 
 class Source(Protocol):
-    """Something that is opened, read and closed. Opening happens in `__enter__`, never in `__init__`."""
+    """Something that is opened, read and closed, and may be opened again.
+
+    Opening happens in `__enter__`, never in `__init__`. Closing again does no harm. Reading what is not open raises
+    SourceError. What is read after opening again comes later than what was read before.
+    """
 
     def __enter__(self) -> Self: ...
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from interfaces.camera import StereoCalibration
 from interfaces.clock import SystemClock
-from interfaces.errors import ConfigError, SourceEnded
+from interfaces.errors import ConfigError, SourceEnded, SourceError
 from interfaces.records import FloatArray, ImageArray, JointReading, StereoFrame, frozen_array
 from interfaces.robot import RobotDescription
 from kbmaps import RigidChain
@@ -142,6 +142,7 @@ class SimWorld:
         with self._moved:
             while True:
                 self._check_running()
+                _check_open(self._joints_open)
                 if self._readings:
                     self._moved.notify_all()
                     return self._readings.popleft()
@@ -170,6 +171,7 @@ class SimWorld:
         with self._moved:
             while self._may_take_frame():
                 self._check_running()
+                _check_open(self._camera_open)
                 if self._may_keep_reading():
                     self._step()
                 elif self._frame_times:
@@ -177,6 +179,7 @@ class SimWorld:
                 elif not self._moved.wait(end - time.monotonic()):
                     return False
             self._check_running()
+            _check_open(self._camera_open)
             return True
 
     def _may_take_frame(self) -> bool:
@@ -215,6 +218,11 @@ class SimWorld:
         self._renderer.hold_tool(self._truth.marker(self._wanted_tool))
         self._wanted_tool = None
         self.stats.tool_changes += 1
+
+
+def _check_open(is_open: bool) -> None:
+    if not is_open:
+        raise SourceError("the simulated source is not open; use it in a with statement")
 
 
 def true_chain(

@@ -10,7 +10,7 @@ import numpy as np
 
 from daemon.sources import Simulation, Sources
 from interfaces.clock import SystemClock
-from interfaces.errors import SourceEnded
+from interfaces.errors import SourceEnded, SourceError
 from interfaces.records import JointReading, MarkerFix, MarkerMiss, frozen_array
 from interfaces.robot import RobotDescription
 from kbmaps import RigidChain
@@ -29,6 +29,7 @@ class Scripted:
         self.joints = joints
         self._script = list(script)
         self._openings = list(openings)
+        self._is_open = False
         self.opened = self.closed = 0
         self.newest_s = 0.0
 
@@ -37,12 +38,16 @@ class Scripted:
         self.opened += 1
         if failure is not None:
             raise failure
+        self._is_open = True
         return self
 
     def __exit__(self, *error: object) -> None:
+        self._is_open = False
         self.closed += 1
 
     def read(self, timeout_s: float) -> Any:
+        if not self._is_open:
+            raise SourceError("the script is not open; use it in a with statement")
         if not self._script:
             raise SourceEnded("the script is through")
         step = self._script[0]

@@ -1,0 +1,50 @@
+"""The laws of `interfaces.protocols.Clock`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from datetime import UTC, datetime, timedelta
+from importlib.util import find_spec
+
+import pytest
+
+from interfaces.clock import SystemClock
+from interfaces.protocols import Clock
+from interfaces.robot import RobotDescription
+from sim_backend import SimConfig, SimWorld, model_file
+
+
+@contextmanager
+def system_clock() -> Iterator[Clock]:
+    yield SystemClock()
+
+
+@contextmanager
+def simulated_clock() -> Iterator[Clock]:
+    with SimWorld(RobotDescription.load(model_file("upper_body")), SimConfig()) as world:
+        yield world.clock
+
+
+SIMULATED = pytest.mark.skipif(find_spec("pybullet") is None, reason="pybullet is not installed")
+
+
+@pytest.fixture(params=[system_clock, pytest.param(simulated_clock, marks=SIMULATED)])
+def clock(request: pytest.FixtureRequest) -> Iterator[Clock]:
+    with request.param() as clock:
+        yield clock
+
+
+def test_monotonic_time_never_goes_back(clock: Clock) -> None:
+    times = [clock.now() for _ in range(100)]
+    assert times == sorted(times)
+
+
+def test_wall_time_says_that_it_is_utc_to_the_millisecond(clock: Clock) -> None:
+    shown = clock.utc()
+    assert datetime.fromisoformat(shown).utcoffset() == timedelta(0)
+    assert len(shown) == len("2026-01-01T00:00:00.000+00:00")
+
+
+def test_wall_time_begins_at_the_machine_s(clock: Clock) -> None:
+    assert abs(datetime.fromisoformat(clock.utc()) - datetime.now(UTC)) < timedelta(minutes=10)

@@ -1,0 +1,269 @@
+"""The laws of `interfaces.protocols`, held to every source that the sampler may read."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, ExitStack, contextmanager
+from dataclasses import dataclass
+from importlib.util import find_spec
+from typing import Any
+
+import numpy as np
+import pytest
+from scripted_sources import COV, Scripted
+
+from drivers.replay import Replay
+from interfaces.errors import SourceEnded, SourceError
+from interfaces.protocols import JointSource, MarkerSource, StereoCamera
+from interfaces.recording import Recording
+from interfaces.records import JointReading, MarkerFix, MarkerMiss, StereoFrame, frozen_array
+from interfaces.robot import RobotDescription
+from sim_backend import SimConfig, SimWorld, model_file
+from vision.tracked_camera import TrackedCamera
+from vision.tracker import StereoTracker
+
+LIMIT_S = 60.0
+WAIT_S = 0.005
+SOME = 10
+ROWS = 60
+TIMES = np.cumsum(np.random.default_rng(1).uniform(0.01, 0.1, ROWS))
+
+
+@dataclass
+class Rig:
+    """A source under test, and what else has to be read for time to go on.
+
+    Attributes:
+        end: makes the source end; without it the source ends by itself.
+    """
+
+    source: Any
+    other: Any = None
+    end: Callable[[], None] | None = None
+
+    @property
+    def sources(self) -> list[Any]:
+        return [self.source] if self.other is None else [self.source, self.other]
+
+    @contextmanager
+    def opened(self) -> Iterator[Rig]:
+        with ExitStack() as stack:
+            for source in self.sources:
+                stack.enter_context(source)
+            yield self
+
+    def read(self, count: int = SOME) -> list[Any]:
+        """The next `count` items of the source."""
+        items: list[Any] = []
+        deadline = time.monotonic() + LIMIT_S
+        while len(items) < count:
+            assert time.monotonic() < deadline
+            item = self.source.read(WAIT_S)
+            if item is not None:
+                items.append(item)
+            elif self.other is not None:
+                self.other.read(WAIT_S)
+        return items
+
+    def read_to_the_end(self) -> None:
+        """Read until SourceEnded is raised."""
+        if self.end is not None:
+            self.end()
+        while True:
+            self.read(1)
+
+
+# --- who has to obey
+
+
+def recording() -> Recording:
+    rng = np.random.default_rng(2)
+    return Recording(("a", "b"), rng.normal(size=(ROWS, 2)), rng.normal(size=(ROWS, 3)), t=TIMES)
+
+
+@contextmanager
+def replayed_joints() -> Iterator[Rig]:
+    replay = Replay(recording(), speed=0)
+    yield Rig(replay.joints, replay.marker)
+
+
+@contextmanager
+def replayed_marker() -> Iterator[Rig]:
+    replay = Replay(recording(), speed=0)
+    yield Rig(replay.marker, replay.joints)
+
+
+@contextmanager
+def scripted_joints() -> Iterator[Rig]:
+    yield Rig(Scripted([JointReading(t, frozen_array([0.1, t])) for t in TIMES.tolist()], ("a", "b")))
+
+
+@contextmanager
+def scripted_marker() -> Iterator[Rig]:
+    yield Rig(Scripted([MarkerFix(t, frozen_array([0.1, 0.2, t]), COV) for t in TIMES.tolist()]))
+
+
+@contextmanager
+def simulated_world() -> Iterator[SimWorld]:
+    with SimWorld(RobotDescription.load(model_file("upper_body")), SimConfig()) as world:
+        yield world
+
+
+def close(world: SimWorld) -> Callable[[], None]:
+    return lambda: world.__exit__(None, None, None)
+
+
+@contextmanager
+def simulated_joints() -> Iterator[Rig]:
+    with simulated_world() as world:
+        yield Rig(world.joints, world.camera, close(world))
+
+
+@contextmanager
+def simulated_camera() -> Iterator[Rig]:
+    with simulated_world() as world:
+        yield Rig(world.camera, world.joints, close(world))
+
+
+@contextmanager
+def tracked_camera() -> Iterator[Rig]:
+    with simulated_world() as world:
+        yield Rig(TrackedCamera(world.camera, StereoTracker(world.camera.calibration)), world.joints, close(world))
+
+
+SIMULATED = pytest.mark.skipif(find_spec("pybullet") is None, reason="pybullet is not installed")
+JOINTS = [replayed_joints, scripted_joints, pytest.param(simulated_joints, marks=SIMULATED)]
+MARKERS = [replayed_marker, scripted_marker, pytest.param(tracked_camera, marks=SIMULATED)]
+CAMERAS = [pytest.param(simulated_camera, marks=SIMULATED)]
+Make = Callable[[], AbstractContextManager[Rig]]
+
+
+@pytest.fixture(scope="module", params=[*JOINTS, *MARKERS, *CAMERAS])
+def rig(request: pytest.FixtureRequest) -> Iterator[Rig]:
+    """A closed source of each kind, shared by the laws after which it can still be used."""
+    with request.param() as rig:
+        yield rig
+
+
+# --- lifetime
+
+
+def test_reading_before_opening_is_an_error(rig: Rig) -> None:
+    with pytest.raises(SourceError):
+        rig.source.read(0.05)
+
+
+def test_times_are_finite_and_strictly_increase_also_after_opening_again(rig: Rig) -> None:
+    times = []
+    for _ in range(2):
+        with rig.opened():
+            times += [item.t for item in rig.read()]
+    assert np.isfinite(times).all()
+    assert (np.diff(times) > 0).all()
+
+
+def test_opening_returns_the_source(rig: Rig) -> None:
+    with rig.source as opened:
+        assert opened is rig.source
+
+
+def test_closing_again_does_no_harm(rig: Rig) -> None:
+    with rig.opened():
+        rig.read(1)
+    for source in rig.sources:
+        source.__exit__(None, None, None)
+    with rig.opened():
+        assert len(rig.read(1)) == 1
+
+
+def test_reading_after_closing_is_an_error(rig: Rig) -> None:
+    with rig.opened():
+        rig.read(1)
+    with pytest.raises(SourceError):
+        rig.source.read(0.05)
+
+
+def test_an_error_in_the_block_passes_through_the_closing(rig: Rig) -> None:
+    with pytest.raises(ZeroDivisionError), rig.opened():
+        raise ZeroDivisionError
+
+
+@pytest.mark.parametrize("make", [*JOINTS, *MARKERS, *CAMERAS])
+def test_the_end_is_said_each_time_one_reads(make: Make) -> None:
+    with make() as rig, rig.opened():
+        rig.read(1)
+        with pytest.raises(SourceEnded):
+            rig.read_to_the_end()
+        with pytest.raises(SourceEnded):
+            rig.source.read(0.05)
+
+
+# --- waiting
+
+
+@pytest.mark.parametrize("make", [replayed_joints, replayed_marker, *JOINTS[2:], *MARKERS[2:], *CAMERAS])
+def test_where_nothing_comes_in_time_none_is_returned(make: Make) -> None:
+    with make() as rig, rig.opened():
+        while rig.source.read(0.01) is not None:  # time stands still until the other side is read too
+            continue
+        assert rig.source.read(0.0) is None
+
+
+# --- what is read
+
+
+@pytest.fixture(scope="module", params=JOINTS)
+def joints(request: pytest.FixtureRequest) -> Iterator[tuple[JointSource, list[Any]]]:
+    with request.param() as rig, rig.opened():
+        yield rig.source, rig.read()
+
+
+@pytest.fixture(scope="module", params=MARKERS)
+def seen(request: pytest.FixtureRequest) -> Iterator[tuple[MarkerSource, list[Any]]]:
+    with request.param() as rig, rig.opened():
+        yield rig.source, rig.read()
+
+
+@pytest.fixture(scope="module", params=CAMERAS)
+def frames(request: pytest.FixtureRequest) -> Iterator[tuple[StereoCamera, list[Any]]]:
+    with request.param() as rig, rig.opened():
+        yield rig.source, rig.read()
+
+
+def is_frozen(array: np.ndarray, shape: tuple[int, ...]) -> bool:
+    """Whether it is a finite, read-only float64 array of this shape."""
+    whole = bool(np.isfinite(array).all()) and not array.flags.writeable
+    return whole and (array.shape, array.dtype) == (shape, np.float64)
+
+
+def test_a_joint_source_gives_a_finite_angle_for_each_joint_it_names(joints) -> None:
+    source, readings = joints
+    assert isinstance(source, JointSource)
+    assert len(source.joints) > 0
+    assert all(type(reading) is JointReading and is_frozen(reading.q, (len(source.joints),)) for reading in readings)
+
+
+def test_a_marker_source_gives_finite_positions_or_a_reason(seen) -> None:
+    source, items = seen
+    assert isinstance(source, MarkerSource)
+    assert all(type(item) is MarkerMiss or is_frozen(item.x, (3,)) for item in items)
+    assert any(type(item) is MarkerFix for item in items)
+
+
+def test_a_fix_has_a_positive_definite_covariance(seen) -> None:
+    for fix in seen[1]:
+        if isinstance(fix, MarkerFix):
+            assert is_frozen(fix.cov, (3, 3))
+            assert fix.cov == pytest.approx(fix.cov.T, rel=1e-9)
+            assert np.linalg.eigvalsh(fix.cov)[0] > 0
+
+
+def test_a_camera_gives_two_colour_images_of_its_calibration_s_size(frames) -> None:
+    camera, items = frames
+    assert isinstance(camera, StereoCamera)
+    width, height = camera.calibration.image_size_px
+    for frame in items:
+        assert type(frame) is StereoFrame
+        for image in (frame.left, frame.right):
+            assert (image.shape, image.dtype) == ((height, width, 3), np.uint8)
