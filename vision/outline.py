@@ -44,9 +44,7 @@ _EDGE_SIGMA_PX = 0.06
 _UNEVEN_PX = 0.4
 # Residuals beyond this are no longer edge noise [px], whatever the spread is.
 _LEAST_GATE_PX, _LARGEST_GATE_PX, _GATE_SIGMAS = 0.8, 2.0, 3.5
-# Power of the wave once round the outline over what the next ones let expect (measured, docs/vision.md).
-_SLOWEST_WAVE = 1.1
-# The waves that tell it go up to this one, or up to radius / _WAVE_RADIUS_PX if that is more.
+# The waves that tell the covariance go up to this one, or up to radius / _WAVE_RADIUS_PX if that is more.
 _LEAST_WAVES, _WAVE_RADIUS_PX = 4, 3.0
 # Lens and interpolation smooth along the outline too, which takes power from the quicker waves (1-sigma) [px].
 _SMOOTHING_PX = 1.0
@@ -251,4 +249,4 @@ def _noise_density(angles: FloatArray, residual: FloatArray, radius_px: float) -
     slow, quick = float(share @ power[is_slow]), float(np.mean(power[~is_slow]))
     # Student's t with two degrees of freedom per wave: 1-sigma of a spread that is itself estimated.
     student = 1.0 + 0.25 * float(share @ share)
-    return _SLOWEST_WAVE * student**2 * (slow + max(0.0, slow - quick))
+    return student**2 * (slow + max(0.0, slow - quick))
