@@ -37,17 +37,16 @@ class Process:
         lines = self.log.read_text(errors="replace").strip().splitlines() or ["it said nothing"]
         raise BusError(f"the {self.name} ended with exit code {code}: {lines[-1].removeprefix('bodyschema: ')}")
 
-    def wait_for(self, endpoint: str) -> None:
-        """Return as soon as it listens on `endpoint`; BusError when it ends before, or does not in time."""
+    def wait_for(self, endpoint: str, token: str) -> None:
+        """Return as soon as it is alive on `endpoint`; BusError when it ends before, or is not in time.
+
+        Listening is not enough: it is alive when it answers.
+        """
         limit = time.monotonic() + START_LIMIT_S
-        while True:
+        while not _is_alive(endpoint, token):
             self.check()
-            try:
-                with Bus(connect=endpoint, client=True):
-                    return
-            except BusError:
-                if time.monotonic() > limit:
-                    raise
+            if time.monotonic() > limit:
+                raise BusError(f"the {self.name} does not answer after {START_LIMIT_S:.0f} s; {self.log} may say why")
             time.sleep(0.1)
 
     def end(self) -> None:
@@ -59,6 +58,14 @@ class Process:
         except subprocess.TimeoutExpired:
             self.popen.kill()
             self.popen.wait()
+
+
+def _is_alive(endpoint: str, token: str) -> bool:
+    try:
+        with Bus(connect=endpoint, client=True) as bus:
+            return bus.alive(token)
+    except BusError:
+        return False
 
 
 @contextmanager

@@ -199,7 +199,7 @@ def _running(job: Job) -> Iterator[_Live]:
     """Both processes; the learner is there before the first pair, as in a live system."""
     fed = job.folder / "learnt_rows.csv"
     job.learnt_rows.write_csv(fed)
-    sampler_endpoint, learner_endpoint = free_endpoint(), free_endpoint()
+    sampler_endpoint, learner_endpoint, keys = free_endpoint(), free_endpoint(), Keys(job.config.robot.name)
     environment = {
         **override("zenoh", "sampler", sampler_endpoint),
         **override("zenoh", "learner", learner_endpoint),
@@ -210,16 +210,16 @@ def _running(job: Job) -> Iterator[_Live]:
     arguments = ["--robot", os.fspath(job.config.file), "--state-dir", os.fspath(job.folder)]
     with (
         started("learner", arguments, environment, job.folder / "learner.log") as learner,
-        _connected(learner, learner_endpoint) as learner_bus,
+        _connected(learner, learner_endpoint, keys.alive(learner.name)) as learner_bus,
         started("sampler", arguments, environment, job.folder / "sampler.log") as sampler,
-        _connected(sampler, sampler_endpoint) as sampler_bus,
+        _connected(sampler, sampler_endpoint, keys.alive(sampler.name)) as sampler_bus,
     ):
         yield _Live(job, (sampler, sampler_bus), (learner, learner_bus))
 
 
 @contextmanager
-def _connected(process: Process, endpoint: str) -> Iterator[Bus]:
-    process.wait_for(endpoint)
+def _connected(process: Process, endpoint: str, token: str) -> Iterator[Bus]:
+    process.wait_for(endpoint, token)
     with client(endpoint) as bus:
         yield bus
 
