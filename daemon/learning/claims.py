@@ -47,12 +47,14 @@ class ClaimsState(msgspec.Struct, kw_only=True):
 
     Attributes:
         errors: prequential errors, by model.
+        delayed: those of the instant learner as it was when the exact solution was asked for.
         residuals: errors on pairs that are learnt already, by model.
         misfit: errors of the prior, over longer.
         arm_sigma: 1-sigma of the prior before the tool was changed [m].
     """
 
     errors: dict[str, ErrorMemory]
+    delayed: ErrorMemory
     residuals: dict[str, ErrorMemory]
     misfit: ErrorMemory
     arm_sigma: float | None
@@ -73,10 +75,19 @@ class Claims:
     def _begin(self, expected_m: float) -> None:
         self._expected_m = expected_m
         self.errors = {name: ErrorMemory(expected_m) for name in (PRIOR, INSTANT)}
+        self._delayed = ErrorMemory(expected_m)
         self._residuals: dict[str, ErrorMemory] = {}
         self._misfit = ErrorMemory(expected_m, discount=PRIOR_DISCOUNT)
         self._asked: tuple[Layer, ...] | None = None
         self._solved: tuple[Layer, ...] | None = None
+
+    @property
+    def compared(self) -> Mapping[str, ErrorMemory]:
+        """Errors by model that may be compared.
+
+        A solution is some pairs old when it is judged, and on a path that is far: the instant learner is judged as old.
+        """
+        return self.errors | {INSTANT: self._delayed} if self._delayed.weight else self.errors
 
     @property
     def support(self) -> SupportSet | None:
@@ -104,6 +115,10 @@ class Claims:
             claimed = self.of(name).variance(q[None])[0] + variance
             self.errors[name].add(error, variance, float(np.square(error).sum() / claimed.sum()))
         self._misfit.add(errors[PRIOR], variance)
+
+    def predicted_by_delayed(self, error: FloatArray, variance: FloatArray) -> None:
+        """Error (3,) [m] of the instant learner as it was when the exact solution was asked for."""
+        self._delayed.add(error, variance)
 
     def learnt(self, q: FloatArray) -> None:
         """A pair has been learnt at q (d,) [rad]."""
@@ -147,7 +162,11 @@ class Claims:
     def state(self) -> ClaimsState:
         """Everything needed to go on from here, but `arm_configurations`."""
         return ClaimsState(
-            errors=self.errors, residuals=self._residuals, misfit=self._misfit, arm_sigma=self._unknowns.arm_sigma
+            errors=self.errors,
+            delayed=self._delayed,
+            residuals=self._residuals,
+            misfit=self._misfit,
+            arm_sigma=self._unknowns.arm_sigma,
         )
 
     def restore(self, state: ClaimsState, arm_configurations: FloatArray, q: FloatArray) -> None:
@@ -158,7 +177,8 @@ class Claims:
             self._unknowns.change_tool(state.arm_sigma)
         for row in q:
             self._unknowns.add(row)
-        self.errors, self._residuals, self._misfit = dict(state.errors), dict(state.residuals), state.misfit
+        self.errors, self._residuals = dict(state.errors), dict(state.residuals)
+        self._delayed, self._misfit = state.delayed, state.misfit
 
     @property
     def _prior_sigma(self) -> float:

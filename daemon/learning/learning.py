@@ -33,9 +33,6 @@ from .state import Counters, LearningHeader, LearningState, StateError
 EXPECTED_M = 0.1
 # A measurement farther away than this is not one in metres [m].
 FARTHEST_M = 1000.0
-# The instant learner is asked about the next pair, an exact solution about pairs up to `solve_every` steps on, and all
-# lie on the path. Measured: as good as the other there, the instant learner is 1.1 to 1.7 times as wrong beside it.
-HANDICAP = {INSTANT: 2.0}
 # So many of the learnt pairs say how well a model fits what it knows.
 LOOKED_BACK = 64
 # Pairs from which the errors of a prior that was fitted anew are taken, and that are replayed on top of it.
@@ -274,7 +271,9 @@ class Learning:
                 self._follow_change()
             return
         self._claims.predicted(pair.q, errors, variance)
-        self._answering = choose(self._claims.errors, self._answering, HANDICAP)
+        if members.delayed is not None:
+            self._claims.predicted_by_delayed(pair.x - members.delayed.predict(pair.q), variance)
+        self._answering = choose(self._claims.compared, self._answering)
         self._curve.add(self._counters.pairs, self._claims.errors[self._answering].mean_m or 0.0)
         members.learn(pair.q, errors[INSTANT], np.inf)
         self._keep(pair.q, pair.x)
@@ -395,6 +394,7 @@ class Learning:
             q, x, fed = self._memory.since(solving.fed, FEED_PAIRS)
             if not len(q) and solving.due:
                 self._claims.solution_asked()
+                self._members_now.ask()
         if len(q):
             solving.feed(q, x, fed)
         elif solving.due:

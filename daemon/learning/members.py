@@ -23,6 +23,13 @@ class Members:
         self._step_size = step_size
         self._maps = {PRIOR: prior, INSTANT: prior}
         self._instant = NLMS(prior, step_size)
+        self._asked: KBMap | None = None
+        self._delayed: KBMap | None = None
+
+    @property
+    def delayed(self) -> KBMap | None:
+        """The instant learner as it was when the present exact solution was asked for; None before any."""
+        return self._delayed
 
     @property
     def maps(self) -> Mapping[str, KBMap]:
@@ -49,9 +56,14 @@ class Members:
         self._instant.replay(q, x)
         self._renew()
 
+    def ask(self) -> None:
+        """The exact solver works on all pairs up to here."""
+        self._asked = self._maps[INSTANT]
+
     def take(self, solution: KBMap) -> None:
-        """A new solution of the exact solver."""
+        """The exact solver's solution of what it was asked."""
         self._maps[EXACT] = solution
+        self._delayed = self._asked
 
     def start_again(self, prior: KBMap, q: FloatArray, x: FloatArray) -> None:
         """Another prior for the same pairs, q (n, d) and x (n, 3): the instant learner learns them on top of it.

@@ -87,19 +87,13 @@ class ErrorMemory(msgspec.Struct):
         return math.sqrt(max((self.ratio + missing) / max(self.weight, WARM), 1.0))
 
 
-def choose(errors: Mapping[str, ErrorMemory], present: str, handicap: Mapping[str, float]) -> str:
+def choose(errors: Mapping[str, ErrorMemory], present: str) -> str:
     """The model that shall answer: the best on recent pairs; the present one while nobody is clearly better.
 
     Args:
         errors: by model, the most trusted first: while errors are few, the first one answers.
-        handicap: factor by which a model's errors count more than 1: recent pairs are neighbours, and do not show how
-            wrong a model is beside their path.
     """
-    tried = {
-        name: memory.rms_m * handicap.get(name, 1.0)
-        for name, memory in errors.items()
-        if memory.weight >= FEWEST_TO_ANSWER
-    }
+    tried = {name: memory.rms_m for name, memory in errors.items() if memory.weight >= FEWEST_TO_ANSWER}
     if present not in tried:
         present = next(iter(errors))
     if not tried:

@@ -7,6 +7,9 @@ from kbmaps import KBMap
 
 from .solver import ExactSolver, Solved
 
+# While pairs are few, a solution is worth renewing, and cheap, when so many more have come as a share of them.
+GROWTH = 0.1
+
 
 class Solving:
     """Keeps one exact solver up to date. For the background thread alone.
@@ -32,7 +35,8 @@ class Solving:
     @property
     def due(self) -> bool:
         """Whether it is time to ask."""
-        return self._fed > 0 and (self._soon or self._fed - self._solved_at >= self._every)
+        enough = min(self._every, max(GROWTH * self._solved_at, 1.0))
+        return self._fed > 0 and (self._soon or self._fed - self._solved_at >= enough)
 
     def restart(self) -> None:
         """The solver has lost everything."""

@@ -55,10 +55,17 @@ def test_a_new_task_is_told_once(solver: ScriptedSolver, solving: Solving) -> No
     assert solver.told == [("start", 1)]
 
 
-def test_a_solution_is_due_after_so_many_pairs(solving: Solving) -> None:
-    solving.feed(Q, X, 10)
+@pytest.mark.parametrize(("solved_at", "not_yet", "due_at"), [(50, 54, 55), (1000, 1024, 1025)])
+def test_a_solution_is_due_after_a_tenth_more_pairs_but_never_later_than_configured(
+    solver: ScriptedSolver, solving: Solving, solved_at: int, not_yet: int, due_at: int
+) -> None:
+    solving.feed(Q, X, solved_at)
+    solving.ask()
+    solver.answer = Solved(1, solved_at, PRIOR)
+    solving.poll()
+    solving.feed(Q, X, not_yet)
     early = solving.due
-    solving.feed(Q, X, 25)
+    solving.feed(Q, X, due_at)
     assert (early, solving.due) == (False, True)
 
 
