@@ -1,0 +1,123 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from guided_arm import Scene, new_learning, teach
+
+from daemon.checkpoint import CheckpointError, read_checkpoint, set_aside, write_checkpoint
+from daemon.learning import LearningState
+
+UTC = "2026-11-21T12:00:00.000+00:00"
+
+
+def state(pairs: int) -> LearningState:
+    learning = new_learning()
+    teach(learning, Scene.draw(0, pairs).pairs, background=False)
+    return learning.state()
+
+
+def write(file: Path, written: LearningState, robot: str = "arm") -> None:
+    write_checkpoint(file, written, robot=robot, utc=UTC)
+
+
+def same(a: LearningState, b: LearningState | None) -> bool:
+    return (
+        b is not None
+        and (a.header, a.arrays.keys()) == (b.header, b.arrays.keys())
+        and all(np.array_equal(a.arrays[name], b.arrays[name], equal_nan=True) for name in a.arrays)
+    )
+
+
+@pytest.fixture(scope="module")
+def old() -> LearningState:
+    return state(3)
+
+
+@pytest.fixture(scope="module")
+def new() -> LearningState:
+    return state(5)
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    return tmp_path / "state" / "learner.ckpt"
+
+
+@pytest.fixture
+def written(file: Path, old: LearningState) -> Path:
+    write(file, old)
+    return file
+
+
+def test_what_is_read_is_what_was_written_bit_by_bit(written, old) -> None:
+    assert same(old, read_checkpoint(written, robot="arm"))
+
+
+def test_before_the_first_checkpoint_there_is_none(file) -> None:
+    assert read_checkpoint(file, robot="arm") is None
+
+
+def test_a_new_checkpoint_takes_the_place_of_the_old_one_and_leaves_no_other_file(written, new) -> None:
+    write(written, new)
+    assert same(new, read_checkpoint(written, robot="arm"))
+    assert list(written.parent.iterdir()) == [written]
+
+
+def test_a_full_disk_is_named_and_leaves_the_old_checkpoint(written, old, new) -> None:
+    written.with_name("learner.ckpt.tmp").symlink_to("/dev/full")
+    with pytest.raises(CheckpointError, match=f"{written} could not be written: the disk is full. Free some space"):
+        write(written, new)
+    assert same(old, read_checkpoint(written, robot="arm"))
+    assert list(written.parent.iterdir()) == [written]
+
+
+def test_a_read_only_disk_is_named(mount_small_disk, old) -> None:
+    file = mount_small_disk("ro,size=512k") / "learner.ckpt"
+    with pytest.raises(CheckpointError, match=r"Read-only file system. Learning goes on; give a --state-dir"):
+        write(file, old)
+
+
+def test_another_robots_checkpoint_is_refused(written) -> None:
+    with pytest.raises(CheckpointError, match="belongs to the robot 'arm', this one is 'leg'"):
+        read_checkpoint(written, robot="leg")
+
+
+def test_a_file_that_is_no_checkpoint_is_refused(written) -> None:
+    written.write_text("my diary " * 100)
+    with pytest.raises(CheckpointError, match="is not a checkpoint"):
+        read_checkpoint(written, robot="arm")
+
+
+def test_a_checkpoint_of_a_newer_version_is_refused(written) -> None:
+    data = bytearray(written.read_bytes())
+    data[8] = 99
+    written.write_bytes(data)
+    with pytest.raises(CheckpointError, match="has the version 99"):
+        read_checkpoint(written, robot="arm")
+
+
+@pytest.mark.parametrize("share", [0.0, 0.01, 0.5, 0.999])
+def test_a_torn_checkpoint_is_refused(written, share) -> None:
+    data = written.read_bytes()
+    written.write_bytes(data[: int(share * len(data))])
+    with pytest.raises(CheckpointError, match=r"is not a checkpoint|is damaged"):
+        read_checkpoint(written, robot="arm")
+
+
+def test_a_flipped_bit_anywhere_is_found(written) -> None:
+    data = written.read_bytes()
+    for place in range(12, len(data), len(data) // 50):
+        written.write_bytes(data[:place] + bytes([data[place] ^ 4]) + data[place + 1 :])
+        with pytest.raises(CheckpointError, match="is damaged"):
+            read_checkpoint(written, robot="arm")
+
+
+def test_what_is_set_aside_is_kept_beside_what_was_before(written) -> None:
+    content = written.read_bytes()
+    first = set_aside(written)
+    written.write_bytes(b"second")
+    second = set_aside(written)
+    assert (first.read_bytes(), second.read_bytes()) == (content, b"second")
+    assert not written.exists()

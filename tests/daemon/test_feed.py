@@ -1,0 +1,210 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import msgspec
+import numpy as np
+import pytest
+from guided_arm import STORE, Scene, make_pair, new_learning
+
+from daemon.feed import RETRY_S, WAITING, PairFeed
+from daemon.learning import Learning
+from daemon.wire import PairMessage, PairsReply, encode, pair_to_wire
+from interfaces.errors import BusError
+from interfaces.records import Pair
+
+PAGE = 7
+PAIRS = Scene.draw(0, 40).pairs
+
+
+class HandClock:
+    """A clock that is moved by hand."""
+
+    def __init__(self) -> None:
+        self.time = 0.0
+
+    def now(self) -> float:
+        return self.time
+
+    def utc(self) -> str:
+        return ""
+
+
+class Store:
+    """The sampler's history: answers a page at a time, or not at all."""
+
+    def __init__(self, pairs: list[Pair]) -> None:
+        self.pairs, self.store, self.asked, self.answers = pairs, STORE, 0, True
+
+    def __call__(self, begin: int) -> PairsReply:
+        self.asked += 1
+        if not self.answers:
+            raise BusError("nobody answers")
+        page = [pair_to_wire(pair) for pair in self.pairs if pair.seq >= begin][:PAGE]
+        return PairsReply(self.store, len(self.pairs), page)
+
+
+def payload(pair: Pair) -> bytes:
+    return encode(pair_to_wire(pair))
+
+
+class Fed:
+    """A feed with what is around it."""
+
+    def __init__(self, stored: int = 0) -> None:
+        self.learning: Learning = new_learning()
+        self.clock = HandClock()
+        self.history = Store(PAIRS[:stored])
+        self.feed = PairFeed(self.learning, self.history, self.clock)
+
+    def publish(self, *pairs: Pair) -> None:
+        for pair in pairs:
+            self.feed.offer(payload(pair))
+
+    def settle(self) -> None:
+        """Take all that has been offered, and what is behind."""
+        self.feed.step(0.0)
+        while not self.feed.caught_up:
+            self.clock.time += RETRY_S
+            self.feed.step(0.0)
+
+    @property
+    def learnt(self) -> tuple[int, int]:
+        return self.learning.counters.pairs, self.learning.counters.last_seq
+
+
+def test_what_was_stored_before_is_learnt_from_history_page_by_page() -> None:
+    fed = Fed(stored=20)
+    fed.settle()
+    assert fed.learnt == (20, 20)
+    assert fed.learning.counters.gaps_recovered == 20
+
+
+def test_published_pairs_are_learnt_in_order_without_asking_for_history_again() -> None:
+    fed = Fed(stored=5)
+    fed.settle()
+    asked = fed.history.asked
+    fed.publish(*PAIRS[5:20])
+    fed.settle()
+    assert (fed.learnt, fed.history.asked) == ((20, 20), asked)
+
+
+def test_a_gap_is_filled_from_history_before_what_came_after_it_is_learnt() -> None:
+    fed = Fed(stored=5)
+    fed.settle()
+    fed.history.pairs = PAIRS[:20]
+    fed.publish(PAIRS[19])
+    fed.settle()
+    assert fed.learnt == (20, 20)
+
+
+@pytest.mark.parametrize("again", [[4], [0, 4], [4, 4, 3]])
+def test_a_pair_that_comes_again_is_not_learnt_again(again) -> None:
+    fed = Fed(stored=5)
+    fed.settle()
+    fed.publish(*(PAIRS[k] for k in again))
+    fed.settle()
+    assert fed.learnt == (5, 5)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_however_publications_are_lost_doubled_and_shuffled_each_pair_is_learnt_once(seed) -> None:
+    rng = np.random.default_rng(seed)
+    fed = Fed()
+    for end in (10, 25, 40):
+        fed.history.pairs = PAIRS[:end]
+        fed.publish(*(PAIRS[k] for k in rng.integers(0, end, size=rng.integers(0, 30))))
+        if rng.random() < 0.5:
+            fed.feed.wake()
+        fed.settle()
+    fed.feed.wake()
+    fed.settle()
+    assert fed.learnt == (40, 40)
+
+
+def test_more_publications_than_there_is_room_for_are_made_up_from_history() -> None:
+    fed = Fed(stored=1)
+    fed.settle()
+    fed.history.pairs = PAIRS[:10]
+    fed.publish(*[PAIRS[1]] * (WAITING + 50))
+    fed.settle()
+    assert fed.learnt == (10, 10)
+
+
+def test_while_nobody_answers_the_feed_asks_again_and_then_catches_up() -> None:
+    fed = Fed(stored=10)
+    fed.history.answers = False
+    fed.feed.step(0.0)
+    fed.clock.time += RETRY_S
+    fed.feed.step(0.0)
+    assert (fed.history.asked, fed.learnt) == (2, (0, 0))
+    fed.history.answers = True
+    fed.settle()
+    assert fed.learnt == (10, 10)
+
+
+def test_what_comes_while_paused_is_learnt_after_resume() -> None:
+    fed = Fed(stored=5)
+    fed.settle()
+    fed.feed.pause()
+    fed.history.pairs = PAIRS[:10]
+    fed.publish(*PAIRS[5:10])
+    for _ in range(6):
+        fed.feed.step(0.0)
+    assert fed.learnt == (5, 5)
+    fed.feed.resume()
+    fed.settle()
+    assert fed.learnt == (10, 10)
+
+
+# --- what cannot be taken
+
+
+def wrong(pair: Pair) -> list[bytes]:
+    message: PairMessage = pair_to_wire(pair)
+    return [
+        b"",
+        b"{",
+        payload(replace(pair, q=pair.q[:3])),
+        payload(replace(pair, x=np.array([1e309, 0.0, 0.0]))),
+        encode(msgspec.structs.replace(message, q=[float("nan"), 0.0, 0.0, 0.0])),
+        encode(message).replace(b'"seq":6', b'"seq":-6'),
+    ]
+
+
+@pytest.mark.parametrize("kind", range(6))
+def test_a_pair_that_is_none_is_refused_counted_and_not_learnt(kind) -> None:
+    fed = Fed(stored=5)
+    fed.settle()
+    fed.feed.offer(wrong(PAIRS[5])[kind])
+    fed.feed.step(0.0)
+    assert (fed.learnt, fed.learning.counters.refused) == ((5, 5), 1)
+
+
+def test_after_a_pair_that_is_none_the_right_one_is_learnt() -> None:
+    fed = Fed(stored=5)
+    fed.settle()
+    fed.feed.offer(wrong(PAIRS[5])[2])
+    fed.publish(*PAIRS[5:8])
+    fed.settle()
+    assert fed.learnt == (8, 8)
+
+
+def test_pairs_of_another_store_are_not_mixed_in_and_the_remedy_is_named() -> None:
+    fed = Fed(stored=5)
+    fed.settle()
+    fed.publish(make_pair(6, PAIRS[5].q, PAIRS[5].x, store="other"))
+    fed.settle()
+    assert fed.learnt == (5, 5)
+    assert "pairs now come from the store other" in fed.feed.problem
+    assert "reset_to_prior" in fed.feed.problem
+
+
+def test_an_older_copy_of_the_store_is_told() -> None:
+    fed = Fed(stored=10)
+    fed.settle()
+    fed.history.pairs = PAIRS[:4]
+    fed.feed.wake()
+    fed.settle()
+    assert fed.learnt == (10, 10)
+    assert "ends at pair 4, but 10 were learnt: it is an older copy" in fed.feed.problem
