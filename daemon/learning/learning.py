@@ -15,14 +15,15 @@ from daemon.config import LearnerConfig
 from daemon.status import CurvePoint
 from interfaces.errors import RequestError
 from interfaces.records import FloatArray, Pair
-from kbmaps import DegenerateDataError, KBMap, RigidChain
+from kbmaps import KBMap
 
 from .claims import Claims
 from .curve import Curve
+from .fitting import Fitting
 from .gate import CHANGE, DOUBT, Gate, limit_m, sound
 from .members import INSTANT, PRIOR, Members
 from .memory import PairMemory, Permutations
-from .nominal import PAIRS_TO_REFIT, NominalModel
+from .nominal import NominalModel
 from .scores import FEWEST_TO_ANSWER, choose
 from .snapshot import Snapshot
 from .solver import LARGEST_NET, ExactSolver
@@ -160,7 +161,7 @@ class Learning:
 
     def work(self) -> bool:
         """One small piece of background work; False when there is none."""
-        return self._align() or self._serve_solver() or self._replay()
+        return self._fit() or self._serve_solver() or self._replay()
 
     def state(self) -> LearningState:
         """Everything needed to go on from here."""
@@ -176,14 +177,11 @@ class Learning:
                 curve=self._curve.points,
                 curve_stride=self._curve.stride,
                 doubted_in_a_row=self._gate.in_a_row,
-                next_fit=self._next_fit,
+                next_fit=self._fitting.due_at,
                 replays_due=self._replays_due,
             )
-            before, chain = self._before_change, self._chain
-            kept = {"arm_q": self._claims.arm_configurations}
-        kept |= {"q": q, "x": x, "doubted_q": doubted_q, "doubted_x": doubted_x, "chain_fixed": chain.fixed}
-        if before is not None:
-            kept["before_change"] = before.net
+            kept = {"arm_q": self._claims.arm_configurations} | self._fitting.arrays()
+        kept |= {"q": q, "x": x, "doubted_q": doubted_q, "doubted_x": doubted_x}
         return LearningState(header, kept | {f"net_{name}": net for name, net in nets.items()})
 
     def restore(self, state: LearningState) -> None:
@@ -202,11 +200,7 @@ class Learning:
                 self._members_now.restore(nets)
             else:
                 self._begin_at_nominal()
-            self._chain = RigidChain(
-                state.arrays["chain_fixed"], self._nominal.chain.axes, self._nominal.chain.prismatic
-            )
-            if "before_change" in state.arrays:
-                self._before_change = KBMap(self._nominal.bases, state.arrays["before_change"])
+            self._fitting.restore(header.next_fit, state.arrays)
             self._claims = Claims(self._nominal.bases, EXPECTED_M)
             self._claims.restore(header.claims, state.arrays["arm_q"], state.arrays["q"])
             for q, x in zip(state.arrays["q"], state.arrays["x"], strict=True):
@@ -216,15 +210,13 @@ class Learning:
             self._counters, self._answering = header.counters, header.answering
             self._curve = Curve(header.curve, header.curve_stride)
             self._gate = Gate(header.doubted_in_a_row)
-            self._next_fit, self._replays_due = header.next_fit, header.replays_due
+            self._replays_due = header.replays_due
             self._publish()
 
     def _begin_at_nominal(self) -> None:
-        known = self._nominal.frame_known
-        self._chain = self._nominal.chain
+        self._fitting = Fitting(self._nominal)
         self._claims = Claims(self._nominal.bases, EXPECTED_M)
-        self._begin(self._nominal.prior() if known else None)
-        self._next_fit = None if known else self._nominal.pairs_to_align
+        self._begin(self._nominal.prior() if self._nominal.frame_known else None)
 
     def _begin(self, prior: KBMap | None) -> None:
         """Start anew from `prior` (None: wait for an alignment), with no pairs."""
@@ -234,8 +226,6 @@ class Learning:
         self._doubts.clear()
         self._order = Permutations(self._settings.seed)
         self._gate = Gate()
-        self._next_fit: int | None = None
-        self._before_change: KBMap | None = None
         self._replays_due = 0.0
         self._task += 1
 
@@ -306,33 +296,27 @@ class Learning:
         else:
             before = self._members.maps[self._answering]
             self._claims.change_tool(expected_m)
+            self._fitting.change_tool(before)
             self._begin(before)
-            self._before_change, self._next_fit = before, PAIRS_TO_REFIT
 
-    def _align(self) -> bool:
-        """Fit what is not known, or a changed tool, once enough pairs have come, and again when they have doubled."""
+    def _fit(self) -> bool:
+        """Fit what is not known, or a changed tool, when it is due."""
         with self._lock:
-            if self._next_fit is None or self._memory.count < self._next_fit:
+            if not self._fitting.due(self._memory.count):
                 return False
-            task, count, chain, before = self._task, self._memory.count, self._chain, self._before_change
+            task, count, fitting = self._task, self._memory.count, copy.copy(self._fitting)
             q, x = self._memory.all()
-        try:
-            prior, chain = self._fitted(before, chain, q, x)
-        except DegenerateDataError:
-            prior = None
+        fit = fitting.fit(q, x)
         with self._lock:
             if task != self._task:
                 return True
-            if prior is None:
-                self._next_fit = count + max(self._nominal.pairs_to_align, PAIRS_TO_REFIT)
-                return True
-            if self._next_fit == self._first_fit:
-                self._set_aside(prior)
-            self._next_fit, self._chain = 2 * count, chain
-            if self._members is None:
-                self._start_members(prior)
-            else:
-                self._change_prior(self._members, prior)
+            if fit is not None and fitting.is_first:
+                self._set_aside(fit.prior)
+            self._fitting.done(count, fit)
+            if fit is not None and self._members is None:
+                self._start_members(fit.prior)
+            elif fit is not None:
+                self._change_prior(self._members_now, fit.prior)
             self._publish()
         return True
 
@@ -346,20 +330,8 @@ class Learning:
         self._memory.clear()
         for row_q, row_x, belonging in zip(q, x, belongs, strict=True):
             (self._memory if belonging else self._doubts).append(row_q, row_x)
+        self._order.restart()
         self._task += 1
-
-    @property
-    def _first_fit(self) -> int:
-        return PAIRS_TO_REFIT if self._before_change is not None else self._nominal.pairs_to_align
-
-    def _fitted(
-        self, before: KBMap | None, chain: RigidChain, q: FloatArray, x: FloatArray
-    ) -> tuple[KBMap, RigidChain]:
-        """The prior that fits pairs best, and its chain: another tool on what was learnt, or another frame."""
-        if before is not None:
-            return self._nominal.with_other_tool(before, chain, q, x), chain
-        aligned = self._nominal.aligned(q, x)
-        return aligned.to_kbmap(self._nominal.bases), aligned
 
     def _change_prior(self, members: Members, prior: KBMap) -> None:
         q, x = self._memory.all()
@@ -371,7 +343,6 @@ class Learning:
         """The first alignment: the pairs that waited for it are learnt now, each once, in their order."""
         q, x = self._memory.all()
         self._begin(prior)
-        self._next_fit = 2 * len(q)
         for row_q, row_x in zip(q, x, strict=True):
             self._keep(row_q, row_x)
         self._members_now.replay(q, x)

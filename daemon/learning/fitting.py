@@ -1,0 +1,82 @@
+"""What is fitted as a whole before anything is learnt on top of it: an unknown frame, or a changed tool."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from interfaces.records import FloatArray
+from kbmaps import DegenerateDataError, KBMap, RigidChain
+
+from .nominal import PAIRS_TO_REFIT, NominalModel
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A prior that was fitted to pairs.
+
+    Attributes:
+        prior: the map to learn on top of.
+        chain: the nominal chain in its frame.
+    """
+
+    prior: KBMap
+    chain: RigidChain
+
+
+class Fitting:
+    """Tells when a fit is due, at first after few pairs and then whenever they have doubled, and makes it."""
+
+    def __init__(self, nominal: NominalModel) -> None:
+        self._nominal = nominal
+        self._chain = nominal.chain
+        self._before: KBMap | None = None
+        self._due_at = None if nominal.frame_known else nominal.pairs_to_align
+
+    @property
+    def due_at(self) -> int | None:
+        """How many pairs it takes until the next fit; None when nothing is to be fitted."""
+        return self._due_at
+
+    @property
+    def is_first(self) -> bool:
+        """Whether the next fit is the first one."""
+        return self._due_at == (self._nominal.pairs_to_align if self._before is None else PAIRS_TO_REFIT)
+
+    def due(self, pairs: int) -> bool:
+        """Whether it is time to fit."""
+        return self._due_at is not None and pairs >= self._due_at
+
+    def change_tool(self, before: KBMap) -> None:
+        """From now on another tool is fitted on top of the map `before`."""
+        self._before, self._due_at = before, PAIRS_TO_REFIT
+
+    def fit(self, q: FloatArray, x: FloatArray) -> Fit | None:
+        """The prior that fits pairs q (n, d) [rad] and x (n, 3) [m] best; None when they do not determine it."""
+        try:
+            if self._before is not None:
+                return Fit(self._nominal.with_other_tool(self._before, self._chain, q, x), self._chain)
+            aligned = self._nominal.aligned(q, x)
+        except DegenerateDataError:
+            return None
+        return Fit(aligned.to_kbmap(self._nominal.bases), aligned)
+
+    def done(self, pairs: int, fit: Fit | None) -> None:
+        """That many pairs were fitted."""
+        if fit is None:
+            self._due_at = pairs + max(self._nominal.pairs_to_align, PAIRS_TO_REFIT)
+        else:
+            self._due_at, self._chain = 2 * pairs, fit.chain
+
+    def arrays(self) -> dict[str, FloatArray]:
+        """What a checkpoint has to keep beside `due_at`."""
+        kept = {"chain_fixed": self._chain.fixed}
+        return kept if self._before is None else kept | {"before_change": self._before.net}
+
+    def restore(self, due_at: int | None, arrays: Mapping[str, FloatArray]) -> None:
+        """Go on from `due_at` and `arrays`."""
+        nominal = self._nominal.chain
+        self._due_at = due_at
+        self._chain = RigidChain(arrays["chain_fixed"], nominal.axes, nominal.prismatic)
+        if "before_change" in arrays:
+            self._before = KBMap(self._nominal.bases, arrays["before_change"])
