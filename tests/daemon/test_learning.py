@@ -176,6 +176,31 @@ def test_a_pair_of_the_old_tool_after_a_told_change_is_doubted_and_spoils_nothin
     assert Scene(changed, q, []).error_m(learning) < 0.025
 
 
+def test_a_learner_restored_amid_a_tool_change_fits_the_tool_all_the_same() -> None:
+    scene = Scene.draw(0, 200)
+    rng = np.random.default_rng(0)
+    learning, restored = new_learning(), new_learning()
+    teach(learning, scene.pairs)
+    learning.tool_changed()
+    changed = scene.chain.with_tool([0.0, 0.15, 0.2])
+    q = scene.q[-1] + path(rng, 60)
+    pairs = measured(changed, q, rng, first=201)
+    teach(learning, pairs[:3])
+    restored.restore(learning.state())
+    teach(restored, pairs[3:])
+    assert Scene(changed, q, []).error_m(restored) < 0.025
+
+
+def test_a_restored_learner_answers_as_the_one_that_was_saved() -> None:
+    scene = Scene.draw(0, 100)
+    learning, restored = new_learning(), new_learning()
+    teach(learning, scene.pairs)
+    restored.restore(learning.state())
+    before, after = learning.snapshot.predict(scene.q), restored.snapshot.predict(scene.q)
+    np.testing.assert_array_equal(before.x, after.x)
+    np.testing.assert_allclose(before.sigma, after.sigma, rtol=0.1)
+
+
 @pytest.mark.parametrize("seed", SEEDS)
 def test_an_untold_tool_change_is_found_once(seed: int) -> None:
     scene = Scene.draw(seed, 300)
