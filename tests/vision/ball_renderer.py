@@ -37,6 +37,7 @@ class Look:
         samples: rays per pixel and direction; 1 gives hard, aliased edges.
         blur_px: 1-sigma of the lens blur [px].
         noise_sd: 1-sigma of each channel [grey levels].
+        wall: an even grey behind the ball instead of clutter.
     """
 
     ball_rgb: tuple[float, float, float] = (0.85, 0.08, 0.08)
@@ -49,6 +50,12 @@ class Look:
     samples: int = 4
     blur_px: float = 0.7
     noise_sd: float = 3.0
+    wall: float | None = None
+
+
+def backdrop(rng: np.random.Generator, size_px: tuple[int, int], wall: float | None) -> FloatArray:
+    """A picture (height, width, 3) RGB of 0..1: an even wall, or clutter when `wall` is None."""
+    return clutter(rng, size_px) if wall is None else np.full((size_px[1], size_px[0], 3), wall)
 
 
 def clutter(rng: np.random.Generator, size_px: tuple[int, int]) -> FloatArray:
@@ -99,7 +106,7 @@ class Room:
         """Draw the pictures and an exposure; `look` says how they are taken."""
         self._calibration, self._rng = calibration, rng
         self._look = replace(look, exposure=float(rng.uniform(0.6, 1.2)))
-        self._pictures = [clutter(rng, calibration.image_size_px) for _ in range(2)]
+        self._pictures = [backdrop(rng, calibration.image_size_px, look.wall) for _ in range(2)]
         self._images = [take(picture, self._look, rng) for picture in self._pictures]
 
     def photograph(self, x: FloatArray, radius_m: float, t: float) -> StereoFrame:

@@ -1,0 +1,50 @@
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from interfaces.records import MarkerMiss, Reason
+from vision.config import NAMED_COLOURS, HueBand, VisionConfig
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGE = (ROOT / "docs" / "vision.md").read_text(encoding="utf-8")
+
+
+def blocks(language: str) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", PAGE, re.DOTALL)
+
+
+def test_the_pages_example_runs(capsys):
+    names: dict = {}
+    exec(blocks("python")[0], names)
+    assert names["answer"] == MarkerMiss(0.0, Reason.NO_MARKER)
+    assert capsys.readouterr().out.strip() in blocks("python")[0]
+
+
+def test_the_page_shows_every_setting_with_its_default():
+    shown = msgspec.toml.decode(blocks("toml")[0])["vision"]
+    assert shown == msgspec.to_builtins(VisionConfig())
+
+
+def test_the_page_shows_every_setting_of_a_band_of_hues_with_its_default():
+    shown = msgspec.toml.decode(blocks("toml")[1])["vision"]["colour"]
+    assert shown == msgspec.to_builtins(HueBand(shown["hue_deg"]))
+
+
+def test_the_page_names_every_colour():
+    comment = next(line for line in blocks("toml")[0].splitlines() if line.startswith("colour"))
+    assert all(colour in comment for colour in NAMED_COLOURS)
+
+
+def test_the_page_lists_every_reason_that_the_tracker_gives():
+    sources = "".join(file.read_text(encoding="utf-8") for file in (ROOT / "vision").glob("*.py"))
+    given = {Reason[name].value for name in re.findall(r"\bReason\.([A-Z_]+)", sources)}
+    assert given == set(re.findall(r"^\| `(\w+)` \|", PAGE, re.MULTILINE)) & set(Reason)
+
+
+@pytest.mark.parametrize("file", re.findall(r"`(\w+\.py)`", PAGE))
+def test_every_module_that_the_page_names_exists(file):
+    assert (ROOT / "vision" / file).is_file()
