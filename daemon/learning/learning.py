@@ -343,9 +343,13 @@ class Learning:
         """The first alignment: the pairs that waited for it are learnt now, each once, in their order."""
         q, x = self._memory.all()
         self._begin(prior)
+        members = self._members_now
         for row_q, row_x in zip(q, x, strict=True):
+            errors = members.errors(row_q, row_x)
+            self._claims.predicted(row_q, errors, np.zeros(3))
+            members.learn(row_q, errors[INSTANT], np.inf)
             self._keep(row_q, row_x)
-        self._members_now.replay(q, x)
+        self._answering = choose(self._claims.compared, self._answering)
         self._replays_due = self._settings.replays_per_pair * len(q)
 
     def _serve_solver(self) -> bool:
