@@ -12,7 +12,7 @@ from daemon.bus import Bus, Request, client
 from daemon.wire import JSON, MSGPACK, ErrorReply, decode
 from interfaces.errors import BusError, RequestError
 
-LIMIT_S = 10.0
+LIMIT_S = 60.0
 KEY = "bodyschema/arm/status/sampler"
 
 
@@ -128,7 +128,7 @@ def test_who_is_alive_is_seen(server, asking) -> None:
     changes: Queue[bool] = Queue()
     asking.watch("bodyschema/arm/alive/sampler", changes.put)
     assert changes.get(timeout=LIMIT_S)
-    assert asking.alive("bodyschema/arm/alive/sampler")
+    assert asking.alive("bodyschema/arm/alive/sampler", timeout_s=LIMIT_S)
 
 
 def test_who_ends_is_no_longer_alive(endpoint) -> None:

@@ -23,7 +23,7 @@ from daemon.status_view import Seen, Watcher, as_json, screen
 from daemon.store import PairStore
 from interfaces.clock import SystemClock
 
-LIMIT_S = 20.0
+LIMIT_S = 60.0
 SAMPLER = SamplerStatus(
     robot="arm",
     store="2f9a",
