@@ -115,6 +115,8 @@ class Sampler:
             stack.callback(self._buffer.close)
             stack.callback(self.stop)
             self._serve()
+            name, endpoint = self._config.robot.name, self._config.tables.zenoh.sampler
+            log.info("the sampler of %s answers on %s; %d pairs are in %s", name, endpoint, self._seq, self._store.file)
             try:
                 self._sample()
                 self._serve_history()

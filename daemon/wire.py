@@ -13,6 +13,7 @@ from msgspec import Meta
 
 from interfaces.errors import RequestError
 from interfaces.records import Pair, frozen_array
+from interfaces.suggest import with_choices
 
 JSON = "application/json"
 MSGPACK = "application/msgpack"
@@ -123,7 +124,7 @@ def decode(payload: bytes, kind: type[M], encoding: str = JSON) -> M:
         decoder: Any = msgspec.msgpack if encoding == MSGPACK else msgspec.json
         return decoder.decode(payload, type=kind)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise RequestError(f"not a {kind.__name__}: {error}") from error
+        raise RequestError(f"not a {kind.__name__}: {with_choices(str(error), kind)}") from error
 
 
 def pair_to_wire(pair: Pair) -> PairMessage:

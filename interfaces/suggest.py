@@ -2,8 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import re
+from collections.abc import Iterable, Sequence
 from difflib import get_close_matches
+from typing import Any, Literal, get_args, get_origin
+
+import msgspec
+
+_CHOICE = re.compile(r"Invalid enum value (?P<value>'[^']*'|\S+)(?: - at `\$(?P<path>[^`]*)`)?")
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
@@ -13,3 +19,39 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
     if close:
         return f"Did you mean {close[0]!r}?"
     return f"Known are: {', '.join(names) or 'none'}"
+
+
+def with_choices(message: str, kind: Any) -> str:
+    """msgspec's message about a value that is none of the known ones, with these."""
+    wrong = _CHOICE.match(message)
+    if wrong is None:
+        return message
+    keys = key_path(wrong["path"] or "")
+    choices = _choices(hint_at(kind, keys))
+    known = f", known are: {', '.join(choices)}" if choices else ""
+    return f"{'.'.join(keys)}: {wrong['value']} is unknown{known}"
+
+
+def key_path(path: str) -> tuple[str, ...]:
+    """The keys in msgspec's path to a value, without the places in lists."""
+    return tuple(part for part in re.sub(r"\[[^\]]*\]", "", path).split(".") if part)
+
+
+def hint_at(kind: Any, keys: Sequence[str]) -> Any:
+    """The type of what stands under `keys` in the struct `kind`; None when it has no such field."""
+    for key in keys:
+        struct = struct_in(kind)
+        fields = {} if struct is None else {field.encode_name: field.type for field in msgspec.structs.fields(struct)}
+        kind = fields.get(key)
+    return kind
+
+
+def struct_in(hint: Any) -> type[msgspec.Struct] | None:
+    """The struct that a type is, or is made of."""
+    candidates = [hint, *get_args(hint)]
+    return next((c for c in candidates if isinstance(c, type) and issubclass(c, msgspec.Struct)), None)
+
+
+def _choices(hint: Any) -> list[str]:
+    found = [hint, *get_args(hint)]
+    return next(([str(value) for value in get_args(c)] for c in found if get_origin(c) is Literal), [])

@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 import msgspec
 
 from .errors import ConfigError
-from .suggest import did_you_mean
+from .suggest import did_you_mean, hint_at, key_path, struct_in, with_choices
 
 T = TypeVar("T")
 
@@ -87,35 +87,25 @@ def _dotted(key: str) -> tuple[str, ...]:
 def _located(message: str, kind: type, file: Path, text: str, prefix: tuple[str, ...]) -> ConfigError:
     unknown = _UNKNOWN.match(message)
     if unknown:
-        keys = prefix + _keys(unknown["path"] or "")
+        keys = prefix + key_path(unknown["path"] or "")
         field = unknown["field"]
         where = ".".join(keys)
         return ConfigError(
             f"unknown key {field!r}{f' in [{where}]' if where else ''}",
             file=file,
             line=line_of(text, (*keys, field)),
-            remedy=did_you_mean(field, _fields(kind, _keys(unknown["path"] or ""))),
+            remedy=did_you_mean(field, _fields(kind, key_path(unknown["path"] or ""))),
         )
     place = _PLACE.match(message)
-    keys = prefix + _keys(place["path"] if place else "")
+    keys = prefix + key_path(place["path"] if place else "")
+    explained = with_choices(message, kind)
+    if explained != message:
+        return ConfigError(".".join((*prefix, explained)), file=file, line=line_of(text, keys))
     what = place["what"] if place else message
     named = f"{'.'.join(keys)}: " if keys else ""
     return ConfigError(f"{named}{what[:1].lower()}{what[1:]}", file=file, line=line_of(text, keys) if keys else None)
 
 
-def _keys(path: str) -> tuple[str, ...]:
-    return tuple(part for part in re.sub(r"\[[^\]]*\]", "", path).split(".") if part)
-
-
 def _fields(kind: Any, keys: tuple[str, ...]) -> list[str]:
-    for key in keys:
-        hints = {field.encode_name: field.type for field in msgspec.structs.fields(kind)}
-        kind = _struct_of(hints.get(key))
-        if kind is None:
-            return []
-    return [field.encode_name for field in msgspec.structs.fields(kind)]
-
-
-def _struct_of(hint: Any) -> Any:
-    candidates = [hint, *getattr(hint, "__args__", ())]
-    return next((c for c in candidates if isinstance(c, type) and issubclass(c, msgspec.Struct)), None)
+    struct = struct_in(hint_at(kind, keys))
+    return [] if struct is None else [field.encode_name for field in msgspec.structs.fields(struct)]
