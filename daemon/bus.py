@@ -131,7 +131,10 @@ class Bus:
         self._declared.append(self._open.liveliness().declare_subscriber(key, receive, history=True))
 
     def alive(self, key: str, *, timeout_s: float = 2.0) -> bool:
-        """Whether somebody is alive under `key`."""
+        """Whether somebody is alive under `key`, which this session does not watch too.
+
+        zenoh answers from what a watch of the same session has heard so far, which may be nothing yet.
+        """
         return any(reply.ok is not None for reply in self._open.liveliness().get(key, timeout=timeout_s))
 
     def ask(self, key: str, payload: bytes = b"", *, encoding: str = JSON, timeout_s: float = 5.0) -> list[Reply]:

@@ -123,12 +123,17 @@ def test_an_endpoint_that_cannot_be_is_named() -> None:
         Bus(listen="carrier/pigeon").__enter__()
 
 
-def test_who_is_alive_is_seen(server, asking) -> None:
+def test_who_is_alive_is_found(server, asking) -> None:
+    server.token("bodyschema/arm/alive/sampler")
+    assert asking.alive("bodyschema/arm/alive/sampler", timeout_s=LIMIT_S)
+    assert not asking.alive("bodyschema/arm/alive/learner", timeout_s=LIMIT_S)
+
+
+def test_who_is_alive_already_is_told_to_who_watches(server, asking) -> None:
     server.token("bodyschema/arm/alive/sampler")
     changes: Queue[bool] = Queue()
     asking.watch("bodyschema/arm/alive/sampler", changes.put)
     assert changes.get(timeout=LIMIT_S)
-    assert asking.alive("bodyschema/arm/alive/sampler", timeout_s=LIMIT_S)
 
 
 def test_who_ends_is_no_longer_alive(endpoint) -> None:

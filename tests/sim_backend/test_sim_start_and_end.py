@@ -21,10 +21,13 @@ HOLD_OPEN = """
 import sys
 from interfaces.robot import RobotDescription
 from sim_backend import SimConfig, SimWorld, model_file
-with SimWorld(RobotDescription.load(model_file("upper_body")), SimConfig()) as world, world.joints, world.camera:
-    world.camera.read(20.0)
-    print(world.renderer_process.pid, flush=True)
-    {then}
+try:
+    with SimWorld(RobotDescription.load(model_file("upper_body")), SimConfig()) as world, world.joints, world.camera:
+        world.camera.read(20.0)
+        print(world.renderer_process.pid, flush=True)
+        sys.stdin.read()
+except KeyboardInterrupt:
+    pass
 """
 
 
@@ -36,7 +39,7 @@ def run_python(code, **options):
 
 
 def test_a_killed_parent_leaves_no_renderer_behind():
-    with run_python(HOLD_OPEN.format(then="sys.stdin.read()"), stdin=subprocess.PIPE) as parent:
+    with run_python(HOLD_OPEN, stdin=subprocess.PIPE) as parent:
         renderer = os.pidfd_open(int(parent.stdout.readline()))
         parent.kill()
     ended, _, _ = select.select([renderer], [], [], 20.0)
@@ -45,8 +48,7 @@ def test_a_killed_parent_leaves_no_renderer_behind():
 
 
 def test_an_interrupted_world_closes_its_renderer_and_says_nothing():
-    then = "\n    try: sys.stdin.read()\n    except KeyboardInterrupt: pass"
-    with run_python(HOLD_OPEN.format(then=then), stdin=subprocess.PIPE) as parent:
+    with run_python(HOLD_OPEN, stdin=subprocess.PIPE) as parent:
         renderer = os.pidfd_open(int(parent.stdout.readline()))
         parent.send_signal(signal.SIGINT)
         complaints = parent.stderr.read()
