@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from importlib.metadata import version
 
@@ -53,6 +54,8 @@ app = command_line()
 
 def main() -> None:
     """Run the command line; errors of ours become one line and exit code 1."""
+    # Threads of BLAS spin on the small matrices of tracker and learner, and take twice the time.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     arguments = sys.argv[1:]
     try:
         command_line(arguments[0] if arguments else None)(arguments)

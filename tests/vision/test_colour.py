@@ -75,7 +75,7 @@ def test_a_band_of_hues_is_a_table_in_the_file(tmp_path):
 @pytest.mark.parametrize(
     ("table", "line", "said"),
     [
-        ('colour = "read"', 2, "vision.colour: invalid enum value 'read'"),
+        ('colour = "read"', 2, "vision.colour: 'read' is unknown, known are: red, orange"),
         ("radius_m = 0", 2, "vision.radius_m: expected `float` > 0"),
         ("radius_m = -0.02", 2, "vision.radius_m"),
         ('radius_m = "20 mm"', 2, "vision.radius_m: expected `float`, got `str`"),
