@@ -252,7 +252,9 @@ def _parse(file: Path) -> Any:
             raise RobotError("the URDF is larger than 16 MiB", file=file, remedy="Keep meshes in files of their own")
         data = file.read_bytes()
     except OSError as error:
-        raise RobotError(f"cannot read the URDF: {error.strerror}", file=file, remedy="Mend the path: [robot] urdf in robot.toml, or --urdf") from error
+        raise RobotError(
+            f"cannot read the URDF: {error.strerror}", file=file, remedy="Mend [robot] urdf, or --urdf"
+        ) from error
     parser = etree.XMLParser(resolve_entities=False, no_network=True, load_dtd=False, huge_tree=False)
     try:
         root = etree.fromstring(data, parser)
