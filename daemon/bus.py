@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import logging
+import socket
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -24,6 +25,8 @@ log = logging.getLogger(__name__)
 
 LEASE_MS = 2000
 FIRST_TRY_MS = 100  # how long opening waits for a peer that is not there; trying goes on in the background
+ACCEPT_LIMIT_S = 1.0
+OPEN_TIMEOUT_MS = 5000
 RETRY_MS = {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 2}
 
 
@@ -177,12 +180,18 @@ class Bus:
             "connect/retry": RETRY_MS,
             "timestamping/enabled": True,
             "transport/link/tx/lease": LEASE_MS,
+            "transport/unicast/open_timeout": OPEN_TIMEOUT_MS,
         }
         for key, value in settings.items():
             config.insert_json5(key, json.dumps(value))
         return config
 
     def _explain(self, message: str) -> str:
+        if self._client and _accepts(self._connect or ""):
+            return (
+                f"somebody listens on {self._connect} but does not answer: it is stopped, very busy, or no bodyschema. "
+                "`ps` shows what it is"
+            )
         if self._client:
             return (
                 f"nobody listens on {self._connect}. Start the daemon with `bodyschema run`, "
@@ -239,3 +248,16 @@ def _taken_apart(reply: zenoh.Reply) -> Reply:
         return Reply(payload, decode(payload, ErrorReply, str(reply.err.encoding)).error)
     except RequestError:
         return Reply(payload, payload.decode(errors="replace"))
+
+
+def _accepts(endpoint: str) -> bool:
+    """Whether a connection to a TCP endpoint is taken, be it by a process that never answers."""
+    protocol, _, address = endpoint.partition("/")
+    host, _, port = address.rpartition(":")
+    if protocol != "tcp" or not port.isdigit():
+        return False
+    try:
+        with socket.create_connection((host.strip("[]"), int(port)), ACCEPT_LIMIT_S):
+            return True
+    except OSError:
+        return False

@@ -8,6 +8,7 @@ from importlib.metadata import version
 
 import cyclopts
 
+from daemon.signals import end_with_parent
 from interfaces.errors import BodyschemaError
 
 COMMANDS = {
@@ -56,6 +57,7 @@ def main() -> None:
     """Run the command line; errors of ours become one line and exit code 1."""
     # Threads of BLAS spin on the small matrices of tracker and learner, and take twice the time.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    end_with_parent()
     arguments = sys.argv[1:]
     try:
         command_line(arguments[0] if arguments else None)(arguments)

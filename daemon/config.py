@@ -7,6 +7,7 @@ word), then the file.
 from __future__ import annotations
 
 import os
+import re
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -18,25 +19,26 @@ from msgspec import Meta
 
 from drivers.config import DriversConfig
 from interfaces.errors import ConfigError
-from interfaces.robot import RobotDescription
-from interfaces.suggest import did_you_mean
+from interfaces.robot import CameraSection, RobotDescription, RobotSection
+from interfaces.suggest import did_you_mean, hint_at, with_choices
 from interfaces.toml_file import convert, line_of, read_toml
 from sim_backend.config import SimConfig
 from vision.config import VisionConfig
 
-Endpoint = Annotated[str, Meta(pattern=r"^[a-z0-9-]+/.+")]
 NonNegative = Annotated[float, Meta(ge=0)]
 Positive = Annotated[float, Meta(gt=0)]
 Count = Annotated[int, Meta(ge=1)]
 
 ENVIRONMENT = "BODYSCHEMA_"
+# Sockets in the file system have no port.
+ENDPOINT = re.compile(r"(tcp|udp|tls|quic|ws)/.+:[0-9]+|unixsock-stream/.+")
 
 
 class ZenohConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The table [zenoh]: where the two processes listen."""
 
-    sampler: Endpoint = "tcp/127.0.0.1:7447"
-    learner: Endpoint = "tcp/127.0.0.1:7448"
+    sampler: str = "tcp/127.0.0.1:7447"
+    learner: str = "tcp/127.0.0.1:7448"
 
 
 class DaemonConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -125,6 +127,7 @@ class Config:
         if tables.daemon.min_step_deg >= tables.daemon.max_step_deg:
             line = line_of(text, ("daemon", "min_step_deg"))
             raise ConfigError("min_step_deg is not below max_step_deg", file=file, line=line)
+        _check_endpoints(tables.zenoh, file, text)
         return cls(file, robot, tables)
 
     def with_state_dir(self, folder: Path) -> Config:
@@ -151,13 +154,38 @@ class Config:
         return self.state_dir / "learner.ckpt"
 
 
+def _check_endpoints(zenoh: ZenohConfig, file: Path, text: str) -> None:
+    for name, endpoint in msgspec.structs.asdict(zenoh).items():
+        if not ENDPOINT.fullmatch(endpoint):
+            line, remedy = line_of(text, ("zenoh", name)), "Write one like tcp/127.0.0.1:7447"
+            raise ConfigError(f"zenoh.{name}: {endpoint!r} is no endpoint", file=file, line=line, remedy=remedy)
+    if zenoh.sampler == zenoh.learner:
+        line = line_of(text, ("zenoh", "learner"))
+        raise ConfigError("sampler and learner have the same endpoint", file=file, line=line, remedy="Give two")
+
+
 def _override(raw: dict[str, Any], known: list[str], environment: Mapping[str, str]) -> dict[str, Any]:
     merged = {name: dict(table) if isinstance(table, dict) else table for name, table in raw.items()}
     for variable, value in environment.items():
         table, _, key = variable.removeprefix(ENVIRONMENT).lower().partition("_")
         if variable.startswith(ENVIRONMENT) and table in known and key:
-            merged.setdefault(table, {})[key] = _toml_value(value)
+            merged.setdefault(table, {})[key] = _checked(variable, table, key, _toml_value(value))
     return merged
+
+
+def _checked(variable: str, table: str, key: str, value: Any) -> Any:
+    """The value; ConfigError naming the environment variable when the table has no such key or it does not fit."""
+    kind = {"robot": RobotSection, "camera": CameraSection}.get(table) or hint_at(Tables, (table,))
+    fields = {field.encode_name: field.type for field in msgspec.structs.fields(kind)}
+    if key not in fields:
+        remedy = did_you_mean(key, fields)
+        raise ConfigError(f"the environment variable {variable}: unknown key {key!r} in [{table}]", remedy=remedy)
+    try:
+        msgspec.convert(value, fields[key])
+    except msgspec.ValidationError as error:
+        said = with_choices(str(error), fields[key])
+        raise ConfigError(f"the environment variable {variable}: {said[:1].lower()}{said[1:]}") from error
+    return value
 
 
 def _toml_value(text: str) -> Any:

@@ -29,6 +29,8 @@ class Readable(Source, Protocol[R_co]):
 class Reopening(Generic[R_co]):
     """Reads a source; when it is lost says so once, and tries to open it again, less and less often.
 
+    It is back when something was read: a device that can be opened and not be read is not.
+
     The first opening has to succeed: what fails at the start needs a person.
 
     Attributes:
@@ -49,11 +51,13 @@ class Reopening(Generic[R_co]):
         self._opened = ExitStack()
         self._wait_s = FIRST_WAIT_S
         self._next_try = 0.0
+        self._is_open = False
         self.trouble: str | None = None
         self.losses = 0
 
     def __enter__(self) -> Self:
         self._opened.enter_context(self._source)
+        self._is_open = True
         return self
 
     def __exit__(
@@ -63,16 +67,18 @@ class Reopening(Generic[R_co]):
 
     def read(self, timeout_s: float) -> R_co | None:
         """As the source's `read`; None also while the source is lost."""
-        if self.trouble is not None and not self._try_again(timeout_s):
+        if not self._is_open and not self._try_again(timeout_s):
             return None
         try:
-            return self._source.read(timeout_s)
+            seen = self._source.read(timeout_s)
         except SourceLost as error:
             self._opened.close()
-            self.losses += 1
-            self._wait_s = FIRST_WAIT_S
             self._lost(error)
             return None
+        if seen is not None and self.trouble is not None:
+            log.info("%s are back", self._name)
+            self.trouble, self._wait_s = None, FIRST_WAIT_S
+        return seen
 
     def _try_again(self, timeout_s: float) -> bool:
         left = self._next_try - self._wall.now()
@@ -82,15 +88,17 @@ class Reopening(Generic[R_co]):
         try:
             self._opened.enter_context(self._source)
         except SourceError as error:
-            self._wait_s = min(2 * self._wait_s, LONGEST_WAIT_S)
             self._lost(error)
             return False
-        log.info("%s are back", self._name)
-        self.trouble = None
+        self._is_open = True
         return True
 
     def _lost(self, error: SourceError) -> None:
         if self.trouble is None:
             log.warning("%s are lost: %s; trying to open them again", self._name, error)
+            self.losses += 1
+        else:
+            self._wait_s = min(2 * self._wait_s, LONGEST_WAIT_S)
+        self._is_open = False
         self.trouble = f"{self._name} are lost ({error}); trying to open them again"
         self._next_try = self._wall.now() + self._wait_s

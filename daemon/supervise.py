@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import logging
+import os
 import signal
 import subprocess
 import time
 from collections.abc import Sequence
 
+from daemon.signals import with_parent
 from interfaces.errors import BodyschemaError
 
 log = logging.getLogger(__name__)
@@ -45,7 +47,8 @@ class Child:
         now = time.monotonic()
         if self._process is None:
             if now >= self._start_at:
-                self._process = subprocess.Popen(self._command, stdin=subprocess.DEVNULL)
+                environment = os.environ | with_parent()
+                self._process = subprocess.Popen(self._command, stdin=subprocess.DEVNULL, env=environment)
                 self._started_at = now
             return
         lasted_s = now - self._started_at

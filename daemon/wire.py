@@ -66,7 +66,7 @@ class PredictReply(msgspec.Struct, frozen=True):
         in_support: whether the joint angles lie where data was.
         model: hash of the model that answered.
         pairs: how many pairs it had learnt.
-        age_s: time since the last of them, or null before any.
+        age_s: time since the last of them, or null before any since the learner started.
     """
 
     x: list[list[float]]

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import re
 import tomllib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -38,6 +40,18 @@ def read_toml(file: Path) -> tuple[dict[str, Any], str]:
         raise ConfigError(f"not TOML: {error}", file=file, line=int(line[1]) if line else None) from error
 
 
+def _not_finite(value: object, keys: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
+    """The keys under which a float is infinite or no number at all."""
+    if isinstance(value, float) and not math.isfinite(value):
+        yield keys
+    elif isinstance(value, dict):
+        for key, inner in value.items():
+            yield from _not_finite(inner, (*keys, key))
+    elif isinstance(value, list):
+        for inner in value:
+            yield from _not_finite(inner, keys)
+
+
 def _decoded(data: bytes, file: Path) -> str:
     try:
         return data.decode("utf-8-sig").replace("\r\n", "\n")
@@ -56,6 +70,8 @@ def convert(tables: object, kind: type[T], *, file: Path, text: str, prefix: tup
     Args:
         prefix: the keys under which `tables` stands in the file.
     """
+    for keys in _not_finite(tables, prefix):
+        raise ConfigError(f"{'.'.join(keys)}: not a finite number", file=file, line=line_of(text, keys))
     try:
         return msgspec.convert(tables, kind)
     except msgspec.ValidationError as error:

@@ -223,7 +223,7 @@ def _joint(joint: Any, file: Path) -> UrdfJoint:
     if lower > upper:
         raise RobotError(f"joint {joint.name!r} has its lower limit above its upper one", file=file, remedy="Swap them")
     origin = np.eye(4) if joint.origin is None else np.asarray(joint.origin, dtype=np.float64)
-    if not (np.isfinite(origin).all() and np.isfinite(axis).all()):
+    if not all(np.isfinite(part).all() for part in (origin, axis, lower, upper)):
         raise RobotError(f"joint {joint.name!r} has a number that is not finite", file=file)
     return UrdfJoint(
         name=joint.name,

@@ -133,4 +133,5 @@ def _start(memory: int, requests: int, answers: int) -> subprocess.Popen[bytes]:
         stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,
         env={**os.environ, "PYTHONPATH": path, "OPENBLAS_NUM_THREADS": "1"},
+        process_group=0,  # a signal to the group is the parent's to handle
     )

@@ -131,8 +131,10 @@ class SimWorld:
             self._moved.notify_all()
 
     def open_camera(self, is_open: bool) -> None:
-        """Begin or end to take frames for the camera."""
-        with self._moved:
+        """Begin or end to take frames for the camera; begins with a new renderer when the old one has died."""
+        with self._fetching, self._moved:
+            if is_open and self._renderer.process.poll() is not None:
+                self._renew_renderer()
             self._camera_open = is_open
             self._moved.notify_all()
 
@@ -181,6 +183,14 @@ class SimWorld:
             self._check_running()
             _check_open(self._camera_open)
             return True
+
+    def _renew_renderer(self) -> None:
+        """The frames that were under way are lost."""
+        self._renderer.__exit__(None, None, None)
+        self._renderer.__enter__()
+        self._renderer.hold_tool(self._truth.marker(self._physics.marker_xyz))
+        self._delivered = self._taken
+        self._frame_times.clear()
 
     def _may_take_frame(self) -> bool:
         return not self._camera_open or self._taken - self._delivered < FRAMES_AHEAD

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import queue
 import signal
 import subprocess
@@ -14,6 +15,7 @@ from contextlib import contextmanager
 from typing import IO
 
 from daemon.bus import Bus
+from daemon.signals import with_parent
 from interfaces.errors import BusError
 
 from .scene import Scene
@@ -60,7 +62,8 @@ def started_daemon(scene: Scene) -> Iterator[Daemon]:
     """Sampler and learner, from here to the end of the with statement."""
     command = [sys.executable, "-m", "daemon", "run", "--sim", "--robot", str(scene.robot_file)]
     with scene.log_file.open("wb") as log:
-        process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=log, stderr=log)
+        environment = os.environ | with_parent()
+        process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=log, stderr=log, env=environment)
         try:
             yield Daemon(process, scene)
         finally:

@@ -11,7 +11,8 @@ from daemon.wiring import demonstration_model
 from interfaces.errors import ConfigError
 
 STATE = "state"
-OURS = ("robot.toml", "recording.csv", "learning_curve.csv", "learning_curve.png", "daemon.log", STATE)
+# A folder with this file is a demo's, and may be emptied by the next one.
+MARK = ".bodyschema-demo"
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,17 +56,17 @@ def prepare(folder: Path, seed: int) -> Scene:
     """Lay out the demo's folder; what an earlier demo left there is replaced.
 
     Raises:
-        ConfigError: the folder holds files that no demo made, or cannot be written.
+        ConfigError: the folder is neither empty nor a demo's, or cannot be written.
     """
     model = demonstration_model()
-    known = {*OURS, *(path.name for path in model.parent.iterdir())}
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        foreign = sorted(path.name for path in folder.iterdir() if path.name not in known)
-        if foreign:
-            raise ConfigError(f"holds {foreign[0]!r}, which no demo made", file=folder, remedy="Give another --out")
+        found = sorted(path.name for path in folder.iterdir())
+        if found and MARK not in found:
+            raise ConfigError(f"holds {found[0]!r}, and no demo was here", file=folder, remedy="Give another --out")
         for path in list(folder.iterdir()):
             shutil.rmtree(path) if path.is_dir() else path.unlink()
+        (folder / MARK).touch()
         for path in model.parent.iterdir():
             if path.suffix in {".urdf", ".toml"}:
                 shutil.copyfile(path, folder / path.name)

@@ -171,9 +171,9 @@ class Claims:
 
     def restore(self, state: ClaimsState, arm_configurations: FloatArray, q: FloatArray) -> None:
         """Go on from a state; q (n, d) [rad] are the pairs with the present tool."""
+        for row in arm_configurations:
+            self._unknowns.add(row)
         if state.arm_sigma is not None:
-            for row in arm_configurations:
-                self._unknowns.add(row)
             self._unknowns.change_tool(state.arm_sigma)
         for row in q:
             self._unknowns.add(row)

@@ -32,6 +32,7 @@ class Fitting:
         self._chain = nominal.chain
         self._before: KBMap | None = None
         self._due_at = None if nominal.frame_known else nominal.pairs_to_align
+        self._is_first = True
 
     @property
     def due_at(self) -> int | None:
@@ -40,8 +41,8 @@ class Fitting:
 
     @property
     def is_first(self) -> bool:
-        """Whether the next fit is the first one."""
-        return self._due_at == (self._nominal.pairs_to_align if self._before is None else PAIRS_TO_REFIT)
+        """Whether nothing has been fitted yet."""
+        return self._is_first
 
     def due(self, pairs: int) -> bool:
         """Whether it is time to fit."""
@@ -49,7 +50,7 @@ class Fitting:
 
     def change_tool(self, before: KBMap) -> None:
         """From now on another tool is fitted on top of the map `before`."""
-        self._before, self._due_at = before, PAIRS_TO_REFIT
+        self._before, self._due_at, self._is_first = before, PAIRS_TO_REFIT, True
 
     def fit(self, q: FloatArray, x: FloatArray) -> Fit | None:
         """The prior that fits pairs q (n, d) [rad] and x (n, 3) [m] best; None when they do not determine it."""
@@ -66,17 +67,17 @@ class Fitting:
         if fit is None:
             self._due_at = pairs + max(self._nominal.pairs_to_align, PAIRS_TO_REFIT)
         else:
-            self._due_at, self._chain = 2 * pairs, fit.chain
+            self._due_at, self._chain, self._is_first = 2 * pairs, fit.chain, False
 
     def arrays(self) -> dict[str, FloatArray]:
-        """What a checkpoint has to keep beside `due_at`."""
+        """What a checkpoint has to keep beside `due_at` and `is_first`."""
         kept = {"chain_fixed": self._chain.fixed}
         return kept if self._before is None else kept | {"before_change": self._before.net}
 
-    def restore(self, due_at: int | None, arrays: Mapping[str, FloatArray]) -> None:
-        """Go on from `due_at` and `arrays`."""
+    def restore(self, due_at: int | None, is_first: bool, arrays: Mapping[str, FloatArray]) -> None:
+        """Go on from these and from `arrays`."""
         nominal = self._nominal.chain
-        self._due_at = due_at
+        self._due_at, self._is_first = due_at, is_first
         self._chain = RigidChain(arrays["chain_fixed"], nominal.axes, nominal.prismatic)
         if "before_change" in arrays:
             self._before = KBMap(self._nominal.bases, arrays["before_change"])

@@ -21,7 +21,7 @@ from .claims import Claims
 from .curve import Curve
 from .fitting import Fitting
 from .gate import CHANGE, DOUBT, Gate, limit_m, sound
-from .members import INSTANT, PRIOR, Members
+from .members import EXACT, INSTANT, PRIOR, Members
 from .memory import PairMemory, Permutations
 from .nominal import NominalModel
 from .scores import FEWEST_TO_ANSWER, choose
@@ -152,8 +152,10 @@ class Learning:
             self._publish()
 
     def restart_solver(self) -> None:
-        """The exact solver has lost its pairs: give it all of them again. For the thread that calls `work`."""
+        """The exact solver has lost its pairs: give them to it again. For the thread that calls `work`."""
         self._solving.restart()
+        with self._lock:
+            self._solve_from_what_is_known()
 
     def solve_soon(self) -> None:
         """Let the exact solver catch up although fewer than `solve_every` pairs are new. For that thread too."""
@@ -177,7 +179,9 @@ class Learning:
                 curve=self._curve.points,
                 curve_stride=self._curve.stride,
                 doubted_in_a_row=self._gate.in_a_row,
+                kept_of=self._memory.count,
                 next_fit=self._fitting.due_at,
+                first_fit=self._fitting.is_first,
                 replays_due=self._replays_due,
             )
             kept = {"arm_q": self._claims.arm_configurations} | self._fitting.arrays()
@@ -200,11 +204,11 @@ class Learning:
                 self._members_now.restore(nets)
             else:
                 self._begin_at_nominal()
-            self._fitting.restore(header.next_fit, state.arrays)
+            self._fitting.restore(header.next_fit, header.first_fit, state.arrays)
             self._claims = Claims(self._nominal.bases, EXPECTED_M)
             self._claims.restore(header.claims, state.arrays["arm_q"], state.arrays["q"])
-            for q, x in zip(state.arrays["q"], state.arrays["x"], strict=True):
-                self._memory.append(q, x)
+            self._memory.restore(state.arrays["q"], state.arrays["x"], header.kept_of)
+            self._solve_from_what_is_known()
             for q, x in zip(state.arrays["doubted_q"], state.arrays["doubted_x"], strict=True):
                 self._doubts.append(q, x)
             self._counters, self._answering = header.counters, header.answering
@@ -227,6 +231,7 @@ class Learning:
         self._order = Permutations(self._settings.seed)
         self._gate = Gate()
         self._replays_due = 0.0
+        self._solver_prior: KBMap | None = None
         self._task += 1
 
     @property
@@ -333,9 +338,16 @@ class Learning:
         self._order.restart()
         self._task += 1
 
+    def _solve_from_what_is_known(self) -> None:
+        """Where pairs are no longer kept, the last exact solution stands for them in the place of the prior."""
+        members = self._members
+        if members is not None and EXACT in members.maps and not self._memory.complete:
+            self._solver_prior = members.maps[EXACT]
+
     def _change_prior(self, members: Members, prior: KBMap) -> None:
         q, x = self._memory.all()
         members.start_again(prior, q, x)
+        self._solver_prior = None
         self._claims.prior_changed(x[-RECENT:] - prior.predict(q[-RECENT:]))
         self._replays_due += self._settings.replays_per_pair * min(len(q), RECENT)
 
@@ -358,7 +370,7 @@ class Learning:
         with self._lock:
             if self._members is None or self._members.prior.size > LARGEST_NET:
                 return False
-            task, prior = self._task, self._members.prior
+            task, prior = self._task, self._solver_prior or self._members.prior
         if solving.busy:
             return self._take_solution()
         if solving.begin(task, prior):

@@ -78,6 +78,8 @@ class Members:
         """The models that `nets` names."""
         self._maps |= {name: KBMap(self.prior.bases, net) for name, net in nets.items()}
         self._instant = NLMS(self._maps[INSTANT], self._step_size)
+        if EXACT in self._maps:
+            self._delayed = self._maps[INSTANT]
 
     def _renew(self) -> None:
         try:

@@ -16,15 +16,20 @@ class PairMemory:
     def __init__(self, joints: int, capacity: int) -> None:
         self._q = np.empty((capacity, joints))
         self._x = np.empty((capacity, 3))
-        self._count = 0
+        self._count = self._first = 0
 
     @property
     def count(self) -> int:
         """Pairs added since the last `clear`, kept or not."""
         return self._count
 
+    @property
+    def complete(self) -> bool:
+        """Whether all of them are kept."""
+        return self._oldest == 0
+
     def __len__(self) -> int:
-        return min(self._count, len(self._q))
+        return self._count - self._oldest
 
     def append(self, q: FloatArray, x: FloatArray) -> None:
         """Keep one pair, q (d,) and x (3,); the oldest makes room."""
@@ -34,14 +39,19 @@ class PairMemory:
 
     def clear(self) -> None:
         """Forget all pairs."""
-        self._count = 0
+        self._count = self._first = 0
+
+    def restore(self, q: FloatArray, x: FloatArray, count: int) -> None:
+        """Hold the pairs q (n, d), x (n, 3): the newest of `count`."""
+        self._count = self._first = count - len(q)
+        for row_q, row_x in zip(q, x, strict=True):
+            self.append(row_q, row_x)
 
     def since(self, count: int, limit: int | None = None) -> tuple[FloatArray, FloatArray, int]:
         """The kept pairs from the one numbered `count` (from 0) on: q (n, d), x (n, 3), and the count after them."""
-        begin = max(count, self._count - len(self._q))
+        begin = max(count, self._oldest)
         end = self._count if limit is None else min(self._count, begin + limit)
-        places = np.arange(begin, end) % len(self._q)
-        return self._q[places], self._x[places], end
+        return *self._numbered(np.arange(begin, end)), end
 
     def all(self) -> tuple[FloatArray, FloatArray]:
         """All kept pairs in order: q (n, d), x (n, 3)."""
@@ -50,12 +60,19 @@ class PairMemory:
 
     def some(self, end: int, limit: int) -> tuple[FloatArray, FloatArray]:
         """At most `limit` of the kept pairs before the one numbered `end`, evenly spread: q (n, d), x (n, 3)."""
-        begin = max(self._count - len(self._q), 0)
-        places = np.linspace(begin, end - 1, min(limit, max(end - begin, 0))).astype(np.intp) % len(self._q)
-        return self._q[places], self._x[places]
+        count = min(limit, max(end - self._oldest, 0))
+        return self._numbered(np.linspace(self._oldest, end - 1, count).astype(np.intp))
 
     def at(self, places: IntArray) -> tuple[FloatArray, FloatArray]:
-        """The pairs at places 0 ... len − 1, in no particular order: q (n, d), x (n, 3)."""
+        """The kept pairs at places 0 (the oldest) ... len − 1: q (n, d), x (n, 3)."""
+        return self._numbered(self._oldest + places)
+
+    @property
+    def _oldest(self) -> int:
+        return max(self._first, self._count - len(self._q))
+
+    def _numbered(self, numbers: IntArray) -> tuple[FloatArray, FloatArray]:
+        places = numbers % len(self._q)
         return self._q[places], self._x[places]
 
 

@@ -47,7 +47,9 @@ class LearningHeader(msgspec.Struct, kw_only=True):
         answering: the model that answers.
         claims: what is known of each model's errors.
         doubted_in_a_row: length of the present run of doubted pairs.
+        kept_of: how many pairs there were since the prior; the newest of them are kept.
         next_fit: pairs at which what is not known, or the tool after a change, is fitted again; None when nothing is.
+        first_fit: whether that is the first one.
         replays_due: replay steps that are still owed.
     """
 
@@ -58,7 +60,9 @@ class LearningHeader(msgspec.Struct, kw_only=True):
     curve: list[CurvePoint]
     curve_stride: int
     doubted_in_a_row: int
+    kept_of: int
     next_fit: int | None
+    first_fit: bool
     replays_due: float
 
 

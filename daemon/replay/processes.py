@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from daemon.bus import Bus
+from daemon.signals import with_parent
 from interfaces.errors import BusError
 
 START_LIMIT_S = 60.0
@@ -73,8 +74,14 @@ def started(name: str, arguments: list[str], environment: Mapping[str, str], log
     """`bodyschema NAME ARGUMENTS` from here to the end of the with statement."""
     command = [sys.executable, "-m", "daemon", name, *arguments]
     with log.open("wb") as stream:
+        # In a process group of its own: Ctrl-C in a terminal is the parent's to handle.
         popen = subprocess.Popen(
-            command, stdin=subprocess.DEVNULL, stdout=stream, stderr=stream, env=os.environ | environment
+            command,
+            stdin=subprocess.DEVNULL,
+            stdout=stream,
+            stderr=stream,
+            env=os.environ | environment | with_parent(),
+            process_group=0,
         )
         process = Process(name, log, popen)
         try:

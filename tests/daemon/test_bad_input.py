@@ -6,6 +6,7 @@ import contextlib
 import io
 import json
 import os
+import socket
 import subprocess
 import sys
 import tempfile
@@ -25,7 +26,7 @@ from daemon.keys import Keys
 from daemon.status import LearnerStatus
 from daemon.store import PairReader
 from daemon.wire import decode
-from interfaces.errors import RequestError
+from interfaces.errors import BusError, RequestError
 
 LIMIT_S = 60.0
 PROCESSES = ("sampler", "learner", "run")
@@ -242,6 +243,16 @@ def process_running(config: Config, process: str, by: tuple[str, ...] = ("-m", "
         finally:
             child.terminate()
             child.wait(LIMIT_S)
+
+
+def test_a_process_that_takes_the_connection_and_says_nothing_is_not_taken_for_none(free_endpoint) -> None:
+    endpoint = free_endpoint()
+    with (
+        socket.create_server(("127.0.0.1", int(endpoint.rpartition(":")[2]))),
+        pytest.raises(BusError, match=r"listens on .* but does not answer"),
+        client(endpoint),
+    ):
+        pass
 
 
 @pytest.fixture(scope="module")

@@ -65,7 +65,11 @@ LINE = ROBOT.count("\n")  # the tables appended begin on the next line
         ("[daemon]\nmin_step_deg = 'one'\n", 2, "daemon.min_step_deg: expected `float`, got `str`"),
         ("[daemon]\nmin_step_deg = -1\n", 2, "daemon.min_step_deg: expected `float` > 0"),
         ("[daemon]\nmin_step_deg = 4\n", 2, "min_step_deg is not below max_step_deg"),
-        ("[zenoh]\nsampler = '7447'\n", 2, "zenoh.sampler: expected `str` matching regex"),
+        ("[zenoh]\nsampler = '7447'\n", 2, "zenoh.sampler: '7447' is no endpoint. Write one like tcp/127.0.0.1:7447"),
+        ("[zenoh]\nlearner = 'tcp/127.0.0.1'\n", 2, "zenoh.learner: 'tcp/127.0.0.1' is no endpoint"),
+        ("[zenoh]\nlearner = 'tcp/127.0.0.1:7447'\n", 2, "sampler and learner have the same endpoint"),
+        ("[daemon]\nmax_step_deg = inf\n", 2, "daemon.max_step_deg: not a finite number"),
+        ("[sim.encoders]\n\nnoise_ticks = nan\n", 3, "sim.encoders.noise_ticks: not a finite number"),
         ("[daemon]\nmin_step_deg = = 1\n", 2, "not TOML"),
     ],
 )
@@ -77,12 +81,12 @@ def test_a_mistake_is_named_with_its_line(tmp_path, tables, line, said) -> None:
 
 
 def test_a_mistake_in_the_environment_is_named(tmp_path) -> None:
-    with pytest.raises(ConfigError, match=r"daemon\.min_step_deg: expected `float`, got `str`"):
+    with pytest.raises(ConfigError, match="variable BODYSCHEMA_DAEMON_MIN_STEP_DEG: expected `float`, got `str`"):
         load(tmp_path, environment={"BODYSCHEMA_DAEMON_MIN_STEP_DEG": "little"})
 
 
 def test_an_unknown_key_in_the_environment_is_refused(tmp_path) -> None:
-    with pytest.raises(ConfigError, match=r"unknown key 'min_step' in \[daemon\]"):
+    with pytest.raises(ConfigError, match=r"BODYSCHEMA_DAEMON_MIN_STEP: unknown key 'min_step' in \[daemon\]"):
         load(tmp_path, environment={"BODYSCHEMA_DAEMON_MIN_STEP": "1"})
 
 

@@ -201,6 +201,29 @@ def test_a_restored_learner_answers_as_the_one_that_was_saved() -> None:
     np.testing.assert_allclose(before.sigma, after.sigma, rtol=0.1)
 
 
+@pytest.mark.parametrize("end", ["restart", "lost solver"])
+def test_what_was_learnt_from_pairs_that_are_no_longer_kept_is_not_forgotten(end: str) -> None:
+    scene = Scene.draw(0, 600)
+    settings = LearnerConfig(replay_capacity=150)
+    learning = new_learning(settings=settings)
+    teach(learning, scene.pairs)
+    early = Scene(scene.chain, scene.q[:300], [])
+    before, sigma = early.error_m(learning), learning.snapshot.predict(early.q).sigma.mean()
+    if end == "restart":
+        state, learning = learning.state(), new_learning(settings=settings)
+        learning.restore(state)
+    else:
+        learning.restart_solver()
+    learning.solve_soon()
+    teach(
+        learning,
+        measured(scene.chain, scene.q[-1] + path(np.random.default_rng(1), 60), np.random.default_rng(1), first=601),
+    )
+    assert early.error_m(learning) < 1.5 * before
+    assert learning.snapshot.predict(early.q).sigma.mean() < 3.0 * sigma
+    assert learning.snapshot.predict(early.q).in_support.all()
+
+
 @pytest.mark.parametrize("seed", SEEDS)
 def test_an_untold_tool_change_is_found_once(seed: int) -> None:
     scene = Scene.draw(seed, 300)

@@ -78,6 +78,22 @@ def test_a_loss_is_logged_once_however_long_it_lasts(caplog) -> None:
     ]
 
 
+def test_a_source_that_opens_but_cannot_be_read_is_tried_less_and_less_often() -> None:
+    clock, script = SteppedClock(), Scripted([*[SourceLost("dead")] * 5, READING])
+    with Reopening(script, "the encoders", clock, clock.sleep) as source:
+        read_until_reading(source)
+    assert clock.t - 100.0 == pytest.approx(0.5 + 1 + 2 + 4 + 8)
+
+
+def test_a_source_that_opens_but_cannot_be_read_is_not_called_back(caplog) -> None:
+    with reopening(Scripted([*[SourceLost("dead")] * 5, READING])) as source, caplog.at_level(logging.INFO):
+        read_until_reading(source)
+    assert [record.message for record in caplog.records] == [
+        "the encoders are lost: dead; trying to open them again",
+        "the encoders are back",
+    ]
+
+
 def test_the_trouble_is_told_until_the_source_is_back() -> None:
     with reopening(Scripted([SourceLost("unplugged"), READING])) as source:
         source.read(0.1)

@@ -1,13 +1,15 @@
 from __future__ import annotations
 
-import itertools
 import os
+import select
 import signal
+import socket
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -102,38 +104,54 @@ def test_a_child_that_fails_after_it_had_settled_is_started_again(tmp_path, monk
 
 
 def test_the_command_run_ends_both_processes_on_sigterm(tmp_path, free_endpoint) -> None:
-    robot, log = _robot(tmp_path, free_endpoint), tmp_path / "log"
-    with log.open("wb") as stream:
-        run = subprocess.Popen([sys.executable, "-m", "daemon", "run", "--robot", robot], stderr=stream)
-    try:
-        wait_until(lambda: (tmp_path / "state" / "pairs.sqlite").exists() and b"answers on" in log.read_bytes())
+    with running(_robot(tmp_path, free_endpoint(), free_endpoint()), tmp_path / "log") as run:
         children = _children(run.pid)
         run.send_signal(signal.SIGTERM)
-        assert run.wait(LIMIT_S) == 0, log.read_text()
-    finally:
-        run.kill()
+        assert run.wait(LIMIT_S) == 0, (tmp_path / "log").read_text()
     assert len(children) == 2
     assert all(map(gone, children))
 
 
+def test_a_killed_run_takes_both_processes_with_it(tmp_path, free_endpoint) -> None:
+    with running(_robot(tmp_path, free_endpoint(), free_endpoint()), tmp_path / "log") as run:
+        children = [os.pidfd_open(pid) for pid in _children(run.pid)]
+        run.kill()
+        ended = [bool(select.select([child], [], [], LIMIT_S)[0]) for child in children]
+    assert ended == [True, True]
+
+
 def test_the_command_run_with_a_port_in_use_ends_with_its_message(tmp_path, free_endpoint) -> None:
-    robot = _robot(tmp_path, itertools.repeat(free_endpoint()).__next__)  # one endpoint for both processes
-    command = [sys.executable, "-m", "daemon", "run", "--robot", robot]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=LIMIT_S, check=False)
+    taken = free_endpoint()
+    with socket.create_server(("127.0.0.1", int(taken.rpartition(":")[2]))):
+        command = [sys.executable, "-m", "daemon", "run", "--robot", _robot(tmp_path, taken, free_endpoint())]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=LIMIT_S, check=False)
     assert done.returncode == 1
     assert "is in use. Stop the other bodyschema" in done.stderr
+
+
+@contextmanager
+def running(robot: Path, log: Path) -> Iterator[subprocess.Popen[bytes]]:
+    """`bodyschema run`, with both processes at work."""
+    with log.open("wb") as stream:
+        run = subprocess.Popen([sys.executable, "-m", "daemon", "run", "--robot", robot], stderr=stream)
+    try:
+        wait_until(lambda: log.read_bytes().count(b" answers on ") == 2)
+        yield run
+    finally:
+        run.kill()
+        run.wait()
 
 
 def _children(pid: int) -> list[int]:
     return [int(child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
 
 
-def _robot(folder: Path, endpoint: Callable[[], str]) -> Path:
+def _robot(folder: Path, sampler: str, learner: str) -> Path:
     from small_arm import write_small_arm
 
     (folder / "walk.csv").write_text("waist,shoulder,x,y,z\n0.1,0.2,0.3,0.4,0.5\n")
     return write_small_arm(
         folder,
-        f'[zenoh]\nsampler = "{endpoint()}"\nlearner = "{endpoint()}"\n[daemon]\nstate_dir = "state"\n'
+        f'[zenoh]\nsampler = "{sampler}"\nlearner = "{learner}"\n[daemon]\nstate_dir = "state"\n'
         '[drivers]\nrecording = "walk.csv"\nspeed = 0\n',
     )

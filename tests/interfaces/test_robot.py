@@ -70,6 +70,8 @@ def test_a_joint_that_is_not_learnt_stands_where_held_at_says(tmp_path) -> None:
 @pytest.mark.parametrize(
     ("right", "wrong", "line", "said"),
     [
+        ('"base"\n', '"base"\nxyz = [0.0, nan, 0.0]\n', 8, "camera.xyz: not a finite number"),
+        ('"base"\n', '"base"\nfocal_px = inf\n', 8, "camera.focal_px: not a finite number"),
         ('"waist", ', '"wiast", ', 4, "there is no joint 'wiast' in arm.urdf. Did you mean 'waist'?"),
         ('"waist", ', '"leg", ', 4, "there is no joint 'leg' in arm.urdf. Known are: waist, shoulder, flange"),
         ('"waist", ', '"flange", ', 4, "joint 'flange' is fixed. Take it out of joints"),

@@ -187,6 +187,14 @@ def test_a_dead_renderer_is_a_lost_source(world):
         frames(world, 10)
 
 
+def test_a_camera_that_is_opened_again_after_its_renderer_died_gives_frames(world):
+    world.renderer_process.kill()
+    with pytest.raises(SourceLost):
+        frames(world, 10)
+    with world.camera:
+        assert None not in frames(world, 3)
+
+
 def test_the_ball_is_red_in_both_images(world):
     frame = frames(world, 1)[0]
     assert min(red_pixels(frame.left), red_pixels(frame.right)) > 200

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import re
 import subprocess
 import sys
 from dataclasses import dataclass
@@ -60,6 +61,20 @@ def test_predictions_were_answered_all_the_while(demo: Demo) -> None:
 
 def test_without_a_terminal_the_demo_prints_plain_lines(demo: Demo) -> None:
     assert "\x1b" not in demo.result.stdout
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("seed", range(5))
+def test_the_demo_reaches_its_figures_and_claims_what_is_true(tmp_path: Path, seed: int) -> None:
+    """At most 20 mm after 600 pairs and 30 mm 300 pairs after the tool change; the claim is right within a factor 2."""
+    command = [sys.executable, "-m", "daemon", "demo", "--out", str(tmp_path / "out"), "--seed", str(seed)]
+    done = subprocess.run(command, check=True, capture_output=True, text=True, timeout=LIMIT_S)
+    first, second = re.findall(r"│ +([\d.]+) mm │ +([\d.]+) mm │ +(\d+) % │", done.stdout)
+    print(f"seed {seed}: {first}, {second}")
+    for (error, claimed, covered), limit_mm in ((first, 20.0), (second, 30.0)):
+        assert float(error) <= limit_mm
+        assert 0.5 < float(claimed) / float(error) < 2.0
+        assert 40.0 < float(covered) < 95.0
 
 
 def test_the_demo_refuses_a_folder_that_is_not_its_own(tmp_path: Path) -> None:
