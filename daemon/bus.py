@@ -27,6 +27,8 @@ LEASE_MS = 2000
 FIRST_TRY_MS = 100  # how long opening waits for a peer that is not there; trying goes on in the background
 ACCEPT_LIMIT_S = 1.0
 OPEN_TIMEOUT_MS = 5000
+# What clients call a payload when nobody told them: taken for JSON.
+PLAIN = ("zenoh/", "text/")
 RETRY_MS = {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 2}
 
 
@@ -209,6 +211,10 @@ class Bus:
     ) -> None:
         asked = str(query.encoding) if query.encoding is not None else JSON
         encoding = MSGPACK if asked.startswith(MSGPACK) else JSON
+        if not asked.startswith((JSON, MSGPACK, *PLAIN)):
+            said = f"the encoding {asked} is unknown; known are {JSON} and {MSGPACK}"
+            query.reply_err(encode(ErrorReply(said), encoding), encoding=zenoh.Encoding(encoding))
+            return
         payload = query.payload.to_bytes() if query.payload is not None else b""
         parameters = dict(_parameters(str(query.parameters)))
         try:

@@ -6,6 +6,7 @@ Meshes are never loaded: kinematics and limits are all that is asked of the file
 from __future__ import annotations
 
 import io
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -274,4 +275,13 @@ def _read_robot(data: bytes, file: Path) -> Any:
     try:
         return URDF.load(io.BytesIO(data), build_scene_graph=False, load_meshes=False).robot
     except Exception as error:  # yourdfpy raises whatever its conversions raise
-        raise RobotError(f"not a URDF that can be understood: {error}", file=file) from error
+        raise RobotError(
+            f"not a URDF that can be understood: {error}", file=file, line=_line_of(error, data)
+        ) from error
+
+
+def _line_of(error: Exception, data: bytes) -> int | None:
+    """The first line (from 1) that holds the text which the error quotes; None when it quotes none that is there."""
+    quoted = re.search(r"'([^']+)'", str(error))
+    place = -1 if quoted is None else data.find(quoted[1].encode())
+    return None if place < 0 else data.count(b"\n", 0, place) + 1

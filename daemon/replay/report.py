@@ -7,6 +7,9 @@ import msgspec
 from daemon.evaluate import BLOCKS, ErrorFigures
 from daemon.screen import mm
 
+# No arm is described that badly: rather another unit, or another robot [mm].
+FAR_MM = 1000.0
+
 
 class Figures(msgspec.Struct, frozen=True):
     """Distances between prediction and measurement on the held-out rows [mm]."""
@@ -101,6 +104,8 @@ def _row(figures: Figures) -> str:
 
 
 def _verdict(report: ReplayReport) -> str:
+    if report.before.mean_mm > FAR_MM:
+        return "Metres apart: are the positions in metres, the angles in radians, and both of this robot?"
     ratio = report.after.mean_mm / report.before.mean_mm if report.before.mean_mm else 1.0
     if abs(ratio - 1.0) < 0.01:
         return "Learning left the mean error as it was."

@@ -67,6 +67,12 @@ def test_an_error_comes_in_the_encoding_of_the_request(server, asking) -> None:
     assert decode(reply.err.payload.to_bytes(), ErrorReply, MSGPACK).error.startswith("q has 3 numbers")
 
 
+def test_an_encoding_that_nobody_speaks_is_refused_by_name(server, asking) -> None:
+    server.answer(KEY, lambda request: request.payload)
+    with pytest.raises(RequestError, match="encoding application/x-msgpack is unknown; known are application/json"):
+        asking.ask_one(KEY, encoding="application/x-msgpack")
+
+
 def test_a_handler_with_a_bug_answers_all_the_same(server, asking) -> None:
     server.answer(KEY, break_down)
     with pytest.raises(RequestError, match="please report it: ZeroDivisionError: a bug"):
