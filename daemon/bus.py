@@ -236,6 +236,15 @@ def client(endpoint: str) -> Iterator[Bus]:
         yield bus
 
 
+def is_alive(endpoint: str, token: str) -> bool:
+    """Whether somebody listens on `endpoint` and has declared the liveliness token."""
+    try:
+        with client(endpoint) as bus:
+            return bus.alive(token)
+    except BusError:
+        return False
+
+
 def _parameters(text: str) -> Iterator[tuple[str, str]]:
     for part in text.split(";"):
         name, _, value = part.partition("=")

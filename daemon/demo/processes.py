@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import IO
 
-from daemon.bus import Bus
+from daemon.bus import is_alive
 from daemon.signals import with_parent
 from interfaces.errors import BusError
 
@@ -40,21 +40,13 @@ class Daemon:
     def wait_for(self, endpoint: str, alive: str) -> None:
         """Return as soon as the process that listens on `endpoint` is alive; BusError when it is not in time."""
         limit = time.monotonic() + START_LIMIT_S
-        while not _is_alive(endpoint, alive):
+        while not is_alive(endpoint, alive):
             self.check()
             if time.monotonic() > limit:
                 raise BusError(
                     f"nobody is alive on {endpoint} after {START_LIMIT_S:.0f} s; {self._scene.log_file} says why"
                 )
             time.sleep(0.1)
-
-
-def _is_alive(endpoint: str, key: str) -> bool:
-    try:
-        with Bus(connect=endpoint, client=True) as bus:
-            return bus.alive(key)
-    except BusError:
-        return False
 
 
 @contextmanager

@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from daemon.bus import Bus
+from daemon.bus import is_alive
 from daemon.signals import with_parent
 from interfaces.errors import BusError
 
@@ -44,7 +44,7 @@ class Process:
         Listening is not enough: it is alive when it answers.
         """
         limit = time.monotonic() + START_LIMIT_S
-        while not _is_alive(endpoint, token):
+        while not is_alive(endpoint, token):
             self.check()
             if time.monotonic() > limit:
                 raise BusError(f"the {self.name} does not answer after {START_LIMIT_S:.0f} s; {self.log} may say why")
@@ -59,14 +59,6 @@ class Process:
         except subprocess.TimeoutExpired:
             self.popen.kill()
             self.popen.wait()
-
-
-def _is_alive(endpoint: str, token: str) -> bool:
-    try:
-        with Bus(connect=endpoint, client=True) as bus:
-            return bus.alive(token)
-    except BusError:
-        return False
 
 
 @contextmanager
