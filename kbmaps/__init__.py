@@ -7,6 +7,7 @@ from kbmaps.align import Alignment, align
 from kbmaps.basis import JointBasis, learning_bases
 from kbmaps.block_choice import blockwise_precision, follow_a_path
 from kbmaps.chain import RigidChain
+from kbmaps.chain_parameters import ChainParameters, ChainTolerances
 from kbmaps.errors import (
     BasisError,
     ChainError,
@@ -30,6 +31,8 @@ __all__ = [
     "Alignment",
     "BasisError",
     "ChainError",
+    "ChainParameters",
+    "ChainTolerances",
     "DegenerateDataError",
     "ExactLearner",
     "ExactSolution",
