@@ -8,6 +8,7 @@ from kbmaps.basis import JointBasis, learning_bases
 from kbmaps.block_choice import blockwise_precision, follow_a_path
 from kbmaps.chain import RigidChain
 from kbmaps.chain_parameters import ChainParameters, ChainTolerances
+from kbmaps.chain_report import ChainReport, Interval
 from kbmaps.errors import (
     BasisError,
     ChainError,
@@ -21,7 +22,9 @@ from kbmaps.errors import (
 )
 from kbmaps.exact import ExactLearner, ExactSolution
 from kbmaps.kbmap import KBMap, prediction_errors
+from kbmaps.model import Estimate, Model
 from kbmaps.nlms import NLMS
+from kbmaps.rigid_learner import RigidLearner
 from kbmaps.support import SUPPORT_LIMIT, SupportSet
 from kbmaps.tool import with_refitted_marker
 
@@ -32,16 +35,21 @@ __all__ = [
     "BasisError",
     "ChainError",
     "ChainParameters",
+    "ChainReport",
     "ChainTolerances",
     "DegenerateDataError",
+    "Estimate",
     "ExactLearner",
     "ExactSolution",
+    "Interval",
     "JointBasis",
     "KBMap",
     "KBMapsError",
+    "Model",
     "ModelFormatError",
     "NonFiniteError",
     "RigidChain",
+    "RigidLearner",
     "SettingError",
     "ShapeError",
     "SingularAlphaError",

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kbmaps.arrays import FloatArray, frozen, rows_or_vector, vector
+from kbmaps.arrays import BoolArray, FloatArray, frozen, rows_or_vector, vector
 from kbmaps.chain import RigidChain
 from kbmaps.errors import SettingError
 
@@ -171,7 +171,8 @@ class ChainParameters:
         """Positions (n, 3) and their derivatives (n, 3, size) by the change, at q (n, d); the inputs are trusted.
 
         With R_k the rotation before and R_{k+1} the one after joint k, and r the lever from its axis to the marker, a
-        tilt of the axis about u moves the marker by (R_k u − R_{k+1} u) × r, a shift by v moves it by R_k v − R_{k+1} v.
+        tilt of the axis about u moves the marker by (R_k u − R_{k+1} u) × r, a shift by v moves it by
+        R_k v − R_{k+1} v.
         """
         geometry = self._geometry(change)
         angles = q + geometry.zeros
@@ -270,13 +271,13 @@ def _exponentials(turns: FloatArray) -> tuple[FloatArray, FloatArray]:
 
     exp([φ + δ]×) = exp([J δ]×) exp([φ]×) to first order, with the left Jacobian J (Chirikjian 2012, section 10.8).
     """
-    angles = np.sqrt(np.einsum("ki,ki->k", turns, turns))[:, None, None]
-    safe = np.maximum(angles, _SMALL_ANGLE)
-    small = angles < _SMALL_ANGLE
+    angles: FloatArray = np.sqrt(np.einsum("ki,ki->k", turns, turns))[:, None, None]
+    safe: FloatArray = np.maximum(angles, _SMALL_ANGLE)
+    small: BoolArray = angles < _SMALL_ANGLE
     squares = angles * angles
-    sine = np.where(small, 1.0 - squares / 6.0, np.sin(safe) / safe)
-    cosine = np.where(small, 0.5 - squares / 24.0, (1.0 - np.cos(safe)) / (safe * safe))
-    rest = np.where(small, 1.0 / 6.0 - squares / 120.0, (1.0 - np.sin(safe) / safe) / (safe * safe))
+    sine: FloatArray = np.where(small, 1.0 - squares / 6.0, np.sin(safe) / safe)
+    cosine: FloatArray = np.where(small, 0.5 - squares / 24.0, (1.0 - np.cos(safe)) / (safe * safe))
+    rest: FloatArray = np.where(small, 1.0 / 6.0 - squares / 120.0, (1.0 - np.sin(safe) / safe) / (safe * safe))
     k = _cross_matrices(turns)
     kk = k @ k
     return _EYE + sine * k + cosine * kk, _EYE + cosine * k + rest * kk
