@@ -9,6 +9,7 @@ from kbmaps.block_choice import blockwise_precision, follow_a_path
 from kbmaps.chain import RigidChain
 from kbmaps.chain_parameters import ChainParameters, ChainTolerances
 from kbmaps.chain_report import ChainReport, Interval
+from kbmaps.chain_search import find_chain
 from kbmaps.errors import (
     BasisError,
     ChainError,
@@ -25,6 +26,7 @@ from kbmaps.kbmap import KBMap, prediction_errors
 from kbmaps.model import Estimate, Model
 from kbmaps.nlms import NLMS
 from kbmaps.rigid_learner import RigidLearner
+from kbmaps.rigid_recursive import RecursiveRigidLearner
 from kbmaps.support import SUPPORT_LIMIT, SupportSet
 from kbmaps.tool import with_refitted_marker
 
@@ -48,6 +50,7 @@ __all__ = [
     "Model",
     "ModelFormatError",
     "NonFiniteError",
+    "RecursiveRigidLearner",
     "RigidChain",
     "RigidLearner",
     "SettingError",
@@ -56,6 +59,7 @@ __all__ = [
     "SupportSet",
     "align",
     "blockwise_precision",
+    "find_chain",
     "follow_a_path",
     "learning_bases",
     "prediction_errors",
