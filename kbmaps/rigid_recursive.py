@@ -234,7 +234,7 @@ class RecursiveRigidLearner:
         self._change = self._moved(update.step)
         self._covariance -= update.gains @ update.precision @ update.gains.T
         if not told:
-            self._reestimate(distance)
+            self._reestimate(distance, update.precision)
 
     def _update(
         self, change: FloatArray, present: FloatArray, q: FloatArray, x: FloatArray, noise_square: float, weight: float
@@ -266,9 +266,13 @@ class RecursiveRigidLearner:
         square = float(np.vdot(turning @ self._covariance, turning)) / 3.0
         return 0.25 * (square / self._reach) ** 2
 
-    def _reestimate(self, distance: float) -> None:
-        """Noise² from the squared Mahalanobis distance of an innovation, which is 3 on average when it is right."""
-        total = self._noise_coordinates + 3.0
-        square = self._noise_square * (self._noise_coordinates + distance) / total
+    def _reestimate(self, distance: float, precision: FloatArray) -> None:
+        """Noise² from the squared Mahalanobis distance of an innovation, which is 3 on average when it is right.
+
+        Fisher scoring: an innovation tells of the noise by the share that noise has in its variance.
+        """
+        share = self._noise_square * float(np.trace(precision)) / 3.0
+        total = self._noise_coordinates + 3.0 * share**2
+        square = self._noise_square * (1.0 + share * (distance - 3.0) / total)
         self._noise_square = max(square, _LEAST_NOISE_M**2)
         self._noise_coordinates = min(total, _NOISE_MEMORY)
