@@ -11,6 +11,8 @@ from kbmaps.arrays import BoolArray, FloatArray, frozen, rows_or_vector, vector
 from kbmaps.chain import RigidChain
 from kbmaps.errors import SettingError
 
+# What an infinite tolerance is taken for [rad, m]: far beyond anything real, and still a proper prior.
+WIDE = 10.0
 _FIXED_PARAMETERS = 9
 _JOINT_PARAMETERS = 5
 # Below this angle [rad] the quotients of the exponential map are taken from their series.

@@ -43,6 +43,7 @@ class ChainReport:
         zeros: what has to be added to each joint's reading (d) [rad, m].
         noise: 1-sigma of a measured coordinate [m], estimated or told (their RMS).
         misfit: residual over what the noise explains; about 1 for a rigid chain, 1 where the noise was not told.
+        freedom: residual coordinates minus those that the parameters have used up; few make `noise` uncertain.
         outliers: how many pairs were left out.
         determined: how many independent directions of the free parameters the pairs show.
         undetermined: names of the free parameters that the pairs do not fix on their own. They can make up for each
@@ -56,6 +57,7 @@ class ChainReport:
     zeros: Interval
     noise: float
     misfit: float
+    freedom: float
     outliers: int
     determined: int
     undetermined: tuple[str, ...]
@@ -69,6 +71,7 @@ def chain_report(
     *,
     noise: float,
     misfit: float,
+    freedom: float,
     outliers: int,
     determined: int,
 ) -> ChainReport:
@@ -86,6 +89,7 @@ def chain_report(
         zeros=interval(parameters.zeros),
         noise=noise,
         misfit=misfit,
+        freedom=freedom,
         outliers=outliers,
         determined=determined,
         undetermined=tuple(names[k] for k in np.flatnonzero(loose > _LOOSE)),

@@ -9,11 +9,9 @@ from typing import cast
 import numpy as np
 
 from kbmaps.arrays import BoolArray, FloatArray
-from kbmaps.chain_parameters import ChainParameters
+from kbmaps.chain_parameters import WIDE, ChainParameters
 from kbmaps.pairs import Pairs
 
-# What an infinite tolerance is taken for [rad, m]: far beyond anything real, and still a proper prior.
-_WIDE = 10.0
 # Noise that is estimated is never below this [m]: there rounding begins.
 _ROUNDING_M = 1e-9
 # A pair beyond this many sigma is an outlier: of good ones 3 in 100,000 are as far out (chi, three dimensions).
@@ -84,7 +82,7 @@ class _Fitter:
     def __init__(self, parameters: ChainParameters, std: FloatArray, pairs: Pairs, start: FloatArray) -> None:
         self.parameters, self.pairs = parameters, pairs
         self.free = std > 0.0
-        self.scales = np.minimum(std[self.free], _WIDE)
+        self.scales = np.minimum(std[self.free], WIDE)
         self.linear = _Linearised(parameters, pairs, self.scales, self.free)
         self.linear.at(start)
         self.least_noise = 1.0 if pairs.known else _ROUNDING_M / float(pairs.unit.min())

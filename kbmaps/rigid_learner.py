@@ -11,9 +11,9 @@ from numpy.typing import ArrayLike
 from scipy.special import stdtrit  # pyright: ignore[reportMissingTypeStubs, reportUnknownVariableType]
 
 from kbmaps.align import align
-from kbmaps.arrays import BoolArray, FloatArray, rows, rows_or_vector
+from kbmaps.arrays import BoolArray, FloatArray, frozen, rows, rows_or_vector
 from kbmaps.chain import RigidChain
-from kbmaps.chain_parameters import ChainParameters, ChainTolerances, rotation_vector
+from kbmaps.chain_parameters import WIDE, ChainParameters, ChainTolerances, rotation_vector
 from kbmaps.chain_report import ChainReport, chain_report
 from kbmaps.errors import DegenerateDataError, KBMapsError, ModelFormatError
 from kbmaps.model import Estimate
@@ -69,6 +69,23 @@ class RigidLearner:
         return self._parameters.chain(self._change())
 
     @property
+    def tolerances(self) -> ChainTolerances:
+        """How far the real chain may be from the nominal one."""
+        return self._tolerances
+
+    @property
+    def change(self) -> FloatArray:
+        """The most probable parameters (size,) as in `ChainParameters` (read-only)."""
+        return frozen(self._change())
+
+    @property
+    def covariance(self) -> FloatArray:
+        """Posterior covariance (size, size) of the parameters [rad², m²]; the prior's without pairs (read-only)."""
+        fit = self._fitted()
+        spread = self._prior_spread() if fit is None else fit.spread
+        return frozen(spread @ spread.T)
+
+    @property
     def inliers(self) -> BoolArray:
         """Which pairs (n,), as they came, are no outliers."""
         fit = self._fitted()
@@ -116,8 +133,7 @@ class RigidLearner:
         angles = rows("q", q, self.joints)
         fit = self._fitted()
         if fit is None:
-            prior = np.diag(np.minimum(self._std, 1e6))
-            x, variance = self._spread(np.zeros(self._parameters.size), prior, angles)
+            x, variance = self._spread(np.zeros(self._parameters.size), self._prior_spread(), angles)
             return Estimate(x, np.sqrt(variance), np.zeros(len(angles), dtype=np.bool_))
         x, variance = self._spread(fit.change, fit.spread, angles)
         inside = variance.sum(axis=1) <= _SUPPORT_FACTOR * self._widest
@@ -146,6 +162,7 @@ class RigidLearner:
             fit.loose,
             noise=unit if pairs.known else unit * fit.noise,
             misfit=fit.noise if pairs.known else 1.0,
+            freedom=fit.freedom,
             outliers=int((~fit.inliers).sum()),
             determined=fit.rank,
         )
@@ -176,6 +193,9 @@ class RigidLearner:
             raise ModelFormatError(f"the bytes do not describe a rigid learner: {error}") from error
         learner._sigma = sigma
         return learner
+
+    def _prior_spread(self) -> FloatArray:
+        return np.diag(np.minimum(self._std, WIDE))
 
     def _units(self) -> Pairs:
         return with_units(self._q, self._x, self._sigma)

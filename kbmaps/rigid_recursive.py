@@ -11,15 +11,14 @@ from numpy.typing import ArrayLike
 
 from kbmaps.arrays import FloatArray, frozen, rows, rows_or_vector
 from kbmaps.chain import RigidChain
-from kbmaps.chain_parameters import ChainParameters, ChainTolerances
+from kbmaps.chain_parameters import WIDE, ChainParameters, ChainTolerances
 from kbmaps.errors import KBMapsError, ModelFormatError, NonFiniteError, SettingError, ShapeError
 from kbmaps.model import Estimate
 from kbmaps.packing import pack, unpack
 from kbmaps.pairs import checked_pairs
+from kbmaps.rigid_learner import RigidLearner
 
 _KIND = "rigid chain, recursive, 1"
-# What an infinite tolerance is taken for [rad, m].
-_WIDE = 10.0
 # Unit of the marker's place where its tolerance is 0, so that a tool change can loosen it [m].
 _TOOL_UNIT = 0.1
 _ITERATIONS = 5
@@ -55,7 +54,8 @@ class RecursiveRigidLearner:
     """Corrects a rigid chain with each pair, at a constant cost (7 joints: 0.3 ms) and without keeping pairs.
 
     The parameters and the prior are those of `RigidLearner`. The filter linearises each pair once, where the chain is
-    when the pair comes; the curvature left out is taken for noise, so that early pairs do not make it too sure.
+    when the pair comes; the curvature left out is taken for noise, so that early pairs do not make it too sure. That
+    works from tolerances as rough drawings have them; where more is open, begin with `continuing` a batch.
 
     Args:
         nominal: the chain as drawn.
@@ -72,7 +72,7 @@ class RecursiveRigidLearner:
             raise SettingError(f"noise must be finite and greater than 0 m, got {noise!r}")
         self._parameters = ChainParameters(nominal)
         self._tolerances = tolerances
-        std = np.minimum(self._parameters.standard_deviations(tolerances), _WIDE)
+        std = np.minimum(self._parameters.standard_deviations(tolerances), WIDE)
         tool = np.zeros(self._parameters.size, dtype=np.bool_)
         tool[self._parameters.tool] = True
         self._active = (std > 0.0) | tool
@@ -84,6 +84,22 @@ class RecursiveRigidLearner:
         self._noise_square = noise**2
         self._noise_coordinates = _NOISE_COORDINATES
         self._pairs = 0
+
+    @classmethod
+    def continuing(cls, batch: RigidLearner) -> Self:
+        """A learner that goes on from what a batch has found.
+
+        Raises:
+            DegenerateDataError: the batch has learnt no pair.
+        """
+        report = batch.report()
+        learner = cls(batch.nominal, batch.tolerances, noise=max(report.noise, _LEAST_NOISE_M))
+        active = learner._active
+        learner._change = np.array(batch.change)
+        learner._covariance = batch.covariance[np.ix_(active, active)] / np.outer(learner._scales, learner._scales)
+        learner._noise_coordinates = max(float(np.clip(report.freedom, 0.0, _NOISE_MEMORY)), _NOISE_COORDINATES)
+        learner._pairs = batch.pairs
+        return learner
 
     @property
     def joints(self) -> int:
