@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kbmaps.arrays import BoolArray, FloatArray, rows_or_vector
+from kbmaps.arrays import FloatArray, rows_or_vector
 from kbmaps.errors import NonFiniteError, SettingError, ShapeError
 
 
@@ -27,10 +27,6 @@ class Pairs:
 
     def __len__(self) -> int:
         return len(self.q)
-
-    def only(self, chosen: BoolArray) -> Pairs:
-        """The chosen ones (n,) of the pairs."""
-        return Pairs(self.q[chosen], self.x[chosen], self.unit[chosen], self.known)
 
 
 def with_units(q: FloatArray, x: FloatArray, sigma: FloatArray) -> Pairs:

@@ -50,43 +50,40 @@ class RigidFit:
     log_evidence: float
 
 
-class _Linearised:
-    """Residuals and Jacobian at one change, in parameters of unit prior variance."""
+@dataclass(frozen=True, eq=False)
+class _Point:
+    """Residuals (n, 3), their norms in units (n,), and Jacobian (n, 3, f) at one change (size,).
 
-    def __init__(self, parameters: ChainParameters, pairs: Pairs, scales: FloatArray, free: BoolArray) -> None:
-        self._parameters, self._pairs = parameters, pairs
-        self._scales, self._free = scales, free
+    The f free parameters are counted in prior standard deviations; `offset` (f,) is how far they are from the prior.
+    """
 
-    def at(self, change: FloatArray) -> None:
-        x, jacobian = self._parameters.linearised(change, self._pairs.q)
-        self.change = change
-        self.residuals = self._pairs.x - x
-        self.norms = np.linalg.norm(self.residuals, axis=1) / self._pairs.unit
-        self.jacobian = jacobian[:, :, self._free] * self._scales
-        self.offset = change[self._free] / self._scales
+    change: FloatArray
+    residuals: FloatArray
+    norms: FloatArray
+    jacobian: FloatArray
+    offset: FloatArray
 
     def reduced(self, roots: FloatArray) -> FloatArray:
         """Triangular factor (f+1, f+1) of the rows [J, residual], each pair's multiplied by its root (n,)."""
         rows = np.concatenate([self.jacobian, self.residuals[:, :, None]], axis=2) * roots[:, None, None]
         return cast(FloatArray, np.linalg.qr(rows.reshape(-1, rows.shape[2]), mode="r"))
 
-    def moved(self, step: FloatArray) -> FloatArray:
-        change = self.change.copy()
-        change[self._free] += self._scales * step
-        return change
+    def cost(self, roots: FloatArray) -> float:
+        residuals = np.einsum("ni,ni,n->", self.residuals, self.residuals, roots * roots)
+        return float(residuals + self.offset @ self.offset)
 
 
 class _Fitter:
     """One fit on its way: what is minimised is Σ (root ‖residual‖)² + ‖offset‖² with the roots of the present noise."""
 
     def __init__(self, parameters: ChainParameters, std: FloatArray, pairs: Pairs, start: FloatArray) -> None:
-        self.parameters, self.pairs = parameters, pairs
+        self._parameters, self.pairs = parameters, pairs
         self.free = std > 0.0
         self.scales = np.minimum(std[self.free], WIDE)
-        self.linear = _Linearised(parameters, pairs, self.scales, self.free)
-        self.linear.at(start)
+        self.point = self._at(start)
         self.least_noise = 1.0 if pairs.known else _ROUNDING_M / float(pairs.unit.min())
-        self.damping = _FIRST_DAMPING
+        self._damping = _FIRST_DAMPING
+        # Residual coordinates that the parameters use up.
         self.used = float(min(self.free.sum(), 3 * len(pairs)))
 
     def typical(self) -> float:
@@ -94,47 +91,41 @@ class _Fitter:
 
         The middle lies above the median by the pairs that the parameters can explain whatever they are.
         """
-        norms = self.linear.norms
+        norms = self.point.norms
         rank = min(int(0.5 * (len(norms) + self.used / 3.0)), len(norms) - 1)
         return max(float(np.partition(norms, rank)[rank]) / _MEDIAN_NORM, self.least_noise)
 
     def improve(self, weights: FloatArray, noise: float) -> float:
         """A Levenberg-Marquardt step; returns its length in units of what is left open (0: none was found)."""
-        linear = self.linear
-        roots = np.sqrt(weights) / (self.pairs.unit * noise)
-        factor = linear.reduced(roots)
+        point, roots = self.point, np.sqrt(weights) / (self.pairs.unit * noise)
+        factor = point.reduced(roots)
         design, target = factor[:, :-1], factor[:, -1]
-        before = self._cost(roots)
-        columns = np.einsum("ij,ij->j", design, design)
-        self._measure(design)
-        while self.damping <= _MOST_DAMPING:
-            held = np.sqrt(1.0 + self.damping * columns)
-            rows = np.concatenate([design, np.diag(held)])
-            wanted = np.concatenate([target, -linear.offset / held])
-            q, r = np.linalg.qr(rows)
-            projected = q.T @ wanted
-            step = cast(FloatArray, np.linalg.solve(r, projected))
-            length = float(np.linalg.norm(projected))
-            point = (linear.change, linear.residuals, linear.norms, linear.jacobian, linear.offset)
-            linear.at(linear.moved(step))
-            if self._cost(roots) <= before:
-                self.damping = max(self.damping * 0.1, _LEAST_DAMPING)
+        before, columns = point.cost(roots), np.einsum("ij,ij->j", design, design)
+        squares = np.square(np.linalg.svd(design, compute_uv=False))
+        self.used = float((squares / (1.0 + squares)).sum())  # γ of MacKay 1992, "Bayesian interpolation"
+        while self._damping <= _MOST_DAMPING:
+            held = np.sqrt(1.0 + self._damping * columns)
+            q, r = np.linalg.qr(np.concatenate([design, np.diag(held)]))
+            projected = q.T @ np.concatenate([target, -point.offset / held])
+            change = point.change.copy()
+            change[self.free] += self.scales * np.linalg.solve(r, projected)
+            length, tried = float(np.linalg.norm(projected)), self._at(change)
+            if tried.cost(roots) <= before:
+                self.point, self._damping = tried, max(self._damping * 0.1, _LEAST_DAMPING)
                 return length
-            linear.change, linear.residuals, linear.norms, linear.jacobian, linear.offset = point
             if length < _SMALL_STEP:
                 return 0.0
-            self.damping = max(self.damping * 10.0, _FIRST_DAMPING)
-        self.damping = _FIRST_DAMPING
+            self._damping = max(self._damping * 10.0, _FIRST_DAMPING)
+        self._damping = _FIRST_DAMPING
         return 0.0
 
-    def _cost(self, roots: FloatArray) -> float:
-        residuals = np.einsum("ni,ni,n->", self.linear.residuals, self.linear.residuals, roots * roots)
-        return float(residuals + self.linear.offset @ self.linear.offset)
-
-    def _measure(self, design: FloatArray) -> None:
-        """How many residual coordinates the parameters use up: Σ s² / (1 + s²) (MacKay 1992)."""
-        squares = np.square(np.linalg.svd(design, compute_uv=False))
-        self.used = float((squares / (1.0 + squares)).sum())
+    def _at(self, change: FloatArray) -> _Point:
+        x, jacobian = self._parameters.linearised(change, self.pairs.q)
+        residuals = self.pairs.x - x
+        norms = np.linalg.norm(residuals, axis=1) / self.pairs.unit
+        return _Point(
+            change, residuals, norms, jacobian[:, :, self.free] * self.scales, change[self.free] / self.scales
+        )
 
 
 def fit_chain(parameters: ChainParameters, std: FloatArray, pairs: Pairs, start: FloatArray) -> RigidFit:
@@ -152,7 +143,7 @@ def fit_chain(parameters: ChainParameters, std: FloatArray, pairs: Pairs, start:
 def _anneal(fitter: _Fitter) -> None:
     scale = math.inf
     for _ in range(_ROUNDS):
-        norms = fitter.linear.norms
+        norms = fitter.point.norms
         goal = _SCALES_PER_SIGMA * fitter.typical()
         scale = max(min(scale / 1.4, float(norms.max())), goal)
         step = fitter.improve((scale**2 / (scale**2 + norms**2)) ** 2, scale / _SCALES_PER_SIGMA)
@@ -163,14 +154,14 @@ def _anneal(fitter: _Fitter) -> None:
 def _polish(fitter: _Fitter) -> RigidFit:
     pairs = fitter.pairs
     noise = fitter.typical()
-    inliers = fitter.linear.norms <= _OUTLIER_SIGMAS * noise
+    inliers = fitter.point.norms <= _OUTLIER_SIGMAS * noise
     freedom = 0.0
     for _ in range(_ROUNDS):
         step = fitter.improve(inliers.astype(np.float64), noise)
         freedom = max(3.0 * float(inliers.sum()) - fitter.used, 0.0)
-        square = float(np.square(fitter.linear.norms[inliers]).sum())
+        square = float(np.square(fitter.point.norms[inliers]).sum())
         estimate = _noise(square, freedom, pairs.known, fitter.least_noise)
-        chosen = fitter.linear.norms <= _OUTLIER_SIGMAS * max(estimate, fitter.typical())
+        chosen = fitter.point.norms <= _OUTLIER_SIGMAS * max(estimate, fitter.typical())
         settled = bool((chosen == inliers).all()) and abs(estimate - noise) <= 1e-3 * noise
         inliers, noise = chosen, estimate
         if settled and step < _SMALL_STEP * math.sqrt(1.0 + freedom):
@@ -188,9 +179,9 @@ def _noise(square: float, freedom: float, known: bool, least: float) -> float:
 
 
 def _summary(fitter: _Fitter, inliers: BoolArray, noise: float, freedom: float) -> RigidFit:
-    linear, free, scales = fitter.linear, fitter.free, fitter.scales
+    point, free, scales = fitter.point, fitter.free, fitter.scales
     size = len(free)
-    factor = linear.reduced(inliers / (fitter.pairs.unit * noise))
+    factor = point.reduced(inliers / (fitter.pairs.unit * noise))
     _, singular, vt = np.linalg.svd(factor[:, :-1])
     singular = np.concatenate([singular, np.zeros(len(vt) - len(singular))])
     loose, rank = _undetermined(factor[:, :-1] / scales)
@@ -199,11 +190,11 @@ def _summary(fitter: _Fitter, inliers: BoolArray, noise: float, freedom: float) 
     spread[np.ix_(free, free)] = scales[:, None] * left
     looseness = np.zeros(size)
     looseness[free] = loose
-    square = float(np.square(linear.norms[inliers]).sum()) / noise**2 + float(linear.offset @ linear.offset)
+    square = float(np.square(point.norms[inliers]).sum()) / noise**2 + float(point.offset @ point.offset)
     spans = 6.0 * float(np.log(noise * fitter.pairs.unit[inliers]).sum())
     evidence = -0.5 * (square + spans + 3.0 * float(inliers.sum()) * math.log(2.0 * math.pi))
     evidence -= 0.5 * float(np.log1p(np.square(singular)).sum())
-    return RigidFit(linear.change, noise, freedom, inliers, spread, rank, looseness, evidence)
+    return RigidFit(point.change, noise, freedom, inliers, spread, rank, looseness, evidence)
 
 
 def _undetermined(design: FloatArray) -> tuple[FloatArray, int]:
