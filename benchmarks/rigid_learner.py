@@ -18,6 +18,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 
+from benchmarks.humanoid_arm import guided_path
 from benchmarks.rough_arm import ROUGH, RoughArm, least_error, rough_arm
 from benchmarks.timing import interleaved_medians_us
 from interfaces.robot import RobotDescription
@@ -170,6 +171,39 @@ def new_tool(seeds: int) -> None:
     print(f"\nTool moved by 200 mm after 600 pairs, sigma 5 mm: {np.mean(errors):.2f} mm after 10 pairs (recursive)")
 
 
+def guided_stream(seeds: int) -> None:
+    """A marker moved by about 250 mm, met on a hand-guided path in steps of 1 to 3 degrees; sigma 20 mm, d = 7."""
+    moved = 0.25 / math.sqrt(3.0)
+    drawings = {
+        "calibrated drawing": ChainTolerances(tool=moved),
+        "rough drawing (2 deg, 10 mm)": ChainTolerances(axes=math.radians(2.0), points=0.01, tool=moved),
+    }
+    stages = (30, 300, 1700)
+    for name, tolerances in drawings.items():
+        rows: list[list[float]] = []
+        for seed in range(seeds):
+            rng = np.random.default_rng(seed)
+            arm = rough_arm(7, rng, tolerances)
+            q = guided_path(stages[-1], rng).q
+            x = arm.measured(q, 0.02, rng)
+            off_path = rng.normal(0.0, math.radians(22.0), (TEST_ROWS, 7))
+            recursive = RecursiveRigidLearner(arm.drawing, tolerances)
+            row: list[float] = []
+            for stage in stages:
+                recursive.learn(q[recursive.pairs : stage], x[recursive.pairs : stage], 0.02)
+                whole = RigidLearner(arm.drawing, tolerances)
+                whole.learn(q[:stage], x[:stage], 0.02)
+                near = q[rng.integers(0, stage, TEST_ROWS)] + rng.normal(0.0, math.radians(5.0), (TEST_ROWS, 7))
+                row += [mean_error_mm(model, arm, off_path) for model in (recursive, whole)]
+                row += [1e3 * least_error(arm, q[:stage], 0.02, off_path, rng, tolerances)]
+                row += [mean_error_mm(whole, arm, near)]
+            rows.append(row)
+        print(f"\nGuided path, {name}, sigma 20 mm: pairs, recursive, batch (bound) off the path; batch near it")
+        for stage, figures in zip(stages, np.mean(rows, axis=0).reshape(len(stages), 4), strict=True):
+            recursive_mm, batch_mm, bound, near_mm = figures
+            print(f"  {stage:5d}  {recursive_mm:6.2f}  {batch_mm:6.2f} ({bound:5.2f})  {near_mm:6.2f}")
+
+
 def cost() -> None:
     rng = np.random.default_rng(0)
     arm = rough_arm(7, rng)
@@ -234,7 +268,7 @@ def main() -> None:
     parser.add_argument("--recording", type=Path, action="append", default=[], help="folder with a robot.toml")
     arguments = parser.parse_args()
     seeds: int = arguments.seeds
-    for part in (exactness, noisy, from_nothing, local_zone, outliers, new_tool):
+    for part in (exactness, noisy, from_nothing, local_zone, outliers, new_tool, guided_stream):
         part(seeds)
     cost()
     for folder in arguments.recording:

@@ -53,9 +53,16 @@ def rough_arm(joints: int, rng: np.random.Generator, tolerances: ChainTolerances
     return RoughArm(drawing, drawing.standard_deviations(tolerances) * rng.normal(size=drawing.size))
 
 
-def least_error(arm: RoughArm, q: FloatArray, sigma: float, test: FloatArray, rng: np.random.Generator) -> float:
+def least_error(
+    arm: RoughArm,
+    q: FloatArray,
+    sigma: float,
+    test: FloatArray,
+    rng: np.random.Generator,
+    tolerances: ChainTolerances = ROUGH,
+) -> float:
     """Mean error [m] at `test` of the posterior of the right model with the right prior, linearised at the truth."""
-    std = arm.parameters.standard_deviations(ROUGH)
+    std = arm.parameters.standard_deviations(tolerances)
     free = std > 0.0
     _, jacobian = arm.parameters.linearised(arm.change, q)
     design = (jacobian[:, :, free] * std[free]).reshape(3 * len(q), -1) / sigma
