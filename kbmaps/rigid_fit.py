@@ -19,6 +19,8 @@ _OUTLIER_SIGMAS = 4.8
 # A residual norm of noise σ per axis has the median 1.538 σ in three dimensions.
 _MEDIAN_NORM = 1.538
 _SCALES_PER_SIGMA = 3.0
+# Told noise explains a sum of squared residuals up to so many of its standard deviations (χ²) above its mean.
+_MISFIT_SIGMAS = 3.0
 _ROUNDS = 80
 _FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-3, 1e-12, 1e8
 # A step that changes the fit by less than this share of what the noise leaves open is the last.
@@ -173,7 +175,7 @@ def _noise(square: float, freedom: float, known: bool, least: float) -> float:
     if not known:
         return max(math.sqrt(square / freedom), least) if freedom > 0.0 else least
     # Residuals by chance above what the known noise explains are no sign of a chain that does not fit.
-    if square <= freedom + 2.0 * math.sqrt(2.0 * freedom):
+    if square <= freedom + _MISFIT_SIGMAS * math.sqrt(2.0 * freedom):
         return 1.0
     return max(math.sqrt(square / freedom), 1.0)
 

@@ -17,6 +17,7 @@ from kbmaps import (
     DegenerateDataError,
     ModelFormatError,
     NonFiniteError,
+    RecursiveRigidLearner,
     RigidLearner,
     SettingError,
     ShapeError,
@@ -86,6 +87,26 @@ def test_claimed_intervals_cover_as_they_say():
     # 40 arms with some 27 directions each: 1.5 % is the standard error of the first mean.
     assert 0.63 < np.mean(inside) < 0.74
     assert 0.92 < np.mean(inside_twice) < 0.98
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("learner", [RigidLearner, RecursiveRigidLearner])
+@pytest.mark.parametrize("told", [True, False])
+@pytest.mark.parametrize(("pairs", "reach_deg"), [(30, 80), (300, 80), (300, 20)])
+def test_over_two_hundred_arms_the_claimed_intervals_cover_as_they_say(learner, told, pairs, reach_deg):
+    inside, inside_twice = [], []
+    for seed in range(200):
+        rng = np.random.default_rng(seed)
+        arm = rough_arm(rng)
+        model = learner(arm.nominal, ROUGH)
+        model.learn(*arm.pairs(rng, pairs, 0.01, reach_deg), 0.01 if told else None)
+        q = random_q(rng, arm.kinds, 200, 80)
+        estimate = model.estimate(q)
+        off = np.abs(estimate.x - arm.real.positions(q)) / estimate.sigma
+        inside.append((off < 1).mean())
+        inside_twice.append((off < 1.96).mean())
+    assert 0.66 < np.mean(inside) < 0.70
+    assert 0.93 < np.mean(inside_twice) < 0.97
 
 
 @pytest.mark.parametrize("told", [True, False])
