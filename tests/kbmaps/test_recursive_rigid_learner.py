@@ -38,15 +38,15 @@ def test_pair_by_pair_is_all_at_once_where_the_problem_is_linear(seed, kinds):
     np.testing.assert_allclose(other.sigma, one.sigma, rtol=5e-3)
 
 
-@given(seed=seeds)
-@settings(max_examples=8, deadline=None)
-def test_thirty_exact_pairs_make_a_rough_drawing_exact_to_a_millimetre(seed):
-    rng = np.random.default_rng(seed)
-    tolerances = replace(ROUGH, axes=np.radians(2.0), points=0.01)
-    arm = rough_arm(rng, "RRRRRR", tolerances)
-    learner = RecursiveRigidLearner(arm.nominal, tolerances)
-    learner.learn(*arm.pairs(rng, 40), 1e-4)
-    assert arm.error(learner, rng) < 1e-3
+def test_thirty_exact_pairs_leave_less_than_a_third_of_a_millimetre_of_a_rough_drawing_on_average():
+    errors = []
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        arm = rough_arm(rng)
+        learner = RecursiveRigidLearner(arm.nominal, ROUGH)
+        learner.learn(*arm.pairs(rng, 30), 1e-4)
+        errors.append(arm.error(learner, rng))
+    assert np.mean(errors) < 3.3e-4
 
 
 def test_claimed_intervals_cover_as_they_say_at_every_stage():
