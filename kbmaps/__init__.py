@@ -7,6 +7,9 @@ from kbmaps.align import Alignment, align
 from kbmaps.basis import JointBasis, learning_bases
 from kbmaps.block_choice import blockwise_precision, follow_a_path
 from kbmaps.chain import RigidChain
+from kbmaps.chain_parameters import ChainParameters, ChainTolerances
+from kbmaps.chain_report import ChainReport, Interval
+from kbmaps.chain_search import find_chain
 from kbmaps.errors import (
     BasisError,
     ChainError,
@@ -20,7 +23,10 @@ from kbmaps.errors import (
 )
 from kbmaps.exact import ExactLearner, ExactSolution
 from kbmaps.kbmap import KBMap, prediction_errors
+from kbmaps.model import Estimate, Model
 from kbmaps.nlms import NLMS
+from kbmaps.rigid_learner import RigidLearner
+from kbmaps.rigid_recursive import RecursiveRigidLearner
 from kbmaps.support import SUPPORT_LIMIT, SupportSet
 from kbmaps.tool import with_refitted_marker
 
@@ -30,21 +36,30 @@ __all__ = [
     "Alignment",
     "BasisError",
     "ChainError",
+    "ChainParameters",
+    "ChainReport",
+    "ChainTolerances",
     "DegenerateDataError",
+    "Estimate",
     "ExactLearner",
     "ExactSolution",
+    "Interval",
     "JointBasis",
     "KBMap",
     "KBMapsError",
+    "Model",
     "ModelFormatError",
     "NonFiniteError",
+    "RecursiveRigidLearner",
     "RigidChain",
+    "RigidLearner",
     "SettingError",
     "ShapeError",
     "SingularAlphaError",
     "SupportSet",
     "align",
     "blockwise_precision",
+    "find_chain",
     "follow_a_path",
     "learning_bases",
     "prediction_errors",

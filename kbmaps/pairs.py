@@ -1,0 +1,66 @@
+"""Pairs of joint angles and measured positions, checked where they come in."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from kbmaps.arrays import FloatArray, rows_or_vector
+from kbmaps.errors import NonFiniteError, SettingError, ShapeError
+
+
+@dataclass(frozen=True, eq=False)
+class Pairs:
+    """Pairs q (n, d) [rad, m] and x (n, 3) [m].
+
+    Attributes:
+        unit: 1-sigma (n,) of each coordinate [m] up to a common factor.
+        known: whether that factor is 1; otherwise it has to be estimated.
+    """
+
+    q: FloatArray
+    x: FloatArray
+    unit: FloatArray
+    known: bool
+
+    def __len__(self) -> int:
+        return len(self.q)
+
+
+def with_units(q: FloatArray, x: FloatArray, sigma: FloatArray) -> Pairs:
+    """Pairs from their sigma (n,) [m], NaN where it was not told.
+
+    As soon as one was not told, the others count relative to their median, which stands for the missing ones too.
+    """
+    told = ~np.isnan(sigma)
+    if told.all():
+        return Pairs(q, x, sigma, len(q) > 0)
+    if not told.any():
+        return Pairs(q, x, np.ones(len(q)), False)
+    return Pairs(q, x, np.where(told, sigma / np.median(sigma[told]), 1.0), False)
+
+
+def checked_pairs(
+    q: ArrayLike, x: ArrayLike, sigma: ArrayLike | None, joints: int
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """q (n, d), x (n, 3) and sigma (n,), NaN for None, from many pairs or one.
+
+    Raises:
+        ShapeError, NonFiniteError, SettingError: a sigma that is not positive.
+    """
+    angles = np.atleast_2d(rows_or_vector("q", q, joints))
+    positions = np.atleast_2d(rows_or_vector("x", x, 3))
+    if len(angles) != len(positions):
+        raise ShapeError("x", f"({len(angles)}, 3) to go with q", positions.shape)
+    if sigma is None:
+        return angles, positions, np.full(len(angles), np.nan)
+    sigmas = np.asarray(sigma, dtype=np.float64)
+    if sigmas.shape not in ((), (len(angles),)):
+        raise ShapeError("sigma", f"() or ({len(angles)},)", sigmas.shape)
+    if not np.isfinite(sigmas).all():
+        raise NonFiniteError("sigma")
+    if sigmas.size and sigmas.min() <= 0.0:
+        raise SettingError("every sigma must be greater than 0 m; pass None where the noise is not known")
+    return angles, positions, np.broadcast_to(sigmas, (len(angles),))

@@ -1,0 +1,210 @@
+"""The most probable chain for a set of pairs: robust Gauss-Newton with a Gaussian prior."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import cast
+
+import numpy as np
+
+from kbmaps.arrays import BoolArray, FloatArray
+from kbmaps.chain_parameters import WIDE, ChainParameters
+from kbmaps.pairs import Pairs
+
+# Noise that is estimated is never below this [m]: there rounding begins.
+_ROUNDING_M = 1e-9
+# A pair beyond this many sigma is an outlier: of good ones 3 in 100,000 are as far out (chi, three dimensions).
+_OUTLIER_SIGMAS = 4.8
+# A residual norm of noise σ per axis has the median 1.538 σ in three dimensions.
+_MEDIAN_NORM = 1.538
+_SCALES_PER_SIGMA = 3.0
+# Told noise explains a sum of squared residuals up to so many of its standard deviations (χ²) above its mean.
+_MISFIT_SIGMAS = 3.0
+_ROUNDS = 80
+_FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-3, 1e-12, 1e8
+# A step that changes the fit by less than this share of what the noise leaves open is the last.
+_SMALL_STEP = 1e-4
+
+
+@dataclass(frozen=True, eq=False)
+class RigidFit:
+    """A change of the chain and how sure it is.
+
+    Attributes:
+        change: the most probable parameters (size,).
+        noise: estimated noise over unit; at least 1 where the units are the noise (more: the chain does not fit).
+        freedom: residual coordinates minus those that the parameters have used up.
+        inliers: which pairs (n,) are no outliers.
+        spread: matrix W (size, size) with the posterior covariance W Wᵀ [rad², m²].
+        rank: how many independent directions of the parameters the data determine.
+        loose: how far (size,) each free parameter takes part in directions that the data do not show, in 0..1.
+        log_evidence: log marginal likelihood of the inliers (Laplace's approximation).
+    """
+
+    change: FloatArray
+    noise: float
+    freedom: float
+    inliers: BoolArray
+    spread: FloatArray
+    rank: int
+    loose: FloatArray
+    log_evidence: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Point:
+    """Residuals (n, 3), their norms in units (n,), and Jacobian (n, 3, f) at one change (size,).
+
+    The f free parameters are counted in prior standard deviations; `offset` (f,) is how far they are from the prior.
+    """
+
+    change: FloatArray
+    residuals: FloatArray
+    norms: FloatArray
+    jacobian: FloatArray
+    offset: FloatArray
+
+    def reduced(self, roots: FloatArray) -> FloatArray:
+        """Triangular factor (f+1, f+1) of the rows [J, residual], each pair's multiplied by its root (n,)."""
+        rows = np.concatenate([self.jacobian, self.residuals[:, :, None]], axis=2) * roots[:, None, None]
+        return cast(FloatArray, np.linalg.qr(rows.reshape(-1, rows.shape[2]), mode="r"))
+
+    def cost(self, roots: FloatArray) -> float:
+        residuals = np.einsum("ni,ni,n->", self.residuals, self.residuals, roots * roots)
+        return float(residuals + self.offset @ self.offset)
+
+
+class _Fitter:
+    """One fit on its way: what is minimised is Σ (root ‖residual‖)² + ‖offset‖² with the roots of the present noise."""
+
+    def __init__(self, parameters: ChainParameters, std: FloatArray, pairs: Pairs, start: FloatArray) -> None:
+        self._parameters, self.pairs = parameters, pairs
+        self.free = std > 0.0
+        self.scales = np.minimum(std[self.free], WIDE)
+        self.point = self._at(start)
+        self.least_noise = 1.0 if pairs.known else _ROUNDING_M / float(pairs.unit.min())
+        self._damping = _FIRST_DAMPING
+        # Residual coordinates that the parameters use up.
+        self.used = float(min(self.free.sum(), 3 * len(pairs)))
+
+    def typical(self) -> float:
+        """Noise over unit as the middle residual shows it (Rousseeuw and Leroy 1987, least median of squares).
+
+        The middle lies above the median by the pairs that the parameters can explain whatever they are.
+        """
+        norms = self.point.norms
+        rank = min(int(0.5 * (len(norms) + self.used / 3.0)), len(norms) - 1)
+        return max(float(np.partition(norms, rank)[rank]) / _MEDIAN_NORM, self.least_noise)
+
+    def improve(self, weights: FloatArray, noise: float) -> float:
+        """A Levenberg-Marquardt step; returns its length in units of what is left open (0: none was found)."""
+        point, roots = self.point, np.sqrt(weights) / (self.pairs.unit * noise)
+        factor = point.reduced(roots)
+        design, target = factor[:, :-1], factor[:, -1]
+        before, columns = point.cost(roots), np.einsum("ij,ij->j", design, design)
+        squares = np.square(np.linalg.svd(design, compute_uv=False))
+        self.used = float((squares / (1.0 + squares)).sum())  # γ of MacKay 1992, "Bayesian interpolation"
+        while self._damping <= _MOST_DAMPING:
+            held = np.sqrt(1.0 + self._damping * columns)
+            q, r = np.linalg.qr(np.concatenate([design, np.diag(held)]))
+            projected = q.T @ np.concatenate([target, -point.offset / held])
+            change = point.change.copy()
+            change[self.free] += self.scales * np.linalg.solve(r, projected)
+            length, tried = float(np.linalg.norm(projected)), self._at(change)
+            if tried.cost(roots) <= before:
+                self.point, self._damping = tried, max(self._damping * 0.1, _LEAST_DAMPING)
+                return length
+            if length < _SMALL_STEP:
+                return 0.0
+            self._damping = max(self._damping * 10.0, _FIRST_DAMPING)
+        self._damping = _FIRST_DAMPING
+        return 0.0
+
+    def _at(self, change: FloatArray) -> _Point:
+        x, jacobian = self._parameters.linearised(change, self.pairs.q)
+        residuals = self.pairs.x - x
+        norms = np.linalg.norm(residuals, axis=1) / self.pairs.unit
+        return _Point(
+            change, residuals, norms, jacobian[:, :, self.free] * self.scales, change[self.free] / self.scales
+        )
+
+
+def fit_chain(parameters: ChainParameters, std: FloatArray, pairs: Pairs, start: FloatArray) -> RigidFit:
+    """The most probable change for at least one pair, given the prior N(0, std²) on each parameter.
+
+    Graduated non-convexity (Yang et al. 2020): Geman-McClure weights, and with them the noise that weighs data against
+    prior, shrink from the largest residual to what is typical, so that neither outliers nor a marker far from its
+    place stop the way. Then least squares on all pairs that are no outliers, with the noise estimated from them.
+    """
+    fitter = _Fitter(parameters, std, pairs, start)
+    _anneal(fitter)
+    return _polish(fitter)
+
+
+def _anneal(fitter: _Fitter) -> None:
+    scale = math.inf
+    for _ in range(_ROUNDS):
+        norms = fitter.point.norms
+        goal = _SCALES_PER_SIGMA * fitter.typical()
+        scale = max(min(scale / 1.4, float(norms.max())), goal)
+        step = fitter.improve((scale**2 / (scale**2 + norms**2)) ** 2, scale / _SCALES_PER_SIGMA)
+        if scale == goal and (step < 1.0 or scale <= 2.0 * _SCALES_PER_SIGMA * fitter.least_noise):
+            return
+
+
+def _polish(fitter: _Fitter) -> RigidFit:
+    pairs = fitter.pairs
+    noise = fitter.typical()
+    inliers = fitter.point.norms <= _OUTLIER_SIGMAS * noise
+    freedom = 0.0
+    for _ in range(_ROUNDS):
+        step = fitter.improve(inliers.astype(np.float64), noise)
+        freedom = max(3.0 * float(inliers.sum()) - fitter.used, 0.0)
+        square = float(np.square(fitter.point.norms[inliers]).sum())
+        estimate = _noise(square, freedom, pairs.known, fitter.least_noise)
+        chosen = fitter.point.norms <= _OUTLIER_SIGMAS * max(estimate, fitter.typical())
+        settled = bool((chosen == inliers).all()) and abs(estimate - noise) <= 1e-3 * noise
+        inliers, noise = chosen, estimate
+        if settled and step < _SMALL_STEP * math.sqrt(1.0 + freedom):
+            break
+    return _summary(fitter, inliers, noise, freedom)
+
+
+def _noise(square: float, freedom: float, known: bool, least: float) -> float:
+    if not known:
+        return max(math.sqrt(square / freedom), least) if freedom > 0.0 else least
+    # Residuals by chance above what the known noise explains are no sign of a chain that does not fit.
+    if square <= freedom + _MISFIT_SIGMAS * math.sqrt(2.0 * freedom):
+        return 1.0
+    return max(math.sqrt(square / freedom), 1.0)
+
+
+def _summary(fitter: _Fitter, inliers: BoolArray, noise: float, freedom: float) -> RigidFit:
+    point, free, scales = fitter.point, fitter.free, fitter.scales
+    size = len(free)
+    factor = point.reduced(inliers / (fitter.pairs.unit * noise))
+    _, singular, vt = np.linalg.svd(factor[:, :-1])
+    singular = np.concatenate([singular, np.zeros(len(vt) - len(singular))])
+    loose, rank = _undetermined(factor[:, :-1] / scales)
+    spread = np.zeros((size, size))
+    left = vt.T / np.sqrt(1.0 + np.square(singular))
+    spread[np.ix_(free, free)] = scales[:, None] * left
+    looseness = np.zeros(size)
+    looseness[free] = loose
+    square = float(np.square(point.norms[inliers]).sum()) / noise**2 + float(point.offset @ point.offset)
+    spans = 6.0 * float(np.log(noise * fitter.pairs.unit[inliers]).sum())
+    evidence = -0.5 * (square + spans + 3.0 * float(inliers.sum()) * math.log(2.0 * math.pi))
+    evidence -= 0.5 * float(np.log1p(np.square(singular)).sum())
+    return RigidFit(point.change, noise, freedom, inliers, spread, rank, looseness, evidence)
+
+
+def _undetermined(design: FloatArray) -> tuple[FloatArray, int]:
+    """How far each parameter lies in directions that no row shows, and how many directions the rows do show."""
+    lengths = np.linalg.norm(design, axis=0)
+    seen = lengths > 1e-12 * max(float(lengths.max(initial=0.0)), 1e-300)
+    _, singular, vt = np.linalg.svd(design[:, seen] / lengths[seen])
+    rank = int((singular > 1e-8 * singular.max(initial=0.0)).sum())
+    loose = np.ones(design.shape[1])
+    loose[seen] = np.linalg.norm(vt[rank:], axis=0)
+    return loose, rank

@@ -1,0 +1,61 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from planted_chains import random_chain, random_q
+
+from kbmaps import ChainTolerances, DegenerateDataError, RigidLearner, SettingError, ShapeError, find_chain
+
+
+@pytest.mark.parametrize("kinds", ["RRRRRRR", "RRRRRR", "RRPRR"])
+def test_a_chain_is_found_from_sixty_exact_pairs_and_nothing_else(kinds):
+    found = 0
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        chain = random_chain(rng, kinds)
+        q = random_q(rng, kinds, 60, 80)
+        prismatic = [kind == "P" for kind in kinds]
+        test = random_q(rng, kinds, 50, 80)
+        guess = find_chain(q, chain.positions(q), prismatic, rng=rng)
+        found += bool(np.allclose(guess.positions(test), chain.positions(test), rtol=0, atol=1e-7))
+    assert found == 4
+
+
+def test_a_found_chain_is_the_start_of_a_learner_without_a_prior():
+    rng = np.random.default_rng(0)
+    chain = random_chain(rng, "RRRRRR")
+    q = random_q(rng, "RRRRRR", 300, 80)
+    x = chain.positions(q) + 0.01 * rng.normal(size=q[:, :3].shape)
+    learner = RigidLearner(
+        find_chain(q, x, rng=rng, sigma=0.01), ChainTolerances(axes=np.inf, points=np.inf, tool=np.inf)
+    )
+    learner.learn(q, x, 0.01)
+    test = random_q(rng, "RRRRRR", 300, 80)
+    assert np.linalg.norm(learner.predict(test) - chain.positions(test), axis=1).mean() < 0.0045
+
+
+def test_the_same_generator_finds_the_same_chain():
+    chain = random_chain(np.random.default_rng(2), "RRR")
+    q = random_q(np.random.default_rng(3), "RRR", 20, 80)
+    x = chain.positions(q) + 0.001 * np.random.default_rng(4).normal(size=(20, 3))
+    first, second = (find_chain(q, x, rng=np.random.default_rng(5), starts=3) for _ in range(2))
+    np.testing.assert_array_equal(first.fixed, second.fixed)
+
+
+def test_fewer_pairs_than_unknowns_are_refused_with_the_number_needed():
+    with pytest.raises(DegenerateDataError, match="record 11"):
+        find_chain(np.zeros((10, 7)), np.zeros((10, 3)), rng=np.random.default_rng(0))
+
+
+def test_positions_in_one_place_are_refused():
+    with pytest.raises(DegenerateDataError, match="one place"):
+        find_chain(np.zeros((30, 3)), np.ones((30, 3)), rng=np.random.default_rng(0))
+
+
+@pytest.mark.parametrize(
+    ("settings", "error"),
+    [({"starts": 0}, SettingError), ({"sigma": 0.0}, SettingError), ({"prismatic": [True]}, ShapeError)],
+)
+def test_impossible_settings_are_refused(settings, error):
+    with pytest.raises(error):
+        find_chain(np.zeros((30, 3)), np.ones((30, 3)), rng=np.random.default_rng(0), **settings)

@@ -1,0 +1,181 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from planted_chains import random_q
+from rough_arms import ROUGH, rough_arm
+
+from kbmaps import (
+    ChainTolerances,
+    ModelFormatError,
+    NonFiniteError,
+    RecursiveRigidLearner,
+    RigidLearner,
+    SettingError,
+    ShapeError,
+)
+
+seeds = st.integers(0, 2**32 - 1)
+SLIGHT = ChainTolerances(axes=1e-4, points=1e-4, zeros=1e-4, slide_zeros=1e-4, tool=1e-4, base_rotation=1e-4)
+
+
+@given(seed=seeds, kinds=st.sampled_from(["RRRR", "RPR", "RRRRRRR"]))
+@settings(max_examples=15, deadline=None)
+def test_pair_by_pair_is_all_at_once_where_the_problem_is_linear(seed, kinds):
+    rng = np.random.default_rng(seed)
+    arm = rough_arm(rng, kinds, SLIGHT)
+    q, x = arm.pairs(rng, 30, 2e-5)
+    batch, recursive = RigidLearner(arm.nominal, SLIGHT), RecursiveRigidLearner(arm.nominal, SLIGHT)
+    batch.learn(q, x, 1e-4)
+    recursive.learn(q, x, 1e-4)
+    test = random_q(rng, kinds, 50, 80)
+    one, other = batch.estimate(test), recursive.estimate(test)
+    np.testing.assert_allclose(other.x, one.x, rtol=0, atol=2e-7)
+    np.testing.assert_allclose(other.sigma, one.sigma, rtol=5e-3)
+
+
+def test_thirty_exact_pairs_leave_less_than_a_third_of_a_millimetre_of_a_rough_drawing_on_average():
+    errors = []
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        arm = rough_arm(rng)
+        learner = RecursiveRigidLearner(arm.nominal, ROUGH)
+        learner.learn(*arm.pairs(rng, 30), 1e-4)
+        errors.append(arm.error(learner, rng))
+    assert np.mean(errors) < 3.3e-4
+
+
+def test_claimed_intervals_cover_as_they_say_at_every_stage():
+    inside: dict[int, list[float]] = {3: [], 30: [], 100: []}
+    for seed in range(16):
+        rng = np.random.default_rng(seed)
+        arm = rough_arm(rng)
+        learner = RecursiveRigidLearner(arm.nominal, ROUGH)
+        test = random_q(rng, arm.kinds, 100, 80)
+        for stage, shares in inside.items():
+            learner.learn(*arm.pairs(rng, stage - learner.pairs, 0.01), 0.01)
+            estimate = learner.estimate(test)
+            shares.append((np.abs(estimate.x - arm.real.positions(test)) < estimate.sigma).mean())
+    # 16 arms with some 27 directions each: 2.2 % is the standard error of a mean.
+    assert all(0.60 < np.mean(shares) < 0.77 for shares in inside.values())
+
+
+@pytest.mark.parametrize("sigma", [0.003, 0.02])
+def test_the_noise_is_estimated_when_no_one_tells_it(sigma):
+    rng = np.random.default_rng(3)
+    arm = rough_arm(rng)
+    learner = RecursiveRigidLearner(arm.nominal, ROUGH)
+    learner.learn(*arm.pairs(rng, 400, sigma))
+    assert learner.noise == pytest.approx(sigma, rel=0.1)
+
+
+def test_it_goes_on_from_a_batch_as_the_batch_would():
+    rng = np.random.default_rng(10)
+    arm = rough_arm(rng)
+    unknown = ChainTolerances(axes=np.inf, points=np.inf, tool=np.inf)
+    batch = RigidLearner(arm.nominal, unknown)
+    batch.learn(*arm.pairs(rng, 60, 0.005))
+    recursive = RecursiveRigidLearner.continuing(batch)
+    more = arm.pairs(rng, 60, 0.005)
+    batch.learn(*more)
+    recursive.learn(*more)
+    test = random_q(rng, arm.kinds, 100, 80)
+    one, other = batch.estimate(test), recursive.estimate(test)
+    assert recursive.pairs == 120
+    assert np.abs(other.x - one.x).max() < 0.3 * one.sigma.min()
+    np.testing.assert_allclose(other.sigma, one.sigma, rtol=0.1)
+
+
+def test_a_new_tool_is_learnt_from_few_pairs_without_losing_the_arm():
+    rng = np.random.default_rng(4)
+    arm = rough_arm(rng, "RRRRRRR")
+    learner = RecursiveRigidLearner(arm.nominal, ROUGH)
+    learner.learn(*arm.pairs(rng, 300, 0.005), 0.005)
+    moved = arm.real.with_tool([0.1, -0.1, 0.15])
+    q = random_q(rng, arm.kinds, 10, 80)
+    learner.tool_changed(0.2)
+    learner.learn(q, moved.positions(q) + 0.005 * rng.normal(size=(10, 3)), 0.005)
+    test = random_q(rng, arm.kinds, 200, 80)
+    assert np.linalg.norm(learner.predict(test) - moved.positions(test), axis=1).mean() < 0.005
+
+
+def test_a_tool_that_was_held_is_set_free_by_its_change():
+    rng = np.random.default_rng(6)
+    tolerances = replace(ROUGH, tool=0.0)
+    arm = rough_arm(rng, "RRRR", tolerances)
+    learner = RecursiveRigidLearner(arm.nominal, tolerances)
+    learner.learn(*arm.pairs(rng, 100, 0.001), 0.001)
+    moved = arm.real.with_tool([0.1, 0.0, 0.1])
+    learner.tool_changed(0.2)
+    q = random_q(rng, arm.kinds, 20, 80)
+    learner.learn(q, moved.positions(q), 0.001)
+    np.testing.assert_allclose(learner.predict(q), moved.positions(q), atol=0.003)
+
+
+def test_an_outlier_moves_the_chain_no_further_than_a_pair_at_the_gate():
+    rng = np.random.default_rng(7)
+    arm = rough_arm(rng)
+    q, x = arm.pairs(rng, 200, 0.005)
+    x[::10] += rng.choice([-1, 1], (20, 3)) * rng.uniform(0.2, 0.4, (20, 3))
+    learner = RecursiveRigidLearner(arm.nominal, ROUGH)
+    learner.learn(q, x, 0.005)
+    assert arm.error(learner, rng) < 0.006
+
+
+def test_a_wild_pair_leaves_finite_numbers():
+    rng = np.random.default_rng(8)
+    arm = rough_arm(rng)
+    learner = RecursiveRigidLearner(arm.nominal, ROUGH)
+    learner.learn(rng.normal(size=6), [1e9, -1e9, 1e9])
+    learner.learn(*arm.pairs(rng, 100, 0.005))
+    assert arm.error(learner, rng) < 0.02
+
+
+@pytest.mark.parametrize("sigma", [0.004, None])
+def test_bytes_give_a_learner_that_goes_on_to_the_last_bit(sigma):
+    rng = np.random.default_rng(9)
+    arm = rough_arm(rng, "RPRR")
+    learner = RecursiveRigidLearner(arm.nominal, ROUGH, noise=0.02)
+    learner.learn(*arm.pairs(rng, 30, 0.004), sigma)
+    learner.tool_changed(0.1)
+    twin = RecursiveRigidLearner.from_bytes(learner.to_bytes())
+    more = arm.pairs(rng, 20, 0.004)
+    learner.learn(*more, sigma)
+    twin.learn(*more, sigma)
+    assert twin.to_bytes() == learner.to_bytes()
+    np.testing.assert_array_equal(twin.chain.fixed, learner.chain.fixed)
+
+
+def test_bytes_of_the_other_learner_are_refused():
+    arm = rough_arm(np.random.default_rng(1), "RR")
+    with pytest.raises(ModelFormatError, match="batch"):
+        RecursiveRigidLearner.from_bytes(RigidLearner(arm.nominal, ROUGH).to_bytes())
+
+
+@pytest.mark.parametrize(
+    ("q", "x", "sigma", "error"),
+    [
+        (np.zeros((2, 3)), np.zeros((2, 3)), None, ShapeError),
+        (np.array([[0.1] * 6, [np.nan] * 6]), np.zeros((2, 3)), None, NonFiniteError),
+        (np.zeros((2, 6)), np.zeros((2, 3)), [0.1, -0.1], SettingError),
+    ],
+)
+def test_bad_input_changes_nothing_not_even_by_its_good_rows(q, x, sigma, error):
+    learner = RecursiveRigidLearner(rough_arm(np.random.default_rng(14)).nominal, ROUGH)
+    before = learner.to_bytes()
+    with pytest.raises(error):
+        learner.learn(q, x, sigma)
+    assert learner.to_bytes() == before
+
+
+@pytest.mark.parametrize("wrong", [0.0, -1.0, float("nan"), float("inf")])
+def test_a_tool_change_of_no_size_is_refused(wrong):
+    learner = RecursiveRigidLearner(rough_arm(np.random.default_rng(14)).nominal, ROUGH)
+    with pytest.raises(SettingError):
+        learner.tool_changed(wrong)
+    with pytest.raises(SettingError):
+        RecursiveRigidLearner(learner.nominal, ROUGH, noise=wrong)

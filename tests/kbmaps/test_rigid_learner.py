@@ -1,0 +1,287 @@
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from planted_chains import random_q
+from rough_arms import ROUGH, rough_arm
+from scipy.spatial.transform import Rotation
+
+from kbmaps import (
+    ChainParameters,
+    ChainTolerances,
+    DegenerateDataError,
+    ModelFormatError,
+    NonFiniteError,
+    RecursiveRigidLearner,
+    RigidLearner,
+    SettingError,
+    ShapeError,
+)
+
+seeds = st.integers(0, 2**32 - 1)
+
+
+@given(seed=seeds, kinds=st.sampled_from(["RRRRRRR", "RPRRRR", "PPPRRR", "RRP"]))
+@settings(max_examples=15, deadline=None)
+def test_fifteen_exact_pairs_make_a_rough_drawing_exact(seed, kinds):
+    rng = np.random.default_rng(seed)
+    arm = rough_arm(rng, kinds, replace(ROUGH, slide_zeros=0.01))
+    learner = RigidLearner(arm.nominal, replace(ROUGH, slide_zeros=0.01))
+    learner.learn(*arm.pairs(rng, 15))
+    assert arm.error(learner, rng) < 1e-9
+
+
+@given(seed=seeds)
+@settings(max_examples=15, deadline=None)
+def test_the_order_of_the_pairs_does_not_matter(seed):
+    rng = np.random.default_rng(seed)
+    arm = rough_arm(rng)
+    q, x = arm.pairs(rng, 40, 0.005)
+    order = rng.permutation(40)
+    at_once, one_by_one = RigidLearner(arm.nominal, ROUGH), RigidLearner(arm.nominal, ROUGH)
+    at_once.learn(q, x, 0.005)
+    for k in order:
+        one_by_one.learn(q[k], x[k], 0.005)
+    assert one_by_one.pairs == 40
+    np.testing.assert_allclose(one_by_one.predict(q), at_once.predict(q), rtol=0, atol=1e-6)
+
+
+def test_the_posterior_of_a_nearly_linear_problem_is_the_closed_form():
+    """With tiny tolerances the chain is linear in its parameters and textbook formulas hold."""
+    rng = np.random.default_rng(11)
+    tolerances = ChainTolerances(axes=1e-5, points=1e-5, zeros=1e-5, tool=1e-5, base_rotation=1e-5)
+    arm = rough_arm(rng, "RRRR", tolerances)
+    q, x = arm.pairs(rng, 50, 1e-5)
+    learner = RigidLearner(arm.nominal, tolerances)
+    learner.learn(q, x, 1e-5)
+    parameters = ChainParameters(arm.nominal)
+    std = parameters.standard_deviations(tolerances)
+    free = std > 0
+    start, jacobian = parameters.linearised(np.zeros(parameters.size), q)
+    design = jacobian[:, :, free].reshape(150, -1) / 1e-5
+    covariance = np.linalg.inv(design.T @ design + np.diag(std[free] ** -2))
+    change = covariance @ design.T @ (x - start).ravel() / 1e-5
+    shift = (jacobian[:, :, free] @ change) - (learner.predict(q) - start)
+    assert np.abs(shift).max() < 1e-8
+    sigma = np.sqrt(np.einsum("nip,pr,nir->ni", jacobian[:, :, free], covariance, jacobian[:, :, free]))
+    np.testing.assert_allclose(learner.estimate(q).sigma, sigma, rtol=1e-3)
+
+
+def test_claimed_intervals_cover_as_they_say():
+    inside, inside_twice = [], []
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        arm = rough_arm(rng)
+        learner = RigidLearner(arm.nominal, ROUGH)
+        learner.learn(*arm.pairs(rng, 30, 0.01))
+        q = random_q(rng, arm.kinds, 100, 80)
+        estimate = learner.estimate(q)
+        off = np.abs(estimate.x - arm.real.positions(q)) / estimate.sigma
+        inside.append((off < 1).mean())
+        inside_twice.append((off < 1.96).mean())
+    # 40 arms with some 27 directions each: 1.5 % is the standard error of the first mean.
+    assert 0.63 < np.mean(inside) < 0.74
+    assert 0.92 < np.mean(inside_twice) < 0.98
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("learner", [RigidLearner, RecursiveRigidLearner])
+@pytest.mark.parametrize("told", [True, False])
+@pytest.mark.parametrize(("pairs", "reach_deg"), [(30, 80), (300, 80), (300, 20)])
+def test_over_two_hundred_arms_the_claimed_intervals_cover_as_they_say(learner, told, pairs, reach_deg):
+    inside, inside_twice = [], []
+    for seed in range(200):
+        rng = np.random.default_rng(seed)
+        arm = rough_arm(rng)
+        model = learner(arm.nominal, ROUGH)
+        model.learn(*arm.pairs(rng, pairs, 0.01, reach_deg), 0.01 if told else None)
+        q = random_q(rng, arm.kinds, 200, 80)
+        estimate = model.estimate(q)
+        off = np.abs(estimate.x - arm.real.positions(q)) / estimate.sigma
+        inside.append((off < 1).mean())
+        inside_twice.append((off < 1.96).mean())
+    assert 0.66 < np.mean(inside) < 0.70
+    assert 0.93 < np.mean(inside_twice) < 0.97
+
+
+@pytest.mark.parametrize("told", [True, False])
+def test_gross_outliers_are_left_out(told):
+    rng = np.random.default_rng(21)
+    arm = rough_arm(rng)
+    q, x = arm.pairs(rng, 200, 0.01)
+    x[:30] += rng.choice([-1, 1], (30, 3)) * rng.uniform(0.15, 0.3, (30, 3))
+    spoilt, clean = RigidLearner(arm.nominal, ROUGH), RigidLearner(arm.nominal, ROUGH)
+    spoilt.learn(q, x, 0.01 if told else None)
+    clean.learn(q[30:], x[30:], 0.01 if told else None)
+    assert not spoilt.inliers[:30].any()
+    assert spoilt.inliers[30:].all()
+    np.testing.assert_allclose(spoilt.predict(q), clean.predict(q), atol=1e-4)
+
+
+def test_a_marker_far_off_its_place_is_found_without_noise():
+    rng = np.random.default_rng(31)
+    arm = rough_arm(rng, "RRRRRRR")
+    moved = arm.real.with_tool([0.0, 0.15, -0.2])
+    learner = RigidLearner(arm.nominal, ROUGH)
+    q = random_q(rng, arm.kinds, 40, 80)
+    learner.learn(q, moved.positions(q))
+    test = random_q(rng, arm.kinds, 100, 80)
+    np.testing.assert_allclose(learner.predict(test), moved.positions(test), atol=1e-9)
+
+
+@given(seed=seeds)
+@settings(max_examples=6, deadline=None)
+def test_camera_pose_tool_and_zeros_lie_in_their_intervals(seed):
+    rng = np.random.default_rng(seed)
+    planted = ChainTolerances(zeros=0.03, tool=0.1, base_rotation=0.9, base_translation=1.0)
+    arm = rough_arm(rng, "RRRRRR", planted)
+    unknown = ChainTolerances(zeros=0.03, tool=math.inf, base_rotation=math.inf, base_translation=math.inf)
+    learner = RigidLearner(arm.nominal, unknown)
+    learner.learn(*arm.pairs(rng, 200, 0.001))
+    report, parameters = learner.report(), ChainParameters(arm.nominal)
+    for interval, part in (
+        (report.base_translation, parameters.base_shift),
+        (report.tool_shift, parameters.tool),
+        (report.zeros, parameters.zeros),
+    ):
+        # Five standard deviations: none of some 150 numbers may be out by chance.
+        assert (np.abs(interval.value - arm.change[part]) < 2.55 * interval.half_width).all()
+        assert (interval.low < interval.high).all()
+    turn = Rotation.from_matrix(report.T_measured_nominal[:3, :3])
+    assert (turn.inv() * Rotation.from_rotvec(arm.change[parameters.base_turn])).magnitude() < 0.1
+    assert report.noise == pytest.approx(0.001, rel=0.15)
+
+
+def test_what_no_motion_can_show_is_named():
+    rng = np.random.default_rng(5)
+    arm = rough_arm(rng, "RRR", ROUGH)
+    learner = RigidLearner(arm.nominal, ROUGH)
+    q = random_q(rng, arm.kinds, 60, 80)
+    q[:, 1] = 0.0
+    learner.learn(q, arm.real.positions(q))
+    report = learner.report()
+    assert set(report.undetermined) == {
+        f"joint 2 axis {change} {side}" for change in ("tilt", "shift") for side in (1, 2)
+    }
+    assert report.determined == 4 * 2 + 3
+
+
+def test_moving_every_joint_determines_axes_and_tool():
+    rng = np.random.default_rng(5)
+    arm = rough_arm(rng, "RRRR")
+    learner = RigidLearner(arm.nominal, ROUGH)
+    learner.learn(*arm.pairs(rng, 60))
+    assert learner.report().undetermined == ()
+    assert learner.report().determined == 4 * 4 + 3
+
+
+def test_sigma_grows_and_support_ends_away_from_the_data():
+    rng = np.random.default_rng(8)
+    arm = rough_arm(rng)
+    learner = RigidLearner(arm.nominal, ROUGH)
+    learner.learn(*arm.pairs(rng, 100, 0.01, reach_deg=20))
+    near = learner.estimate(random_q(rng, arm.kinds, 200, 18))
+    far = learner.estimate(random_q(rng, arm.kinds, 200, 120))
+    assert far.sigma.mean() > 3 * near.sigma.mean()
+    assert near.in_support.mean() > 0.95
+    assert far.in_support.mean() < 0.05
+
+
+def test_an_arm_that_is_not_rigid_widens_sigma_to_what_is_left():
+    rng = np.random.default_rng(9)
+    arm = rough_arm(rng)
+    q, x = arm.pairs(rng, 400)
+    sag = 0.01 * np.sin(3.0 * q[:, :3])
+    learner = RigidLearner(arm.nominal, ROUGH)
+    learner.learn(q, x + sag + 0.001 * rng.normal(size=x.shape), 0.001)
+    rest = learner.predict(q) - (x + sag)
+    assert learner.estimate(q).sigma.mean() == pytest.approx(np.sqrt(np.square(rest).mean()), rel=0.2)
+    assert learner.report().misfit > 3
+
+
+def test_more_evidence_for_the_right_tolerances():
+    rng = np.random.default_rng(12)
+    arm = rough_arm(rng)
+    q, x = arm.pairs(rng, 100, 0.005)
+    evidence = []
+    for factor in (0.05, 1.0, 20.0):
+        tolerances = ChainTolerances(axes=factor * ROUGH.axes, points=factor * ROUGH.points, tool=factor * ROUGH.tool)
+        learner = RigidLearner(arm.nominal, tolerances)
+        learner.learn(q, x, 0.005)
+        evidence.append(learner.log_evidence)
+    assert evidence[1] > max(evidence[0], evidence[2])
+
+
+def test_before_any_pair_the_drawing_and_its_tolerances_speak():
+    arm = rough_arm(np.random.default_rng(2), "RRRR")
+    learner = RigidLearner(arm.nominal, ROUGH)
+    q = random_q(np.random.default_rng(3), "RRRR", 20, 80)
+    estimate = learner.estimate(q)
+    np.testing.assert_allclose(estimate.x, arm.nominal.positions(q), atol=1e-12)
+    assert 0.02 < estimate.sigma.mean() < 0.1
+    assert not estimate.in_support.any()
+    with pytest.raises(DegenerateDataError, match="before the first pair"):
+        learner.report()
+
+
+@pytest.mark.parametrize("sigma", [0.002, None])
+def test_bytes_give_the_same_learner_back(sigma):
+    rng = np.random.default_rng(13)
+    arm = rough_arm(rng, "RPRR")
+    learner = RigidLearner(arm.nominal, ROUGH)
+    learner.learn(*arm.pairs(rng, 30, 0.002), sigma)
+    twin = RigidLearner.from_bytes(learner.to_bytes())
+    more = arm.pairs(rng, 5, 0.002)
+    learner.learn(*more, 0.002)
+    twin.learn(*more, 0.002)
+    assert twin.pairs == 35
+    for a, b in zip(vars(learner.estimate(more[0])).values(), vars(twin.estimate(more[0])).values(), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+@given(position=st.floats(0, 1, exclude_max=True), bit=st.integers(0, 7))
+@settings(max_examples=40, deadline=None)
+def test_damaged_bytes_are_refused(position, bit):
+    arm = rough_arm(np.random.default_rng(1), "RR")
+    data = bytearray(RigidLearner(arm.nominal, ROUGH).to_bytes())
+    data[int(position * len(data))] ^= 1 << bit
+    with pytest.raises(ModelFormatError):
+        RigidLearner.from_bytes(bytes(data))
+
+
+@pytest.mark.parametrize(
+    ("q", "x", "sigma", "error"),
+    [
+        (np.zeros((2, 3)), np.zeros((2, 3)), None, ShapeError),
+        (np.zeros((2, 6)), np.zeros((3, 3)), None, ShapeError),
+        (np.full((1, 6), np.nan), np.zeros((1, 3)), None, NonFiniteError),
+        (np.zeros((1, 6)), np.full((1, 3), np.inf), None, NonFiniteError),
+        (np.zeros((2, 6)), np.zeros((2, 3)), 0.0, SettingError),
+        (np.zeros((2, 6)), np.zeros((2, 3)), [0.1, np.nan], NonFiniteError),
+        (np.zeros((2, 6)), np.zeros((2, 3)), [0.1, 0.1, 0.1], ShapeError),
+    ],
+)
+def test_bad_input_changes_nothing(q, x, sigma, error):
+    rng = np.random.default_rng(14)
+    arm = rough_arm(rng)
+    learner = RigidLearner(arm.nominal, ROUGH)
+    learner.learn(*arm.pairs(rng, 20, 0.01))
+    before = learner.to_bytes()
+    with pytest.raises(error):
+        learner.learn(q, x, sigma)
+    assert learner.to_bytes() == before
+
+
+def test_one_pair_that_comes_twice_and_no_pair_at_all_are_learnt():
+    arm = rough_arm(np.random.default_rng(4), "RRRR")
+    learner = RigidLearner(arm.nominal, ROUGH)
+    q, x = arm.pairs(np.random.default_rng(5), 1)
+    learner.learn(q[:0], x[:0])
+    learner.learn(q[0], x[0], 0.001)
+    learner.learn(q[0], x[0], 0.001)
+    assert np.linalg.norm(learner.predict(q[0]) - x[0]) < 0.002
