@@ -7,6 +7,7 @@ from kbmaps.align import Alignment, align
 from kbmaps.basis import JointBasis, learning_bases
 from kbmaps.block_choice import blockwise_precision, follow_a_path
 from kbmaps.chain import RigidChain
+from kbmaps.core_prior import CorePrior
 from kbmaps.errors import (
     BasisError,
     ChainError,
@@ -22,6 +23,8 @@ from kbmaps.exact import ExactLearner, ExactSolution
 from kbmaps.kbmap import KBMap, prediction_errors
 from kbmaps.nlms import NLMS
 from kbmaps.support import SUPPORT_LIMIT, SupportSet
+from kbmaps.tensor_learner import TensorLearner, TensorSettings
+from kbmaps.tensor_train import TensorTrain
 from kbmaps.tool import with_refitted_marker
 
 __all__ = [
@@ -30,6 +33,7 @@ __all__ = [
     "Alignment",
     "BasisError",
     "ChainError",
+    "CorePrior",
     "DegenerateDataError",
     "ExactLearner",
     "ExactSolution",
@@ -43,6 +47,9 @@ __all__ = [
     "ShapeError",
     "SingularAlphaError",
     "SupportSet",
+    "TensorLearner",
+    "TensorSettings",
+    "TensorTrain",
     "align",
     "blockwise_precision",
     "follow_a_path",

@@ -107,7 +107,8 @@ class CorePrior:
     def whitened(self, cores: FloatArray) -> FloatArray:
         """The z (36 d,) of cores (d, 3, 3, 4)."""
         off = cores.reshape(self.joints, CORE_NUMBERS, 1) - self.mean[:, :, None]
-        return np.linalg.solve(self.spread, off).ravel()
+        z: FloatArray = np.linalg.solve(self.spread, off).astype(np.float64, copy=False)
+        return z.ravel()
 
 
 def _motions(

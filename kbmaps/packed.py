@@ -80,7 +80,9 @@ def parse_bases(value: Any) -> tuple[JointBasis, ...]:
 
 
 def _parse_basis(entry: Any) -> JointBasis:
-    kind, *numbers = cast(list[Any], entry) if isinstance(entry, list) and entry else [None]
+    parts = cast(list[Any], entry) if isinstance(entry, list) else []
+    kind: Any = parts[0] if parts else None
+    numbers = parts[1:]
     if not isinstance(kind, str) or kind not in PARAMETER_NAMES:
         raise ModelFormatError("a basis is of no known kind")
     if not all(isinstance(number, float) for number in numbers):
@@ -113,10 +115,8 @@ def _arrays(shapes: dict[str, Any], payload: memoryview) -> dict[str, FloatArray
     arrays: dict[str, FloatArray] = {}
     begin = 0
     for name, entry in shapes.items():
-        shape = cast(list[Any], entry) if isinstance(entry, list) else [None]
-        if len(shape) > _MAX_DIMENSIONS or not all(type(size) is int and size >= 0 for size in shape):
-            raise ModelFormatError("an array has an impossible shape")
-        end = begin + 8 * math.prod(cast(list[int], shape))
+        shape = _shape(entry)
+        end = begin + 8 * math.prod(shape)
         if end > len(payload):
             raise ModelFormatError("the header announces more numbers than there are")
         array = np.frombuffer(payload[begin:end], dtype="<f8").astype(np.float64).reshape(shape)
@@ -126,6 +126,13 @@ def _arrays(shapes: dict[str, Any], payload: memoryview) -> dict[str, FloatArray
     if begin != len(payload):
         raise ModelFormatError(f"the header announces {begin} bytes of numbers, there are {len(payload)}")
     return arrays
+
+
+def _shape(entry: Any) -> list[int]:
+    sizes = cast(list[Any], entry) if isinstance(entry, list) else []
+    if not 1 <= len(sizes) <= _MAX_DIMENSIONS or not all(type(size) is int and size >= 0 for size in sizes):
+        raise ModelFormatError("an array has an impossible shape")
+    return cast(list[int], sizes)
 
 
 def _checksum(body: bytes | memoryview) -> bytes:

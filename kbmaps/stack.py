@@ -37,7 +37,7 @@ class BasisStack:
         for k, basis in enumerate(bases):
             self._mix[k, : basis.size, : basis.size] = basis.terms.mix
 
-    # Tables of 3^(d/2) entries a joint: made when first asked for, since a tensor train of 30 joints has no use for them.
+    # Tables of 3^(d/2) entries a joint, made when first asked for: a tensor train of 30 joints has no use for them.
     @cached_property
     def _left_index(self) -> IntArray:
         return _factor_index(self.sizes[: self.split], 0)

@@ -93,7 +93,8 @@ def alternate(problem: TensorProblem, z: FloatArray, sweeps: int) -> FloatArray:
             miss = problem.x - ahead - (linear @ apply(maps[k], points[k + 1])[:, :, None])[:, :, 0]
             normal = rows.T @ rows
             normal[np.diag_indices(CORE_NUMBERS)] += 1.0 + _SMALLEST_DAMPING * normal.trace()
-            step = np.linalg.solve(normal, rows.T @ (miss.ravel() * scale[:, 0]) - z[part])
+            factor, _ = lapack.cholesky_lower(np.asfortranarray(normal))
+            step = lapack.cholesky_solve(factor, rows.T @ (miss.ravel() * scale[:, 0]) - z[part])
             z[part] += step
             change = (spread[k] @ step).reshape(3, 12)
             maps[k] += (problem.weights[:, k] @ change).reshape(-1, 3, 4)

@@ -104,7 +104,7 @@ class TensorLearner:
         turn_std: float = math.radians(3.0),
         shift_std: float = 0.015,
         marker_std: float = 0.03,
-        ellipse_std: float = 0.01,
+        ellipse_std: float = 0.003,
     ) -> TensorLearner:
         """A learner with a nominal chain as prior; the standard deviations as in `CorePrior.around`.
 
@@ -156,8 +156,8 @@ class TensorLearner:
         """
         if self._train is None:
             raise DegenerateDataError(
-                f"without a prior a train of {self.joints} joints needs {self.pairs_needed} pairs; {self.kept} are kept, "
-                f"{self._waiting} of them wait for the next fit"
+                f"without a prior a train of {self.joints} joints needs {self.pairs_needed} pairs; "
+                f"{self.kept} are kept, {self._waiting} of them wait for the next fit"
             )
         return self._train
 

@@ -73,7 +73,9 @@ class TensorTrain:
             last = chain.fixed[k + 1] if k == chain.joints - 1 else np.eye(4)
             link = RigidChain(np.stack([chain.fixed[k], last]), chain.axes[k : k + 1], chain.prismatic[k : k + 1])
             # monomials = weights @ inv(matrix), so Σ_i monomial_i A_i = Σ_j weight_j Σ_i inv(matrix)_ji A_i
-            cores[k, : basis.size] = np.tensordot(np.linalg.inv(basis.matrix), _monomial_terms(link)[:, :3], axes=(1, 0))
+            cores[k, : basis.size] = np.tensordot(
+                np.linalg.inv(basis.matrix), _monomial_terms(link)[:, :3], axes=(1, 0)
+            )
         return cls(tuple(bases), cores)
 
     @property
