@@ -23,7 +23,8 @@ from kbmaps.exact import ExactLearner, ExactSolution
 from kbmaps.kbmap import KBMap, prediction_errors
 from kbmaps.nlms import NLMS
 from kbmaps.support import SUPPORT_LIMIT, SupportSet
-from kbmaps.tensor_learner import TensorLearner, TensorSettings
+from kbmaps.tensor_learner import TensorLearner
+from kbmaps.tensor_settings import TensorSettings
 from kbmaps.tensor_train import TensorTrain
 from kbmaps.tool import with_refitted_marker
 

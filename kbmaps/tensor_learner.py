@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from typing import Any, Self
 
 import numpy as np
@@ -19,7 +19,8 @@ from kbmaps.model import Estimate
 from kbmaps.packed import describe_bases, named, pack, parse_bases, unpack
 from kbmaps.stack import BasisStack
 from kbmaps.tensor_fit import whitened_jacobian
-from kbmaps.tensor_search import Fit, Pairs, information, refine, search
+from kbmaps.tensor_search import PLAUSIBLE, Fit, Pairs, information, refine, search
+from kbmaps.tensor_settings import TensorSettings
 from kbmaps.tensor_train import TensorTrain
 
 KIND = "tensor learner"
@@ -28,44 +29,20 @@ _BATCH_ROWS = 512
 _FIRST_NOISE = 0.1
 # A refit that leaves this many times the noise of the fit before has lost its way and is searched anew.
 _LOST = 3.0
-
-
-@dataclass(frozen=True)
-class TensorSettings:
-    """How a TensorLearner works.
-
-    Attributes:
-        window: how many of the last pairs are kept; None keeps all.
-        refit_every: pairs after which `learn` fits anew. Fewer wait until then, or for `refit`.
-        robust: leave out pairs that lie more than five robust standard deviations off.
-        starts: most random chains to start from where there is no prior.
-        seed: of these random chains, so that the same pairs give the same train.
-
-    Raises:
-        SettingError: window, refit_every or starts below 1, seed below 0.
-    """
-
-    window: int | None = None
-    refit_every: int = 25
-    robust: bool = True
-    starts: int = 12
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        lower = {"window": 1 if self.window is None else self.window, "refit_every": self.refit_every}
-        for name, value in {**lower, "starts": self.starts}.items():
-            if value < 1:
-                raise SettingError(f"{name} must be at least 1, got {value}")
-        if self.seed < 0:
-            raise SettingError(f"seed must be at least 0, got {self.seed}")
+# By how much the axes of the last frame may be off, as a share of a marker's move.
+_FRAME_ERROR = 0.05
+_SHARE_BEFORE_REFIT = 4
+# Times the pairs that could just determine a train: to search at all, and until a search has found what it should.
+_PAIRS_TO_SEARCH = 1.5
+_SEARCHES_UNTIL = 1.5
 
 
 class TensorLearner:
     """Learns a TensorTrain. A `kbmaps.model.Model`.
 
     With a prior, every fit is the most likely train under it (`TensorLearner.around` makes one of a nominal chain).
-    Without, the first fit searches from random chains as soon as there are as many numbers as the train has; later
-    fits go on from the one before. Where no sigma is given the noise is found from the residuals.
+    Without, the first fits search from random chains once there are `pairs_needed`; later ones go on from the one
+    before. Where no sigma is given the noise is found from the residuals.
 
     Args:
         bases: one a joint; orthonormal over the joints' ranges (`learning_bases`) are advised.
@@ -140,12 +117,14 @@ class TensorLearner:
 
     @property
     def pairs_needed(self) -> int:
-        """Pairs before the first fit where there is no prior: three numbers each for every number of the train.
+        """Pairs before the first fit where there is no prior: half as many again as three numbers each could do with.
 
-        Σ 12 m_k over all joints but the last, and 3 m_d of that, less 12 for the frame between any two cores.
+        The train has Σ 12 m_k numbers over all joints but the last and 3 m_d of that, less 12 for the frame between
+        any two cores: 24 d − 15 for revolute joints.
         """
         sizes = [basis.size for basis in self.bases]
-        return math.ceil((12 * sum(sizes[:-1]) + 3 * sizes[-1] - 12 * (self.joints - 1)) / 3)
+        numbers = 12 * sum(sizes[:-1]) + 3 * sizes[-1] - 12 * (self.joints - 1)
+        return math.ceil(_PAIRS_TO_SEARCH * numbers / 3)
 
     @property
     def train(self) -> TensorTrain:
@@ -192,11 +171,12 @@ class TensorLearner:
         self._waiting += len(angles)
         if self.settings.window is not None:
             self._keep(self.settings.window)
-        if self._waiting >= self.settings.refit_every:
+        # A quarter more pairs may change much while they are few.
+        if self._waiting >= min(self.settings.refit_every, max(1, self.kept // _SHARE_BEFORE_REFIT)):
             self.refit()
 
     def forget(self, keep: int) -> None:
-        """Drops all but the last `keep` pairs, as after a change of the tool. The train stays until the next fit.
+        """Drops all but the last `keep` pairs. The train stays until the next fit.
 
         Raises:
             SettingError: keep below 0.
@@ -204,6 +184,36 @@ class TensorLearner:
         if keep < 0:
             raise SettingError(f"keep must be at least 0, got {keep}")
         self._keep(keep)
+
+    def move_marker(self, std: float) -> None:
+        """The marker has been moved: keeps what is known of all other cores, and forgets the pairs.
+
+        The train so far becomes the prior's mean. Each core's covariance is the one it has while the others rest,
+        which pins the frames between them. The last core is as free as a marker moved by `std` makes it: along the
+        axes of its frame where a nominal chain gave them, and any way where nothing did.
+
+        Args:
+            std: standard deviation of each component of the move [m].
+
+        Raises:
+            SettingError: std is not positive.
+            DegenerateDataError: there is neither a prior nor enough pairs.
+        """
+        if not std > 0.0:
+            raise SettingError(f"std must be greater than 0, got {std!r}")
+        cores, prior = self.train.cores.reshape(self.joints, CORE_NUMBERS), self._known_prior()
+        spread = prior.spread
+        if self._information is not None:
+            blocks = range(0, CORE_NUMBERS * self.joints, CORE_NUMBERS)
+            told = np.stack([self._information[k : k + CORE_NUMBERS, k : k + CORE_NUMBERS] for k in blocks])
+            spread = spread @ _inverse_roots(told)
+        spread = spread.copy()
+        moves = _marker_moves(cores[-1].reshape(3, 3, 4), std)
+        widened = spread[-1] @ spread[-1].T + moves @ moves.T
+        values, vectors = np.linalg.eigh(widened)
+        spread[-1] = vectors * np.sqrt(np.maximum(values, 0.0))
+        self._keep(0)
+        self.rebase(CorePrior(cores, spread))
 
     def rebase(self, prior: CorePrior) -> None:
         """Another prior for the same pairs; the next fit starts from its mean.
@@ -330,10 +340,11 @@ class TensorLearner:
             z = np.zeros(CORE_NUMBERS * self.joints)
             guess = _FIRST_NOISE * math.sqrt(float(np.square(data.problem(self._prior, 1.0).residuals(z)).mean()))
             return refine(data, self._prior, z, max(guess, data.noise_floor), robust=robust)
-        if before is None:
+        if before is None or (self._searches and self.kept < _SEARCHES_UNTIL * self.pairs_needed):
             return search(data, self._prior, self.bases, rng, self.settings.starts, robust=robust)
         fit = refine(data, self._prior, before.z, before.noise, robust=robust)
-        if self._searches and fit.noise > max(_LOST * before.noise, _LOST * data.noise_floor):
+        lost = fit.noise > _LOST * max(before.noise, data.noise_floor) or fit.noise > PLAUSIBLE * data.size
+        if self._searches and lost:
             again = search(data, self._prior, self.bases, rng, self.settings.starts, robust=robust)
             fit = min(fit, again, key=lambda candidate: candidate.noise)
         return fit
@@ -345,13 +356,28 @@ class TensorLearner:
             if self._information is None:
                 self._root = np.eye(size)
             else:
-                # Directions that the data do not show have eigenvalues of rounding, which may be negative.
-                values, vectors = np.linalg.eigh(self._information)
-                self._root = vectors / np.sqrt(1.0 + np.maximum(values, 0.0))
+                self._root = _inverse_roots(self._information)
         return self._root
 
 
 _SETTINGS = tuple(field.name for field in fields(TensorSettings))
+
+
+def _marker_moves(last_core: FloatArray, std: float) -> FloatArray:
+    """Changes (36, moves) of the last core when the marker moves by `std` [m] each way."""
+    free = np.diag(np.tile([0.0, 0.0, 0.0, std], 9))
+    if not last_core[:, :, :3].any():
+        return free
+    along = np.zeros((3, 3, 4, 3))
+    along[:, :, 3, :] = std * last_core[:, :, :3]
+    return np.column_stack([along.reshape(CORE_NUMBERS, 3), _FRAME_ERROR * free])
+
+
+def _inverse_roots(information: FloatArray) -> FloatArray:
+    """Square roots of (H + I)⁻¹ (..., m, m) for H (..., m, m), positive semidefinite up to rounding."""
+    values, vectors = np.linalg.eigh(information)
+    roots: FloatArray = vectors / np.sqrt(1.0 + np.maximum(values, 0.0))[..., None, :]
+    return roots
 
 
 def _checked_sigma(sigma: ArrayLike | None, count: int) -> FloatArray:

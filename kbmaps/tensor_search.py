@@ -27,7 +27,7 @@ _ROUND_STEPS = 6
 _ROUNDS = 40
 _SAME_NOISE = 0.02
 # Starts that failed leave a tenth or more of the spread, and may agree on it by chance.
-_PLAUSIBLE = 0.1
+PLAUSIBLE = 0.1
 # The median of |r| for r ~ N(0, I) in three dimensions.
 _MEDIAN_DISTANCE = 1.538
 # Farther than this many robust standard deviations a pair is wrong: 1.5e-5 of good pairs are.
@@ -129,7 +129,7 @@ def search(
         if best.noise < _EXPLAINED * pairs.size:
             break
         fit = _from_a_random_chain(some, prior, bases, rng)
-        plausible = best.noise < _PLAUSIBLE * pairs.size
+        plausible = best.noise < PLAUSIBLE * pairs.size
         agrees = plausible and abs(fit.noise / best.noise - 1.0) < _SAME_NOISE
         best = min(best, fit, key=lambda candidate: candidate.noise)
         if agrees:
