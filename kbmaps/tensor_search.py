@@ -22,7 +22,7 @@ _NOISE_FLOOR = 1e-13
 _EXPLAINED = 1e-4
 _FIRST_NOISE = 2e-2
 _SWEEPS = 40
-_FIRST_STEPS = 60
+_FIRST_STEPS = 30
 _ROUND_STEPS = 6
 _ROUNDS = 40
 _SAME_NOISE = 0.02
@@ -144,6 +144,10 @@ def _from_a_random_chain(pairs: Pairs, prior: CorePrior, bases: Sequence[JointBa
     problem = TensorProblem(pairs.weights, pairs.x, np.full(len(pairs.x), noise), prior)
     z = alternate(problem, prior.whitened(TensorTrain.from_chain(chain, bases).cores), _SWEEPS)
     z, _ = LevenbergMarquardt().run(problem, z, _FIRST_STEPS)
+    left = math.sqrt(float(np.square(problem.residuals(z)).mean()))
+    if left > PLAUSIBLE * pairs.size:
+        # Most failed starts show by now; settling them would take longer than the next start.
+        return Fit(z, left, np.ones(len(pairs.x), dtype=np.bool_))
     blind = Pairs(pairs.weights, pairs.x, np.full(len(pairs.x), np.nan))
     return _settle(blind, prior, z, noise)
 
