@@ -10,6 +10,7 @@ from kbmaps.chain import RigidChain
 from kbmaps.chain_parameters import ChainParameters, ChainTolerances
 from kbmaps.chain_report import ChainReport, Interval
 from kbmaps.chain_search import find_chain
+from kbmaps.core_prior import CorePrior
 from kbmaps.errors import (
     BasisError,
     ChainError,
@@ -28,6 +29,9 @@ from kbmaps.nlms import NLMS
 from kbmaps.rigid_learner import RigidLearner
 from kbmaps.rigid_recursive import RecursiveRigidLearner
 from kbmaps.support import SUPPORT_LIMIT, SupportSet
+from kbmaps.tensor_learner import TensorLearner
+from kbmaps.tensor_settings import TensorSettings
+from kbmaps.tensor_train import TensorTrain
 from kbmaps.tool import with_refitted_marker
 
 __all__ = [
@@ -39,6 +43,7 @@ __all__ = [
     "ChainParameters",
     "ChainReport",
     "ChainTolerances",
+    "CorePrior",
     "DegenerateDataError",
     "Estimate",
     "ExactLearner",
@@ -57,6 +62,9 @@ __all__ = [
     "ShapeError",
     "SingularAlphaError",
     "SupportSet",
+    "TensorLearner",
+    "TensorSettings",
+    "TensorTrain",
     "align",
     "blockwise_precision",
     "find_chain",

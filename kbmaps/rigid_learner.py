@@ -17,7 +17,7 @@ from kbmaps.chain_parameters import WIDE, ChainParameters, ChainTolerances, rota
 from kbmaps.chain_report import ChainReport, chain_report
 from kbmaps.errors import DegenerateDataError, KBMapsError, ModelFormatError
 from kbmaps.model import Estimate
-from kbmaps.packing import pack, unpack
+from kbmaps.packed import numbers, pack, unpack
 from kbmaps.pairs import Pairs, checked_pairs, with_units
 from kbmaps.rigid_fit import RigidFit, fit_chain
 
@@ -183,7 +183,8 @@ class RigidLearner:
     @classmethod
     def from_bytes(cls, data: bytes) -> Self:
         """The learner in `data`. Raises ModelFormatError: it is none of this kind, or damaged."""
-        settings, arrays = unpack(_KIND, data)
+        fields, arrays = unpack(data, _KIND)
+        settings = numbers(fields)
         try:
             chain = RigidChain(arrays["fixed"], arrays["axes"], arrays["prismatic"] != 0.0)
             learner = cls(chain, ChainTolerances(**settings))

@@ -14,7 +14,7 @@ from kbmaps.chain import RigidChain
 from kbmaps.chain_parameters import WIDE, ChainParameters, ChainTolerances
 from kbmaps.errors import KBMapsError, ModelFormatError, NonFiniteError, SettingError, ShapeError
 from kbmaps.model import Estimate
-from kbmaps.packing import pack, unpack
+from kbmaps.packed import numbers, pack, unpack
 from kbmaps.pairs import checked_pairs
 from kbmaps.rigid_learner import RigidLearner
 
@@ -198,7 +198,8 @@ class RecursiveRigidLearner:
     @classmethod
     def from_bytes(cls, data: bytes) -> Self:
         """The learner in `data`. Raises ModelFormatError: it is none of this kind, or damaged."""
-        settings, arrays = unpack(_KIND, data)
+        fields, arrays = unpack(data, _KIND)
+        settings = numbers(fields)
         try:
             pairs, coordinates = settings.pop("pairs"), settings.pop("noise_coordinates")
             noise = settings.pop("noise")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import cached_property
 
 import numpy as np
 
@@ -32,11 +33,18 @@ class BasisStack:
         self._slides = np.array([basis.is_prismatic for basis in bases])
         self._any_slides = bool(self._slides.any())
         self._start, self._span = self._half_phases * 2.0
-        self._left_index = _factor_index(self.sizes[: self.split], 0)
-        self._right_index = _factor_index(self.sizes[self.split :], self.split)
         self._mix = np.zeros((self.joints, 3, 3))
         for k, basis in enumerate(bases):
             self._mix[k, : basis.size, : basis.size] = basis.terms.mix
+
+    # Tables of 3^(d/2) entries a joint, made when first asked for: a tensor train of 30 joints has no use for them.
+    @cached_property
+    def _left_index(self) -> IntArray:
+        return _factor_index(self.sizes[: self.split], 0)
+
+    @cached_property
+    def _right_index(self) -> IntArray:
+        return _factor_index(self.sizes[self.split :], self.split)
 
     def joint_weights(self, q: FloatArray) -> FloatArray:
         """Basis functions (..., d, 3) of every joint for q (..., d); a prismatic joint's third entry is 0."""

@@ -152,7 +152,7 @@ def test_bytes_give_a_learner_that_goes_on_to_the_last_bit(sigma):
 
 def test_bytes_of_the_other_learner_are_refused():
     arm = rough_arm(np.random.default_rng(1), "RR")
-    with pytest.raises(ModelFormatError, match="batch"):
+    with pytest.raises(ModelFormatError, match="something else"):
         RecursiveRigidLearner.from_bytes(RigidLearner(arm.nominal, ROUGH).to_bytes())
 
 

@@ -1,0 +1,38 @@
+"""The settings of a learner of tensor trains."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from kbmaps.errors import SettingError
+
+
+@dataclass(frozen=True)
+class TensorSettings:
+    """How a TensorLearner works.
+
+    Attributes:
+        window: how many of the last pairs are kept; None keeps all.
+        refit_every: pairs after which `learn` fits anew; earlier where they are a quarter of all kept pairs. Until
+            then they wait, or for `refit`.
+        robust: leave out pairs that lie more than five robust standard deviations off.
+        starts: most random chains to start from where there is no prior.
+        seed: of these random chains, so that the same pairs give the same train.
+
+    Raises:
+        SettingError: window, refit_every or starts below 1, seed below 0.
+    """
+
+    window: int | None = None
+    refit_every: int = 25
+    robust: bool = True
+    starts: int = 12
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        lower = {"window": 1 if self.window is None else self.window, "refit_every": self.refit_every}
+        for name, value in {**lower, "starts": self.starts}.items():
+            if value < 1:
+                raise SettingError(f"{name} must be at least 1, got {value}")
+        if self.seed < 0:
+            raise SettingError(f"seed must be at least 0, got {self.seed}")
