@@ -14,13 +14,18 @@ from kbmaps.errors import (
     KBMapsError,
     ModelFormatError,
     NonFiniteError,
+    RotationError,
     SettingError,
     ShapeError,
     SingularAlphaError,
 )
 from kbmaps.exact import ExactLearner, ExactSolution
+from kbmaps.inverse import InverseKinematics, InverseSolution
 from kbmaps.kbmap import KBMap, prediction_errors
 from kbmaps.nlms import NLMS
+from kbmaps.reach import PoseModel, PositionModel
+from kbmaps.resolved_rates import resolved_rates
+from kbmaps.rotations import nearest_rotation
 from kbmaps.support import SUPPORT_LIMIT, SupportSet
 from kbmaps.tool import with_refitted_marker
 
@@ -33,12 +38,17 @@ __all__ = [
     "DegenerateDataError",
     "ExactLearner",
     "ExactSolution",
+    "InverseKinematics",
+    "InverseSolution",
     "JointBasis",
     "KBMap",
     "KBMapsError",
     "ModelFormatError",
     "NonFiniteError",
+    "PoseModel",
+    "PositionModel",
     "RigidChain",
+    "RotationError",
     "SettingError",
     "ShapeError",
     "SingularAlphaError",
@@ -47,6 +57,8 @@ __all__ = [
     "blockwise_precision",
     "follow_a_path",
     "learning_bases",
+    "nearest_rotation",
     "prediction_errors",
+    "resolved_rates",
     "with_refitted_marker",
 ]
