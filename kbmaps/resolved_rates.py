@@ -7,10 +7,12 @@ from typing import cast
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kbmaps.arrays import FloatArray, vector
+from kbmaps.arrays import BoolArray, FloatArray, vector
 from kbmaps.errors import NonFiniteError, SettingError, ShapeError
 
 _ROUNDING = 1e-24
+_ROUNDING_SLOPE = 1e-10
+_ROUNDS_A_JOINT = 6
 
 
 def resolved_rates(
@@ -25,9 +27,9 @@ def resolved_rates(
 ) -> FloatArray:
     """Joint rates u (d,) [rad/s, m/s] that give the velocity as well as damping and limits let them.
 
-    Without limits, u minimises ‖J u − v‖² + damping² ‖(u − preferred) / scale‖²: Whitney 1969 with the damping of
-    Wampler 1986 and Nakamura and Hanafusa 1986. For little damping what J leaves free follows `preferred`. A joint
-    that would pass its limit is held there, and the others make up for it as far as they can.
+    u minimises ‖J u − v‖² + damping² ‖(u − preferred) / scale‖² within the limits: Whitney 1969 with the damping of
+    Wampler 1986 and Nakamura and Hanafusa 1986. For little damping what J leaves free follows `preferred`. For a joint
+    that is held at its limit the others make up as far as they can.
 
     Args:
         jacobian: J (m, d), m = 3 for a position [m/rad] or 6 for a pose.
@@ -69,25 +71,55 @@ def bounded_step(
     preferred: FloatArray,
     scale: FloatArray,
 ) -> FloatArray:
-    """`resolved_rates` for trusted input. Bounds as in Baerlocher and Boulic 2004: the worst joint is held, the rest
-    solved anew, until none passes its bound."""
+    """`resolved_rates` for trusted input.
+
+    An active-set method for least squares with bounds (Stark and Parker 1995): joints are held at bounds, and let go
+    again where that lessens the cost. The cost is strictly convex, so it ends at the one best step.
+    """
     low, high = bounds
-    step = np.zeros(len(preferred))
     free = np.ones(len(preferred), dtype=np.bool_)
-    ridge = damping_square * np.eye(len(wanted))
-    for _ in range(len(preferred)):
-        # With S = diag(scale): step = p + S² Jᵀ (J S² Jᵀ + damping²)⁻¹ (v − J p) over the joints that are free.
-        scaled = jacobian * (scale * free)
+    trial = _unbounded_step(jacobian, wanted, damping_square, preferred, scale, free)
+    step = np.clip(trial, low, high)
+    if (step == trial).all():
+        return step
+    free = step == trial
+    for _ in range(_ROUNDS_A_JOINT * len(preferred)):
         base = np.where(free, preferred, step)
-        multipliers = cast(FloatArray, np.linalg.solve(scaled @ scaled.T + ridge, wanted - jacobian @ base))
-        step = base + scale * (scaled.T @ multipliers)
-        excess = np.maximum(low - step, step - high) / scale
-        worst = int(excess.argmax())
-        if excess[worst] <= 0.0:
-            return step
-        step[worst] = low[worst] if step[worst] < low[worst] else high[worst]
-        free[worst] = False
-    return np.clip(step, low, high)
+        trial = _unbounded_step(jacobian, wanted, damping_square, base, scale, free)
+        inside = np.clip(trial, low, high)
+        passed = free & (inside != trial)
+        if passed.any():
+            # As far towards the trial as the first bound.
+            portions = np.where(passed, (inside - step) / np.where(passed, trial - step, 1.0), 1.0)
+            first = int(portions.argmin())
+            step = np.clip(step + portions[first] * (trial - step), low, high)
+            step[first] = inside[first]
+            free[first] = False
+            continue
+        step = inside
+        # Half the cost's slope in the scaled joints; a held joint is let go where it points away from its bound.
+        slope = damping_square * (step - preferred) / scale - scale * (jacobian.T @ (wanted - jacobian @ step))
+        gain = np.where(free | (low == high), 0.0, np.where(step <= low, -slope, slope))
+        best = int(gain.argmax())
+        if gain[best] <= _ROUNDING_SLOPE * float(np.abs(slope).max()):
+            break
+        free[best] = True
+    return step
+
+
+def _unbounded_step(
+    jacobian: FloatArray,
+    wanted: FloatArray,
+    damping_square: float,
+    base: FloatArray,
+    scale: FloatArray,
+    free: BoolArray,
+) -> FloatArray:
+    """With S = diag(scale) over the free joints: base + S² Jᵀ (J S² Jᵀ + damping²)⁻¹ (v − J base)."""
+    scaled = jacobian * (scale * free)
+    gram = scaled @ scaled.T
+    np.einsum("ii->i", gram)[:] += damping_square
+    return base + scale * (scaled.T @ cast(FloatArray, np.linalg.solve(gram, wanted - jacobian @ base)))
 
 
 def _limits(name: str, values: ArrayLike, joints: int) -> FloatArray:

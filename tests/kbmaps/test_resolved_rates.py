@@ -33,17 +33,18 @@ def test_a_preferred_rate_of_a_redundant_arm_does_not_disturb_the_velocity(seed)
     np.testing.assert_allclose(J @ u, v, atol=1e-6)
 
 
-@given(seed=seeds, joints=st.integers(1, 8))
-@settings(max_examples=50)
-def test_limits_are_kept_at_little_cost_against_the_best_rates_within_them(seed, joints):
+@given(seed=seeds, joints=st.integers(1, 12), damping=st.floats(0.01, 1.0))
+@settings(max_examples=100, deadline=None)
+def test_rates_within_limits_are_the_best_there_are(seed, joints, damping):
+    """As an independent solver finds them."""
     rng = np.random.default_rng(seed)
-    J, v = rng.normal(size=(3, joints)), rng.normal(size=3)
-    low, high = -rng.uniform(0.0, 0.5, joints), rng.uniform(0.0, 0.5, joints)
-    u = resolved_rates(J, v, damping=1e-3, low=low, high=high)
+    J, v, preferred = rng.normal(size=(3, joints)), rng.normal(size=3), 0.3 * rng.normal(size=joints)
+    low, high = -rng.uniform(0.01, 0.5, joints), rng.uniform(0.01, 0.5, joints)
+    u = resolved_rates(J, v, damping=damping, low=low, high=high, preferred=preferred)
+    stacked, wanted = np.concatenate([J, damping * np.eye(joints)]), np.concatenate([v, damping * preferred])
+    best = lsq_linear(stacked, wanted, (low, high), method="bvls", tol=1e-14, max_iter=1000)
     assert ((low <= u) & (u <= high)).all()
-    assert np.linalg.norm(J @ u - v) <= np.linalg.norm(v) + 1e-9
-    best = lsq_linear(J, v, (low - 1e-12, high + 1e-12)).cost
-    assert 0.5 * np.sum((J @ u - v) ** 2) >= best - 1e-9
+    np.testing.assert_allclose(u, best.x, atol=1e-7)
 
 
 def test_other_joints_make_up_for_one_that_is_held():
