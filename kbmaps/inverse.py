@@ -19,8 +19,8 @@ from kbmaps.rotations import rotation_matrices
 Reason = Literal["reached", "out_of_reach", "steps_ran_out"]
 
 SAMPLES = 4096
-STARTS, POSE_STARTS = 16, 64
-MAX_STEPS = 2000
+STARTS, POSE_STARTS = 16, 48
+MAX_STEPS = 3000
 TOLERANCE_M = 1e-7
 TOLERANCE_RAD = 1e-7
 # Starts are chosen among so many times as many samples near the target.
@@ -67,7 +67,7 @@ class InverseKinematics:
             taken from one turn.
         seed: of the samples.
         samples: how many.
-        starts: how many configurations are tried at most; None: 16 for a position, 64 for a pose.
+        starts: how many configurations are tried at most; None: 16 for a position, 48 for a pose.
         max_steps: of all starts together; each takes about one evaluation of `model.jacobian`.
         tolerance, angle_tolerance: distance [m] and angle [rad] that count as reached.
 
