@@ -105,7 +105,7 @@ def main() -> None:
     print(f"{options.arms} random arms, {options.targets} targets each")
     print("time [ms] and steps: median / 99 %")
     print(
-        "| joints | half range [deg] | target | reached | steps | at first start | time | outside: told | time of that |"
+        "| joints | half range [deg] | target | reached | steps | first start | time | outside: told | time of that |"
     )
     print("| --- | --- | --- | --- | --- | --- | --- | --- | --- |")
     for case in CASES:
