@@ -1,18 +1,35 @@
-"""What the learner answers: predictions, Jacobians and the model, from its present snapshot."""
+"""What the learner answers: predictions, Jacobians, inverse kinematics and the model, from its present snapshot."""
 
 from __future__ import annotations
 
+import math
+
 from daemon.bus import Request
 from daemon.learning import Learning
-from daemon.wire import JacobianReply, JointsRequest, PredictReply, decode, encode, joint_angles
+from daemon.wire import (
+    IkReply,
+    IkRequest,
+    JacobianReply,
+    JointsRequest,
+    PredictReply,
+    decode,
+    encode,
+    finite_vector,
+    joint_angles,
+)
+from interfaces.errors import RequestError
 from interfaces.protocols import Clock
+from interfaces.robot import RobotDescription
+from kbmaps import InverseKinematics, KBMap
 
 
 class Answers:
     """Handlers for the learner's queries. They take no lock, so that learning never delays them."""
 
-    def __init__(self, learning: Learning, joints: tuple[str, ...], robot: str, clock: Clock) -> None:
-        self._learning, self._joints, self._robot, self._clock = learning, joints, robot, clock
+    def __init__(self, learning: Learning, robot: RobotDescription, clock: Clock) -> None:
+        self._learning, self._robot, self._clock = learning, robot, clock
+        self._joints = robot.joints
+        self._inverse: tuple[KBMap, InverseKinematics] | None = None
 
     def predict(self, request: Request) -> bytes:
         """Positions, 1-sigma and support; RequestError for a bad request, or before there is a model."""
@@ -37,8 +54,45 @@ class Answers:
         jacobians = snapshot.require_map().jacobian(q)
         return encode(JacobianReply(jacobians.tolist(), snapshot.digest, snapshot.pairs), request.encoding)
 
+    def ik(self, request: Request) -> bytes:
+        """Joint angles that put the marker where it is wanted; RequestError as for `predict`."""
+        wanted = decode(request.payload, IkRequest, request.encoding)
+        if not all(map(math.isfinite, wanted.x)):
+            raise RequestError("x is not finite")
+        start = None if wanted.start is None else finite_vector("start", wanted.start, self._joints)
+        snapshot = self._learning.snapshot
+        inverse = self._inverse_of(snapshot.require_map())
+        if wanted.posture is None:
+            posture = None
+        elif wanted.posture == "middle":
+            posture = inverse.middle
+        else:
+            posture = finite_vector("posture", wanted.posture, self._joints)
+        found = inverse.solve(wanted.x, start=start, posture=posture)
+        there = snapshot.predict(found.q[None])
+        reply = IkReply(
+            q=found.q.tolist(),
+            x=found.x.tolist(),
+            distance=found.distance,
+            converged=found.converged,
+            reason=found.reason,
+            sigma=there.sigma[0].tolist(),
+            in_support=bool(there.in_support[0]),
+            model=snapshot.digest,
+            pairs=snapshot.pairs,
+        )
+        return encode(reply, request.encoding)
+
+    def _inverse_of(self, kbmap: KBMap) -> InverseKinematics:
+        """The solver for this map; the last one is kept, since building it costs as much as several answers."""
+        kept = self._inverse
+        if kept is None or kept[0] is not kbmap:
+            kept = kbmap, InverseKinematics(kbmap, self._robot.lower, self._robot.upper)
+            self._inverse = kept
+        return kept[1]
+
     def model(self, _request: Request) -> bytes:
         """The model as one self-describing file, with the robot's name and joints in its metadata."""
         snapshot = self._learning.snapshot
-        texts = {"robot": self._robot, "joints": " ".join(self._joints), "pairs": str(snapshot.pairs)}
+        texts = {"robot": self._robot.name, "joints": " ".join(self._joints), "pairs": str(snapshot.pairs)}
         return snapshot.require_map().with_metadata(texts | {"model": snapshot.digest}).to_bytes()

@@ -21,6 +21,7 @@ COMMANDS = {
     "learner": "Only the learner: pairs in, answers out. On any machine.",
     "status": "What the two processes are doing.",
     "predict": "Ask where the marker is at given joint angles.",
+    "ik": "Ask for joint angles that bring the marker to a position.",
     "command": "Pause, resume, tell of a changed tool, reset, checkpoint.",
     "record": "Copy the running sampler's pairs into a file.",
     "export": "Turn a store or a recording into CSV, Parquet or MCAP.",

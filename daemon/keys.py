@@ -35,6 +35,11 @@ class Keys:
         return self._key("jacobian")
 
     @property
+    def ik(self) -> str:
+        """Marker positions to joint angles, answered by the learner."""
+        return self._key("ik")
+
+    @property
     def model(self) -> str:
         """The model as one self-describing file, answered by the learner."""
         return self._key("model")

@@ -54,7 +54,7 @@ class Learner:
         self._set_aside: str | None = None
         self._restore()
         self._feed = PairFeed(self._learning, self._history, clock)
-        self._answers = Answers(self._learning, config.robot.joints, config.robot.name, clock)
+        self._answers = Answers(self._learning, config.robot, clock)
         self._sampler_alive = False
         self._started_at = clock.now()
         self._checkpointed_at: float | None = None
@@ -178,6 +178,7 @@ class Learner:
         bus, keys, answers = self._bus, self._keys, self._answers
         bus.answer(keys.predict, answers.predict)
         bus.answer(keys.jacobian, answers.jacobian)
+        bus.answer(keys.ik, answers.ik)
         bus.answer(keys.model, answers.model, encoding=OCTETS)
         bus.answer(keys.status("learner"), lambda request: encode(self.status(), request.encoding))
         bus.answer(keys.command("learner"), self._command)

@@ -5,6 +5,7 @@ Requests are checked for unknown keys; replies and publications may grow keys, s
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Annotated, Any, Literal, TypeVar
 
 import msgspec
@@ -83,6 +84,47 @@ class JacobianReply(msgspec.Struct, frozen=True):
     """Jacobians dx/dq [m/rad], a 3 × d matrix for each row of the request."""
 
     J: list[list[list[float]]]
+    model: str
+    pairs: int
+    schema: int = SCHEMA
+
+
+class IkRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Where the marker is wanted.
+
+    Attributes:
+        x: in the measurement frame [m].
+        start: joint angles of the arm as it is now [rad]: the answer is near to them where it can be.
+        posture: joint angles to stay near to as far as x leaves a choice [rad], or "middle" of the joint limits.
+    """
+
+    x: tuple[float, float, float]
+    start: list[float] | None = None
+    posture: Literal["middle"] | list[float] | None = None
+
+
+class IkReply(msgspec.Struct, frozen=True):
+    """Joint angles within the limits, and what is missing.
+
+    Attributes:
+        q: joint angles [rad].
+        x: where the model puts the marker there [m].
+        distance: from x to what was asked for [m].
+        converged: whether that is nothing, to the solver's tolerance.
+        reason: `reached`, `out_of_reach` or `steps_ran_out`.
+        sigma: 1-sigma per axis of x against the truth [m].
+        in_support: whether q lies where data was.
+        model: hash of the model that answered.
+        pairs: how many pairs it had learnt.
+    """
+
+    q: list[float]
+    x: list[float]
+    distance: float
+    converged: bool
+    reason: str
+    sigma: list[float]
+    in_support: bool
     model: str
     pairs: int
     schema: int = SCHEMA
@@ -167,6 +209,22 @@ def pair_from_wire(message: PairMessage, joints: int) -> Pair:
         x=frozen_array(message.x),
         cov=frozen_array(cov + np.triu(cov, 1).T),
     )
+
+
+def finite_vector(name: str, values: Sequence[float], joints: tuple[str, ...]) -> np.ndarray:
+    """One number for each joint, shape (d,).
+
+    Raises:
+        RequestError: too many or too few, or one that is not finite.
+    """
+    if len(values) != len(joints):
+        raise RequestError(
+            f"{name} has {len(values)} numbers; this robot has {len(joints)} joints: {', '.join(joints)}"
+        )
+    vector = np.array(values, dtype=np.float64)
+    if not np.isfinite(vector).all():
+        raise RequestError(f"{name} is not finite at joint {joints[int(np.isfinite(vector).argmin())]!r}")
+    return vector
 
 
 def joint_angles(request: JointsRequest, joints: tuple[str, ...]) -> np.ndarray:

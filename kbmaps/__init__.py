@@ -18,16 +18,21 @@ from kbmaps.errors import (
     KBMapsError,
     ModelFormatError,
     NonFiniteError,
+    RotationError,
     SettingError,
     ShapeError,
     SingularAlphaError,
 )
 from kbmaps.exact import ExactLearner, ExactSolution
+from kbmaps.inverse import InverseKinematics, InverseSolution
 from kbmaps.kbmap import KBMap, prediction_errors
 from kbmaps.model import Estimate, Model
 from kbmaps.nlms import NLMS
+from kbmaps.reach import PoseModel, PositionModel
+from kbmaps.resolved_rates import resolved_rates
 from kbmaps.rigid_learner import RigidLearner
 from kbmaps.rigid_recursive import RecursiveRigidLearner
+from kbmaps.rotations import nearest_rotation
 from kbmaps.support import SUPPORT_LIMIT, SupportSet
 from kbmaps.tensor_learner import TensorLearner
 from kbmaps.tensor_settings import TensorSettings
@@ -49,15 +54,20 @@ __all__ = [
     "ExactLearner",
     "ExactSolution",
     "Interval",
+    "InverseKinematics",
+    "InverseSolution",
     "JointBasis",
     "KBMap",
     "KBMapsError",
     "Model",
     "ModelFormatError",
     "NonFiniteError",
+    "PoseModel",
+    "PositionModel",
     "RecursiveRigidLearner",
     "RigidChain",
     "RigidLearner",
+    "RotationError",
     "SettingError",
     "ShapeError",
     "SingularAlphaError",
@@ -70,6 +80,8 @@ __all__ = [
     "find_chain",
     "follow_a_path",
     "learning_bases",
+    "nearest_rotation",
     "prediction_errors",
+    "resolved_rates",
     "with_refitted_marker",
 ]

@@ -6,6 +6,7 @@ KBMapsError
 ├── BasisError            a basis cannot be built from these parameters
 │   └── SingularAlphaError    alpha is too near to 90 degrees
 ├── ChainError            transforms or axes do not describe a rigid chain
+├── RotationError         matrices or quaternions do not describe rotations
 ├── SettingError          a learner's setting is outside its range
 ├── DegenerateDataError   the data do not determine what is asked for
 └── ModelFormatError      these bytes are not a stored map
@@ -48,6 +49,13 @@ class SingularAlphaError(BasisError):
 
 class ChainError(KBMapsError):
     """Transforms or axes do not describe a rigid chain."""
+
+
+class RotationError(KBMapsError):
+    """Matrices or quaternions do not describe rotations."""
+
+    def __init__(self, name: str, what: str) -> None:
+        super().__init__(f"{name}: {what}; give rotation matrices, or unit quaternions in the order x, y, z, w")
 
 
 class SettingError(KBMapsError):

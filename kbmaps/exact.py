@@ -15,8 +15,9 @@ from kbmaps.arrays import FloatArray, rows_or_vector
 from kbmaps.basis import JointBasis
 from kbmaps.errors import BasisError, NonFiniteError, SettingError, ShapeError
 from kbmaps.factor import RowFactor, ShiftedGram
-from kbmaps.kbmap import POSITION_OUTPUTS, KBMap
+from kbmaps.kbmap import POSE_OUTPUTS, POSITION_OUTPUTS, KBMap
 from kbmaps.stack import BasisStack
+from kbmaps.targets import pose_targets
 
 _BLOCK = 128
 # Below this reciprocal condition number a triangular solve would return rounding errors.
@@ -39,9 +40,10 @@ class ExactSolution:
     Attributes:
         map: in the bases of the prior that the learner was given.
         noise_std: estimated noise of one coordinate at weight 1 [m]; None where the data do not tell.
+        orientation_noise_std: the same of one entry of the rotation matrices; None also where none were learnt.
         prior_precision: λ = (noise_std / spread of the prior's coefficients)²; 0 for the unregularised solution.
-        log_evidence: log marginal likelihood of the positions at λ; None for the unregularised solution.
-        residual_rms: weighted RMS distance between the map and the pairs it was fitted to [m].
+        log_evidence: log marginal likelihood of all that was learnt at λ; None for the unregularised solution.
+        residual_rms: weighted RMS distance between the map's positions and those it was fitted to [m].
     """
 
     map: KBMap
@@ -49,6 +51,7 @@ class ExactSolution:
     prior_precision: float
     log_evidence: float | None
     residual_rms: float
+    orientation_noise_std: float | None = None
 
     @property
     def prior_std(self) -> float | None:
@@ -63,10 +66,10 @@ class ExactSolution:
 
 @dataclass(frozen=True)
 class _Fit:
-    """One λ: the multipliers (k, 3), noise variance and evidence."""
+    """One λ: the multipliers (k, outputs), noise variances of positions and of orientations, and evidence."""
 
     multipliers: FloatArray
-    variance: float
+    variances: list[float]
     log_evidence: float
 
 
@@ -79,18 +82,20 @@ class ExactLearner:
     one its share of a block.
 
     Args:
-        prior: where the solution stays in the directions that the data do not show.
+        prior: where the solution stays in the directions that the data do not show. With an orientation, that is learnt
+            too: its nine planes have a noise of their own and share λ with the position's.
         bases: what the solution is computed in; it decides what "nearest to the prior" means. None takes the prior's.
             Scaled orthonormal bases over the joints' ranges (`learning_bases`) are advised.
 
     Raises:
-        ShapeError: the prior holds an orientation. BasisError: bases do not fit the prior.
+        BasisError: bases do not fit the prior.
     """
 
     def __init__(self, prior: KBMap, bases: Sequence[JointBasis] | None = None) -> None:
         self._bases = prior.bases if bases is None else tuple(bases)
         self._stack = BasisStack(self._bases)
-        self._factor = RowFactor(prior.size, POSITION_OUTPUTS)
+        self._outputs = len(prior.net)
+        self._factor = RowFactor(prior.size, self._outputs)
         self._pending: list[tuple[FloatArray, FloatArray]] = []
         self._pending_rows = 0
         self._pairs = 0
@@ -111,32 +116,39 @@ class ExactLearner:
         """Another prior for the same data.
 
         Raises:
-            ShapeError: the prior holds an orientation. BasisError: it has other joints.
+            ShapeError: the prior has an orientation and the one before had none, or the other way round.
+            BasisError: it has other joints.
         """
-        if prior.has_orientation:
-            raise ShapeError("prior.net", f"({POSITION_OUTPUTS}, ...): this learner learns positions", prior.net.shape)
+        if len(prior.net) != self._outputs:
+            raise ShapeError("prior.net", f"({self._outputs}, ...) as before", prior.net.shape)
         if len(prior.bases) != len(self._bases):
             raise BasisError(f"the prior has {len(prior.bases)} joints, the learner {len(self._bases)}")
-        self._prior_coefficients = prior.in_basis(self._bases).net.reshape(POSITION_OUTPUTS, -1).T
+        self._prior_coefficients = prior.in_basis(self._bases).net.reshape(self._outputs, -1).T
         self._prior = prior
 
-    def learn(self, q: ArrayLike, x: ArrayLike, weight: ArrayLike | None = None) -> None:
+    def learn(
+        self, q: ArrayLike, x: ArrayLike, weight: ArrayLike | None = None, rotation: ArrayLike | None = None
+    ) -> None:
         """One pair, q (d,) [rad] and x (3,) [m], or many, (n, d) and (n, 3).
 
         Args:
             weight: relative inverse variance of each pair, () or (n,), greater than 0; None means 1.
+            rotation: the orientations, rotation matrices (n, 3, 3) or quaternions x, y, z, w (n, 4), for one pair also
+                (3, 3) or (4,); where the prior has an orientation, and only there.
 
         Raises:
-            ShapeError, NonFiniteError, SettingError (a weight that is not positive): nothing has changed.
+            ShapeError, NonFiniteError, RotationError
+            SettingError: a weight that is not positive, rotations too many or too few. Nothing has changed.
         """
         angles = np.atleast_2d(rows_or_vector("q", q, self._stack.joints))
         positions = np.atleast_2d(rows_or_vector("x", x, POSITION_OUTPUTS))
         if len(angles) != len(positions):
             raise ShapeError("x", f"({len(angles)}, 3) to go with q", positions.shape)
+        targets = pose_targets(positions, rotation, self._outputs)
         weights = _checked_weights(weight, len(angles))
         for start in range(0, len(angles), _BLOCK):
             part = slice(start, start + _BLOCK)
-            self._collect(angles[part], positions[part], weights[part])
+            self._collect(angles[part], targets[part], weights[part])
         self._pairs += len(angles)
         self._log_weights += float(np.log(weights).sum())
 
@@ -169,9 +181,9 @@ class ExactLearner:
             self._last_precision = prior_precision
         return self._solve_ridge(gram, errors, prior_precision)
 
-    def _collect(self, q: FloatArray, x: FloatArray, weights: FloatArray) -> None:
+    def _collect(self, q: FloatArray, targets: FloatArray, weights: FloatArray) -> None:
         scale = np.sqrt(weights)[:, None]
-        self._pending.append((self._stack.full(q) * scale, x * scale))
+        self._pending.append((self._stack.full(q) * scale, targets * scale))
         self._pending_rows += len(q)
         if self._pending_rows >= _BLOCK:
             self._flush()
@@ -191,13 +203,13 @@ class ExactLearner:
             change = lapack.smallest_solution(factor.rows, errors, _SMALLEST_RCOND)
         if change is None:
             change = self._nearest(errors)
-        freedom = POSITION_OUTPUTS * (self._pairs - factor.unknowns)
-        square = self._residual_square(errors, change)
-        noise = math.sqrt(square / freedom) if freedom > 0 else None
-        return self._solution(change, noise, 0.0, None, square)
+        freedom = self._pairs - factor.unknowns
+        squares = self._residual_squares(errors, change)
+        noises = [math.sqrt(float(squares[part].mean()) / freedom) if freedom > 0 else None for part in self._parts]
+        return self._solution(change, noises, 0.0, None, squares)
 
     def _nearest(self, errors: FloatArray) -> FloatArray:
-        """The smallest change of the coefficients (m, 3) that explains `errors` (k, 3), whatever the rank.
+        """The smallest change of the coefficients (m, outputs) that explains `errors` (k, outputs), whatever the rank.
 
         Iterated Tikhonov: each pass leaves the share λ / (σ² + λ) of what a singular value σ has still to explain, and
         corrects the rounding of the pass before. Directions with σ² far below λ stay at the prior.
@@ -224,21 +236,30 @@ class ExactLearner:
         # One step of refinement through the rows themselves mends the rounding of the Gram matrix.
         remaining = errors - a @ (a.T @ fit.multipliers) - precision * fit.multipliers
         change = a.T @ (fit.multipliers + gram.solve(remaining))
-        square = self._residual_square(errors, change)
-        return self._solution(change, math.sqrt(fit.variance), precision, fit.log_evidence, square)
+        squares = self._residual_squares(errors, change)
+        noises = [math.sqrt(variance) for variance in fit.variances]
+        return self._solution(change, noises, precision, fit.log_evidence, squares)
 
     def _fit(self, gram: ShiftedGram, errors: FloatArray, precision: float) -> _Fit:
         """Evidence of λ. With A the kept rows, the errors of one coordinate are N(0, s² (A Aᵀ / λ + I))."""
         if not gram.factorise(precision):
             raise SettingError(f"prior_precision = {precision:.3g} is below rounding here; use None or a larger one")
         multipliers = gram.solve(errors)
-        samples = POSITION_OUTPUTS * self._pairs
-        explained = precision * float(np.einsum("ko,ko->", errors, multipliers))
-        variance = max((explained + self._factor.residual_square) / samples, _VARIANCE_FLOOR)
+        squares = precision * np.einsum("ko,ko->o", errors, multipliers) + self._factor.residual_squares
         spread = gram.log_determinant - len(errors) * math.log(precision)
-        log_evidence = -0.5 * samples * (math.log(2.0 * math.pi * variance) + 1.0)
-        log_evidence += 0.5 * POSITION_OUTPUTS * (self._log_weights - spread)
-        return _Fit(multipliers, variance, log_evidence)
+        variances = [max(float(squares[part].mean()) / self._pairs, _VARIANCE_FLOOR) for part in self._parts]
+        log_evidence = 0.0
+        for part, variance in zip(self._parts, variances, strict=True):
+            outputs = part.stop - part.start
+            log_evidence -= 0.5 * outputs * self._pairs * (math.log(2.0 * math.pi * variance) + 1.0)
+            log_evidence += 0.5 * outputs * (self._log_weights - spread)
+        return _Fit(multipliers, variances, log_evidence)
+
+    @property
+    def _parts(self) -> list[slice]:
+        """The outputs that share a noise: the positions, and the orientations where there are any."""
+        positions = slice(0, POSITION_OUTPUTS)
+        return [positions] if self._outputs == POSITION_OUTPUTS else [positions, slice(POSITION_OUTPUTS, POSE_OUTPUTS)]
 
     def _most_evident(self, gram: ShiftedGram, errors: FloatArray) -> float:
         """λ of the greatest evidence: climbs from the last one in steps, then takes the vertex of a parabola."""
@@ -264,17 +285,28 @@ class ExactLearner:
             middle = max((middle, vertex), key=evidence)
         return math.exp(middle)
 
-    def _residual_square(self, errors: FloatArray, change: FloatArray) -> float:
+    def _residual_squares(self, errors: FloatArray, change: FloatArray) -> FloatArray:
         remaining = errors - self._factor.rows @ change
-        return float(np.square(remaining).sum()) + self._factor.residual_square
+        return np.square(remaining).sum(axis=0) + self._factor.residual_squares
 
     def _solution(
-        self, change: FloatArray, noise: float | None, precision: float, log_evidence: float | None, square: float
+        self,
+        change: FloatArray,
+        noises: Sequence[float | None],
+        precision: float,
+        log_evidence: float | None,
+        squares: FloatArray,
     ) -> ExactSolution:
-        shape = (POSITION_OUTPUTS, *(basis.size for basis in self._bases))
+        shape = (self._outputs, *(basis.size for basis in self._bases))
         learnt = KBMap(self._bases, (self._prior_coefficients + change).T.reshape(shape), self._prior.metadata)
-        rms = math.sqrt(square / self._pairs)
-        return ExactSolution(learnt.in_basis(self._prior.bases), noise, precision, log_evidence, rms)
+        return ExactSolution(
+            map=learnt.in_basis(self._prior.bases),
+            noise_std=noises[0],
+            prior_precision=precision,
+            log_evidence=log_evidence,
+            residual_rms=math.sqrt(float(squares[:POSITION_OUTPUTS].sum()) / self._pairs),
+            orientation_noise_std=noises[1] if len(noises) > 1 else None,
+        )
 
 
 def _vertex(positions: tuple[float, float, float], heights: tuple[float, float, float]) -> float:

@@ -12,14 +12,14 @@ class RowFactor:
     """Rows A (k, m) and targets (k, outputs) of a least-squares problem, never more of them than unknowns.
 
     Up to m rows are kept as they come. From then on A is their triangular QR factor, into which later rows are
-    folded: ‖A g − targets‖² + residual_square stays the sum of squares over all rows ever added, for every g,
-    at the same memory and the same cost a row. No normal equations are formed, so nothing is lost to squaring the
-    condition number. Inputs are trusted.
+    folded: for every g, the squares of A g − targets plus `residual_squares` (outputs,) stay the sum over all rows ever
+    added, at the same memory and the same cost a row. No normal equations are formed, so nothing is lost to squaring
+    the condition number. Inputs are trusted.
     """
 
     def __init__(self, unknowns: int, outputs: int) -> None:
         self.unknowns = unknowns
-        self.residual_square = 0.0
+        self.residual_squares = np.zeros(outputs)
         self._rows = np.zeros((unknowns, unknowns))
         self._targets = np.zeros((unknowns, outputs))
         self._filled = 0
@@ -52,7 +52,7 @@ class RowFactor:
         if taken < len(rows):
             below, below_targets = np.asfortranarray(rows[taken:]), np.array(targets[taken:], order="F")
             self._rows, self._targets, remainder = lapack.qr_append(self._rows, self._targets, below, below_targets)
-            self.residual_square += float(np.square(remainder).sum())
+            self.residual_squares += np.square(remainder).sum(axis=0)
 
     def gram(self) -> FloatArray:
         """A new A Aᵀ (k, k), Fortran-ordered, of which only the upper triangle counts."""

@@ -15,6 +15,7 @@ from kbmaps import serial
 from kbmaps.arrays import FloatArray, frozen, rows, rows_or_vector
 from kbmaps.basis import JointBasis
 from kbmaps.errors import BasisError, NonFiniteError, ShapeError
+from kbmaps.rotations import nearest_rotation, nearest_rotation_rates
 from kbmaps.stack import BasisStack
 
 POSITION_OUTPUTS = 3
@@ -84,17 +85,18 @@ class KBMap:
         """
         return self._outputs(rows_or_vector("q", q, self.joints), 0, POSITION_OUTPUTS)
 
-    def orientation(self, q: ArrayLike) -> FloatArray:
-        """The marker's axes as columns of (3, 3), or (n, 3, 3); orthonormal as far as the map was learnt so.
+    def orientation(self, q: ArrayLike, *, orthonormal: bool = False) -> FloatArray:
+        """The marker's axes e1, e2, e3 as columns of (3, 3), or (n, 3, 3).
+
+        Args:
+            orthonormal: the nearest rotation to what was learnt, which by itself is orthonormal as far as it is exact.
 
         Raises:
             ShapeError: the map holds positions only, or q has the wrong length. NonFiniteError.
         """
-        if not self.has_orientation:
-            raise ShapeError("net", f"({POSE_OUTPUTS}, ...) to give an orientation", self.net.shape)
-        checked = rows_or_vector("q", q, self.joints)
-        axes = self._outputs(checked, POSITION_OUTPUTS, POSE_OUTPUTS)
-        return axes.reshape(*axes.shape[:-1], 3, 3).swapaxes(-1, -2)
+        self._require_orientation()
+        axes = _as_columns(self._outputs(rows_or_vector("q", q, self.joints), POSITION_OUTPUTS, POSE_OUTPUTS))
+        return nearest_rotation(axes) if orthonormal else axes
 
     def jacobian(self, q: ArrayLike) -> FloatArray:
         """Derivative (3, d) of the position [m/rad, or m/m], or (n, 3, d) for q (n, d).
@@ -102,10 +104,22 @@ class KBMap:
         Raises:
             ShapeError, NonFiniteError
         """
+        return self._derivatives(rows_or_vector("q", q, self.joints), 0, POSITION_OUTPUTS)
+
+    def angular_jacobian(self, q: ArrayLike) -> FloatArray:
+        """Angular velocity (3, d) of the orthonormal orientation R [rad/rad, or rad/m], or (n, 3, d) for q (n, d).
+
+        In the measurement frame: dR/dq_k = [column k]× R.
+
+        Raises:
+            ShapeError: the map holds positions only, or q has the wrong length. NonFiniteError.
+        """
+        self._require_orientation()
         checked = rows_or_vector("q", q, self.joints)
-        if checked.ndim == 1:
-            return self._jacobian(checked)
-        return np.concatenate([self._jacobian(chunk) for chunk in _chunks(checked)])
+        axes = self._outputs(checked, POSITION_OUTPUTS, POSE_OUTPUTS)
+        slopes = self._derivatives(checked, POSITION_OUTPUTS, POSE_OUTPUTS)
+        turning = slopes.reshape(*checked.shape[:-1], 3, 3, self.joints).swapaxes(-3, -2)
+        return nearest_rotation_rates(_as_columns(axes), turning)
 
     def weights(self, q: ArrayLike) -> FloatArray:
         """The full weight vector (3^d,) for q (d,), or (n, 3^d): the Kronecker product over the joints.
@@ -136,9 +150,51 @@ class KBMap:
         """The same map with other texts."""
         return KBMap(self.bases, self.net, metadata)
 
+    def with_alpha(self, alpha: ArrayLike, centre: ArrayLike = 0.0) -> KBMap:
+        """The same map with Bézier control points for another α; exact up to rounding.
+
+        Args:
+            alpha: α [rad], one for all revolute joints or one a joint (d,); prismatic joints keep their Bézier basis.
+            centre: the angle that −α and α are counted from [rad], likewise.
+
+        Raises:
+            BasisError: an α that is not within 0..180 degrees (SingularAlphaError: within 80..100).
+            ShapeError, NonFiniteError
+        """
+        alphas, centres = _one_a_joint("alpha", alpha, self.joints), _one_a_joint("centre", centre, self.joints)
+        return self.in_basis(
+            [
+                basis.to_bernstein() if basis.is_prismatic else JointBasis.bernstein(a, c)
+                for basis, a, c in zip(self.bases, alphas, centres, strict=True)
+            ]
+        )
+
+    @classmethod
+    def from_control_points(cls, bases: Sequence[JointBasis], points: ArrayLike) -> KBMap:
+        """The map of Bézier control points (m1, ..., md, 3) [m], as `control_points` gives them.
+
+        Args:
+            bases: one a joint, Bernstein or prismatic.
+
+        Raises:
+            BasisError: a basis whose coefficients are no control points. ShapeError, NonFiniteError.
+        """
+        for k, basis in enumerate(bases):
+            if basis.to_bernstein() != basis:
+                raise BasisError(
+                    f"joint {k} has a {basis.kind} basis; control points need a Bernstein or prismatic one"
+                )
+        given = np.asarray(points, dtype=np.float64)
+        if given.ndim == 0 or given.shape[-1] != POSITION_OUTPUTS:
+            raise ShapeError("points", f"(m1, ..., md, {POSITION_OUTPUTS})", given.shape)
+        return cls(tuple(bases), np.moveaxis(given, -1, 0))
+
     @property
     def control_points(self) -> FloatArray:
-        """Bézier control points (m1, ..., md, 3) [m], in the bases that `JointBasis.to_bernstein` names."""
+        """Bézier control points (m1, ..., md, 3) [m], in the bases that `JointBasis.to_bernstein` names.
+
+        `with_alpha` chooses other bases first.
+        """
         bernstein = self.in_basis([basis.to_bernstein() for basis in self.bases])
         return frozen(np.moveaxis(bernstein.net[:POSITION_OUTPUTS], 0, -1))
 
@@ -176,16 +232,25 @@ class KBMap:
             out[start : start + len(chunk)] = (by_left @ left[:, :, None])[:, :, 0]
         return out
 
-    def _jacobian(self, q: FloatArray) -> FloatArray:
-        """Derivative (..., 3, d) for q (..., d)."""
-        stack, lead = self._stack, q.shape[:-1]
+    def _require_orientation(self) -> None:
+        if not self.has_orientation:
+            raise ShapeError("net", f"({POSE_OUTPUTS}, ...) to give an orientation", self.net.shape)
+
+    def _derivatives(self, q: FloatArray, begin: int, end: int) -> FloatArray:
+        """Derivatives of outputs begin..end, (end − begin, d) or (n, end − begin, d)."""
+        if q.ndim == 1:
+            return self._derivatives_of_few(q, begin, end)
+        return np.concatenate([self._derivatives_of_few(chunk, begin, end) for chunk in _chunks(q)])
+
+    def _derivatives_of_few(self, q: FloatArray, begin: int, end: int) -> FloatArray:
+        stack, lead, count = self._stack, q.shape[:-1], end - begin
         weights, slopes = stack.joint_weights(q), stack.joint_derivatives(q)
-        planes = self._planes[: POSITION_OUTPUTS * stack.left_size]
-        cube = planes.reshape(POSITION_OUTPUTS, stack.left_size, stack.right_size)
-        by_left = (stack.right(weights) @ planes.T).reshape(*lead, POSITION_OUTPUTS, stack.left_size)
+        planes = self._planes[begin * stack.left_size : end * stack.left_size]
+        cube = planes.reshape(count, stack.left_size, stack.right_size)
+        by_left = (stack.right(weights) @ planes.T).reshape(*lead, count, stack.left_size)
         by_right = stack.left(weights) @ cube.swapaxes(0, 1).reshape(stack.left_size, -1)
-        by_right = by_right.reshape(*lead, POSITION_OUTPUTS, stack.right_size)
-        columns = np.empty((*lead, POSITION_OUTPUTS, self.joints))
+        by_right = by_right.reshape(*lead, count, stack.right_size)
+        columns = np.empty((*lead, count, self.joints))
         for k in range(self.joints):
             varied = weights.copy()
             varied[..., k, :] = slopes[..., k, :]
@@ -194,6 +259,20 @@ class KBMap:
             else:
                 columns[..., k] = (by_right @ stack.right(varied)[..., None])[..., 0]
         return columns
+
+
+def _as_columns(axes: FloatArray) -> FloatArray:
+    """Outputs (..., 9), three a unit vector, as matrices (..., 3, 3) with the unit vectors as columns."""
+    return axes.reshape(*axes.shape[:-1], 3, 3).swapaxes(-1, -2)
+
+
+def _one_a_joint(name: str, values: ArrayLike, joints: int) -> list[float]:
+    given = np.asarray(values, dtype=np.float64)
+    if given.shape not in ((), (joints,)):
+        raise ShapeError(name, f"() or ({joints},)", given.shape)
+    if not np.isfinite(given).all():
+        raise NonFiniteError(name)
+    return np.broadcast_to(given, (joints,)).tolist()
 
 
 def _chunks(q: FloatArray) -> list[FloatArray]:

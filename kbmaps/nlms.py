@@ -10,6 +10,7 @@ from kbmaps.arrays import FloatArray, IntArray, rows, vector
 from kbmaps.errors import SettingError, ShapeError
 from kbmaps.kbmap import POSITION_OUTPUTS, KBMap
 from kbmaps.stack import BasisStack
+from kbmaps.targets import pose_targets
 
 DEFAULT_MU0 = 0.5
 _BLOCK = 64
@@ -18,22 +19,21 @@ _BLOCK = 64
 class NLMS:
     """Moves the control points a step towards each new pair, the least that mends the share mu0 of its error.
 
-    Learns the position in the bases of the map it starts from; scaled orthonormal ones (`learning_bases`) are advised.
+    Learns what the map it starts from has, the position or position and orientation, in that map's bases; scaled
+    orthonormal ones (`learning_bases`) are advised.
     Any 0 < mu0 < 2 is stable; the noise left in the map is about 1.6 σ √(mu0 / (2 − mu0)).
 
     Raises:
         SettingError: mu0 is not between 0 and 2.
-        ShapeError: the map also holds an orientation.
     """
 
     def __init__(self, kbmap: KBMap, mu0: float = DEFAULT_MU0) -> None:
         if not 0.0 < mu0 < 2.0:
             raise SettingError(f"mu0 must lie between 0 and 2 for the rule to be stable, got {mu0!r}")
-        if kbmap.has_orientation:
-            raise ShapeError("net", f"({POSITION_OUTPUTS}, ...): this learner learns positions", kbmap.net.shape)
         self._bases = kbmap.bases
         self._mu0 = float(mu0)
         self._stack = BasisStack(kbmap.bases)
+        self._outputs = len(kbmap.net)
         # One row for each output and left weight, one column for each right weight.
         self._planes = np.array(kbmap.net.reshape(-1, self._stack.right_size))
 
@@ -45,42 +45,55 @@ class NLMS:
     def map(self) -> KBMap:
         """What has been learnt so far: a snapshot that later learning does not touch."""
         sizes = [basis.size for basis in self._bases]
-        return KBMap(self._bases, self._planes.reshape(POSITION_OUTPUTS, *sizes))
+        return KBMap(self._bases, self._planes.reshape(self._outputs, *sizes))
 
-    def learn(self, q: ArrayLike, x: ArrayLike) -> None:
+    def learn(self, q: ArrayLike, x: ArrayLike, rotation: ArrayLike | None = None) -> None:
         """One step for marker position x (3,) [m] at joint angles q (d,) [rad].
 
+        Args:
+            rotation: the orientation, (3, 3) or a quaternion x, y, z, w (4,); for a map with orientation only.
+
         Raises:
-            ShapeError, NonFiniteError: nothing has changed.
+            ShapeError, NonFiniteError, RotationError
+            SettingError: a rotation too many or too few. Nothing has changed.
         """
         angles = vector("q", q, self._stack.joints)
-        position = vector("x", x, POSITION_OUTPUTS)
+        target = vector("x", x, POSITION_OUTPUTS)
+        if rotation is not None or self._outputs > POSITION_OUTPUTS:
+            target = pose_targets(target[None], rotation, self._outputs)[0]
         left, right = self._stack.halves(angles)
-        predicted = (self._planes @ right).reshape(POSITION_OUTPUTS, -1) @ left
+        predicted = (self._planes @ right).reshape(self._outputs, -1) @ left
         # ‖w‖² of a Kronecker product is the product of its factors' norms.
         mu = self._mu0 / float((left @ left) * (right @ right))
         # Ulbrich et al. 2009, eq. (20)
-        error = mu * (position - predicted)
+        error = mu * (target - predicted)
         lapack.add_outer_in_place(self._planes, (error[:, None] * left).ravel(), right)
 
-    def replay(self, q: ArrayLike, x: ArrayLike, order: ArrayLike | None = None) -> None:
+    def replay(
+        self, q: ArrayLike, x: ArrayLike, order: ArrayLike | None = None, rotation: ArrayLike | None = None
+    ) -> None:
         """Steps for the pairs q (n, d) [rad], x (n, 3) [m] in the sequence `order` (indices), else as they stand.
 
         Equal to `learn` on each of them up to rounding, at a fraction of its cost.
 
+        Args:
+            rotation: the orientations, (n, 3, 3) or quaternions (n, 4), as for `learn`.
+
         Raises:
-            ShapeError, NonFiniteError, SettingError (an index outside the pairs): nothing has changed.
+            ShapeError, NonFiniteError, RotationError
+            SettingError: an index outside the pairs, rotations too many or too few. Nothing has changed.
         """
         angles = rows("q", q, self._stack.joints)
         positions = rows("x", x, POSITION_OUTPUTS)
         if len(angles) != len(positions):
             raise ShapeError("x", f"({len(angles)}, 3) to go with q", positions.shape)
+        targets = pose_targets(positions, rotation, self._outputs)
         sequence = np.arange(len(angles)) if order is None else _checked_order(order, len(angles))
         for start in range(0, len(sequence), _BLOCK):
             block = sequence[start : start + _BLOCK]
-            self._learn_block(angles[block], positions[block])
+            self._learn_block(angles[block], targets[block])
 
-    def _learn_block(self, q: FloatArray, x: FloatArray) -> None:
+    def _learn_block(self, q: FloatArray, targets: FloatArray) -> None:
         """A block of consecutive steps as one triangular solve.
 
         Step j sees the errors left by the steps i < j: e_j = x_j − f(q_j) − Σ_{i<j} mu0 k_ij / k_ii e_i with
@@ -89,8 +102,8 @@ class NLMS:
         left, right = self._stack.halves(q)
         kernel = (left @ left.T) * (right @ right.T)
         steps = self._mu0 / np.diag(kernel)
-        by_left = (right @ self._planes.T).reshape(len(q), POSITION_OUTPUTS, -1)
-        errors = x - (by_left @ left[:, :, None])[:, :, 0]
+        by_left = (right @ self._planes.T).reshape(len(q), self._outputs, -1)
+        errors = targets - (by_left @ left[:, :, None])[:, :, 0]
         np.einsum("ij,j->ij", kernel, steps, out=kernel)
         for j in range(1, len(q)):
             errors[j] -= kernel[j, :j] @ errors[:j]

@@ -282,7 +282,13 @@ def test_a_prediction_before_any_pair_is_refused_where_the_camera_stands_anywher
 
 
 @pytest.mark.parametrize(
-    ("key", "payload"), [(KEYS.predict, b'{"q": [0.1, 0.2]}'), (KEYS.jacobian, b'{"q": [0.1, 0.2]}'), (KEYS.model, b"")]
+    ("key", "payload"),
+    [
+        (KEYS.predict, b'{"q": [0.1, 0.2]}'),
+        (KEYS.jacobian, b'{"q": [0.1, 0.2]}'),
+        (KEYS.ik, b'{"x": [0.1, 0.2, 0.3]}'),
+        (KEYS.model, b""),
+    ],
 )
 def test_every_query_for_the_model_before_any_pair_gets_an_error_reply(lonely_learner, key, payload) -> None:
     with client(lonely_learner.tables.zenoh.learner) as bus, pytest.raises(RequestError, match="no frame"):
@@ -297,7 +303,7 @@ def test_refused_requests_change_nothing_of_the_learner(lonely_learner) -> None:
     before = unchanged()
     with client(lonely_learner.tables.zenoh.learner) as bus:
         for payload in (b"", b"{", b'{"q": []}', b'{"q": [1]}', b'{"q": ["a", 1]}', b'{"command": "dance"}', b"\xff"):
-            for key in (KEYS.predict, KEYS.jacobian, KEYS.command("learner")):
+            for key in (KEYS.predict, KEYS.jacobian, KEYS.ik, KEYS.command("learner")):
                 with pytest.raises(RequestError):
                     bus.ask_one(key, payload)
     assert unchanged() == before

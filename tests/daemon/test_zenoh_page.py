@@ -14,6 +14,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import msgspec
+import numpy as np
 import pytest
 from scripted_sources import Walk
 from small_arm import write_small_arm
@@ -27,7 +28,7 @@ from daemon.sampler import Sampler
 from daemon.session import session_of
 from daemon.sources import Sources
 from daemon.store import PairStore
-from daemon.wire import MSGPACK, JointsRequest, PredictReply, decode, encode
+from daemon.wire import MSGPACK, IkReply, IkRequest, JointsRequest, PredictReply, decode, encode
 from interfaces.clock import SystemClock
 from interfaces.errors import RequestError
 from interfaces.records import Reason
@@ -73,7 +74,7 @@ def test_the_page_s_examples_are_such_messages_with_all_their_fields(name: str) 
 
 
 def test_the_page_has_every_key() -> None:
-    whole = [KEYS.pair, KEYS.pairs, KEYS.predict, KEYS.jacobian, KEYS.model, KEYS.simulation]
+    whole = [KEYS.pair, KEYS.pairs, KEYS.predict, KEYS.jacobian, KEYS.ik, KEYS.model, KEYS.simulation]
     whole += [key(process) for key in (KEYS.status, KEYS.command, KEYS.alive) for process in ("sampler", "learner")]
     assert {code(row[0]) for row in rows(section("Keys"))} == {key.removeprefix("bodyschema/arm/") for key in whole}
 
@@ -138,6 +139,42 @@ def test_the_command_predict_prints_the_same(learner: Config) -> None:
     done = subprocess.run(command, capture_output=True, text=True, timeout=LIMIT_S, check=True)
     assert done.stdout.splitlines()[0].split("]")[:3] == ["x [mm", "  y [mm", "  z [mm"]
     assert done.stdout.splitlines()[1].split()[:3] == ["300.0", "0.0", "0.0"]
+
+
+def ask_ik(learner: Config, request: IkRequest) -> IkReply:
+    with client(learner.tables.zenoh.learner) as bus:
+        return decode(bus.ask_one(KEYS.ik, encode(request)), IkReply)
+
+
+def test_joint_angles_for_a_position_bring_the_marker_there(learner: Config) -> None:
+    chain, target = learner.robot.chain, learner.robot.chain.positions([0.7, 0.0])
+    reply = ask_ik(learner, IkRequest(tuple(target.tolist()), start=[0.5, 0.4], posture="middle"))
+    assert (reply.converged, reply.reason) == (True, "reached")
+    assert np.linalg.norm(chain.positions(reply.q) - target) < 1e-6
+    assert ((learner.robot.lower <= reply.q) & (reply.q <= learner.robot.upper)).all()
+
+
+def test_a_position_out_of_reach_is_answered_with_the_nearest_and_its_distance(learner: Config) -> None:
+    reply = ask_ik(learner, IkRequest((0.0, 1.3, 0.0)))
+    assert (reply.converged, reply.reason, round(reply.distance, 6)) == (False, "out_of_reach", 1.0)
+
+
+def test_the_command_ik_ends_with_1_where_the_position_is_not_reached(learner: Config) -> None:
+    command = [sys.executable, "-m", "daemon", "ik", "--deg", "--robot", str(learner.file), "--"]
+    inside, outside = (
+        subprocess.run([*command, x, "0", "0"], capture_output=True, text=True, timeout=LIMIT_S, check=False)
+        for x in ("0.3", "0.8")
+    )
+    assert (inside.returncode, inside.stdout.splitlines()[2]) == (0, "reached")
+    assert inside.stdout.splitlines()[0].split() == ["waist", "0.00", "deg"]
+    assert outside.returncode == 1
+    assert outside.stdout.splitlines()[2] == "out of reach: the nearest position found is 500.0 mm away"
+
+
+def test_an_infinite_target_in_messagepack_is_refused(learner: Config) -> None:
+    for request in (IkRequest((0.0, float("inf"), 0.0)), IkRequest((0.0, 0.0, 0.3), posture=[0.0, float("nan")])):
+        with client(learner.tables.zenoh.learner) as bus, pytest.raises(RequestError, match="not finite"):
+            bus.ask_one(KEYS.ik, encode(request, MSGPACK), encoding=MSGPACK)
 
 
 @pytest.mark.parametrize(("key", "request_", "error"), [row for row in rows(section("ErrorReply")) if len(row) == 3])

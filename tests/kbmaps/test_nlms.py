@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from planted_chains import bases_for, literal_weights, random_chain, random_map, random_q
 
-from kbmaps import NLMS, JointBasis, KBMap, NonFiniteError, SettingError, ShapeError, prediction_errors
+from kbmaps import NLMS, JointBasis, NonFiniteError, SettingError, ShapeError, prediction_errors
 
 seeds = st.integers(0, 2**32 - 1)
 
@@ -113,8 +113,3 @@ def test_wrong_shapes_are_refused_and_change_nothing():
 def test_an_unstable_rate_is_refused(mu0):
     with pytest.raises(SettingError, match="mu0"):
         NLMS(random_map(np.random.default_rng(1), bases_for("R")), mu0)
-
-
-def test_a_map_with_orientation_is_refused():
-    with pytest.raises(ShapeError):
-        NLMS(KBMap((JointBasis.trigonometric(),), np.ones((12, 3))))

@@ -1,0 +1,104 @@
+"""What is to be reached, a position or a pose, as errors that a step of the joints can lessen."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from kbmaps.arrays import FloatArray
+from kbmaps.rotations import rotation_vector
+
+
+class PositionModel(Protocol):
+    """A map from joint values to positions, with its derivative."""
+
+    @property
+    def joints(self) -> int:
+        """Number of joints d."""
+        ...
+
+    def predict(self, q: ArrayLike) -> FloatArray:
+        """Positions (n, 3) [m] at q (n, d) [rad, m], or (3,) at q (d,)."""
+        ...
+
+    def jacobian(self, q: ArrayLike) -> FloatArray:
+        """Their derivative (n, 3, d), or (3, d) at q (d,)."""
+        ...
+
+
+@runtime_checkable
+class PoseModel(PositionModel, Protocol):
+    """A map that has the orientation too."""
+
+    def orientation(self, q: ArrayLike, *, orthonormal: bool = False) -> FloatArray:
+        """Orientations (n, 3, 3), or (3, 3) at q (d,); with `orthonormal`, proper rotations."""
+        ...
+
+    def angular_jacobian(self, q: ArrayLike) -> FloatArray:
+        """Angular velocities (n, 3, d), or (3, d), of the orthonormal orientation, in the measurement frame."""
+        ...
+
+
+class Goal(Protocol):
+    """Something to reach. Errors are in m, also those of an orientation."""
+
+    def error(self, q: FloatArray) -> FloatArray:
+        """What is missing (m,) [m] at q (d,)."""
+        ...
+
+    def jacobian(self, q: FloatArray) -> FloatArray:
+        """How a step of the joints lessens it, to first order (m, d)."""
+        ...
+
+    def reached(self, error: FloatArray) -> bool:
+        """Whether so small an error counts as none."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class PositionGoal:
+    """The marker at x (3,) [m], to within the tolerance [m]."""
+
+    model: PositionModel
+    x: FloatArray
+    tolerance: float
+
+    def error(self, q: FloatArray) -> FloatArray:
+        return self.x - self.model.predict(q)
+
+    def jacobian(self, q: FloatArray) -> FloatArray:
+        return self.model.jacobian(q)
+
+    def reached(self, error: FloatArray) -> bool:
+        return float(error @ error) <= self.tolerance**2
+
+
+@dataclass(frozen=True, eq=False)
+class PoseGoal:
+    """The marker at x (3,) [m] with the orientation `rotation` (3, 3).
+
+    Attributes:
+        lever: the length [m] at which a radian of orientation counts as much as the arc that it makes.
+        tolerance, angle_tolerance: how near is near enough [m], [rad].
+    """
+
+    model: PoseModel
+    x: FloatArray
+    rotation: FloatArray
+    lever: float
+    tolerance: float
+    angle_tolerance: float
+
+    def error(self, q: FloatArray) -> FloatArray:
+        turn = rotation_vector(self.rotation @ self.model.orientation(q, orthonormal=True).T)
+        return np.concatenate([self.x - self.model.predict(q), self.lever * turn])
+
+    def jacobian(self, q: FloatArray) -> FloatArray:
+        return np.concatenate([self.model.jacobian(q), self.lever * self.model.angular_jacobian(q)])
+
+    def reached(self, error: FloatArray) -> bool:
+        distance, angle = np.linalg.norm(error[:3]), np.linalg.norm(error[3:]) / self.lever
+        return bool(distance <= self.tolerance and angle <= self.angle_tolerance)

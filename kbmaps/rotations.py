@@ -1,0 +1,90 @@
+"""Rotation matrices: from what is measured, the nearest one, how it turns, and how far two are apart."""
+
+from __future__ import annotations
+
+from typing import cast
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation  # pyright: ignore[reportMissingTypeStubs]
+
+from kbmaps.arrays import FloatArray
+from kbmaps.errors import NonFiniteError, RotationError, ShapeError
+
+# What a measured rotation may be off by: quaternions and matrices are often written with six digits.
+_TOLERANCE = 1e-4
+
+
+def nearest_rotation(matrices: ArrayLike) -> FloatArray:
+    """The proper rotations (..., 3, 3) nearest to matrices (..., 3, 3) in the Frobenius norm.
+
+    The orthogonal factor of the polar decomposition, with the smallest singular direction turned round where the
+    matrix is a reflection. Higham 1986, "Computing the polar decomposition"; Kabsch 1976 for the sign.
+
+    Raises:
+        ShapeError, NonFiniteError
+    """
+    checked = np.asarray(matrices, dtype=np.float64)
+    if checked.shape[-2:] != (3, 3):
+        raise ShapeError("matrices", "(..., 3, 3)", checked.shape)
+    if not np.isfinite(checked).all():
+        raise NonFiniteError("matrices")
+    u, _, vt = np.linalg.svd(checked)
+    handed = np.ones(checked.shape[:-1])
+    handed[..., 2] = np.where(np.linalg.det(u @ vt) < 0.0, -1.0, 1.0)
+    return (u * handed[..., None, :]) @ vt
+
+
+def nearest_rotation_rates(matrices: FloatArray, derivatives: FloatArray) -> FloatArray:
+    """Angular velocities ω (..., 3, d) of the nearest rotations R of matrices (..., 3, 3): dR = [ω_k]× R dq_k.
+
+    With M = R P, Rᵀ dM − dMᵀ R = Ω P + P Ω, and for [ω]× = Ω this is [(tr P · 1 − P) ω]×: exact, also where M is not
+    orthonormal.
+
+    Args:
+        matrices: M (..., 3, 3).
+        derivatives: dM/dq_k (..., 3, 3, d).
+    """
+    rotations = nearest_rotation(matrices)
+    stretch = rotations.swapaxes(-1, -2) @ matrices
+    stretch = 0.5 * (stretch + stretch.swapaxes(-1, -2))
+    turned = np.einsum("...ji,...jak->...iak", rotations, derivatives)
+    skew = turned - turned.swapaxes(-2, -3)
+    twice = np.stack([skew[..., 2, 1, :], skew[..., 0, 2, :], skew[..., 1, 0, :]], axis=-2)
+    trace = np.trace(stretch, axis1=-2, axis2=-1)[..., None, None]
+    return rotations @ cast(FloatArray, np.linalg.solve(trace * np.eye(3) - stretch, twice))
+
+
+def rotation_vector(rotation: FloatArray) -> FloatArray:
+    """Axis times angle (3,) [rad], angle at most π, of a rotation matrix (3, 3)."""
+    return np.asarray(Rotation.from_matrix(rotation).as_rotvec(), dtype=np.float64)
+
+
+def rotation_matrices(name: str, values: ArrayLike) -> FloatArray:
+    """Measured orientations as proper rotation matrices (3, 3) or (n, 3, 3).
+
+    Args:
+        values: rotation matrices (3, 3) or (n, 3, 3), or unit quaternions x, y, z, w, (4,) or (n, 4). What they are off
+            by, up to 1e-4, is mended.
+
+    Raises:
+        ShapeError, NonFiniteError, RotationError: neither matrices nor quaternions of rotations.
+    """
+    given = np.asarray(values, dtype=np.float64)
+    is_quaternion = given.ndim in (1, 2) and given.shape[-1:] == (4,)
+    if not is_quaternion and not (given.ndim in (2, 3) and given.shape[-2:] == (3, 3)):
+        raise ShapeError(name, "(3, 3) or (n, 3, 3), or (4,) or (n, 4) for quaternions", given.shape)
+    if not np.isfinite(given).all():
+        raise NonFiniteError(name)
+    if is_quaternion:
+        off = np.abs(np.linalg.norm(given, axis=-1) - 1.0)
+        if given.size and off.max() > _TOLERANCE:
+            raise RotationError(name, "a quaternion is not of length 1")
+        # The empty batch is one that scipy refuses.
+        return (
+            np.asarray(Rotation.from_quat(given).as_matrix(), dtype=np.float64) if given.size else np.empty((0, 3, 3))
+        )
+    mended = nearest_rotation(given)
+    if given.size and np.abs(mended - given).max() > _TOLERANCE:
+        raise RotationError(name, "a matrix is no proper rotation (orthonormal, determinant 1)")
+    return mended
