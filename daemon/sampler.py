@@ -87,6 +87,8 @@ class Sampler:
         self._publish = bus.publisher(self._keys.pair, cache=PAIR_CACHE)
         self._publish_status = bus.publisher(self._keys.status("sampler"))
         self._stopping = False
+        # Whoever has been told of a pause can rely on it: no pair comes after the answer.
+        self._deciding = threading.Lock()
         self._paused = False
         self._resumed_at = -math.inf
         self._ended = False
@@ -195,10 +197,14 @@ class Sampler:
         q = self._buffer.at(seen.t, JOINTS_TIMEOUT_S)
         if isinstance(q, Reason):
             return q
-        verdict = self._gate.offer(seen.t, q, seen.x)
-        if isinstance(verdict, Reason):
-            return verdict
-        self._accept(verdict, q, seen)
+        with self._deciding:
+            if self._paused:
+                self._gate.break_segment()
+                return Reason.PAUSED
+            verdict = self._gate.offer(seen.t, q, seen.x)
+            if isinstance(verdict, Reason):
+                return verdict
+            self._accept(verdict, q, seen)
         return None
 
     def _accept(self, verdict: Accepted, q: FloatArray, fix: MarkerFix) -> None:
@@ -250,7 +256,8 @@ class Sampler:
         if command == "resume" and self._paused:
             # A frame that is still under way shows the arm as it was during the pause.
             self._resumed_at = self._source_clock.now()
-        self._paused = command == "pause"
+        with self._deciding:
+            self._paused = command == "pause"
         message = "no pairs are accepted until resume" if self._paused else "pairs are accepted, in a new segment"
         log.info("%s: %s", command, message)
         return encode(CommandReply(command, message), request.encoding)

@@ -24,8 +24,9 @@ def demo(
 
     Needs: the extra `sim` (`pip install 'bodyschema[sim]'`), and no hardware.
 
-    Next: `bodyschema replay` on the recording it leaves; `bodyschema config init` for a robot of your own.
+    Next: `bodyschema replay` on the recording of the first tool; `bodyschema config init` for a robot of your own.
     """
+    import numpy as np
     from rich.console import Console
 
     from daemon import recordings
@@ -42,5 +43,7 @@ def demo(
         outcome = play(scene, first=pairs, second=pairs_after, seed=seed, show=show)
     write_curve(outcome.rows, scene.curve_file)
     plot_curve(outcome.rows, outcome.first_tool.pairs, scene.plot_file)
-    recordings.write(recordings.from_store(scene.store_file), scene.recording_file)
+    recording = recordings.from_store(scene.store_file)
+    recordings.write(recording, scene.recording_file)
+    recordings.write(recording.rows(np.arange(outcome.changed_at)), scene.first_tool_file)
     show_outcome(console, outcome, scene)

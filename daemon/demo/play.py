@@ -58,11 +58,15 @@ class Chapter:
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What the demo found: the learning curve, and how things stood before and after the tool change."""
+    """What the demo found: the learning curve, and how things stood before and after the tool change.
+
+    `changed_at` pairs came before it.
+    """
 
     rows: list[CurveRow]
     first_tool: Chapter
     second_tool: Chapter
+    changed_at: int
     answers: int
     unanswered: int
 
@@ -88,9 +92,9 @@ def play(scene: Scene, *, first: int, second: int, seed: int, show: Callable[[Sn
         asker = stack.enter_context(started_asker(scene, seed))
         stage = _Stage(config, daemon, sampler, learner, asker, show, seed)
         before = stage.learn(first, f"guided by hand, {first} pairs with the first tool", first, first + second)
-        stage.change_tool()
+        changed_at = stage.change_tool()
         after = stage.learn(second, "guided by hand, the tool is 250 mm longer now", first, first + second)
-        return Outcome(stage.rows, before, after, asker.answers, asker.unanswered)
+        return Outcome(stage.rows, before, after, changed_at, asker.answers, asker.unanswered)
 
 
 @dataclass
@@ -131,18 +135,20 @@ class _Stage:
                 raise BusError(f"no new pair for {STALL_LIMIT_S:.0f} s; the scene's daemon.log says why")
             time.sleep(GLANCE_S)
 
-    def change_tool(self) -> None:
-        """What a person would do: pause, change the tool, tell the learner, go on."""
+    def change_tool(self) -> int:
+        """What a person would do: pause, change the tool, tell the learner, go on. How many pairs came before."""
         self._command("sampler", "pause")
         self._judge.follow()
         while self._learner_status().last_seq < self._judge.seen:
             self.daemon.check()
             time.sleep(0.05)
+        changed_at = self._judge.seen
         marker = np.array(self.config.robot.robot.marker_xyz)
         self._judge.change_tool(marker * (1.0 + TOOL_LENGTH_M / float(np.linalg.norm(marker))))
         self._judge.new_region()
         self._command("learner", "tool_changed")
         self._command("sampler", "resume")
+        return changed_at
 
     def _verdict(self, learner: LearnerStatus) -> Verdict | None:
         verdict = self._judge.verdict()

@@ -42,6 +42,11 @@ class Scene:
         return self.folder / "recording.csv"
 
     @property
+    def first_tool_file(self) -> Path:
+        """The pairs with the first tool alone, which one model can explain."""
+        return self.folder / "recording_first_tool.csv"
+
+    @property
     def curve_file(self) -> Path:
         """The learning curve as numbers."""
         return self.folder / "learning_curve.csv"

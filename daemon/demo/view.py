@@ -136,7 +136,7 @@ def show_outcome(console: Console, outcome: Outcome, scene: Scene) -> None:
         console.print(f"{what:10s}{_short(file)}", soft_wrap=True)
     console.print()
     console.print(
-        f"Next: `bodyschema replay {_short(scene.recording_file)}` learns it again;\n"
+        f"Next: `bodyschema replay {_short(scene.first_tool_file)}` learns it again;\n"
         "`bodyschema config init` begins with a robot of your own.",
         soft_wrap=True,
     )

@@ -9,7 +9,11 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import pytest
+
+from interfaces.recording import Recording
+from interfaces.robot import RobotDescription
 
 pytest.importorskip("pybullet")
 
@@ -40,6 +44,15 @@ def test_the_demo_ends_well(demo: Demo) -> None:
 def test_the_demo_leaves_a_recording_with_every_pair(demo: Demo) -> None:
     with (demo.folder / "recording.csv").open(newline="") as stream:
         assert len(list(csv.DictReader(stream))) >= FIRST + SECOND
+
+
+def test_the_recording_of_the_first_tool_ends_where_the_tool_was_changed(demo: Demo) -> None:
+    robot = RobotDescription.load(demo.folder / "robot.toml")
+    both, first = (
+        Recording.read(demo.folder / f"{name}.csv", robot.joints) for name in ("recording", "recording_first_tool")
+    )
+    moved = np.linalg.norm(np.diff(both.x[len(first) - 3 : len(first) + 3], axis=0), axis=1)
+    assert moved.argmax() == 2
 
 
 def test_the_demo_plots_the_curve_it_measured(demo: Demo) -> None:
