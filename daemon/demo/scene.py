@@ -44,7 +44,7 @@ class Scene:
     @property
     def first_tool_file(self) -> Path:
         """The pairs with the first tool alone, which one model can explain."""
-        return self.folder / "recording_first_tool.csv"
+        return self.folder / "first_tool.csv"
 
     @property
     def curve_file(self) -> Path:

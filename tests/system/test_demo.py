@@ -48,9 +48,7 @@ def test_the_demo_leaves_a_recording_with_every_pair(demo: Demo) -> None:
 
 def test_the_recording_of_the_first_tool_ends_where_the_tool_was_changed(demo: Demo) -> None:
     robot = RobotDescription.load(demo.folder / "robot.toml")
-    both, first = (
-        Recording.read(demo.folder / f"{name}.csv", robot.joints) for name in ("recording", "recording_first_tool")
-    )
+    both, first = (Recording.read(demo.folder / f"{name}.csv", robot.joints) for name in ("recording", "first_tool"))
     moved = np.linalg.norm(np.diff(both.x[len(first) - 3 : len(first) + 3], axis=0), axis=1)
     assert moved.argmax() == 2
 
