@@ -65,6 +65,8 @@ def test_a_killed_child_is_started_again(tmp_path, supervise) -> None:
     wait_until(lambda: len(started(tmp_path / "pids")) == 1)
     os.kill(started(tmp_path / "pids")[0], signal.SIGKILL)
     wait_until(lambda: len(started(tmp_path / "pids")) == 2)
+    first, second = started(tmp_path / "pids")
+    assert (first != second, gone(second)) == (True, False)
 
 
 def test_stopping_ends_every_child(tmp_path) -> None:

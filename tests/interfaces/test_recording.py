@@ -148,7 +148,7 @@ def test_a_missing_file_is_named(tmp_path: Path) -> None:
 def test_a_folder_is_not_a_recording(tmp_path: Path) -> None:
     folder = tmp_path / "folder.csv"
     folder.mkdir()
-    fault(folder)
+    assert "folder" in fault(folder).what
 
 
 def test_an_unknown_ending_is_refused(write) -> None:

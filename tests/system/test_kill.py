@@ -13,6 +13,7 @@ from typing import TypeVar
 import numpy as np
 import pytest
 from killed_at import LEARNER_POINTS, NOWHERE, SAMPLER_POINTS
+from small_arm import URDF
 
 from daemon.bus import Bus, client
 from daemon.config import Config
@@ -31,11 +32,6 @@ S = TypeVar("S", SamplerStatus, LearnerStatus)
 PAIRS_PER_S = 60.0
 CHECKPOINT_EVERY_S = 0.2
 LATEST_PAIR, LATEST_CHECKPOINT, LATEST_S = 40, 3, 1.0
-URDF = """<robot name="arm"><link name="base"/><link name="upper"/><link name="hand"/>
-<joint name="waist" type="revolute"><parent link="base"/><child link="upper"/><axis xyz="0 0 1"/>
-<limit lower="-3" upper="3" effort="1" velocity="1"/></joint>
-<joint name="shoulder" type="revolute"><parent link="upper"/><child link="hand"/><origin xyz="0.3 0 0"/>
-<axis xyz="0 1 0"/><limit lower="-2" upper="2" effort="1" velocity="1"/></joint></robot>"""
 ROBOT = """[robot]
 name = "arm"
 urdf = "arm.urdf"
