@@ -7,6 +7,7 @@ from kbmaps.align import Alignment, align
 from kbmaps.basis import JointBasis, learning_bases
 from kbmaps.block_choice import blockwise_precision, follow_a_path
 from kbmaps.chain import RigidChain
+from kbmaps.chain_belief import ChainBelief
 from kbmaps.chain_parameters import ChainParameters, ChainTolerances
 from kbmaps.chain_report import ChainReport, Interval
 from kbmaps.chain_search import find_chain
@@ -44,6 +45,7 @@ __all__ = [
     "SUPPORT_LIMIT",
     "Alignment",
     "BasisError",
+    "ChainBelief",
     "ChainError",
     "ChainParameters",
     "ChainReport",

@@ -7,9 +7,10 @@ from dataclasses import dataclass
 from typing import cast
 
 import numpy as np
+from scipy.special import chdtrc  # pyright: ignore[reportMissingTypeStubs, reportUnknownVariableType]
 
 from kbmaps.arrays import BoolArray, FloatArray
-from kbmaps.chain_parameters import WIDE, ChainParameters
+from kbmaps.chain_belief import ChainBelief, squared
 from kbmaps.pairs import Pairs
 
 # Noise that is estimated is never below this [m]: there rounding begins.
@@ -19,8 +20,8 @@ _OUTLIER_SIGMAS = 4.8
 # A residual norm of noise σ per axis has the median 1.538 σ in three dimensions.
 _MEDIAN_NORM = 1.538
 _SCALES_PER_SIGMA = 3.0
-# Told noise explains a sum of squared residuals up to so many of its standard deviations (χ²) above its mean.
-_MISFIT_SIGMAS = 3.0
+# Told noise explains a sum of squared residuals that is not less probable than this (χ²).
+_MISFIT_CHANCE = 1e-3
 _ROUNDS = 80
 _FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-3, 1e-12, 1e8
 # A step that changes the fit by less than this share of what the noise leaves open is the last.
@@ -32,21 +33,19 @@ class RigidFit:
     """A change of the chain and how sure it is.
 
     Attributes:
-        change: the most probable parameters (size,).
+        belief: the posterior of the parameters.
         noise: estimated noise over unit; at least 1 where the units are the noise (more: the chain does not fit).
         freedom: residual coordinates minus those that the parameters have used up.
         inliers: which pairs (n,) are no outliers.
-        spread: matrix W (size, size) with the posterior covariance W Wᵀ [rad², m²].
         rank: how many independent directions of the parameters the data determine.
         loose: how far (size,) each free parameter takes part in directions that the data do not show, in 0..1.
         log_evidence: log marginal likelihood of the inliers (Laplace's approximation).
     """
 
-    change: FloatArray
+    belief: ChainBelief
     noise: float
     freedom: float
     inliers: BoolArray
-    spread: FloatArray
     rank: int
     loose: FloatArray
     log_evidence: float
@@ -56,7 +55,7 @@ class RigidFit:
 class _Point:
     """Residuals (n, 3), their norms in units (n,), and Jacobian (n, 3, f) at one change (size,).
 
-    The f free parameters are counted in prior standard deviations; `offset` (f,) is how far they are from the prior.
+    The f free parameters are counted from the prior's mean in columns of its root; `offset` (f,) is where they are.
     """
 
     change: FloatArray
@@ -78,15 +77,14 @@ class _Point:
 class _Fitter:
     """One fit on its way: what is minimised is Σ (root ‖residual‖)² + ‖offset‖² with the roots of the present noise."""
 
-    def __init__(self, parameters: ChainParameters, std: FloatArray, pairs: Pairs, start: FloatArray) -> None:
-        self._parameters, self.pairs = parameters, pairs
-        self.free = std > 0.0
-        self.scales = np.minimum(std[self.free], WIDE)
-        self.point = self._at(start)
+    def __init__(self, prior: ChainBelief, pairs: Pairs, start: FloatArray) -> None:
+        self.prior, self.pairs = prior, pairs
+        self.free, self.root = squared(prior.root)
+        self.point = self._at(np.linalg.solve(self.root, (start - prior.mean)[self.free]))
         self.least_noise = 1.0 if pairs.known else _ROUNDING_M / float(pairs.unit.min())
         self._damping = _FIRST_DAMPING
         # Residual coordinates that the parameters use up.
-        self.used = float(min(self.free.sum(), 3 * len(pairs)))
+        self.used = float(min(len(self.free), 3 * len(pairs)))
 
     def typical(self) -> float:
         """Noise over unit as the middle residual shows it (Rousseeuw and Leroy 1987, least median of squares).
@@ -109,9 +107,8 @@ class _Fitter:
             held = np.sqrt(1.0 + self._damping * columns)
             q, r = np.linalg.qr(np.concatenate([design, np.diag(held)]))
             projected = q.T @ np.concatenate([target, -point.offset / held])
-            change = point.change.copy()
-            change[self.free] += self.scales * np.linalg.solve(r, projected)
-            length, tried = float(np.linalg.norm(projected)), self._at(change)
+            length = float(np.linalg.norm(projected))
+            tried = self._at(cast(FloatArray, point.offset + np.linalg.solve(r, projected)))
             if tried.cost(roots) <= before:
                 self.point, self._damping = tried, max(self._damping * 0.1, _LEAST_DAMPING)
                 return length
@@ -121,23 +118,23 @@ class _Fitter:
         self._damping = _FIRST_DAMPING
         return 0.0
 
-    def _at(self, change: FloatArray) -> _Point:
-        x, jacobian = self._parameters.linearised(change, self.pairs.q)
+    def _at(self, offset: FloatArray) -> _Point:
+        change = self.prior.mean.copy()
+        change[self.free] += self.root @ offset
+        x, jacobian = self.prior.parameters.linearised(change, self.pairs.q)
         residuals = self.pairs.x - x
         norms = np.linalg.norm(residuals, axis=1) / self.pairs.unit
-        return _Point(
-            change, residuals, norms, jacobian[:, :, self.free] * self.scales, change[self.free] / self.scales
-        )
+        return _Point(change, residuals, norms, jacobian[:, :, self.free] @ self.root, offset)
 
 
-def fit_chain(parameters: ChainParameters, std: FloatArray, pairs: Pairs, start: FloatArray) -> RigidFit:
-    """The most probable change for at least one pair, given the prior N(0, std²) on each parameter.
+def fit_chain(prior: ChainBelief, pairs: Pairs, start: FloatArray) -> RigidFit:
+    """The most probable change for at least one pair, on the way from `start` (size,).
 
     Graduated non-convexity (Yang et al. 2020): Geman-McClure weights, and with them the noise that weighs data against
     prior, shrink from the largest residual to what is typical, so that neither outliers nor a marker far from its
     place stop the way. Then least squares on all pairs that are no outliers, with the noise estimated from them.
     """
-    fitter = _Fitter(parameters, std, pairs, start)
+    fitter = _Fitter(prior, pairs, start)
     _anneal(fitter)
     return _polish(fitter)
 
@@ -155,8 +152,10 @@ def _anneal(fitter: _Fitter) -> None:
 
 def _polish(fitter: _Fitter) -> RigidFit:
     pairs = fitter.pairs
-    noise = fitter.typical()
-    inliers = fitter.point.norms <= _OUTLIER_SIGMAS * noise
+    typical = fitter.typical()
+    inliers = fitter.point.norms <= _OUTLIER_SIGMAS * typical
+    # Few pairs can be fitted with much noise or with little; what was told has the first say.
+    noise = 1.0 if pairs.known else typical
     freedom = 0.0
     for _ in range(_ROUNDS):
         step = fitter.improve(inliers.astype(np.float64), noise)
@@ -175,28 +174,27 @@ def _noise(square: float, freedom: float, known: bool, least: float) -> float:
     if not known:
         return max(math.sqrt(square / freedom), least) if freedom > 0.0 else least
     # Residuals by chance above what the known noise explains are no sign of a chain that does not fit.
-    if square <= freedom + _MISFIT_SIGMAS * math.sqrt(2.0 * freedom):
+    if freedom == 0.0 or chdtrc(freedom, square) >= _MISFIT_CHANCE:
         return 1.0
     return max(math.sqrt(square / freedom), 1.0)
 
 
 def _summary(fitter: _Fitter, inliers: BoolArray, noise: float, freedom: float) -> RigidFit:
-    point, free, scales = fitter.point, fitter.free, fitter.scales
-    size = len(free)
+    point, free, root = fitter.point, fitter.free, fitter.root
+    parameters, size = fitter.prior.parameters, fitter.prior.parameters.size
     factor = point.reduced(inliers / (fitter.pairs.unit * noise))
     _, singular, vt = np.linalg.svd(factor[:, :-1])
     singular = np.concatenate([singular, np.zeros(len(vt) - len(singular))])
-    loose, rank = _undetermined(factor[:, :-1] / scales)
+    loose, rank = _undetermined(cast(FloatArray, np.linalg.solve(root.T, factor[:, :-1].T)).T)
     spread = np.zeros((size, size))
-    left = vt.T / np.sqrt(1.0 + np.square(singular))
-    spread[np.ix_(free, free)] = scales[:, None] * left
+    spread[np.ix_(free, free)] = root @ (vt.T / np.sqrt(1.0 + np.square(singular)))
     looseness = np.zeros(size)
     looseness[free] = loose
     square = float(np.square(point.norms[inliers]).sum()) / noise**2 + float(point.offset @ point.offset)
     spans = 6.0 * float(np.log(noise * fitter.pairs.unit[inliers]).sum())
     evidence = -0.5 * (square + spans + 3.0 * float(inliers.sum()) * math.log(2.0 * math.pi))
     evidence -= 0.5 * float(np.log1p(np.square(singular)).sum())
-    return RigidFit(point.change, noise, freedom, inliers, spread, rank, looseness, evidence)
+    return RigidFit(ChainBelief(parameters, point.change, spread), noise, freedom, inliers, rank, looseness, evidence)
 
 
 def _undetermined(design: FloatArray) -> tuple[FloatArray, int]:

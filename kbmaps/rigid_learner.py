@@ -13,7 +13,8 @@ from scipy.special import stdtrit  # pyright: ignore[reportMissingTypeStubs, rep
 from kbmaps.align import align
 from kbmaps.arrays import BoolArray, FloatArray, frozen, rows, rows_or_vector
 from kbmaps.chain import RigidChain
-from kbmaps.chain_parameters import WIDE, ChainParameters, ChainTolerances, rotation_vector
+from kbmaps.chain_belief import ChainBelief
+from kbmaps.chain_parameters import ChainParameters, ChainTolerances, rotation_vector
 from kbmaps.chain_report import ChainReport, chain_report
 from kbmaps.errors import DegenerateDataError, KBMapsError, ModelFormatError
 from kbmaps.model import Estimate
@@ -25,7 +26,6 @@ _KIND = "rigid chain, batch, 1"
 _ONE_SIGMA = 0.841344746
 # Configurations where the chain is surer than this times the least sure pair (in variance) lie where data was.
 _SUPPORT_FACTOR = 2.0
-_BLOCK = 2048
 
 
 class RigidLearner:
@@ -37,12 +37,21 @@ class RigidLearner:
     Args:
         nominal: the chain as drawn, or as `find_chain` found it.
         tolerances: how far the real one may be from it.
+        prior: what is believed before the first pair, where more is known than the tolerances; it changes the same
+            nominal chain. So an arm that got another tool is learnt on: `learner.belief.with_other_tool(0.2)`.
+
+    Raises:
+        ShapeError: the prior is one of another chain.
     """
 
-    def __init__(self, nominal: RigidChain, tolerances: ChainTolerances) -> None:
+    def __init__(self, nominal: RigidChain, tolerances: ChainTolerances, prior: ChainBelief | None = None) -> None:
         self._parameters = ChainParameters(nominal)
         self._tolerances = tolerances
-        self._std = self._parameters.standard_deviations(tolerances)
+        self._told_prior = prior is not None
+        if prior is None:
+            self._prior = ChainBelief.from_tolerances(self._parameters, tolerances)
+        else:
+            self._prior = ChainBelief(self._parameters, prior.mean, prior.root)
         self._q, self._x = np.empty((0, nominal.joints)), np.empty((0, 3))
         self._sigma = np.empty(0)
         self._fit: RigidFit | None = None
@@ -66,7 +75,7 @@ class RigidLearner:
     @property
     def chain(self) -> RigidChain:
         """The most probable chain."""
-        return self._parameters.chain(self._change())
+        return self.belief.chain
 
     @property
     def tolerances(self) -> ChainTolerances:
@@ -74,16 +83,20 @@ class RigidLearner:
         return self._tolerances
 
     @property
+    def belief(self) -> ChainBelief:
+        """What the pairs let believe of the chain; the prior without pairs."""
+        fit = self._fitted()
+        return self._prior if fit is None else fit.belief
+
+    @property
     def change(self) -> FloatArray:
         """The most probable parameters (size,) as in `ChainParameters` (read-only)."""
-        return frozen(self._change())
+        return self.belief.mean
 
     @property
     def covariance(self) -> FloatArray:
         """Posterior covariance (size, size) of the parameters [rad², m²]; the prior's without pairs (read-only)."""
-        fit = self._fitted()
-        spread = self._prior_spread() if fit is None else fit.spread
-        return frozen(spread @ spread.T)
+        return frozen(self.belief.covariance)
 
     @property
     def inliers(self) -> BoolArray:
@@ -120,7 +133,7 @@ class RigidLearner:
             ShapeError, NonFiniteError
         """
         angles = rows_or_vector("q", q, self.joints)
-        return self._parameters.positions(self._change(), angles)
+        return self._parameters.positions(self.belief.mean, angles)
 
     def estimate(self, q: ArrayLike) -> Estimate:
         """Positions at q (n, d), their 1-sigma per axis against the truth, and whether data was there.
@@ -132,10 +145,9 @@ class RigidLearner:
         """
         angles = rows("q", q, self.joints)
         fit = self._fitted()
+        x, variance = self.belief.predict_with_variance(angles)
         if fit is None:
-            x, variance = self._spread(np.zeros(self._parameters.size), self._prior_spread(), angles)
             return Estimate(x, np.sqrt(variance), np.zeros(len(angles), dtype=np.bool_))
-        x, variance = self._spread(fit.change, fit.spread, angles)
         inside = variance.sum(axis=1) <= _SUPPORT_FACTOR * self._widest
         pairs = self._units()
         if pairs.known:
@@ -153,11 +165,11 @@ class RigidLearner:
         if fit is None:
             raise DegenerateDataError("there is nothing to report before the first pair was learnt")
         pairs = self._units()
-        std = np.sqrt(np.square(fit.spread).sum(axis=1)) * (1.0 if pairs.known else _student(fit.freedom))
+        std = np.sqrt(np.square(fit.belief.root).sum(axis=1)) * (1.0 if pairs.known else _student(fit.freedom))
         unit = math.sqrt(float(np.square(pairs.unit).mean()))
         return chain_report(
             self._parameters,
-            fit.change,
+            fit.belief.mean,
             std,
             fit.loose,
             noise=unit if pairs.known else unit * fit.noise,
@@ -178,6 +190,8 @@ class RigidLearner:
             "x": self._x,
             "sigma": self._sigma,
         }
+        if self._told_prior:
+            arrays |= {"prior_mean": self._prior.mean, "prior_root": self._prior.root}
         return pack(_KIND, asdict(self._tolerances), arrays)
 
     @classmethod
@@ -187,7 +201,10 @@ class RigidLearner:
         settings = numbers(fields)
         try:
             chain = RigidChain(arrays["fixed"], arrays["axes"], arrays["prismatic"] != 0.0)
-            learner = cls(chain, ChainTolerances(**settings))
+            prior = None
+            if "prior_mean" in arrays:
+                prior = ChainBelief(ChainParameters(chain), arrays["prior_mean"], arrays["prior_root"])
+            learner = cls(chain, ChainTolerances(**settings), prior)
             sigma = arrays["sigma"]
             learner.learn(arrays["q"], arrays["x"], np.where(np.isnan(sigma), 1.0, sigma))
         except (KeyError, TypeError, KBMapsError) as error:
@@ -195,27 +212,22 @@ class RigidLearner:
         learner._sigma = sigma
         return learner
 
-    def _prior_spread(self) -> FloatArray:
-        return np.diag(np.minimum(self._std, WIDE))
-
     def _units(self) -> Pairs:
         return with_units(self._q, self._x, self._sigma)
 
-    def _change(self) -> FloatArray:
-        fit = self._fitted()
-        return np.zeros(self._parameters.size) if fit is None else fit.change
-
     def _fitted(self) -> RigidFit | None:
         if self._fit is None and self.pairs:
-            fit = fit_chain(self._parameters, self._std, self._units(), self._start())
-            _, variance = self._spread(fit.change, fit.spread, self._q[fit.inliers])
+            fit = fit_chain(self._prior, self._units(), self._start())
+            _, variance = fit.belief.predict_with_variance(self._q[fit.inliers])
             self._widest = float(variance.sum(axis=1).max(initial=0.0))
             self._fit = fit
         return self._fit
 
     def _start(self) -> FloatArray:
         """The nominal chain, placed where it fits best if its place is anyone's guess."""
-        start = np.zeros(self._parameters.size)
+        start = self._prior.mean.copy()
+        if self._told_prior:
+            return start
         if math.isfinite(self._tolerances.base_rotation) and math.isfinite(self._tolerances.base_translation):
             return start
         marker_known = math.isfinite(self._tolerances.tool)
@@ -227,15 +239,6 @@ class RigidLearner:
         start[self._parameters.base_shift] = placed.T_measured_nominal[:3, 3]
         start[self._parameters.tool] = placed.marker_shift
         return start
-
-    def _spread(self, change: FloatArray, spread: FloatArray, q: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Positions and the variance of each coordinate, both (n, 3)."""
-        x, variance = np.empty((len(q), 3)), np.empty((len(q), 3))
-        for start in range(0, len(q), _BLOCK):
-            part = slice(start, start + _BLOCK)
-            x[part], jacobian = self._parameters.linearised(change, q[part])
-            variance[part] = np.square(jacobian @ spread).sum(axis=2)
-        return x, variance
 
 
 def _student(freedom: float) -> float:

@@ -1,0 +1,108 @@
+"""What is believed of a rigid chain: a Gaussian over the changes of a reference chain."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Self, cast
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from kbmaps.arrays import FloatArray, IntArray, frozen, rows, rows_or_vector
+from kbmaps.chain import RigidChain
+from kbmaps.chain_parameters import WIDE, ChainParameters, ChainTolerances
+from kbmaps.errors import NonFiniteError, SettingError, ShapeError
+
+_BLOCK = 2048
+
+
+@dataclass(frozen=True, eq=False)
+class ChainBelief:
+    """Mean and covariance of the parameters of a chain.
+
+    Attributes:
+        parameters: what they are, and the reference chain that they change.
+        mean: (size,) [rad, m].
+        root: matrix W (size, k) with the covariance W Wᵀ; a row of zeros holds its parameter.
+
+    Raises:
+        ShapeError, NonFiniteError
+    """
+
+    parameters: ChainParameters
+    mean: FloatArray
+    root: FloatArray
+
+    def __post_init__(self) -> None:
+        size = self.parameters.size
+        if self.mean.shape != (size,):
+            raise ShapeError("mean", f"({size},)", self.mean.shape)
+        if self.root.ndim != 2 or len(self.root) != size:
+            raise ShapeError("root", f"({size}, k)", self.root.shape)
+        for name in ("mean", "root"):
+            if not np.isfinite(getattr(self, name)).all():
+                raise NonFiniteError(name)
+            object.__setattr__(self, name, frozen(getattr(self, name)))
+
+    @classmethod
+    def from_tolerances(cls, parameters: ChainParameters, tolerances: ChainTolerances) -> Self:
+        """The reference chain, as far as its tolerances let believe in it."""
+        std = np.minimum(parameters.standard_deviations(tolerances), WIDE)
+        return cls(parameters, np.zeros(parameters.size), np.diag(std))
+
+    @property
+    def chain(self) -> RigidChain:
+        """The most probable chain."""
+        return self.parameters.chain(self.mean)
+
+    @property
+    def covariance(self) -> FloatArray:
+        """Covariance (size, size) of the parameters [rad², m²]."""
+        return self.root @ self.root.T
+
+    def predict(self, q: ArrayLike) -> FloatArray:
+        """Positions (n, 3) [m] of the most probable chain at q (n, d), or (3,) at q (d,).
+
+        Raises:
+            ShapeError, NonFiniteError
+        """
+        return self.parameters.positions(self.mean, rows_or_vector("q", q, self.parameters.reference.joints))
+
+    def predict_with_variance(self, q: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """Positions at q (n, d) and the variance of each coordinate to first order, both (n, 3) [m, m²].
+
+        Raises:
+            ShapeError, NonFiniteError
+        """
+        angles = rows("q", q, self.parameters.reference.joints)
+        x, variance = np.empty((len(angles), 3)), np.empty((len(angles), 3))
+        for start in range(0, len(angles), _BLOCK):
+            part = slice(start, start + _BLOCK)
+            x[part], jacobian = self.parameters.linearised(self.mean, angles[part])
+            variance[part] = np.square(jacobian @ self.root).sum(axis=2)
+        return x, variance
+
+    def with_other_tool(self, tolerance: float) -> Self:
+        """The same arm with a marker that was moved, by `tolerance` (1-sigma of each component [m]).
+
+        Raises:
+            SettingError: the tolerance is not positive.
+        """
+        if not (tolerance > 0.0 and math.isfinite(tolerance)):
+            raise SettingError(f"tolerance must be finite and greater than 0 m, got {tolerance!r}")
+        moved = np.zeros((self.parameters.size, 3))
+        moved[self.parameters.tool] = tolerance * np.eye(3)
+        free, root = squared(np.concatenate([self.root, moved], axis=1))
+        full = np.zeros((self.parameters.size, self.parameters.size))
+        full[np.ix_(free, free)] = root
+        return type(self)(self.parameters, self.mean, full)
+
+
+def squared(root: FloatArray) -> tuple[IntArray, FloatArray]:
+    """Which rows of a root (size, k) are free, as indices (f,), and their lower triangular root (f, f)."""
+    free = np.flatnonzero(root.any(axis=1))
+    held = root[free]
+    if held.shape[1] < len(free):
+        held = np.concatenate([held, np.zeros((len(free), len(free) - held.shape[1]))], axis=1)
+    return free, cast(FloatArray, np.linalg.qr(held.T, mode="r")).T

@@ -1,0 +1,115 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from rough_arms import ROUGH, rough_arm
+
+from kbmaps import (
+    ChainBelief,
+    ChainParameters,
+    ChainTolerances,
+    NonFiniteError,
+    RigidLearner,
+    SettingError,
+    ShapeError,
+)
+
+seeds = st.integers(0, 2**32 - 1)
+SLIGHT = ChainTolerances(axes=1e-4, points=1e-4, zeros=1e-4, tool=1e-4, base_rotation=1e-4)
+
+
+@given(seed=seeds, first=st.integers(1, 39))
+@settings(max_examples=15, deadline=None)
+def test_what_was_believed_before_and_new_pairs_give_what_all_pairs_give(seed, first):
+    rng = np.random.default_rng(seed)
+    arm = rough_arm(rng, "RRRR", SLIGHT)
+    q, x = arm.pairs(rng, 40, 1e-4)
+    at_once, before = RigidLearner(arm.nominal, SLIGHT), RigidLearner(arm.nominal, SLIGHT)
+    at_once.learn(q, x, 1e-4)
+    before.learn(q[:first], x[:first], 1e-4)
+    after = RigidLearner(arm.nominal, SLIGHT, before.belief)
+    after.learn(q[first:], x[first:], 1e-4)
+    claimed = at_once.estimate(q)
+    np.testing.assert_allclose(after.predict(q), claimed.x, rtol=0, atol=0.1 * claimed.sigma.min())
+    np.testing.assert_allclose(after.estimate(q).sigma, claimed.sigma, rtol=0.02)
+
+
+@given(seed=seeds)
+@settings(max_examples=10, deadline=None)
+def test_another_tool_is_learnt_from_three_exact_pairs_without_losing_the_arm(seed):
+    rng = np.random.default_rng(seed)
+    arm = rough_arm(rng)
+    learner = RigidLearner(arm.nominal, ROUGH)
+    learner.learn(*arm.pairs(rng, 60))
+    after = RigidLearner(arm.nominal, ROUGH, learner.belief.with_other_tool(0.2))
+    moved = replace(arm, real=arm.real.with_tool([0.1, -0.1, 0.15]))
+    after.learn(*moved.pairs(rng, 3))
+    assert moved.error(after, rng) < 1e-6
+
+
+def test_a_tool_that_was_held_is_set_free_by_its_change():
+    rng = np.random.default_rng(5)
+    tolerances = replace(ROUGH, tool=0.0)
+    arm = rough_arm(rng, tolerances=tolerances)
+    learner = RigidLearner(arm.nominal, tolerances)
+    learner.learn(*arm.pairs(rng, 60))
+    after = RigidLearner(arm.nominal, tolerances, learner.belief.with_other_tool(0.2))
+    moved = replace(arm, real=arm.real.with_tool([0.1, 0.0, 0.1]))
+    after.learn(*moved.pairs(rng, 5))
+    assert moved.error(after, rng) < 1e-5
+
+
+def test_another_tool_leaves_the_belief_in_the_arm_as_it_was():
+    rng = np.random.default_rng(6)
+    arm = rough_arm(rng)
+    learner = RigidLearner(arm.nominal, ROUGH)
+    learner.learn(*arm.pairs(rng, 60, 0.005))
+    before, after = learner.belief, learner.belief.with_other_tool(0.2)
+    added = after.covariance - before.covariance
+    tool = before.parameters.tool
+    expected = np.zeros_like(added)
+    expected[tool, tool] = 0.04 * np.eye(3)
+    np.testing.assert_allclose(added, expected, rtol=0, atol=1e-12)
+
+
+def test_a_learner_with_a_told_prior_survives_as_bytes():
+    rng = np.random.default_rng(7)
+    arm = rough_arm(rng)
+    q, x = arm.pairs(rng, 50, 0.005)
+    before = RigidLearner(arm.nominal, ROUGH)
+    before.learn(q[:30], x[:30])
+    learner = RigidLearner(arm.nominal, ROUGH, before.belief.with_other_tool(0.1))
+    learner.learn(q[30:], x[30:])
+    copy = RigidLearner.from_bytes(learner.to_bytes())
+    np.testing.assert_array_equal(copy.estimate(q).sigma, learner.estimate(q).sigma)
+
+
+def test_without_pairs_the_tolerances_are_what_is_believed():
+    arm = rough_arm(np.random.default_rng(8))
+    learner = RigidLearner(arm.nominal, ROUGH)
+    expected = learner.belief.parameters.standard_deviations(ROUGH)
+    np.testing.assert_allclose(np.sqrt(np.diag(learner.belief.covariance)), expected)
+
+
+@pytest.mark.parametrize("wrong", [0.0, -0.1, np.inf, np.nan])
+def test_a_tool_change_of_no_size_is_refused(wrong):
+    arm = rough_arm(np.random.default_rng(9))
+    with pytest.raises(SettingError, match="tolerance must be finite and greater than 0"):
+        RigidLearner(arm.nominal, ROUGH).belief.with_other_tool(wrong)
+
+
+def test_a_prior_of_another_chain_is_refused():
+    rng = np.random.default_rng(10)
+    long, short = rough_arm(rng), rough_arm(rng, "RRR")
+    with pytest.raises(ShapeError, match="mean"):
+        RigidLearner(long.nominal, ROUGH, RigidLearner(short.nominal, ROUGH).belief)
+
+
+def test_a_belief_that_is_not_finite_is_refused():
+    parameters = ChainParameters(rough_arm(np.random.default_rng(11)).nominal)
+    with pytest.raises(NonFiniteError, match="root"):
+        ChainBelief(parameters, np.zeros(parameters.size), np.full((parameters.size, 1), np.nan))
