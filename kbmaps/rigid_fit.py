@@ -80,7 +80,7 @@ class _Fitter:
     def __init__(self, prior: ChainBelief, pairs: Pairs, start: FloatArray) -> None:
         self.prior, self.pairs = prior, pairs
         self.free, self.root = squared(prior.root)
-        self.point = self._at(np.linalg.solve(self.root, (start - prior.mean)[self.free]))
+        self.point = self._at(cast(FloatArray, np.linalg.solve(self.root, (start - prior.mean)[self.free])))
         self.least_noise = 1.0 if pairs.known else _ROUNDING_M / float(pairs.unit.min())
         self._damping = _FIRST_DAMPING
         # Residual coordinates that the parameters use up.
@@ -108,7 +108,7 @@ class _Fitter:
             q, r = np.linalg.qr(np.concatenate([design, np.diag(held)]))
             projected = q.T @ np.concatenate([target, -point.offset / held])
             length = float(np.linalg.norm(projected))
-            tried = self._at(cast(FloatArray, point.offset + np.linalg.solve(r, projected)))
+            tried = self._at(point.offset + np.linalg.solve(r, projected))
             if tried.cost(roots) <= before:
                 self.point, self._damping = tried, max(self._damping * 0.1, _LEAST_DAMPING)
                 return length
