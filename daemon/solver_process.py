@@ -1,4 +1,4 @@
-"""The exact solver in a process of its own.
+"""The solver in a process of its own.
 
 One solve takes tenths of a second inside LAPACK, which holds the interpreter's lock: in a thread it would keep
 answers waiting that long. The child works at low priority, at most half of the time, and ends with its parent.
@@ -21,10 +21,10 @@ from typing import IO, Self
 import msgspec
 import numpy as np
 
-from daemon.learning import DirectSolver, Solved
+from daemon.learning import DirectSolver, Solved, Task
 from interfaces.errors import BodyschemaError
 from interfaces.records import FloatArray
-from kbmaps import KBMap
+from kbmaps import ChainBelief, KBMap
 
 NICENESS = 5
 LONGEST_REST_S = 5.0
@@ -37,16 +37,12 @@ class SolverLostError(BodyschemaError):
 
 
 class StartTask(msgspec.Struct, frozen=True, tag="start"):
-    """Forget all pairs and begin with this prior."""
+    """Forget all pairs and begin this task."""
 
-    task: int
+    number: int
     prior: bytes
-
-
-class Rebase(msgspec.Struct, frozen=True, tag="rebase"):
-    """Another prior for the same pairs."""
-
-    prior: bytes
+    belief: bytes
+    prior_stays: bool
 
 
 class Learn(msgspec.Struct, frozen=True, tag="learn"):
@@ -62,19 +58,22 @@ class Solve(msgspec.Struct, frozen=True, tag="solve"):
 
 
 class Solution(msgspec.Struct, frozen=True):
-    """The answer to `Solve`; without a map when there is no solution."""
+    """One answer to `Solve`; without a map when there is no solution."""
 
     task: int
     pairs: int
+    name: str
     map: bytes | None
+    belief: bytes | None
+    last: bool
 
 
-_orders = msgspec.msgpack.Decoder(StartTask | Rebase | Learn | Solve)
+_orders = msgspec.msgpack.Decoder(StartTask | Learn | Solve)
 _solutions = msgspec.msgpack.Decoder(Solution)
 
 
 class SolverProcess:
-    """An `ExactSolver` in a child process, started with the first task. Use as a context manager.
+    """A `Solver` in a child process, started with the first task. Use as a context manager.
 
     All methods but `__exit__` raise SolverLostError when the child has died.
     """
@@ -96,7 +95,7 @@ class SolverProcess:
         """Process id of the child, or None before the first task."""
         return self._child.pid if self._child is not None else None
 
-    def start(self, task: int, prior: KBMap) -> None:
+    def start(self, task: Task) -> None:
         """Forget all pairs and begin a new task."""
         if self._child is None:
             command = [sys.executable, "-m", "daemon.solver_process"]
@@ -105,11 +104,7 @@ class SolverProcess:
             self._child = subprocess.Popen(
                 command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment, process_group=0
             )
-        self._send(StartTask(task, prior.to_bytes()))
-
-    def rebase(self, prior: KBMap) -> None:
-        """Another prior for the same pairs."""
-        self._send(Rebase(prior.to_bytes()))
+        self._send(StartTask(task.number, task.prior.to_bytes(), task.belief.to_bytes(), task.prior_stays))
 
     def learn(self, q: FloatArray, x: FloatArray) -> None:
         """More pairs, q (n, d) [rad] and x (n, 3) [m]."""
@@ -139,12 +134,13 @@ class SolverProcess:
             return None
         solution = _solutions.decode(bytes(self._received[_LENGTH.size : end]))
         del self._received[:end]
-        solved = None if solution.map is None else KBMap.from_bytes(solution.map)
-        return Solved(solution.task, solution.pairs, solved)
+        learnt = None if solution.map is None else KBMap.from_bytes(solution.map)
+        belief = None if solution.belief is None else ChainBelief.from_bytes(solution.belief)
+        return Solved(solution.task, solution.pairs, solution.name, learnt, belief, solution.last)
 
-    def _send(self, order: StartTask | Rebase | Learn | Solve) -> None:
+    def _send(self, order: StartTask | Learn | Solve) -> None:
         if self._child is None or self._child.stdin is None:
-            raise SolverLostError("the exact solver has not been started")
+            raise SolverLostError("the solver has not been started")
         try:
             _write(self._child.stdin, order)
         except OSError as error:
@@ -152,7 +148,7 @@ class SolverProcess:
 
     def _lost(self) -> SolverLostError:
         code = self._end()
-        return SolverLostError(f"the exact solver's process ended with exit code {code}; it is started again")
+        return SolverLostError(f"the solver's process ended with exit code {code}; it is started again")
 
     def _end(self) -> int | None:
         child, self._child = self._child, None
@@ -176,10 +172,9 @@ def serve(orders: IO[bytes], solutions: IO[bytes]) -> None:
     solver, rested_at = DirectSolver(), 0.0
     while (order := _read(orders)) is not None:
         if isinstance(order, StartTask):
-            solver.start(order.task, KBMap.from_bytes(order.prior))
+            prior, belief = KBMap.from_bytes(order.prior), ChainBelief.from_bytes(order.belief)
+            solver.start(Task(order.number, prior, belief, order.prior_stays))
             rested_at = 0.0  # a new task begins with few pairs, and somebody waits for it
-        elif isinstance(order, Rebase):
-            solver.rebase(KBMap.from_bytes(order.prior))
         elif isinstance(order, Learn):
             solver.learn(
                 np.frombuffer(order.q, dtype="<f8").reshape(-1, order.joints),
@@ -191,13 +186,12 @@ def serve(orders: IO[bytes], solutions: IO[bytes]) -> None:
 
 
 def _solve(solver: DirectSolver, solutions: IO[bytes]) -> float:
-    """Solve and answer; how long it took [s]."""
+    """Solve, and answer with each solution as it comes; how long it took [s]."""
     begin = time.monotonic()
-    solver.solve()
-    solved = solver.poll()
-    if solved is not None:
+    for solved in solver.solutions():
         learnt = None if solved.map is None else solved.map.to_bytes()
-        _write(solutions, Solution(solved.task, solved.pairs, learnt))
+        belief = None if solved.belief is None else solved.belief.to_bytes()
+        _write(solutions, Solution(solved.task, solved.pairs, solved.name, learnt, belief, solved.last))
     return time.monotonic() - begin
 
 
@@ -207,7 +201,7 @@ def _write(stream: IO[bytes], message: msgspec.Struct) -> None:
     stream.flush()
 
 
-def _read(stream: IO[bytes]) -> StartTask | Rebase | Learn | Solve | None:
+def _read(stream: IO[bytes]) -> StartTask | Learn | Solve | None:
     """The next order; None when the parent has gone, even in the middle of one."""
     head = stream.read(_LENGTH.size)
     if len(head) < _LENGTH.size:

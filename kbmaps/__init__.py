@@ -4,6 +4,7 @@ Numpy and scipy only; no I/O, no clock, no logging. Angles [rad], lengths [m], f
 """
 
 from kbmaps.align import Alignment, align
+from kbmaps.autocorrelation import shared_by
 from kbmaps.basis import JointBasis, learning_bases
 from kbmaps.block_choice import blockwise_precision, follow_a_path
 from kbmaps.chain import RigidChain
@@ -85,5 +86,6 @@ __all__ = [
     "nearest_rotation",
     "prediction_errors",
     "resolved_rates",
+    "shared_by",
     "with_refitted_marker",
 ]

@@ -12,8 +12,10 @@ from numpy.typing import ArrayLike
 from kbmaps.arrays import FloatArray, IntArray, frozen, rows, rows_or_vector
 from kbmaps.chain import RigidChain
 from kbmaps.chain_parameters import WIDE, ChainParameters, ChainTolerances
-from kbmaps.errors import NonFiniteError, SettingError, ShapeError
+from kbmaps.errors import KBMapsError, ModelFormatError, NonFiniteError, SettingError, ShapeError
+from kbmaps.packed import chain_arrays, chain_from_arrays, pack, unpack
 
+_KIND = "belief in a rigid chain, 1"
 _BLOCK = 2048
 
 
@@ -82,6 +84,19 @@ class ChainBelief:
             x[part], jacobian = self.parameters.linearised(self.mean, angles[part])
             variance[part] = np.square(jacobian @ self.root).sum(axis=2)
         return x, variance
+
+    def to_bytes(self) -> bytes:
+        """The belief and its reference chain, as one self-describing byte string."""
+        return pack(_KIND, {}, chain_arrays(self.parameters.reference) | {"mean": self.mean, "root": self.root})
+
+    @classmethod
+    def from_bytes(cls, data: bytes) -> Self:
+        """The belief in `data`. Raises ModelFormatError: it is none, or damaged."""
+        _, arrays = unpack(data, _KIND)
+        try:
+            return cls(ChainParameters(chain_from_arrays(arrays)), arrays["mean"], arrays["root"])
+        except (KeyError, KBMapsError) as error:
+            raise ModelFormatError(f"the bytes do not describe a belief in a chain: {error}") from error
 
     def with_other_tool(self, tolerance: float) -> Self:
         """The same arm with a marker that was moved, by `tolerance` (1-sigma of each component [m]).

@@ -23,6 +23,7 @@ import numpy as np
 
 from kbmaps.arrays import FloatArray
 from kbmaps.basis import PARAMETER_NAMES, BasisKind, JointBasis
+from kbmaps.chain import RigidChain
 from kbmaps.errors import BasisError, ModelFormatError
 
 MAGIC = b"KBPACK\r\n"
@@ -73,6 +74,16 @@ def numbers(fields: Mapping[str, Any]) -> dict[str, float]:
         if type(value) not in (int, float):
             raise ModelFormatError(f"the field {name} is not a number")
     return {name: float(value) for name, value in fields.items()}
+
+
+def chain_arrays(chain: RigidChain) -> dict[str, FloatArray]:
+    """A chain as arrays to pack."""
+    return {"fixed": chain.fixed, "axes": chain.axes, "prismatic": chain.prismatic.astype(np.float64)}
+
+
+def chain_from_arrays(arrays: Mapping[str, FloatArray]) -> RigidChain:
+    """The chain in unpacked arrays. Raises KeyError (one is missing), ChainError, ShapeError, NonFiniteError."""
+    return RigidChain(arrays["fixed"], arrays["axes"], arrays["prismatic"] != 0.0)
 
 
 def describe_bases(bases: Sequence[JointBasis]) -> list[list[Any]]:

@@ -18,7 +18,7 @@ from kbmaps.chain_parameters import ChainParameters, ChainTolerances, rotation_v
 from kbmaps.chain_report import ChainReport, chain_report
 from kbmaps.errors import DegenerateDataError, KBMapsError, ModelFormatError
 from kbmaps.model import Estimate
-from kbmaps.packed import numbers, pack, unpack
+from kbmaps.packed import chain_arrays, chain_from_arrays, numbers, pack, unpack
 from kbmaps.pairs import Pairs, checked_pairs, with_units
 from kbmaps.rigid_fit import RigidFit, fit_chain
 
@@ -181,11 +181,7 @@ class RigidLearner:
 
     def to_bytes(self) -> bytes:
         """The learner with all its pairs; `from_bytes` gives the same predictions to the last bit."""
-        chain = self.nominal
-        arrays = {
-            "fixed": chain.fixed,
-            "axes": chain.axes,
-            "prismatic": chain.prismatic.astype(np.float64),
+        arrays = chain_arrays(self.nominal) | {
             "q": self._q,
             "x": self._x,
             "sigma": self._sigma,
@@ -200,7 +196,7 @@ class RigidLearner:
         fields, arrays = unpack(data, _KIND)
         settings = numbers(fields)
         try:
-            chain = RigidChain(arrays["fixed"], arrays["axes"], arrays["prismatic"] != 0.0)
+            chain = chain_from_arrays(arrays)
             prior = None
             if "prior_mean" in arrays:
                 prior = ChainBelief(ChainParameters(chain), arrays["prior_mean"], arrays["prior_root"])

@@ -14,7 +14,7 @@ from kbmaps.chain import RigidChain
 from kbmaps.chain_parameters import WIDE, ChainParameters, ChainTolerances
 from kbmaps.errors import KBMapsError, ModelFormatError, NonFiniteError, SettingError, ShapeError
 from kbmaps.model import Estimate
-from kbmaps.packed import numbers, pack, unpack
+from kbmaps.packed import chain_arrays, chain_from_arrays, numbers, pack, unpack
 from kbmaps.pairs import checked_pairs
 from kbmaps.rigid_learner import RigidLearner
 
@@ -179,16 +179,12 @@ class RecursiveRigidLearner:
 
     def to_bytes(self) -> bytes:
         """The learner as it is; `from_bytes` learns on to the last bit as this one would."""
-        chain = self.nominal
         settings = asdict(self._tolerances) | {
             "noise": self.noise,
             "noise_coordinates": self._noise_coordinates,
             "pairs": self._pairs,
         }
-        arrays = {
-            "fixed": chain.fixed,
-            "axes": chain.axes,
-            "prismatic": chain.prismatic.astype(np.float64),
+        arrays = chain_arrays(self.nominal) | {
             "change": self._change,
             "covariance": self._covariance,
             "noise_square": np.array([self._noise_square]),
@@ -203,7 +199,7 @@ class RecursiveRigidLearner:
         try:
             pairs, coordinates = settings.pop("pairs"), settings.pop("noise_coordinates")
             noise = settings.pop("noise")
-            chain = RigidChain(arrays["fixed"], arrays["axes"], arrays["prismatic"] != 0.0)
+            chain = chain_from_arrays(arrays)
             learner = cls(chain, ChainTolerances(**settings), noise=noise)
             learner._restore(arrays["change"], arrays["covariance"])
             learner._noise_square = float(arrays["noise_square"][0])

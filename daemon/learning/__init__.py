@@ -5,12 +5,11 @@ from __future__ import annotations
 from .learning import Learning
 from .nominal import NominalModel
 from .snapshot import NoFrameError, Prediction, Snapshot
-from .solver import DirectSolver, ExactSolver, Solved
+from .solver import DirectSolver, Solved, Solver, Task
 from .state import LearningState, StateError
 
 __all__ = [
     "DirectSolver",
-    "ExactSolver",
     "Learning",
     "LearningState",
     "NoFrameError",
@@ -18,5 +17,7 @@ __all__ = [
     "Prediction",
     "Snapshot",
     "Solved",
+    "Solver",
     "StateError",
+    "Task",
 ]

@@ -9,11 +9,11 @@ import msgspec
 import numpy as np
 
 from interfaces.records import FloatArray
-from kbmaps import JointBasis, SupportSet
+from kbmaps import ChainBelief, JointBasis, SupportSet
 
-from .members import EXACT, INSTANT, PRIOR
-from .scores import ErrorMemory
-from .unknowns import Layer, Unknowns
+from .members import INSTANT, PRIOR, RIGID, SOLVED, TRUSTED
+from .scores import Contest, ErrorMemory
+from .unknowns import ChainLayer, Layer, Unknowns
 
 # The data leave shapes open that the prior's own error shows little of. Measured on guided paths of simulated arms:
 # the errors a few degrees beside the path are mostly 0.6 to 1.7 times what the prior's error lets expect.
@@ -33,13 +33,13 @@ class Claim:
     """
 
     inside: FloatArray
-    layers: tuple[Layer, ...] = ()
+    layers: tuple[Layer | ChainLayer, ...] = ()
     surprise: float = 1.0
 
     def variance(self, q: FloatArray) -> FloatArray:
         """Variance per axis of predictions at q (n, d) [rad], shape (n, 3) [m²]."""
-        left_open = sum((layer.variance(q) for layer in self.layers), np.zeros(len(q)))
-        return self.surprise**2 * (self.inside**2 + left_open[:, None])
+        left_open = sum((layer.variance(q) for layer in self.layers), np.zeros((len(q), 3)))
+        return self.surprise**2 * (self.inside**2 + left_open)
 
 
 class ClaimsState(msgspec.Struct, kw_only=True):
@@ -47,17 +47,21 @@ class ClaimsState(msgspec.Struct, kw_only=True):
 
     Attributes:
         errors: prequential errors, by model.
-        delayed: those of the instant learner as it was when the exact solution was asked for.
+        contest: squared prequential errors [m²] of the last pairs.
         residuals: errors on pairs that are learnt already, by model.
         misfit: errors of the prior, over longer.
         arm_sigma: 1-sigma of the prior before the tool was changed [m].
+        expected_residual_m: RMS residual that a solution is expected to leave before there are any [m].
+        belief: what is believed of the chain, as bytes; None before the first solution.
     """
 
     errors: dict[str, ErrorMemory]
-    delayed: ErrorMemory
+    contest: list[dict[str, float]]
     residuals: dict[str, ErrorMemory]
     misfit: ErrorMemory
     arm_sigma: float | None
+    expected_residual_m: float | None
+    belief: bytes | None
 
 
 class Claims:
@@ -70,24 +74,22 @@ class Claims:
 
     def __init__(self, bases: Sequence[JointBasis], expected_m: float) -> None:
         self._unknowns = Unknowns(bases)
+        self._expected_residual_m: float | None = None
         self._begin(expected_m)
 
     def _begin(self, expected_m: float) -> None:
         self._expected_m = expected_m
         self.errors = {name: ErrorMemory(expected_m) for name in (PRIOR, INSTANT)}
-        self._delayed = ErrorMemory(expected_m)
+        self._contest = Contest()
         self._residuals: dict[str, ErrorMemory] = {}
         self._misfit = ErrorMemory(expected_m, discount=PRIOR_DISCOUNT)
-        self._asked: tuple[Layer, ...] | None = None
-        self._solved: tuple[Layer, ...] | None = None
+        self._asked: SupportSet | None = None
+        self._solved: SupportSet | None = None
+        self._belief: ChainBelief | None = None
 
-    @property
-    def compared(self) -> Mapping[str, ErrorMemory]:
-        """Errors by model that may be compared.
-
-        A solution is some pairs old when it is judged, and on a path that is far: the instant learner is judged as old.
-        """
-        return self.errors | {INSTANT: self._delayed} if self._delayed.weight else self.errors
+    def best(self, present: str) -> str:
+        """The model that shall answer; `present` while there is nothing to compare."""
+        return self._contest.best(TRUSTED, present)
 
     @property
     def support(self) -> SupportSet | None:
@@ -100,6 +102,11 @@ class Claims:
         return float(np.sqrt(self.errors[PRIOR].noise_variance.sum()))
 
     @property
+    def belief(self) -> ChainBelief | None:
+        """What the pairs with the present tool let believe of the chain; None before the first solution."""
+        return self._belief
+
+    @property
     def arm_configurations(self) -> FloatArray:
         """The configurations (n, d) [rad] that stand for all data, with any tool."""
         return self._unknowns.arm_configurations
@@ -107,18 +114,32 @@ class Claims:
     def change_tool(self, expected_m: float) -> None:
         """Another tool: a new prior with other errors, and what was not known of the arm is not known now."""
         self._unknowns.change_tool(self._prior_sigma)
+        if RIGID in self._residuals:
+            self._expected_residual_m = self._residuals[RIGID].rms_m
         self._begin(expected_m)
 
-    def predicted(self, q: FloatArray, errors: Mapping[str, FloatArray], variance: FloatArray) -> None:
-        """Errors (3,) [m] by model at q (d,) [rad], before learning, against a measurement with this variance (3,)."""
+    def predicted(
+        self,
+        q: FloatArray,
+        errors: Mapping[str, FloatArray],
+        variance: FloatArray,
+        delayed: FloatArray | None = None,
+    ) -> None:
+        """One pair that was predicted before it is learnt.
+
+        Args:
+            q: where (d,) [rad].
+            errors: measured minus predicted (3,) [m] by model.
+            variance: the measurement's (3,) [m²].
+            delayed: the error (3,) [m] of the instant learner as old as the solutions. On a path a few pairs are far,
+                so the models are compared at the same age.
+        """
         for name, error in errors.items():
             claimed = self.of(name).variance(q[None])[0] + variance
             self.errors[name].add(error, variance, float(np.square(error).sum() / claimed.sum()))
         self._misfit.add(errors[PRIOR], variance)
-
-    def predicted_by_delayed(self, error: FloatArray, variance: FloatArray) -> None:
-        """Error (3,) [m] of the instant learner as it was when the exact solution was asked for."""
-        self._delayed.add(error, variance)
+        compared = dict(errors) if delayed is None else {**errors, INSTANT: delayed}
+        self._contest.add({name: float(np.square(error).sum()) for name, error in compared.items()})
 
     def learnt(self, q: FloatArray) -> None:
         """A pair has been learnt at q (d,) [rad]."""
@@ -126,26 +147,37 @@ class Claims:
 
     def replayed(self, name: str, errors: FloatArray) -> None:
         """Errors (n, 3) [m] of a model at pairs that it has learnt before."""
-        memory = self._residuals.setdefault(name, ErrorMemory(self._expected_m))
+        self._add_residuals(name, errors, ErrorMemory(self._expected_m))
+
+    def _add_residuals(self, name: str, errors: FloatArray, start: ErrorMemory) -> None:
+        memory = self._residuals.setdefault(name, start)
         for error in errors:
             memory.add(error, self.errors[PRIOR].noise_variance)
 
     def solution_asked(self) -> None:
-        """The exact solver works on all pairs up to here."""
-        self._asked = self._unknowns.layers(self._prior_sigma)
+        """The solver works on all pairs up to here."""
+        self._asked = self._unknowns.support
 
-    def solution_taken(self, errors: FloatArray) -> None:
-        """The exact solver's solution answers from now on; its errors (n, 3) [m] at pairs that it knows."""
-        self.errors.setdefault(EXACT, ErrorMemory(self._expected_m))
+    def solution_taken(self, name: str, errors: FloatArray, belief: ChainBelief | None) -> None:
+        """A solution answers for this model from now on.
+
+        Args:
+            errors: its errors (n, 3) [m] at pairs that it knows.
+            belief: what is believed of the chain now; None: as before.
+        """
+        self.errors.setdefault(name, ErrorMemory(self._expected_m))
         self._solved = self._asked
-        self._residuals.pop(EXACT, None)
-        self.replayed(EXACT, errors)
+        self._belief = belief or self._belief
+        self._residuals.pop(name, None)
+        expected_m = self.noise_m if self._expected_residual_m is None else self._expected_residual_m
+        self._add_residuals(name, errors, ErrorMemory(expected_m, discount=1.0))
 
     def prior_changed(self, errors: FloatArray) -> None:
         """Another prior for the same pairs; its errors (n, 3) [m] at them."""
         noise = self.errors[PRIOR].noise_variance
         self.errors[PRIOR] = ErrorMemory(self._expected_m)
         self._misfit = ErrorMemory(self._expected_m, discount=PRIOR_DISCOUNT)
+        self._contest.forget(PRIOR)
         for error in errors:
             self.errors[PRIOR].add(error, noise)
             self._misfit.add(error, noise)
@@ -155,18 +187,23 @@ class Claims:
         memory = self.errors.get(name, ErrorMemory(self._expected_m))
         if name == PRIOR:
             return Claim(memory.sigma)
-        layers = self._solved if name == EXACT else None
-        inside = self._residuals.get(name, memory).sigma
-        return Claim(inside, layers or self._unknowns.layers(self._prior_sigma), memory.surprise)
+        residuals = self._residuals.get(name, memory)
+        if name in SOLVED and self._belief is not None:
+            # Where no data was, the arm may be less rigid than it was seen to be by as much again.
+            rest = float(np.sqrt(np.square(self._residuals.get(RIGID, memory).excess).mean()))
+            return Claim(residuals.excess, (ChainLayer(self._belief), Layer(self._solved, rest)), memory.surprise)
+        return Claim(residuals.sigma, self._unknowns.layers(self._prior_sigma), memory.surprise)
 
     def state(self) -> ClaimsState:
         """Everything needed to go on from here, but `arm_configurations`."""
         return ClaimsState(
             errors=self.errors,
-            delayed=self._delayed,
+            contest=self._contest.rows,
             residuals=self._residuals,
             misfit=self._misfit,
             arm_sigma=self._unknowns.arm_sigma,
+            expected_residual_m=self._expected_residual_m,
+            belief=None if self._belief is None else self._belief.to_bytes(),
         )
 
     def restore(self, state: ClaimsState, arm_configurations: FloatArray, q: FloatArray) -> None:
@@ -178,7 +215,10 @@ class Claims:
         for row in q:
             self._unknowns.add(row)
         self.errors, self._residuals = dict(state.errors), dict(state.residuals)
-        self._delayed, self._misfit = state.delayed, state.misfit
+        self._contest, self._misfit = Contest(state.contest), state.misfit
+        self._expected_residual_m = state.expected_residual_m
+        self._belief = None if state.belief is None else ChainBelief.from_bytes(state.belief)
+        self._asked = self._solved = self._unknowns.support
 
     @property
     def _prior_sigma(self) -> float:

@@ -17,6 +17,10 @@ MEDIAN_TO_SIGMA = 0.6501
 SMALLEST_M = 1e-3
 # So many doubted pairs in a row are no outliers: the world has changed.
 CHANGE = 6
+# So many are enough where one other place of the marker explains them, and their distances from it are at most so many
+# times what is expected.
+FEWEST_FOR_CHANGE = 3
+TOGETHER = 2.0
 
 
 class Gate:
@@ -45,6 +49,11 @@ def sound(distances_m: FloatArray, noise_m: float) -> NDArray[np.bool_]:
     """
     rms = math.sqrt(3.0) * MEDIAN_TO_SIGMA * float(np.median(distances_m))
     return np.asarray(distances_m <= DOUBT * max(math.hypot(rms, noise_m), SMALLEST_M))
+
+
+def belong_together(distances_m: FloatArray, expected_m: float) -> bool:
+    """Whether one explanation fits a run of pairs that lie at these distances (n,) [m] from it."""
+    return bool(np.sqrt(np.square(distances_m).mean()) <= TOGETHER * expected_m)
 
 
 def limit_m(inside_m: float, open_m: float) -> float:

@@ -15,18 +15,17 @@ from daemon.config import LearnerConfig
 from daemon.status import CurvePoint
 from interfaces.errors import RequestError
 from interfaces.records import FloatArray, Pair
-from kbmaps import KBMap
+from kbmaps import ChainBelief, ChainTolerances, KBMap
 
 from .claims import Claims
 from .curve import Curve
-from .fitting import Fitting
-from .gate import CHANGE, DOUBT, Gate, limit_m, sound
+from .fitting import Fit, Fitting
+from .gate import CHANGE, DOUBT, FEWEST_FOR_CHANGE, Gate, belong_together, limit_m, sound
 from .members import EXACT, INSTANT, PRIOR, Members
 from .memory import PairMemory, Permutations
-from .nominal import NominalModel
-from .scores import FEWEST_TO_ANSWER, choose
+from .nominal import PAIRS_TO_REFIT, NominalModel
 from .snapshot import Snapshot
-from .solver import LARGEST_NET, ExactSolver
+from .solver import Solver, Task
 from .solving import Solving
 from .state import Counters, LearningHeader, LearningState, StateError
 
@@ -34,8 +33,12 @@ from .state import Counters, LearningHeader, LearningState, StateError
 EXPECTED_M = 0.1
 # A measurement farther away than this is not one in metres [m].
 FARTHEST_M = 1000.0
+# How far another tool may hold the marker from where the last one did, 1-sigma of each coordinate [m].
+OTHER_TOOL_M = 0.25
+# Pairs that a model has to have predicted before its errors say what is to be expected.
+FEWEST_TO_CLAIM = 5.0
 # So many of the learnt pairs say how well a model fits what it knows.
-LOOKED_BACK = 64
+LOOKED_BACK = 500
 # Pairs from which the errors of a prior that was fitted anew are taken, and that are replayed on top of it.
 RECENT = 200
 REPLAY_STEPS = 64
@@ -49,7 +52,7 @@ LOOKED_BACK_IN_REPLAY = 4
 class Learning:
     """Learns the forward kinematics of one robot from pairs."""
 
-    def __init__(self, nominal: NominalModel, settings: LearnerConfig, solver: ExactSolver) -> None:
+    def __init__(self, nominal: NominalModel, settings: LearnerConfig, solver: Solver) -> None:
         self._nominal, self._settings = nominal, settings
         self._solving = Solving(solver, settings.solve_every)
         self._lock = threading.Lock()
@@ -58,6 +61,7 @@ class Learning:
         self._doubts = PairMemory(nominal.joints, KEPT_DOUBTS)
         self._learnt_at: float | None = None
         self._task = 0
+        self._tolerances = _tolerances(settings)
         self._begin_at_nominal()
         self._publish()
 
@@ -101,7 +105,7 @@ class Learning:
         """
         with self._lock:
             answering, snapshot, count = self._claims.errors.get(self._answering), self._snapshot, len(self._memory)
-            if answering is None or answering.weight < FEWEST_TO_ANSWER:
+            if answering is None or answering.weight < FEWEST_TO_CLAIM:
                 return None
             rng = np.random.default_rng(0)
             q, _ = self._memory.at(rng.integers(count, size=REGION_SAMPLES))
@@ -152,13 +156,13 @@ class Learning:
             self._publish()
 
     def restart_solver(self) -> None:
-        """The exact solver has lost its pairs: give them to it again. For the thread that calls `work`."""
+        """The solver has lost its pairs: give them to it again. For the thread that calls `work`."""
         self._solving.restart()
         with self._lock:
             self._solve_from_what_is_known()
 
     def solve_soon(self) -> None:
-        """Let the exact solver catch up although fewer than `solve_every` pairs are new. For that thread too."""
+        """Let the solver catch up although fewer than `solve_every` pairs are new. For that thread too."""
         self._solving.solve_soon()
 
     def work(self) -> bool:
@@ -183,13 +187,14 @@ class Learning:
                 next_fit=self._fitting.due_at,
                 first_fit=self._fitting.is_first,
                 replays_due=self._replays_due,
+                belief=None if self._belief is None else self._belief.to_bytes(),
             )
             kept = {"arm_q": self._claims.arm_configurations} | self._fitting.arrays()
         kept |= {"q": q, "x": x, "doubted_q": doubted_q, "doubted_x": doubted_x}
         return LearningState(header, kept | {f"net_{name}": net for name, net in nets.items()})
 
     def restore(self, state: LearningState) -> None:
-        """Go on from a state; the exact solver gets the kept pairs again in the background.
+        """Go on from a state; the solver gets the kept pairs again in the background.
 
         Raises:
             StateError: it belongs to another nominal model.
@@ -200,7 +205,8 @@ class Learning:
         nets = {name[4:]: net for name, net in state.arrays.items() if name.startswith("net_")}
         with self._lock:
             if nets:
-                self._begin(KBMap(self._nominal.bases, nets[PRIOR]))
+                belief = None if header.belief is None else ChainBelief.from_bytes(header.belief)
+                self._begin(KBMap(self._nominal.bases, nets[PRIOR]), belief)
                 self._members_now.restore(nets)
             else:
                 self._begin_at_nominal()
@@ -220,11 +226,16 @@ class Learning:
     def _begin_at_nominal(self) -> None:
         self._fitting = Fitting(self._nominal)
         self._claims = Claims(self._nominal.bases, EXPECTED_M)
-        self._begin(self._nominal.prior() if self._nominal.frame_known else None)
+        known = self._nominal.frame_known
+        self._begin(
+            self._nominal.prior() if known else None,
+            self._nominal.belief(self._nominal.chain, self._tolerances) if known else None,
+        )
 
-    def _begin(self, prior: KBMap | None) -> None:
-        """Start anew from `prior` (None: wait for an alignment), with no pairs."""
+    def _begin(self, prior: KBMap | None, belief: ChainBelief | None) -> None:
+        """Start anew from `prior` and what is believed of the chain (None: wait for an alignment), with no pairs."""
         self._members = Members(prior, self._settings.step_size) if prior is not None else None
+        self._belief = belief
         self._answering = PRIOR
         self._memory.clear()
         self._doubts.clear()
@@ -262,13 +273,12 @@ class Learning:
             self._counters.doubted += 1
             self._doubts.append(pair.q, pair.x)
             members.learn(pair.q, errors[INSTANT], limit / DOUBT)  # a step no longer than any other
-            if self._gate.changed:
+            if self._gate.changed or self._moved_together(limit / DOUBT):
                 self._follow_change()
             return
-        self._claims.predicted(pair.q, errors, variance)
-        if members.delayed is not None:
-            self._claims.predicted_by_delayed(pair.x - members.delayed.predict(pair.q), variance)
-        self._answering = choose(self._claims.compared, self._answering)
+        delayed = None if members.delayed is None else pair.x - members.delayed.predict(pair.q)
+        self._claims.predicted(pair.q, errors, variance, delayed)
+        self._answering = self._claims.best(self._answering)
         self._curve.add(self._counters.pairs, self._claims.errors[self._answering].mean_m or 0.0)
         members.learn(pair.q, errors[INSTANT], np.inf)
         self._keep(pair.q, pair.x)
@@ -283,26 +293,40 @@ class Learning:
         self._memory.append(q, x)
         self._claims.learnt(q)
 
+    def _doubted_run(self) -> tuple[FloatArray, FloatArray]:
+        """The doubted pairs in a row up to now: q (n, d), x (n, 3)."""
+        q, x, _ = self._doubts.since(self._doubts.count - min(self._gate.in_a_row, CHANGE))
+        return q, x
+
+    def _moved_together(self, expected_m: float) -> bool:
+        """Whether one other place of the marker on the hand explains the doubted pairs in a row."""
+        if self._gate.in_a_row < FEWEST_FOR_CHANGE:
+            return False
+        q, x = self._doubted_run()
+        moved = self._fitting.with_other_tool(self._members_now.maps[self._answering], q, x)
+        return belong_together(np.linalg.norm(x - moved.predict(q), axis=1), expected_m)
+
     def _follow_change(self) -> None:
         """The doubted pairs in a row are the new truth: begin again with them."""
-        run_q, run_x, _ = self._doubts.since(self._doubts.count - CHANGE)
+        run_q, run_x = self._doubted_run()
         distances = np.linalg.norm(self._members_now.maps[self._answering].predict(run_q) - run_x, axis=1)
-        self._change_tool(max(float(np.median(distances)), EXPECTED_M))
+        self._change_tool(max(float(np.median(distances)), EXPECTED_M), first_fit=len(run_q))
         for q, x in zip(run_q, run_x, strict=True):
             self._keep(q, x)
         self._members_now.replay(run_q, run_x)
-        self._counters.since_change = CHANGE
+        self._counters.since_change = len(run_q)
 
-    def _change_tool(self, expected_m: float) -> None:
+    def _change_tool(self, expected_m: float, first_fit: int = PAIRS_TO_REFIT) -> None:
         self._counters.changes += 1
         self._counters.since_change = 0
-        if self._members is None:
+        if self._members is None or self._belief is None:
             self._begin_at_nominal()
         else:
             before = self._members.maps[self._answering]
+            belief = (self._claims.belief or self._belief).with_other_tool(OTHER_TOOL_M)
             self._claims.change_tool(expected_m)
-            self._fitting.change_tool(before)
-            self._begin(before)
+            self._fitting.change_tool(before, first_fit)
+            self._begin(before, belief)
 
     def _fit(self) -> bool:
         """Fit what is not known, or a changed tool, when it is due."""
@@ -319,7 +343,7 @@ class Learning:
                 self._set_aside(fit.prior)
             self._fitting.done(count, fit)
             if fit is not None and self._members is None:
-                self._start_members(fit.prior)
+                self._start_members(fit)
             elif fit is not None:
                 self._change_prior(self._members_now, fit.prior)
             self._publish()
@@ -339,44 +363,44 @@ class Learning:
         self._task += 1
 
     def _solve_from_what_is_known(self) -> None:
-        """Where pairs are no longer kept, the last exact solution stands for them in the place of the prior."""
+        """Where pairs are no longer kept, the last solutions stand for them in the place of what was before."""
         members = self._members
         if members is not None and EXACT in members.maps and not self._memory.complete:
-            self._solver_prior = members.maps[EXACT]
+            self._solver_prior, self._belief = members.maps[EXACT], self._claims.belief or self._belief
 
     def _change_prior(self, members: Members, prior: KBMap) -> None:
         q, x = self._memory.all()
         members.start_again(prior, q, x)
-        self._solver_prior = None
         self._claims.prior_changed(x[-RECENT:] - prior.predict(q[-RECENT:]))
         self._replays_due += self._settings.replays_per_pair * min(len(q), RECENT)
 
-    def _start_members(self, prior: KBMap) -> None:
+    def _start_members(self, fit: Fit) -> None:
         """The first alignment: the pairs that waited for it are learnt now, each once, in their order."""
         q, x = self._memory.all()
-        self._begin(prior)
+        self._begin(fit.prior, self._nominal.belief(fit.chain, self._tolerances))
         members = self._members_now
         for row_q, row_x in zip(q, x, strict=True):
             errors = members.errors(row_q, row_x)
             self._claims.predicted(row_q, errors, np.zeros(3))
             members.learn(row_q, errors[INSTANT], np.inf)
             self._keep(row_q, row_x)
-        self._answering = choose(self._claims.compared, self._answering)
+        self._answering = self._claims.best(self._answering)
         self._replays_due = self._settings.replays_per_pair * len(q)
 
     def _serve_solver(self) -> bool:
-        """Give the exact solver its pairs, ask it from time to time, take what it found."""
+        """Give the solver its pairs, ask it from time to time, take what it found."""
         solving = self._solving
         with self._lock:
-            if self._members is None or self._members.prior.size > LARGEST_NET:
+            if self._members is None or self._belief is None:
                 return False
-            task, prior = self._task, self._solver_prior or self._members.prior
+            known = self._solver_prior
+            task = Task(self._task, known or self._members.prior, self._belief, prior_stays=known is not None)
         if solving.busy:
             return self._take_solution()
-        if solving.begin(task, prior):
+        if solving.begin(task):
             return True
         with self._lock:
-            if task != self._task:
+            if task.number != self._task:
                 return True
             q, x, fed = self._memory.since(solving.fed, FEED_PAIRS)
             if not len(q) and solving.due:
@@ -396,9 +420,9 @@ class Learning:
             return False
         with self._lock:
             if solved.task == self._task and solved.map is not None:
-                self._members_now.take(solved.map)
+                self._members_now.take(solved.name, solved.map)
                 q, x = self._memory.some(self._solving.fed, LOOKED_BACK)
-                self._claims.solution_taken(x - solved.map.predict(q))
+                self._claims.solution_taken(solved.name, x - solved.map.predict(q), solved.belief)
                 self._publish()
         return True
 
@@ -434,3 +458,16 @@ class Learning:
             f"there is no model yet: robot.toml says {self._nominal.unknown}, so positions have no frame until about "
             f"{needed} pairs have come ({have} so far). Start the sampler with `bodyschema sampler` and guide the arm"
         )
+
+
+def _tolerances(settings: LearnerConfig) -> ChainTolerances:
+    angle, place = np.radians(settings.angle_tolerance_deg), settings.place_tolerance_m
+    return ChainTolerances(
+        axes=angle,
+        points=settings.length_tolerance_m,
+        zeros=angle,
+        slide_zeros=settings.length_tolerance_m,
+        tool=place,
+        base_rotation=angle,
+        base_translation=place,
+    )

@@ -1,4 +1,4 @@
-"""The models that learn side by side: the prior, the instant learner and the exact solver's last solution."""
+"""The models that learn side by side: the prior, the instant learner and the solver's last solutions."""
 
 from __future__ import annotations
 
@@ -9,14 +9,17 @@ import numpy as np
 from interfaces.records import FloatArray
 from kbmaps import NLMS, KBMap, NonFiniteError
 
-PRIOR, INSTANT, EXACT = "prior", "nlms", "exact"
+PRIOR, INSTANT, RIGID, EXACT = "prior", "nlms", "rigid", "exact"
+SOLVED = (RIGID, EXACT)
+# Who is believed first when the errors do not tell: what has fewer numbers says more about places without data.
+TRUSTED = (RIGID, EXACT, PRIOR, INSTANT)
 
 
 class Members:
     """All in the bases of the prior.
 
-    Between two solutions the exact one stays as it is. Instant steps on top of it would follow the newest pairs, and
-    spoil it beside their path: measured, its error a few degrees away grew from 7 to 10 mm within 20 pairs.
+    Between two solutions the solved ones stay as they are. Instant steps on top of them would follow the newest pairs,
+    and spoil them beside their path: measured, the error a few degrees away grew from 7 to 10 mm within 20 pairs.
     """
 
     def __init__(self, prior: KBMap, step_size: float) -> None:
@@ -28,7 +31,7 @@ class Members:
 
     @property
     def delayed(self) -> KBMap | None:
-        """The instant learner as it was when the present exact solution was asked for; None before any."""
+        """The instant learner as it was when the present solutions were asked for; None before any."""
         return self._delayed
 
     @property
@@ -57,18 +60,18 @@ class Members:
         self._renew()
 
     def ask(self) -> None:
-        """The exact solver works on all pairs up to here."""
+        """The solver works on all pairs up to here."""
         self._asked = self._maps[INSTANT]
 
-    def take(self, solution: KBMap) -> None:
-        """The exact solver's solution of what it was asked."""
-        self._maps[EXACT] = solution
+    def take(self, name: str, solution: KBMap) -> None:
+        """The solver's solution for one of the models of what it was asked."""
+        self._maps[name] = solution
         self._delayed = self._asked
 
     def start_again(self, prior: KBMap, q: FloatArray, x: FloatArray) -> None:
         """Another prior for the same pairs, q (n, d) and x (n, 3): the instant learner learns them on top of it.
 
-        The exact solution stays: it fits the pairs, and the solver's next one will have the new prior.
+        The solutions stay: they fit the pairs.
         """
         self._maps[PRIOR] = prior
         self._instant = NLMS(prior, self._step_size)
@@ -78,7 +81,7 @@ class Members:
         """The models that `nets` names."""
         self._maps |= {name: KBMap(self.prior.bases, net) for name, net in nets.items()}
         self._instant = NLMS(self._maps[INSTANT], self._step_size)
-        if EXACT in self._maps:
+        if any(name in self._maps for name in SOLVED):
             self._delayed = self._maps[INSTANT]
 
     def _renew(self) -> None:

@@ -4,14 +4,24 @@ from __future__ import annotations
 
 import hashlib
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from interfaces.records import FloatArray, frozen_array
 from interfaces.robot import RobotDescription
-from kbmaps import JointBasis, KBMap, RigidChain, align, learning_bases, with_refitted_marker
+from kbmaps import (
+    ChainBelief,
+    ChainParameters,
+    ChainTolerances,
+    JointBasis,
+    KBMap,
+    RigidChain,
+    align,
+    learning_bases,
+    with_refitted_marker,
+)
 
 # Pairs after a tool change with which the tool is first fitted; with as many more as there were, it is again.
 PAIRS_TO_REFIT = 5
@@ -90,6 +100,19 @@ class NominalModel:
     def prior(self) -> KBMap:
         """The chain as a map in the learning bases."""
         return self.chain.to_kbmap(self.bases)
+
+    def belief(self, chain: RigidChain, tolerances: ChainTolerances) -> ChainBelief:
+        """What is believed of the real chain before any pair.
+
+        Args:
+            chain: the nominal chain, in the frame that was found where none is known.
+            tolerances: of a chain whose frame and marker are known.
+        """
+        if not self.pose_known:
+            tolerances = replace(tolerances, base_rotation=math.inf, base_translation=math.inf)
+        if not self.marker_known:
+            tolerances = replace(tolerances, tool=math.inf)
+        return ChainBelief.from_tolerances(ChainParameters(chain), tolerances)
 
     def aligned(self, q: FloatArray, x: FloatArray) -> RigidChain:
         """The chain with what is not known fitted to pairs, q (n, d) [rad] and x (n, 3) [m].

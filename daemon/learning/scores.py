@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections import deque
+from collections.abc import Iterable, Mapping, Sequence
 
 import msgspec
 import numpy as np
@@ -14,10 +15,12 @@ from interfaces.records import FloatArray
 DISCOUNT = 0.98
 # Below this many pairs the expectation from before the data counts.
 WARM = 10.0
-# Pairs that a model has to have predicted before it may answer.
-FEWEST_TO_ANSWER = 5.0
-# A challenger has to be this much better than the model that answers.
-CHALLENGE = 0.9
+# Pairs that two models have to have predicted both before they are compared.
+FEWEST_TO_COMPARE = 3
+# So many of the last pairs are compared.
+COMPARED = 100
+# A model is worse than another when the difference of their squared errors is so many standard errors.
+CLEARLY = 2.0
 
 
 class ErrorMemory(msgspec.Struct):
@@ -76,6 +79,15 @@ class ErrorMemory(msgspec.Struct):
         return np.sqrt(np.maximum(square - noise, noise * _resolution(self.weight)))
 
     @property
+    def excess(self) -> FloatArray:
+        """What the errors have beyond the measurements' noise per axis (3,) [m]; 0 where that may be chance."""
+        missing = max(WARM - self.weight, 0.0)
+        square = (np.array(self.square) + missing * self.expected_m**2 / 3.0) / max(self.weight, WARM)
+        noise = self.noise_variance
+        excess = square - noise
+        return np.sqrt(np.where(excess > CLEARLY * noise * _resolution(self.weight), excess, 0.0))
+
+    @property
     def noise_variance(self) -> FloatArray:
         """Mean variance of the measurements per axis (3,) [m²]."""
         return np.array(self.noise) / max(self.weight, 1.0)
@@ -87,19 +99,49 @@ class ErrorMemory(msgspec.Struct):
         return math.sqrt(max((self.ratio + missing) / max(self.weight, WARM), 1.0))
 
 
-def choose(errors: Mapping[str, ErrorMemory], present: str) -> str:
-    """The model that shall answer: the best on recent pairs; the present one while nobody is clearly better.
+class Contest:
+    """Squared distances between predictions and measurements, pair by pair, for the last pairs.
 
-    Args:
-        errors: by model, the most trusted first: while errors are few, the first one answers.
+    Two models meet the same noise at the same pair, so their difference there tells more than their own errors do.
     """
-    tried = {name: memory.rms_m for name, memory in errors.items() if memory.weight >= FEWEST_TO_ANSWER}
-    if present not in tried:
-        present = next(iter(errors))
-    if not tried:
+
+    def __init__(self, rows: Iterable[Mapping[str, float]] = ()) -> None:
+        self._rows: deque[dict[str, float]] = deque(map(dict, rows), maxlen=COMPARED)
+
+    @property
+    def rows(self) -> list[dict[str, float]]:
+        """By pair and model [m²]."""
+        return list(self._rows)
+
+    def add(self, squares: Mapping[str, float]) -> None:
+        """One more pair: the squared distance [m²] of each model that predicted it."""
+        self._rows.append(dict(squares))
+
+    def forget(self, name: str) -> None:
+        """A model is another one from now on."""
+        for row in self._rows:
+            row.pop(name, None)
+
+    def best(self, trusted: Sequence[str], present: str) -> str:
+        """The model that shall answer: the most trusted one that is not clearly worse than any other.
+
+        Args:
+            trusted: the models, the most trusted first.
+            present: who answers while too few pairs were predicted.
+        """
+        tried = [name for name in trusted if sum(name in row for row in self._rows) >= FEWEST_TO_COMPARE]
+        for name in tried:
+            if not any(self._clearly_worse(name, other) for other in tried if other != name):
+                return name
         return present
-    best = min(tried, key=lambda name: tried[name])
-    return best if present not in tried or tried[best] < CHALLENGE * tried[present] else present
+
+    def _clearly_worse(self, name: str, other: str) -> bool:
+        losses = np.array([row[name] - row[other] for row in self._rows if name in row and other in row])
+        if len(losses) < FEWEST_TO_COMPARE:
+            return False
+        # A few equal losses have a small spread by chance: no smaller than Student's t with so few would allow.
+        error = float(losses.std(ddof=1)) / math.sqrt(len(losses)) * (1.0 + 3.0 / len(losses))
+        return bool(losses.mean() > CLEARLY * error)
 
 
 def _resolution(samples: float) -> float:

@@ -1,47 +1,86 @@
-"""The exact member: least squares over all pairs since the tool was last changed, at the prior elsewhere."""
+"""What is solved for all pairs at once, beside the instant learner: the rigid chain, and the map around it."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal, Protocol
 
 import numpy as np
 
 from interfaces.records import FloatArray
-from kbmaps import ExactLearner, KBMap, SettingError, blockwise_precision, follow_a_path
+from kbmaps import (
+    ChainBelief,
+    ChainTolerances,
+    ExactLearner,
+    KBMap,
+    RigidLearner,
+    SettingError,
+    blockwise_precision,
+    follow_a_path,
+    shared_by,
+)
+
+from .members import EXACT, RIGID
 
 # Memory and time grow with the square and the cube of the control points: 3^7 take 77 MB and 0.2 s.
 LARGEST_NET = 2187
 # The prior's precision is looked for anew when the pairs have grown by this factor.
 RETUNE = 1.25
-# So many of the newest pairs are kept to look for it.
-KEPT = 5000
+# So many of the newest pairs are kept for what needs the pairs themselves; what the older ones say of the chain is
+# folded into what is believed before them, so many at a time.
+KEPT, FOLDED = 4000, 2000
+# Of so many pairs, evenly spread, a chain is fitted.
+FITTED = 2000
+# From so many neighbours on that count as one, their errors are no chance.
+SHARED = 1.5
+
+
+@dataclass(frozen=True)
+class Task:
+    """What is to be solved.
+
+    Attributes:
+        number: tells it from other tasks.
+        prior: the map to start from; its bases are what is learnt in.
+        belief: what is believed of the chain before the first pair of this task.
+        prior_stays: whether the exact map holds to `prior`, and not to the rigid chain: it stands for pairs that are
+            no longer kept.
+    """
+
+    number: int
+    prior: KBMap
+    belief: ChainBelief
+    prior_stays: bool = False
 
 
 @dataclass(frozen=True)
 class Solved:
-    """What a solver found.
+    """What a solver found for one model.
 
     Attributes:
         task: number of the task it belongs to.
         pairs: how many pairs it is the solution of.
+        name: the model; empty when these pairs have no solution.
         map: None when these pairs have no solution.
+        belief: what is believed of the chain now; None where that is as before.
+        last: whether this is all that one `solve` gives.
     """
 
     task: int
     pairs: int
-    map: KBMap | None
+    name: str = ""
+    map: KBMap | None = None
+    belief: ChainBelief | None = None
+    last: bool = True
 
 
-class ExactSolver(Protocol):
-    """Solves one task at a time; a task is a prior and the pairs that came since `start`."""
+class Solver(Protocol):
+    """Solves one task at a time, for the pairs that came since `start`."""
 
-    def start(self, task: int, prior: KBMap) -> None:
+    def start(self, task: Task) -> None:
         """Forget all pairs and begin a new task."""
-        ...
-
-    def rebase(self, prior: KBMap) -> None:
-        """Another prior for the same pairs."""
         ...
 
     def learn(self, q: FloatArray, x: FloatArray) -> None:
@@ -49,11 +88,11 @@ class ExactSolver(Protocol):
         ...
 
     def solve(self) -> None:
-        """Ask for the solution of all pairs so far; `poll` gives it, perhaps later."""
+        """Ask for the solutions of all pairs so far; `poll` gives them one by one, perhaps later."""
         ...
 
     def poll(self) -> Solved | None:
-        """The answer to a `solve` that has not been given yet, without waiting."""
+        """The next answer to a `solve`, without waiting."""
         ...
 
 
@@ -61,58 +100,97 @@ class DirectSolver:
     """Solves at once, in the caller's thread."""
 
     def __init__(self) -> None:
-        self._task = 0
-        self._learner: ExactLearner | None = None
+        self._task: Task | None = None
+        self._folded: ChainBelief | None = None
+        self._exact: ExactLearner | None = None
         self._precision: float | None = None
-        self._tuned_at = 0
-        self._solved: Solved | None = None
+        self._tuned_at = self._pairs = 0
+        self._solved: list[Solved] = []
         self._q = self._x = np.empty((0, 0))
 
-    def start(self, task: int, prior: KBMap) -> None:
+    def start(self, task: Task) -> None:
         """Forget all pairs and begin a new task."""
-        self._task, self._learner = task, ExactLearner(prior)
-        self._precision, self._tuned_at, self._solved = None, 0, None
-        self._q, self._x = np.empty((0, prior.joints)), np.empty((0, 3))
-
-    def rebase(self, prior: KBMap) -> None:
-        """Another prior for the same pairs."""
-        self._started.rebase(prior)
-        self._precision = None
+        self._task, self._folded = task, task.belief
+        self._exact = ExactLearner(task.prior) if task.prior.size <= LARGEST_NET else None
+        self._precision, self._tuned_at, self._pairs, self._solved = None, 0, 0, []
+        self._q, self._x = np.empty((0, task.prior.joints)), np.empty((0, 3))
 
     def learn(self, q: FloatArray, x: FloatArray) -> None:
         """More pairs, q (n, d) [rad] and x (n, 3) [m]."""
-        self._started.learn(q, x)
-        self._q, self._x = np.vstack([self._q, q])[-KEPT:], np.vstack([self._x, x])[-KEPT:]
+        if self._exact is not None:
+            self._exact.learn(q, x)
+        self._pairs += len(q)
+        self._q, self._x = np.vstack([self._q, q]), np.vstack([self._x, x])
+        while len(self._q) > KEPT:
+            self._folded = fitted_belief(self._before, self._q[:FOLDED], self._x[:FOLDED])
+            self._q, self._x = self._q[FOLDED:], self._x[FOLDED:]
 
     def solve(self) -> None:
-        """Solve; the prior's precision is looked for when the pairs have grown.
+        """Solve for all models."""
+        self._solved += self.solutions()
 
-        The evidence finds it where pairs are apart. On a guided path neighbours share their errors, and it would take
-        those for shape: there, left-out blocks speak.
+    def poll(self) -> Solved | None:
+        """The next answer to the last `solve`."""
+        return self._solved.pop(0) if self._solved else None
+
+    def solutions(self) -> Iterator[Solved]:
+        """Each model's solution as it is found, the rigid chain first: it is the quickest."""
+        task = self._started
+        belief = fitted_belief(self._before, self._q, self._x)
+        rigid = belief.chain.to_kbmap(task.prior.bases)
+        yield Solved(task.number, self._pairs, RIGID, rigid, belief, last=self._exact is None)
+        if self._exact is not None:
+            if not task.prior_stays:
+                self._exact.rebase(rigid)
+            yield self._solve_exact(task, self._exact)
+
+    def _solve_exact(self, task: Task, learner: ExactLearner) -> Solved:
+        """Least squares around the rigid chain.
+
+        The evidence finds the prior's precision where pairs are apart. On a guided path neighbours share their
+        errors, and it would take those for shape: there, left-out blocks speak.
         """
-        learner = self._started
         retune = self._precision is None or learner.pairs >= RETUNE * self._tuned_at
         try:
             solution = learner.solve(self._sought_precision(learner.prior) if retune else self._precision)
         except SettingError:
             # The precision was lost in rounding: without a solution the others go on answering.
             self._precision = None
-            self._solved = Solved(self._task, learner.pairs, None)
-            return
+            return Solved(task.number, learner.pairs)
         if retune:
             self._precision, self._tuned_at = solution.prior_precision or None, learner.pairs
-        self._solved = Solved(self._task, learner.pairs, solution.map)
+        return Solved(task.number, learner.pairs, EXACT, solution.map)
 
     def _sought_precision(self, prior: KBMap) -> float | Literal["evidence"]:
         return blockwise_precision(prior, self._q, self._x) if follow_a_path(prior, self._q) else "evidence"
 
-    def poll(self) -> Solved | None:
-        """The answer to the last `solve`, once."""
-        solved, self._solved = self._solved, None
-        return solved
+    @property
+    def _started(self) -> Task:
+        if self._task is None:
+            raise RuntimeError("start a task first")
+        return self._task
 
     @property
-    def _started(self) -> ExactLearner:
-        if self._learner is None:
+    def _before(self) -> ChainBelief:
+        """What is believed of the chain before the pairs that are kept."""
+        if self._folded is None:
             raise RuntimeError("start a task first")
-        return self._learner
+        return self._folded
+
+
+def fitted_belief(prior: ChainBelief, q: FloatArray, x: FloatArray) -> ChainBelief:
+    """What is believed of a chain after pairs q (n, d) [rad] and x (n, 3) [m] along a path.
+
+    Neighbours share part of their errors. So many pairs count as one as do so.
+    """
+    chosen = np.linspace(0, len(q) - 1, min(len(q), FITTED)).round().astype(np.intp)
+    q, x = q[chosen], x[chosen]
+    learner = RigidLearner(prior.parameters.reference, ChainTolerances(), prior)
+    learner.learn(q, x)
+    inliers = learner.inliers
+    shared = shared_by(x[inliers] - learner.predict(q[inliers]))
+    if shared < SHARED:
+        return learner.belief
+    again = RigidLearner(prior.parameters.reference, ChainTolerances(), prior)
+    again.learn(q[inliers], x[inliers], learner.report().noise * math.sqrt(shared))
+    return again.belief

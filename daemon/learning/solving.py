@@ -1,24 +1,23 @@
-"""What an exact solver is given, and when it is asked."""
+"""What a solver is given, and when it is asked."""
 
 from __future__ import annotations
 
 from interfaces.records import FloatArray
-from kbmaps import KBMap
 
-from .solver import ExactSolver, Solved
+from .solver import Solved, Solver, Task
 
 # While pairs are few, a solution is worth renewing, and cheap, when so many more have come as a share of them.
 GROWTH = 0.1
 
 
 class Solving:
-    """Keeps one exact solver up to date. For the background thread alone.
+    """Keeps one solver up to date. For the background thread alone.
 
     Nothing is sent while the solver works: in a process of its own it does not listen meanwhile, and the sender would
     wait for it with everything else that the thread has to do.
     """
 
-    def __init__(self, solver: ExactSolver, solve_every: int) -> None:
+    def __init__(self, solver: Solver, solve_every: int) -> None:
         self._solver, self._every = solver, solve_every
         self.restart()
 
@@ -41,7 +40,6 @@ class Solving:
     def restart(self) -> None:
         """The solver has lost everything."""
         self._task: int | None = None
-        self._prior: KBMap | None = None
         self._fed = self._solved_at = 0
         self._busy = self._soon = False
 
@@ -49,17 +47,13 @@ class Solving:
         """Ask although fewer pairs than usual are new."""
         self._soon = self._soon or self._fed > self._solved_at or self._task is None
 
-    def begin(self, task: int, prior: KBMap) -> bool:
-        """Tell the solver of a new task, or of another prior for the same pairs; False when it knows both."""
-        if task != self._task:
-            self._solver.start(task, prior)
-            self._fed = self._solved_at = 0
-        elif prior is not self._prior:
-            self._solver.rebase(prior)
-            self._soon = True
-        else:
+    def begin(self, task: Task) -> bool:
+        """Tell the solver of a new task; False when it knows it."""
+        if task.number == self._task:
             return False
-        self._task, self._prior = task, prior
+        self._solver.start(task)
+        self._fed = self._solved_at = 0
+        self._task = task.number
         return True
 
     def feed(self, q: FloatArray, x: FloatArray, fed: int) -> None:
@@ -68,13 +62,13 @@ class Solving:
         self._fed = fed
 
     def ask(self) -> None:
-        """Ask for the solution of all pairs so far."""
+        """Ask for the solutions of all pairs so far."""
         self._solver.solve()
         self._busy, self._soon, self._solved_at = True, False, self._fed
 
     def poll(self) -> Solved | None:
-        """The answer when it has come, without waiting."""
+        """The next answer when it has come, without waiting."""
         solved = self._solver.poll()
         if solved is not None:
-            self._busy = False
+            self._busy = not solved.last
         return solved

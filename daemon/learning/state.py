@@ -51,6 +51,7 @@ class LearningHeader(msgspec.Struct, kw_only=True):
         next_fit: pairs at which what is not known, or the tool after a change, is fitted again; None when nothing is.
         first_fit: whether that is the first one.
         replays_due: replay steps that are still owed.
+        belief: what was believed of the chain before the first of these pairs, as bytes; None before the alignment.
     """
 
     fingerprint: str
@@ -64,6 +65,7 @@ class LearningHeader(msgspec.Struct, kw_only=True):
     next_fit: int | None
     first_fit: bool
     replays_due: float
+    belief: bytes | None
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from interfaces.records import FloatArray
-from kbmaps import JointBasis, SupportSet
+from kbmaps import ChainBelief, JointBasis, SupportSet
 
 
 @dataclass(frozen=True)
@@ -25,8 +25,19 @@ class Layer:
     sigma: float
 
     def variance(self, q: FloatArray) -> FloatArray:
-        """Variance of a coordinate that is left open at q (n, d) [rad], shape (n,) [m²]."""
-        return unexplained(self.support, q) * self.sigma**2
+        """Variance of a coordinate that is left open at q (n, d) [rad], shape (n, 1) [m²]."""
+        return unexplained(self.support, q)[:, None] * self.sigma**2
+
+
+@dataclass(frozen=True, eq=False)
+class ChainLayer:
+    """What the data leave open of a rigid chain."""
+
+    belief: ChainBelief
+
+    def variance(self, q: FloatArray) -> FloatArray:
+        """Variance of each coordinate that is left open at q (n, d) [rad], shape (n, 3) [m²]."""
+        return self.belief.predict_with_variance(q)[1]
 
 
 def unexplained(support: SupportSet | None, q: FloatArray) -> FloatArray:

@@ -6,8 +6,9 @@ import pytest
 from guided_arm import JOINTS, nominal_model, path
 
 from daemon.learning.claims import Claims, ClaimsState
-from daemon.learning.members import EXACT, INSTANT, PRIOR
+from daemon.learning.members import INSTANT, PRIOR, RIGID
 from interfaces.records import FloatArray
+from kbmaps import ChainBelief, ChainTolerances
 
 NOISE = np.full(3, 1e-6)
 FAR = np.full((1, JOINTS), 2.5)
@@ -22,6 +23,11 @@ def learnt(claims: Claims, q: FloatArray, prior_error_m: float, error_m: float =
 
 def sigma(claims: Claims, name: str, q: FloatArray) -> float:
     return float(np.sqrt(claims.of(name).variance(q)).mean())
+
+
+def sure_belief() -> ChainBelief:
+    nominal = nominal_model()
+    return nominal.belief(nominal.chain, ChainTolerances())
 
 
 @pytest.fixture
@@ -77,14 +83,22 @@ def test_where_the_arm_was_seen_with_the_old_tool_only_the_new_tool_is_unknown(w
     assert sigma(claims, INSTANT, walk[-1:]) < 0.008
 
 
-def test_an_exact_solution_is_not_credited_with_pairs_that_it_does_not_know(walk: FloatArray) -> None:
+def test_away_from_the_pairs_that_a_solution_knows_its_claim_grows_by_what_it_misses_at_them(walk: FloatArray) -> None:
     claims = Claims(nominal_model().bases, 0.1)
-    learnt(claims, walk[:20], prior_error_m=0.04)
+    learnt(claims, walk, prior_error_m=0.04)
     claims.solution_asked()
-    learnt(claims, walk[20:], prior_error_m=0.04)
-    claims.solution_taken(np.zeros((20, 3)))
-    there = walk[-1:]
-    assert sigma(claims, EXACT, there) > 3.0 * sigma(claims, INSTANT, there)
+    claims.solution_taken(RIGID, np.full((50, 3), 0.005), sure_belief())
+    assert sigma(claims, RIGID, walk) == pytest.approx(0.005, rel=0.1)
+    assert sigma(claims, RIGID, FAR) == pytest.approx(np.sqrt(2.0) * 0.005, rel=0.2)
+
+
+def test_residuals_within_the_noise_add_nothing_to_what_is_left_open_of_the_chain(walk: FloatArray) -> None:
+    claims = Claims(nominal_model().bases, 0.1)
+    learnt(claims, walk, prior_error_m=0.04)
+    claims.solution_asked()
+    noise = np.random.default_rng(0).normal(0.0, np.sqrt(NOISE[0]), (50, 3))
+    claims.solution_taken(RIGID, noise, sure_belief())
+    assert sigma(claims, RIGID, walk) < 1e-6
 
 
 def test_claims_are_the_same_after_a_restart(walk: FloatArray) -> None:

@@ -20,11 +20,13 @@ from hypothesis import strategies as st
 
 from daemon.config import LearnerConfig
 from daemon.learning import Learning
+from daemon.learning.members import SOLVED
 from interfaces.errors import RequestError
 from interfaces.records import Pair
 from kbmaps import NLMS
 
 SEEDS = range(4)
+MANY_SEEDS = range(12)
 
 
 def fingerprint(learning: Learning) -> tuple[object, ...]:
@@ -90,25 +92,29 @@ def test_three_hundred_pairs_take_most_of_the_nominal_error_away(seed: int) -> N
     assert scene.error_m(learning) < 0.2 * nominal_error
 
 
-@pytest.mark.parametrize("seed", SEEDS)
-def test_the_claimed_error_is_of_the_size_of_the_true_one(seed: int) -> None:
-    scene = Scene.draw(seed, 300)
-    learning = new_learning()
-    teach(learning, scene.pairs)
-    claimed = learning.claimed_error_m()
-    assert claimed is not None
-    assert 0.5 < claimed / scene.error_m(learning) < 3.5
+@pytest.fixture(scope="module")
+def taught() -> list[tuple[Scene, Learning]]:
+    """Twelve arms after 150 pairs each."""
+    cases = [(Scene.draw(seed, 150), new_learning()) for seed in MANY_SEEDS]
+    for scene, learning in cases:
+        teach(learning, scene.pairs)
+    return cases
 
 
-@pytest.mark.parametrize("seed", SEEDS)
-def test_the_claimed_sigma_covers_most_coordinates(seed: int) -> None:
-    scene = Scene.draw(seed, 300)
-    learning = new_learning()
-    teach(learning, scene.pairs)
-    q = near(np.random.default_rng(seed), scene.q)
-    prediction = learning.snapshot.predict(q)
-    covered = np.abs(prediction.x - scene.chain.positions(q)) <= prediction.sigma
-    assert covered.mean() > 0.6
+def test_the_claimed_error_is_the_true_one_on_average(taught: list[tuple[Scene, Learning]]) -> None:
+    ratios = [(learning.claimed_error_m() or 0.0) / scene.error_m(learning) for scene, learning in taught]
+    assert 0.8 < np.mean(ratios) < 1.5
+
+
+def test_the_claimed_sigma_covers_two_thirds_of_the_coordinates_on_average(
+    taught: list[tuple[Scene, Learning]],
+) -> None:
+    covered = []
+    for seed, (scene, learning) in enumerate(taught):
+        q = near(np.random.default_rng(seed), scene.q)
+        prediction = learning.snapshot.predict(q)
+        covered.append((np.abs(prediction.x - scene.chain.positions(q)) <= prediction.sigma).mean())
+    assert 0.58 < np.mean(covered) < 0.78
 
 
 def test_the_claimed_sigma_grows_away_from_the_data() -> None:
@@ -261,10 +267,10 @@ def test_the_prior_answers_while_there_are_few_pairs() -> None:
     assert learning.snapshot.answering == "prior"
 
 
-def test_the_exact_solution_answers_in_the_end() -> None:
+def test_a_solution_answers_in_the_end() -> None:
     learning = new_learning()
     teach(learning, Scene.draw(0, 200).pairs)
-    assert learning.snapshot.answering == "exact"
+    assert learning.snapshot.answering in SOLVED
 
 
 def test_a_snapshot_does_not_change_when_learning_goes_on() -> None:

@@ -4,13 +4,15 @@ import numpy as np
 import pytest
 from guided_arm import JOINTS, nominal_model
 
-from daemon.learning.solver import Solved
+from daemon.learning.members import RIGID
+from daemon.learning.solver import Solved, Task
 from daemon.learning.solving import Solving
 from interfaces.records import FloatArray
-from kbmaps import KBMap
+from kbmaps import ChainTolerances
 
-PRIOR = nominal_model().prior()
-OTHER = KBMap(PRIOR.bases, 2.0 * PRIOR.net)
+NOMINAL = nominal_model()
+PRIOR = NOMINAL.prior()
+TASK = Task(1, PRIOR, NOMINAL.belief(NOMINAL.chain, ChainTolerances()))
 Q, X = np.zeros((10, JOINTS)), np.zeros((10, 3))
 
 
@@ -21,11 +23,8 @@ class ScriptedSolver:
         self.told: list[object] = []
         self.answer: Solved | None = None
 
-    def start(self, task: int, prior: KBMap) -> None:
-        self.told.append(("start", task))
-
-    def rebase(self, prior: KBMap) -> None:
-        self.told.append("rebase")
+    def start(self, task: Task) -> None:
+        self.told.append(("start", task.number))
 
     def learn(self, q: FloatArray, x: FloatArray) -> None:
         self.told.append(("learn", len(q)))
@@ -46,12 +45,12 @@ def solver() -> ScriptedSolver:
 @pytest.fixture
 def solving(solver: ScriptedSolver) -> Solving:
     solving = Solving(solver, solve_every=25)
-    solving.begin(1, PRIOR)
+    solving.begin(TASK)
     return solving
 
 
 def test_a_new_task_is_told_once(solver: ScriptedSolver, solving: Solving) -> None:
-    assert not solving.begin(1, PRIOR)
+    assert not solving.begin(TASK)
     assert solver.told == [("start", 1)]
 
 
@@ -61,7 +60,7 @@ def test_a_solution_is_due_after_a_tenth_more_pairs_but_never_later_than_configu
 ) -> None:
     solving.feed(Q, X, solved_at)
     solving.ask()
-    solver.answer = Solved(1, solved_at, PRIOR)
+    solver.answer = Solved(1, solved_at, RIGID, PRIOR)
     solving.poll()
     solving.feed(Q, X, not_yet)
     early = solving.due
@@ -72,24 +71,28 @@ def test_a_solution_is_due_after_a_tenth_more_pairs_but_never_later_than_configu
 def test_no_solution_is_due_without_new_pairs(solver: ScriptedSolver, solving: Solving) -> None:
     solving.feed(Q, X, 25)
     solving.ask()
-    solver.answer = Solved(1, 25, PRIOR)
+    solver.answer = Solved(1, 25, RIGID, PRIOR)
     solving.poll()
     solving.solve_soon()
     assert not solving.due
 
 
-def test_another_prior_for_the_same_pairs_is_solved_for_at_once(solver: ScriptedSolver, solving: Solving) -> None:
-    solving.feed(Q, X, 10)
-    assert solving.begin(1, OTHER)
-    assert solver.told[-1] == "rebase"
-    assert solving.due
+def test_it_is_busy_until_the_last_answer(solver: ScriptedSolver, solving: Solving) -> None:
+    solving.feed(Q, X, 25)
+    solving.ask()
+    busy = []
+    for last in (False, True):
+        solver.answer = Solved(1, 25, RIGID, PRIOR, last=last)
+        solving.poll()
+        busy.append(solving.busy)
+    assert busy == [True, False]
 
 
 def test_it_is_busy_from_the_question_to_the_answer(solver: ScriptedSolver, solving: Solving) -> None:
     solving.feed(Q, X, 25)
     solving.ask()
     waiting = solving.busy, solving.poll(), solving.busy
-    solver.answer = Solved(1, 25, PRIOR)
+    solver.answer = Solved(1, 25, RIGID, PRIOR)
     assert solving.poll() is not None
     assert (waiting, solving.busy) == ((True, None, True), False)
 
@@ -97,5 +100,5 @@ def test_it_is_busy_from_the_question_to_the_answer(solver: ScriptedSolver, solv
 def test_a_solver_that_lost_everything_is_given_everything_again(solver: ScriptedSolver, solving: Solving) -> None:
     solving.feed(Q, X, 10)
     solving.restart()
-    assert solving.begin(1, PRIOR)
+    assert solving.begin(TASK)
     assert (solver.told[-1], solving.fed) == (("start", 1), 0)
