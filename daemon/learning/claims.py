@@ -11,7 +11,8 @@ import numpy as np
 from interfaces.records import FloatArray
 from kbmaps import ChainBelief, JointBasis, SupportSet
 
-from .members import INSTANT, PRIOR, RIGID, SOLVED, TRUSTED
+from .members import INSTANT, PRIOR, RIGID, TRUSTED
+from .misfit import misfit
 from .scores import Contest, ErrorMemory
 from .unknowns import ChainLayer, Layer, Unknowns
 
@@ -48,19 +49,21 @@ class ClaimsState(msgspec.Struct, kw_only=True):
     Attributes:
         errors: prequential errors, by model.
         contest: squared prequential errors [m²] of the last pairs.
-        residuals: errors on pairs that are learnt already, by model.
-        misfit: errors of the prior, over longer.
+        residuals: errors of the instant learner on pairs that it has learnt already; None before any.
+        misfits: what each solution misses at pairs that it knows, 1-sigma per axis [m].
+        prior_errors: those of the prior, over longer.
         arm_sigma: 1-sigma of the prior before the tool was changed [m].
-        expected_residual_m: RMS residual that a solution is expected to leave before there are any [m].
+        misfit_before: what the rigid chain missed with the last tool, 1-sigma per axis [m].
         belief: what is believed of the chain, as bytes; None before the first solution.
     """
 
     errors: dict[str, ErrorMemory]
     contest: list[dict[str, float]]
-    residuals: dict[str, ErrorMemory]
-    misfit: ErrorMemory
+    residuals: ErrorMemory | None
+    misfits: dict[str, tuple[float, float, float]]
+    misfit_before: tuple[float, float, float]
+    prior_errors: ErrorMemory
     arm_sigma: float | None
-    expected_residual_m: float | None
     belief: bytes | None
 
 
@@ -74,15 +77,16 @@ class Claims:
 
     def __init__(self, bases: Sequence[JointBasis], expected_m: float) -> None:
         self._unknowns = Unknowns(bases)
-        self._expected_residual_m: float | None = None
+        self._misfit_before = np.zeros(3)
         self._begin(expected_m)
 
     def _begin(self, expected_m: float) -> None:
         self._expected_m = expected_m
         self.errors = {name: ErrorMemory(expected_m) for name in (PRIOR, INSTANT)}
         self._contest = Contest()
-        self._residuals: dict[str, ErrorMemory] = {}
-        self._misfit = ErrorMemory(expected_m, discount=PRIOR_DISCOUNT)
+        self._residuals: ErrorMemory | None = None
+        self._misfits: dict[str, FloatArray] = {}
+        self._prior_errors = ErrorMemory(expected_m, discount=PRIOR_DISCOUNT)
         self._asked: SupportSet | None = None
         self._solved: SupportSet | None = None
         self._belief: ChainBelief | None = None
@@ -114,8 +118,7 @@ class Claims:
     def change_tool(self, expected_m: float) -> None:
         """Another tool: a new prior with other errors, and what was not known of the arm is not known now."""
         self._unknowns.change_tool(self._prior_sigma)
-        if RIGID in self._residuals:
-            self._expected_residual_m = self._residuals[RIGID].rms_m
+        self._misfit_before = self._misfits.get(RIGID, self._misfit_before)
         self._begin(expected_m)
 
     def predicted(
@@ -137,7 +140,7 @@ class Claims:
         for name, error in errors.items():
             claimed = self.of(name).variance(q[None])[0] + variance
             self.errors[name].add(error, variance, float(np.square(error).sum() / claimed.sum()))
-        self._misfit.add(errors[PRIOR], variance)
+        self._prior_errors.add(errors[PRIOR], variance)
         compared = dict(errors) if delayed is None else {**errors, INSTANT: delayed}
         self._contest.add({name: float(np.square(error).sum()) for name, error in compared.items()})
 
@@ -145,54 +148,51 @@ class Claims:
         """A pair has been learnt at q (d,) [rad]."""
         self._unknowns.add(q)
 
-    def replayed(self, name: str, errors: FloatArray) -> None:
-        """Errors (n, 3) [m] of a model at pairs that it has learnt before."""
-        self._add_residuals(name, errors, ErrorMemory(self._expected_m))
-
-    def _add_residuals(self, name: str, errors: FloatArray, start: ErrorMemory) -> None:
-        memory = self._residuals.setdefault(name, start)
+    def replayed(self, errors: FloatArray) -> None:
+        """Errors (n, 3) [m] of the instant learner at pairs that it has learnt before."""
+        self._residuals = self._residuals or ErrorMemory(self._expected_m)
         for error in errors:
-            memory.add(error, self.errors[PRIOR].noise_variance)
+            self._residuals.add(error, self.errors[PRIOR].noise_variance)
 
     def solution_asked(self) -> None:
         """The solver works on all pairs up to here."""
         self._asked = self._unknowns.support
 
-    def solution_taken(self, name: str, errors: FloatArray, belief: ChainBelief | None) -> None:
+    def solution_taken(self, name: str, errors: FloatArray, belief: ChainBelief | None, *, neighbours: bool) -> None:
         """A solution answers for this model from now on.
 
         Args:
-            errors: its errors (n, 3) [m] at pairs that it knows.
+            errors: its errors (n, 3) [m] at pairs that it knows, in their order.
             belief: what is believed of the chain now; None: as before.
+            neighbours: whether these pairs follow a path.
         """
         self.errors.setdefault(name, ErrorMemory(self._expected_m))
         self._solved = self._asked
         self._belief = belief or self._belief
-        self._residuals.pop(name, None)
-        expected_m = self.noise_m if self._expected_residual_m is None else self._expected_residual_m
-        self._add_residuals(name, errors, ErrorMemory(expected_m, discount=1.0))
+        noise = self.errors[PRIOR].noise_variance
+        self._misfits[name] = misfit(errors, noise, self._misfit_before, neighbours=neighbours)
 
     def prior_changed(self, errors: FloatArray) -> None:
         """Another prior for the same pairs; its errors (n, 3) [m] at them."""
         noise = self.errors[PRIOR].noise_variance
         self.errors[PRIOR] = ErrorMemory(self._expected_m)
-        self._misfit = ErrorMemory(self._expected_m, discount=PRIOR_DISCOUNT)
+        self._prior_errors = ErrorMemory(self._expected_m, discount=PRIOR_DISCOUNT)
         self._contest.forget(PRIOR)
         for error in errors:
             self.errors[PRIOR].add(error, noise)
-            self._misfit.add(error, noise)
+            self._prior_errors.add(error, noise)
 
     def of(self, name: str) -> Claim:
         """What is claimed for one model."""
         memory = self.errors.get(name, ErrorMemory(self._expected_m))
         if name == PRIOR:
             return Claim(memory.sigma)
-        residuals = self._residuals.get(name, memory)
-        if name in SOLVED and self._belief is not None:
+        if name in self._misfits and self._belief is not None:
             # Where no data was, the arm may be less rigid than it was seen to be by as much again.
-            rest = float(np.sqrt(np.square(self._residuals.get(RIGID, memory).excess).mean()))
-            return Claim(residuals.excess, (ChainLayer(self._belief), Layer(self._solved, rest)), memory.surprise)
-        return Claim(residuals.sigma, self._unknowns.layers(self._prior_sigma), memory.surprise)
+            rest = float(np.sqrt(np.square(self._misfits[RIGID]).mean()))
+            return Claim(self._misfits[name], (ChainLayer(self._belief), Layer(self._solved, rest)), memory.surprise)
+        inside = memory if self._residuals is None else self._residuals
+        return Claim(inside.sigma, self._unknowns.layers(self._prior_sigma), memory.surprise)
 
     def state(self) -> ClaimsState:
         """Everything needed to go on from here, but `arm_configurations`."""
@@ -200,9 +200,10 @@ class Claims:
             errors=self.errors,
             contest=self._contest.rows,
             residuals=self._residuals,
-            misfit=self._misfit,
+            misfits={name: _triple(missed) for name, missed in self._misfits.items()},
+            misfit_before=_triple(self._misfit_before),
+            prior_errors=self._prior_errors,
             arm_sigma=self._unknowns.arm_sigma,
-            expected_residual_m=self._expected_residual_m,
             belief=None if self._belief is None else self._belief.to_bytes(),
         )
 
@@ -214,12 +215,18 @@ class Claims:
             self._unknowns.change_tool(state.arm_sigma)
         for row in q:
             self._unknowns.add(row)
-        self.errors, self._residuals = dict(state.errors), dict(state.residuals)
-        self._contest, self._misfit = Contest(state.contest), state.misfit
-        self._expected_residual_m = state.expected_residual_m
+        self.errors, self._residuals = dict(state.errors), state.residuals
+        self._contest, self._prior_errors = Contest(state.contest), state.prior_errors
+        self._misfits = {name: np.array(missed) for name, missed in state.misfits.items()}
+        self._misfit_before = np.array(state.misfit_before)
         self._belief = None if state.belief is None else ChainBelief.from_bytes(state.belief)
         self._asked = self._solved = self._unknowns.support
 
     @property
     def _prior_sigma(self) -> float:
-        return OPEN_SHARE * float(np.sqrt(np.square(self._misfit.sigma).mean()))
+        return OPEN_SHARE * float(np.sqrt(np.square(self._prior_errors.sigma).mean()))
+
+
+def _triple(values: FloatArray) -> tuple[float, float, float]:
+    x, y, z = values.tolist()
+    return x, y, z

@@ -15,7 +15,7 @@ from daemon.config import LearnerConfig
 from daemon.status import CurvePoint
 from interfaces.errors import RequestError
 from interfaces.records import FloatArray, Pair
-from kbmaps import ChainBelief, ChainTolerances, KBMap
+from kbmaps import ChainBelief, ChainTolerances, KBMap, follow_a_path
 
 from .claims import Claims
 from .curve import Curve
@@ -422,7 +422,8 @@ class Learning:
             if solved.task == self._task and solved.map is not None:
                 self._members_now.take(solved.name, solved.map)
                 q, x = self._memory.some(self._solving.fed, LOOKED_BACK)
-                self._claims.solution_taken(solved.name, x - solved.map.predict(q), solved.belief)
+                errors, neighbours = x - solved.map.predict(q), follow_a_path(solved.map, q)
+                self._claims.solution_taken(solved.name, errors, solved.belief, neighbours=neighbours)
                 self._publish()
         return True
 
@@ -433,7 +434,7 @@ class Learning:
             places = self._order.take(min(REPLAY_STEPS, int(self._replays_due)), len(self._memory))
             q, x = self._memory.at(places)
             seen = slice(LOOKED_BACK_IN_REPLAY)
-            self._claims.replayed(INSTANT, x[seen] - self._members.maps[INSTANT].predict(q[seen]))
+            self._claims.replayed(x[seen] - self._members.maps[INSTANT].predict(q[seen]))
             self._members.replay(q, x)
             self._replays_due -= len(places)
             self._counters.replayed += len(places)

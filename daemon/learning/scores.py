@@ -79,15 +79,6 @@ class ErrorMemory(msgspec.Struct):
         return np.sqrt(np.maximum(square - noise, noise * _resolution(self.weight)))
 
     @property
-    def excess(self) -> FloatArray:
-        """What the errors have beyond the measurements' noise per axis (3,) [m]; 0 where that may be chance."""
-        missing = max(WARM - self.weight, 0.0)
-        square = (np.array(self.square) + missing * self.expected_m**2 / 3.0) / max(self.weight, WARM)
-        noise = self.noise_variance
-        excess = square - noise
-        return np.sqrt(np.where(excess > CLEARLY * noise * _resolution(self.weight), excess, 0.0))
-
-    @property
     def noise_variance(self) -> FloatArray:
         """Mean variance of the measurements per axis (3,) [m²]."""
         return np.array(self.noise) / max(self.weight, 1.0)

@@ -63,7 +63,7 @@ def test_errors_larger_than_claimed_raise_the_claim(walk: FloatArray) -> None:
 def test_residuals_at_learnt_pairs_raise_the_claim_at_the_data(walk: FloatArray) -> None:
     claims = Claims(nominal_model().bases, 0.1)
     learnt(claims, walk, prior_error_m=0.02)
-    claims.replayed(INSTANT, np.full((50, 3), 0.005))
+    claims.replayed(np.full((50, 3), 0.005))
     assert sigma(claims, INSTANT, walk) == pytest.approx(0.005, rel=0.2)
 
 
@@ -87,7 +87,7 @@ def test_away_from_the_pairs_that_a_solution_knows_its_claim_grows_by_what_it_mi
     claims = Claims(nominal_model().bases, 0.1)
     learnt(claims, walk, prior_error_m=0.04)
     claims.solution_asked()
-    claims.solution_taken(RIGID, np.full((50, 3), 0.005), sure_belief())
+    claims.solution_taken(RIGID, np.full((50, 3), 0.005), sure_belief(), neighbours=True)
     assert sigma(claims, RIGID, walk) == pytest.approx(0.005, rel=0.1)
     assert sigma(claims, RIGID, FAR) == pytest.approx(np.sqrt(2.0) * 0.005, rel=0.2)
 
@@ -97,7 +97,7 @@ def test_residuals_within_the_noise_add_nothing_to_what_is_left_open_of_the_chai
     learnt(claims, walk, prior_error_m=0.04)
     claims.solution_asked()
     noise = np.random.default_rng(0).normal(0.0, np.sqrt(NOISE[0]), (50, 3))
-    claims.solution_taken(RIGID, noise, sure_belief())
+    claims.solution_taken(RIGID, noise, sure_belief(), neighbours=True)
     assert sigma(claims, RIGID, walk) < 1e-6
 
 

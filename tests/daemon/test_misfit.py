@@ -1,0 +1,48 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from daemon.learning.misfit import misfit
+
+NONE = np.zeros(3)
+
+
+def bent(n: int) -> np.ndarray:
+    """A misfit of 3 mm RMS on each axis that changes slowly along a path."""
+    phase = np.linspace(0.0, 12.0 * np.pi, n)
+    return 0.003 * np.sqrt(2.0) * np.stack([np.sin(phase), np.cos(phase), np.sin(phase + 1.0)], axis=1)
+
+
+@pytest.mark.parametrize("claimed", [1e-12, 1e-4])
+def test_on_a_path_the_misfit_is_found_whatever_noise_is_claimed(claimed: float) -> None:
+    noise = np.random.default_rng(0).normal(0.0, 0.002, (500, 3))
+    found = misfit(bent(500) + noise, np.full(3, claimed), NONE, neighbours=True)
+    np.testing.assert_allclose(found, 0.003, rtol=0.1)
+
+
+@pytest.mark.parametrize("neighbours", [True, False])
+def test_noise_alone_is_mostly_no_misfit(neighbours: bool) -> None:
+    found = [
+        misfit(
+            np.random.default_rng(seed).normal(0.0, 0.002, (500, 3)),
+            np.full(3, 0.002**2),
+            NONE,
+            neighbours=neighbours,
+        )
+        for seed in range(50)
+    ]
+    assert (np.array(found) > 0.0).mean() < 0.1
+
+
+def test_poses_far_apart_are_measured_against_the_claimed_noise() -> None:
+    rng = np.random.default_rng(0)
+    errors = rng.normal(0.0, np.hypot(0.003, 0.002), (500, 3))
+    np.testing.assert_allclose(misfit(errors, np.full(3, 0.002**2), NONE, neighbours=False), 0.003, rtol=0.1)
+
+
+def test_while_pairs_are_few_the_misfit_with_the_last_tool_counts() -> None:
+    before = np.full(3, 0.004)
+    few = misfit(np.zeros((2, 3)), np.full(3, 1e-6), before, neighbours=True)
+    many = misfit(np.zeros((50, 3)), np.full(3, 1e-6), before, neighbours=True)
+    np.testing.assert_allclose([few, many], [np.sqrt(0.8) * before, NONE])
