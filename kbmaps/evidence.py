@@ -12,7 +12,8 @@ _STEP = math.log(8.0)
 def most_evident(log_evidence: Callable[[float], float], start: float, low: float, high: float) -> float:
     """The positive scale of the greatest evidence near `start`.
 
-    Climbs in steps of a factor until both neighbours are lower, then tries the vertex of the parabola through the three.
+    Climbs in steps of a factor until both neighbours are lower, then tries the vertex of the parabola
+    through the three.
 
     Args:
         log_evidence: of a scale.

@@ -94,9 +94,7 @@ class ExactLearner:
         SettingError: forgetting is not a factor in 0..1.
     """
 
-    def __init__(
-        self, prior: KBMap, bases: Sequence[JointBasis] | None = None, *, forgetting: float = 1.0
-    ) -> None:
+    def __init__(self, prior: KBMap, bases: Sequence[JointBasis] | None = None, *, forgetting: float = 1.0) -> None:
         check_forgetting(forgetting)
         self._forgetting = float(forgetting)
         self._bases = prior.bases if bases is None else tuple(bases)

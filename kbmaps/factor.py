@@ -9,7 +9,6 @@ import numpy as np
 from kbmaps import lapack
 from kbmaps.arrays import FloatArray
 
-
 _NOTHING = 1e-150
 
 

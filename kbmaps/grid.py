@@ -18,7 +18,7 @@ _THIRD_OF_A_TURN = 2.0 * math.pi / 3.0
 def sampled_map(model: Predictor, bases: Sequence[JointBasis]) -> KBMap:
     """The KB-Map in these bases that agrees with a model at 3^d configurations (2 for each prismatic joint).
 
-    If the model is a KB-Map in another form, such as a rigid chain or a kernel learner around one, they agree everywhere.
+    If the model is a KB-Map in another form, as a rigid chain is or a kernel learner around one, they agree everywhere.
 
     Raises:
         BasisError, and what the model raises for joint values that are not its own.

@@ -34,9 +34,7 @@ class KeptPairs:
     def __len__(self) -> int:
         return len(self.q)
 
-    def checked(
-        self, q: ArrayLike, x: ArrayLike, sigma: ArrayLike | None
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def checked(self, q: ArrayLike, x: ArrayLike, sigma: ArrayLike | None) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Pairs as `add` takes them. Raises ShapeError, NonFiniteError, SettingError."""
         return checked_pairs(q, x, sigma, self.q.shape[1])
 

@@ -58,8 +58,8 @@ class KernelFit:
     """The posterior after some observations.
 
     Args:
-        precision: λ; "evidence" takes the most probable one; None explains the pairs exactly by the smallest coefficients
-            (without features, where the pairs contradict each other nowhere).
+        precision: λ; "evidence" takes the most probable one; None explains the pairs exactly by the smallest
+            coefficients (without features, where no pair contradicts another).
 
     Attributes:
         precision: λ; 0 for the exact one.
@@ -87,7 +87,10 @@ class KernelFit:
             # Where pairs are few, evidence may be level towards τ = 0, a prior mean that is right everywhere. A density
             # of τ that is level there (Gelman 2006) stops at what the pairs speak for, and the claim with it.
             precision = most_evident(
-                lambda tried: self._log_evidence(tried) - 0.5 * math.log1p(tried / mean), _SEARCH_START * mean, low, high
+                lambda tried: self._log_evidence(tried) - 0.5 * math.log1p(tried / mean),
+                _SEARCH_START * mean,
+                low,
+                high,
             )
         self._condition(precision)
 

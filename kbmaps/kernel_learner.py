@@ -31,9 +31,9 @@ _KIND = "kernel learner, 1"
 class KernelLearner:
     """Learns a KB-Map around a prior from n pairs with n² numbers instead of 3^d control points. A `Model`.
 
-    The same solution as `ExactLearner` where both can be computed; this one for fewer pairs than control points, and for
-    more joints than a net has room for. It is fitted when first asked after `learn`, at n³ / 3 multiplications for each
-    λ that is tried (0.3 s at 1,000 pairs), and depends on the pairs that the memory keeps only.
+    The same solution as `ExactLearner` where both can be computed; this one for fewer pairs than control points, and
+    for more joints than a net has room for. It is fitted when first asked after `learn`, at n³ / 3 multiplications for
+    each λ that is tried (0.3 s at 1,000 pairs), and depends on the pairs that the memory keeps only.
 
     Args:
         bases: what "nearest to the prior" means; scaled orthonormal ones (`learning_bases`) are advised.
@@ -125,8 +125,8 @@ class KernelLearner:
         points = math.prod(basis.size for basis in self.bases)
         if self._precision is None and kept > points:
             raise DegenerateDataError(
-                f"{kept} pairs cannot all be explained by {points} control points; give a precision, a window of at most "
-                f"{points} pairs, or use ExactLearner"
+                f"{kept} pairs cannot all be explained by {points} control points; give a precision, a window of at "
+                f"most {points} pairs, or use ExactLearner"
             )
         self._pairs.add(angles, positions, sigmas, self._prior)
         self._fit = None
@@ -153,8 +153,8 @@ class KernelLearner:
     def estimate(self, q: ArrayLike) -> Estimate:
         """Positions at q (n, d), their 1-sigma per axis against the truth, and whether data was there.
 
-        A configuration is in support while the pairs leave at most `SUPPORT_LIMIT` of its prior variance open. Before the
-        first pair sigma is infinite: how good the prior is, only pairs can tell.
+        A configuration is in support while the pairs leave at most `SUPPORT_LIMIT` of its prior variance open. Before
+        the first pair sigma is infinite: how good the prior is, only pairs can tell.
 
         Raises:
             ShapeError, NonFiniteError

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Self, cast
+from typing import Self
 
 import numpy as np
 
@@ -56,11 +56,12 @@ class MarkerKnowledge:
     """All that pairs and a prior say about δ and the noise, as sums: the order of the pairs does not matter.
 
     Attributes:
-        information, pull: Λ (3, 3) [1/m²] and Λ m (3,) [1/m] of a Gaussian N(m, Λ⁻¹) of δ: the prior, and the pairs whose
-            sigma was told.
+        information, pull: Λ (3, 3) [1/m²] and Λ m (3,) [1/m] of a Gaussian N(m, Λ⁻¹) of δ: the prior, and the pairs
+            whose sigma was told.
         square, inner, count: of the pairs whose noise is not known, Σ Rᵀ R (3, 3), Σ Rᵀ e (3,) and their number.
         errors: Σ eᵀ e of these [m²].
-        noise_count, noise_square: what is known of their noise beforehand, as so many coordinates and their squares' sum.
+        noise_count, noise_square: what is known of their noise beforehand, as so many coordinates and the sum of
+            their squares.
     """
 
     information: FloatArray
@@ -75,9 +76,16 @@ class MarkerKnowledge:
     @classmethod
     def before(cls, shift: FloatArray, covariance: FloatArray, noise: float, noise_count: float) -> Self:
         """A prior: shift (3,) [m], its covariance (3, 3), and the noise [m] as if found from so many coordinates."""
-        information = np.linalg.inv(covariance)
+        information: FloatArray = np.asarray(np.linalg.inv(covariance), dtype=np.float64)
         return cls(
-            information, information @ shift, np.zeros((3, 3)), np.zeros(3), 0.0, 0.0, noise_count, noise_count * noise**2
+            information,
+            information @ shift,
+            np.zeros((3, 3)),
+            np.zeros(3),
+            0.0,
+            0.0,
+            noise_count,
+            noise_count * noise**2,
         )
 
     def given(self, pairs: Residuals) -> MarkerKnowledge:
@@ -163,7 +171,7 @@ def _near(pairs: Residuals, shift: FloatArray, outlier_sigmas: float) -> BoolArr
         limits[told] += outlier_sigmas * sigma * max(_spread(norms[told] / sigma), 1.0)
     if not told.all():
         limits[~told] += outlier_sigmas * _spread(norms[~told])
-    return cast(BoolArray, norms <= limits)
+    return norms <= limits
 
 
 def _spread(norms: FloatArray) -> float:

@@ -43,4 +43,6 @@ class Memory:
 def check_forgetting(forgetting: float) -> None:
     """Raises SettingError unless it is a factor in 0..1, 0 excluded."""
     if not (0.0 < forgetting <= 1.0 and math.isfinite(forgetting)):
-        raise SettingError(f"forgetting must be greater than 0 and at most 1 (which forgets nothing), got {forgetting!r}")
+        raise SettingError(
+            f"forgetting must be greater than 0 and at most 1 (which forgets nothing), got {forgetting!r}"
+        )

@@ -17,8 +17,8 @@ DEFAULT_MU0 = 0.5
 class StepSize:
     """μ(t) = max(floor, mu0 / (1 + t / decay)) after t pairs: constant unless a decay is given.
 
-    Any μ between 0 and 2 is stable. A constant one leaves noise of about 1.6 σ √(μ / (2 − μ)) in the map; one that decays
-    averages the noise out down to what the floor leaves, and the floor is what keeps the map able to follow changes.
+    Any μ between 0 and 2 is stable. A constant one leaves noise of about 1.6 σ √(μ / (2 − μ)) in the map; one that
+    decays averages the noise out down to what the floor leaves, and the floor keeps the map able to follow changes.
 
     Attributes:
         mu0: share of the first error that is mended.

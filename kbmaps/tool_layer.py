@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any, Protocol, Self, cast, runtime_checkable
 
 import numpy as np
@@ -61,11 +62,12 @@ class ToolLayer:
     """f(q) + R(q) δ on a model that is taken as it is, with δ in the marker's frame learnt by least squares. A `Model`.
 
     The pairs enter through sums, at a constant cost and memory; outliers are judged among the last 512 or more. What is
-    learnt is the posterior of Gaussian δ, with the most evident noise where none was told, and depends on the pairs only,
-    not on their order.
+    learnt is the posterior of a Gaussian δ, with the most evident noise where none was told. The order of the pairs does
+    not matter, but for outliers older than that.
 
     Args:
-        model: an arm with orientations: a `RigidChain`, a `KBMap` that has them, or any `PoseModel`; it must not change.
+        model: an arm with orientations: a `RigidChain`, a `KBMap` that has them, or any `PoseModel`; it must not
+            change.
         spread: 1-sigma of each component of δ before the first pair [m]; infinity leaves it to the pairs alone.
         noise: 1-sigma of a coordinate to start from where pairs come without [m].
         outlier_sigmas: pairs farther off than so many robust standard deviations do not count.
@@ -227,7 +229,8 @@ class ToolLayer:
             outlier_sigmas = math.inf if fields["outlier_sigmas"] is None else fields["outlier_sigmas"]
             layer = cls(unpacked(fields["model"], arrays, model), outlier_sigmas=outlier_sigmas)
             sums = {name: _shaped(arrays[name], getattr(layer._before, name)) for name in _SUMS}
-            layer._before = MarkerKnowledge(**sums, **numbers(named(fields["known"], "what is known", _NUMBERS)))
+            scalars = numbers(named(fields["known"], "what is known", _NUMBERS))
+            layer._before = replace(layer._before, **cast(dict[str, Any], sums | scalars))
             rotations, errors, sigma = arrays["rotations"], arrays["residuals"], arrays["sigma"]
             layer._recent = Residuals(
                 _shaped(rotations, np.empty((len(sigma), 3, 3))), _shaped(errors, np.empty((len(sigma), 3))), sigma
@@ -275,4 +278,4 @@ def _shaped(array: FloatArray, like: FloatArray) -> FloatArray:
     """The array if it is finite and of this shape. Raises ModelFormatError."""
     if array.shape != like.shape or not np.isfinite(array).all():
         raise ModelFormatError(f"an array of finite numbers of shape {like.shape} was expected, got {array.shape}")
-    return cast(FloatArray, array)
+    return array
