@@ -40,8 +40,9 @@ class Residuals:
 
     def joined(self, more: Residuals) -> Residuals:
         """These and then more."""
+        # In C order, whatever the model's: sums must not depend on a layout that is lost in bytes.
         return Residuals(
-            np.concatenate([self.rotations, more.rotations]),
+            np.ascontiguousarray(np.concatenate([self.rotations, more.rotations])),
             np.concatenate([self.errors, more.errors]),
             np.concatenate([self.sigma, more.sigma]),
         )

@@ -17,7 +17,9 @@ class Memory:
 
     Attributes:
         window: how many of the last pairs count; None means all.
-        forgetting: the factor by which each new pair lessens the weight of all before; 1 forgets nothing.
+        forgetting: the factor by which each new pair lessens the weight of all before; 1 forgets nothing. The pairs are
+            then worth about 1 / (1 − forgetting) in all, and the evidence holds to the prior if that is fewer than the
+            control points that they would have to pay for.
 
     Raises:
         SettingError: a window below 1, forgetting not within 0..1 or 0 itself.

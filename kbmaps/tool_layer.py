@@ -62,8 +62,8 @@ class ToolLayer:
     """f(q) + R(q) δ on a model that is taken as it is, with δ in the marker's frame learnt by least squares. A `Model`.
 
     The pairs enter through sums, at a constant cost and memory; outliers are judged among the last 512 or more. What is
-    learnt is the posterior of a Gaussian δ, with the most evident noise where none was told. The order of the pairs does
-    not matter, but for outliers older than that.
+    learnt is the posterior of a Gaussian δ, with the most evident noise where none was told. The order of the pairs
+    does not matter, but for outliers older than that.
 
     Args:
         model: an arm with orientations: a `RigidChain`, a `KBMap` that has them, or any `PoseModel`; it must not
