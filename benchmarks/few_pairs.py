@@ -1,8 +1,9 @@
-"""What the learners of the net's own family reach with few pairs: `python -m benchmarks.few_pairs [--seeds N] [--only PART]`.
+"""What the learners of the net's own family reach with few pairs.
 
-The arm is a humanoid's, its marker seen by a camera on the head; the drawing is wrong by 3 degrees an axis, 15 mm a point
-and 30 mm at the marker (each component). Errors are mean distances to the noise-free truth [mm], means over the seeds, with
-the share of coordinates within one and 1.96 claimed sigma where there is a claim [%]. No learner is told the noise.
+Run `python -m benchmarks.few_pairs [--seeds N] [--only PART]`. The arm is a humanoid's, its marker seen by a camera on
+the head; the drawing is wrong by 3 degrees an axis, 15 mm a point and 30 mm at the marker (each component). Errors are
+mean distances to the noise-free truth [mm], means over the seeds, with the share of coordinates within one and 1.96
+claimed sigma where there is a claim [%]. No learner is told the noise.
 """
 
 from __future__ import annotations
@@ -162,10 +163,10 @@ def large(seeds: int) -> None:
                 begin = time.perf_counter()
                 row += [error_mm(taught(model, q, x), true, test), time.perf_counter() - begin]
             rows.append(row)
-        drawing, kernel, kernel_s, structured, structured_s = np.mean(rows, axis=0)
+        drawing, kernel, kernel_s, linear, linear_s = np.mean(rows, axis=0)
         print(
             f"  d = {joints}: drawing {drawing:.0f} mm, kernel {kernel:.0f} mm in {kernel_s:.2f} s, "
-            f"structured {structured:.1f} mm in {structured_s:.2f} s"
+            f"structured {linear:.1f} mm in {linear_s:.2f} s"
         )
 
 

@@ -26,8 +26,9 @@ Precision = float | Literal["evidence"] | None
 # Limits of the search for λ and where it begins, relative to the mean diagonal of the Gram matrix.
 _SEARCH_LIMITS, _SEARCH_START = (1e-12, 1e6), 1e-4
 # Relative to the trace of the Gram matrix: just enough to keep its Cholesky factorisation alive.
-_VANISHING_RIDGE = 1e-13
-_REFINEMENTS = 30
+_VANISHING_RIDGE = 1e-15
+# The refinement of the exact solution ends when a step no longer lessens what is left to this share.
+_REFINEMENTS, _PROGRESS = 200, 0.95
 _BLOCK = 256
 
 
@@ -203,7 +204,7 @@ class KernelFit:
         for _ in range(_REFINEMENTS):
             remaining = errors - self._times_gram(self._multipliers)
             size = float(np.linalg.norm(remaining))
-            if not size < 0.5 * left:
+            if not size < _PROGRESS * left:
                 break
             left = size
             self._multipliers = self._multipliers + self._gram.solve(remaining)
