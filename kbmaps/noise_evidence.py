@@ -10,7 +10,7 @@ from kbmaps.arrays import FloatArray
 
 # Variances below (1 pm)² are rounding.
 VARIANCE_FLOOR = 1e-24
-_ROUNDS, _POINTS = 7, 41
+_ROUNDS, _POINTS = 5, 41
 # How far the best variance is looked for around the mean square: below it by as much as float64 can tell, and above.
 _LEAST_SHARE, _GREATEST_SHARE = 1e-20, 1e2
 

@@ -26,7 +26,7 @@ _WIDE = 1e6
 # The noise is guessed as if it had been found from this many coordinates.
 _NOISE_COORDINATES = 6.0
 # So many pairs are kept to judge outliers among; older ones live on in sums.
-_RECENT = 512
+_RECENT = 128
 _SUPPORT_FACTOR = 1.0
 _SUMS = ("information", "pull", "square", "inner")
 _NUMBERS = ("errors", "count", "noise_count", "noise_square")
@@ -61,7 +61,7 @@ class _Estimating(Protocol):
 class ToolLayer:
     """f(q) + R(q) δ on a model that is taken as it is, with δ in the marker's frame learnt by least squares. A `Model`.
 
-    The pairs enter through sums, at a constant cost and memory; outliers are judged among the last 512 or more. What is
+    The pairs enter through sums, at a constant cost and memory; outliers are judged among the last 128 or more. What is
     learnt is the posterior of a Gaussian δ, with the most evident noise where none was told. The order of the pairs
     does not matter, but for outliers older than that.
 
