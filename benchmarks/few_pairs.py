@@ -118,6 +118,20 @@ def table(seeds: int) -> None:
             print_rows(str(n), rows)
 
 
+def claims(seeds: int) -> None:
+    print("\nd = 6, sigma 10 mm, kernel around the drawing: coordinates within 1 and 1.96 claimed sigma [%]")
+    for n in (10, 30, 75, 300):
+        shares: list[list[float]] = []
+        for seed in range(seeds):
+            rng = np.random.default_rng(seed)
+            arm = rough_arm(6, rng)
+            q, test = arm.angles(n, 80, rng), arm.angles(TEST_ROWS, 80, rng)
+            learner = taught(KernelLearner(bases(6), arm.drawing), q, arm.measured(q, SIGMA, rng))
+            shares.append(covered(learner, arm.positions(test), test))
+        one, two = np.mean(shares, axis=0)
+        print(f"  {n} pairs: {one:.0f} / {two:.0f}")
+
+
 def local(seeds: int) -> None:
     print(f"\nd = 6, sigma 10 mm, pairs within +-20 deg of a random centre, test over +-80 deg\n{HEADER}")
     for n in (100, 300, 500):
@@ -255,6 +269,7 @@ def memory(seeds: int) -> None:
 
 PARTS: dict[str, Callable[[int], None]] = {
     "table": table,
+    "claims": claims,
     "local": local,
     "exact": exact,
     "large": large,

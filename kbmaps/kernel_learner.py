@@ -23,6 +23,7 @@ from kbmaps.memory import Memory
 from kbmaps.model import Estimate
 from kbmaps.packed import describe_bases, pack, parse_bases, unpack
 from kbmaps.product_kernel import ProductKernel
+from kbmaps.slopes import slopes
 from kbmaps.support import SUPPORT_LIMIT
 
 _KIND = "kernel learner, 1"
@@ -149,6 +150,16 @@ class KernelLearner:
             return x
         weights = self._kernel.joint_weights(np.atleast_2d(angles))
         return x + self._fitted().mean(weights, _no_features(len(weights))).reshape(x.shape)
+
+    def jacobian(self, q: ArrayLike) -> FloatArray:
+        """Derivative (3, d) of the position [m/rad, or m/m], or (n, 3, d) at q (n, d).
+
+        Exact where the prior is a KB-Map, also one in another form, as a chain is.
+
+        Raises:
+            ShapeError, NonFiniteError
+        """
+        return slopes(self, q, self._kernel.bases)
 
     def estimate(self, q: ArrayLike) -> Estimate:
         """Positions at q (n, d), their 1-sigma per axis against the truth, and whether data was there.

@@ -24,6 +24,7 @@ from kbmaps.memory import Memory
 from kbmaps.model import Estimate
 from kbmaps.packed import describe_bases, named, numbers, pack, parse_bases, unpack
 from kbmaps.product_kernel import ProductKernel
+from kbmaps.slopes import slopes
 
 _KIND = "structured learner, 1"
 # A configuration lies where data was while what is left open is at most the noise of a pair (in variance).
@@ -34,10 +35,10 @@ class StructuredLearner:
     """f(q) = f_nominal(q) + J(q) β + r(q), linear in what is learnt. A `Model`.
 
     J is the derivative of the nominal chain by its parameters and β has the variances S of the tolerances, so that J β
-    has the covariance J S Jᵀ; r is a KB-Map around zero whose scale the evidence chooses. The posterior is in closed
-    form and a KB-Map, since every column of J is one. It has no local optimum; what it misses of a far-off chain is the
-    curvature, which r makes up for where pairs are. Fitted when first asked after `learn`, from the pairs that the
-    memory keeps.
+    has the covariance J S Jᵀ; r is a KB-Map around zero whose scale the evidence chooses. For given scales the
+    posterior is in closed form, without local optima, and a KB-Map, since every column of J is one. What it misses of a
+    far-off chain is the curvature, which r makes up for where pairs are. Fitted when first asked after `learn`, from the
+    pairs that the memory keeps.
 
     Args:
         nominal: the chain as drawn.
@@ -140,6 +141,14 @@ class StructuredLearner:
         if self.kept:
             x = x + self._fitted().mean(self._kernel.joint_weights(np.atleast_2d(angles)), features)
         return x[0] if angles.ndim == 1 else x
+
+    def jacobian(self, q: ArrayLike) -> FloatArray:
+        """Derivative (3, d) of the position [m/rad, or m/m], or (n, 3, d) at q (n, d).
+
+        Raises:
+            ShapeError, NonFiniteError
+        """
+        return slopes(self, q, self._kernel.bases)
 
     def estimate(self, q: ArrayLike) -> Estimate:
         """Positions at q (n, d), their 1-sigma per axis against the truth, and whether data was there.

@@ -219,6 +219,18 @@ def test_its_control_points_are_those_of_its_predictions(joint_kinds):
     np.testing.assert_allclose(learner.to_kbmap().predict(q), learner.predict(q), rtol=0, atol=1e-12)
 
 
+@pytest.mark.parametrize("joint_kinds", ["RRRR", "RPRR"])
+def test_its_derivative_is_that_of_its_control_points(joint_kinds):
+    rng = np.random.default_rng(10)
+    arm = rough_arm(rng, joint_kinds)
+    learner = KernelLearner(bases_for(joint_kinds), arm.nominal)
+    learner.learn(*arm.pairs(rng, 40, 0.01))
+    q = random_q(rng, joint_kinds, 50, 180)
+    expected = learner.to_kbmap().jacobian(q)
+    np.testing.assert_allclose(learner.jacobian(q), expected, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(learner.jacobian(q[0]), expected[0], rtol=0, atol=1e-10)
+
+
 @given(
     seed=seeds,
     prior=st.sampled_from(["none", "chain", "map"]),

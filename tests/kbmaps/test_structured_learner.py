@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from planted_chains import bases_for, random_chain, random_q
+from planted_chains import bases_for, half_ranges, random_chain, random_q
 from rough_arms import ROUGH, rough_arm
 
 from kbmaps import (
@@ -14,6 +14,7 @@ from kbmaps import (
     ChainParameters,
     ChainTolerances,
     DegenerateDataError,
+    InverseKinematics,
     KernelLearner,
     Model,
     ModelFormatError,
@@ -118,6 +119,20 @@ def test_its_control_points_are_those_of_its_predictions():
     learner.learn(*arm.pairs(rng, 40, 0.01))
     q = random_q(rng, "RPRR", 200, 80)
     np.testing.assert_allclose(learner.to_kbmap().predict(q), learner.predict(q), rtol=0, atol=1e-12)
+
+
+def test_it_can_be_told_where_to_reach():
+    rng = np.random.default_rng(9)
+    arm = rough_arm(rng, "RRPR")
+    learner = StructuredLearner(arm.nominal, ROUGH, bases_for("RRPR"))
+    learner.learn(*arm.pairs(rng, 60, 0.005))
+    np.testing.assert_allclose(
+        learner.jacobian(q := random_q(rng, "RRPR", 30, 80)), learner.to_kbmap().jacobian(q), rtol=0, atol=1e-10
+    )
+    reach = half_ranges("RRPR", 80)
+    solver = InverseKinematics(learner, -reach, reach)
+    target = learner.predict(random_q(rng, "RRPR", 1, 60)[0])
+    np.testing.assert_allclose(learner.predict(solver.solve(target).q), target, rtol=0, atol=1e-6)
 
 
 def test_a_small_change_of_the_chain_is_found():
