@@ -37,8 +37,8 @@ class StructuredLearner:
     J is the derivative of the nominal chain by its parameters and β has the variances S of the tolerances, so that J β
     has the covariance J S Jᵀ; r is a KB-Map around zero whose scale the evidence chooses. For given scales the
     posterior is in closed form, without local optima, and a KB-Map, since every column of J is one. What it misses of a
-    far-off chain is the curvature, which r makes up for where pairs are. Fitted when first asked after `learn`, from the
-    pairs that the memory keeps.
+    far-off chain is the curvature, which r makes up for where pairs are. Fitted when first asked after `learn`,
+    from the pairs that the memory keeps.
 
     Args:
         nominal: the chain as drawn.
