@@ -28,6 +28,8 @@ from kbmaps.errors import (
 from kbmaps.exact import ExactLearner, ExactSolution
 from kbmaps.inverse import InverseKinematics, InverseSolution
 from kbmaps.kbmap import KBMap, prediction_errors
+from kbmaps.kernel_learner import KernelLearner
+from kbmaps.memory import Memory
 from kbmaps.model import Estimate, Model
 from kbmaps.nlms import NLMS
 from kbmaps.reach import PoseModel, PositionModel
@@ -35,11 +37,14 @@ from kbmaps.resolved_rates import resolved_rates
 from kbmaps.rigid_learner import RigidLearner
 from kbmaps.rigid_recursive import RecursiveRigidLearner
 from kbmaps.rotations import nearest_rotation
+from kbmaps.step_size import StepSize
+from kbmaps.structured_learner import StructuredLearner
 from kbmaps.support import SUPPORT_LIMIT, SupportSet
 from kbmaps.tensor_learner import TensorLearner
 from kbmaps.tensor_settings import TensorSettings
 from kbmaps.tensor_train import TensorTrain
 from kbmaps.tool import with_refitted_marker
+from kbmaps.tool_layer import ToolLayer
 
 __all__ = [
     "NLMS",
@@ -62,6 +67,8 @@ __all__ = [
     "JointBasis",
     "KBMap",
     "KBMapsError",
+    "KernelLearner",
+    "Memory",
     "Model",
     "ModelFormatError",
     "NonFiniteError",
@@ -74,10 +81,13 @@ __all__ = [
     "SettingError",
     "ShapeError",
     "SingularAlphaError",
+    "StepSize",
+    "StructuredLearner",
     "SupportSet",
     "TensorLearner",
     "TensorSettings",
     "TensorTrain",
+    "ToolLayer",
     "align",
     "blockwise_precision",
     "find_chain",

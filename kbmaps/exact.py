@@ -14,8 +14,10 @@ from kbmaps import lapack
 from kbmaps.arrays import FloatArray, rows_or_vector
 from kbmaps.basis import JointBasis
 from kbmaps.errors import BasisError, NonFiniteError, SettingError, ShapeError
+from kbmaps.evidence import most_evident
 from kbmaps.factor import RowFactor, ShiftedGram
 from kbmaps.kbmap import POSE_OUTPUTS, POSITION_OUTPUTS, KBMap
+from kbmaps.memory import check_forgetting
 from kbmaps.stack import BasisStack
 from kbmaps.targets import pose_targets
 
@@ -25,8 +27,7 @@ _SMALLEST_RCOND = 1e-13
 # Relative to the trace of the Gram matrix: just enough to keep its Cholesky factorisation alive.
 _VANISHING_RIDGE = 1e-13
 _REFINEMENTS = 30
-# Evidence: multiplicative step of the search for lambda, its limits relative to the mean diagonal of the Gram matrix.
-_SEARCH_STEP = math.log(8.0)
+# Evidence: limits of the search for lambda, relative to the mean diagonal of the Gram matrix.
 _SEARCH_LIMITS = (1e-12, 1e6)
 _FIRST_PRECISION = 1e-2
 # Variances below (1 pm)² are rounding.
@@ -86,12 +87,16 @@ class ExactLearner:
             too: its nine planes have a noise of their own and share λ with the position's.
         bases: what the solution is computed in; it decides what "nearest to the prior" means. None takes the prior's.
             Scaled orthonormal bases over the joints' ranges (`learning_bases`) are advised.
+        forgetting: the factor by which each new pair lessens the weight of all before, as in `Memory`.
 
     Raises:
         BasisError: bases do not fit the prior.
+        SettingError: forgetting is not a factor in 0..1.
     """
 
-    def __init__(self, prior: KBMap, bases: Sequence[JointBasis] | None = None) -> None:
+    def __init__(self, prior: KBMap, bases: Sequence[JointBasis] | None = None, *, forgetting: float = 1.0) -> None:
+        check_forgetting(forgetting)
+        self._forgetting = float(forgetting)
         self._bases = prior.bases if bases is None else tuple(bases)
         self._stack = BasisStack(self._bases)
         self._outputs = len(prior.net)
@@ -99,6 +104,8 @@ class ExactLearner:
         self._pending: list[tuple[FloatArray, FloatArray]] = []
         self._pending_rows = 0
         self._pairs = 0
+        # Of the pairs that are not forgotten: their number, and the logarithms of their weights.
+        self._count = 0.0
         self._log_weights = 0.0
         self._last_precision = _FIRST_PRECISION
         self.rebase(prior)
@@ -150,7 +157,10 @@ class ExactLearner:
             part = slice(start, start + _BLOCK)
             self._collect(angles[part], targets[part], weights[part])
         self._pairs += len(angles)
-        self._log_weights += float(np.log(weights).sum())
+        ages = np.arange(len(angles) - 1, -1, -1.0)
+        shares, faded = self._forgetting**ages, self._forgetting ** len(angles)
+        self._count = self._count * faded + float(shares.sum())
+        self._log_weights = self._log_weights * faded + float(shares @ np.log(weights))
 
     def solve(self, prior_precision: float | Literal["evidence"] | None = None) -> ExactSolution:
         """The map for all pairs so far.
@@ -191,9 +201,17 @@ class ExactLearner:
     def _flush(self) -> None:
         if self._pending:
             weighted_rows, targets = zip(*self._pending, strict=True)
-            self._factor.add(np.concatenate(weighted_rows), np.concatenate(targets))
+            self._fold(np.concatenate(weighted_rows), np.concatenate(targets))
             self._pending.clear()
             self._pending_rows = 0
+
+    def _fold(self, weighted_rows: FloatArray, targets: FloatArray) -> None:
+        """Takes in rows (n, m) after all before have lost weight to them, and the earlier of them to the later."""
+        if self._forgetting < 1.0:
+            self._factor.fade(self._forgetting ** len(targets))
+            scale = self._forgetting ** (0.5 * np.arange(len(targets) - 1, -1, -1.0))[:, None]
+            weighted_rows, targets = weighted_rows * scale, targets * scale
+        self._factor.add(weighted_rows, targets)
 
     def _solve_unregularised(self, errors: FloatArray) -> ExactSolution:
         factor = self._factor
@@ -203,7 +221,7 @@ class ExactLearner:
             change = lapack.smallest_solution(factor.rows, errors, _SMALLEST_RCOND)
         if change is None:
             change = self._nearest(errors)
-        freedom = self._pairs - factor.unknowns
+        freedom = self._count - factor.unknowns
         squares = self._residual_squares(errors, change)
         noises = [math.sqrt(float(squares[part].mean()) / freedom) if freedom > 0 else None for part in self._parts]
         return self._solution(change, noises, 0.0, None, squares)
@@ -247,11 +265,11 @@ class ExactLearner:
         multipliers = gram.solve(errors)
         squares = precision * np.einsum("ko,ko->o", errors, multipliers) + self._factor.residual_squares
         spread = gram.log_determinant - len(errors) * math.log(precision)
-        variances = [max(float(squares[part].mean()) / self._pairs, _VARIANCE_FLOOR) for part in self._parts]
+        variances = [max(float(squares[part].mean()) / self._count, _VARIANCE_FLOOR) for part in self._parts]
         log_evidence = 0.0
         for part, variance in zip(self._parts, variances, strict=True):
             outputs = part.stop - part.start
-            log_evidence -= 0.5 * outputs * self._pairs * (math.log(2.0 * math.pi * variance) + 1.0)
+            log_evidence -= 0.5 * outputs * self._count * (math.log(2.0 * math.pi * variance) + 1.0)
             log_evidence += 0.5 * outputs * (self._log_weights - spread)
         return _Fit(multipliers, variances, log_evidence)
 
@@ -264,26 +282,10 @@ class ExactLearner:
     def _most_evident(self, gram: ShiftedGram, errors: FloatArray) -> float:
         """λ of the greatest evidence: climbs from the last one in steps, then takes the vertex of a parabola."""
         mean = gram.trace / len(errors)
-        low, high = (math.log(limit * mean) for limit in _SEARCH_LIMITS)
-        known: dict[float, float] = {}
-
-        def evidence(position: float) -> float:
-            if position not in known:
-                known[position] = self._fit(gram, errors, math.exp(position)).log_evidence
-            return known[position]
-
-        middle = min(max(math.log(self._last_precision), low), high)
-        step = _SEARCH_STEP
-        while True:
-            below, above = max(middle - step, low), min(middle + step, high)
-            best = max((middle, below, above), key=evidence)
-            if best == middle:
-                break
-            middle = best
-        if below < middle < above:
-            vertex = _vertex((below, middle, above), (evidence(below), evidence(middle), evidence(above)))
-            middle = max((middle, vertex), key=evidence)
-        return math.exp(middle)
+        low, high = (limit * mean for limit in _SEARCH_LIMITS)
+        return most_evident(
+            lambda precision: self._fit(gram, errors, precision).log_evidence, self._last_precision, low, high
+        )
 
     def _residual_squares(self, errors: FloatArray, change: FloatArray) -> FloatArray:
         remaining = errors - self._factor.rows @ change
@@ -304,18 +306,9 @@ class ExactLearner:
             noise_std=noises[0],
             prior_precision=precision,
             log_evidence=log_evidence,
-            residual_rms=math.sqrt(float(squares[:POSITION_OUTPUTS].sum()) / self._pairs),
+            residual_rms=math.sqrt(float(squares[:POSITION_OUTPUTS].sum()) / self._count),
             orientation_noise_std=noises[1] if len(noises) > 1 else None,
         )
-
-
-def _vertex(positions: tuple[float, float, float], heights: tuple[float, float, float]) -> float:
-    """Where the parabola through three points, the middle one highest, has its maximum."""
-    (a, b, c), (fa, fb, fc) = positions, heights
-    left, right = (b - a) * (fb - fc), (b - c) * (fb - fa)
-    if left == right:
-        return b
-    return b - 0.5 * ((b - a) * left - (b - c) * right) / (left - right)
 
 
 def _checked_weights(weight: ArrayLike | None, pairs: int) -> FloatArray:

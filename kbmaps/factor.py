@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from kbmaps import lapack
 from kbmaps.arrays import FloatArray
+
+_NOTHING = 1e-150
 
 
 class RowFactor:
@@ -53,6 +57,15 @@ class RowFactor:
             below, below_targets = np.asfortranarray(rows[taken:]), np.array(targets[taken:], order="F")
             self._rows, self._targets, remainder = lapack.qr_append(self._rows, self._targets, below, below_targets)
             self.residual_squares += np.square(remainder).sum(axis=0)
+
+    def fade(self, weight: float) -> None:
+        """Multiplies the weight of all rows so far by a factor in 0..1."""
+        scale = math.sqrt(weight)
+        for kept in (self._rows, self._targets):
+            kept *= scale
+            # Directions that are no longer seen would end in subnormal numbers, which are slow.
+            kept[np.abs(kept) < _NOTHING] = 0.0
+        self.residual_squares *= weight
 
     def gram(self) -> FloatArray:
         """A new A Aᵀ (k, k), Fortran-ordered, of which only the upper triangle counts."""

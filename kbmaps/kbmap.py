@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from kbmaps import serial
-from kbmaps.arrays import FloatArray, frozen, rows, rows_or_vector
+from kbmaps.arrays import FloatArray, frozen, rows, rows_or_vector, vector
 from kbmaps.basis import JointBasis
 from kbmaps.errors import BasisError, NonFiniteError, ShapeError
 from kbmaps.rotations import nearest_rotation, nearest_rotation_rates
@@ -149,6 +149,19 @@ class KBMap:
     def with_metadata(self, metadata: Mapping[str, str]) -> KBMap:
         """The same map with other texts."""
         return KBMap(self.bases, self.net, metadata)
+
+    def with_tool(self, marker_shift: ArrayLike) -> KBMap:
+        """The map with its marker moved by a vector δ (3,) [m] given in the marker frame: G + E1 δ1 + E2 δ2 + E3 δ3.
+
+        Raises:
+            ShapeError: the map holds positions only, or δ has the wrong length. NonFiniteError.
+        """
+        self._require_orientation()
+        shift = vector("marker_shift", marker_shift, 3)
+        axes = self.net[POSITION_OUTPUTS:].reshape(3, POSITION_OUTPUTS, *self.net.shape[1:])
+        net = self.net.copy()
+        net[:POSITION_OUTPUTS] += np.einsum("a,a...->...", shift, axes)
+        return KBMap(self.bases, net, self.metadata)
 
     def with_alpha(self, alpha: ArrayLike, centre: ArrayLike = 0.0) -> KBMap:
         """The same map with Bézier control points for another α; exact up to rounding.

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import math
+from typing import Any, Self
+
 import numpy as np
 from numpy.typing import ArrayLike
 
 from kbmaps import lapack
 from kbmaps.arrays import FloatArray, IntArray, rows, vector
-from kbmaps.errors import SettingError, ShapeError
+from kbmaps.errors import KBMapsError, ModelFormatError, SettingError, ShapeError
 from kbmaps.kbmap import POSITION_OUTPUTS, KBMap
+from kbmaps.packed import describe_bases, pack, parse_bases, unpack
 from kbmaps.stack import BasisStack
+from kbmaps.step_size import DEFAULT_MU0, StepSize
 from kbmaps.targets import pose_targets
 
-DEFAULT_MU0 = 0.5
+_KIND = "nlms, 1"
 _BLOCK = 64
 
 
@@ -21,25 +26,36 @@ class NLMS:
 
     Learns what the map it starts from has, the position or position and orientation, in that map's bases; scaled
     orthonormal ones (`learning_bases`) are advised.
-    Any 0 < mu0 < 2 is stable; the noise left in the map is about 1.6 σ √(mu0 / (2 − mu0)).
+
+    Args:
+        mu0: the share, constant or as a `StepSize` of the pairs learnt so far.
 
     Raises:
         SettingError: mu0 is not between 0 and 2.
     """
 
-    def __init__(self, kbmap: KBMap, mu0: float = DEFAULT_MU0) -> None:
-        if not 0.0 < mu0 < 2.0:
-            raise SettingError(f"mu0 must lie between 0 and 2 for the rule to be stable, got {mu0!r}")
+    def __init__(self, kbmap: KBMap, mu0: float | StepSize = DEFAULT_MU0) -> None:
         self._bases = kbmap.bases
-        self._mu0 = float(mu0)
+        self._step_size = mu0 if isinstance(mu0, StepSize) else StepSize(mu0)
+        self._pairs = 0
         self._stack = BasisStack(kbmap.bases)
         self._outputs = len(kbmap.net)
         # One row for each output and left weight, one column for each right weight.
         self._planes = np.array(kbmap.net.reshape(-1, self._stack.right_size))
 
     @property
-    def mu0(self) -> float:
-        return self._mu0
+    def step_size(self) -> StepSize:
+        return self._step_size
+
+    @property
+    def joints(self) -> int:
+        """Number of joints d."""
+        return self._stack.joints
+
+    @property
+    def pairs(self) -> int:
+        """How many steps have been made, replayed ones included."""
+        return self._pairs
 
     @property
     def map(self) -> KBMap:
@@ -64,10 +80,11 @@ class NLMS:
         left, right = self._stack.halves(angles)
         predicted = (self._planes @ right).reshape(self._outputs, -1) @ left
         # ‖w‖² of a Kronecker product is the product of its factors' norms.
-        mu = self._mu0 / float((left @ left) * (right @ right))
+        mu = self._step_size.at(self._pairs) / float((left @ left) * (right @ right))
         # Ulbrich et al. 2009, eq. (20)
         error = mu * (target - predicted)
         lapack.add_outer_in_place(self._planes, (error[:, None] * left).ravel(), right)
+        self._pairs += 1
 
     def replay(
         self, q: ArrayLike, x: ArrayLike, order: ArrayLike | None = None, rotation: ArrayLike | None = None
@@ -93,15 +110,41 @@ class NLMS:
             block = sequence[start : start + _BLOCK]
             self._learn_block(angles[block], targets[block])
 
+    def to_bytes(self) -> bytes:
+        """The learner as it is; `from_bytes` learns on to the last bit as this one would."""
+        settings = self._step_size
+        fields: dict[str, Any] = {
+            "bases": describe_bases(self._bases),
+            "mu0": settings.mu0,
+            "decay": settings.decay if math.isfinite(settings.decay) else None,
+            "floor": settings.floor,
+            "pairs": self._pairs,
+        }
+        return pack(_KIND, fields, {"planes": self._planes})
+
+    @classmethod
+    def from_bytes(cls, data: bytes) -> Self:
+        """The learner in `data`. Raises ModelFormatError: it is none of this kind, or damaged."""
+        fields, arrays = unpack(data, _KIND)
+        try:
+            bases = parse_bases(fields["bases"])
+            decay = math.inf if fields["decay"] is None else fields["decay"]
+            net = arrays["planes"].reshape(-1, *(basis.size for basis in bases))
+            learner = cls(KBMap(bases, net), StepSize(fields["mu0"], decay, fields["floor"]))
+            learner._pairs = int(fields["pairs"])
+        except (KeyError, TypeError, ValueError, KBMapsError) as error:
+            raise ModelFormatError(f"the bytes do not describe an NLMS learner: {error}") from error
+        return learner
+
     def _learn_block(self, q: FloatArray, targets: FloatArray) -> None:
         """A block of consecutive steps as one triangular solve.
 
-        Step j sees the errors left by the steps i < j: e_j = x_j − f(q_j) − Σ_{i<j} mu0 k_ij / k_ii e_i with
+        Step j sees the errors left by the steps i < j: e_j = x_j − f(q_j) − Σ_{i<j} μ_i k_ij / k_ii e_i with
         k_ij = w_i · w_j, a product over the joints.
         """
         left, right = self._stack.halves(q)
         kernel = (left @ left.T) * (right @ right.T)
-        steps = self._mu0 / np.diag(kernel)
+        steps = self._step_size.run(self._pairs, len(q)) / np.diag(kernel)
         by_left = (right @ self._planes.T).reshape(len(q), self._outputs, -1)
         errors = targets - (by_left @ left[:, :, None])[:, :, 0]
         np.einsum("ij,j->ij", kernel, steps, out=kernel)
@@ -109,6 +152,7 @@ class NLMS:
             errors[j] -= kernel[j, :j] @ errors[:j]
         moves = (errors * steps[:, None])[:, :, None] * left[:, None, :]
         self._planes += moves.reshape(len(q), -1).T @ right
+        self._pairs += len(q)
 
 
 def _checked_order(order: ArrayLike, pairs: int) -> IntArray:

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kbmaps.align import align
 from kbmaps.arrays import rows
 from kbmaps.chain import RigidChain
+from kbmaps.errors import DegenerateDataError
 from kbmaps.kbmap import POSITION_OUTPUTS, KBMap
+from kbmaps.tool_layer import ToolLayer
+
+# Far out, since the errors of an uncalibrated arm have long tails themselves and must not be rejected.
+_OUTLIER_SIGMAS = 15.0
 
 
 def with_refitted_marker(
@@ -17,7 +23,8 @@ def with_refitted_marker(
     """The map after its marker was moved to another place on the last link, or the tool was changed.
 
     The move δ is fitted, robustly, to pairs seen since: x ≈ f(q) + R(q) δ with the orientation R of the nominal
-    chain. With E the nets of R it is built in exactly, G ← G + E δ. What R's own errors leave is for a learner.
+    chain (`ToolLayer`). With E the nets of R it is built in exactly, G ← G + E δ. What R's own errors leave is for a
+    learner.
 
     Args:
         kbmap: the map as learnt before the change; of its outputs only the position moves.
@@ -29,10 +36,12 @@ def with_refitted_marker(
         ShapeError, NonFiniteError, SettingError, DegenerateDataError (no pairs)
     """
     angles, positions = rows("q", q, chain.joints), rows("x", x, POSITION_OUTPUTS)
-    # The marker's move explains what the map gets wrong, so let it be seen from the nominal chain alone.
-    seen = positions - kbmap.predict(angles) + chain.positions(angles)
-    shift = align(chain, angles, seen, pose_known=True, marker_known=False, sigma=sigma).marker_shift
-    axes = chain.orientation_maps(kbmap.bases).reshape(3, POSITION_OUTPUTS, *kbmap.net.shape[1:])
+    if not len(angles):
+        raise DegenerateDataError("a marker's move needs at least 1 pair seen since; record more")
+    positions_net = kbmap.net[:POSITION_OUTPUTS]
+    oriented = KBMap(kbmap.bases, np.concatenate([positions_net, chain.orientation_maps(kbmap.bases)]))
+    layer = ToolLayer(oriented, spread=math.inf, outlier_sigmas=_OUTLIER_SIGMAS)
+    layer.learn(angles, positions, sigma)
     net = kbmap.net.copy()
-    net[:POSITION_OUTPUTS] += np.einsum("a,a...->...", shift, axes)
+    net[:POSITION_OUTPUTS] = oriented.with_tool(layer.shift).net[:POSITION_OUTPUTS]
     return KBMap(kbmap.bases, net, kbmap.metadata)

@@ -8,7 +8,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from planted_chains import bases_for, literal_weights, random_chain, random_map, random_q
 
-from kbmaps import NLMS, JointBasis, NonFiniteError, SettingError, ShapeError, prediction_errors
+from kbmaps import (
+    NLMS,
+    JointBasis,
+    ModelFormatError,
+    NonFiniteError,
+    SettingError,
+    ShapeError,
+    StepSize,
+    prediction_errors,
+)
 
 seeds = st.integers(0, 2**32 - 1)
 
@@ -113,3 +122,78 @@ def test_wrong_shapes_are_refused_and_change_nothing():
 def test_an_unstable_rate_is_refused(mu0):
     with pytest.raises(SettingError, match="mu0"):
         NLMS(random_map(np.random.default_rng(1), bases_for("R")), mu0)
+
+
+@given(seed=seeds, decay=st.floats(0.5, 100.0), floor=st.floats(0.0, 0.5), pairs=st.integers(1, 150))
+@settings(max_examples=30, deadline=None)
+def test_replay_goes_through_a_schedule_as_single_steps_do(seed, decay, floor, pairs):
+    rng = np.random.default_rng(seed)
+    kbmap = random_map(rng, bases_for("RRP"))
+    q, x = random_q(rng, "RRP", pairs, 80), rng.normal(size=(pairs, 3))
+    schedule = StepSize(1.0, decay, floor)
+    blockwise, sequential = NLMS(kbmap, schedule), NLMS(kbmap, schedule)
+    blockwise.replay(q, x)
+    for k in range(pairs):
+        sequential.learn(q[k], x[k])
+    np.testing.assert_allclose(blockwise.map.net, sequential.map.net, rtol=0, atol=1e-10)
+    assert blockwise.pairs == sequential.pairs == pairs
+
+
+@given(mu0=st.floats(0.01, 1.99), decay=st.floats(0.1, 1e4), share=st.floats(0.0, 1.0), pairs=st.integers(0, 10_000))
+def test_a_schedule_falls_from_mu0_to_its_floor(mu0, decay, share, pairs):
+    schedule = StepSize(mu0, decay, share * mu0)
+    assert schedule.at(0) == mu0
+    assert schedule.at(pairs) >= schedule.at(pairs + 1) >= schedule.floor
+    assert schedule.at(pairs) == max(share * mu0, mu0 / (1.0 + pairs / decay))
+    np.testing.assert_array_equal(schedule.run(pairs, 3), [schedule.at(pairs + k) for k in range(3)])
+
+
+def test_a_step_of_one_over_the_pairs_is_their_mean():
+    rng = np.random.default_rng(3)
+    learner = NLMS(random_map(rng, bases_for("RR")), StepSize(1.0, 1.0))
+    x = rng.normal(size=(40, 3))
+    for position in x:
+        learner.learn([0.3, -0.4], position)
+    np.testing.assert_allclose(learner.map.predict([0.3, -0.4]), x.mean(axis=0), rtol=0, atol=1e-12)
+
+
+def test_a_falling_step_leaves_less_noise_than_a_constant_one():
+    rng = np.random.default_rng(4)
+    chain = random_chain(rng, "RRR")
+    q = random_q(rng, "RRR", 4000, 80)
+    x, test = chain.positions(q) + 0.02 * rng.normal(size=(4000, 3)), random_q(rng, "RRR", 300, 80)
+    errors = []
+    for step_size in (StepSize(0.5), StepSize(0.5, 100.0, 0.02)):
+        learner = NLMS(chain.to_kbmap(bases_for("RRR")), step_size)
+        learner.replay(q, x)
+        errors.append(prediction_errors(learner.map, test, chain.positions(test)).mean())
+    assert errors[1] < 0.4 * errors[0]
+
+
+@given(seed=seeds, decay=st.sampled_from([math.inf, 10.0]))
+@settings(max_examples=20, deadline=None)
+def test_bytes_learn_on_to_the_last_bit(seed, decay):
+    rng = np.random.default_rng(seed)
+    learner = NLMS(random_map(rng, bases_for("RPR")), StepSize(0.8, decay, 0.1))
+    q, x = random_q(rng, "RPR", 30, 80), rng.normal(size=(30, 3))
+    learner.replay(q[:20], x[:20])
+    again = NLMS.from_bytes(learner.to_bytes())
+    for one in (learner, again):
+        one.replay(q[20:], x[20:])
+        one.learn(q[0], x[0])
+    assert again.map.digest == learner.map.digest
+    assert again.to_bytes() == learner.to_bytes()
+
+
+def test_bytes_of_something_else_are_refused():
+    kbmap = random_map(np.random.default_rng(1), bases_for("RR"))
+    with pytest.raises(ModelFormatError):
+        NLMS.from_bytes(kbmap.to_bytes())
+    with pytest.raises(ModelFormatError):
+        NLMS.from_bytes(NLMS(kbmap).to_bytes()[:-1])
+
+
+@pytest.mark.parametrize("wrong", [{"decay": 0.0}, {"decay": math.nan}, {"floor": -0.1}, {"floor": 0.9}])
+def test_an_impossible_schedule_is_refused(wrong):
+    with pytest.raises(SettingError):
+        StepSize(**wrong)

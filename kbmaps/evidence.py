@@ -1,0 +1,50 @@
+"""Choosing the scale of a prior by the marginal likelihood of the data."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+# Multiplicative step of the search.
+_STEP = math.log(8.0)
+
+
+def most_evident(log_evidence: Callable[[float], float], start: float, low: float, high: float) -> float:
+    """The positive scale of the greatest evidence near `start`.
+
+    Climbs in steps of a factor until both neighbours are lower, then tries the vertex of the parabola
+    through the three.
+
+    Args:
+        log_evidence: of a scale.
+        start: where to begin; taken into the limits.
+        low, high: limits of the scale.
+    """
+    lowest, highest = math.log(low), math.log(high)
+    known: dict[float, float] = {}
+
+    def evidence(position: float) -> float:
+        if position not in known:
+            known[position] = log_evidence(math.exp(position))
+        return known[position]
+
+    middle = min(max(math.log(start), lowest), highest)
+    while True:
+        below, above = max(middle - _STEP, lowest), min(middle + _STEP, highest)
+        best = max((middle, below, above), key=evidence)
+        if best == middle:
+            break
+        middle = best
+    if below < middle < above:
+        vertex = _vertex((below, middle, above), (evidence(below), evidence(middle), evidence(above)))
+        middle = max((middle, vertex), key=evidence)
+    return math.exp(middle)
+
+
+def _vertex(positions: tuple[float, float, float], heights: tuple[float, float, float]) -> float:
+    """Where the parabola through three points, the middle one highest, has its maximum."""
+    (a, b, c), (fa, fb, fc) = positions, heights
+    left, right = (b - a) * (fb - fc), (b - c) * (fb - fa)
+    if left == right:
+        return b
+    return b - 0.5 * ((b - a) * left - (b - c) * right) / (left - right)

@@ -1,0 +1,50 @@
+"""How much of the past a learner goes by."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from kbmaps.arrays import FloatArray
+from kbmaps.errors import SettingError
+
+
+@dataclass(frozen=True)
+class Memory:
+    """What becomes of old pairs.
+
+    Attributes:
+        window: how many of the last pairs count; None means all.
+        forgetting: the factor by which each new pair lessens the weight of all before; 1 forgets nothing. The pairs are
+            then worth about 1 / (1 − forgetting) in all, and the evidence holds to the prior if that is fewer than the
+            control points that they would have to pay for.
+
+    Raises:
+        SettingError: a window below 1, forgetting not within 0..1 or 0 itself.
+    """
+
+    window: int | None = None
+    forgetting: float = 1.0
+
+    def __post_init__(self) -> None:
+        if self.window is not None and self.window < 1:
+            raise SettingError(f"a window must hold at least 1 pair, got {self.window}")
+        check_forgetting(self.forgetting)
+
+    def kept(self, pairs: int) -> int:
+        """How many of the last pairs count, of so many."""
+        return pairs if self.window is None else min(pairs, self.window)
+
+    def weights(self, pairs: int) -> FloatArray:
+        """Weights (pairs,) of pairs in the order in which they came: 1 for the last."""
+        return self.forgetting ** np.arange(pairs - 1, -1, -1.0)
+
+
+def check_forgetting(forgetting: float) -> None:
+    """Raises SettingError unless it is a factor in 0..1, 0 excluded."""
+    if not (0.0 < forgetting <= 1.0 and math.isfinite(forgetting)):
+        raise SettingError(
+            f"forgetting must be greater than 0 and at most 1 (which forgets nothing), got {forgetting!r}"
+        )
