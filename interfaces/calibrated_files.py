@@ -24,6 +24,7 @@ from .toml_text import toml_text
 CAMERA_LINK = "calibrated_camera"
 MARKER_LINK = "calibrated_marker"
 ROBOT_FILE = "robot.toml"
+_ROUNDING = 1e-12
 # What is next to nothing for a simulator, which would else give a link without a mass one of its own.
 _NO_MASS = (
     '<inertial><mass value="1e-6"/><inertia ixx="1e-9" ixy="0" ixz="0" iyy="1e-9" iyz="0" izz="1e-9"/></inertial>'
@@ -73,6 +74,8 @@ def calibrated_urdf(robot: RobotDescription, geometry: CalibratedGeometry, folde
     for joint in root.iterfind("joint"):
         if joint.get("name") in geometry.T_parent_joint:
             _set_origin(etree, joint, geometry.T_parent_joint[joint.get("name")])
+    for joint in root.iterfind("joint[axis]"):
+        _set_unit_axis(joint.find("axis"), robot.tree.joint(joint.get("name")).axis)
     for element in (*root.iter("mesh"), *root.iter("texture")):
         if element.get("filename"):
             element.set("filename", _moved_mesh(element.get("filename"), robot.tree.file, folder))
@@ -89,6 +92,13 @@ def _set_origin(etree: Any, joint: Any, pose: FloatArray) -> None:
         origin = etree.SubElement(joint, "origin")
     origin.set("xyz", _numbers(pose[:3, 3]))
     origin.set("rpy", _numbers(rpy_of(pose[:3, :3])))
+
+
+def _set_unit_axis(element: Any, unit: FloatArray) -> None:
+    """An axis of another length is an axis to us, but pybullet slides a joint by its length times the way."""
+    given = np.array([float(number) for number in element.get("xyz", "1 0 0").split()])
+    if np.abs(given - unit).max() > _ROUNDING:
+        element.set("xyz", _numbers(unit))
 
 
 def _set_frame(etree: Any, root: Any, name: str, parent: str, pose: FloatArray) -> None:
