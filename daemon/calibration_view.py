@@ -8,7 +8,7 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
-from daemon.calibration import CalibrationReport, Figure, Zero
+from daemon.calibration_report import CalibrationReport, Figure, Zero
 
 # Of the noise; so far off is no calibrated camera, but another unit or another robot [mm].
 FAR_MM = 50.0
@@ -40,8 +40,8 @@ def sentences(report: CalibrationReport) -> list[str]:
         f"Mean distance to the pairs: {report.drawn_error_mm:.3f} mm for the drawn arm in its best place, "
         f"{report.learnt_error_mm:.3f} mm for the learnt one. Noise of a coordinate: {report.noise_mm:.3f} mm{told}. "
         f"{_outliers(report)}",
-        f"This arm is made to about {report.axes_deg:.2g}° (axes) and {report.points_mm:.2g} mm (their places), which "
-        "explains the pairs best; the intervals take that for right.",
+        f"This arm is made to about {report.axes_deg:.2g}° (axes) and {report.points_mm:.2g} mm (their places), as the "
+        "pairs have it.",
         f"The pairs show {report.shown} of the {report.showable} numbers that positions can show of such an arm."
         + _advice(report),
     ]

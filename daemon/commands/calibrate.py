@@ -49,6 +49,7 @@ def calibrate(
 
     from daemon import recordings
     from daemon.calibration import Calibration
+    from daemon.calibration_report import CalibrationReport
     from daemon.calibration_view import view
     from daemon.config import Config
     from daemon.wire import encode
@@ -62,7 +63,7 @@ def calibrate(
         recording = Recording.read(source, description.joints)
     sigma_m = None if sigma_mm is None else 1e-3 * sigma_mm
     found = Calibration.of(description, recording, sigma_m=sigma_m, zeros_rad=math.radians(zeros_deg))
-    report = found.report(source.name)
+    report = CalibrationReport.of(found, source.name)
     written = None
     if out is not None:
         heading = f"Calibrated by bodyschema from {report.pairs} pairs of {source.name}"
