@@ -29,7 +29,7 @@ def main() -> dict[str, float]:
     arm = parameters.chain(0.04 * rng.normal(size=parameters.size))
     poses = rng.uniform(-REACH, REACH, (500, 4))
 
-    learner = NLMS(drawing.to_kbmap(learning_bases([-REACH] * 4, [REACH] * 4, drawing.prismatic)))
+    learner = NLMS(drawing.to_kbmap(learning_bases([-REACH] * 4, [REACH] * 4)))
 
     def error_mm() -> float:
         return 1e3 * float(np.linalg.norm(learner.map.predict(poses) - arm.positions(poses), axis=1).mean())

@@ -9,11 +9,27 @@ import pytest
 
 import kbmaps
 
-CALLED_FIRST = """
-    NLMS ChainParameters ChainTolerances ExactLearner InverseKinematics JointBasis KBMap RecursiveRigidLearner RigidChain
-    RigidLearner SupportSet TensorLearner TensorTrain align find_chain learning_bases nearest_rotation
-    prediction_errors resolved_rates
-""".split()
+CALLED_FIRST = [
+    "NLMS",
+    "ChainParameters",
+    "ChainTolerances",
+    "ExactLearner",
+    "InverseKinematics",
+    "JointBasis",
+    "KBMap",
+    "RecursiveRigidLearner",
+    "RigidChain",
+    "RigidLearner",
+    "SupportSet",
+    "TensorLearner",
+    "TensorTrain",
+    "align",
+    "find_chain",
+    "learning_bases",
+    "nearest_rotation",
+    "prediction_errors",
+    "resolved_rates",
+]
 
 
 @pytest.mark.parametrize("name", CALLED_FIRST)
