@@ -29,14 +29,15 @@ _ROUNDING = 1e-12
 _NO_MASS = (
     '<inertial><mass value="1e-6"/><inertia ixx="1e-9" ixy="0" ixz="0" iyy="1e-9" iyz="0" izz="1e-9"/></inertial>'
 )
-# Keys of robot.toml whose values are paths relative to it.
-_PATHS = (("daemon", "state_dir"), ("drivers", "recording"))
+# Store and checkpoint of the nominal robot are not this one's: what they hold is what it was learnt from.
+STATE_DIR = "state"
 
 
 def write_calibrated(robot: RobotDescription, geometry: CalibratedGeometry, folder: Path, heading: str) -> Path:
     """Write `robot` with another geometry as a URDF and a robot.toml into `folder`, which is made if need be.
 
-    Meshes stay where they are; their relative names are made to lead there.
+    Meshes stay where they are; their relative names are made to lead there, names with a scheme are left. Store and
+    checkpoint will be kept in a folder of their own.
 
     Args:
         heading: one line for the top of both files: where they come from.
@@ -70,7 +71,9 @@ def calibrated_urdf(robot: RobotDescription, geometry: CalibratedGeometry, folde
 
     parser = etree.XMLParser(resolve_entities=False, no_network=True, load_dtd=False, huge_tree=False)
     root = etree.fromstring(robot.tree.file.read_bytes(), parser)
-    root.insert(0, etree.Comment(f" {heading.replace('--', '- -')} "))
+    comment = etree.Comment(f" {heading.replace('--', '- -')} ")
+    comment.tail = "\n  "
+    root.insert(0, comment)
     for joint in root.iterfind("joint"):
         if joint.get("name") in geometry.T_parent_joint:
             _set_origin(etree, joint, geometry.T_parent_joint[joint.get("name")])
@@ -112,7 +115,10 @@ def _set_frame(etree: Any, root: Any, name: str, parent: str, pose: FloatArray) 
     etree.SubElement(joint, "parent", link=parent)
     etree.SubElement(joint, "child", link=name)
     _set_origin(etree, joint, pose)
-    root.extend([link, joint])
+    for element in (link, joint):
+        etree.indent(element, space="  ", level=1)
+        root[-1].tail, element.tail = "\n  ", "\n"
+        root.append(element)
 
 
 def _moved_mesh(name: str, urdf: Path, folder: Path) -> str:
@@ -129,10 +135,11 @@ def _relative(path: str, old: Path, new: Path) -> str:
 def _tables(robot: RobotDescription, geometry: CalibratedGeometry, folder: Path) -> dict[str, Any]:
     """The tables of the nominal robot.toml, with what has been learnt in its place."""
     tables, _ = read_toml(robot.file)
-    for table, key in _PATHS:
-        if key in tables.get(table, {}):
-            tables[table][key] = _relative(tables[table][key], robot.file.parent, folder)
-    tables["robot"] = msgspec.to_builtins(robot.robot) | {
+    tables["daemon"] = tables.get("daemon", {}) | {"state_dir": STATE_DIR}
+    if "recording" in tables.get("drivers", {}):
+        tables["drivers"]["recording"] = _relative(tables["drivers"]["recording"], robot.file.parent, folder)
+    described = {key: value for key, value in msgspec.to_builtins(robot.robot).items() if value != {}}
+    tables["robot"] = described | {
         "urdf": robot.tree.file.name,
         "marker_xyz": geometry.marker_xyz.tolist(),
         "marker_known": True,
@@ -147,4 +154,4 @@ def _tables(robot: RobotDescription, geometry: CalibratedGeometry, folder: Path)
 
 
 def _numbers(values: FloatArray) -> str:
-    return " ".join(map(repr, values.tolist()))
+    return " ".join(map(repr, (values + 0.0).tolist()))  # no minus before a zero

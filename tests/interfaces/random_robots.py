@@ -39,7 +39,7 @@ def random_robot(rng: np.random.Generator, folder: Path, *, head: str, arm: str)
         f"held_at = {{{', '.join(f'{name} = {value!r}' for name, value in held.items())}}}\n"
         f'[camera]\nparent_link = "{ends[0]}"\nxyz = {rng.normal(0, 0.3, 3).tolist()}\n'
         f"rpy = {rng.uniform(-3, 3, 3).tolist()}\npose_known = false\n"
-        '[daemon]\nstate_dir = "state"\n[sim]\nseed = 5\n'
+        '[daemon]\nstate_dir = "state"\n[drivers]\nrecording = "pairs.csv"\n[sim]\nseed = 5\n'
         "[[sim.tool_changes]]\nat_s = 1.5\nmarker_xyz = [0.0, 0.0, 0.1]\n"
     )
     return RobotDescription.load(folder / "robot.toml")

@@ -186,11 +186,16 @@ def test_comments_stay(tmp_path) -> None:
     assert ("<!-- From a test -->" in text, "<!-- kept -->" in text) == (True, True)
 
 
-def test_the_other_tables_of_robot_toml_stay_and_paths_lead_where_they_led(tmp_path) -> None:
+def test_the_other_tables_of_robot_toml_stay_and_a_recording_is_found_where_it_was(tmp_path) -> None:
     _, _, file = written(tmp_path, 1, "", "RR")
     before, after = read_toml(tmp_path / "robot.toml")[0], read_toml(file)[0]
     assert after["sim"] == before["sim"]
-    assert (file.parent / after["daemon"]["state_dir"]).resolve() == tmp_path / "state"
+    assert (file.parent / after["drivers"]["recording"]).resolve() == tmp_path / "pairs.csv"
+
+
+def test_store_and_checkpoint_of_the_nominal_robot_are_left_alone(tmp_path) -> None:
+    _, _, file = written(tmp_path, 1, "", "RR")
+    assert (file.parent / read_toml(file)[0]["daemon"]["state_dir"]).resolve() == tmp_path / "out" / "state"
 
 
 def test_what_was_learnt_is_called_known(tmp_path) -> None:
