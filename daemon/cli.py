@@ -15,6 +15,7 @@ COMMANDS = {
     "demo": "Watch it all in simulation, about a minute. No hardware needed.",
     "config": "Write, check or show robot.toml: begin here with your robot.",
     "replay": "Learn a recording; prints the error before and after.",
+    "calibrate": "Camera, tool and joint zeros from a recording; writes a URDF.",
     "reproduce": "Run the paper's experiments again, its figures beside ours.",
     "run": "Start sampler and learner, and keep them running.",
     "sampler": "Only the sampler: encoders and cameras in, pairs out.",

@@ -15,7 +15,7 @@ from interfaces.records import Pair
 from .mcap_export import write_mcap
 from .store import PairReader
 
-MCAP = ".mcap"
+MCAP, URDF = ".mcap", ".urdf"
 STORE_ENDINGS = (".sqlite", ".sqlite3", ".db")
 
 _WRITERS: dict[str, Callable[[Recording, Path], None]] = {
@@ -53,8 +53,21 @@ def from_store(file: Path) -> Recording:
         return from_pairs(pairs, reader.joints)
 
 
+def of_robot(recording: Recording, joints: tuple[str, ...], file: Path) -> Recording:
+    """The recording; RecordingError when it is not of these joints in this order."""
+    if recording.joints != joints:
+        raise RecordingError(
+            f"the pairs are of other joints: {', '.join(recording.joints)}",
+            file=file,
+            remedy=f"Give the robot.toml that they were taken with; this one has {', '.join(joints)}",
+        )
+    return recording
+
+
 def check_target(out: Path, *, force: bool) -> None:
     """RecordingError unless a recording can be written to `out`: its ending is known and nothing is in the way."""
+    if out.suffix.lower() == URDF:
+        raise RecordingError("a URDF is of a robot, not of pairs", file=out, remedy="`bodyschema calibrate` learns one")
     if out.suffix.lower() not in _WRITERS:
         raise RecordingError(f"recordings end in {', '.join(_WRITERS)}", file=out, remedy="Give another name")
     if not out.parent.is_dir():

@@ -156,7 +156,7 @@ def chain_between(
             f"joints are not in the order in which they follow from {start!r} to {end!r}",
             remedy=f"Write joints = {list(on_way)}",
         )
-    return _assemble(way, joints, held_at, _inverse(T_start_camera), marker_xyz)
+    return _assemble(way, joints, held_at, inverse(T_start_camera), marker_xyz)
 
 
 def _assemble(
@@ -168,7 +168,7 @@ def _assemble(
 ) -> RigidChain:
     fixed, axes, prismatic = [T_camera_start], [], []
     for joint, upward in way:
-        T_joint_parent = _inverse(joint.T_parent_joint)
+        T_joint_parent = inverse(joint.T_parent_joint)
         if joint.name in joints:
             if not upward:
                 fixed[-1] = fixed[-1] @ joint.T_parent_joint
@@ -176,14 +176,19 @@ def _assemble(
             axes.append(-joint.axis if upward else joint.axis)
             prismatic.append(joint.kind == "prismatic")
             continue
-        motion = _motion(joint, held_at.get(joint.name, 0.0))
-        fixed[-1] = fixed[-1] @ (_inverse(motion) @ T_joint_parent if upward else joint.T_parent_joint @ motion)
+        fixed[-1] = fixed[-1] @ standing(joint, upward, held_at.get(joint.name, 0.0))
     tool = np.eye(4)
     tool[:3, 3] = marker_xyz
     fixed[-1] = fixed[-1] @ tool
     return RigidChain(
         fixed=np.array(fixed), axes=np.array(axes).reshape(-1, 3), prismatic=np.array(prismatic, dtype=bool)
     )
+
+
+def standing(joint: UrdfJoint, upward: bool, position: float) -> FloatArray:
+    """What a joint that stands still at `position` [rad or m] adds to the way through it, shape (4, 4)."""
+    T_parent_child = joint.T_parent_joint @ _motion(joint, position)
+    return inverse(T_parent_child) if upward else T_parent_child
 
 
 def _motion(joint: UrdfJoint, position: float) -> FloatArray:
@@ -197,7 +202,8 @@ def _motion(joint: UrdfJoint, position: float) -> FloatArray:
     return T
 
 
-def _inverse(T: FloatArray) -> FloatArray:
+def inverse(T: FloatArray) -> FloatArray:
+    """The inverse of a transform (4, 4)."""
     return np.linalg.inv(T).astype(np.float64)
 
 

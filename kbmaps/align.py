@@ -131,6 +131,17 @@ def align(
         ShapeError, NonFiniteError
         SettingError: sigma is not positive.
         DegenerateDataError: too few pairs, or positions on one line.
+
+    Example:
+        >>> import numpy as np
+        >>> from kbmaps import RigidChain, align
+        >>> fixed = np.tile(np.eye(4), (3, 1, 1))
+        >>> fixed[1:, 0, 3] = 0.3, 0.2  # links [m]
+        >>> arm = RigidChain(fixed, axes=[[0, 0, 1], [0, 1, 0]], prismatic=[False, False])
+        >>> q = np.random.default_rng(0).uniform(-1, 1, (20, 2))
+        >>> x = arm.positions(q) + [0.0, 0.0, 1.0]  # the camera stands one metre lower
+        >>> align(arm, q, x, pose_known=False, marker_known=True).T_measured_nominal[:3, 3].round(6) + 0.0
+        array([0., 0., 1.])
     """
     angles, positions = rows("q", q, chain.joints), rows("x", x, 3)
     if len(angles) != len(positions):

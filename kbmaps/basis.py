@@ -128,6 +128,13 @@ class JointBasis:
 
     Raises:
         BasisError: the parameters do not give a basis; SingularAlphaError for alpha in 80..100 degrees.
+
+    Example:
+        >>> import numpy as np
+        >>> from kbmaps import JointBasis
+        >>> paper = JointBasis.bernstein(alpha=np.pi / 3)
+        >>> paper.weights(np.pi / 3).round(9) + 0.0  # at the end of its range: the last control point alone
+        array([0., 0., 1.])
     """
 
     kind: BasisKind
@@ -257,6 +264,12 @@ def learning_bases(
 
     Raises:
         BasisError: a range is empty, or the lengths differ.
+
+    Example:
+        >>> from kbmaps import learning_bases
+        >>> turning, sliding = learning_bases([-1.4, 0.0], [1.4, 0.3], prismatic=[False, True])
+        >>> turning.kind, sliding.size
+        ('orthonormal', 2)
     """
     lows = [float(v) for v in np.atleast_1d(np.asarray(low, dtype=np.float64))]
     highs = [float(v) for v in np.atleast_1d(np.asarray(high, dtype=np.float64))]

@@ -31,6 +31,15 @@ class RigidChain:
     Raises:
         ShapeError, NonFiniteError
         ChainError: a transform is not rigid or an axis is not of unit length.
+
+    Example:
+        >>> import numpy as np
+        >>> from kbmaps import RigidChain
+        >>> fixed = np.tile(np.eye(4), (3, 1, 1))
+        >>> fixed[1:, 0, 3] = 0.3, 0.2  # links [m]
+        >>> arm = RigidChain(fixed, axes=[[0, 0, 1], [0, 1, 0]], prismatic=[False, False])
+        >>> arm.positions([0.0, -np.pi / 2]).round(9)
+        array([0.3, 0. , 0.2])
     """
 
     fixed: FloatArray

@@ -45,6 +45,11 @@ class ChainTolerances:
 
     Raises:
         SettingError: one is negative or NaN.
+
+    Example:
+        >>> from kbmaps import ChainTolerances
+        >>> ChainTolerances(zeros=0.05, tool=0.03).axes  # what is not named is held as drawn
+        0.0
     """
 
     axes: float = 0.0
@@ -92,6 +97,18 @@ class ChainParameters:
 
     Turns of an axis about itself and shifts along itself would change nothing and are left out. What remains is
     over-complete on purpose: base and zeros can be made up for by axes and tool, and only a prior tells them apart.
+
+    Example:
+        >>> import numpy as np
+        >>> from kbmaps import ChainParameters, RigidChain
+        >>> fixed = np.tile(np.eye(4), (3, 1, 1))
+        >>> fixed[1:, 0, 3] = 0.3, 0.2  # links [m]
+        >>> arm = RigidChain(fixed, axes=[[0, 0, 1], [0, 1, 0]], prismatic=[False, False])
+        >>> parameters = ChainParameters(arm)
+        >>> change = np.zeros(parameters.size)
+        >>> change[parameters.zeros] = 0.0, -np.pi / 2
+        >>> parameters.positions(change, [0.0, 0.0]).round(9)
+        array([0.3, 0. , 0.2])
     """
 
     def __init__(self, reference: RigidChain) -> None:

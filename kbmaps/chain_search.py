@@ -49,6 +49,17 @@ def find_chain(
     Raises:
         ShapeError, NonFiniteError, SettingError (no starts, a sigma that is not positive)
         DegenerateDataError: fewer pairs than unknowns, or all positions in one place.
+
+    Example:
+        >>> import numpy as np
+        >>> from kbmaps import RigidChain, find_chain
+        >>> fixed = np.tile(np.eye(4), (3, 1, 1))
+        >>> fixed[1:, 0, 3] = 0.3, 0.2  # links [m]
+        >>> arm = RigidChain(fixed, axes=[[0, 0, 1], [0, 1, 0]], prismatic=[False, False])
+        >>> q = np.random.default_rng(0).uniform(-1, 1, (20, 2))
+        >>> found = find_chain(q, arm.positions(q), rng=np.random.default_rng(1))
+        >>> found.positions([0.0, -np.pi / 2]).round(6) + 0.0
+        array([0.3, 0. , 0.2])
     """
     width = np.shape(q)[-1] if np.ndim(q) == 2 else 0
     angles, positions = rows("q", q, max(width, 1)), rows("x", x, 3)

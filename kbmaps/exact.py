@@ -92,6 +92,19 @@ class ExactLearner:
     Raises:
         BasisError: bases do not fit the prior.
         SettingError: forgetting is not a factor in 0..1.
+
+    Example:
+        >>> import numpy as np
+        >>> from kbmaps import ExactLearner, RigidChain, learning_bases
+        >>> fixed = np.tile(np.eye(4), (3, 1, 1))
+        >>> fixed[1:, 0, 3] = 0.3, 0.2  # links [m]
+        >>> arm = RigidChain(fixed, axes=[[0, 0, 1], [0, 1, 0]], prismatic=[False, False])
+        >>> drawing = arm.with_tool([0.0, 0.0, 0.1])  # wrong about the marker
+        >>> learner = ExactLearner(drawing.to_kbmap(learning_bases([-1, -1], [1, 1])))
+        >>> q = np.random.default_rng(0).uniform(-1, 1, (9, 2))
+        >>> learner.learn(q, arm.positions(q))
+        >>> learner.solve().map.predict([0.0, -np.pi / 2]).round(9) + 0.0
+        array([0.3, 0. , 0.2])
     """
 
     def __init__(self, prior: KBMap, bases: Sequence[JointBasis] | None = None, *, forgetting: float = 1.0) -> None:

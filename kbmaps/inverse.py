@@ -73,6 +73,19 @@ class InverseKinematics:
 
     Raises:
         ShapeError, SettingError (limits the wrong way round, or a setting that is not positive)
+
+    Example:
+        >>> import numpy as np
+        >>> from kbmaps import InverseKinematics, RigidChain, learning_bases
+        >>> fixed = np.tile(np.eye(4), (3, 1, 1))
+        >>> fixed[1:, 0, 3] = 0.3, 0.2  # links [m]
+        >>> arm = RigidChain(fixed, axes=[[0, 0, 1], [0, 1, 0]], prismatic=[False, False])
+        >>> kbmap = arm.to_kbmap(learning_bases([-3, -2], [3, 2]))
+        >>> inverse = InverseKinematics(kbmap, lower=[-3, -2], upper=[3, 2])
+        >>> inverse.solve([0.3, 0.0, 0.2]).q.round(4) + 0.0
+        array([ 0.    , -1.5708])
+        >>> inverse.solve([0.6, 0.0, 0.0]).reason
+        'out_of_reach'
     """
 
     def __init__(

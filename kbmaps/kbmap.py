@@ -38,6 +38,16 @@ class KBMap:
 
     Raises:
         ShapeError, NonFiniteError, BasisError
+
+    Example:
+        >>> import numpy as np
+        >>> from kbmaps import JointBasis, RigidChain
+        >>> fixed = np.tile(np.eye(4), (3, 1, 1))
+        >>> fixed[1:, 0, 3] = 0.3, 0.2  # links [m]
+        >>> arm = RigidChain(fixed, axes=[[0, 0, 1], [0, 1, 0]], prismatic=[False, False])
+        >>> kbmap = arm.to_kbmap([JointBasis.trigonometric()] * 2)
+        >>> kbmap.net.shape, kbmap.predict([0.0, -np.pi / 2]).round(9)
+        ((3, 3, 3), array([0.3, 0. , 0.2]))
     """
 
     bases: tuple[JointBasis, ...]
@@ -298,6 +308,13 @@ def prediction_errors(kbmap: KBMap, q: ArrayLike, x: ArrayLike) -> FloatArray:
 
     Raises:
         ShapeError, NonFiniteError
+
+    Example:
+        >>> import numpy as np
+        >>> from kbmaps import JointBasis, KBMap, prediction_errors
+        >>> still = KBMap((JointBasis.trigonometric(),), np.zeros((3, 3)))
+        >>> prediction_errors(still, [[0.0]], [[0.0, 0.3, 0.4]])
+        array([0.5])
     """
     angles = rows("q", q, kbmap.joints)
     positions = rows("x", x, POSITION_OUTPUTS)

@@ -32,6 +32,17 @@ class NLMS:
 
     Raises:
         SettingError: mu0 is not between 0 and 2.
+
+    Example:
+        >>> import numpy as np
+        >>> from kbmaps import NLMS, RigidChain, learning_bases
+        >>> fixed = np.tile(np.eye(4), (3, 1, 1))
+        >>> fixed[1:, 0, 3] = 0.3, 0.2  # links [m]
+        >>> arm = RigidChain(fixed, axes=[[0, 0, 1], [0, 1, 0]], prismatic=[False, False])
+        >>> learner = NLMS(arm.to_kbmap(learning_bases([-1, -1], [1, 1])), mu0=1.0)
+        >>> learner.learn([0.1, 0.2], [0.5, 0.0, 0.0])
+        >>> learner.map.predict([0.1, 0.2]).round(9) + 0.0  # a full step: the pair is met
+        array([0.5, 0. , 0. ])
     """
 
     def __init__(self, kbmap: KBMap, mu0: float | StepSize = DEFAULT_MU0) -> None:

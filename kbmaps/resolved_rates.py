@@ -41,6 +41,11 @@ def resolved_rates(
 
     Raises:
         ShapeError, NonFiniteError, SettingError
+
+    Example:
+        >>> from kbmaps import resolved_rates
+        >>> resolved_rates([[0.0, 0.5]], [0.1], damping=1e-6).round(6)
+        array([0. , 0.2])
     """
     J = np.asarray(jacobian, dtype=np.float64)
     if J.ndim != 2:

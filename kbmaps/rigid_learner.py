@@ -42,6 +42,18 @@ class RigidLearner:
 
     Raises:
         ShapeError: the prior is one of another chain.
+
+    Example:
+        >>> import numpy as np
+        >>> from kbmaps import ChainTolerances, RigidChain, RigidLearner
+        >>> fixed = np.tile(np.eye(4), (3, 1, 1))
+        >>> fixed[1:, 0, 3] = 0.3, 0.2  # links [m]
+        >>> arm = RigidChain(fixed, axes=[[0, 0, 1], [0, 1, 0]], prismatic=[False, False])
+        >>> learner = RigidLearner(arm.with_tool([0.0, 0.0, 0.1]), ChainTolerances(tool=0.1))
+        >>> q = np.random.default_rng(0).uniform(-1, 1, (5, 2))
+        >>> learner.learn(q, arm.positions(q))
+        >>> learner.report().tool_shift.value.round(6) + 0.0
+        array([ 0. ,  0. , -0.1])
     """
 
     def __init__(self, nominal: RigidChain, tolerances: ChainTolerances, prior: ChainBelief | None = None) -> None:

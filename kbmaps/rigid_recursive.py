@@ -65,6 +65,17 @@ class RecursiveRigidLearner:
 
     Raises:
         SettingError: noise is not positive.
+
+    Example:
+        >>> import numpy as np
+        >>> from kbmaps import ChainTolerances, RecursiveRigidLearner, RigidChain
+        >>> fixed = np.tile(np.eye(4), (3, 1, 1))
+        >>> fixed[1:, 0, 3] = 0.3, 0.2  # links [m]
+        >>> arm = RigidChain(fixed, axes=[[0, 0, 1], [0, 1, 0]], prismatic=[False, False])
+        >>> learner = RecursiveRigidLearner(arm, ChainTolerances(tool=0.1), noise=1e-6)
+        >>> learner.learn([0.0, 0.0], [0.5, 0.0, 0.1])  # 100 mm above where it was drawn
+        >>> learner.predict([0.0, -np.pi / 2]).round(6)
+        array([0.2, 0. , 0.2])
     """
 
     def __init__(self, nominal: RigidChain, tolerances: ChainTolerances, *, noise: float = 0.01) -> None:

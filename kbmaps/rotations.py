@@ -23,6 +23,13 @@ def nearest_rotation(matrices: ArrayLike) -> FloatArray:
 
     Raises:
         ShapeError, NonFiniteError
+
+    Example:
+        >>> from kbmaps import nearest_rotation
+        >>> nearest_rotation([[1.1, 0.0, 0.0], [0.0, 0.9, 0.0], [0.0, 0.0, 1.0]])
+        array([[1., 0., 0.],
+               [0., 1., 0.],
+               [0., 0., 1.]])
     """
     checked = np.asarray(matrices, dtype=np.float64)
     if checked.shape[-2:] != (3, 3):

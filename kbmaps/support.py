@@ -38,6 +38,14 @@ class SupportSet:
 
     Raises:
         SettingError: capacity below 2, noise or threshold not within 0..1.
+
+    Example:
+        >>> from kbmaps import SupportSet, learning_bases
+        >>> support = SupportSet(learning_bases([-1, -1], [1, 1]))
+        >>> support.add([0.0, 0.0])  # something new
+        True
+        >>> support.covers([[0.01, 0.0], [1.0, -1.0]])
+        array([ True, False])
     """
 
     def __init__(

@@ -50,6 +50,18 @@ class TensorLearner:
 
     Raises:
         ShapeError: the prior has another number of joints.
+
+    Example:
+        >>> import numpy as np
+        >>> from kbmaps import RigidChain, TensorLearner, learning_bases
+        >>> fixed = np.tile(np.eye(4), (3, 1, 1))
+        >>> fixed[1:, 0, 3] = 0.3, 0.2  # links [m]
+        >>> arm = RigidChain(fixed, axes=[[0, 0, 1], [0, 1, 0]], prismatic=[False, False])
+        >>> learner = TensorLearner(learning_bases([-1, -1], [1, 1]))
+        >>> q = np.random.default_rng(0).uniform(-1, 1, (40, 2))
+        >>> learner.learn(q, arm.positions(q))
+        >>> bool(np.abs(learner.predict(q) - arm.positions(q)).max() < 1e-9)
+        True
     """
 
     def __init__(

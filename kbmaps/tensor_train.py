@@ -35,6 +35,16 @@ class TensorTrain:
 
     Raises:
         ShapeError, NonFiniteError, BasisError
+
+    Example:
+        >>> import numpy as np
+        >>> from kbmaps import RigidChain, TensorTrain, learning_bases
+        >>> fixed = np.tile(np.eye(4), (3, 1, 1))
+        >>> fixed[1:, 0, 3] = 0.3, 0.2  # links [m]
+        >>> arm = RigidChain(fixed, axes=[[0, 0, 1], [0, 1, 0]], prismatic=[False, False])
+        >>> train = TensorTrain.from_chain(arm, learning_bases([-1, -1], [1, 1]))
+        >>> train.predict([0.0, -np.pi / 2]).round(9)
+        array([0.3, 0. , 0.2])
     """
 
     bases: tuple[JointBasis, ...]

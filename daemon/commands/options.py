@@ -14,3 +14,11 @@ RobotFile = Annotated[Path, Parameter(env_var="BODYSCHEMA_ROBOT", help="The robo
 def flag(text: str, *, name: str | None = None) -> Parameter:
     """An option without a value, which is off unless it is given."""
     return Parameter(name=name, help=text, negative="", show_default=False)
+
+
+def robot_file(given: Path | None, source: Path) -> Path:
+    """The robot.toml that was given; else the one beside `source`, or in the working directory."""
+    if given is not None:
+        return given
+    beside = source.parent / HERE
+    return beside if beside.exists() else HERE

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
-from daemon.commands.options import flag
+from daemon.commands.options import flag, robot_file
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -65,7 +65,7 @@ def replay(
     from daemon.wire import encode
     from interfaces.recording import Recording
 
-    config = Config.load(_robot_file(robot, recording))
+    config = Config.load(robot_file(robot, recording))
     rows = Recording.read(recording, config.robot.joints)
     split = split_blocks(len(rows), held_out)
     any_step |= config.tables.daemon.any_step
@@ -89,13 +89,6 @@ def _ending_on_sigterm() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGTERM, before)
-
-
-def _robot_file(robot: Path | None, recording: Path) -> Path:
-    if robot is not None:
-        return robot
-    beside = recording.parent / "robot.toml"
-    return beside if beside.exists() else Path("robot.toml")
 
 
 def _make_folder(folder: Path) -> None:

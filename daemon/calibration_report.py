@@ -1,0 +1,137 @@
+"""What a calibration found, in the units of people."""
+
+from __future__ import annotations
+
+import math
+
+import msgspec
+import numpy as np
+
+from daemon.calibration import Calibration
+from interfaces.recording import Recording
+from interfaces.records import FloatArray
+from interfaces.robot import RobotDescription
+from interfaces.rpy import rpy_of
+
+# A joint that moved less is named [rad, m].
+STILL_RAD, STILL_M = math.radians(10.0), 0.02
+_DEG = math.degrees(1.0)
+_UNITS = (1e3, 1e3, 1e3, _DEG, _DEG, _DEG, 1e3, 1e3, 1e3)
+
+
+class Figure(msgspec.Struct, frozen=True):
+    """One number as drawn and as learnt, with half the width of its 95 % interval."""
+
+    drawn: float
+    learnt: float
+    half_width: float
+
+
+class Zero(msgspec.Struct, frozen=True):
+    """What has to be added to a joint's reading, in `unit` (° or mm).
+
+    `half_width` of its 95 % interval is null where no motion shows it and it is left as drawn: the other figures are
+    given that it is right.
+    """
+
+    joint: str
+    unit: str
+    zero: float
+    half_width: float | None
+
+
+class CalibrationReport(msgspec.Struct, frozen=True, kw_only=True):
+    """The answers.
+
+    Attributes:
+        pairs: that were learnt, `outliers` of them left out.
+        camera_link, camera_xyz_mm, camera_rpy_deg: pose of the measurement frame in this link (URDF convention).
+        marker_link, marker_xyz_mm: the marker in this link.
+        zeros: of the joints, in the order of q.
+        noise_mm: 1-sigma of a measured coordinate, estimated or (`noise_told`) from the recording.
+        misfit: residuals over what the told noise explains; 1 where it explains them, or was not told.
+        drawn_error_mm: mean distance from the pairs to the drawn arm, with what robot.toml calls not known fitted.
+        learnt_error_mm: mean distance to the learnt arm, over the same pairs, which it was fitted to.
+        axes_deg, points_mm: how well the arm is made, by the pairs: 1-sigma of an axis' tilt and shift.
+        shown: independent numbers of the arm that the pairs determine, of `showable` that positions can.
+        still: joints that hardly moved.
+    """
+
+    robot: str
+    source: str
+    pairs: int
+    outliers: int
+    camera_link: str
+    camera_xyz_mm: list[Figure]
+    camera_rpy_deg: list[Figure]
+    marker_link: str
+    marker_xyz_mm: list[Figure]
+    zeros: list[Zero]
+    noise_mm: float
+    noise_told: bool
+    misfit: float
+    drawn_error_mm: float
+    learnt_error_mm: float
+    axes_deg: float
+    points_mm: float
+    shown: int
+    showable: int
+    still: list[str]
+    schema: int = 1
+
+    @classmethod
+    def of(cls, calibration: Calibration, source: str) -> CalibrationReport:
+        """The answers of `calibration`; `source` is what the recording is called."""
+        robot, recording, learner = calibration.robot, calibration.recording, calibration.learner
+        report, tolerances, slides = learner.report(), learner.tolerances, robot.chain.prismatic
+        values, halves = calibration.figures, calibration.half_widths
+        drawn = [*robot.camera.xyz, *rpy_of(robot.camera.pose[:3, :3]), *robot.robot.marker_xyz]
+        figures = [
+            Figure(*(float(unit * number) for number in numbers))
+            for unit, *numbers in zip(_UNITS, drawn, values[:9], halves[:9], strict=True)
+        ]
+        return cls(
+            robot=robot.name,
+            source=source,
+            pairs=len(recording),
+            outliers=report.outliers,
+            camera_link=robot.camera.parent_link,
+            camera_xyz_mm=figures[:3],
+            camera_rpy_deg=figures[3:6],
+            marker_link=robot.robot.marker_link,
+            marker_xyz_mm=figures[6:],
+            zeros=_zeros(calibration, values[9:], halves[9:]),
+            noise_mm=1e3 * report.noise,
+            noise_told=calibration.noise_told,
+            misfit=report.misfit,
+            drawn_error_mm=1e3 * _mean_error(calibration.placed.chain.positions(recording.q), recording),
+            learnt_error_mm=1e3 * _mean_error(learner.predict(recording.q), recording),
+            axes_deg=_DEG * tolerances.axes,
+            points_mm=1e3 * tolerances.points,
+            shown=report.determined,
+            # Everett and Hsu 1988: four for each joint that turns, two for each that slides, six for the ends of the
+            # chain, less the three turns of the marker that its place does not show.
+            showable=4 * int((~slides).sum()) + 2 * int(slides.sum()) + 3,
+            still=_still(robot, recording),
+        )
+
+
+def _zeros(calibration: Calibration, values: FloatArray, halves: FloatArray) -> list[Zero]:
+    robot = calibration.robot
+    units = np.where(robot.chain.prismatic, 1e3, _DEG)
+    return [
+        Zero(name, "mm" if slides else "°", float(unit * value), float(unit * half) if shown else None)
+        for name, slides, unit, value, half, shown in zip(
+            robot.joints, robot.chain.prismatic, units, values, halves, calibration.shown, strict=True
+        )
+    ]
+
+
+def _still(robot: RobotDescription, recording: Recording) -> list[str]:
+    least = np.where(robot.chain.prismatic, STILL_M, STILL_RAD)
+    moved = np.ptp(recording.q, axis=0)
+    return [name for name, still in zip(robot.joints, moved < least, strict=True) if still]
+
+
+def _mean_error(predicted: FloatArray, recording: Recording) -> float:
+    return float(np.linalg.norm(predicted - recording.x, axis=1).mean())

@@ -1,0 +1,105 @@
+"""What a calibration found, for a terminal of 80 columns."""
+
+from __future__ import annotations
+
+from rich import box
+from rich.console import Group
+from rich.padding import Padding
+from rich.table import Table
+from rich.text import Text
+
+from daemon.calibration_report import CalibrationReport, Figure, Zero
+
+# Of the noise; so far off is no calibrated camera, but another unit or another robot [mm].
+FAR_MM = 50.0
+# Told noise that explains the residuals leaves less than this.
+MISFIT = 1.5
+
+
+def view(report: CalibrationReport) -> Group:
+    """Tables of the figures, then what they mean in sentences."""
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False)
+    table.add_column(Text(f"{report.robot}, {report.pairs} pairs of {report.source}"), overflow="fold")
+    for name in ("drawn", "learnt", "95 %"):
+        table.add_column(name, justify="right", no_wrap=True)
+    _section(table, f"camera on {report.camera_link}")
+    _figures(table, ("x [mm]", "y [mm]", "z [mm]"), report.camera_xyz_mm, 2)
+    _figures(table, ("roll [°]", "pitch [°]", "yaw [°]"), report.camera_rpy_deg, 3)
+    _section(table, f"marker on {report.marker_link} (tool centre point)")
+    _figures(table, ("x [mm]", "y [mm]", "z [mm]"), report.marker_xyz_mm, 2)
+    _section(table, "joint zeros, to be added to the readings")
+    for zero in report.zeros:
+        table.add_row(Text(f"  {zero.joint} [{zero.unit}]"), "", *_zero(zero))
+    return Group(table, *(Padding(Text(sentence), (1, 0, 0, 0), expand=False) for sentence in sentences(report)))
+
+
+def sentences(report: CalibrationReport) -> list[str]:
+    """The report in words."""
+    told = "" if report.noise_told else ", estimated"
+    said = [
+        f"Mean distance to the pairs: {report.drawn_error_mm:.3f} mm for the drawn arm in its best place, "
+        f"{report.learnt_error_mm:.3f} mm for the learnt one. Noise of a coordinate: {report.noise_mm:.3f} mm{told}. "
+        f"{_outliers(report)}",
+        f"This arm is made to about {report.axes_deg:.2g}° (axes) and {report.points_mm:.2g} mm (their places), as the "
+        "pairs have it.",
+        f"The pairs show {report.shown} of the {report.showable} numbers that positions can show of such an arm."
+        + _advice(report),
+    ]
+    hidden = [zero.joint for zero in report.zeros if zero.half_width is None]
+    if hidden:
+        said.append(
+            f"Left as drawn: {', '.join(hidden)}. Nothing that was measured tells {_such_zeros(hidden)} from a turn of "
+            "the camera, of the marker, or of a neighbouring joint, and nothing needs to: the positions are the same. "
+            "The other figures are given that."
+        )
+    if report.misfit > MISFIT:
+        said.append(
+            f"The residuals are {report.misfit:.1f} times what the noise explains: the arm is not quite a rigid chain "
+            "(it sags, its encoders are eccentric), or the noise is larger than told. The intervals are wider for it."
+        )
+    if report.noise_mm > FAR_MM:
+        said.append("That is very far off. Are positions in metres, angles in radians, and both of this robot?")
+    return said
+
+
+def _advice(report: CalibrationReport) -> str:
+    if report.still:
+        return f" Hardly moved: {', '.join(report.still)}. Pairs where they move would show more."
+    if report.shown < report.showable:
+        return " Where axes stay parallel, or the marker sits on one, the rest does not matter; else move more joints."
+    return ""
+
+
+def _outliers(report: CalibrationReport) -> str:
+    if report.outliers == 0:
+        return "No outliers."
+    return f"{report.outliers} outlier{'s' if report.outliers > 1 else ''} left out."
+
+
+def _such_zeros(hidden: list[str]) -> str:
+    return "its zero" if len(hidden) == 1 else "their zeros"
+
+
+def _section(table: Table, title: str) -> None:
+    table.add_row(Text(title, style="bold"), "", "", "")
+
+
+def _figures(table: Table, names: tuple[str, ...], figures: list[Figure], digits: int) -> None:
+    for name, figure in zip(names, figures, strict=True):
+        table.add_row(
+            Text(f"  {name}"),
+            _fixed(figure.drawn, digits),
+            _fixed(figure.learnt, digits),
+            f"± {figure.half_width:.{digits}f}",
+        )
+
+
+def _fixed(value: float, digits: int) -> str:
+    """Without a minus before nothing but zeros."""
+    return f"{round(value, digits) + 0.0:.{digits}f}"
+
+
+def _zero(zero: Zero) -> tuple[str, str]:
+    if zero.half_width is None:
+        return "as drawn", "–"
+    return f"{zero.zero:+.3f}", f"± {zero.half_width:.3f}"

@@ -1,0 +1,77 @@
+"""`bodyschema calibrate`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+from cyclopts.validators import Number
+
+from daemon.commands.options import flag, robot_file
+
+
+def calibrate(
+    source: Annotated[Path, Parameter(help="A recording (.csv, .parquet) or a pair store (.sqlite).")],
+    /,
+    *,
+    robot: Annotated[Path | None, Parameter(help="robot.toml; else the one beside the source, or here.")] = None,
+    sigma_mm: Annotated[
+        float | None,
+        Parameter(
+            help="1-sigma of a measured coordinate where the source has none [mm]; else estimated.",
+            validator=Number(gt=0),
+        ),
+    ] = None,
+    zeros_deg: Annotated[
+        float, Parameter(help="How far joint zeros may be off, 1-sigma [°].", validator=Number(gt=0, lte=60))
+    ] = 3.0,
+    out: Annotated[
+        Path | None, Parameter(help="Write the calibrated robot into this folder: a URDF and a robot.toml.")
+    ] = None,
+    as_json: Annotated[bool, flag("Print the figures as JSON.", name="--json")] = False,
+) -> None:
+    """Where camera and tool are and what the joint zeros are, with 95 % intervals; writes a calibrated URDF.
+
+    Learns a rigid chain from all pairs, around the nominal one. Outliers are left out. All pairs have to be of the
+    same tool. The URDF opens in pybullet, Pinocchio and ROS: it has the camera and the marker as links of their own,
+    and takes its positions from them to rounding as the learnt chain does. Meshes, masses and limits stay.
+
+    Needs: a recording or a store, and its robot.toml; neither hardware nor a running daemon. What robot.toml calls
+    not known (`pose_known`, `marker_known`) is taken from the pairs alone, the rest is trusted to 1° and 10 mm.
+
+    Next: `bodyschema run --robot OUT/robot.toml` starts from what was learnt.
+    """
+    import math
+    import sys
+
+    from rich.console import Console
+
+    from daemon import recordings
+    from daemon.calibration import Calibration
+    from daemon.calibration_report import CalibrationReport
+    from daemon.calibration_view import view
+    from daemon.config import Config
+    from daemon.wire import encode
+    from interfaces.calibrated_files import write_calibrated
+    from interfaces.recording import Recording
+
+    description = Config.load(robot_file(robot, source)).robot
+    if source.suffix.lower() in recordings.STORE_ENDINGS:
+        recording = recordings.of_robot(recordings.from_store(source), description.joints, source)
+    else:
+        recording = Recording.read(source, description.joints)
+    sigma_m = None if sigma_mm is None else 1e-3 * sigma_mm
+    found = Calibration.of(description, recording, sigma_m=sigma_m, zeros_rad=math.radians(zeros_deg))
+    report = CalibrationReport.of(found, source.name)
+    written = None
+    if out is not None:
+        heading = f"Calibrated by bodyschema from {report.pairs} pairs of {source.name}"
+        written = write_calibrated(description, found.geometry, out, heading)
+    if as_json:
+        sys.stdout.write(encode(report).decode() + "\n")
+        return
+    console = Console(highlight=False)
+    console.print(view(report))
+    if written is not None:
+        console.print(f"\n{written} written. Next: `bodyschema run --robot {written}`", markup=False, soft_wrap=True)
