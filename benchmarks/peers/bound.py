@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from benchmarks.peers.tasks import Trial
+from benchmarks.rough_arm import RoughArm
 from kbmaps.arrays import FloatArray
 
 _DRAWS = 64
@@ -22,11 +23,10 @@ def bounds(trial: Trial) -> dict[str, float]:
     if problem.tolerances is not None:
         std = parameters.standard_deviations(problem.tolerances)
     precision = np.eye(parameters.size)
-    tool = std.copy()
     if trial.before is not None and problem.tool_move is not None:
-        precision += _information(trial, trial.before.q, std)
+        precision += _information(arm, trial.before.q, std, problem.sigma)
         precision = _with_moved_tool(precision, parameters.tool, std, problem.tool_move)
-    precision += _information(trial, problem.q, tool)
+    precision += _information(arm, problem.q, std, problem.sigma)
     draws = np.linalg.solve(
         np.linalg.cholesky(precision).T, np.random.default_rng(0).normal(size=(parameters.size, _DRAWS))
     )
@@ -37,11 +37,10 @@ def bounds(trial: Trial) -> dict[str, float]:
     return shown
 
 
-def _information(trial: Trial, q: FloatArray, std: FloatArray) -> FloatArray:
+def _information(arm: RoughArm, q: FloatArray, std: FloatArray, sigma: float) -> FloatArray:
     """Precision of the parameters in units of their prior's standard deviations, from pairs at q."""
-    assert trial.arm is not None
-    _, jacobian = trial.arm.parameters.linearised(trial.arm.change, q)
-    design = (jacobian * std).reshape(3 * len(q), -1) / trial.problem.sigma
+    _, jacobian = arm.parameters.linearised(arm.change, q)
+    design = (jacobian * std).reshape(3 * len(q), -1) / sigma
     return design.T @ design
 
 
@@ -50,4 +49,4 @@ def _with_moved_tool(precision: FloatArray, tool: slice, std: FloatArray, move: 
     covariance = np.linalg.inv(precision)
     index = np.arange(len(precision))[tool]
     covariance[index, index] += move**2 / 3.0 / std[tool] ** 2
-    return np.linalg.inv(covariance)
+    return np.asarray(np.linalg.inv(covariance), dtype=np.float64)

@@ -19,7 +19,7 @@ from kbmaps import ChainParameters, ChainTolerances
 _REACH = math.radians(80.0)
 _SIGMA = 0.01
 _TOLERANCES = ChainTolerances(axes=math.radians(3.0), points=0.015, tool=0.03)
-_REPEATS = 3
+_REPEATS = 2
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Series:
 
 
 BY_JOINTS = (
-    Series("nlms", (2, 3, 4, 5, 6, 7, 8, 9, 10), lambda d: 64, lambda d: 3.0**d, "3ᵈ"),
+    Series("nlms", (2, 3, 4, 5, 6, 7, 8, 9, 10), lambda _: 64, lambda d: 3.0**d, "3ᵈ"),
     Series("train", (4, 6, 8, 10, 15, 20, 30), lambda d: 12 * d, lambda d: d**3.0, "n·(24d)² at n = 12 d: d³"),
     Series("rigid", (4, 6, 8, 10, 15, 20, 30), lambda d: 12 * d, lambda d: d**3.0, "n·(5d)² at n = 12 d: d³"),
 )

@@ -28,9 +28,7 @@ def styles(competitors: Sequence[Competitor]) -> dict[str, Style]:
     ours = [competitor.key for competitor in competitors if competitor.family == "ours"]
     peers = [competitor.key for competitor in competitors if competitor.family == "peer"]
     looks = {key: Style(_OURS[i % len(_OURS)]) for i, key in enumerate(ours)}
-    return looks | {
-        key: Style(_PEERS[i % len(_PEERS)], _DASHES[i % len(_DASHES)], 1.5) for i, key in enumerate(peers)
-    }
+    return looks | {key: Style(_PEERS[i % len(_PEERS)], _DASHES[i % len(_DASHES)], 1.5) for i, key in enumerate(peers)}
 
 
 def write_page(path: Path, results: Results, tasks: Sequence[Task], competitors: Sequence[Competitor]) -> None:
@@ -69,7 +67,7 @@ def goal(task: Task, results: Results, pairs: int, test: str) -> float | None:
     """The figure to reach [m], or 1.15 times the bound if that is larger."""
     bound = results.bound(task.key, pairs, test)
     figure = task.goals.get(pairs)
-    if figure is None or test == "drawn alike" and "extrapolated" in tests_of(task, results):
+    if figure is None or (test == "drawn alike" and "extrapolated" in tests_of(task, results)):
         return None
     return max(figure, _GOAL_FACTOR * bound) if bound is not None else figure
 
@@ -79,7 +77,7 @@ def _head(results: Results) -> str:
     return (
         "<header><h1>Learners of forward kinematics, side by side</h1>"
         "<p>Mean distance to the true position on poses that were not learnt [mm], against the number of pairs n. All "
-        "are given the same pairs; who needs poses of its own choosing (marked <i>own</i> below) gets as many readings. "
+        "are given the same pairs; who needs poses of its own choosing gets as many readings. "
         f"Means over up to {seeds} seeds with their standard errors. The grey floor is what the posterior of the right "
         "model with the right prior leaves: no learner can expect to do better. A diamond is a goal: the figure aimed "
         "at, or 1.15 times the floor where that is higher.</p></header>"
@@ -184,7 +182,10 @@ def _table(
 ) -> str:
     counts = counts_of(task, results)
     cells = {c.key: [cell(results.of(task.key, c.key, n), test) for n in counts] for c in competitors}
-    best = [min((row[i].mean for row in cells.values() if row[i].mean is not None), default=None) for i in range(len(counts))]
+    best = [
+        min((mean for row in cells.values() if (mean := row[i].mean) is not None), default=None)
+        for i in range(len(counts))
+    ]
     rows = []
     bounds = [results.bound(task.key, n, test) for n in counts]
     if any(bound is not None for bound in bounds):
@@ -210,7 +211,7 @@ def _table(
 
 def _entry(entry: Cell, best: float | None) -> str:
     failed = f'<small class="bad">{entry.failed}/{entry.ran} failed</small>' if entry.failed else ""
-    title = f' title="{escape(entry.reason, quote=True)}"' if entry.reason else ""
+    title = f' title="{escape(entry.reason or f"{entry.ran} seeds", quote=True)}"'
     if entry.mean is None:
         text = failed or '<span class="why">–</span>'
         return f"<td{title}>{text}"
@@ -239,7 +240,8 @@ def _runs(results: Results) -> str:
         for run in results.runs
     )
     head = "<thead><tr><th>When<th>Took<th>What<th>Machine<th>Versions</tr></thead>"
-    return f'<section id="runs"><h2>Runs</h2><div class="scroll"><table>{head}<tbody>{rows}</tbody></table></div></section>'
+    table = f'<div class="scroll"><table>{head}<tbody>{rows}</tbody></table></div>'
+    return f'<section id="runs"><h2>Runs</h2>{table}</section>'
 
 
 def _mm(metres: float | None) -> str:

@@ -85,7 +85,7 @@ class Competitor:
     family: Literal["ours", "peer"]
     learn: Learn
     about: str
-    refuses: Refusal = lambda problem: None
+    refuses: Refusal = lambda _: None
 
 
 @dataclass(frozen=True)

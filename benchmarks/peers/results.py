@@ -95,7 +95,9 @@ class Results:
 
     def forget(self, competitors: set[str]) -> None:
         """Drops what was measured of some competitors, to measure them again."""
-        self.outcomes = {key: outcome for key, outcome in self.outcomes.items() if outcome.competitor not in competitors}
+        self.outcomes = {
+            key: outcome for key, outcome in self.outcomes.items() if outcome.competitor not in competitors
+        }
         self.growth = [entry for entry in self.growth if entry.competitor not in competitors]
 
     def of(self, task: str, competitor: str, pairs: int) -> list[Outcome]:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from benchmarks.peers.problem import Measure, Problem
-from benchmarks.peers.truths import Affine, Arm, CameraEffect, Eccentric, GearGain, JointEffect, Radial, Sag
+from benchmarks.peers.truths import Affine, Arm, Eccentric, GearGain, Radial, Sag
 from benchmarks.rough_arm import ROUGH, RoughArm, rough_arm
 from benchmarks.tensor_train import random_chain
 from kbmaps import ChainParameters, ChainTolerances
@@ -17,6 +17,8 @@ from kbmaps.arrays import FloatArray
 
 COUNTS = (30, 100, 300, 1000, 3000)
 TEST_POSES = 500
+# Draws what is not rigid about an arm of so many joints.
+Effect = Callable[[int, np.random.Generator], Eccentric | GearGain | Sag | Affine | Radial | None]
 MILD = ChainTolerances(axes=math.radians(2.0), points=0.01, tool=0.03)
 HUMANOID_JOINTS = 7
 PAIRS_BEFORE = 600
@@ -76,7 +78,7 @@ class Setting:
     tolerances: ChainTolerances = ROUGH
     drawn: bool = True
     zone: float | None = None
-    effect: Callable[[int, np.random.Generator], JointEffect | CameraEffect | None] = lambda joints, rng: None
+    effect: Effect = lambda _joints, _rng: None
     tool_move: float | None = None
 
     def __call__(self, seed: int, pairs: int) -> Trial:
@@ -157,21 +159,24 @@ def _readings(arm: Arm, sigma: float, rng: np.random.Generator) -> Measure:
     return measure
 
 
-def _bent(effect: Callable[[int, np.random.Generator], JointEffect | CameraEffect | None]) -> Setting:
+def _bent(effect: Effect) -> Setting:
     return Setting(sigma=0.005, reach=60.0, tolerances=MILD, effect=effect)
 
 
 BENT: dict[str, tuple[str, Setting]] = {
-    "rigid": ("rigid, for comparison", _bent(lambda joints, rng: None)),
-    "sag1": ("gravity sag up to 1°", _bent(lambda joints, rng: Sag.on(joints, math.radians(1.0)))),
-    "sag3": ("gravity sag up to 3°", _bent(lambda joints, rng: Sag.on(joints, math.radians(3.0)))),
+    "rigid": ("rigid, for comparison", _bent(lambda _joints, _rng: None)),
+    "sag1": ("gravity sag up to 1°", _bent(lambda joints, _: Sag.on(joints, math.radians(1.0)))),
+    "sag3": ("gravity sag up to 3°", _bent(lambda joints, _: Sag.on(joints, math.radians(3.0)))),
     "eccentric": (
         "eccentric encoders, 1°",
         _bent(lambda joints, rng: Eccentric(math.radians(1.0), rng.uniform(-np.pi, np.pi, joints))),
     ),
-    "gain": ("gear gains off by 1 %", _bent(lambda joints, rng: GearGain(1.0 + 0.01 * rng.choice([-1.0, 1.0], joints)))),
-    "affine": ("camera affine, 2–3 %", _bent(lambda joints, rng: Affine.drawn(rng))),
-    "radial": ("camera radial, 2 %", _bent(lambda joints, rng: Radial(0.02, 0.5, np.array([0.0, -0.2, -0.3])))),
+    "gain": (
+        "gear gains off by 1 %",
+        _bent(lambda joints, rng: GearGain(1.0 + 0.01 * rng.choice([-1.0, 1.0], joints))),
+    ),
+    "affine": ("camera affine, 2–3 %", _bent(lambda _, rng: Affine.drawn(rng))),
+    "radial": ("camera radial, 2 %", _bent(lambda _joints, _rng: Radial(0.02, 0.5, np.array([0.0, -0.2, -0.3])))),
 }
 
 
@@ -211,7 +216,7 @@ def simulated_tasks() -> list[Task]:
             "Local zone of ±20°",
             Setting(zone=20.0),
             goals={300: 0.015},
-            note="6 joints, rough drawing, zone about a random centre; asked there and, extrapolated, over ±80°; σ 10 mm",
+            note="6 joints, rough drawing, zone about a random centre; asked there and, extrapolated, to ±80°; σ 10 mm",
         ),
     ]
     tasks += [

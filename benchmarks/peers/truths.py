@@ -121,7 +121,7 @@ class Sag:
 
     @classmethod
     def on(cls, joints: int, most: float, first: int = NECK_JOINTS) -> Sag:
-        return cls(most, 2.0 * 0.7 ** np.arange(joints - first), first)
+        return cls(most, 2.0 * np.power(0.7, np.arange(joints - first, dtype=np.float64)), first)
 
     def __call__(self, arm: Arm, q: FloatArray) -> FloatArray:
         poses = np.random.default_rng(0).uniform(-np.pi / 2, np.pi / 2, (_POSES, arm.joints))

@@ -74,6 +74,9 @@ COMPETITORS = (
         "peer",
         partial(learn, _rls, 1),
         "padasip FilterRLS on the features of the KB-Map, one pass; starts as padasip NLMS does.",
-        at_most(_MOST_JOINTS_RLS, "a covariance of 3^d x 3^d for each coordinate is too slow beyond 5 joints (0.1 s a pair at 6)"),
+        at_most(
+            _MOST_JOINTS_RLS,
+            "a covariance of 3^d x 3^d for each coordinate is too slow beyond 5 joints (0.1 s a pair at 6)",
+        ),
     ),
 )

@@ -7,6 +7,7 @@ frame, reduced to the identifiable ones by a pivoted QR of the regressor, then L
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.linalg import qr
@@ -61,19 +62,20 @@ def _left_jacobian(turn: FloatArray) -> FloatArray:
     if angle < 1e-6:
         return np.eye(3)
     axis = turn / angle
-    cross = np.cross(np.eye(3), -axis)
-    return (
-        np.eye(3) + (1.0 - np.cos(angle)) / angle * cross + (1.0 - np.sin(angle) / angle) * (cross @ cross)
-    )
+    cross = np.cross(np.eye(3), axis)
+    return np.eye(3) + (1.0 - np.cos(angle)) / angle * cross + (1.0 - np.sin(angle) / angle) * (cross @ cross)
 
 
 def identifiable(model: Placements, q: FloatArray) -> IntArray:
     """Indices of parameters that the poses tell apart (pivoted QR of the regressor at the present change)."""
     _, jacobian = model.linearised(model.change, q)
     flat = jacobian.reshape(3 * len(q), -1)
-    triangle, pivots = qr(flat, mode="r", pivoting=True)
+    # The stubs of scipy know neither what pivoting adds to the result, nor a function as jac below.
+    factors: Any = qr(flat, mode="r", pivoting=True)
+    triangle, pivots = factors
     diagonal = np.abs(np.diag(triangle))
-    return np.sort(pivots[: int((diagonal > _RANK_TOLERANCE * diagonal[0]).sum())])
+    rank = int((diagonal > _RANK_TOLERANCE * diagonal[0]).sum())
+    return np.sort(pivots[:rank]).astype(np.intp)
 
 
 def learn(problem: Problem, earlier: Fitted | None) -> Fitted:
@@ -92,10 +94,13 @@ def learn(problem: Problem, earlier: Fitted | None) -> Fitted:
         change[free] = values
         return change
 
+    def derivatives(values: FloatArray) -> FloatArray:
+        return start.linearised(with_free(values), problem.q)[1][:, :, free].reshape(-1, len(free))
+
     fit = least_squares(
         lambda values: (start.linearised(with_free(values), problem.q)[0] - problem.x).ravel(),
         start.change[free],
-        jac=lambda values: start.linearised(with_free(values), problem.q)[1][:, :, free].reshape(-1, len(free)),
+        jac=derivatives,  # pyright: ignore[reportArgumentType]
         method="lm",
         x_scale="jac",
         max_nfev=_MOST_EVALUATIONS,

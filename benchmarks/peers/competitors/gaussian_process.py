@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from sklearn.exceptions import ConvergenceWarning
@@ -15,6 +16,8 @@ from kbmaps.arrays import FloatArray
 
 # Marginal likelihoods cost n³ each, so the kernel is found on so many pairs and then used on all.
 _PAIRS_FOR_KERNEL = 200
+# Of the working range scaled to -1 .. 1.
+_FIRST_SCALE = 1.5
 
 
 @dataclass(frozen=True)
@@ -25,7 +28,8 @@ class _Regression:
     problem: Problem
 
     def predict(self, q: FloatArray) -> FloatArray:
-        return self.offset.predict(q) + self.scale * np.asarray(self.process.predict(self.problem.scaled(q)))
+        predicted: Any = self.process.predict(self.problem.scaled(q))
+        return self.offset.predict(q) + self.scale * predicted
 
 
 def learn(problem: Problem, earlier: Fitted | None) -> Fitted:
@@ -33,13 +37,16 @@ def learn(problem: Problem, earlier: Fitted | None) -> Fitted:
     rest = problem.x - offset.predict(problem.q)
     scale = max(float(rest.std()), 1e-9)
     q, y = problem.scaled(problem.q), rest / scale
-    start = ConstantKernel(1.0) * RBF(np.full(problem.joints, 1.5), (0.1, 100.0)) + WhiteKernel(0.05, (1e-8, 2.0))
+    scales: Any = np.full(problem.joints, _FIRST_SCALE)
+    start = ConstantKernel(1.0) * RBF(scales, (0.1, 100.0)) + WhiteKernel(0.05, (1e-8, 2.0))
     few = slice(0, _PAIRS_FOR_KERNEL)
     with warnings.catch_warnings():
         # A length scale at its limit is an answer here: that joint does not matter.
         warnings.simplefilter("ignore", ConvergenceWarning)
         kernel = GaussianProcessRegressor(start).fit(q[few], y[few]).kernel_
-    return _Regression(offset, scale, GaussianProcessRegressor(kernel, optimizer=None).fit(q, y), problem)
+    # The stubs of scikit-learn leave out that None means: keep the kernel as it is.
+    process = GaussianProcessRegressor(kernel, optimizer=None)  # pyright: ignore[reportArgumentType]
+    return _Regression(offset, scale, process.fit(q, y), problem)
 
 
 COMPETITOR = Competitor(

@@ -17,6 +17,8 @@ from kbmaps.arrays import FloatArray, IntArray
 
 _SLIGHT = 1e-3
 _TINY = 1e-10
+_MOST_LEVERAGE = 0.9
+_LARGEST_STEP = 0.1
 # The paper: a few projections do, whatever the number of inputs.
 _MOST_PROJECTIONS = 4
 
@@ -36,7 +38,7 @@ class Settings:
 
     first_metric: float = 10.0
     generate: float = 0.1
-    learning_rate: float = 50.0
+    learning_rate: float = 30.0
     penalty: float = 1e-6
     forgetting: float = 0.995
     last_forgetting: float = 0.9999
@@ -59,7 +61,7 @@ class LWPR:
         self.weight, self.seen, self.used = np.empty(0), np.empty(0), np.empty(0, dtype=np.intp)
         self.u, self.sz = np.empty((0, r, d)), np.empty((0, r, d))
         self.ss, self.sr, self.mse = np.empty((0, r)), np.empty((0, r)), np.empty((0, r + 1))
-        self.h, self.r2 = np.empty((0, r)), np.empty((0, r))
+        self.h, self.r2 = np.empty((0, r + 1)), np.empty((0, r + 1))
         self.cv, self.forgetting = np.empty(0), np.empty(0)
 
     @property
@@ -119,7 +121,7 @@ class LWPR:
         fresh: dict[str, object] = {
             "output": output, "centre": x, "root": root, "mean_x": x, "mean_y": y, "weight": _TINY, "seen": 0.0,
             "used": min(2, r), "u": np.zeros((r, d)), "sz": np.zeros((r, d)), "ss": np.zeros(r), "sr": np.zeros(r),
-            "mse": np.zeros(r + 1), "h": np.zeros(r), "r2": np.zeros(r), "cv": 0.0,
+            "mse": np.zeros(r + 1), "h": np.zeros(r + 1), "r2": np.zeros(r + 1), "cv": 0.0,
             "forgetting": self.settings.forgetting,
         }  # fmt: skip
         for name, value in fresh.items():
@@ -169,15 +171,19 @@ class LWPR:
         self, at: IntArray, w: FloatArray, x: FloatArray, error: FloatArray, s: FloatArray, keep: FloatArray
     ) -> None:
         """One step down the gradient of J = Σ w e²/(1 − h)² / W + γ/d Σ D², with respect to the Cholesky root of D."""
-        ready = self.seen[at] > self.settings.trusted_pairs * self.inputs
-        share = s / np.maximum(self.ss[at], _TINY)
-        share[self.ss[at] < _TINY] = 0.0
-        h = np.clip(w * (s * share).sum(axis=1), 0.0, 0.99)
-        loo = error / (1.0 - h)
+        # In units of full activation, so that a few pairs at a field's fringe do not move it.
+        ready = self.weight[at] > self.settings.trusted_pairs * self.inputs
+        # The mean counts as one more regression, on a constant.
+        s = np.concatenate([np.ones((len(at), 1)), s], axis=1)
         total = self.weight[at]
-        # dJ/dw: the weight's own share, what the slopes do to all earlier errors, and to their leverages.
+        squares = np.concatenate([total[:, None], self.ss[at]], axis=1)
+        share = np.where(squares > _TINY, s / np.maximum(squares, _TINY), 0.0)
+        leverage = (s * share).sum(axis=1)
+        h = np.clip(w * leverage, 0.0, _MOST_LEVERAGE)
+        loo = error / (1.0 - h)
+        # dJ/dw: the pair's own share and leverage, what the slopes do to all earlier errors and to their leverages.
         by_weight = (
-            loo**2
+            loo**2 * (1.0 + 2.0 * w * leverage / (1.0 - h))
             - 2.0 * error * (share * self.h[at]).sum(axis=1)
             - 2.0 * (share**2 * self.r2[at]).sum(axis=1)
             - self.cv[at] / total
@@ -191,11 +197,11 @@ class LWPR:
         slope = -(by_weight * w)[:, None, None] * (root @ off[:, :, None]) * off[:, None, :]
         slope += (self.settings.penalty / self.inputs * w / total)[:, None, None] * 4.0 * (root @ metric)
         step = self.settings.learning_rate * np.triu(slope)
-        # A step never changes a root by more than a tenth of itself (the paper's safeguard against overshooting).
         # While its leave-one-out error is far above its training error a field knows too little to move.
         settled = (self.mse[at, self.used[at]] / np.maximum(self.cv[at], _TINY)) ** 4
         step *= np.minimum(settled, 1.0)[:, None, None]
-        size, limit = np.abs(step).max(axis=(1, 2)), 0.1 * np.abs(root).max(axis=(1, 2))
+        # A single pair never changes a root by more than a share of itself.
+        size, limit = np.abs(step).max(axis=(1, 2)), _LARGEST_STEP * np.abs(root).max(axis=(1, 2))
         step *= np.minimum(1.0, limit / np.maximum(size, _TINY))[:, None, None]
         self.root[at] -= np.where((ready & np.isfinite(size))[:, None, None], step, 0.0)
 
@@ -252,6 +258,6 @@ COMPETITOR = Competitor(
     learn,
     "Locally weighted projection regression, own implementation after Vijayakumar, D'Souza and Schaal 2005 "
     "(projections by incremental partial least squares, fields added where none is active, widths by the gradient of "
-    "the leave-one-out error); first width chosen on a fifth held out, 1,500 updates (or one pass, if that is more) in passes over the pairs; learns "
-    "the errors of the drawing, or of its own model before a tool change.",
+    "the leave-one-out error); first width chosen on a fifth held out, 1,500 updates (or one pass, if that is more) in "
+    "passes over the pairs; learns the errors of the drawing, or of its own model before a tool change.",
 )

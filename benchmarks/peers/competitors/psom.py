@@ -65,7 +65,7 @@ def lagrange(angles: FloatArray, nodes: FloatArray) -> FloatArray:
 
 def nodes_for(joints: int, readings: int) -> tuple[int, ...] | None:
     """Nodes a joint for at most `readings` poses, the first joints (longest levers) get one more where it fits."""
-    count = int(math.floor(readings ** (1.0 / joints) + 1e-9))
+    count = math.floor(readings ** (1.0 / joints) + 1e-9)
     if count < 1 or readings < 2**joints:
         return None
     nodes = [count] * joints
@@ -123,9 +123,10 @@ def roughness(nodes: Sequence[int]) -> FloatArray:
 
 def chebyshev_polynomials(nodes: Sequence[int]) -> FloatArray:
     """All products of Chebyshev polynomials of the grid's degrees, at the grid's poses (size, size)."""
-    out = np.ones((1, 1))
+    out: FloatArray = np.ones((1, 1))
     for count in nodes:
-        out = np.kron(out, np.cos(np.arange(count) * np.arccos(chebyshev(count))[:, None]))
+        values = np.cos(np.arange(count) * np.arccos(chebyshev(count))[:, None])
+        out = np.asarray(np.kron(out, values), dtype=np.float64)
     return out
 
 
@@ -133,8 +134,10 @@ def ridge(design: FloatArray, x: FloatArray, penalties: FloatArray) -> FloatArra
     """Coefficients that minimise the squared error plus Σ penalty · coefficient²."""
     if len(design) < design.shape[1]:
         scaled = design / penalties
-        return scaled.T @ np.linalg.solve(scaled @ design.T + np.eye(len(design)), x)
-    return np.linalg.solve(design.T @ design + np.diag(penalties), design.T @ x)
+        coefficients = scaled.T @ np.linalg.solve(scaled @ design.T + np.eye(len(design)), x)
+    else:
+        coefficients = np.linalg.solve(design.T @ design + np.diag(penalties), design.T @ x)
+    return np.asarray(coefficients, dtype=np.float64)
 
 
 def _held_out_error(design: FloatArray, x: FloatArray, penalties: FloatArray) -> float:
@@ -155,9 +158,11 @@ COMPETITORS = (
         "of the working range; n readings at poses of its own choosing.",
         any_of(
             needs_measuring,
-            lambda problem: None
-            if nodes_for(problem.joints, problem.pairs)
-            else f"a grid of 2 poses a joint takes 2^{problem.joints} = {2**problem.joints} readings",
+            lambda problem: (
+                None
+                if nodes_for(problem.joints, problem.pairs)
+                else f"a grid of 2 poses a joint takes 2^{problem.joints} = {2**problem.joints} readings"
+            ),
         ),
     ),
     Competitor(

@@ -1,7 +1,7 @@
 """Decomposition into virtual robots (Ruiz de Angulo and Torras 2005, IEEE Trans. Neural Networks 16; 2008, SMC-B 38).
 
-The arm is cut behind its first half of joints. With q = (a, b), reference poses a0 and b0, and T(a) the pose of the hand
-while the last joints rest at b0, every position follows from two much shorter arms:
+The arm is cut behind its first half of joints. With q = (a, b), reference poses a0 and b0, and T(a) the pose of the
+hand while the last joints rest at b0, every position follows from two much shorter arms:
 
     x(a, b) = T(a) T(a0)⁻¹ x(a0, b)
 
@@ -131,8 +131,8 @@ COMPETITORS = (
         "Virtual robots, PSOM",
         "peer",
         partial(learn, psom_part),
-        "Decomposition into two virtual robots (Ruiz de Angulo and Torras 2005, 2008), each a PSOM on its own grid; the "
-        "first reads three markers a pose (three readings), so it is told orientations; poses of its own choosing.",
+        "Decomposition into two virtual robots (Ruiz de Angulo and Torras 2005, 2008), each a PSOM on its own grid; "
+        "the first reads three markers a pose (three readings), so it is told orientations; poses of its own choosing.",
         any_of(needs_measuring, _too_few_for_grids),
     ),
     Competitor(
