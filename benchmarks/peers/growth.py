@@ -7,6 +7,7 @@ import time
 import tracemalloc
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -22,53 +23,61 @@ _TOLERANCES = ChainTolerances(axes=math.radians(3.0), points=0.015, tool=0.03)
 _REPEATS = 2
 
 
+Law = Callable[[float], float]
+
+
 @dataclass(frozen=True)
 class Series:
-    """A learner, the sizes it is measured at, and the law that theory gives, up to a factor."""
+    """A learner that grows with the joints, or with the pairs, and the laws that theory gives, up to a factor."""
 
+    what: Literal["joints", "pairs"]
     competitor: str
-    joints: Sequence[int]
-    pairs_for: Callable[[int], int]
-    law: Callable[[float], float]
-    law_text: str
+    sizes: Sequence[int]
+    time: Law
+    memory: Law
+    text: str
 
 
-BY_JOINTS = (
-    Series("nlms", (2, 3, 4, 5, 6, 7, 8, 9, 10), lambda _: 64, lambda d: 3.0**d, "3ᵈ"),
-    Series("train", (4, 6, 8, 10, 15, 20, 30), lambda d: 12 * d, lambda d: d**3.0, "n·(24d)² at n = 12 d: d³"),
-    Series("rigid", (4, 6, 8, 10, 15, 20, 30), lambda d: 12 * d, lambda d: d**3.0, "n·(5d)² at n = 12 d: d³"),
-)
-BY_PAIRS = {
-    "nlms": (lambda n: n, "n"),
-    "train": (lambda n: n, "n"),
-    "rigid": (lambda n: n, "n"),
-    "gp": (lambda n: n**3.0, "n³"),
-}
-PAIR_COUNTS = (100, 300, 1000, 3000)
+_JOINTS = (4, 6, 8, 10, 15, 20, 30)
+_PAIRS = (100, 300, 1000, 3000)
+_PAIRS_FULL_MAP, _PAIRS_A_JOINT = 64, 12
 _JOINTS_BY_PAIRS = 6
+SERIES = (
+    Series("joints", "nlms", range(2, 11), lambda d: 3.0**d, lambda d: 3.0**d, "3ᵈ and 3ᵈ"),
+    Series("joints", "train", _JOINTS, lambda d: d**3, lambda d: d**2, "n (24 d)² and 36 n d, so d³ and d²"),
+    Series("joints", "rigid", _JOINTS, lambda d: d**3, lambda d: d**2, "n (5 d)² and 15 n d, so d³ and d²"),
+    Series("pairs", "nlms", _PAIRS, lambda n: n, lambda _: 1.0, "n and constant"),
+    Series("pairs", "train", _PAIRS, lambda n: n, lambda n: n, "n and n"),
+    Series("pairs", "rigid", _PAIRS, lambda n: n, lambda n: n, "n and n"),
+    Series("pairs", "gp", _PAIRS, lambda n: n**3, lambda n: n**2, "n³ and n²"),
+)
 
 
-def measure(deadline: Callable[[], bool]) -> list[Growth]:
-    """One entry a size; stops early when `deadline()` says so."""
-    entries: list[Growth] = []
-    for series in BY_JOINTS:
-        for joints in series.joints:
+def measure(known: Sequence[Growth], deadline: Callable[[], bool]) -> list[Growth]:
+    """What is known and what is missing of it, one entry a size; stops early when `deadline()` says so."""
+    entries = list(known)
+    measured = {(entry.what, entry.competitor, entry.size) for entry in known}
+    for series in SERIES:
+        for size in series.sizes:
+            if (series.what, series.competitor, size) in measured:
+                continue
             if deadline():
                 return entries
-            seconds, mebibytes = _cost(series.competitor, joints, series.pairs_for(joints))
-            entries.append(Growth("joints", series.competitor, joints, seconds, mebibytes))
-    for competitor in BY_PAIRS:
-        for pairs in PAIR_COUNTS:
-            if deadline():
-                return entries
-            entries.append(Growth("pairs", competitor, pairs, *_cost(competitor, _JOINTS_BY_PAIRS, pairs)))
+            entries.append(Growth(series.what, series.competitor, size, *_cost(series, size)))
     return entries
 
 
-def _cost(competitor: str, joints: int, pairs: int) -> tuple[float, float]:
+def _shape(series: Series, size: int) -> tuple[int, int]:
+    """Joints and pairs."""
+    if series.what == "pairs":
+        return _JOINTS_BY_PAIRS, size
+    return size, _PAIRS_FULL_MAP if series.competitor == "nlms" else _PAIRS_A_JOINT * size
+
+
+def _cost(series: Series, size: int) -> tuple[float, float]:
     """Time to learn [s], best of several, and the most memory that it holds at once [MiB]."""
-    problem = _problem(joints, pairs)
-    learn = BY_KEY[competitor].learn
+    problem = _problem(*_shape(series, size))
+    learn = BY_KEY[series.competitor].learn
     best = math.inf
     for _ in range(_REPEATS):
         begin = time.perf_counter()

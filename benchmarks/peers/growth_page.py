@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from benchmarks.peers.chart import Chart, Line, Style
-from benchmarks.peers.growth import BY_JOINTS, BY_PAIRS
+from benchmarks.peers.growth import SERIES, Law
 from benchmarks.peers.problem import Competitor
 from benchmarks.peers.results import Growth, Results
 
+_ROOM_BELOW = 0.7
 _LABELS = {"joints": "joints d", "pairs": "pairs n"}
 
 
@@ -23,11 +24,14 @@ def growth_section(results: Results, competitors: Sequence[Competitor], looks: d
             chart = _chart(what, label, value, results, titles, looks)
             if chart.lines:
                 figures.append(f"<figure>{chart.svg()}</figure>")
-    laws = "; ".join(f"{titles[series.competitor]}: {series.law_text}" for series in BY_JOINTS)
-    by_pairs = "; ".join(f"{titles[key]}: {text}" for key, (_, text) in BY_PAIRS.items())
+    by_joints, by_pairs = (
+        "; ".join(f"{titles[series.competitor]}: {series.text}" for series in SERIES if series.what == what)
+        for what in ("joints", "pairs")
+    )
     return (
-        '<section id="growth"><h2>Growth</h2><p>Dotted: the slope of theory through the largest size. Against joints: '
-        f"{laws} (the full map with 64 pairs, to 10 joints; the others to 30). Against pairs, 6 joints: {by_pairs}.</p>"
+        '<section id="growth"><h2>Growth</h2><p>Dotted: the slope of theory, of time and of memory, through the '
+        f"largest size. Against joints: {by_joints}; the full map with 64 pairs, the others with 12 d. Against pairs, "
+        f"6 joints: {by_pairs}.</p>"
         f'<div class="panels">{"".join(figures)}</div></section>'
     )
 
@@ -50,20 +54,20 @@ def _chart(
 ) -> Chart:
     lines: list[Line] = []
     laws: list[Line] = []
-    for key in dict.fromkeys(entry.competitor for entry in results.growth if entry.what == what):
-        entries = [entry for entry in results.growth if entry.what == what and entry.competitor == key]
-        points = [(float(entry.size), value(entry)) for entry in entries]
+    for series in SERIES:
+        entries = [e for e in results.growth if (e.what, e.competitor) == (series.what, series.competitor)]
+        if series.what != what or not entries:
+            continue
+        key = series.competitor
+        points = sorted((float(entry.size), value(entry)) for entry in entries)
         lines.append(Line(key, titles[key], looks[key], points))
-        if value is _seconds:
-            law = _law(what, key)
-            size, largest = points[-1]
-            slope = [(x, largest * law(x) / law(size)) for x, _ in points]
-            lowest = min(y for _, y in points)
-            laws.append(Line(key, titles[key], looks[key], [point for point in slope if point[1] > 0.3 * lowest]))
+        slope = _slope(series.time if value is _seconds else series.memory, points)
+        laws.append(Line(key, titles[key], looks[key], slope))
     return Chart(_LABELS[what], label, lines, laws=laws)
 
 
-def _law(what: str, key: str) -> Callable[[float], float]:
-    if what == "pairs":
-        return BY_PAIRS[key][0]
-    return next(series.law for series in BY_JOINTS if series.competitor == key)
+def _slope(law: Law, points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
+    """The law through the largest size, as far down as the chart goes."""
+    size, largest = points[-1]
+    lowest = min(y for _, y in points)
+    return [(x, y) for x, _ in points if (y := largest * law(x) / law(size)) > _ROOM_BELOW * lowest]
