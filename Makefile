@@ -5,7 +5,9 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: help setup demo test check soak bench lock wheel clean
+PEERS_BUDGET_S ?= 240
+
+.PHONY: help setup demo test check soak bench peers lock wheel clean
 
 help:           ## Show this list
 	@grep -E '^[a-z]+: .*##|^[a-z]+:  *##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 10
@@ -37,10 +39,14 @@ soak: setup     ## The long tests: many seeds, many kills
 
 bench: setup    ## Side-by-side figures, as ratios within one run
 	@set -e; for file in benchmarks/[a-z]*.py; do echo; echo "== $$file"; $(BIN)/python $$file; done
+	@$(MAKE) --no-print-directory peers
+
+peers: setup    ## Our learners beside others on one page, peers.html; goes on where the last run stopped
+	@$(BIN)/python -m benchmarks.peers --budget-s $(PEERS_BUDGET_S)
 
 lock:           ## Renew requirements.lock from pyproject.toml
 	@$(BIN)/python -m pip install --disable-pip-version-check --quiet uv
-	@$(BIN)/uv pip compile --quiet --upgrade --python-version 3.11 --extra sim --extra export --extra dev \
+	@$(BIN)/uv pip compile --quiet --upgrade --python-version 3.11 --extra sim --extra export --extra bench --extra dev \
 		--generate-hashes --no-emit-index-url --no-annotate --no-header pyproject.toml -o requirements.lock
 
 wheel: setup    ## Build the wheel into dist/

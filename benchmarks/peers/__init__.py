@@ -1,0 +1,1 @@
+"""Our learners beside those of others: same arms, same pairs, same split, one page."""

@@ -1,0 +1,138 @@
+"""Runs go on where they stopped, and the page shows all that was run."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from benchmarks.peers.bound import bounds
+from benchmarks.peers.page import write_page
+from benchmarks.peers.problem import Competitor, Fitted, Problem, drawn
+from benchmarks.peers.registry import BY_KEY, COMPETITORS
+from benchmarks.peers.results import Growth, Outcome, Results, cell, machine
+from benchmarks.peers.runner import Plan, run
+from benchmarks.peers.tasks import Setting, Task, simulated_tasks
+
+TASK = Task("tiny", "A tiny task", Setting(joints=4), counts=(30,))
+
+
+def plan(competitors: list[Competitor], **changes: object) -> Plan:
+    return replace(Plan([TASK], competitors, 2, float("inf"), 20.0, 300), **changes)
+
+
+def run_quietly(a_plan: Plan, results: Results) -> bool:
+    return run(a_plan, results, lambda job, outcomes: None)
+
+
+def loop_for_ever(problem: Problem, earlier: Fitted | None) -> Fitted:
+    del problem, earlier
+    while True:
+        pass
+
+
+def diverge(problem: Problem, earlier: Fitted | None) -> Fitted:
+    del earlier
+    assert problem.drawing is not None
+    return drawn(problem.drawing.with_tool([1e6, 0.0, 0.0]))
+
+
+def test_a_run_is_taken_up_where_it_stopped(tmp_path):
+    path, results = tmp_path / "peers.json", Results()
+    run_quietly(plan([BY_KEY["drawing"]]), results)
+    results.save(path)
+    again = Results.load(path)
+    assert again.outcomes == results.outcomes
+    assert again.bounds == results.bounds
+    never = replace(BY_KEY["drawing"], learn=loop_for_ever)
+    assert run_quietly(plan([never]), again)
+    assert again.outcomes == results.outcomes
+
+
+def test_nothing_is_begun_after_the_deadline():
+    results = Results()
+    assert not run_quietly(plan([BY_KEY["drawing"]], deadline_s=0.0), results)
+    assert not results.outcomes
+
+
+def test_a_fit_that_takes_too_long_is_given_up_and_no_larger_one_is_tried():
+    results = Results()
+    slow = Competitor("slow", "Slow", "peer", loop_for_ever, "")
+    run_quietly(plan([slow], fit_limit_s=0.05), results)
+    assert {outcome.status for outcome in results.outcomes.values()} == {"too slow"}
+
+
+def test_a_divergence_counts_as_a_failure():
+    results = Results()
+    run_quietly(plan([Competitor("wild", "Wild", "peer", diverge, "")]), results)
+    summary = cell(results.of("tiny", "wild", 30), "drawn alike")
+    assert summary.mean is None
+    assert summary.failed == 2
+    assert "diverged" in summary.reason
+
+
+def test_the_mean_and_its_standard_error_are_over_the_seeds_that_came_to_an_end():
+    values = [0.01, 0.02, 0.03]
+    outcomes = [Outcome("t", "c", 30, seed, "ok", {"x": value}) for seed, value in enumerate(values)]
+    summary = cell([*outcomes, Outcome("t", "c", 30, 3, "failed", reason="NaN")], "x")
+    assert summary.mean == pytest.approx(0.02)
+    assert summary.standard_error == pytest.approx(0.01 / np.sqrt(3.0))
+    assert (summary.ran, summary.failed) == (4, 1)
+
+
+def test_the_bound_is_what_the_right_model_reaches():
+    errors, floors = [], []
+    for seed in range(25):
+        trial = Setting(joints=4)(seed, 100)
+        q, x = trial.tests["drawn alike"]
+        fitted = BY_KEY["rigid"].learn(trial.problem, None)
+        errors.append(np.linalg.norm(fitted.predict(q) - x, axis=1).mean())
+        floors.append(bounds(trial)["drawn alike"])
+    assert np.mean(errors) == pytest.approx(np.mean(floors), rel=0.15)
+
+
+def test_no_bound_is_given_where_the_right_model_is_no_rigid_chain():
+    bent = next(task for task in simulated_tasks() if task.key == "sag1").trial(0, 30)
+    assert bent is not None
+    assert bounds(bent) == {}
+
+
+@pytest.fixture
+def page(tmp_path) -> str:
+    results = Results(runs=[machine() | {"when": "now", "seconds": 1, "arguments": "a test"}])
+    for task in simulated_tasks():
+        for competitor in COMPETITORS:
+            for pairs, error in ((30, 0.02), (100, 0.01)):
+                outcome = Outcome(task.key, competitor.key, pairs, 0, "ok", {"drawn alike": error}, 0.1, 1.0)
+                results.outcomes[outcome.key] = outcome
+        results.bounds[task.key, 30, 0, "drawn alike"] = 0.015
+    results.growth = [Growth("joints", "nlms", d, 1e-4 * 3**d, 0.1) for d in (2, 3, 4)]
+    write_page(tmp_path / "peers.html", results, simulated_tasks(), COMPETITORS)
+    return (tmp_path / "peers.html").read_text()
+
+
+def test_the_page_has_every_task_with_a_chart(page):
+    sections = {
+        key: page.split(f'<section id="{key}">')[1].split("</section>")[0] for key in (t.key for t in simulated_tasks())
+    }
+    assert all("<polyline" in section for section in sections.values())
+
+
+def test_the_page_names_every_competitor_and_what_it_is(page):
+    assert all(f"<code>{competitor.key}</code>" in page for competitor in COMPETITORS)
+
+
+def test_the_page_says_that_recordings_were_not_run(page):
+    assert "no folder given" in page
+
+
+def test_the_page_needs_nothing_from_elsewhere(page):
+    assert not re.search(r"""\ssrc\s*=|href\s*=\s*["'](?!#)|https?:|@import|url\(""", page)
+
+
+def test_a_competitor_has_one_colour_in_all_charts(page):
+    colours = re.findall(r'<g data-model="rigid"><title>[^<]*</title><polyline fill="none" stroke="(#\w+)"', page)
+    assert len(colours) >= len(simulated_tasks())
+    assert len(set(colours)) == 1
