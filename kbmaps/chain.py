@@ -82,6 +82,16 @@ class RigidChain:
         """
         return self.poses(q)[..., :3, 3]
 
+    def frames(self, q: ArrayLike) -> FloatArray:
+        """Poses in the measurement frame of joints 1..d before they move and of the marker: (d+1, 4, 4) for q (d,).
+
+        For q (n, d): (n, d+1, 4, 4).
+
+        Raises:
+            ShapeError, NonFiniteError
+        """
+        return np.stack(self._frames(rows_or_vector("q", q, self.joints)), axis=-3)
+
     def jacobian(self, q: ArrayLike) -> FloatArray:
         """Derivative (3, d) of the position [m/rad, or m/m], or (n, 3, d) for q (n, d).
 

@@ -1,0 +1,232 @@
+"""Linear Gaussian models whose weights come in groups: how probable the data are, and which groups they pay for."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import cast
+
+import numpy as np
+
+from kbmaps.arrays import FloatArray, IntArray
+
+# What a group's variance is tried at, over the variance at which its best seen direction would just show.
+_TRIED = 10.0 ** np.arange(0.0, 7.0, 0.5)
+# Nats of evidence that a group must be worth to be taken up or kept: odds of e³.
+GAIN = 3.0
+_ROUNDS = 40
+_SETTLED = 0.02
+# A group's variance is kept within these factors of where it was found.
+_LEAST_VARIANCE = 1e-24
+
+
+@dataclass(frozen=True, eq=False)
+class Moments:
+    """Sums over N whitened rows (a, t) of a linear model t = a·w + noise.
+
+    Attributes:
+        gram: Σ a aᵀ (P, P).
+        product: Σ a t (P,).
+        square: Σ t².
+        count: N.
+    """
+
+    gram: FloatArray
+    product: FloatArray
+    square: float
+    count: int
+
+    @classmethod
+    def of(cls, design: FloatArray, target: FloatArray) -> Moments:
+        """Of rows (N, P) and targets (N,)."""
+        return cls(design.T @ design, design.T @ target, float(target @ target), len(target))
+
+    def minus(self, other: Moments) -> Moments:
+        """The moments without the rows of `other`."""
+        return Moments(
+            self.gram - other.gram, self.product - other.product, self.square - other.square, self.count - other.count
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Posterior:
+    """Weights of the active columns given the data.
+
+    Attributes:
+        mean: (A,).
+        spread: W (A, A) with the covariance W Wᵀ.
+        square: whitened squared residuals.
+        log_evidence: log marginal likelihood up to a constant of the rows.
+        used: how many weights the data determine, by group.
+    """
+
+    mean: FloatArray
+    spread: FloatArray
+    square: float
+    log_evidence: float
+    used: dict[str, float]
+
+
+class GroupedModel:
+    """Weights N(centre, variance of their group), rows with noise of one variance.
+
+    The group of the name "" is always active; its variance is 1 and its prior mean `centre`. The others' prior means
+    are 0 and their variances are found: groups that the evidence (MacKay 1992) does not pay for are left out.
+
+    Args:
+        moments: over the columns of all groups.
+        columns: where each group's columns are.
+        centre: prior mean of the weights of the group "".
+        least_noise: the noise is no smaller [rows' unit].
+        noise: where it starts.
+        blocks: of runs of neighbouring rows, if a group must also better the prediction of each run from the others.
+    """
+
+    def __init__(
+        self,
+        moments: Moments,
+        columns: Mapping[str, slice],
+        centre: FloatArray,
+        *,
+        least_noise: float,
+        noise: float,
+        blocks: Sequence[Moments] = (),
+    ) -> None:
+        self._moments, self._columns = moments, columns
+        self._blocks = blocks
+        self._centre = centre
+        self._least_noise = least_noise
+        self.noise = noise
+        self.variances: dict[str, float] = {}
+
+    def posterior(self, moments: Moments | None = None, without: str | None = None) -> Posterior:
+        """Of the active groups, for other moments or without a group if so told."""
+        active = {name: value for name, value in self.variances.items() if name != without}
+        moments = self._moments if moments is None else moments
+        index = self.index(active)
+        variance = self._variance(active)
+        precision = 1.0 / self.noise**2
+        centre = np.zeros(len(index))
+        centre[: len(self._centre)] = self._centre
+        hessian = moments.gram[np.ix_(index, index)] * precision
+        slope = moments.product[index] * precision + centre / variance
+        root = np.sqrt(variance)
+        scaled = hessian * root[:, None] * root + np.eye(len(index))
+        lower = cast(FloatArray, np.linalg.cholesky(scaled))
+        spread = root[:, None] * cast(FloatArray, np.linalg.inv(lower)).T
+        mean = spread @ (spread.T @ slope)
+        product = moments.product[index]
+        square = moments.square - 2.0 * float(mean @ product) + float(mean @ (hessian @ mean)) / precision
+        square = max(square, 0.0)
+        offset = mean - centre
+        evidence = -0.5 * (square * precision + float(offset @ (offset / variance)))
+        evidence -= float(np.log(np.diag(lower)).sum()) + moments.count * math.log(self.noise)
+        shrunk = np.square(spread).sum(axis=1) / variance
+        return Posterior(mean, spread, square, evidence, self._used(active, 1.0 - shrunk))
+
+    def index(self, groups: Mapping[str, float] | None = None) -> IntArray:
+        """The columns of the active groups, in the order of the posterior's weights."""
+        names = ["", *(self.variances if groups is None else groups)]
+        return np.concatenate([np.arange(self._columns[n].start, self._columns[n].stop) for n in names])
+
+    def select(self, candidates: tuple[str, ...]) -> None:
+        """Takes up groups while the evidence gains by more than `GAIN`, then leaves those that it does not need."""
+        self.settle()
+        refused: set[str] = set()
+        while True:
+            gains = {g: self._gain(g) for g in candidates if g not in self.variances and g not in refused}
+            best = max(gains, key=lambda g: gains[g][0], default=None)
+            if best is None or gains[best][0] < GAIN:
+                break
+            self._try(best, gains[best][1])
+            refused.add(best)
+        while self._leave_the_least_needed():
+            self.settle()
+
+    def settle(self) -> None:
+        """The noise and the groups' variances that make the data most probable, by MacKay's fixed point."""
+        for _ in range(_ROUNDS):
+            posterior = self.posterior()
+            used = sum(posterior.used.values())
+            noise = max(math.sqrt(posterior.square / max(self._moments.count - used, 1.0)), self._least_noise)
+            change = abs(math.log(noise / self.noise))
+            self.noise = noise
+            start = len(self._centre)
+            for name, old in self.variances.items():
+                width = self._columns[name].stop - self._columns[name].start
+                weights = posterior.mean[start : start + width]
+                start += width
+                new = max(float(weights @ weights) / max(posterior.used[name], 1e-9), _LEAST_VARIANCE)
+                change = max(change, 0.5 * abs(math.log(new / old)))
+                self.variances[name] = new
+            if change < _SETTLED:
+                return
+
+    def _try(self, group: str, variance: float) -> None:
+        """Takes up a group unless left-out blocks speak against it."""
+        before, errors = (dict(self.variances), self.noise), self._left_out_errors()
+        self.variances[group] = variance
+        self.settle()
+        if self._blocks:
+            gains = errors - self._left_out_errors()
+            if gains.mean() <= gains.std(ddof=1) / math.sqrt(len(gains)):
+                self.variances, self.noise = before
+
+    def _left_out_errors(self) -> FloatArray:
+        """Squared error of each block, predicted from all others."""
+        index = self.index()
+        errors: list[float] = []
+        for block in self._blocks:
+            mean = self.posterior(self._moments.minus(block)).mean
+            errors.append(block.square + float(mean @ (block.gram[np.ix_(index, index)] @ mean)))
+            errors[-1] -= 2.0 * float(mean @ block.product[index])
+        return np.array(errors)
+
+    def _leave_the_least_needed(self) -> bool:
+        if not self.variances:
+            return False
+        whole = self.posterior().log_evidence
+        losses = {name: whole - self.posterior(without=name).log_evidence for name in self.variances}
+        least = min(losses, key=lambda name: losses[name])
+        if losses[least] >= GAIN:
+            return False
+        del self.variances[least]
+        return True
+
+    def _gain(self, group: str) -> tuple[float, float]:
+        """Evidence that a group adds at its best variance, and that variance; all else stays.
+
+        With the rows' part of the group that the active columns do not explain, S = U Λ Uᵀ and z, the gain is
+        ½ Σ (v y² / (1 + v λ) − ln (1 + v λ)), y = Uᵀ z.
+        """
+        posterior, index = self.posterior(), self.index()
+        columns = self._columns[group]
+        precision = 1.0 / self.noise**2
+        cross = self._moments.gram[index, columns] * precision
+        reduced = posterior.spread.T @ cross
+        schur = self._moments.gram[columns, columns] * precision - reduced.T @ reduced
+        slope = self._moments.product[columns] * precision - cross.T @ posterior.mean
+        values, directions = np.linalg.eigh(schur)
+        values = np.maximum(values, 0.0)
+        if values[-1] <= 0.0:
+            return -math.inf, 1.0
+        squares = np.square(directions.T @ slope)
+        tried = (_TRIED / values[-1])[:, None]
+        gains = 0.5 * (tried * squares / (1.0 + tried * values) - np.log1p(tried * values)).sum(axis=1)
+        best = int(gains.argmax())
+        return float(gains[best]), float(tried[best, 0])
+
+    def _variance(self, active: Mapping[str, float]) -> FloatArray:
+        parts = [np.ones(len(self._centre))]
+        for name, value in active.items():
+            parts.append(np.full(self._columns[name].stop - self._columns[name].start, value))
+        return np.concatenate(parts)
+
+    def _used(self, active: Mapping[str, float], determined: FloatArray) -> dict[str, float]:
+        used, start = {}, 0
+        for name in ("", *active):
+            width = self._columns[name].stop - self._columns[name].start
+            used[name] = float(determined[start : start + width].sum())
+            start += width
+        return used
