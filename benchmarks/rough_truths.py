@@ -1,9 +1,9 @@
 """Arms that are not quite rigid: `python -m benchmarks.rough_truths [--seeds N] [--truth NAME ...] [--pairs N ...]`.
 
-Six joints of a humanoid arm, drawing wrong by 2 degrees an axis, 10 mm a point and 30 mm at the marker (each component),
-pairs uniform within +-60 degrees, 5 mm of noise on each coordinate. Errors are mean distances to the noise-free truth
-within +-60 and within +-80 degrees [mm]; behind them how many per cent of the coordinates lie within 1 and 2 sigma.
-Means over the seeds. The noise is not told to the learners unless `--told`.
+Six joints of a humanoid arm, drawing wrong by 2 degrees an axis, 10 mm a point and 30 mm at the marker (each
+component), pairs uniform within +-60 degrees, 5 mm of noise on each coordinate. Errors are mean distances to the
+noise-free truth within +-60 and within +-80 degrees [mm]; behind them how many per cent of the coordinates lie within
+1 and 2 sigma. Means over the seeds. The noise is not told to the learners unless `--told`.
 
 Truths, all made by what happens to the arm and not by what a learner supposes:
 
@@ -32,9 +32,8 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.humanoid_arm import NECK_JOINTS
 from benchmarks.rough_arm import RoughArm, rough_arm
-from kbmaps import ChainTolerances, Model, RigidLearner, TensorLearner, TensorSettings, learning_bases
+from kbmaps import ChainTolerances, Model, ResidualLearner, RigidLearner, TensorLearner, TensorSettings, learning_bases
 from kbmaps.arrays import FloatArray
-from kbmaps.residual_learner import ResidualLearner
 
 ROUGH = ChainTolerances(axes=np.radians(2.0), points=0.01, tool=0.03)
 SIGMA = 0.005

@@ -29,6 +29,7 @@ from kbmaps.kbmap import KBMap, prediction_errors
 from kbmaps.model import Estimate, Model
 from kbmaps.nlms import NLMS
 from kbmaps.reach import PoseModel, PositionModel
+from kbmaps.residual_learner import ResidualLearner
 from kbmaps.resolved_rates import resolved_rates
 from kbmaps.rigid_learner import RigidLearner
 from kbmaps.rigid_recursive import RecursiveRigidLearner
@@ -65,6 +66,7 @@ __all__ = [
     "PoseModel",
     "PositionModel",
     "RecursiveRigidLearner",
+    "ResidualLearner",
     "RigidChain",
     "RigidLearner",
     "RotationError",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import cast
 
@@ -13,11 +13,17 @@ from kbmaps.arrays import FloatArray, IntArray
 
 # What a group's variance is tried at, over the variance at which its best seen direction would just show.
 _TRIED = 10.0 ** np.arange(0.0, 7.0, 0.5)
-# Nats of evidence that a group must be worth to be taken up or kept: odds of e³.
-GAIN = 3.0
+# Prior odds against a group [nats]. Its variance is the best of many, which a likelihood pays for too readily.
+PRICE = 2.0
+# Models less probable than the best by more than so many nats are left out of averages.
+_WINDOW = 4.0
+# A group that gains less is left out of averages: with or without it is next to the same.
+_LEAST_GAIN = 0.5
+# Sets of groups less probable than the chosen one by more than so many nats are not what others grow from.
+_SWAP_WINDOW = 8.0
 _ROUNDS = 40
 _SETTLED = 0.02
-# A group's variance is kept within these factors of where it was found.
+# A variance is no smaller: weights are of the order of radians or metres.
 _LEAST_VARIANCE = 1e-24
 
 
@@ -68,6 +74,21 @@ class Posterior:
     used: dict[str, float]
 
 
+@dataclass(frozen=True, eq=False)
+class Average:
+    """The weights of several models, averaged by how probable the models are.
+
+    Attributes:
+        groups: that any of the models has, beside the one that all have.
+        mean: (A,) over the columns of "" and then of the groups.
+        spread: W (A, A) with the covariance W Wᵀ.
+    """
+
+    groups: tuple[str, ...]
+    mean: FloatArray
+    spread: FloatArray
+
+
 class GroupedModel:
     """Weights N(centre, variance of their group), rows with noise of one variance.
 
@@ -100,9 +121,9 @@ class GroupedModel:
         self.noise = noise
         self.variances: dict[str, float] = {}
 
-    def posterior(self, moments: Moments | None = None, without: str | None = None) -> Posterior:
-        """Of the active groups, for other moments or without a group if so told."""
-        active = {name: value for name, value in self.variances.items() if name != without}
+    def posterior(self, moments: Moments | None = None, active: Mapping[str, float] | None = None) -> Posterior:
+        """Of the active groups, for other moments or other groups if so told."""
+        active = self.variances if active is None else active
         moments = self._moments if moments is None else moments
         index = self.index(active)
         variance = self._variance(active)
@@ -113,7 +134,7 @@ class GroupedModel:
         slope = moments.product[index] * precision + centre / variance
         root = np.sqrt(variance)
         scaled = hessian * root[:, None] * root + np.eye(len(index))
-        lower = cast(FloatArray, np.linalg.cholesky(scaled))
+        lower = _cholesky(scaled)
         spread = root[:, None] * cast(FloatArray, np.linalg.inv(lower)).T
         mean = spread @ (spread.T @ slope)
         product = moments.product[index]
@@ -125,24 +146,70 @@ class GroupedModel:
         shrunk = np.square(spread).sum(axis=1) / variance
         return Posterior(mean, spread, square, evidence, self._used(active, 1.0 - shrunk))
 
-    def index(self, groups: Mapping[str, float] | None = None) -> IntArray:
+    def index(self, groups: Iterable[str] | None = None) -> IntArray:
         """The columns of the active groups, in the order of the posterior's weights."""
         names = ["", *(self.variances if groups is None else groups)]
         return np.concatenate([np.arange(self._columns[n].start, self._columns[n].stop) for n in names])
 
     def select(self, candidates: tuple[str, ...]) -> None:
-        """Takes up groups while the evidence gains by more than `GAIN`, then leaves those that it does not need."""
+        """Takes up groups while the evidence gains by more than `PRICE`, then leaves those that it does not need."""
         self.settle()
         refused: set[str] = set()
         while True:
-            gains = {g: self._gain(g) for g in candidates if g not in self.variances and g not in refused}
+            posterior = self.posterior()
+            gains = {
+                g: self._gain(g, self.variances, posterior)
+                for g in candidates
+                if g not in self.variances and g not in refused
+            }
             best = max(gains, key=lambda g: gains[g][0], default=None)
-            if best is None or gains[best][0] < GAIN:
+            if best is None or gains[best][0] < PRICE:
                 break
             self._try(best, gains[best][1])
             refused.add(best)
         while self._leave_the_least_needed():
             self.settle()
+
+    def average(self, candidates: Sequence[str]) -> Average:
+        """Over the active groups and all sets that have one fewer, one more, or another in place of one.
+
+        By evidence and prior odds of e^−PRICE a group. Hoeting et al., "Bayesian model averaging", Statistical
+        Science 14, 1999; improbable models are left out (Occam's window there).
+        """
+        whole = self.posterior()
+        models, log_odds = [(dict(self.variances), whole)], [0.0]
+        bases = [(dict(self.variances), whole, 0.0)]
+        for name in self.variances:
+            rest = {group: value for group, value in self.variances.items() if group != name}
+            posterior = self.posterior(active=rest)
+            models.append((rest, posterior))
+            log_odds.append(posterior.log_evidence - whole.log_evidence + PRICE)
+            bases.append((rest, posterior, log_odds[-1]))
+        for active, posterior, odds in bases:
+            for name in candidates if odds > -_SWAP_WINDOW else ():
+                gain, variance = (0.0, 0.0) if name in self.variances else self._gain(name, active, posterior)
+                if gain > _LEAST_GAIN and odds + gain - PRICE > -_WINDOW:
+                    more = {**active, name: variance}
+                    models.append((more, self.posterior(active=more)))
+                    log_odds.append(odds + gain - PRICE)
+        best = max(log_odds)
+        kept = [k for k, odds in enumerate(log_odds) if odds > best - _WINDOW]
+        shares = np.exp(np.array([log_odds[k] for k in kept]) - best)
+        return self._mixture([models[k] for k in kept], shares / shares.sum())
+
+    def _mixture(self, models: Sequence[tuple[dict[str, float], Posterior]], shares: FloatArray) -> Average:
+        groups = tuple(dict.fromkeys(name for active, _ in models for name in active))
+        place = {int(column): k for k, column in enumerate(self.index(groups))}
+        means, spreads = np.zeros((len(models), len(place))), np.zeros((len(models), len(place), len(place)))
+        for k, (active, posterior) in enumerate(models):
+            at = [place[int(column)] for column in self.index(active)]
+            means[k, at] = posterior.mean
+            spreads[k, at, : len(at)] = posterior.spread
+        mean = shares @ means
+        roots = np.sqrt(shares)
+        rows = (roots[:, None, None] * spreads.swapaxes(1, 2)).reshape(-1, len(place))
+        rows = np.concatenate([rows, roots[:, None] * (means - mean)])
+        return Average(groups, mean, cast(FloatArray, np.linalg.qr(rows, mode="r")).T)
 
     def settle(self) -> None:
         """The noise and the groups' variances that make the data most probable, by MacKay's fixed point."""
@@ -187,20 +254,23 @@ class GroupedModel:
         if not self.variances:
             return False
         whole = self.posterior().log_evidence
-        losses = {name: whole - self.posterior(without=name).log_evidence for name in self.variances}
+        losses: dict[str, float] = {}
+        for name in self.variances:
+            rest = {group: value for group, value in self.variances.items() if group != name}
+            losses[name] = whole - self.posterior(active=rest).log_evidence
         least = min(losses, key=lambda name: losses[name])
-        if losses[least] >= GAIN:
+        if losses[least] >= PRICE:
             return False
         del self.variances[least]
         return True
 
-    def _gain(self, group: str) -> tuple[float, float]:
+    def _gain(self, group: str, active: Mapping[str, float], posterior: Posterior) -> tuple[float, float]:
         """Evidence that a group adds at its best variance, and that variance; all else stays.
 
         With the rows' part of the group that the active columns do not explain, S = U Λ Uᵀ and z, the gain is
         ½ Σ (v y² / (1 + v λ) − ln (1 + v λ)), y = Uᵀ z.
         """
-        posterior, index = self.posterior(), self.index()
+        index = self.index(active)
         columns = self._columns[group]
         precision = 1.0 / self.noise**2
         cross = self._moments.gram[index, columns] * precision
@@ -230,3 +300,12 @@ class GroupedModel:
             used[name] = float(determined[start : start + width].sum())
             start += width
         return used
+
+
+def _cholesky(matrix: FloatArray) -> FloatArray:
+    """Lower factor; where rounding has made the matrix indefinite, of the nearest that it has not (a tighter prior)."""
+    try:
+        return cast(FloatArray, np.linalg.cholesky(matrix))
+    except np.linalg.LinAlgError:
+        rounding = 10.0 * len(matrix) * np.finfo(np.float64).eps * float(np.diag(matrix).max())
+        return cast(FloatArray, np.linalg.cholesky(matrix + rounding * np.eye(len(matrix))))

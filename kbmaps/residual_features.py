@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kbmaps.arrays import BoolArray, FloatArray
+from kbmaps.arrays import BoolArray, FloatArray, IntArray
 from kbmaps.basis import learning_bases
 from kbmaps.block_choice import PATH_CORRELATION
 from kbmaps.chain import RigidChain
@@ -17,17 +17,19 @@ from kbmaps.chain_parameters import ChainParameters
 from kbmaps.stack import BasisStack
 
 # Errors of a joint's angle [rad], as functions of its own reading or of gravity's torque about it.
-ANGLE_GROUPS = ("eccentricity", "second harmonic", "gain", "compliance")
+READING_GROUPS = ("eccentricity", "second harmonic", "gain")
+COMPLIANCE = "compliance"
 # Errors of a position [m], as polynomials of the position (the camera's) or functions of the readings.
 CAMERA_GROUPS = ("affine", "quadratic", "cubic")
 SMOOTH_GROUPS = ("one joint", "two joints", "three joints")
-GROUPS = (*ANGLE_GROUPS, *CAMERA_GROUPS, *SMOOTH_GROUPS)
 # Groups with more features than this are left out: arms of many joints then do with the lower orders.
 MOST_FEATURES = 500
 # With more joints, loads are lumped into two points: the marker and the middle of all joints beyond.
 _JOINTS_WITH_OWN_LOADS = 8
 # Ranges of a joint narrower than this [rad, m] would blow its functions up.
 _LEAST_RANGE = 1e-3
+# A camera may ride on a head with so many joints, behind which stands the link where gravity is constant.
+_MOST_NECK_JOINTS = 3
 
 Weights = Mapping[str, FloatArray]
 
@@ -71,24 +73,22 @@ class ResidualFeatures:
         low, high = self._middle - self._half, self._middle + self._half
         self._stack = BasisStack(learning_bases(low, high, self._prismatic.tolist(), 1.0))
         self._products = {name: _products(self._prismatic, order + 1) for order, name in enumerate(SMOOTH_GROUPS)}
-        self._loads = self._load_mask()
+        still = range(min(_MOST_NECK_JOINTS, self.joints - 2) + 1)
+        self._still = {f"{COMPLIANCE} behind joint {k}" if k else COMPLIANCE: k for k in still}
+        self._loads = {group: self._load_mask(k) for group, k in self._still.items()}
 
     def size(self, group: str) -> int:
         """Number of features of a group."""
-        revolute = int((~self._prismatic).sum())
-        if group in ("eccentricity", "second harmonic"):
-            return 2 * revolute
-        if group == "gain":
-            return self.joints
-        if group == "compliance":
-            return int(self._loads.sum())
         if group in CAMERA_GROUPS:
             return 3 * (4, 6, 10)[CAMERA_GROUPS.index(group)]
-        return 3 * len(self._products[group])
+        if group in SMOOTH_GROUPS:
+            return 3 * len(self._products[group])
+        return int(self._mask(group).sum())
 
     def groups(self) -> tuple[str, ...]:
         """The groups that there are for this arm."""
-        return tuple(group for group in GROUPS if 0 < self.size(group) <= MOST_FEATURES)
+        names = (*READING_GROUPS, *self._still, *CAMERA_GROUPS, *SMOOTH_GROUPS)
+        return tuple(group for group in names if 0 < self.size(group) <= MOST_FEATURES)
 
     def follow_a_path(self, q: FloatArray) -> bool:
         """Whether configurations (n, d), in their order, are neighbours on a path: as `kbmaps.follow_a_path`."""
@@ -99,7 +99,8 @@ class ResidualFeatures:
 
     def positions(self, change: FloatArray, chain: RigidChain, weights: Weights, q: FloatArray) -> FloatArray:
         """Positions (n, 3) [m] at q (n, d); `chain` is the parameters' chain at the change."""
-        p = self._parameters.positions(change, self._angles(chain, weights, q))
+        error, _ = self._angle_errors(chain, weights, q, ())
+        p = self._parameters.positions(change, q + error)
         return p + self._offsets(p, q, weights)
 
     def linearised(
@@ -107,72 +108,95 @@ class ResidualFeatures:
     ) -> Linearised:
         """Positions at q (n, d) and their derivatives by the change and by the weights of `groups`.
 
-        That the camera magnifies moves of p by a little is left out of the derivatives.
+        That the camera magnifies moves of p by a little, and yielding changes the torque, is left out of the
+        derivatives, not of the positions.
         """
-        frames = chain.frames(q) if "compliance" in groups or "compliance" in weights else None
-        shapes = {g: self._angle_functions(g, q, frames) for g in ANGLE_GROUPS if g in groups or g in weights}
-        p, jacobian = self._parameters.linearised(change, q + self._error(shapes, weights, q))
+        error, shapes = self._angle_errors(chain, weights, q, groups)
+        p, jacobian = self._parameters.linearised(change, q + error)
         turns = jacobian[:, :, self._parameters.zeros]
-        columns = {g: self._columns(g, shapes[g], turns) for g in ANGLE_GROUPS if g in groups}
+        columns: dict[str, FloatArray] = {}
         for group in groups:
-            if group not in ANGLE_GROUPS:
+            if self._of_places(group):
                 columns[group] = _for_each_axis(self._offset_functions(group, p, q))
-        return Linearised(p + self._offsets(p, q, weights), jacobian, {g: columns[g] for g in groups})
+            else:
+                columns[group] = (turns[:, :, :, None] * shapes[group][:, None])[:, :, self._mask(group)]
+        return Linearised(p + self._offsets(p, q, weights), jacobian, columns)
 
-    def _angles(self, chain: RigidChain, weights: Weights, q: FloatArray) -> FloatArray:
-        active = [group for group in ANGLE_GROUPS if group in weights]
-        frames = chain.frames(q) if "compliance" in active else None
-        return q + self._error({g: self._angle_functions(g, q, frames) for g in active}, weights, q)
+    def effects(self, change: FloatArray, chain: RigidChain, weights: Weights, q: FloatArray) -> dict[str, float]:
+        """By how much each group moves the positions at q (n, d), root mean square of the distances [m]."""
+        point = self.linearised(change, chain, weights, q, tuple(weights))
+        moves = {group: point.groups[group] @ weights[group] for group in weights}
+        return {group: math.sqrt(float(np.square(move).sum(axis=1).mean())) for group, move in moves.items()}
 
-    def _error(self, shapes: Weights, weights: Weights, q: FloatArray) -> FloatArray:
-        """What is added to the readings (n, d) [rad, m]."""
-        error = np.zeros_like(q)
-        for group in shapes:
+    def _angle_errors(
+        self, chain: RigidChain, weights: Weights, q: FloatArray, groups: Sequence[str]
+    ) -> tuple[FloatArray, dict[str, FloatArray]]:
+        """What is added to the readings (n, d) [rad, m], and φ (n, d, m) of the angle groups with weights or asked for.
+
+        Torques are those where the joints have yielded to the torques of the readings.
+        """
+        names = [g for g in (*READING_GROUPS, *self._still) if g in weights or g in groups]
+        shapes = {group: self._reading_functions(group, q) for group in names if group in READING_GROUPS}
+        error = self._weighted(shapes, weights, q)
+        loaded = [group for group in names if group in self._still]
+        if not loaded:
+            return error, shapes
+        yielding = [group for group in loaded if group in weights]
+        there = q + error
+        if yielding:
+            frames = chain.frames(there)
+            there = there + self._weighted({g: self._torques(g, frames) for g in yielding}, weights, q)
+        frames = chain.frames(there)
+        torques = {group: self._torques(group, frames) for group in loaded}
+        return error + self._weighted(torques, weights, q), {**shapes, **torques}
+
+    def _weighted(self, shapes: Weights, weights: Weights, q: FloatArray) -> FloatArray:
+        """Σ_m φ_jm w_jm over those groups that have weights (n, d)."""
+        total = np.zeros_like(q)
+        for group, functions in shapes.items():
             if group in weights:
-                mask = self._mask(group)
-                spread = np.zeros(mask.shape)
-                spread[mask] = weights[group]
-                error += np.einsum("njm,jm->nj", shapes[group], spread)
-        return error
+                table = np.zeros(functions.shape[1:])
+                table[self._mask(group)] = weights[group]
+                total += (functions * table).sum(axis=2)
+        return total
+
+    def _of_places(self, group: str) -> bool:
+        return group in CAMERA_GROUPS or group in SMOOTH_GROUPS
 
     def _offsets(self, p: FloatArray, q: FloatArray, weights: Weights) -> FloatArray:
         total = np.zeros_like(p)
         for group, values in weights.items():
-            if group not in ANGLE_GROUPS:
+            if self._of_places(group):
                 total += self._offset_functions(group, p, q) @ values.reshape(-1, 3)
         return total
 
-    def _columns(self, group: str, shapes: FloatArray, turns: FloatArray) -> FloatArray:
-        """Derivatives (n, 3, features) by a group's weights, from its φ (n, d, m) and the joints' Jacobian (n, 3, d)."""
-        return (turns[:, :, :, None] * shapes[:, None])[:, :, self._mask(group)]
-
     def _mask(self, group: str) -> BoolArray:
         """Which of a group's functions (d, m) there are."""
-        if group == "compliance":
-            return self._loads
+        if group in self._still:
+            return self._loads[group]
         if group == "gain":
             return np.ones((self.joints, 1), dtype=np.bool_)
         return np.repeat(~self._prismatic[:, None], 2, axis=1)
 
-    def _angle_functions(self, group: str, q: FloatArray, frames: FloatArray | None) -> FloatArray:
-        """φ (n, d, m) of a group; of the order of 1 for revolute joints, of the positions' spread [m] for others."""
-        if frames is not None and group == "compliance":
-            return self._torques(frames)
+    def _reading_functions(self, group: str, q: FloatArray) -> FloatArray:
+        """φ (n, d, m); of the order of 1 for revolute joints, of the positions' spread [m] for others."""
         if group == "gain":
             return ((q - self._middle) / self._half * np.where(self._prismatic, self._scale, 1.0))[..., None]
         turns = q if group == "eccentricity" else 2.0 * q
         return np.stack([np.cos(turns), np.sin(turns)], axis=-1)
 
-    def _torques(self, frames: FloatArray) -> FloatArray:
-        """Torque (force, for a prismatic joint) about each joint of unit weights along x, y, z at each load's place.
+    def _torques(self, group: str, frames: FloatArray) -> FloatArray:
+        """Torque (force, for a prismatic joint) about each joint of unit weights at each load's place (n, d, 3 loads).
 
-        z·((p − o) × e_b) = e_b·(z × (p − o)): a weight's torque is its component of the Jacobian of its place p.
-        Positions' spread counts as the unit of length. (n, d, 3 loads)
+        z·((p − o) × e) = e·(z × (p − o)): a weight's torque is a component of the Jacobian of its place p, here along
+        x, y, z of the frame where gravity stands still. Positions' spread counts as the unit of length.
         """
         axes = np.einsum("nkij,kj->nki", frames[:, :-1, :3, :3], self._parameters.reference.axes)
         origins, places = frames[:, :-1, :3, 3], self._places(frames[:, :, :3, 3])
         torques = np.cross(axes[:, :, None], places - origins[:, :, None]) / self._scale
         torques = np.where(self._prismatic[:, None, None], self._scale * axes[:, :, None], torques)
+        if self._still[group]:
+            torques = torques @ frames[:, self._still[group], :3, :3][:, None]
         return torques.reshape(*torques.shape[:2], -1)
 
     def _places(self, points: FloatArray) -> FloatArray:
@@ -182,19 +206,20 @@ class ResidualFeatures:
         beyond = np.cumsum(points[:, :0:-1], axis=1)[:, ::-1] / np.arange(self.joints, 0, -1)[:, None]
         return np.stack([beyond, np.broadcast_to(points[:, -1:], beyond.shape)], axis=2)
 
-    def _load_mask(self) -> BoolArray:
-        """Which loads (d, 3 loads) act on which joint: those beyond it."""
+    def _load_mask(self, still: int) -> BoolArray:
+        """Which loads (d, 3 loads) act on which joint: those beyond it; on none before the link that stands still."""
         if self.joints <= _JOINTS_WITH_OWN_LOADS:
             acts = np.triu(np.ones((self.joints, self.joints), dtype=np.bool_))
         else:
             acts = np.ones((self.joints, 2), dtype=np.bool_)
+        acts[:still] = False
         return np.repeat(acts, 3, axis=1)
 
     def _offset_functions(self, group: str, p: FloatArray, q: FloatArray) -> FloatArray:
         """ψ (n, m) of a camera or a smooth group."""
         if group in SMOOTH_GROUPS:
             weights = self._stack.joint_weights(q)[:, :, 1:].reshape(len(q), -1)
-            return weights[:, self._products[group]].prod(axis=2)
+            return np.multiply.reduce(weights[:, self._products[group]], axis=2)
         s = (p - self._centre) / self._scale
         degree = CAMERA_GROUPS.index(group) + 1
         monomials = [s[:, list(c)].prod(axis=1) for c in itertools.combinations_with_replacement(range(3), degree)]
@@ -207,7 +232,7 @@ def _for_each_axis(functions: FloatArray) -> FloatArray:
     return (functions[:, None, :, None] * np.eye(3)[:, None]).reshape(n, 3, 3 * m)
 
 
-def _products(prismatic: BoolArray, order: int) -> FloatArray:
+def _products(prismatic: BoolArray, order: int) -> IntArray:
     """Which joint functions (two a joint) multiply to each product of `order` different joints (count, order)."""
     sizes = [1 if slides else 2 for slides in prismatic]
     chosen = [

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,8 +13,8 @@ from kbmaps.block_choice import BLOCK_PAIRS, FEWEST_BLOCKS, MOST_BLOCKS
 from kbmaps.chain import RigidChain
 from kbmaps.chain_parameters import WIDE, ChainParameters
 from kbmaps.pairs import Pairs
-from kbmaps.residual_evidence import GroupedModel, Moments, Posterior
-from kbmaps.residual_features import SMOOTH_GROUPS, Linearised, ResidualFeatures
+from kbmaps.residual_evidence import Average, GroupedModel, Moments
+from kbmaps.residual_features import SMOOTH_GROUPS, ResidualFeatures
 
 # Noise that is estimated is never below this [m]: there rounding begins.
 _ROUNDING_M = 1e-9
@@ -34,8 +34,7 @@ class ResidualFit:
     Attributes:
         change: the most probable parameters of the chain (size,).
         chain: the chain with them.
-        weights: of the groups that the pairs pay for.
-        deviations: prior standard deviation of the weights of these groups, as found.
+        weights: of the groups that the pairs speak for.
         scales: of the free parameters (f,): 1 in `spread` is so much.
         spread: W with the covariance W Wᵀ of the free parameters, then the weights.
         noise: estimated noise over unit; at least 1 where the units are the noise.
@@ -46,7 +45,6 @@ class ResidualFit:
     change: FloatArray
     chain: RigidChain
     weights: dict[str, FloatArray]
-    deviations: dict[str, float]
     scales: FloatArray
     spread: FloatArray
     noise: float
@@ -68,28 +66,40 @@ class _Fitter:
         self.change, self.chain = change.copy(), parameters.chain(change)
         self.weights: dict[str, FloatArray] = {}
         self.variances: dict[str, float] = {}
-        self.noise = math.inf
+        self.noise, self.used = math.inf, 0.0
         self.inliers = np.ones(len(pairs), dtype=np.bool_)
 
-    def round(self, select: bool) -> tuple[Posterior, float]:
-        """A step, and its length in predictions over what the weights leave open of them."""
-        groups = self._considered() if select else tuple(self.variances)
-        point = self._features.linearised(self.change, self.chain, self.weights, self._pairs.q, groups)
-        self._judge_pairs(self._pairs.x - point.x)
-        model, design = self._model(point, groups)
+    def step(self, select: bool) -> float:
+        """To the most probable weights; how far that moves predictions, over what the weights leave open of them."""
+        model, design = self._model(self._considered() if select else tuple(self.variances))
         model.variances = dict(self.variances)
         if select:
-            model.select(groups)
+            model.select(self._considered())
         else:
             model.settle()
-        posterior, index = model.posterior(), model.index()
+        posterior = model.posterior()
+        self.used = sum(posterior.used.values())
         step = posterior.mean - self._present(model.variances)
-        moved = float(np.square(design[:, index] @ step).sum()) / model.noise**2
-        self._take(posterior.mean, model)
-        return posterior, math.sqrt(moved / max(sum(posterior.used.values()), 1.0))
+        moved = float(np.square(design[:, model.index()] @ step).sum()) / model.noise**2
+        self.variances, self.noise = dict(model.variances), model.noise
+        self._take(posterior.mean, tuple(model.variances))
+        return math.sqrt(moved / max(self.used, 1.0))
+
+    def average(self) -> Average:
+        """The last step: to the mean over all probable sets of groups."""
+        groups = self._considered()
+        model, _ = self._model(groups)
+        model.variances = dict(self.variances)
+        average = model.average(() if self._on_path else groups)
+        self._take(average.mean, average.groups)
+        return average
 
     def _considered(self) -> tuple[str, ...]:
-        return tuple(g for g in self._features.groups() if g != SMOOTH_GROUPS[2] or SMOOTH_GROUPS[1] in self.variances)
+        """All groups; the largest only where the one before it is not enough."""
+        known = self.variances
+        return tuple(
+            g for g in self._features.groups() if g != SMOOTH_GROUPS[2] or g in known or SMOOTH_GROUPS[1] in known
+        )
 
     def _judge_pairs(self, residuals: FloatArray) -> None:
         """The middle residual tells what is typical, the noise of the last round what is meant to be."""
@@ -100,8 +110,10 @@ class _Fitter:
         if math.isinf(self.noise):
             self.noise = typical
 
-    def _model(self, point: Linearised, groups: Sequence[str]) -> tuple[GroupedModel, FloatArray]:
-        """The linear model of this point; its chain's weights are steps, the groups' are whole."""
+    def _model(self, groups: Sequence[str]) -> tuple[GroupedModel, FloatArray]:
+        """The linear model around the present weights, and its rows; the chain's weights are steps, others whole."""
+        point = self._features.linearised(self.change, self.chain, self.weights, self._pairs.q, groups)
+        self._judge_pairs(self._pairs.x - point.x)
         parts = {"": point.chain[:, :, self._free] * self.scales, **{g: point.groups[g] for g in groups}}
         target = self._pairs.x - point.x
         for group, weights in self.weights.items():
@@ -122,24 +134,21 @@ class _Fitter:
         return model, rows
 
     def _blocks(self, rows: FloatArray, aims: FloatArray) -> list[Moments]:
-        count = min(len(rows) // (3 * BLOCK_PAIRS), MOST_BLOCKS)
-        if count < FEWEST_BLOCKS:
-            count = FEWEST_BLOCKS
+        count = min(max(len(rows) // (3 * BLOCK_PAIRS), FEWEST_BLOCKS), MOST_BLOCKS)
         runs = np.array_split(np.arange(len(rows)), count)
         return [Moments.of(rows[run], aims[run]) for run in runs]
 
-    def _present(self, groups: dict[str, float]) -> FloatArray:
+    def _present(self, groups: Iterable[str]) -> FloatArray:
         """Where the weights are before the step."""
         parts = [np.zeros(len(self.scales))]
         parts += [self.weights.get(g, np.zeros(self._features.size(g))) for g in groups]
         return np.concatenate(parts)
 
-    def _take(self, mean: FloatArray, model: GroupedModel) -> None:
+    def _take(self, mean: FloatArray, groups: Sequence[str]) -> None:
         self.change[self._free] += self.scales * mean[: len(self.scales)]
         self.chain = self._parameters.chain(self.change)
-        self.variances, self.noise = dict(model.variances), model.noise
         start, self.weights = len(self.scales), {}
-        for group in self.variances:
+        for group in groups:
             self.weights[group] = mean[start : start + self._features.size(group)]
             start += self._features.size(group)
 
@@ -147,25 +156,29 @@ class _Fitter:
 def fit_residual(
     features: ResidualFeatures, parameters: ChainParameters, std: FloatArray, pairs: Pairs, change: FloatArray
 ) -> ResidualFit | None:
-    """The fit around the chain at `change`, the most probable rigid one; None if that is all that the pairs pay for."""
+    """The fit around the chain at `change`, the most probable rigid one; None if nothing speaks for more than that."""
     fitter = _Fitter(features, parameters, std, pairs, change)
-    posterior: Posterior | None = None
     for turn in range(_ROUNDS):
-        posterior, length = fitter.round(turn < _SELECTIONS)
-        if not fitter.variances:
-            return None
-        if turn >= _SELECTIONS - 1 and length < _SMALL_STEP:
+        length = fitter.step(turn < _SELECTIONS)
+        if not fitter.variances or (turn >= _SELECTIONS - 1 and length < _SMALL_STEP):
             break
-    assert posterior is not None
-    used = sum(posterior.used.values())
+    average = fitter.average()
+    if not average.groups:
+        return None
+    freedom = max(3.0 * float(fitter.inliers.sum()) - fitter.used, 0.0)
     return ResidualFit(
         change=fitter.change,
         chain=fitter.chain,
         weights=fitter.weights,
-        deviations={group: math.sqrt(value) for group, value in fitter.variances.items()},
         scales=fitter.scales,
-        spread=posterior.spread,
-        noise=fitter.noise,
-        freedom=max(3.0 * float(fitter.inliers.sum()) - used, 0.0),
+        spread=average.spread,
+        noise=_beyond_chance(fitter.noise, freedom) if pairs.known else fitter.noise,
+        freedom=freedom,
         inliers=fitter.inliers,
     )
+
+
+def _beyond_chance(noise: float, freedom: float) -> float:
+    """Told noise, 1, unless the residuals are larger than what chance can make of it."""
+    explained = freedom + _MISFIT_SIGMAS * math.sqrt(2.0 * freedom)
+    return 1.0 if noise**2 * freedom <= explained else noise

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import asdict
 from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.special import stdtrit  # pyright: ignore[reportMissingTypeStubs, reportUnknownVariableType]
 
 from kbmaps.arrays import BoolArray, FloatArray, rows, rows_or_vector
 from kbmaps.chain import RigidChain
@@ -22,6 +24,8 @@ from kbmaps.rigid_learner import RigidLearner
 _KIND = "rigid chain with residual, batch, 1"
 # Configurations where the model is surer than this times the least sure pair (in variance) lie where data was.
 _SUPPORT_FACTOR = 2.0
+_LEAST_FREEDOM = 10.0
+_ONE_SIGMA = 0.841344746
 _BLOCK = 1024
 
 
@@ -30,8 +34,8 @@ class ResidualLearner:
 
     Deviations come in groups: eccentric encoders, gear gains, joints that yield under load, a distorting camera, and
     smooth functions of one to three joints. The chain's tolerances and each group's variance are the prior; the
-    variances are those that make the pairs most probable, and groups that this does not pay for are left out. With
-    none left, this is `RigidLearner` to the last bit.
+    variances are those that make the pairs most probable, and what is predicted is the average over those sets of
+    groups that the pairs speak for. Where they speak for none, this is `RigidLearner` to the last bit.
 
     Args:
         nominal: the chain as drawn, or as `find_chain` found it.
@@ -71,9 +75,11 @@ class ResidualLearner:
 
     @property
     def deviations(self) -> dict[str, float]:
-        """The groups taken up and the standard deviation of their weights as found [rad, or m for places]."""
+        """By how much each group of deviations that the pairs speak for moves the learnt positions (RMS) [m]."""
         fit = self._fitted()
-        return {} if fit is None else dict(fit.deviations)
+        if fit is None or self._features is None:
+            return {}
+        return self._features.effects(fit.change, fit.chain, fit.weights, self._q)
 
     @property
     def inliers(self) -> BoolArray:
@@ -127,7 +133,8 @@ class ResidualLearner:
         pairs = with_units(self._q, self._x, self._sigma)
         if pairs.known:
             variance = variance + (fit.noise**2 - 1.0) * float(np.square(pairs.unit).mean())
-        return Estimate(x, np.sqrt(variance), inside)
+            return Estimate(x, np.sqrt(variance), inside)
+        return Estimate(x, np.sqrt(variance) * float(stdtrit(max(fit.freedom, 1.0), _ONE_SIGMA)), inside)
 
     def to_bytes(self) -> bytes:
         """The learner with all its pairs; `from_bytes` gives the same predictions to the last bit."""
@@ -164,7 +171,10 @@ class ResidualLearner:
         if self._features is None and self.pairs:
             features = ResidualFeatures(self._parameters, self._q, self._x)
             pairs = with_units(self._q, self._x, self._sigma)
-            fit = fit_residual(features, self._parameters, self._std, pairs, self._rigid.change)
+            fit = None
+            # Noise that nobody told must be seen in residuals that the chain alone leaves, or anything explains them.
+            if pairs.known or self._rigid.report().freedom >= _LEAST_FREEDOM:
+                fit = fit_residual(features, self._parameters, self._std, pairs, self._rigid.change)
             if fit is not None:
                 _, variance = self._spread(features, fit, self._q[fit.inliers])
                 self._widest = float(variance.sum(axis=1).max(initial=0.0))
@@ -186,4 +196,4 @@ class ResidualLearner:
 def _runs(values: BoolArray) -> list[tuple[int, int]]:
     """Begin and end of each run of equal values."""
     ends = [0, *(np.flatnonzero(values[1:] != values[:-1]) + 1).tolist(), len(values)]
-    return list(zip(ends[:-1], ends[1:], strict=True))
+    return list(itertools.pairwise(ends)) if len(values) else []
