@@ -48,6 +48,15 @@ class Moments:
         """Of rows (N, P) and targets (N,)."""
         return cls(design.T @ design, design.T @ target, float(target @ target), len(target))
 
+    @classmethod
+    def total(cls, parts: Sequence[Moments]) -> Moments:
+        """Of the rows of all parts, at least one, over the same columns."""
+        gram, product = parts[0].gram.copy(), parts[0].product.copy()
+        for part in parts[1:]:
+            gram += part.gram
+            product += part.product
+        return cls(gram, product, sum(part.square for part in parts), sum(part.count for part in parts))
+
     def minus(self, other: Moments) -> Moments:
         """The moments without the rows of `other`."""
         return Moments(
@@ -145,6 +154,11 @@ class GroupedModel:
         evidence -= float(np.log(np.diag(lower)).sum()) + moments.count * math.log(self.noise)
         shrunk = np.square(spread).sum(axis=1) / variance
         return Posterior(mean, spread, square, evidence, self._used(active, 1.0 - shrunk))
+
+    def square_of(self, weights: FloatArray) -> float:
+        """Σ (a·w)² over the rows, for weights of the active columns."""
+        index = self.index()
+        return float(weights @ (self._moments.gram[np.ix_(index, index)] @ weights))
 
     def index(self, groups: Iterable[str] | None = None) -> IntArray:
         """The columns of the active groups, in the order of the posterior's weights."""
@@ -288,13 +302,14 @@ class GroupedModel:
         return float(gains[best]), float(tried[best, 0])
 
     def _variance(self, active: Mapping[str, float]) -> FloatArray:
-        parts = [np.ones(len(self._centre))]
+        parts: list[FloatArray] = [np.ones(len(self._centre))]
         for name, value in active.items():
             parts.append(np.full(self._columns[name].stop - self._columns[name].start, value))
         return np.concatenate(parts)
 
     def _used(self, active: Mapping[str, float], determined: FloatArray) -> dict[str, float]:
-        used, start = {}, 0
+        used: dict[str, float] = {}
+        start = 0
         for name in ("", *active):
             width = self._columns[name].stop - self._columns[name].start
             used[name] = float(determined[start : start + width].sum())

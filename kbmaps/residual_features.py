@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -89,6 +89,10 @@ class ResidualFeatures:
         """The groups that there are for this arm."""
         names = (*READING_GROUPS, *self._still, *CAMERA_GROUPS, *SMOOTH_GROUPS)
         return tuple(group for group in names if 0 < self.size(group) <= MOST_FEATURES)
+
+    def approximate(self, groups: Iterable[str]) -> tuple[str, ...]:
+        """Those groups whose law is one of engineering and not of geometry."""
+        return tuple(group for group in groups if group in self._still)
 
     def follow_a_path(self, q: FloatArray) -> bool:
         """Whether configurations (n, d), in their order, are neighbours on a path: as `kbmaps.follow_a_path`."""
@@ -229,7 +233,10 @@ class ResidualFeatures:
 def _for_each_axis(functions: FloatArray) -> FloatArray:
     """Derivatives (n, 3, 3 m) of Σ_m ψ_m w_m by the weights w (m, 3), flattened, from ψ (n, m)."""
     n, m = functions.shape
-    return (functions[:, None, :, None] * np.eye(3)[:, None]).reshape(n, 3, 3 * m)
+    derivatives = np.zeros((n, 3, 3 * m))
+    for axis in range(3):
+        derivatives[:, axis, axis::3] = functions
+    return derivatives
 
 
 def _products(prismatic: BoolArray, order: int) -> IntArray:

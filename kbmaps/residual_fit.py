@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from kbmaps.arrays import BoolArray, FloatArray
+from kbmaps.arrays import BoolArray, FloatArray, IntArray
 from kbmaps.block_choice import BLOCK_PAIRS, FEWEST_BLOCKS, MOST_BLOCKS
 from kbmaps.chain import RigidChain
 from kbmaps.chain_parameters import WIDE, ChainParameters
@@ -20,7 +21,9 @@ from kbmaps.residual_features import SMOOTH_GROUPS, ResidualFeatures
 _ROUNDING_M = 1e-9
 # Of the chi distribution in three dimensions: 3 of 100,000 good pairs are further out; its median.
 _OUTLIER_SIGMAS, _MEDIAN_NORM = 4.8, 1.538
-_ROUNDS, _SELECTIONS = 6, 3
+_ROUNDS, _SELECTIONS = 6, 2
+# Few enough rows for a processor's cache.
+_ROWS_AT_ONCE = 150
 # A step that moves the predictions by less than this share of what the weights leave open is the last.
 _SMALL_STEP = 0.05
 # Told noise explains a sum of squared residuals up to so many of its standard deviations (χ²) above its mean.
@@ -71,7 +74,7 @@ class _Fitter:
 
     def step(self, select: bool) -> float:
         """To the most probable weights; how far that moves predictions, over what the weights leave open of them."""
-        model, design = self._model(self._considered() if select else tuple(self.variances))
+        model = self._model(self._considered() if select else tuple(self.variances))
         model.variances = dict(self.variances)
         if select:
             model.select(self._considered())
@@ -80,7 +83,7 @@ class _Fitter:
         posterior = model.posterior()
         self.used = sum(posterior.used.values())
         step = posterior.mean - self._present(model.variances)
-        moved = float(np.square(design[:, model.index()] @ step).sum()) / model.noise**2
+        moved = model.square_of(step) / model.noise**2
         self.variances, self.noise = dict(model.variances), model.noise
         self._take(posterior.mean, tuple(model.variances))
         return math.sqrt(moved / max(self.used, 1.0))
@@ -88,7 +91,7 @@ class _Fitter:
     def average(self) -> Average:
         """The last step: to the mean over all probable sets of groups."""
         groups = self._considered()
-        model, _ = self._model(groups)
+        model = self._model(groups)
         model.variances = dict(self.variances)
         average = model.average(() if self._on_path else groups)
         self._take(average.mean, average.groups)
@@ -110,33 +113,38 @@ class _Fitter:
         if math.isinf(self.noise):
             self.noise = typical
 
-    def _model(self, groups: Sequence[str]) -> tuple[GroupedModel, FloatArray]:
-        """The linear model around the present weights, and its rows; the chain's weights are steps, others whole."""
-        point = self._features.linearised(self.change, self.chain, self.weights, self._pairs.q, groups)
-        self._judge_pairs(self._pairs.x - point.x)
-        parts = {"": point.chain[:, :, self._free] * self.scales, **{g: point.groups[g] for g in groups}}
-        target = self._pairs.x - point.x
-        for group, weights in self.weights.items():
-            target = target + point.groups[group] @ weights
-        unit = self._pairs.unit[self.inliers]
-        design = np.concatenate(list(parts.values()), axis=2)[self.inliers] / unit[:, None, None]
-        rows, aims = design.reshape(-1, design.shape[2]), (target[self.inliers] / unit[:, None]).ravel()
-        ends = np.cumsum([0, *(part.shape[2] for part in parts.values())])
-        columns = {name: slice(int(a), int(b)) for name, a, b in zip(parts, ends[:-1], ends[1:], strict=True)}
-        model = GroupedModel(
-            Moments.of(rows, aims),
-            columns,
+    def _model(self, groups: Sequence[str]) -> GroupedModel:
+        """The linear model around the present weights; the chain's weights are steps, the others' whole."""
+        x = self._features.positions(self.change, self.chain, self.weights, self._pairs.q)
+        self._judge_pairs(self._pairs.x - x)
+        rows = np.flatnonzero(self.inliers)
+        if self._on_path:
+            parts = min(max(len(rows) // BLOCK_PAIRS, FEWEST_BLOCKS), MOST_BLOCKS)
+        else:
+            parts = max(len(rows) // _ROWS_AT_ONCE, 1)
+        sums = [self._moments(part, groups) for part in np.array_split(rows, parts)]
+        sizes = [len(self.scales), *(self._features.size(group) for group in groups)]
+        ends = np.cumsum([0, *sizes]).tolist()
+        spans = itertools.starmap(slice, itertools.pairwise(ends))
+        return GroupedModel(
+            Moments.total(sums),
+            dict(zip(("", *groups), spans, strict=True)),
             -self.change[self._free] / self.scales,
             least_noise=self._least_noise,
             noise=self.noise,
-            blocks=self._blocks(rows, aims) if self._on_path else (),
+            blocks=sums if self._on_path else (),
         )
-        return model, rows
 
-    def _blocks(self, rows: FloatArray, aims: FloatArray) -> list[Moments]:
-        count = min(max(len(rows) // (3 * BLOCK_PAIRS), FEWEST_BLOCKS), MOST_BLOCKS)
-        runs = np.array_split(np.arange(len(rows)), count)
-        return [Moments.of(rows[run], aims[run]) for run in runs]
+    def _moments(self, rows: IntArray, groups: Sequence[str]) -> Moments:
+        """Of some pairs. What the groups explain at present is added to the target, for their weights are whole."""
+        point = self._features.linearised(self.change, self.chain, self.weights, self._pairs.q[rows], groups)
+        target = self._pairs.x[rows] - point.x
+        for group, weights in self.weights.items():
+            target += point.groups[group] @ weights
+        unit = self._pairs.unit[rows, None]
+        chain = point.chain[:, :, self._free] * self.scales
+        design = np.concatenate([chain, *point.groups.values()], axis=2) / unit[:, :, None]
+        return Moments.of(design.reshape(-1, design.shape[2]), (target / unit).ravel())
 
     def _present(self, groups: Iterable[str]) -> FloatArray:
         """Where the weights are before the step."""
