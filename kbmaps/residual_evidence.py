@@ -10,6 +10,7 @@ from typing import cast
 import numpy as np
 
 from kbmaps.arrays import FloatArray, IntArray
+from kbmaps.lapack import lower_inverse
 
 # What a group's variance is tried at, over the variance at which its best seen direction would just show.
 _TRIED = 10.0 ** np.arange(0.0, 7.0, 0.5)
@@ -144,7 +145,7 @@ class GroupedModel:
         root = np.sqrt(variance)
         scaled = hessian * root[:, None] * root + np.eye(len(index))
         lower = _cholesky(scaled)
-        spread = root[:, None] * cast(FloatArray, np.linalg.inv(lower)).T
+        spread = root[:, None] * lower_inverse(lower).T
         mean = spread @ (spread.T @ slope)
         product = moments.product[index]
         square = moments.square - 2.0 * float(mean @ product) + float(mean @ (hessian @ mean)) / precision
@@ -181,6 +182,10 @@ class GroupedModel:
                 break
             self._try(best, gains[best][1])
             refused.add(best)
+        self.prune()
+
+    def prune(self) -> None:
+        """Leaves groups that the evidence does not need, the least needed first."""
         while self._leave_the_least_needed():
             self.settle()
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from kbmaps.arrays import BoolArray, FloatArray, IntArray
-from kbmaps.block_choice import BLOCK_PAIRS, FEWEST_BLOCKS, MOST_BLOCKS
+from kbmaps.block_choice import BLOCK_PAIRS, FEWEST_BLOCKS
 from kbmaps.chain import RigidChain
 from kbmaps.chain_parameters import WIDE, ChainParameters
 from kbmaps.pairs import Pairs
@@ -24,6 +24,8 @@ _OUTLIER_SIGMAS, _MEDIAN_NORM = 4.8, 1.538
 _ROUNDS, _SELECTIONS = 6, 2
 # Few enough rows for a processor's cache.
 _ROWS_AT_ONCE = 150
+# Runs of pairs left out in turn on a path.
+_BLOCKS = 8
 # A step that moves the predictions by less than this share of what the weights leave open is the last.
 _SMALL_STEP = 0.05
 # Told noise explains a sum of squared residuals up to so many of its standard deviations (χ²) above its mean.
@@ -74,12 +76,14 @@ class _Fitter:
 
     def step(self, select: bool) -> float:
         """To the most probable weights; how far that moves predictions, over what the weights leave open of them."""
-        model = self._model(self._considered() if select else tuple(self.variances))
+        groups = self._considered() if select else tuple(self.variances)
+        model = self._model(groups)
         model.variances = dict(self.variances)
         if select:
-            model.select(self._considered())
+            model.select(groups)
         else:
             model.settle()
+            model.prune()
         posterior = model.posterior()
         self.used = sum(posterior.used.values())
         step = posterior.mean - self._present(model.variances)
@@ -98,11 +102,16 @@ class _Fitter:
         return average
 
     def _considered(self) -> tuple[str, ...]:
-        """All groups; the largest only where the one before it is not enough."""
-        known = self.variances
-        return tuple(
-            g for g in self._features.groups() if g != SMOOTH_GROUPS[2] or g in known or SMOOTH_GROUPS[1] in known
-        )
+        """All groups with no more features than there are coordinates; the largest only where the one before is in."""
+        coordinates = 3 * int(self.inliers.sum())
+        largest, before = SMOOTH_GROUPS[2], SMOOTH_GROUPS[1]
+
+        def asked(group: str) -> bool:
+            if group in self.variances:
+                return True
+            return self._features.size(group) <= coordinates and (group != largest or before in self.variances)
+
+        return tuple(group for group in self._features.groups() if asked(group))
 
     def _judge_pairs(self, residuals: FloatArray) -> None:
         """The middle residual tells what is typical, the noise of the last round what is meant to be."""
@@ -119,7 +128,7 @@ class _Fitter:
         self._judge_pairs(self._pairs.x - x)
         rows = np.flatnonzero(self.inliers)
         if self._on_path:
-            parts = min(max(len(rows) // BLOCK_PAIRS, FEWEST_BLOCKS), MOST_BLOCKS)
+            parts = min(max(len(rows) // BLOCK_PAIRS, FEWEST_BLOCKS), _BLOCKS)
         else:
             parts = max(len(rows) // _ROWS_AT_ONCE, 1)
         sums = [self._moments(part, groups) for part in np.array_split(rows, parts)]
