@@ -163,8 +163,8 @@ class GroupedModel:
 
     def index(self, groups: Iterable[str] | None = None) -> IntArray:
         """The columns of the active groups, in the order of the posterior's weights."""
-        names = ["", *(self.variances if groups is None else groups)]
-        return np.concatenate([np.arange(self._columns[n].start, self._columns[n].stop) for n in names])
+        spans = [self._columns[name] for name in ("", *(self.variances if groups is None else groups))]
+        return np.array([column for span in spans for column in range(span.start, span.stop)], dtype=np.intp)
 
     def select(self, candidates: tuple[str, ...]) -> None:
         """Takes up groups while the evidence gains by more than `PRICE`, then leaves those that it does not need."""
@@ -309,7 +309,7 @@ class GroupedModel:
     def _variance(self, active: Mapping[str, float]) -> FloatArray:
         parts: list[FloatArray] = [np.ones(len(self._centre))]
         for name, value in active.items():
-            parts.append(np.full(self._columns[name].stop - self._columns[name].start, value))
+            parts.append(value * np.ones(self._columns[name].stop - self._columns[name].start))
         return np.concatenate(parts)
 
     def _used(self, active: Mapping[str, float], determined: FloatArray) -> dict[str, float]:

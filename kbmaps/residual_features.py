@@ -101,16 +101,16 @@ class ResidualFeatures:
         shared = (inner / np.sqrt(square[:-1] * square[1:])).prod(axis=1)
         return bool(len(shared)) and bool(np.median(shared) > PATH_CORRELATION)
 
-    def positions(self, change: FloatArray, chain: RigidChain, weights: Weights, q: FloatArray) -> FloatArray:
-        """Positions (n, 3) [m] at q (n, d); `chain` is the parameters' chain at the change."""
+    def positions(self, chain: RigidChain, weights: Weights, q: FloatArray) -> FloatArray:
+        """Positions (n, 3) [m] at q (n, d)."""
         error, _ = self._angle_errors(chain, weights, q, ())
-        p = self._parameters.positions(change, q + error)
+        p = chain.positions(q + error)
         return p + self._offsets(p, q, weights)
 
     def linearised(
         self, change: FloatArray, chain: RigidChain, weights: Weights, q: FloatArray, groups: Sequence[str]
     ) -> Linearised:
-        """Positions at q (n, d) and their derivatives by the change and by the weights of `groups`.
+        """Positions at q (n, d) and their derivatives by the change, of which `chain` is the chain, and by weights.
 
         That the camera magnifies moves of p by a little, and yielding changes the torque, is left out of the
         derivatives, not of the positions.

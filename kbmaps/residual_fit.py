@@ -124,7 +124,7 @@ class _Fitter:
 
     def _model(self, groups: Sequence[str]) -> GroupedModel:
         """The linear model around the present weights; the chain's weights are steps, the others' whole."""
-        x = self._features.positions(self.change, self.chain, self.weights, self._pairs.q)
+        x = self._features.positions(self.chain, self.weights, self._pairs.q)
         self._judge_pairs(self._pairs.x - x)
         rows = np.flatnonzero(self.inliers)
         if self._on_path:

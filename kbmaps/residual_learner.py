@@ -115,7 +115,7 @@ class ResidualLearner:
         if fit is None or self._features is None:
             return self._rigid.predict(q)
         angles = rows_or_vector("q", q, self.joints)
-        x = self._features.positions(fit.change, fit.chain, fit.weights, np.atleast_2d(angles))
+        x = self._features.positions(fit.chain, fit.weights, np.atleast_2d(angles))
         return x[0] if angles.ndim == 1 else x
 
     def estimate(self, q: ArrayLike) -> Estimate:
