@@ -33,6 +33,7 @@ from kbmaps.memory import Memory
 from kbmaps.model import Estimate, Model
 from kbmaps.nlms import NLMS
 from kbmaps.reach import PoseModel, PositionModel
+from kbmaps.residual_learner import ResidualLearner
 from kbmaps.resolved_rates import resolved_rates
 from kbmaps.rigid_learner import RigidLearner
 from kbmaps.rigid_recursive import RecursiveRigidLearner
@@ -75,6 +76,7 @@ __all__ = [
     "PoseModel",
     "PositionModel",
     "RecursiveRigidLearner",
+    "ResidualLearner",
     "RigidChain",
     "RigidLearner",
     "RotationError",

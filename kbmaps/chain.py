@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -91,6 +92,16 @@ class RigidChain:
         """
         return self.poses(q)[..., :3, 3]
 
+    def frames(self, q: ArrayLike) -> FloatArray:
+        """Poses in the measurement frame of joints 1..d before they move and of the marker: (d+1, 4, 4) for q (d,).
+
+        For q (n, d): (n, d+1, 4, 4).
+
+        Raises:
+            ShapeError, NonFiniteError
+        """
+        return np.stack(self._frames(rows_or_vector("q", q, self.joints)), axis=-3)
+
     def jacobian(self, q: ArrayLike) -> FloatArray:
         """Derivative (3, d) of the position [m/rad, or m/m], or (n, 3, d) for q (n, d).
 
@@ -157,19 +168,21 @@ class RigidChain:
 
     def _frames(self, q: FloatArray) -> list[FloatArray]:
         """Frames of joints 1..d (before they move), then the marker frame, each (..., 4, 4)."""
-        lead = q.shape[:-1]
-        pose = np.broadcast_to(self.fixed[0], (*lead, 4, 4))
+        constant, first, second = self._moved_links
+        pose = np.broadcast_to(self.fixed[0], (*q.shape[:-1], 4, 4))
+        cosines = np.where(self.prismatic, q, np.cos(q))[..., None, None]
+        links = constant + cosines * first + np.sin(q)[..., None, None] * second
         frames = [pose]
         for k in range(self.joints):
-            constant, first, second = self._joint_terms(k)
-            value = q[..., k, None, None]
-            if self.prismatic[k]:
-                motion = constant + value * first
-            else:
-                motion = constant + np.cos(value) * first + np.sin(value) * second
-            pose = pose @ (motion @ self.fixed[k + 1])
+            pose = pose @ links[..., k, :, :]
             frames.append(pose)
         return frames
+
+    @cached_property
+    def _moved_links(self) -> FloatArray:
+        """Matrices (3, d, 4, 4): J_k(q) F_k of every joint, in the terms of `_joint_terms`."""
+        terms = np.stack([self._joint_terms(k) for k in range(self.joints)], axis=1)
+        return frozen(terms @ self.fixed[1:])
 
     def _joint_terms(self, k: int) -> FloatArray:
         """Matrices A (3, 4, 4): J_k(q) = A0 + cos q·A1 + sin q·A2 (Rodrigues), or A0 + q·A1 for a prismatic joint."""

@@ -21,7 +21,7 @@ _dger = _routine("dger", blas)
 _dgeqrf, _dormqr = _routine("dgeqrf"), _routine("dormqr")
 _dtpqrt, _dtpmqrt = _routine("dtpqrt"), _routine("dtpmqrt")
 _dlauum, _dpotrf, _dpotri, _dpotrs = _routine("dlauum"), _routine("dpotrf"), _routine("dpotri"), _routine("dpotrs")
-_dtrcon, _dtrtrs = _routine("dtrcon"), _routine("dtrtrs")
+_dtrcon, _dtrtri, _dtrtrs = _routine("dtrcon"), _routine("dtrtri"), _routine("dtrtrs")
 
 
 def add_outer_in_place(matrix: FloatArray, column: FloatArray, row: FloatArray) -> None:
@@ -73,6 +73,13 @@ def cholesky_solve(lower: FloatArray, rhs: FloatArray) -> FloatArray:
     """Solution of L Lᵀ y = rhs."""
     solution, _ = _dpotrs(lower, rhs, lower=1)
     return cast(FloatArray, solution)
+
+
+def lower_inverse(lower: FloatArray) -> FloatArray:
+    """The inverse of a lower triangular matrix without zeros on its diagonal."""
+    # In C order it is the transpose of an upper one in Fortran order, which LAPACK takes as it is.
+    inverse, _ = _dtrtri(lower.T, lower=0)
+    return cast(FloatArray, inverse).T
 
 
 def triangular_solve(upper: FloatArray, rhs: FloatArray, smallest_rcond: float) -> FloatArray | None:
