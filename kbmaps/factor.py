@@ -54,12 +54,6 @@ class RowFactor:
             self._rows, self._targets, remainder = lapack.qr_append(self._rows, self._targets, below, below_targets)
             self.residual_squares += np.square(remainder).sum(axis=0)
 
-    def gram(self) -> FloatArray:
-        """A new A Aᵀ (k, k), Fortran-ordered, of which only the upper triangle counts."""
-        if self._triangular:
-            return lapack.upper_times_transpose(self._rows.copy(order="F"))
-        return (self.rows @ self.rows.T).T
-
     def _triangularise(self) -> None:
         self._rows = np.asfortranarray(self._rows)
         self._rows, self._targets = lapack.qr_in_place(self._rows, np.asfortranarray(self._targets))
@@ -84,6 +78,11 @@ class ShiftedGram:
         self.shift: float | None = None
 
     @property
+    def size(self) -> int:
+        """Its rows and columns k."""
+        return len(self._diagonal)
+
+    @property
     def trace(self) -> float:
         return float(self._diagonal.sum())
 
@@ -105,6 +104,12 @@ class ShiftedGram:
     def solve(self, rhs: FloatArray) -> FloatArray:
         """Solution of (K + shift·I) y = rhs."""
         return lapack.cholesky_solve(self._buffer, rhs)
+
+    @property
+    def rcond(self) -> float:
+        """Estimated reciprocal condition number of K + shift·I, at least 1 / k of the true one."""
+        norm = self.trace + (self.shift or 0.0) * self.size
+        return lapack.cholesky_rcond(self._buffer, norm)
 
     @property
     def log_determinant(self) -> float:

@@ -20,7 +20,7 @@ def _routine(name: str, library: object = lapack) -> Callable[..., Any]:
 _dger = _routine("dger", blas)
 _dgeqrf, _dormqr = _routine("dgeqrf"), _routine("dormqr")
 _dtpqrt, _dtpmqrt = _routine("dtpqrt"), _routine("dtpmqrt")
-_dlauum, _dpotrf, _dpotri, _dpotrs = _routine("dlauum"), _routine("dpotrf"), _routine("dpotri"), _routine("dpotrs")
+_dpocon, _dpotrf, _dpotrs = _routine("dpocon"), _routine("dpotrf"), _routine("dpotrs")
 _dtrcon, _dtrtrs = _routine("dtrcon"), _routine("dtrtrs")
 
 
@@ -54,12 +54,6 @@ def qr_append(
     return updated, rotated, remainder
 
 
-def upper_times_transpose(upper: FloatArray) -> FloatArray:
-    """The upper triangle of U Uᵀ, overwriting U."""
-    product, _ = _dlauum(upper, lower=0, overwrite_c=1)
-    return cast(FloatArray, product)
-
-
 def cholesky_lower(symmetric: FloatArray) -> tuple[FloatArray, bool]:
     """The matrix with its Cholesky factor in the lower triangle, and whether it was positive definite.
 
@@ -73,6 +67,12 @@ def cholesky_solve(lower: FloatArray, rhs: FloatArray) -> FloatArray:
     """Solution of L Lᵀ y = rhs."""
     solution, _ = _dpotrs(lower, rhs, lower=1)
     return cast(FloatArray, solution)
+
+
+def cholesky_rcond(lower: FloatArray, norm: float) -> float:
+    """Estimated reciprocal condition number of L Lᵀ, whose norm is given."""
+    rcond, _ = _dpocon(lower, norm, uplo="L")
+    return float(rcond)
 
 
 def triangular_solve(upper: FloatArray, rhs: FloatArray, smallest_rcond: float) -> FloatArray | None:
