@@ -10,6 +10,8 @@ from planted_chains import bases_for, literal_weights, random_chain, random_map,
 
 from kbmaps import NLMS, JointBasis, NonFiniteError, SettingError, ShapeError, prediction_errors
 
+pytestmark = pytest.mark.usefixtures("kernel_path")
+
 seeds = st.integers(0, 2**32 - 1)
 
 
