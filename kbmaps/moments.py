@@ -94,7 +94,7 @@ def _full_products(polynomials: FloatArray, size: int) -> FloatArray:
 
 def _kronecker(factors: Sequence[FloatArray]) -> FloatArray:
     """Row by row: (n, product of the widths)."""
-    product = factors[0]
-    for factor in factors[1:]:
-        product = (product[:, :, None] * factor[:, None, :]).reshape(len(product), -1)
+    product = factors[-1]
+    for factor in reversed(factors[:-1]):
+        product = (factor[:, :, None] * product[:, None, :]).reshape(len(product), -1)
     return product

@@ -83,7 +83,8 @@ class BasisStack:
 
     def _products(self, q: FloatArray) -> FloatArray:
         """The three products (..., 3 d) that the basis functions are mixed from, as `kbmaps.basis.Terms` has them."""
-        sines = np.sin(0.5 * q[..., None, :] - self._half_phases)
+        halved = 0.5 * q
+        sines = np.sin((halved if q.ndim == 1 else halved[..., None, :]) - self._half_phases)
         products = sines.take(_FIRST, axis=-2) * sines.take(_SECOND, axis=-2)
         if self._any_slides:
             share = (q - self._start) / self._span
@@ -96,7 +97,8 @@ class BasisStack:
         if q.ndim > 1:
             weights = self.joint_weights(q)
             return self.left(weights), self.right(weights)
-        weights_and_one = np.ones(3 * self.joints + 1)
+        weights_and_one = np.empty(3 * self.joints + 1)
+        weights_and_one[-1] = 1.0
         np.dot(self._products(q), self._mix_all, out=weights_and_one[:-1])
         both = np.multiply.reduce(weights_and_one.take(self._halves_index), axis=0)
         return both[: self.left_size], both[self.left_size :]
@@ -119,12 +121,12 @@ class BasisStack:
         return (left[:, :, None] * right[:, None, :]).reshape(len(q), -1)
 
     def _kronecker(self, weights: FloatArray, begin: int, end: int) -> FloatArray:
-        """For a batch, joint by joint: less memory than gathering all factors."""
+        """For a batch, joint by joint from the last: less memory than gathering all factors, and long inner loops."""
         count = len(weights)
         product = np.ones((count, 1))
-        for k in range(begin, end):
-            factor = weights[:, k, None, : self.sizes[k]]
-            product = (product[:, :, None] * factor).reshape(count, product.shape[1] * self.sizes[k])
+        for k in range(end - 1, begin - 1, -1):
+            factor = weights[:, k, : self.sizes[k], None]
+            product = (factor * product[:, None, :]).reshape(count, product.shape[1] * self.sizes[k])
         return product
 
 

@@ -13,9 +13,9 @@
 #include <stdlib.h>
 #include <string.h>
 
-/* One body, compiled for plain x86-64 and for AVX2 with FMA; the loader picks. */
+/* One body, compiled for plain x86-64 and for processors with AVX and FMA; the loader picks. */
 #if defined(__x86_64__) && defined(__GNUC__) && !defined(__clang__) && defined(__GLIBC__)
-#define FAST __attribute__((target_clones("arch=haswell", "default")))
+#define FAST __attribute__((target_clones("fma", "default")))
 #else
 #define FAST
 #endif
