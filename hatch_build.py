@@ -35,7 +35,8 @@ class KernelBuildHook(BuildHookInterface):
         complaint = compile_kernels(root, library)
         if complaint:
             self.app.display_warning(
-                f"kbmaps: no compiled kernels, its NumPy path is used instead (slower, otherwise the same). {complaint}\n"
+                "kbmaps: no compiled kernels, its NumPy path is used instead (slower, otherwise the same). "
+                f"{complaint}\n"
                 "To have them: install a C compiler and Python's headers (Debian: apt install gcc python3-dev), "
                 "then install again."
             )

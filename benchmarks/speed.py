@@ -2,7 +2,7 @@
 
 Input checks and basis functions are included, except for padasip's FilterNLMS, one filter a coordinate, which is handed
 its 2187 features ready-made. numba takes part where it is installed. All rivals take turns in this one process, so
-their ratios hold on a busy machine; the absolute times are those of the machine at that moment.
+their ratios hold on a busy machine. Times are those of the thread on the processor.
 """
 
 from __future__ import annotations
@@ -23,7 +23,16 @@ from padasip.filters import FilterNLMS
 
 from benchmarks.humanoid_arm import JOINTS, guided_path, nominal_chain
 from benchmarks.timing import interleaved_medians_us
-from kbmaps import NLMS, ChainTolerances, ExactLearner, KBMap, RecursiveRigidLearner, SupportSet, kernels, learning_bases
+from kbmaps import (
+    NLMS,
+    ChainTolerances,
+    ExactLearner,
+    KBMap,
+    RecursiveRigidLearner,
+    SupportSet,
+    kernels,
+    learning_bases,
+)
 from kbmaps.arrays import FloatArray
 
 ROUGH = ChainTolerances(axes=0.05, points=0.015, tool=0.03)
@@ -123,14 +132,20 @@ def online(q: FloatArray, x: FloatArray) -> None:
         support.add(row)
     rivals[f"SupportSet.unexplained, {support.size} kept"] = lambda: support.unexplained(q[0])
     of_many = {name for name in rivals if name.endswith(("a pair", "a row of 600"))}
-    costs = interleaved_medians_us({name: call for name, call in rivals.items() if name not in of_many}, calls=100)
-    batches = interleaved_medians_us({name: rivals[name] for name in of_many}, rounds=20, calls=3)
+    costs = interleaved_medians_us(
+        {name: call for name, call in rivals.items() if name not in of_many}, calls=100, clock=time.thread_time
+    )
+    batches = interleaved_medians_us(
+        {name: rivals[name] for name in of_many}, rounds=20, calls=3, clock=time.thread_time
+    )
     costs |= {name: cost / len(q) for name, cost in batches.items()}
     print(f"  {'[us]':30s} {'NumPy':>8s} {'goal':>6s} {'compiled':>9s} {'goal':>6s} {'NumPy / compiled':>17s}")
     for name, goals in GOALS.items():
         plain, compiled = (costs.get(f"{path} {name}") for path in ("numpy", "compiled"))
         ratio = plain / compiled if plain and compiled else None
-        print(f"  {name:30s}{cell(plain, 9)}{cell(goals[0], 7)}{cell(compiled, 10)}{cell(goals[1], 7)}{cell(ratio, 18)}")
+        print(
+            f"  {name:30s}{cell(plain, 9)}{cell(goals[0], 7)}{cell(compiled, 10)}{cell(goals[1], 7)}{cell(ratio, 18)}"
+        )
     for name in (name for name in rivals if not name.startswith(("numpy", "compiled"))):
         print(f"  {name:44s} {costs[name]:8.2f}")
 
@@ -142,13 +157,15 @@ def cell(value: float | None, width: int) -> str:
 def exact_learner(kbmap: KBMap, rng: np.random.Generator) -> None:
     print(f"exact learner, {kbmap.size} control points (goals: 32 us a pair, solve 100 ms, 120 MB)")
     learner = ExactLearner(kbmap)
+    q, x = np.empty((0, JOINTS)), np.empty((0, 3))
     for total in STAGES:
         n = total - learner.pairs
-        q = guided_path(n, rng).q
-        x = nominal_chain().with_tool([0.05, 0.0, 0.0]).positions(q) + NOISE_M * rng.normal(size=(n, 3))
-        begin = time.perf_counter()
-        learner.learn(q, x)
-        per_pair = (time.perf_counter() - begin) / n * 1e6
+        new_q = guided_path(n, rng).q
+        new_x = nominal_chain().with_tool([0.05, 0.0, 0.0]).positions(new_q) + NOISE_M * rng.normal(size=(n, 3))
+        q, x = np.concatenate([q, new_q]), np.concatenate([x, new_x])
+        begin = time.thread_time()
+        learner.learn(new_q, new_x)
+        per_pair = (time.thread_time() - begin) / n * 1e6
         fixed, plain, evidence = (solve_ms(learner, precision) for precision in (1.0, None, "evidence"))
         print(
             f"  {total:5d} pairs: learn {per_pair:6.1f} us a pair; solve with a given ridge {fixed:4.0f} ms, "
@@ -162,13 +179,13 @@ def exact_learner(kbmap: KBMap, rng: np.random.Generator) -> None:
     tracemalloc.stop()
 
 
-def solve_ms(learner: ExactLearner, precision: float | None | str) -> float:
+def solve_ms(learner: ExactLearner, precision: float | str | None) -> float:
     """Median of three solves."""
     times: list[float] = []
     for _ in range(3):
-        begin = time.perf_counter()
+        begin = time.thread_time()
         learner.solve(precision)  # pyright: ignore[reportArgumentType]
-        times.append(1e3 * (time.perf_counter() - begin))
+        times.append(1e3 * (time.thread_time() - begin))
     return statistics.median(times)
 
 

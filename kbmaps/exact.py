@@ -73,8 +73,8 @@ class ExactLearner:
     """Collects pairs, and solves for the map when asked.
 
     The pairs are kept as they came, and with more of them than control points the sums for their Gram matrix; the prior
-    is no part of either, so it may change (`rebase`). At d = 7 a pair takes 88 bytes and some 5 µs to learn, and 5 µs of
-    each solve, of which the rest is one Cholesky factorisation of at most (3^d)², within 8 · 9^d bytes (38 MB).
+    is no part of either, so it may change (`rebase`). At d = 7 a pair takes 88 bytes, 6 µs to learn and 5 µs of each
+    solve, of which the rest is one Cholesky factorisation of at most (3^d)², within 8 · 9^d bytes (38 MB).
     Where the data are too one-sided for it, the solution comes from a QR factorisation of all pairs: exact, and slow.
 
     Args:

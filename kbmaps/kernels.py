@@ -7,8 +7,9 @@ of a process leaves it aside.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Generator
 from contextlib import contextmanager
+from contextvars import ContextVar
 from functools import partial
 from importlib import import_module
 from typing import Literal, Protocol, cast
@@ -77,12 +78,12 @@ def _load() -> _Compiled | None:
 
 
 _available = _load()
-_chosen = _available
+_chosen = ContextVar("_chosen", default=_available)
 
 
 def in_use() -> KernelPath:
     """The path of maps and learners that are made now."""
-    return "numpy" if _chosen is None else "compiled"
+    return "numpy" if _chosen.get() is None else "compiled"
 
 
 def available() -> tuple[KernelPath, ...]:
@@ -91,33 +92,36 @@ def available() -> tuple[KernelPath, ...]:
 
 
 @contextmanager
-def using(path: KernelPath) -> Iterator[None]:
+def using(path: KernelPath) -> Generator[None]:
     """Maps and learners made within take this path for good; for comparing the two.
 
     Raises:
         SettingError: there are no compiled kernels.
     """
-    global _chosen
     if path not in available():
-        raise SettingError(f"the {path} kernels are not there; have a C compiler when installing, and no BODYSCHEMA_PURE")
-    before, _chosen = _chosen, _available if path == "compiled" else None
+        raise SettingError(
+            f"the {path} kernels are not there; have a C compiler when installing, and no BODYSCHEMA_PURE"
+        )
+    before = _chosen.set(_available if path == "compiled" else None)
     try:
         yield
     finally:
-        _chosen = before
+        _chosen.reset(before)
 
 
 def net_kernel(stack: BasisStack, planes: FloatArray, check_q: Check, check_x: Check) -> NetKernel:
     """The chosen path's kernel for a net; the arguments are those of `NumpyNet`."""
-    if _chosen is None:
+    compiled = _chosen.get()
+    if compiled is None:
         return NumpyNet(stack, planes, check_q, check_x)
     checks = partial(_contiguous, check_q), partial(_contiguous, check_x)
-    return _chosen.Net(*stack.tables, planes, *checks, np.empty)
+    return compiled.Net(*stack.tables, planes, *checks, np.empty)
 
 
 def filter_kernel(*arrays: FloatArray) -> FilterKernel | None:
     """The compiled loop of `RecursiveRigidLearner`, if that is the path."""
-    return None if _chosen is None else _chosen.RigidFilter(*(np.ascontiguousarray(array) for array in arrays))
+    compiled = _chosen.get()
+    return None if compiled is None else compiled.RigidFilter(*(np.ascontiguousarray(array) for array in arrays))
 
 
 def _contiguous(check: Check, values: ArrayLike) -> FloatArray:

@@ -52,7 +52,7 @@ class _Update:
 
 
 class RecursiveRigidLearner:
-    """Corrects a rigid chain with each pair, at a constant cost (7 joints: 0.2 ms, compiled 7 µs) and without keeping pairs.
+    """Corrects a rigid chain with each pair, at a constant cost (7 joints: 0.2 ms, compiled 8 µs); keeps no pairs.
 
     The parameters and the prior are those of `RigidLearner`. The filter linearises each pair once, where the chain is
     when the pair comes; the curvature left out is taken for noise, so that early pairs do not make it too sure. That

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
-SAY = "import kbmaps, numpy as np; print(kbmaps.__file__, kbmaps.kernels_in_use(), kbmaps.JointBasis.trigonometric().size)"
+SAY = "import kbmaps; print(kbmaps.__file__, kbmaps.kernels_in_use(), kbmaps.JointBasis.trigonometric().size)"
 
 
 @dataclass(frozen=True)
