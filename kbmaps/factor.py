@@ -12,14 +12,13 @@ class RowFactor:
     """Rows A (k, m) and targets (k, outputs) of a least-squares problem, never more of them than unknowns.
 
     Up to m rows are kept as they come. From then on A is their triangular QR factor, into which later rows are
-    folded: for every g, the squares of A g − targets plus `residual_squares` (outputs,) stay the sum over all rows ever
-    added, at the same memory and the same cost a row. No normal equations are formed, so nothing is lost to squaring
+    folded: for every g, the squares of A g − targets stay the sum over all rows ever added, up to what no g can reach,
+    at the same memory and the same cost a row. No normal equations are formed, so nothing is lost to squaring
     the condition number. Inputs are trusted.
     """
 
     def __init__(self, unknowns: int, outputs: int) -> None:
         self.unknowns = unknowns
-        self.residual_squares = np.zeros(outputs)
         self._rows = np.zeros((unknowns, unknowns))
         self._targets = np.zeros((unknowns, outputs))
         self._filled = 0
@@ -27,17 +26,13 @@ class RowFactor:
 
     @property
     def rows(self) -> FloatArray:
-        """A (k, m); upper triangular once `triangular`."""
+        """A (k, m); upper triangular once k = m."""
         return self._rows[: self._filled]
 
     @property
     def targets(self) -> FloatArray:
         """Targets (k, outputs) that go with `rows`."""
         return self._targets[: self._filled]
-
-    @property
-    def triangular(self) -> bool:
-        return self._triangular
 
     def add(self, rows: FloatArray, targets: FloatArray) -> None:
         """More rows (n, m) with targets (n, outputs)."""
@@ -51,8 +46,7 @@ class RowFactor:
                 self._triangularise()
         if taken < len(rows):
             below, below_targets = np.asfortranarray(rows[taken:]), np.array(targets[taken:], order="F")
-            self._rows, self._targets, remainder = lapack.qr_append(self._rows, self._targets, below, below_targets)
-            self.residual_squares += np.square(remainder).sum(axis=0)
+            self._rows, self._targets = lapack.qr_append(self._rows, self._targets, below, below_targets)
 
     def _triangularise(self) -> None:
         self._rows = np.asfortranarray(self._rows)

@@ -41,17 +41,17 @@ def qr_in_place(square: FloatArray, targets: FloatArray) -> tuple[FloatArray, Fl
 
 def qr_append(
     factor: FloatArray, targets: FloatArray, rows: FloatArray, row_targets: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """R and Qᵀ·targets after rows were put below them, and what of the rows' targets no solution can reach.
+) -> tuple[FloatArray, FloatArray]:
+    """R and Qᵀ·targets after rows were put below them.
 
     Overwrites all four.
     """
     panel = min(_PANEL_COLUMNS, len(factor))
     updated, reflectors, blocks, _ = _dtpqrt(0, panel, factor, rows, overwrite_a=1, overwrite_b=1)
-    rotated, remainder, _ = _dtpmqrt(
+    rotated, _, _ = _dtpmqrt(
         0, reflectors, blocks, targets, row_targets, side="L", trans="T", overwrite_a=1, overwrite_b=1
     )
-    return updated, rotated, remainder
+    return updated, rotated
 
 
 def cholesky_lower(symmetric: FloatArray) -> tuple[FloatArray, bool]:

@@ -1,12 +1,15 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from planted_chains import bases_for, random_q
 
 from kbmaps import JointBasis
 from kbmaps.design import Design
+from kbmaps.factor import ShiftedGram
+from kbmaps.least_squares import nearest_solution
 
 seeds = st.integers(0, 2**32 - 1)
 kinds = st.text("RP", min_size=1, max_size=4)
@@ -51,3 +54,17 @@ def test_products_are_those_of_the_rows(seed, joint_kinds, pairs):
     np.testing.assert_allclose(design.times(coefficients), rows @ coefficients, rtol=0, atol=atol)
     np.testing.assert_allclose(design.errors(coefficients), targets - rows @ coefficients, rtol=0, atol=atol)
     np.testing.assert_allclose(design.transposed_times(values), rows.T @ values, rtol=0, atol=atol)
+
+
+@pytest.mark.parametrize("pairs", [9, 40])
+def test_pairs_too_close_together_for_the_gram_matrix_are_solved_by_their_rows(pairs):
+    rng = np.random.default_rng(5)
+    design = Design(bases_for("RR"), 3)
+    q = random_q(rng, "RR", pairs, 0.5)
+    truth = rng.normal(size=(9, 3))
+    design.add(q, np.zeros((pairs, 3)), np.ones(pairs))
+    gram = ShiftedGram(design.gram())
+    assert not gram.factorise(0.0) or gram.rcond < 1e-15
+    rows = design.rows()
+    found = nearest_solution(design, rows @ truth)
+    assert np.abs(found - truth).max() < 1e-15 * np.linalg.cond(rows)
