@@ -14,12 +14,13 @@ help:           ## Show this list
 
 setup: $(STAMP) ## Set up .venv with everything, the command is then .venv/bin/bodyschema
 
-$(STAMP): pyproject.toml requirements.lock
+$(STAMP): pyproject.toml requirements.lock hatch_build.py $(wildcard kbmaps/csrc/*)
 	@$(PYTHON) -c 'import sys; sys.exit(0 if sys.version_info[:2] == (3, 11) else "bodyschema is developed with Python 3.11 (its simulator, pybullet, has wheels for no newer one). Install python3.11, or name it: make PYTHON=/path/to/python3.11 ...")'
 	@echo "Setting up $(VENV) (about 250 MB are downloaded the first time; one to two minutes)"
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	@$(BIN)/python -m pip install --disable-pip-version-check --quiet --only-binary pybullet --require-hashes -r requirements.lock
 	@$(BIN)/python -m pip install --disable-pip-version-check --quiet --no-deps --no-build-isolation -e .
+	@$(BIN)/python -c 'import kbmaps; print("kernels of kbmaps:", kbmaps.kernels_in_use())'
 	@touch $@
 
 demo: setup     ## Watch the whole thing learn in simulation, about a minute
@@ -53,4 +54,4 @@ wheel: setup    ## Build the wheel into dist/
 	@$(BIN)/python -m build --no-isolation --wheel
 
 clean:          ## Remove .venv and what was built
-	rm -rf $(VENV) dist build
+	rm -rf $(VENV) dist build kbmaps/_kernels.abi3.so

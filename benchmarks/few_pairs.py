@@ -248,7 +248,7 @@ def memory(seeds: int) -> None:
         x, test = arm.measured(q, 0.001, rng), arm.angles(TEST_ROWS, 80, rng)
         prior = arm.drawing.to_kbmap(bases(5))
         window = KernelLearner(bases(5), arm.drawing, precision=0.01, memory=Memory(200))
-        fading, begin = ExactLearner(prior, forgetting=0.99), 0
+        fading, begin = ExactLearner(prior, memory=Memory(forgetting=0.99)), 0
         for column, end in enumerate(runs):
             for part in np.array_split(np.arange(begin, end), 100):
                 window.learn(q[part], x[part])

@@ -1,6 +1,7 @@
 """Kinematic Bézier Maps: forward kinematics that is linear in its parameters, and learners for it.
 
-Numpy and scipy only; no I/O, no clock, no logging. Angles [rad], lengths [m], float64.
+Numpy and scipy only; no I/O, no clock, no logging. Angles [rad], lengths [m], float64. The innermost loops are compiled
+where a C compiler was there on installation: `kernels_in_use()` tells; BODYSCHEMA_PURE=1 goes without them.
 """
 
 from kbmaps.align import Alignment, align
@@ -29,6 +30,7 @@ from kbmaps.exact import ExactLearner, ExactSolution
 from kbmaps.inverse import InverseKinematics, InverseSolution
 from kbmaps.kbmap import KBMap, prediction_errors
 from kbmaps.kernel_learner import KernelLearner
+from kbmaps.kernels import in_use as kernels_in_use
 from kbmaps.memory import Memory
 from kbmaps.model import Estimate, Model
 from kbmaps.nlms import NLMS
@@ -94,6 +96,7 @@ __all__ = [
     "blockwise_precision",
     "find_chain",
     "follow_a_path",
+    "kernels_in_use",
     "learning_bases",
     "nearest_rotation",
     "prediction_errors",

@@ -16,7 +16,7 @@ WIDE = 10.0
 _FIXED_PARAMETERS = 9
 _JOINT_PARAMETERS = 5
 # Below this angle [rad] the quotients of the exponential map are taken from their series.
-_SMALL_ANGLE = 1e-3
+SMALL_ANGLE = 1e-3
 _EYE = np.eye(3)
 
 
@@ -126,6 +126,12 @@ class ChainParameters:
         self._points = self._frames[:-1, :3, 3]
         self._tangents = _tangents(self._axes)
         self._slides = np.flatnonzero(reference.prismatic)
+
+    @property
+    def tables(self) -> tuple[FloatArray, ...]:
+        """What `linearised` computes with: axes and points of the reference at q = 0 (d, 3), the tangents (d, 3, 2),
+        1 where prismatic (d,), and the marker's frame (4, 4)."""
+        return self._axes, self._points, self._tangents, self.reference.prismatic.astype(np.float64), self._frames[-1]
 
     def standard_deviations(self, tolerances: ChainTolerances) -> FloatArray:
         """Standard deviation (size,) of each parameter; 0 where it is held."""
@@ -291,8 +297,8 @@ def _exponentials(turns: FloatArray) -> tuple[FloatArray, FloatArray]:
     exp([φ + δ]×) = exp([J δ]×) exp([φ]×) to first order, with the left Jacobian J (Chirikjian 2012, section 10.8).
     """
     angles: FloatArray = np.sqrt(np.einsum("ki,ki->k", turns, turns))[:, None, None]
-    safe: FloatArray = np.maximum(angles, _SMALL_ANGLE)
-    small: BoolArray = angles < _SMALL_ANGLE
+    safe: FloatArray = np.maximum(angles, SMALL_ANGLE)
+    small: BoolArray = angles < SMALL_ANGLE
     squares = angles * angles
     sine: FloatArray = np.where(small, 1.0 - squares / 6.0, np.sin(safe) / safe)
     cosine: FloatArray = np.where(small, 0.5 - squares / 24.0, (1.0 - np.cos(safe)) / (safe * safe))

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from kbmaps import lapack
@@ -16,14 +14,13 @@ class RowFactor:
     """Rows A (k, m) and targets (k, outputs) of a least-squares problem, never more of them than unknowns.
 
     Up to m rows are kept as they come. From then on A is their triangular QR factor, into which later rows are
-    folded: for every g, the squares of A g − targets plus `residual_squares` (outputs,) stay the sum over all rows ever
-    added, at the same memory and the same cost a row. No normal equations are formed, so nothing is lost to squaring
+    folded: for every g, the squares of A g − targets stay the sum over all rows ever added, up to what no g can reach,
+    at the same memory and the same cost a row. No normal equations are formed, so nothing is lost to squaring
     the condition number. Inputs are trusted.
     """
 
     def __init__(self, unknowns: int, outputs: int) -> None:
         self.unknowns = unknowns
-        self.residual_squares = np.zeros(outputs)
         self._rows = np.zeros((unknowns, unknowns))
         self._targets = np.zeros((unknowns, outputs))
         self._filled = 0
@@ -31,17 +28,13 @@ class RowFactor:
 
     @property
     def rows(self) -> FloatArray:
-        """A (k, m); upper triangular once `triangular`."""
+        """A (k, m); upper triangular once k = m."""
         return self._rows[: self._filled]
 
     @property
     def targets(self) -> FloatArray:
         """Targets (k, outputs) that go with `rows`."""
         return self._targets[: self._filled]
-
-    @property
-    def triangular(self) -> bool:
-        return self._triangular
 
     def add(self, rows: FloatArray, targets: FloatArray) -> None:
         """More rows (n, m) with targets (n, outputs)."""
@@ -55,23 +48,7 @@ class RowFactor:
                 self._triangularise()
         if taken < len(rows):
             below, below_targets = np.asfortranarray(rows[taken:]), np.array(targets[taken:], order="F")
-            self._rows, self._targets, remainder = lapack.qr_append(self._rows, self._targets, below, below_targets)
-            self.residual_squares += np.square(remainder).sum(axis=0)
-
-    def fade(self, weight: float) -> None:
-        """Multiplies the weight of all rows so far by a factor in 0..1."""
-        scale = math.sqrt(weight)
-        for kept in (self._rows, self._targets):
-            kept *= scale
-            # Directions that are no longer seen would end in subnormal numbers, which are slow.
-            kept[np.abs(kept) < _NOTHING] = 0.0
-        self.residual_squares *= weight
-
-    def gram(self) -> FloatArray:
-        """A new A Aᵀ (k, k), Fortran-ordered, of which only the upper triangle counts."""
-        if self._triangular:
-            return lapack.upper_times_transpose(self._rows.copy(order="F"))
-        return (self.rows @ self.rows.T).T
+            self._rows, self._targets = lapack.qr_append(self._rows, self._targets, below, below_targets)
 
     def _triangularise(self) -> None:
         self._rows = np.asfortranarray(self._rows)
@@ -97,6 +74,11 @@ class ShiftedGram:
         self.shift: float | None = None
 
     @property
+    def size(self) -> int:
+        """Its rows and columns k."""
+        return len(self._diagonal)
+
+    @property
     def trace(self) -> float:
         return float(self._diagonal.sum())
 
@@ -118,6 +100,12 @@ class ShiftedGram:
     def solve(self, rhs: FloatArray) -> FloatArray:
         """Solution of (K + shift·I) y = rhs."""
         return lapack.cholesky_solve(self._buffer, rhs)
+
+    @property
+    def rcond(self) -> float:
+        """Estimated reciprocal condition number of K + shift·I, at least 1 / k of the true one."""
+        norm = self.trace + (self.shift or 0.0) * self.size
+        return lapack.cholesky_rcond(self._buffer, norm)
 
     @property
     def log_determinant(self) -> float:

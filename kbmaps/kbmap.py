@@ -6,6 +6,7 @@ import hashlib
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from types import MappingProxyType
 
 import numpy as np
@@ -15,12 +16,12 @@ from kbmaps import serial
 from kbmaps.arrays import FloatArray, frozen, rows, rows_or_vector, vector
 from kbmaps.basis import JointBasis
 from kbmaps.errors import BasisError, NonFiniteError, ShapeError
+from kbmaps.kernels import NetKernel, net_kernel
 from kbmaps.rotations import nearest_rotation, nearest_rotation_rates
 from kbmaps.stack import BasisStack
 
 POSITION_OUTPUTS = 3
 POSE_OUTPUTS = 12
-_BATCH_ROWS = 4096
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +55,7 @@ class KBMap:
     net: FloatArray
     metadata: Mapping[str, str] = field(default_factory=dict[str, str])
     _stack: BasisStack = field(init=False, repr=False)
-    _planes: FloatArray = field(init=False, repr=False)
+    _kernel: NetKernel = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         bases = tuple(self.bases)
@@ -71,7 +72,10 @@ class KBMap:
         object.__setattr__(self, "net", net)
         object.__setattr__(self, "metadata", MappingProxyType(dict(self.metadata)))
         object.__setattr__(self, "_stack", stack)
-        object.__setattr__(self, "_planes", net.reshape(-1, stack.right_size))
+        check_q = partial(rows_or_vector, "q", width=len(bases))
+        check_x = partial(vector, "x", width=len(net))
+        kernel = net_kernel(stack, net.reshape(-1, stack.right_size), check_q, check_x)
+        object.__setattr__(self, "_kernel", kernel)
 
     @property
     def joints(self) -> int:
@@ -93,7 +97,7 @@ class KBMap:
         Raises:
             ShapeError, NonFiniteError
         """
-        return self._outputs(rows_or_vector("q", q, self.joints), 0, POSITION_OUTPUTS)
+        return self._kernel.outputs(q, 0, POSITION_OUTPUTS)
 
     def orientation(self, q: ArrayLike, *, orthonormal: bool = False) -> FloatArray:
         """The marker's axes e1, e2, e3 as columns of (3, 3), or (n, 3, 3).
@@ -105,7 +109,7 @@ class KBMap:
             ShapeError: the map holds positions only, or q has the wrong length. NonFiniteError.
         """
         self._require_orientation()
-        axes = _as_columns(self._outputs(rows_or_vector("q", q, self.joints), POSITION_OUTPUTS, POSE_OUTPUTS))
+        axes = _as_columns(self._kernel.outputs(q, POSITION_OUTPUTS, POSE_OUTPUTS))
         return nearest_rotation(axes) if orthonormal else axes
 
     def jacobian(self, q: ArrayLike) -> FloatArray:
@@ -114,7 +118,7 @@ class KBMap:
         Raises:
             ShapeError, NonFiniteError
         """
-        return self._derivatives(rows_or_vector("q", q, self.joints), 0, POSITION_OUTPUTS)
+        return self._kernel.derivatives(q, 0, POSITION_OUTPUTS)
 
     def angular_jacobian(self, q: ArrayLike) -> FloatArray:
         """Angular velocity (3, d) of the orthonormal orientation R [rad/rad, or rad/m], or (n, 3, d) for q (n, d).
@@ -126,8 +130,8 @@ class KBMap:
         """
         self._require_orientation()
         checked = rows_or_vector("q", q, self.joints)
-        axes = self._outputs(checked, POSITION_OUTPUTS, POSE_OUTPUTS)
-        slopes = self._derivatives(checked, POSITION_OUTPUTS, POSE_OUTPUTS)
+        axes = self._kernel.outputs(checked, POSITION_OUTPUTS, POSE_OUTPUTS)
+        slopes = self._kernel.derivatives(checked, POSITION_OUTPUTS, POSE_OUTPUTS)
         turning = slopes.reshape(*checked.shape[:-1], 3, 3, self.joints).swapaxes(-3, -2)
         return nearest_rotation_rates(_as_columns(axes), turning)
 
@@ -241,47 +245,9 @@ class KBMap:
         """
         return cls(*serial.decode(data))
 
-    def _outputs(self, q: FloatArray, begin: int, end: int) -> FloatArray:
-        """Outputs begin..end, (end − begin,) or (n, end − begin), contracted half by half."""
-        stack = self._stack
-        planes = self._planes[begin * stack.left_size : end * stack.left_size]
-        if q.ndim == 1:
-            left, right = stack.halves(q)
-            return (planes @ right).reshape(end - begin, -1) @ left
-        out = np.empty((len(q), end - begin))
-        for start, chunk in zip(range(0, len(q), _BATCH_ROWS), _chunks(q), strict=False):
-            left, right = stack.halves(chunk)
-            by_left = (right @ planes.T).reshape(len(chunk), end - begin, stack.left_size)
-            out[start : start + len(chunk)] = (by_left @ left[:, :, None])[:, :, 0]
-        return out
-
     def _require_orientation(self) -> None:
         if not self.has_orientation:
             raise ShapeError("net", f"({POSE_OUTPUTS}, ...) to give an orientation", self.net.shape)
-
-    def _derivatives(self, q: FloatArray, begin: int, end: int) -> FloatArray:
-        """Derivatives of outputs begin..end, (end − begin, d) or (n, end − begin, d)."""
-        if q.ndim == 1:
-            return self._derivatives_of_few(q, begin, end)
-        return np.concatenate([self._derivatives_of_few(chunk, begin, end) for chunk in _chunks(q)])
-
-    def _derivatives_of_few(self, q: FloatArray, begin: int, end: int) -> FloatArray:
-        stack, lead, count = self._stack, q.shape[:-1], end - begin
-        weights, slopes = stack.joint_weights(q), stack.joint_derivatives(q)
-        planes = self._planes[begin * stack.left_size : end * stack.left_size]
-        cube = planes.reshape(count, stack.left_size, stack.right_size)
-        by_left = (stack.right(weights) @ planes.T).reshape(*lead, count, stack.left_size)
-        by_right = stack.left(weights) @ cube.swapaxes(0, 1).reshape(stack.left_size, -1)
-        by_right = by_right.reshape(*lead, count, stack.right_size)
-        columns = np.empty((*lead, count, self.joints))
-        for k in range(self.joints):
-            varied = weights.copy()
-            varied[..., k, :] = slopes[..., k, :]
-            if k < stack.split:
-                columns[..., k] = (by_left @ stack.left(varied)[..., None])[..., 0]
-            else:
-                columns[..., k] = (by_right @ stack.right(varied)[..., None])[..., 0]
-        return columns
 
 
 def _as_columns(axes: FloatArray) -> FloatArray:
@@ -296,11 +262,6 @@ def _one_a_joint(name: str, values: ArrayLike, joints: int) -> list[float]:
     if not np.isfinite(given).all():
         raise NonFiniteError(name)
     return np.broadcast_to(given, (joints,)).tolist()
-
-
-def _chunks(q: FloatArray) -> list[FloatArray]:
-    """Batches of rows small enough to stay in the cache; one empty batch for none."""
-    return [q[start : start + _BATCH_ROWS] for start in range(0, max(len(q), 1), _BATCH_ROWS)]
 
 
 def prediction_errors(kbmap: KBMap, q: ArrayLike, x: ArrayLike) -> FloatArray:

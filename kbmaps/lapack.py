@@ -20,7 +20,8 @@ def _routine(name: str, library: object = lapack) -> Callable[..., Any]:
 _dger = _routine("dger", blas)
 _dgeqrf, _dormqr = _routine("dgeqrf"), _routine("dormqr")
 _dtpqrt, _dtpmqrt = _routine("dtpqrt"), _routine("dtpmqrt")
-_dlauum, _dpotrf, _dpotri, _dpotrs = _routine("dlauum"), _routine("dpotrf"), _routine("dpotri"), _routine("dpotrs")
+_dpocon, _dpotrf = _routine("dpocon"), _routine("dpotrf")
+_dpotri, _dpotrs = _routine("dpotri"), _routine("dpotrs")
 _dtrcon, _dtrtri, _dtrtrs = _routine("dtrcon"), _routine("dtrtri"), _routine("dtrtrs")
 
 
@@ -41,23 +42,17 @@ def qr_in_place(square: FloatArray, targets: FloatArray) -> tuple[FloatArray, Fl
 
 def qr_append(
     factor: FloatArray, targets: FloatArray, rows: FloatArray, row_targets: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """R and Qᵀ·targets after rows were put below them, and what of the rows' targets no solution can reach.
+) -> tuple[FloatArray, FloatArray]:
+    """R and Qᵀ·targets after rows were put below them.
 
     Overwrites all four.
     """
     panel = min(_PANEL_COLUMNS, len(factor))
     updated, reflectors, blocks, _ = _dtpqrt(0, panel, factor, rows, overwrite_a=1, overwrite_b=1)
-    rotated, remainder, _ = _dtpmqrt(
+    rotated, _, _ = _dtpmqrt(
         0, reflectors, blocks, targets, row_targets, side="L", trans="T", overwrite_a=1, overwrite_b=1
     )
-    return updated, rotated, remainder
-
-
-def upper_times_transpose(upper: FloatArray) -> FloatArray:
-    """The upper triangle of U Uᵀ, overwriting U."""
-    product, _ = _dlauum(upper, lower=0, overwrite_c=1)
-    return cast(FloatArray, product)
+    return updated, rotated
 
 
 def cholesky_lower(symmetric: FloatArray) -> tuple[FloatArray, bool]:
@@ -80,6 +75,12 @@ def lower_inverse(lower: FloatArray) -> FloatArray:
     # In C order it is the transpose of an upper one in Fortran order, which LAPACK takes as it is.
     inverse, _ = _dtrtri(lower.T, lower=0)
     return cast(FloatArray, inverse).T
+
+
+def cholesky_rcond(lower: FloatArray, norm: float) -> float:
+    """Estimated reciprocal condition number of L Lᵀ, whose norm is given."""
+    rcond, _ = _dpocon(lower, norm, uplo="L")
+    return float(rcond)
 
 
 def triangular_solve(upper: FloatArray, rhs: FloatArray, smallest_rcond: float) -> FloatArray | None:

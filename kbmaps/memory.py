@@ -10,6 +10,9 @@ import numpy as np
 from kbmaps.arrays import FloatArray
 from kbmaps.errors import SettingError
 
+# What weighs less than this beside a new pair is no part of a sum in float64.
+_NOTHING = 1e-20
+
 
 @dataclass(frozen=True)
 class Memory:
@@ -31,20 +34,16 @@ class Memory:
     def __post_init__(self) -> None:
         if self.window is not None and self.window < 1:
             raise SettingError(f"a window must hold at least 1 pair, got {self.window}")
-        check_forgetting(self.forgetting)
+        if not (0.0 < self.forgetting <= 1.0 and math.isfinite(self.forgetting)):
+            raise SettingError(
+                f"forgetting must be greater than 0 and at most 1 (which forgets nothing), got {self.forgetting!r}"
+            )
 
     def kept(self, pairs: int) -> int:
         """How many of the last pairs count, of so many."""
-        return pairs if self.window is None else min(pairs, self.window)
+        longest = math.inf if self.forgetting == 1.0 else math.log(_NOTHING) / math.log(self.forgetting) + 1.0
+        return int(min(pairs, longest if self.window is None else min(longest, self.window)))
 
     def weights(self, pairs: int) -> FloatArray:
         """Weights (pairs,) of pairs in the order in which they came: 1 for the last."""
         return self.forgetting ** np.arange(pairs - 1, -1, -1.0)
-
-
-def check_forgetting(forgetting: float) -> None:
-    """Raises SettingError unless it is a factor in 0..1, 0 excluded."""
-    if not (0.0 < forgetting <= 1.0 and math.isfinite(forgetting)):
-        raise SettingError(
-            f"forgetting must be greater than 0 and at most 1 (which forgets nothing), got {forgetting!r}"
-        )

@@ -3,22 +3,22 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kbmaps import lapack
-from kbmaps.arrays import FloatArray, IntArray, rows, vector
+from kbmaps.arrays import IntArray, rows, vector
 from kbmaps.errors import KBMapsError, ModelFormatError, SettingError, ShapeError
 from kbmaps.kbmap import POSITION_OUTPUTS, KBMap
+from kbmaps.kernels import net_kernel
 from kbmaps.packed import describe_bases, pack, parse_bases, unpack
 from kbmaps.stack import BasisStack
 from kbmaps.step_size import DEFAULT_MU0, StepSize
 from kbmaps.targets import pose_targets
 
 _KIND = "nlms, 1"
-_BLOCK = 64
 
 
 class NLMS:
@@ -51,8 +51,10 @@ class NLMS:
         self._pairs = 0
         self._stack = BasisStack(kbmap.bases)
         self._outputs = len(kbmap.net)
-        # One row for each output and left weight, one column for each right weight.
         self._planes = np.array(kbmap.net.reshape(-1, self._stack.right_size))
+        check_q = partial(vector, "q", width=self._stack.joints)
+        check_x = partial(vector, "x", width=self._outputs)
+        self._kernel = net_kernel(self._stack, self._planes, check_q, check_x)
 
     @property
     def step_size(self) -> StepSize:
@@ -84,17 +86,12 @@ class NLMS:
             ShapeError, NonFiniteError, RotationError
             SettingError: a rotation too many or too few. Nothing has changed.
         """
-        angles = vector("q", q, self._stack.joints)
-        target = vector("x", x, POSITION_OUTPUTS)
-        if rotation is not None or self._outputs > POSITION_OUTPUTS:
-            target = pose_targets(target[None], rotation, self._outputs)[0]
-        left, right = self._stack.halves(angles)
-        predicted = (self._planes @ right).reshape(self._outputs, -1) @ left
-        # ‖w‖² of a Kronecker product is the product of its factors' norms.
-        mu = self._step_size.at(self._pairs) / float((left @ left) * (right @ right))
-        # Ulbrich et al. 2009, eq. (20)
-        error = mu * (target - predicted)
-        lapack.add_outer_in_place(self._planes, (error[:, None] * left).ravel(), right)
+        mu = self._step_size.at(self._pairs)
+        if rotation is None and self._outputs == POSITION_OUTPUTS:
+            self._kernel.step(q, x, mu)
+        else:
+            angles, position = vector("q", q, self._stack.joints), vector("x", x, POSITION_OUTPUTS)
+            self._kernel.step(angles, pose_targets(position[None], rotation, self._outputs)[0], mu)
         self._pairs += 1
 
     def replay(
@@ -117,9 +114,9 @@ class NLMS:
             raise ShapeError("x", f"({len(angles)}, 3) to go with q", positions.shape)
         targets = pose_targets(positions, rotation, self._outputs)
         sequence = np.arange(len(angles)) if order is None else _checked_order(order, len(angles))
-        for start in range(0, len(sequence), _BLOCK):
-            block = sequence[start : start + _BLOCK]
-            self._learn_block(angles[block], targets[block])
+        steps = self._step_size.run(self._pairs, len(sequence))
+        self._kernel.replay(np.ascontiguousarray(angles), np.ascontiguousarray(targets), sequence, steps)
+        self._pairs += len(sequence)
 
     def to_bytes(self) -> bytes:
         """The learner as it is; `from_bytes` learns on to the last bit as this one would."""
@@ -146,24 +143,6 @@ class NLMS:
         except (KeyError, TypeError, ValueError, KBMapsError) as error:
             raise ModelFormatError(f"the bytes do not describe an NLMS learner: {error}") from error
         return learner
-
-    def _learn_block(self, q: FloatArray, targets: FloatArray) -> None:
-        """A block of consecutive steps as one triangular solve.
-
-        Step j sees the errors left by the steps i < j: e_j = x_j − f(q_j) − Σ_{i<j} μ_i k_ij / k_ii e_i with
-        k_ij = w_i · w_j, a product over the joints.
-        """
-        left, right = self._stack.halves(q)
-        kernel = (left @ left.T) * (right @ right.T)
-        steps = self._step_size.run(self._pairs, len(q)) / np.diag(kernel)
-        by_left = (right @ self._planes.T).reshape(len(q), self._outputs, -1)
-        errors = targets - (by_left @ left[:, :, None])[:, :, 0]
-        np.einsum("ij,j->ij", kernel, steps, out=kernel)
-        for j in range(1, len(q)):
-            errors[j] -= kernel[j, :j] @ errors[:j]
-        moves = (errors * steps[:, None])[:, :, None] * left[:, None, :]
-        self._planes += moves.reshape(len(q), -1).T @ right
-        self._pairs += len(q)
 
 
 def _checked_order(order: ArrayLike, pairs: int) -> IntArray:

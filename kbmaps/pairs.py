@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -56,6 +57,8 @@ def checked_pairs(
         raise ShapeError("x", f"({len(angles)}, 3) to go with q", positions.shape)
     if sigma is None:
         return angles, positions, np.full(len(angles), np.nan)
+    if isinstance(sigma, float) and 0.0 < sigma < math.inf:
+        return angles, positions, np.full(len(angles), sigma)
     sigmas = np.asarray(sigma, dtype=np.float64)
     if sigmas.shape not in ((), (len(angles),)):
         raise ShapeError("sigma", f"() or ({len(angles)},)", sigmas.shape)

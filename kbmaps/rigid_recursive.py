@@ -11,8 +11,9 @@ from numpy.typing import ArrayLike
 
 from kbmaps.arrays import FloatArray, frozen, rows, rows_or_vector
 from kbmaps.chain import RigidChain
-from kbmaps.chain_parameters import WIDE, ChainParameters, ChainTolerances
+from kbmaps.chain_parameters import SMALL_ANGLE, WIDE, ChainParameters, ChainTolerances
 from kbmaps.errors import KBMapsError, ModelFormatError, NonFiniteError, SettingError, ShapeError
+from kbmaps.kernels import FilterKernel, filter_kernel
 from kbmaps.model import Estimate
 from kbmaps.packed import chain_arrays, chain_from_arrays, numbers, pack, unpack
 from kbmaps.pairs import checked_pairs
@@ -51,7 +52,7 @@ class _Update:
 
 
 class RecursiveRigidLearner:
-    """Corrects a rigid chain with each pair, at a constant cost (7 joints: 0.3 ms) and without keeping pairs.
+    """Corrects a rigid chain with each pair, at a constant cost (7 joints: 0.2 ms, compiled 8 µs); keeps no pairs.
 
     The parameters and the prior are those of `RigidLearner`. The filter linearises each pair once, where the chain is
     when the pair comes; the curvature left out is taken for noise, so that early pairs do not make it too sure. That
@@ -90,6 +91,7 @@ class RecursiveRigidLearner:
         self._scales = np.where((std == 0.0) & tool, _TOOL_UNIT, std)[self._active]
         self._bends = self._turning()[self._active]
         self._reach = max(float(np.linalg.norm(nominal.fixed[1:, :3, 3], axis=1).sum()) / 2.0, 1e-3)
+        self._kernel = self._filter_kernel()
         self._change = np.zeros(self._parameters.size)
         self._covariance: FloatArray = np.diag(np.square(std[self._active] / self._scales))
         self._noise_square = noise**2
@@ -152,8 +154,11 @@ class RecursiveRigidLearner:
             ShapeError, NonFiniteError, SettingError (a sigma that is not positive): nothing has changed.
         """
         angles, positions, sigmas = checked_pairs(q, x, sigma, self.joints)
-        for k in range(len(angles)):
-            self._learn_one(angles[k : k + 1], positions[k], float(sigmas[k]))
+        if self._kernel is None:
+            for k in range(len(angles)):
+                self._learn_one(angles[k : k + 1], positions[k], float(sigmas[k]))
+        else:
+            self._learn_compiled(self._kernel, angles, positions, sigmas)
         self._pairs += len(angles)
 
     def tool_changed(self, tolerance: float) -> None:
@@ -228,7 +233,27 @@ class RecursiveRigidLearner:
                 raise ShapeError(name, str(present.shape), stored.shape)
             if not np.isfinite(stored).all():
                 raise NonFiniteError(name)
-        self._change, self._covariance = change, covariance
+        self._change, self._covariance = np.array(change), np.array(covariance)
+
+    def _filter_kernel(self) -> FilterKernel | None:
+        scales = np.zeros(self._parameters.size)
+        scales[self._active] = self._scales
+        constants = [_ITERATIONS, _SMALL_BEND, _GATE, _NOISE_MEMORY, _LEAST_NOISE_M**2, SMALL_ANGLE, self._reach]
+        return filter_kernel(*self._parameters.tables, scales, self._turning(), np.array(constants))
+
+    def _learn_compiled(self, kernel: FilterKernel, q: FloatArray, x: FloatArray, sigma: FloatArray) -> None:
+        """What `_learn_one` does with each pair."""
+        taken, self._noise_square, self._noise_coordinates = kernel.learn(
+            self._change,
+            self._covariance,
+            np.ascontiguousarray(q),
+            np.ascontiguousarray(x),
+            np.ascontiguousarray(sigma),
+            self._noise_square,
+            self._noise_coordinates,
+        )
+        if taken < len(q):
+            raise np.linalg.LinAlgError("Singular matrix")
 
     def _turning(self) -> FloatArray:
         """1 for the parameters (size,) that are angles and so bend the marker's way, 0 for lengths."""

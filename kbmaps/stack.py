@@ -11,6 +11,7 @@ import numpy as np
 from kbmaps.arrays import FloatArray, IntArray
 from kbmaps.basis import JointBasis
 
+# The three products of the two sines of a joint: first², first · second, second².
 _FIRST = np.array([0, 0, 1])
 _SECOND = np.array([0, 1, 1])
 
@@ -36,6 +37,16 @@ class BasisStack:
         self._mix = np.zeros((self.joints, 3, 3))
         for k, basis in enumerate(bases):
             self._mix[k, : basis.size, : basis.size] = basis.terms.mix
+        # One matrix product for all joints: products (3, d), flattened, to weights (d, 3), flattened.
+        self._mix_all = np.zeros((3, self.joints, self.joints, 3))
+        for k in range(self.joints):
+            self._mix_all[:, k, k] = self._mix[k]
+        self._mix_all = self._mix_all.reshape(3 * self.joints, 3 * self.joints)
+
+    @property
+    def tables(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """What `joint_weights` computes with: half phases (2, d), mixing matrices (d, 3, 3), 1 where prismatic (d,)."""
+        return np.ascontiguousarray(self._half_phases), self._mix, self._slides.astype(np.float64)
 
     # Tables of 3^(d/2) entries a joint, made when first asked for: a tensor train of 30 joints has no use for them.
     @cached_property
@@ -46,31 +57,51 @@ class BasisStack:
     def _right_index(self) -> IntArray:
         return _factor_index(self.sizes[self.split :], self.split)
 
+    @cached_property
+    def _halves_index(self) -> IntArray:
+        """Both side by side; the side of fewer joints is filled up with the entry after the last weight, a 1."""
+        factors = self.joints - self.split
+        index = np.full((factors, self.left_size + self.right_size), 3 * self.joints, dtype=np.intp)
+        index[: self.split, : self.left_size] = self._left_index
+        index[:, self.left_size :] = self._right_index
+        return index
+
     def joint_weights(self, q: FloatArray) -> FloatArray:
         """Basis functions (..., d, 3) of every joint for q (..., d); a prismatic joint's third entry is 0."""
-        sines = np.sin(0.5 * q[..., None, :] - self._half_phases)
-        products = (sines[..., _FIRST, :] * sines[..., _SECOND, :]).swapaxes(-1, -2)
-        if self._any_slides:
-            share = (q - self._start) / self._span
-            stroke = np.stack([1.0 - share, share, np.zeros_like(share)], axis=-1)
-            products = np.where(self._slides[:, None], stroke, products)
-        return (products[..., None, :] @ self._mix)[..., 0, :]
+        return (self._products(q) @ self._mix_all).reshape(*q.shape, 3)
 
     def joint_derivatives(self, q: FloatArray) -> FloatArray:
         """Derivatives (..., d, 3) of the basis functions of every joint."""
         first, second = self._half_phases
         phases = np.stack([2.0 * first, first + second, 2.0 * second])
-        products = 0.5 * np.sin(q[..., None, :] - phases).swapaxes(-1, -2)
+        products = 0.5 * np.sin(q[..., None, :] - phases)
         if self._any_slides:
             slope = np.broadcast_to(1.0 / self._span, q.shape)
-            stroke = np.stack([-slope, slope, np.zeros_like(slope)], axis=-1)
-            products = np.where(self._slides[:, None], stroke, products)
-        return (products[..., None, :] @ self._mix)[..., 0, :]
+            stroke = np.stack([-slope, slope, np.zeros_like(slope)], axis=-2)
+            products = np.where(self._slides, stroke, products)
+        return (products.reshape(*q.shape[:-1], -1) @ self._mix_all).reshape(*q.shape, 3)
+
+    def _products(self, q: FloatArray) -> FloatArray:
+        """The three products (..., 3 d) that the basis functions are mixed from, as `kbmaps.basis.Terms` has them."""
+        halved = 0.5 * q
+        sines = np.sin((halved if q.ndim == 1 else halved[..., None, :]) - self._half_phases)
+        products = sines.take(_FIRST, axis=-2) * sines.take(_SECOND, axis=-2)
+        if self._any_slides:
+            share = (q - self._start) / self._span
+            stroke = np.stack([1.0 - share, share, np.zeros_like(share)], axis=-2)
+            products = np.where(self._slides, stroke, products)
+        return products.reshape(*q.shape[:-1], -1)
 
     def halves(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Left (left_size,) and right (right_size,) weights for q (d,); for q (n, d) with a leading n."""
-        weights = self.joint_weights(q)
-        return self.left(weights), self.right(weights)
+        if q.ndim > 1:
+            weights = self.joint_weights(q)
+            return self.left(weights), self.right(weights)
+        weights_and_one = np.empty(3 * self.joints + 1)
+        weights_and_one[-1] = 1.0
+        np.dot(self._products(q), self._mix_all, out=weights_and_one[:-1])
+        both = np.multiply.reduce(weights_and_one.take(self._halves_index), axis=0)
+        return both[: self.left_size], both[self.left_size :]
 
     def left(self, weights: FloatArray) -> FloatArray:
         """The left half's Kronecker product of joint weights (..., d, 3)."""
@@ -90,12 +121,12 @@ class BasisStack:
         return (left[:, :, None] * right[:, None, :]).reshape(len(q), -1)
 
     def _kronecker(self, weights: FloatArray, begin: int, end: int) -> FloatArray:
-        """For a batch, joint by joint: less memory than gathering all factors."""
+        """For a batch, joint by joint from the last: less memory than gathering all factors, and long inner loops."""
         count = len(weights)
         product = np.ones((count, 1))
-        for k in range(begin, end):
-            factor = weights[:, k, None, : self.sizes[k]]
-            product = (product[:, :, None] * factor).reshape(count, product.shape[1] * self.sizes[k])
+        for k in range(end - 1, begin - 1, -1):
+            factor = weights[:, k, : self.sizes[k], None]
+            product = (factor * product[:, None, :]).reshape(count, product.shape[1] * self.sizes[k])
         return product
 
 

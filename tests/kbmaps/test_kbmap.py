@@ -10,6 +10,8 @@ from planted_chains import bases_for, literal_weights, random_chain, random_map,
 
 from kbmaps import BasisError, JointBasis, KBMap, NonFiniteError, ShapeError, prediction_errors
 
+pytestmark = pytest.mark.usefixtures("kernel_path")
+
 kinds = st.text("RP", min_size=1, max_size=5)
 seeds = st.integers(0, 2**32 - 1)
 

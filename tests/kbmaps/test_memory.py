@@ -36,6 +36,33 @@ def test_a_window_is_a_fresh_learner_on_the_last_pairs(seed, window, pieces):
     assert windowed.kept == min(len(q), window)
 
 
+@given(seed=seeds, window=st.integers(1, 40), pieces=st.lists(st.integers(1, 60), min_size=1, max_size=8))
+@settings(max_examples=30, deadline=None)
+def test_a_window_of_the_exact_learner_is_a_fresh_one_on_the_last_pairs(seed, window, pieces):
+    rng = np.random.default_rng(seed)
+    prior = random_map(rng, bases_for(KINDS))
+    q, x = stream(rng, sum(pieces))
+    weight = rng.uniform(0.5, 2.0, len(q))
+    windowed, fresh = ExactLearner(prior, memory=Memory(window)), ExactLearner(prior)
+    for part in np.split(np.arange(len(q)), np.cumsum(pieces)[:-1]):
+        windowed.learn(q[part], x[part], weight[part])
+    fresh.learn(q[-window:], x[-window:], weight[-window:])
+    found, expected = windowed.solve(0.1), fresh.solve(0.1)
+    np.testing.assert_allclose(found.map.net, expected.map.net, rtol=0, atol=1e-10)
+    assert found.log_evidence == pytest.approx(expected.log_evidence, rel=1e-9, abs=1e-6)
+
+
+def test_a_window_stays_exact_over_a_long_run():
+    rng = np.random.default_rng(5)
+    prior = random_map(rng, bases_for(KINDS))
+    q, x = stream(rng, 20_000)
+    windowed, fresh = ExactLearner(prior, memory=Memory(200)), ExactLearner(prior)
+    for part in np.array_split(np.arange(20_000), 300):
+        windowed.learn(q[part], x[part])
+    fresh.learn(q[-200:], x[-200:])
+    np.testing.assert_allclose(windowed.solve(0.1).map.net, fresh.solve(0.1).map.net, rtol=0, atol=1e-12)
+
+
 @given(seed=seeds, window=st.integers(5, 30))
 @settings(max_examples=10, deadline=None)
 def test_a_window_of_the_structured_learner_is_a_fresh_one_on_the_last_pairs(seed, window):
@@ -58,7 +85,7 @@ def test_forgetting_is_least_squares_weighted_by_age(seed, forgetting, n, precis
     weighted = ExactLearner(prior)
     weighted.learn(q, x, np.maximum(forgetting ** np.arange(n - 1, -1, -1.0), 1e-300))
     expected = weighted.solve(precision).map.predict(q)
-    exact = ExactLearner(prior, forgetting=forgetting)
+    exact = ExactLearner(prior, memory=Memory(forgetting=forgetting))
     kernel = KernelLearner(prior.bases, prior, precision=precision, memory=Memory(forgetting=forgetting))
     for part in np.array_split(np.arange(n), 4):
         exact.learn(q[part], x[part])
@@ -73,7 +100,7 @@ def test_both_learners_see_the_same_noise_and_evidence_in_pairs_half_forgotten(s
     rng = np.random.default_rng(seed)
     prior = random_map(rng, bases_for(KINDS))
     q, x = stream(rng, 100)
-    exact = ExactLearner(prior, forgetting=forgetting)
+    exact = ExactLearner(prior, memory=Memory(forgetting=forgetting))
     kernel = KernelLearner(prior.bases, prior, precision=0.1, memory=Memory(forgetting=forgetting))
     exact.learn(q, x)
     kernel.learn(q, x)
@@ -86,7 +113,7 @@ def test_noise_is_not_taken_for_smaller_because_pairs_were_forgotten():
     rng = np.random.default_rng(1)
     chain = random_chain(rng, KINDS)
     q = random_q(rng, KINDS, 3000, 80)
-    learner = ExactLearner(chain.to_kbmap(bases_for(KINDS)), forgetting=0.99)
+    learner = ExactLearner(chain.to_kbmap(bases_for(KINDS)), memory=Memory(forgetting=0.99))
     learner.learn(q, chain.positions(q) + 0.01 * rng.normal(size=(3000, 3)))
     assert learner.solve("evidence").noise_std == pytest.approx(0.01, rel=0.15)
 
@@ -109,7 +136,7 @@ def test_forgetting_stays_exact_over_a_long_run():
     prior = random_map(rng, bases_for(KINDS))
     n, forgetting = 20_000, 0.98
     q, x = stream(rng, n)
-    long, weighted = ExactLearner(prior, forgetting=forgetting), ExactLearner(prior)
+    long, weighted = ExactLearner(prior, memory=Memory(forgetting=forgetting)), ExactLearner(prior)
     for part in np.array_split(np.arange(n), 300):
         long.learn(q[part], x[part])
     last = slice(-2500, None)
@@ -120,7 +147,7 @@ def test_forgetting_stays_exact_over_a_long_run():
 def test_a_direction_no_longer_seen_fades_to_the_prior_without_trouble():
     rng = np.random.default_rng(4)
     chain, prior = random_chain(rng, "RR"), random_chain(rng, "RR").to_kbmap(bases_for("RR"))
-    learner = ExactLearner(prior, forgetting=0.5)
+    learner = ExactLearner(prior, memory=Memory(forgetting=0.5))
     q = random_q(rng, "RR", 50, 80)
     learner.learn(q, chain.positions(q))
     same = np.tile([[0.3, -0.2]], (4000, 1))
@@ -136,8 +163,3 @@ def test_a_direction_no_longer_seen_fades_to_the_prior_without_trouble():
 def test_an_impossible_memory_is_refused(settings_):
     with pytest.raises(SettingError):
         Memory(**settings_)
-
-
-def test_an_exact_learner_refuses_to_gain_weight_with_age():
-    with pytest.raises(SettingError, match="forgetting"):
-        ExactLearner(random_map(np.random.default_rng(1), bases_for("R")), forgetting=1.5)

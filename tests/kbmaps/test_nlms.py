@@ -19,6 +19,8 @@ from kbmaps import (
     prediction_errors,
 )
 
+pytestmark = pytest.mark.usefixtures("kernel_path")
+
 seeds = st.integers(0, 2**32 - 1)
 
 

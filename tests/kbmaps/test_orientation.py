@@ -10,6 +10,8 @@ from scipy.spatial.transform import Rotation
 from kbmaps import NLMS, ExactLearner, KBMap, RigidChain, RotationError, SettingError, ShapeError, nearest_rotation
 from kbmaps.rotations import rotation_matrices
 
+pytestmark = pytest.mark.usefixtures("kernel_path")
+
 seeds = st.integers(0, 2**32 - 1)
 kinds = st.text("RP", min_size=1, max_size=5)
 

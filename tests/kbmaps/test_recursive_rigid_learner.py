@@ -19,6 +19,8 @@ from kbmaps import (
     ShapeError,
 )
 
+pytestmark = pytest.mark.usefixtures("kernel_path")
+
 seeds = st.integers(0, 2**32 - 1)
 SLIGHT = ChainTolerances(axes=1e-4, points=1e-4, zeros=1e-4, slide_zeros=1e-4, tool=1e-4, base_rotation=1e-4)
 

@@ -1,0 +1,203 @@
+"""What learning and predicting cost at seven joints, NumPy beside compiled: `python -m benchmarks.speed`.
+
+Input checks and basis functions are included, except for padasip's FilterNLMS, one filter a coordinate, which is handed
+its 2187 features ready-made. numba takes part where it is installed. All rivals take turns in this one process, so
+their ratios hold on a busy machine. Times are those of the thread on the processor.
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import importlib
+import importlib.util
+import statistics
+import time
+import tracemalloc
+from collections.abc import Callable
+
+import numpy as np
+from padasip.filters import FilterNLMS
+
+from benchmarks.humanoid_arm import JOINTS, guided_path, nominal_chain
+from benchmarks.timing import interleaved_medians_us
+from kbmaps import (
+    NLMS,
+    ChainTolerances,
+    ExactLearner,
+    KBMap,
+    RecursiveRigidLearner,
+    SupportSet,
+    kernels,
+    learning_bases,
+)
+from kbmaps.arrays import FloatArray
+
+ROUGH = ChainTolerances(axes=0.05, points=0.015, tool=0.03)
+PAIRS = 600
+NOISE_M = 0.003
+# Goals [us]: NumPy, compiled.
+GOALS: dict[str, tuple[float | None, float | None]] = {
+    "NLMS.learn": (35.0, 3.0),
+    "NLMS.replay, a pair": (8.0, None),
+    "KBMap.predict": (12.0, 1.5),
+    "KBMap.predict, a row of 600": (1.0, 1.0),
+    "KBMap.jacobian": (None, None),
+    "RecursiveRigidLearner.learn": (300.0, 8.0),
+}
+# A solve of each kind after each of these totals; 2187 control points lie between the second and the third.
+STAGES = (600, 2000, 2200, 4000, 6000)
+
+
+def start_map() -> KBMap:
+    turn = np.full(JOINTS, np.pi)
+    return nominal_chain().to_kbmap(learning_bases(-turn, turn))
+
+
+def kbmaps_calls(path: kernels.KernelPath, q: FloatArray, x: FloatArray) -> dict[str, Callable[[], object]]:
+    """The calls of `GOALS` on this path. All of them take one pair, but for those that say otherwise."""
+    with kernels.using(path):
+        kbmap = start_map()
+        learner, replayed = NLMS(kbmap), NLMS(kbmap)
+        rigid = RecursiveRigidLearner(nominal_chain(), ROUGH)
+    rigid.learn(q, x)
+    one_q, one_x = q[0].copy(), x[0].copy()
+    calls: list[Callable[[], object]] = [
+        lambda: learner.learn(one_q, one_x),
+        lambda: replayed.replay(q, x),
+        lambda: kbmap.predict(one_q),
+        lambda: kbmap.predict(q),
+        lambda: kbmap.jacobian(one_q),
+        lambda: rigid.learn(one_q, one_x),
+    ]
+    return dict(zip(GOALS, calls, strict=True))
+
+
+def padasip_step(kbmap: KBMap, q: FloatArray, x: FloatArray) -> Callable[[], object]:
+    filters = [FilterNLMS(n=kbmap.size, mu=0.5) for _ in range(3)]
+    features, targets = kbmap.weights(q[0]), [float(value) for value in x[0]]
+
+    def step() -> None:
+        for one, target in zip(filters, targets, strict=True):
+            one.adapt(target, features)
+
+    return step
+
+
+def numba_step(kbmap: KBMap, q: FloatArray, x: FloatArray) -> Callable[[], object]:
+    """The same step in numba, trusting its input; says how long it took to be there."""
+    begin = time.perf_counter()
+    njit = importlib.import_module("numba").njit
+    phases = np.array([basis.terms.phases for basis in kbmap.bases])
+    mixes = np.array([basis.terms.mix for basis in kbmap.bases])
+    net = kbmap.net.reshape(3, -1).copy()
+
+    @njit(fastmath=True)
+    def step(net: FloatArray, phases: FloatArray, mixes: FloatArray, q: FloatArray, x: FloatArray, mu0: float) -> None:
+        weights, size, square = np.ones(net.shape[1]), 1, 1.0
+        for k in range(len(q)):
+            u, v = np.sin(0.5 * (q[k] - phases[k, 0])), np.sin(0.5 * (q[k] - phases[k, 1]))
+            w = u * u * mixes[k, 0] + u * v * mixes[k, 1] + v * v * mixes[k, 2]
+            square *= w[0] ** 2 + w[1] ** 2 + w[2] ** 2
+            for i in range(size - 1, -1, -1):
+                for j in range(2, -1, -1):
+                    weights[3 * i + j] = weights[i] * w[j]
+            size *= 3
+        for o in range(3):
+            predicted = 0.0
+            for i in range(size):
+                predicted += net[o, i] * weights[i]
+            error = mu0 / square * (x[o] - predicted)
+            for i in range(size):
+                net[o, i] += error * weights[i]
+
+    one_q, one_x = q[0].copy(), x[0].copy()
+    step(net, phases, mixes, one_q, one_x, 0.5)
+    print(f"  numba: {time.perf_counter() - begin:.1f} s to import it and compile one function")
+    return lambda: step(net, phases, mixes, one_q, one_x, 0.5)
+
+
+def online(q: FloatArray, x: FloatArray) -> None:
+    rivals: dict[str, Callable[[], object]] = {}
+    for path in kernels.available():
+        rivals |= {f"{path} {name}": call for name, call in kbmaps_calls(path, q, x).items()}
+    kbmap = start_map()
+    rivals["padasip FilterNLMS x 3, features for free"] = padasip_step(kbmap, q, x)
+    if importlib.util.find_spec("numba") is not None:
+        rivals["numba NLMS step, input trusted"] = numba_step(kbmap, q, x)
+    support = SupportSet(kbmap.bases)
+    for row in q:
+        support.add(row)
+    rivals[f"SupportSet.unexplained, {support.size} kept"] = lambda: support.unexplained(q[0])
+    of_many = {name for name in rivals if name.endswith(("a pair", "a row of 600"))}
+    costs = interleaved_medians_us(
+        {name: call for name, call in rivals.items() if name not in of_many}, calls=100, clock=time.thread_time
+    )
+    batches = interleaved_medians_us(
+        {name: rivals[name] for name in of_many}, rounds=20, calls=3, clock=time.thread_time
+    )
+    costs |= {name: cost / len(q) for name, cost in batches.items()}
+    print(f"  {'[us]':30s} {'NumPy':>8s} {'goal':>6s} {'compiled':>9s} {'goal':>6s} {'NumPy / compiled':>17s}")
+    for name, goals in GOALS.items():
+        plain, compiled = (costs.get(f"{path} {name}") for path in ("numpy", "compiled"))
+        ratio = plain / compiled if plain and compiled else None
+        print(
+            f"  {name:30s}{cell(plain, 9)}{cell(goals[0], 7)}{cell(compiled, 10)}{cell(goals[1], 7)}{cell(ratio, 18)}"
+        )
+    for name in (name for name in rivals if not name.startswith(("numpy", "compiled"))):
+        print(f"  {name:44s} {costs[name]:8.2f}")
+
+
+def cell(value: float | None, width: int) -> str:
+    return f"{'-':>{width}s}" if value is None else f"{value:{width}.2f}"
+
+
+def exact_learner(kbmap: KBMap, rng: np.random.Generator) -> None:
+    print(f"exact learner, {kbmap.size} control points (goals: 32 us a pair, solve 100 ms, 120 MB)")
+    learner = ExactLearner(kbmap)
+    q, x = np.empty((0, JOINTS)), np.empty((0, 3))
+    for total in STAGES:
+        n = total - learner.pairs
+        new_q = guided_path(n, rng).q
+        new_x = nominal_chain().with_tool([0.05, 0.0, 0.0]).positions(new_q) + NOISE_M * rng.normal(size=(n, 3))
+        q, x = np.concatenate([q, new_q]), np.concatenate([x, new_x])
+        begin = time.thread_time()
+        learner.learn(new_q, new_x)
+        per_pair = (time.thread_time() - begin) / n * 1e6
+        fixed, plain, evidence = (solve_ms(learner, precision) for precision in (1.0, None, "evidence"))
+        print(
+            f"  {total:5d} pairs: learn {per_pair:6.1f} us a pair; solve with a given ridge {fixed:4.0f} ms, "
+            f"without {plain:4.0f} ms, with the evidence's {evidence:4.0f} ms"
+        )
+    tracemalloc.start()
+    again = ExactLearner(kbmap)
+    again.learn(q, x)
+    again.solve(1.0)
+    print(f"  peak memory of learning and solving {len(q)} pairs: {tracemalloc.get_traced_memory()[1] / 1e6:.0f} MB")
+    tracemalloc.stop()
+
+
+def solve_ms(learner: ExactLearner, precision: float | str | None) -> float:
+    """Median of three solves."""
+    times: list[float] = []
+    for _ in range(3):
+        begin = time.thread_time()
+        learner.solve(precision)  # pyright: ignore[reportArgumentType]
+        times.append(1e3 * (time.thread_time() - begin))
+    return statistics.median(times)
+
+
+def main() -> None:
+    rng = np.random.default_rng(0)
+    q = guided_path(PAIRS, rng).q
+    x = nominal_chain().with_tool([0.05, 0.0, 0.0]).positions(q) + NOISE_M * rng.normal(size=(PAIRS, 3))
+    load = os.getloadavg()[0]
+    print(f"{JOINTS} joints (medians of interleaved rounds; {os.cpu_count()} cores, load average {load:.1f})")
+    online(q, x)
+    exact_learner(start_map(), rng)
+
+
+if __name__ == "__main__":
+    main()

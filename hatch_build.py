@@ -1,0 +1,81 @@
+"""Builds the compiled kernels of kbmaps where there is a C compiler, and does without them where there is none.
+
+BODYSCHEMA_PURE=1 in the environment leaves them out, for a wheel that installs anywhere. CC and CFLAGS are honoured.
+"""
+
+from __future__ import annotations
+
+import os
+import shlex
+import subprocess
+import sysconfig
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from hatchling.builders.hooks.plugin.interface import BuildHookInterface
+
+SOURCES = "kbmaps/csrc"
+LIBRARY = "kbmaps/_kernels.abi3.so"
+# The oldest Python whose limited API the sources use.
+ABI_TAG = "cp311-abi3"
+FLAGS = ["-O3", "-std=gnu11", "-fPIC", "-shared", "-fvisibility=hidden", "-fno-math-errno"]
+TIMEOUT_S = 300.0
+
+
+class KernelBuildHook(BuildHookInterface):
+    """Adds the shared library to wheels; editable installs get it beside the sources."""
+
+    def initialize(self, version: str, build_data: dict[str, Any]) -> None:
+        """Compiles, or says why not and leaves the wheel pure Python."""
+        if os.environ.get("BODYSCHEMA_PURE", "") not in ("", "0"):
+            return
+        root = Path(self.root)
+        library = root / LIBRARY if version == "editable" else Path(self._scratch()) / Path(LIBRARY).name
+        complaint = compile_kernels(root, library)
+        if complaint:
+            self.app.display_warning(
+                "kbmaps: no compiled kernels, its NumPy path is used instead (slower, otherwise the same). "
+                f"{complaint}\n"
+                "To have them: install a C compiler and Python's headers (Debian: apt install gcc python3-dev), "
+                "then install again."
+            )
+            return
+        platform = sysconfig.get_platform().replace("-", "_").replace(".", "_")
+        build_data["pure_python"] = False
+        build_data["tag"] = f"{ABI_TAG}-{platform}"
+        if version != "editable":
+            build_data["force_include"][str(library)] = LIBRARY
+
+    def finalize(self, version: str, build_data: dict[str, Any], artifact_path: str) -> None:  # noqa: ARG002
+        """Removes what was needed only until the wheel was written."""
+        if self._directory is not None:
+            self._directory.cleanup()
+
+    def clean(self, versions: list[str]) -> None:  # noqa: ARG002
+        """Removes the library of an editable install."""
+        Path(self.root, LIBRARY).unlink(missing_ok=True)
+
+    _directory: tempfile.TemporaryDirectory[str] | None = None
+
+    def _scratch(self) -> str:
+        self._directory = tempfile.TemporaryDirectory()
+        return self._directory.name
+
+
+def compile_kernels(root: Path, library: Path) -> str:
+    """Compiles the sources into the library; what went wrong, or nothing."""
+    library.unlink(missing_ok=True)
+    compiler = shlex.split(os.environ.get("CC") or sysconfig.get_config_var("CC") or "cc")
+    include = sysconfig.get_path("include")
+    sources = sorted(str(path) for path in (root / SOURCES).glob("*.c"))
+    flags = [*FLAGS, *shlex.split(os.environ.get("CFLAGS", "")), f"-I{include}"]
+    command = [*compiler, *flags, *sources, "-o", str(library), "-lm"]
+    try:
+        result = subprocess.run(command, capture_output=True, text=True, timeout=TIMEOUT_S, check=False)
+    except (OSError, subprocess.TimeoutExpired) as error:
+        return f"The compiler did not run: {error}."
+    if result.returncode == 0:
+        return ""
+    errors = [line for line in result.stderr.splitlines() if "error" in line] or result.stderr.splitlines()[-1:]
+    return f"{compiler[0]} failed with {result.returncode}: {errors[0] if errors else 'no message'}"

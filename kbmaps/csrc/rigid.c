@@ -1,0 +1,356 @@
+/* kbmaps._kernels.RigidFilter: the loop of kbmaps.rigid_recursive over kbmaps.chain_parameters.linearised. */
+#include "common.h"
+#include "vectors.h"
+
+enum { AXES, POINTS, TANGENTS, FIXED_SLIDES, TIP_FRAME, SCALES, BENDS, CONSTANTS, FILTER_ARRAYS };
+enum { ITERATIONS, SMALL_BEND, GATE, NOISE_MEMORY, LEAST_SQUARE, SMALL_ANGLE, REACH, CONSTANT_COUNT };
+/* Numbers kept of each joint: effects of shifts (2) and tilts (2), the axis, a point of it, each a vector; its angle. */
+enum { SHIFTED = 0, TILTED = 6, AXIS = 12, CENTRE = 15, JOINT_NUMBERS = 18 };
+
+typedef struct {
+    PyObject_HEAD
+    index_t joints, size, active;
+    Py_buffer arrays[FILTER_ARRAYS];
+    index_t *places; /* of each parameter among the active ones, or -1 */
+    double *scales, *bends; /* of the active ones */
+} Filter;
+
+typedef struct {
+    double variance, distance, bend;
+    double precision[9];
+} Update;
+
+#define GIVEN(self, which) ((const double *)(self)->arrays[which].buf)
+#define CONSTANT(self, which) (GIVEN(self, CONSTANTS)[which])
+
+/* ---- the chain ------------------------------------------------------------------------------------------------- */
+
+/* Moves the frame (rotation, shift) by joint k at `angle`, and notes what its parameters do. */
+INLINE void pass_joint(const Filter *self, index_t k, const double *change, double q, double *rotation, double *shift,
+                       double *numbers)
+{
+    index_t d = self->joints;
+    const double *tangents = GIVEN(self, TANGENTS) + 6 * k, *tilt = change + 6 + 2 * k, *move = change + 6 + 2 * d + 2 * k;
+    double tilting[3], point[3], axis[3], turn[9], tilt_jacobian[9], motion[9], after[9], vector[3], moved[3];
+    double angle = q + change[6 + 4 * d + k];
+    for (int i = 0; i < 3; i++) {
+        tilting[i] = tangents[2 * i] * tilt[0] + tangents[2 * i + 1] * tilt[1];
+        point[i] = GIVEN(self, POINTS)[3 * k + i] + tangents[2 * i] * move[0] + tangents[2 * i + 1] * move[1];
+    }
+    exponential(tilting, CONSTANT(self, SMALL_ANGLE), turn, tilt_jacobian);
+    times(turn, GIVEN(self, AXES) + 3 * k, axis);
+    times(rotation, axis, numbers + AXIS);
+    times(rotation, point, numbers + CENTRE);
+    for (int i = 0; i < 3; i++)
+        numbers[CENTRE + i] += shift[i];
+    int slides = GIVEN(self, FIXED_SLIDES)[k] != 0.0;
+    if (!slides) {
+        rodrigues(axis, sin(angle), 1.0 - cos(angle), motion);
+        product(rotation, motion, after);
+    }
+    for (int side = 0; side < 2; side++) {
+        double tangent[3], turned[3], before_turned[3];
+        column_of(tangents, 2, side, tangent);
+        times(tilt_jacobian, tangent, turned);
+        if (slides) {
+            memset(numbers + SHIFTED + 3 * side, 0, 3 * sizeof(double));
+            cross(turned, axis, vector);
+            times(rotation, vector, moved);
+            for (int i = 0; i < 3; i++)
+                numbers[TILTED + 3 * side + i] = angle * moved[i];
+            continue;
+        }
+        times(rotation, tangent, moved);
+        times(after, tangent, vector);
+        times(rotation, turned, before_turned);
+        for (int i = 0; i < 3; i++)
+            numbers[SHIFTED + 3 * side + i] = moved[i] - vector[i];
+        times(after, turned, vector);
+        for (int i = 0; i < 3; i++)
+            numbers[TILTED + 3 * side + i] = before_turned[i] - vector[i];
+    }
+    if (slides) {
+        for (int i = 0; i < 3; i++)
+            shift[i] += angle * numbers[AXIS + i];
+        return;
+    }
+    times(after, point, vector);
+    for (int i = 0; i < 3; i++)
+        shift[i] = numbers[CENTRE + i] - vector[i];
+    memcpy(rotation, after, 9 * sizeof(double));
+}
+
+/* Writes the effect of one parameter on the marker, in its unit, if it is active. */
+INLINE void set_column(const Filter *self, index_t parameter, const double *effect, double *jacobian)
+{
+    index_t place = self->places[parameter];
+    for (int i = 0; i < 3 && place >= 0; i++)
+        jacobian[i * self->active + place] = effect[i] * self->scales[place];
+}
+
+/* Position (3) at q and its derivatives (3, active) by the change. `numbers` is working memory. */
+INLINE void linearise(const Filter *self, const double *change, const double *q, double *numbers, double *x,
+                      double *jacobian)
+{
+    index_t d = self->joints, tool = 6 + 5 * d;
+    double base[9], base_jacobian[9], rotation[9], shift[3], tip[3], effect[3], column[3], lever[3];
+    const double *frame = GIVEN(self, TIP_FRAME), *kept;
+    exponential(change, CONSTANT(self, SMALL_ANGLE), base, base_jacobian);
+    memcpy(rotation, base, sizeof base);
+    memcpy(shift, change + 3, sizeof shift);
+    for (index_t k = 0; k < d; k++)
+        pass_joint(self, k, change, q[k], rotation, shift, numbers + JOINT_NUMBERS * k);
+    for (int i = 0; i < 3; i++) {
+        const double *row = frame + 4 * i;
+        tip[i] = row[3] + row[0] * change[tool] + row[1] * change[tool + 1] + row[2] * change[tool + 2];
+    }
+    times(rotation, tip, x);
+    for (int i = 0; i < 3; i++) {
+        x[i] += shift[i];
+        lever[i] = change[3 + i] - x[i];
+    }
+    for (int j = 0; j < 3; j++) {
+        double unit[3] = {j == 0, j == 1, j == 2};
+        column_of(base_jacobian, 3, j, column);
+        cross(lever, column, effect);
+        set_column(self, j, effect, jacobian);
+        set_column(self, 3 + j, unit, jacobian);
+        column_of(frame, 4, j, column);
+        times(rotation, column, effect);
+        set_column(self, tool + j, effect, jacobian);
+    }
+    for (index_t k = 0; k < d; k++) {
+        kept = numbers + JOINT_NUMBERS * k;
+        int slides = GIVEN(self, FIXED_SLIDES)[k] != 0.0;
+        for (int i = 0; i < 3; i++)
+            lever[i] = kept[CENTRE + i] - x[i];
+        for (int side = 0; side < 2; side++) {
+            cross(lever, kept + TILTED + 3 * side, effect);
+            set_column(self, 6 + 2 * k + side, slides ? kept + TILTED + 3 * side : effect, jacobian);
+            set_column(self, 6 + 2 * d + 2 * k + side, kept + SHIFTED + 3 * side, jacobian);
+        }
+        cross(lever, kept + AXIS, effect);
+        set_column(self, 6 + 4 * d + k, slides ? kept + AXIS : effect, jacobian);
+    }
+}
+
+/* ---- the filter ------------------------------------------------------------------------------------------------ */
+
+typedef struct {
+    double *numbers, *jacobian, *gains, *step, *present, *row, *change;
+} Work;
+
+static size_t work_size(const Filter *self)
+{
+    return (size_t)(JOINT_NUMBERS * self->joints + 9 * self->active + self->size);
+}
+
+static Work divided(const Filter *self, double *memory)
+{
+    Work work;
+    index_t p = self->active;
+    work.numbers = memory;
+    work.jacobian = work.numbers + JOINT_NUMBERS * self->joints;
+    work.gains = work.jacobian + 3 * p;
+    work.step = work.gains + 3 * p;
+    work.present = work.step + p;
+    work.row = work.present + p;
+    work.change = work.row + p;
+    return work;
+}
+
+/* work.change = change + scales * step */
+INLINE void move(const Filter *self, const double *change, const double *step, double *out)
+{
+    for (index_t i = 0; i < self->size; i++) {
+        index_t place = self->places[i];
+        out[i] = change[i] + (place >= 0 ? self->scales[place] * step[place] : 0.0);
+    }
+}
+
+/* RecursiveRigidLearner._curvature */
+INLINE double curvature(const Filter *self, const double *covariance, const Work *work)
+{
+    index_t p = self->active;
+    double square = 0.0;
+    for (int c = 0; c < 3; c++) {
+        for (index_t i = 0; i < p; i++)
+            work->step[i] = work->jacobian[c * p + i] * self->bends[i];
+        combine(covariance, p, p, work->step, work->row);
+        square += dot(work->row, work->step, p);
+    }
+    double share = square / 3.0 / CONSTANT(self, REACH);
+    return 0.25 * share * share;
+}
+
+/* RecursiveRigidLearner._update, linearised at work.change, to which work.present led; 0 if it is singular. */
+INLINE int make_update(const Filter *self, const double *covariance, const double *q, const double *x,
+                       double noise_square, double weight, const Work *work, Update *update)
+{
+    index_t p = self->active;
+    double position[3], innovation[3], weighted[3], matrix[9], moved = 0.0, turn = 0.0;
+    linearise(self, work->change, q, work->numbers, position, work->jacobian);
+    update->variance = noise_square + curvature(self, covariance, work);
+    for (int c = 0; c < 3; c++) {
+        combine(covariance, p, p, work->jacobian + c * p, work->gains + c * p);
+        innovation[c] = x[c] - position[c] + dot(work->jacobian + c * p, work->present, p);
+    }
+    for (int a = 0; a < 3; a++)
+        for (int b = 0; b < 3; b++)
+            matrix[3 * a + b] = dot(work->jacobian + a * p, work->gains + b * p, p) +
+                                (a == b) * update->variance / weight;
+    if (!inverse(matrix, update->precision))
+        return 0;
+    times(update->precision, innovation, weighted);
+    update->distance = dot(innovation, weighted, 3);
+    for (index_t i = 0; i < p; i++) {
+        work->step[i] = work->gains[i] * weighted[0] + work->gains[p + i] * weighted[1] +
+                        work->gains[2 * p + i] * weighted[2];
+        work->row[i] = work->step[i] - work->present[i];
+        double turned = work->row[i] * self->scales[i] * self->bends[i];
+        turn += turned * turned;
+    }
+    for (int c = 0; c < 3; c++) {
+        double way = dot(work->jacobian + c * p, work->row, p);
+        moved += way * way;
+    }
+    update->bend = sqrt(turn) * sqrt(moved);
+    return 1;
+}
+
+/* RecursiveRigidLearner._learn_one; 0 if the innovation's covariance is singular, and then nothing has changed. */
+FAST static int learn_pair(const Filter *self, double *change, double *covariance, const double *q, const double *x,
+                           double sigma, double *noise_square, double *coordinates, const Work *work)
+{
+    index_t p = self->active;
+    Update update;
+    double square = isnan(sigma) ? *noise_square : sigma * sigma, gate = CONSTANT(self, GATE);
+    memset(work->present, 0, (size_t)p * sizeof(double));
+    memcpy(work->change, change, (size_t)self->size * sizeof(double));
+    if (!make_update(self, covariance, q, x, square, 1.0, work, &update))
+        return 0;
+    double distance = update.distance < gate ? update.distance : gate;
+    double weight = distance > 0.0 ? distance / update.distance : 1.0;
+    if (weight < 1.0 && !make_update(self, covariance, q, x, square, weight, work, &update))
+        return 0;
+    for (int i = 0; i < CONSTANT(self, ITERATIONS); i++) {
+        if (update.bend <= CONSTANT(self, SMALL_BEND) * sqrt(update.variance))
+            break;
+        move(self, change, work->step, work->change);
+        memcpy(work->present, work->step, (size_t)p * sizeof(double));
+        if (!make_update(self, covariance, q, x, square, weight, work, &update))
+            return 0;
+    }
+    move(self, change, work->step, work->change);
+    memcpy(change, work->change, (size_t)self->size * sizeof(double));
+    for (index_t i = 0; i < p; i++) {
+        double pull[3], *row = covariance + i * p;
+        double gain[3] = {work->gains[i], work->gains[p + i], work->gains[2 * p + i]};
+        for (int c = 0; c < 3; c++)
+            pull[c] = gain[0] * update.precision[c] + gain[1] * update.precision[3 + c] + gain[2] * update.precision[6 + c];
+        for (index_t j = 0; j < p; j++)
+            row[j] -= pull[0] * work->gains[j] + pull[1] * work->gains[p + j] + pull[2] * work->gains[2 * p + j];
+    }
+    if (isnan(sigma)) {
+        double trace = update.precision[0] + update.precision[4] + update.precision[8];
+        double share = *noise_square * trace / 3.0, total = *coordinates + 3.0 * share * share;
+        double estimate = *noise_square * (1.0 + share * (distance - 3.0) / total);
+        *noise_square = estimate > CONSTANT(self, LEAST_SQUARE) ? estimate : CONSTANT(self, LEAST_SQUARE);
+        *coordinates = total < CONSTANT(self, NOISE_MEMORY) ? total : CONSTANT(self, NOISE_MEMORY);
+    }
+    return 1;
+}
+
+/* learn(change, covariance, q, x, sigma, noise_square, coordinates) -> (pairs learnt, noise_square, coordinates) */
+static PyObject *filter_learn(Filter *self, PyObject *const *args, index_t count)
+{
+    Py_buffer views[5];
+    index_t p = self->active, elements[5] = {self->size, p * p, -1, -1, -1};
+    if (count != 7)
+        return PyErr_Format(PyExc_TypeError, "seven arguments are needed");
+    double noise_square = PyFloat_AsDouble(args[5]), coordinates = PyFloat_AsDouble(args[6]);
+    if (PyErr_Occurred() || !take_all(args, views, elements, 5))
+        return NULL;
+    index_t n = views[4].len / (index_t)sizeof(double), done = 0;
+    double *memory = malloc(work_size(self) * sizeof(double));
+    int sound = views[2].len == self->joints * views[4].len && views[3].len == 3 * views[4].len &&
+                !views[0].readonly && !views[1].readonly;
+    if (memory == NULL) {
+        PyErr_NoMemory();
+    } else if (!sound) {
+        PyErr_SetString(PyExc_TypeError, "q, x and sigma must be of one length, and the state writable");
+    } else {
+        Work work = divided(self, memory);
+        const double *q = views[2].buf, *x = views[3].buf, *sigma = views[4].buf;
+        PyThreadState *thread = n > 1 ? PyEval_SaveThread() : NULL;
+        while (done < n && learn_pair(self, views[0].buf, views[1].buf, q + done * self->joints, x + 3 * done,
+                                      sigma[done], &noise_square, &coordinates, &work))
+            done++;
+        if (thread != NULL)
+            PyEval_RestoreThread(thread);
+    }
+    free(memory);
+    release_all(views, 5);
+    return PyErr_Occurred() ? NULL : Py_BuildValue("(ndd)", done, noise_square, coordinates);
+}
+
+static int find_active(Filter *self)
+{
+    self->places = malloc((size_t)self->size * sizeof(index_t));
+    self->scales = malloc((size_t)self->size * sizeof(double));
+    self->bends = malloc((size_t)self->size * sizeof(double));
+    if (self->places == NULL || self->scales == NULL || self->bends == NULL)
+        return 0;
+    for (index_t i = 0; i < self->size; i++) {
+        double scale = GIVEN(self, SCALES)[i];
+        self->places[i] = scale > 0.0 ? self->active : -1;
+        if (scale > 0.0) {
+            self->scales[self->active] = scale;
+            self->bends[self->active++] = GIVEN(self, BENDS)[i];
+        }
+    }
+    return 1;
+}
+
+static PyObject *filter_new(PyTypeObject *type, PyObject *args, PyObject *Py_UNUSED(keywords))
+{
+    PyObject *given[FILTER_ARRAYS];
+    if (!PyArg_ParseTuple(args, "OOOOOOOO", &given[0], &given[1], &given[2], &given[3], &given[4], &given[5], &given[6],
+                          &given[7]))
+        return NULL;
+    Filter *self = (Filter *)((allocfunc)PyType_GetSlot(type, Py_tp_alloc))(type, 0);
+    if (self == NULL)
+        return NULL;
+    index_t d = PyObject_Length(given[FIXED_SLIDES]);
+    self->joints = d, self->size = 9 + 5 * d;
+    index_t elements[FILTER_ARRAYS] = {3 * d, 3 * d, 6 * d, d, 16, self->size, self->size, CONSTANT_COUNT};
+    if (d < 0 || !take_all(given, self->arrays, elements, FILTER_ARRAYS)) {
+        Py_DECREF(self);
+        return NULL;
+    }
+    if (!find_active(self)) {
+        Py_DECREF(self);
+        return PyErr_NoMemory();
+    }
+    return (PyObject *)self;
+}
+
+static void filter_dealloc(Filter *self)
+{
+    PyTypeObject *type = Py_TYPE((PyObject *)self);
+    release_all(self->arrays, FILTER_ARRAYS);
+    free(self->places), free(self->scales), free(self->bends);
+    ((freefunc)PyType_GetSlot(type, Py_tp_free))(self);
+    Py_DECREF(type);
+}
+
+static PyMethodDef filter_methods[] = {
+    {"learn", (PyCFunction)(void (*)(void))filter_learn, METH_FASTCALL, NULL},
+    {NULL, NULL, 0, NULL},
+};
+
+static PyType_Slot filter_slots[] = {
+    {Py_tp_new, filter_new}, {Py_tp_dealloc, filter_dealloc}, {Py_tp_methods, filter_methods}, {0, NULL}};
+
+PyType_Spec filter_spec = {
+    "kbmaps._kernels.RigidFilter", sizeof(Filter), 0, Py_TPFLAGS_DEFAULT | Py_TPFLAGS_IMMUTABLETYPE, filter_slots};

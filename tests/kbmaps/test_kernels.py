@@ -1,0 +1,175 @@
+"""The two paths of the innermost loops do the same."""
+
+from __future__ import annotations
+
+import math
+import os
+import subprocess
+import sys
+import threading
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from planted_chains import bases_for, random_map, random_q
+from rough_arms import ROUGH, rough_arm
+
+from kbmaps import NLMS, KBMap, KBMapsError, RecursiveRigidLearner, SettingError, kernels, kernels_in_use
+
+seeds = st.integers(0, 2**32 - 1)
+kinds = st.text("RP", min_size=1, max_size=6)
+needs_both = pytest.mark.skipif(len(kernels.available()) < 2, reason="kbmaps was installed without a C compiler")
+
+
+def on_both_paths(make: Callable[[], object]) -> list[object]:
+    results = []
+    for path in ("numpy", "compiled"):
+        with kernels.using(path):
+            results.append(make())
+    return results
+
+
+def pose_map(rng: np.random.Generator, joint_kinds: str) -> KBMap:
+    bases = bases_for(joint_kinds)
+    return KBMap(bases, rng.normal(size=(12, *(basis.size for basis in bases))))
+
+
+@needs_both
+@given(seed=seeds, joint_kinds=kinds, rows=st.sampled_from([None, 0, 1, 5]))
+@settings(max_examples=60, deadline=None)
+def test_predictions_and_derivatives_agree_to_rounding(seed, joint_kinds, rows):
+    rng = np.random.default_rng(seed)
+    given_map = pose_map(rng, joint_kinds)
+    q = random_q(rng, joint_kinds, 1 if rows is None else rows, 170)
+    q = q[0] if rows is None else q
+    one, other = on_both_paths(lambda: KBMap(given_map.bases, given_map.net))
+    for ask in ("predict", "orientation", "jacobian"):
+        expected, got = getattr(one, ask)(q), getattr(other, ask)(q)
+        assert got.shape == expected.shape
+        np.testing.assert_allclose(got, expected, rtol=0, atol=1e-12 * max(1.0, np.abs(expected).max(initial=0.0)))
+
+
+@needs_both
+@given(seed=seeds, joint_kinds=kinds, mu0=st.floats(0.05, 1.95))
+@settings(max_examples=40, deadline=None)
+def test_learning_and_replaying_agree_to_rounding(seed, joint_kinds, mu0):
+    rng = np.random.default_rng(seed)
+    start = random_map(rng, bases_for(joint_kinds))
+    q, x = random_q(rng, joint_kinds, 90, 80), rng.normal(size=(90, 3))
+    order = rng.integers(0, 90, 130)
+    one, other = on_both_paths(lambda: NLMS(start, mu0))
+    for learner in (one, other):
+        learner.learn(q[0], x[0])
+        learner.replay(q, x, order)
+    np.testing.assert_allclose(other.map.net, one.map.net, rtol=0, atol=1e-11)
+
+
+@needs_both
+@given(seed=seeds, joint_kinds=kinds, sigma=st.sampled_from([None, 0.004]), jump=st.sampled_from([0.0, 0.3]))
+@settings(max_examples=25, deadline=None)
+def test_recursive_rigid_learners_agree_to_rounding(seed, joint_kinds, sigma, jump):
+    rng = np.random.default_rng(seed)
+    arm = rough_arm(rng, joint_kinds)
+    q, x = arm.pairs(rng, 25, 0.004)
+    x[-1] += jump
+    one, other = on_both_paths(lambda: RecursiveRigidLearner(arm.nominal, ROUGH, noise=0.01))
+    for learner in (one, other):
+        learner.learn(q[0], x[0], sigma)
+        learner.learn(q[1:], x[1:], sigma)
+    np.testing.assert_allclose(other.change, one.change, rtol=0, atol=1e-9)
+    assert other.noise == pytest.approx(one.noise, rel=1e-7)
+    expected, got = one.estimate(q), other.estimate(q)
+    np.testing.assert_allclose(got.x, expected.x, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(got.sigma, expected.sigma, rtol=1e-5, atol=1e-9)
+
+
+BAD_VECTORS = [
+    [0.1, math.nan],
+    [0.1, math.inf],
+    [0.1],
+    np.zeros((1, 1, 2)),
+    np.zeros((2, 2))[:, :1],
+    0.5,
+    np.array([0.0, -math.inf], dtype=np.float32),
+]
+
+
+def complaint(call: Callable[[object], object], argument: object) -> tuple[type[Exception], str]:
+    with pytest.raises(KBMapsError) as caught:
+        call(argument)
+    return caught.type, str(caught.value)
+
+
+@needs_both
+@pytest.mark.parametrize("bad", BAD_VECTORS, ids=str)
+@pytest.mark.parametrize("ask", ["predict", "jacobian", "learn", "learn to"])
+def test_bad_input_is_refused_in_the_same_words(ask, bad):
+    start = random_map(np.random.default_rng(1), bases_for("RR"))
+
+    def call(path: str) -> tuple[type[Exception], str]:
+        with kernels.using(path):
+            kbmap, learner = KBMap(start.bases, start.net), NLMS(start)
+        calls = {
+            "predict": kbmap.predict,
+            "jacobian": kbmap.jacobian,
+            "learn": lambda q: learner.learn(q, np.zeros(3)),
+            "learn to": lambda x: learner.learn(np.zeros(2), x),
+        }
+        refused = complaint(calls[ask], bad)
+        assert learner.map.digest == start.digest
+        return refused
+
+    assert call("compiled") == call("numpy")
+
+
+@pytest.mark.usefixtures("kernel_path")
+@pytest.mark.parametrize(
+    "convert",
+    [list, tuple, np.float32, lambda q: q.astype(">f8"), lambda q: np.repeat(q, 2)[::2], lambda q: q.astype(int)],
+    ids=["list", "tuple", "float32", "big-endian", "strided", "int"],
+)
+def test_whatever_numpy_understands_is_taken(convert):
+    kbmap = random_map(np.random.default_rng(2), bases_for("RRR"))
+    q = np.array([1.0, -2.0, 0.0])
+    fresh = KBMap(kbmap.bases, kbmap.net)
+    np.testing.assert_array_equal(fresh.predict(convert(q)), fresh.predict(q))
+
+
+@needs_both
+def test_threads_share_a_compiled_map():
+    with kernels.using("compiled"):
+        kbmap = random_map(np.random.default_rng(3), bases_for("RRRR"))
+    q = random_q(np.random.default_rng(4), "RRRR", 3000, 80)
+    expected, results = kbmap.predict(q), [None] * 4
+
+    def work(place: int) -> None:
+        results[place] = kbmap.predict(q)
+
+    threads = [threading.Thread(target=work, args=(place,)) for place in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert all(np.array_equal(result, expected) for result in results)
+
+
+def test_the_environment_can_ask_for_numpy():
+    code = "import kbmaps; print(kbmaps.kernels_in_use())"
+    environment = os.environ | {"BODYSCHEMA_PURE": "1"}
+    result = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+    assert result.stdout.strip() == "numpy"
+
+
+def test_a_path_that_is_not_there_is_refused(monkeypatch):
+    monkeypatch.setattr(kernels, "_available", None)
+    with pytest.raises(SettingError, match="C compiler"), kernels.using("compiled"):
+        pass
+
+
+def test_the_path_is_chosen_for_a_block_only():
+    before = kernels_in_use()
+    with kernels.using("numpy"):
+        assert kernels_in_use() == "numpy"
+    assert kernels_in_use() == before
