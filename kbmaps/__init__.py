@@ -24,10 +24,13 @@ from kbmaps.errors import (
     SingularAlphaError,
 )
 from kbmaps.exact import ExactLearner, ExactSolution
+from kbmaps.experiment_design import ExperimentDesign, next_pose, next_poses, next_stretch
+from kbmaps.expected_gain import ExpectedError, Forecast, candidate_motions, expected_gain
 from kbmaps.inverse import InverseKinematics, InverseSolution
 from kbmaps.kbmap import KBMap, prediction_errors
 from kbmaps.model import Estimate, Model
 from kbmaps.nlms import NLMS
+from kbmaps.posterior import ChainPosterior, Posterior
 from kbmaps.reach import PoseModel, PositionModel
 from kbmaps.resolved_rates import resolved_rates
 from kbmaps.rigid_learner import RigidLearner
@@ -46,6 +49,7 @@ __all__ = [
     "BasisError",
     "ChainError",
     "ChainParameters",
+    "ChainPosterior",
     "ChainReport",
     "ChainTolerances",
     "CorePrior",
@@ -53,6 +57,9 @@ __all__ = [
     "Estimate",
     "ExactLearner",
     "ExactSolution",
+    "ExpectedError",
+    "ExperimentDesign",
+    "Forecast",
     "Interval",
     "InverseKinematics",
     "InverseSolution",
@@ -64,6 +71,7 @@ __all__ = [
     "NonFiniteError",
     "PoseModel",
     "PositionModel",
+    "Posterior",
     "RecursiveRigidLearner",
     "RigidChain",
     "RigidLearner",
@@ -77,10 +85,15 @@ __all__ = [
     "TensorTrain",
     "align",
     "blockwise_precision",
+    "candidate_motions",
+    "expected_gain",
     "find_chain",
     "follow_a_path",
     "learning_bases",
     "nearest_rotation",
+    "next_pose",
+    "next_poses",
+    "next_stretch",
     "prediction_errors",
     "resolved_rates",
     "with_refitted_marker",
