@@ -24,8 +24,8 @@ from kbmaps.errors import (
     SingularAlphaError,
 )
 from kbmaps.exact import ExactLearner, ExactSolution
-from kbmaps.experiment_design import ExperimentDesign, next_pose, next_poses, next_stretch
 from kbmaps.expected_gain import ExpectedError, Forecast, candidate_motions, expected_gain
+from kbmaps.experiment_design import ExperimentDesign, next_pose, next_poses, next_stretch
 from kbmaps.inverse import InverseKinematics, InverseSolution
 from kbmaps.kbmap import KBMap, prediction_errors
 from kbmaps.model import Estimate, Model

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import combinations
+from itertools import combinations, pairwise
+from typing import cast
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.special import ndtr, ndtri  # pyright: ignore[reportMissingTypeStubs, reportUnknownVariableType]
 
 from kbmaps.arrays import FloatArray, rows, vector
 from kbmaps.errors import SettingError
@@ -78,7 +80,7 @@ def expected_gain(
         SettingError: there is no motion, one without poses, no region, or `pairs` do not ascend from at least 1.
     """
     counts = tuple(pairs)
-    if not counts or counts[0] < 1 or any(a >= b for a, b in zip(counts, counts[1:], strict=False)):
+    if not counts or counts[0] < 1 or any(a >= b for a, b in pairwise(counts)):
         raise SettingError(f"pairs must ascend from at least 1, got {counts}")
     if not motions:
         raise SettingError("there is no motion to speak of")
@@ -139,19 +141,47 @@ def _errors(
     design: ExperimentDesign, pool: FloatArray, counts: tuple[int, ...], rng: np.random.Generator
 ) -> tuple[float, ...]:
     drawn = rng.integers(0, len(pool), (_DESIGNS, counts[-1]))
-    return tuple(float(np.mean([design.error_after(pool[row[:count]]) for row in drawn])) for count in counts)
+    errors: list[float] = []
+    for count in counts:
+        # A pose that is drawn k times tells as much as one pair there with the noise over √k.
+        times = [np.bincount(row[:count], minlength=len(pool)) for row in drawn]
+        errors.append(float(np.mean([design.error_after(pool * np.sqrt(k)[:, None, None]) for k in times])))
+    return tuple(errors)
 
 
 def _resampled(poses: FloatArray, count: int, rng: np.random.Generator) -> FloatArray:
-    """Poses (count, d) like those given, with the same mean and covariance but not the same ones.
+    """Poses (count, d) like those given: each joint spread as it was, and going with the others as it did.
 
-    A smoothed bootstrap that keeps the covariance (Silverman and Young 1987), with Silverman's Gaussian bandwidth.
+    A smoothed bootstrap that keeps the covariance (Silverman and Young 1987), with Silverman's Gaussian bandwidth, of
+    the joints' normal scores; so smoothing does not carry joints beyond where they have been. As many poses as chance
+    has a share in the correlations have their joints drawn independently.
     """
     n, d = poses.shape
-    mean = poses.mean(axis=0)
+    ranked = np.sort(poses, axis=0)
+    places = (np.arange(n) + 0.5) / n
+    scores = cast(FloatArray, ndtri(places))[poses.argsort(axis=0).argsort(axis=0)]
     width = (4.0 / ((d + 2.0) * n)) ** (1.0 / (d + 4.0))
-    picked = poses[rng.integers(0, n, count)] - mean
-    partners = poses[rng.integers(0, n, (count, 2))]
+    picked = np.repeat(rng.integers(0, n, (3, count, 1)), d, axis=2)
+    apart = rng.random(count) < _chance_in_correlations(scores)
+    picked[:, apart] = rng.integers(0, n, (3, int(apart.sum()), d))
+    drawn, one, other = scores[picked, np.arange(d)]
     # Differences of two poses over √2 have the poses' covariance, whatever its rank.
-    jitter = (partners[:, 0] - partners[:, 1]) / np.sqrt(2.0)
-    return mean + (picked + width * jitter) / np.sqrt(1.0 + width**2)
+    smooth = (drawn + width * (one - other) / np.sqrt(2.0)) / np.sqrt(1.0 + width**2)
+    shares = cast(FloatArray, ndtr(smooth))
+    return np.stack([np.interp(share, places, joint) for share, joint in zip(shares.T, ranked.T, strict=True)], axis=1)
+
+
+def _chance_in_correlations(scores: FloatArray) -> float:
+    """The share of the squared correlations of scores (n, d) that independent joints would show too, in 0..1.
+
+    It is by how much correlations are best shrunk towards none (Schäfer and Strimmer 2005, target "D").
+    """
+    n, d = scores.shape
+    if n < 3 or d == 1:
+        return 1.0
+    centred = scores - scores.mean(axis=0)
+    centred /= np.sqrt(np.square(centred).sum(axis=0))
+    squares = np.square((centred.T @ centred)[~np.eye(d, dtype=np.bool_)])
+    variances = np.square(1.0 - squares) / (n - 1.0)
+    by_chance, shown = float(variances.sum()), float(squares.sum())
+    return by_chance / shown if by_chance < shown else 1.0

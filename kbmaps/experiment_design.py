@@ -16,6 +16,8 @@ from kbmaps.posterior import Posterior
 _EYE = np.eye(3)
 # Values that each joint is tried at when a chosen pose is improved within its limits.
 _EXCHANGE_VALUES = 9
+# Rounds in which each pose of a plan is improved in the presence of the others; a third gains 2 % at most.
+_PLAN_ROUNDS = 2
 # A variance [m²] below which an error is taken for none.
 _TINY_VARIANCE = 1e-24
 
@@ -71,6 +73,12 @@ class ExperimentDesign:
         self._information = self._with(roots)
         self._settle()
 
+    def remove(self, roots: FloatArray) -> None:
+        """Takes pairs at `roots` (n, 3, p), which were added before, for not measured."""
+        flat = roots.reshape(-1, roots.shape[2])
+        self._information = self._information - flat.T @ flat / self._noise_square
+        self._settle()
+
     def error_after(self, roots: FloatArray) -> float:
         """`error` [m] as it would be with pairs at `roots` (n, 3, p) too."""
         return self._mean_error(_under(np.linalg.cholesky(self._with(roots)), self._region))
@@ -93,6 +101,24 @@ class ExperimentDesign:
     def _mean_error(self, left: FloatArray) -> float:
         covariances = left @ left.swapaxes(1, 2) + self._floor_square * _EYE
         return float(mean_distances(covariances).mean())
+
+
+class _Exchange:
+    """Improves a pose within limits, one joint at a time."""
+
+    def __init__(self, design: ExperimentDesign, posterior: Posterior, lower: ArrayLike, upper: ArrayLike) -> None:
+        self._design, self._posterior = design, posterior
+        low, high = vector("lower limits", lower, posterior.joints), vector("upper limits", upper, posterior.joints)
+        self._values = np.linspace(low, high, _EXCHANGE_VALUES)
+
+    def improved(self, pose: FloatArray) -> FloatArray:
+        """The pose (d,) after one round in which each joint goes to the best of a few values, or stays."""
+        best = pose
+        for joint in range(len(pose)):
+            tried = np.tile(best, (_EXCHANGE_VALUES + 1, 1))
+            tried[:-1, joint] = self._values[:, joint]
+            best = tried[int(self._design.gains(self._posterior.roots(tried)).argmax())]
+        return best
 
 
 def next_pose(
@@ -119,9 +145,11 @@ def next_poses(
     *,
     limits: tuple[ArrayLike, ArrayLike] | None = None,
 ) -> FloatArray:
-    """Poses (count, d) to take together before the model is asked again: each the best after those before it.
+    """Poses (count, d) to take together before the model is asked again.
 
-    No candidate is taken twice. `limits` as in `next_pose`.
+    Each is the best after those before it, and no candidate is taken twice. With `limits`, as in `next_pose`, each is
+    then improved in the presence of all others: a plan for many pairs is better than the best next one
+    after the other.
 
     Raises:
         ShapeError, NonFiniteError
@@ -131,16 +159,20 @@ def next_poses(
     if not 1 <= count <= len(poses):
         raise SettingError(f"count must be from 1 to the number of candidates, {len(poses)}; got {count}")
     design, roots = ExperimentDesign(posterior, region), posterior.roots(poses)
-    bounds = None if limits is None else tuple(vector("limits", limit, posterior.joints) for limit in limits)
+    exchange = None if limits is None else _Exchange(design, posterior, *limits)
     left, chosen = np.arange(len(poses)), np.empty((count, posterior.joints))
     for k in range(count):
-        gains = design.gains(roots[left])
-        best = int(gains.argmax())
+        best = int(design.gains(roots[left]).argmax())
         chosen[k] = poses[left[best]]
-        if bounds is not None:
-            chosen[k] = _exchanged(design, posterior, chosen[k], float(gains[best]), bounds[0], bounds[1])
+        if exchange is not None:
+            chosen[k] = exchange.improved(chosen[k])
         left = np.delete(left, best)
         design.add(posterior.roots(chosen[k : k + 1]))
+    if exchange is not None and count > 1:
+        for k in list(range(count)) * _PLAN_ROUNDS:
+            design.remove(posterior.roots(chosen[k : k + 1]))
+            chosen[k] = exchange.improved(chosen[k])
+            design.add(posterior.roots(chosen[k : k + 1]))
     return chosen
 
 
@@ -171,7 +203,7 @@ def mean_distances(covariances: FloatArray) -> FloatArray:
     """Mean length (n,) of Gaussian vectors with covariances (n, 3, 3).
 
     The squared length has the first two moments of a Gamma distribution (Satterthwaite 1946), whose mean square root is
-    known. Exact for one direction and for three equal ones; in between within 1 %.
+    known. Exact for one direction and for three equal ones; in between within 2.5 %.
     """
     traces = np.einsum("nii->n", covariances)
     squares = np.einsum("nij,nij->n", covariances, covariances)
@@ -185,20 +217,6 @@ def _steps(begin: FloatArray, end: FloatArray, pairs: int, step: float) -> Float
     distance = float(np.linalg.norm(end - begin))
     count = min(int(distance / step), pairs)
     return begin + np.arange(1, count + 1)[:, None] * (step / max(distance, step)) * (end - begin)
-
-
-def _exchanged(
-    design: ExperimentDesign, posterior: Posterior, pose: FloatArray, gain: float, lower: FloatArray, upper: FloatArray
-) -> FloatArray:
-    """The pose after one round in which each joint goes to the best of a few values."""
-    best, most = pose, gain
-    for joint in range(posterior.joints):
-        tried = np.tile(best, (_EXCHANGE_VALUES, 1))
-        tried[:, joint] = np.linspace(lower[joint], upper[joint], _EXCHANGE_VALUES)
-        gains = design.gains(posterior.roots(tried))
-        if gains.max() > most:
-            best, most = tried[int(gains.argmax())], float(gains.max())
-    return best
 
 
 def _under(factor: FloatArray, roots: FloatArray) -> FloatArray:
