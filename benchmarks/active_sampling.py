@@ -1,4 +1,4 @@
-"""Pairs saved by choosing the next pose: `python -m benchmarks.active_sampling [--seeds N] [--only PART]`.
+"""Pairs saved by choosing the next pose: `python -m benchmarks.active_sampling [--seeds N] [--pairs N] [--only PART]`.
 
 The arm, its drawing and the noise are those of benchmarks.rigid_learner (drawing wrong by 3 degrees an axis, 15 mm a
 point, 30 mm at the marker; 10 mm of noise, told). Both kinds start from the drawing. "chosen" takes the best of 200
@@ -29,7 +29,7 @@ from kbmaps.arrays import FloatArray
 SIGMA = 0.01
 TEST_DEG = 80.0
 TEST_ROWS, REGION_ROWS, CANDIDATES, GOALS = 500, 200, 200, 30
-LEVELS = (10, 20, 40, 80)
+LEVELS = (10, 20, 40, 80, 160)
 STEP_RAD, STRETCH = np.radians(2.0), 20
 BOOTSTRAPS = 1000
 
@@ -180,18 +180,20 @@ def _ratio(level: int, grids: dict[str, FloatArray], means: dict[str, FloatArray
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=50)
+    parser.add_argument("--pairs", type=int, default=80, help="most pairs of a curve")
     parser.add_argument("--only", choices=[*SETUPS, WALK], action="append", default=[])
     arguments = parser.parse_args()
     seeds: int = arguments.seeds
+    last: int = arguments.pairs
     parts: list[str] = arguments.only or [*SETUPS, WALK]
     ways = (CHOSEN, PLANNED)
     for part in parts:
         if part == WALK:
-            walks = {w: [walk_curve(seed, w, LEVELS[-1]) for seed in range(seeds)] for w in (RANDOM, CHOSEN)}
+            walks = {w: [walk_curve(seed, w, last) for seed in range(seeds)] for w in (RANDOM, CHOSEN)}
             compare("d = 7, walking in steps of 2 deg within +-80 deg", (CHOSEN,), walks, 0)
             continue
         setup = SETUPS[part]
-        curves = {w: [curve(setup, seed, w, LEVELS[-1]) for seed in range(seeds)] for w in (RANDOM, *ways)}
+        curves = {w: [curve(setup, seed, w, last) for seed in range(seeds)] for w in (RANDOM, *ways)}
         compare(setup.name, ways, curves, setup.first)
 
 

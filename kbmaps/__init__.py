@@ -28,6 +28,7 @@ from kbmaps.expected_gain import ExpectedError, Forecast, candidate_motions, exp
 from kbmaps.experiment_design import ExperimentDesign, next_pose, next_poses, next_stretch
 from kbmaps.inverse import InverseKinematics, InverseSolution
 from kbmaps.kbmap import KBMap, prediction_errors
+from kbmaps.lack_of_fit import systematic_error
 from kbmaps.model import Estimate, Model
 from kbmaps.nlms import NLMS
 from kbmaps.posterior import ChainPosterior, Posterior
@@ -96,5 +97,6 @@ __all__ = [
     "next_stretch",
     "prediction_errors",
     "resolved_rates",
+    "systematic_error",
     "with_refitted_marker",
 ]

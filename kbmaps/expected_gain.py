@@ -158,7 +158,7 @@ def _resampled(poses: FloatArray, count: int, rng: np.random.Generator) -> Float
     """
     n, d = poses.shape
     ranked = np.sort(poses, axis=0)
-    places = (np.arange(n) + 0.5) / n
+    places = cast(FloatArray, np.linspace(0.5 / n, 1.0 - 0.5 / n, n))
     scores = cast(FloatArray, ndtri(places))[poses.argsort(axis=0).argsort(axis=0)]
     width = (4.0 / ((d + 2.0) * n)) ** (1.0 / (d + 4.0))
     picked = np.repeat(rng.integers(0, n, (3, count, 1)), d, axis=2)
@@ -168,7 +168,10 @@ def _resampled(poses: FloatArray, count: int, rng: np.random.Generator) -> Float
     # Differences of two poses over √2 have the poses' covariance, whatever its rank.
     smooth = (drawn + width * (one - other) / np.sqrt(2.0)) / np.sqrt(1.0 + width**2)
     shares = cast(FloatArray, ndtr(smooth))
-    return np.stack([np.interp(share, places, joint) for share, joint in zip(shares.T, ranked.T, strict=True)], axis=1)
+    like = np.empty((count, d))
+    for joint in range(d):
+        like[:, joint] = np.interp(shares[:, joint], places, ranked[:, joint])
+    return like
 
 
 def _chance_in_correlations(scores: FloatArray) -> float:

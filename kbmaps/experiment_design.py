@@ -81,16 +81,16 @@ class ExperimentDesign:
 
     def error_after(self, roots: FloatArray) -> float:
         """`error` [m] as it would be with pairs at `roots` (n, 3, p) too."""
-        return self._mean_error(_under(np.linalg.cholesky(self._with(roots)), self._region))
+        return self._mean_error(_under(_triangle(self._with(roots)), self._region))
 
     def _with(self, roots: FloatArray) -> FloatArray:
         flat = roots.reshape(-1, roots.shape[2])
         return self._information + flat.T @ flat / self._noise_square
 
     def _settle(self) -> None:
-        self._factor = np.linalg.cholesky(self._information)
+        self._factor = _triangle(self._information)
         self._left = self._reduced(self._region)
-        variances = np.einsum("tip,tip->t", self._left, self._left) + 3.0 * self._floor_square
+        variances: FloatArray = np.einsum("tip,tip->t", self._left, self._left) + 3.0 * self._floor_square
         weights = 0.5 / np.sqrt(np.maximum(variances, _TINY_VARIANCE)) / len(variances)
         flat = (self._left * np.sqrt(weights)[:, None, None]).reshape(-1, self._left.shape[2])
         self._moment = flat.T @ flat
@@ -219,7 +219,13 @@ def _steps(begin: FloatArray, end: FloatArray, pairs: int, step: float) -> Float
     return begin + np.arange(1, count + 1)[:, None] * (step / max(distance, step)) * (end - begin)
 
 
+def _triangle(information: FloatArray) -> FloatArray:
+    """L (p, p), lower triangular, with L Lᵀ the information."""
+    return cast(FloatArray, np.linalg.cholesky(information))
+
+
 def _under(factor: FloatArray, roots: FloatArray) -> FloatArray:
     """R L⁻ᵀ (n, 3, p) for the information L Lᵀ: the roots under it."""
     flat = roots.reshape(-1, roots.shape[2])
-    return cast(FloatArray, solve_triangular(factor, flat.T, lower=True, check_finite=False).T.reshape(roots.shape))
+    reduced = cast(FloatArray, solve_triangular(factor, flat.T, lower=True, check_finite=False))
+    return reduced.T.reshape(roots.shape)

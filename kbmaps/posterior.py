@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from typing import Protocol, cast
+from copy import copy
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -59,8 +60,6 @@ class ChainPosterior:
     ) -> None:
         if not (noise > 0.0 and math.isfinite(noise)):
             raise SettingError(f"noise must be finite and greater than 0 m, got {noise!r}")
-        if not (floor >= 0.0 and math.isfinite(floor)):
-            raise SettingError(f"floor must be finite and at least 0 m, got {floor!r}")
         self._parameters = ChainParameters(nominal)
         size = self._parameters.size
         for name, array, shape in (("change", change, (size,)), ("covariance", covariance, (size, size))):
@@ -68,11 +67,11 @@ class ChainPosterior:
                 raise ShapeError(name, str(shape), array.shape)
         self._change = np.array(change)
         self._spread = _square_root(covariance)
-        self.noise, self.floor = noise, floor
+        self.noise, self.floor = noise, _checked_floor(floor)
 
     @classmethod
     def of(cls, learner: RigidLearner | RecursiveRigidLearner, *, noise: float | None = None) -> ChainPosterior:
-        """What a learner knows now.
+        """What a learner knows now. Its floor is 0 unless the pairs were told a noise that does not explain them.
 
         Args:
             noise: 1-sigma of a coordinate of further pairs [m]; None takes that of the pairs so far. A recursive
@@ -101,6 +100,16 @@ class ChainPosterior:
         """Number of joints d."""
         return self._parameters.reference.joints
 
+    def with_floor(self, floor: float) -> ChainPosterior:
+        """The same with another floor [m], e.g. one found by `systematic_error` where the noise was not told.
+
+        Raises:
+            SettingError: floor is negative.
+        """
+        changed = copy(self)
+        changed.floor = _checked_floor(floor)
+        return changed
+
     def roots(self, q: ArrayLike) -> FloatArray:
         """Matrices R (n, 3, p) [m] at q (n, d): R_i R_jᵀ is the covariance of the positions at q_i and q_j.
 
@@ -108,7 +117,13 @@ class ChainPosterior:
             ShapeError, NonFiniteError
         """
         _, jacobian = self._parameters.linearised(self._change, rows("q", q, self.joints))
-        return cast(FloatArray, jacobian @ self._spread)
+        return jacobian @ self._spread
+
+
+def _checked_floor(floor: float) -> float:
+    if not (floor >= 0.0 and math.isfinite(floor)):
+        raise SettingError(f"floor must be finite and at least 0 m, got {floor!r}")
+    return floor
 
 
 def _square_root(covariance: FloatArray) -> FloatArray:
