@@ -5,8 +5,8 @@ point, 30 mm at the marker; 10 mm of noise, told). Both kinds start from the dra
 random candidates within the given range, one or (later) a tenth of the pairs so far between two fits. "planned" plans
 ten pairs, later half as many as there are, together and anywhere within the range. The error is the
 mean over the seeds of the mean distance to the truth at poses within +-80 degrees that nothing else has seen. The
-ratio is of the numbers of pairs, all counted, with which the error reaches what random pairs reach; 95 % interval by
-bootstrap over the seeds.
+ratio is of the numbers of pairs, all counted, that lead to this error: chosen over random ones (up to `random_times` as
+many were tried, so a ratio of its inverse means "at most"); 95 % interval by bootstrap over the seeds.
 """
 
 from __future__ import annotations
@@ -23,7 +23,16 @@ import numpy as np
 
 from benchmarks.bent_arm import RIGID, bent
 from benchmarks.rough_arm import ROUGH, RoughArm, rough_arm
-from kbmaps import ChainPosterior, RigidLearner, next_poses, next_stretch
+from benchmarks.timing import interleaved_medians_us
+from kbmaps import (
+    ChainPosterior,
+    RigidLearner,
+    candidate_motions,
+    expected_gain,
+    next_pose,
+    next_poses,
+    next_stretch,
+)
 from kbmaps.arrays import FloatArray
 
 SIGMA = 0.01
@@ -44,6 +53,7 @@ class Setup:
         range_deg: half the range of the poses to choose from.
         first: pairs taken at random within `first_deg` before any choice.
         bend: as in `bent`.
+        random_times: random pairs tried, over those chosen.
     """
 
     name: str
@@ -52,17 +62,18 @@ class Setup:
     first: int = 0
     first_deg: float = 20.0
     bend: str = RIGID
+    random_times: int = 2
 
 
 SETUPS = {
     "wide": Setup("d = 7, poses within +-80 deg"),
     "six": Setup("d = 6, poses within +-80 deg", joints=6),
-    "local": Setup("d = 7, poses within +-20 deg, tested within +-80", range_deg=20.0),
+    "local": Setup("d = 7, poses within +-20 deg, tested within +-80", range_deg=20.0, random_times=6),
     "opened": Setup("d = 7, 30 pairs within +-20 deg, then poses within +-80", first=30),
     "sag": Setup("d = 7, joints sag by 1 deg, poses within +-80 deg", bend="sag"),
     "eccentric": Setup("d = 7, encoders eccentric by 1 deg, poses within +-80 deg", bend="eccentric"),
 }
-WALK = "walk"
+WALK, COST = "walk", "cost"
 RANDOM, CHOSEN, PLANNED = "random", "chosen", "planned"
 
 
@@ -137,33 +148,34 @@ def walk_curve(seed: int, way: str, last: int) -> dict[int, float]:
 
 
 def pairs_to_reach(level: float, pairs: FloatArray, errors: FloatArray) -> float:
-    """Where a curve of mean errors first falls to a level, between its points by a straight line in logarithms."""
+    """Where a curve of mean errors first falls to a level, between its points by a straight line in logarithms.
+
+    The last of them where it does not fall so far: the pairs needed are at least as many.
+    """
     falling = np.minimum.accumulate(errors)
-    if level < falling[-1]:
-        return float("nan")
-    shifted = np.log(np.maximum(pairs, 0.5))
-    return float(np.exp(np.interp(-np.log(level), -np.log(falling), shifted)))
+    return float(np.exp(np.interp(-np.log(level), -np.log(falling), np.log(np.maximum(pairs, 0.5)))))
 
 
 def compare(name: str, ways: Sequence[str], curves: dict[str, list[dict[int, float]]], first: int) -> None:
-    print(f"\n{name}: pairs at random, error [mm]; error with as many chosen; ratio of pairs to the same error (95 %)")
+    print(
+        f"\n{name}: pairs; error [mm] at random; error with as many chosen, their ratio to random pairs for it (95 %)"
+    )
     seeds = len(curves[RANDOM])
     grids = {way: np.array(list(curves[way][0]), dtype=np.float64) for way in curves}
     errors = {way: np.array([list(one.values()) for one in curves[way]]) for way in curves}
     resamples = np.random.default_rng(0).integers(0, seeds, (BOOTSTRAPS, seeds))
-    for level in LEVELS:
-        if not max(first, grids[RANDOM][0]) < level <= grids[RANDOM][-1]:
+    for pairs in LEVELS:
+        if not max(first, *(grid[0] for grid in grids.values())) < pairs <= min(grid[-1] for grid in grids.values()):
             continue
-        by_random = _at(level, grids[RANDOM], errors[RANDOM].mean(axis=0))
-        text = f"  {level:4d} {1e3 * by_random:7.2f}"
+        text = f"  {pairs:4d} {1e3 * _at(pairs, grids[RANDOM], errors[RANDOM].mean(axis=0)):7.2f}"
         for way in ways:
-            ratios = [
-                _ratio(level, grids, {w: e[rows].mean(axis=0) for w, e in errors.items()}, way)
-                for rows in (np.arange(seeds), *resamples)
-            ]
+            ratios: list[float] = []
+            for rows in (np.arange(seeds), *resamples):
+                level = _at(pairs, grids[way], errors[way][rows].mean(axis=0))
+                ratios.append(pairs / pairs_to_reach(level, grids[RANDOM], errors[RANDOM][rows].mean(axis=0)))
             low, high = np.quantile(ratios[1:], (0.025, 0.975))
-            same = 1e3 * _at(level, grids[way], errors[way].mean(axis=0))
-            text += f"   {way} {same:6.2f}  {ratios[0]:.2f} ({low:.2f}-{high:.2f})"
+            error = 1e3 * _at(pairs, grids[way], errors[way].mean(axis=0))
+            text += f"   {way} {error:6.2f}  {ratios[0]:.2f} ({low:.2f}-{high:.2f})"
         print(text, flush=True)
 
 
@@ -172,28 +184,55 @@ def _at(pairs: float, grid: FloatArray, errors: FloatArray) -> float:
     return float(np.exp(np.interp(np.log(pairs), np.log(np.maximum(grid, 0.5)), np.log(errors))))
 
 
-def _ratio(level: int, grids: dict[str, FloatArray], means: dict[str, FloatArray], way: str) -> float:
-    goal = _at(level, grids[RANDOM], means[RANDOM])
-    return pairs_to_reach(goal, grids[way], means[way]) / level
+def cost() -> None:
+    rng = np.random.default_rng(0)
+    arm = rough_arm(7, rng)
+    learner = RigidLearner(arm.drawing, ROUGH)
+    q = arm.angles(40, 20.0, rng)
+    learner.learn(q, arm.measured(q, SIGMA, rng), SIGMA)
+    region, candidates = arm.angles(REGION_ROWS, 80, rng), arm.angles(CANDIDATES, 80, rng)
+    limit = np.full(7, np.radians(80.0))
+    limits = (-limit, limit)
+    posterior = ChainPosterior.of(learner)
+    motions = candidate_motions(q, *limits, rng)
+    costs = interleaved_medians_us(
+        {
+            f"next_pose, {CANDIDATES} candidates": lambda: next_pose(posterior, region, candidates),
+            "the same, improved within limits": lambda: next_pose(posterior, region, candidates, limits=limits),
+            "next_poses, ten planned": lambda: next_poses(posterior, region, candidates, 10, limits=limits),
+            f"expected_gain, {len(motions)} motions": lambda: expected_gain(posterior, region, motions, (300,), rng),
+        },
+        rounds=10,
+        calls=2,
+    )
+    print(f"\nCost at d = 7, a region of {REGION_ROWS} poses [ms]")
+    for name, cost_us in costs.items():
+        print(f"  {name:36s}{1e-3 * cost_us:8.1f}")
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", type=int, default=50)
+    parser.add_argument("--seeds", type=int, default=20, help="the goal is over 50")
     parser.add_argument("--pairs", type=int, default=80, help="most pairs of a curve")
-    parser.add_argument("--only", choices=[*SETUPS, WALK], action="append", default=[])
+    parser.add_argument("--only", choices=[*SETUPS, WALK, COST], action="append", default=[])
     arguments = parser.parse_args()
     seeds: int = arguments.seeds
     last: int = arguments.pairs
-    parts: list[str] = arguments.only or [*SETUPS, WALK]
+    parts: list[str] = arguments.only or [*SETUPS, WALK, COST]
     ways = (CHOSEN, PLANNED)
     for part in parts:
+        if part == COST:
+            cost()
+            continue
         if part == WALK:
-            walks = {w: [walk_curve(seed, w, last) for seed in range(seeds)] for w in (RANDOM, CHOSEN)}
+            walks = {
+                w: [walk_curve(seed, w, n) for seed in range(seeds)] for w, n in ((RANDOM, 3 * last), (CHOSEN, last))
+            }
             compare("d = 7, walking in steps of 2 deg within +-80 deg", (CHOSEN,), walks, 0)
             continue
         setup = SETUPS[part]
-        curves = {w: [curve(setup, seed, w, last) for seed in range(seeds)] for w in (RANDOM, *ways)}
+        most = {RANDOM: setup.random_times * last, CHOSEN: last, PLANNED: last}
+        curves = {w: [curve(setup, seed, w, n) for seed in range(seeds)] for w, n in most.items()}
         compare(setup.name, ways, curves, setup.first)
 
 
