@@ -129,7 +129,11 @@ def curve(setup: Setup, seed: int, way: str, last: int) -> dict[int, float]:
     trial = Trial(setup, seed, way)
     errors = {trial.pairs: trial.error()}
     while trial.pairs < last:
-        batch = max(10, trial.pairs // 2) if way == PLANNED else max(1, trial.pairs // 10)
+        batch = {
+            RANDOM: max(2, trial.pairs // 5),
+            CHOSEN: max(1, trial.pairs // 10),
+            PLANNED: max(10, trial.pairs // 2),
+        }[way]
         trial.learn(trial.poses(min(batch, last - trial.pairs)))
         errors[trial.pairs] = trial.error()
     return errors
