@@ -7,7 +7,7 @@ from typing import cast
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.spatial import cKDTree  # pyright: ignore[reportMissingTypeStubs, reportUnknownVariableType]
+from scipy.spatial import KDTree  # pyright: ignore[reportMissingTypeStubs]
 
 from kbmaps.arrays import FloatArray, IntArray, rows
 from kbmaps.errors import ShapeError
@@ -53,7 +53,8 @@ def _neighbours(poses: FloatArray) -> tuple[IntArray, IntArray]:
     """Each pose with the one nearest to it, each such couple once, joints counted in their standard deviations."""
     std = poses.std(axis=0)
     scaled = poses / np.where(std > 0.0, std, 1.0)
-    nearest = cast(IntArray, cKDTree(scaled).query(scaled, 2)[1])
+    found_two = KDTree(scaled).query(scaled, 2)  # pyright: ignore[reportUnknownMemberType]
+    nearest = cast(IntArray, found_two[1])
     # Where poses are equal a pose may not be found first among its own neighbours.
     own = np.arange(len(poses))
     found = np.where(nearest[:, 0] == own, nearest[:, 1], nearest[:, 0])
