@@ -53,8 +53,7 @@ def _neighbours(poses: FloatArray) -> tuple[IntArray, IntArray]:
     """Each pose with the one nearest to it, each such couple once, joints counted in their standard deviations."""
     std = poses.std(axis=0)
     scaled = poses / np.where(std > 0.0, std, 1.0)
-    found_two = KDTree(scaled).query(scaled, 2)  # pyright: ignore[reportUnknownMemberType]
-    nearest = cast(IntArray, found_two[1])
+    nearest = cast(IntArray, KDTree(scaled).query(scaled, 2)[1])  # pyright: ignore[reportUnknownMemberType]
     # Where poses are equal a pose may not be found first among its own neighbours.
     own = np.arange(len(poses))
     found = np.where(nearest[:, 0] == own, nearest[:, 1], nearest[:, 0])
