@@ -27,13 +27,17 @@ from kbmaps.errors import (
     SingularAlphaError,
 )
 from kbmaps.exact import ExactLearner, ExactSolution
+from kbmaps.expected_gain import ExpectedError, Forecast, candidate_motions, expected_gain
+from kbmaps.experiment_design import ExperimentDesign, next_pose, next_poses, next_stretch
 from kbmaps.inverse import InverseKinematics, InverseSolution
 from kbmaps.kbmap import KBMap, prediction_errors
 from kbmaps.kernel_learner import KernelLearner
 from kbmaps.kernels import in_use as kernels_in_use
+from kbmaps.lack_of_fit import systematic_error
 from kbmaps.memory import Memory
 from kbmaps.model import Estimate, Model
 from kbmaps.nlms import NLMS
+from kbmaps.posterior import ChainPosterior, Posterior
 from kbmaps.reach import PoseModel, PositionModel
 from kbmaps.residual_learner import ResidualLearner
 from kbmaps.resolved_rates import resolved_rates
@@ -57,6 +61,7 @@ __all__ = [
     "ChainBelief",
     "ChainError",
     "ChainParameters",
+    "ChainPosterior",
     "ChainReport",
     "ChainTolerances",
     "CorePrior",
@@ -64,6 +69,9 @@ __all__ = [
     "Estimate",
     "ExactLearner",
     "ExactSolution",
+    "ExpectedError",
+    "ExperimentDesign",
+    "Forecast",
     "Interval",
     "InverseKinematics",
     "InverseSolution",
@@ -77,6 +85,7 @@ __all__ = [
     "NonFiniteError",
     "PoseModel",
     "PositionModel",
+    "Posterior",
     "RecursiveRigidLearner",
     "ResidualLearner",
     "RigidChain",
@@ -94,13 +103,19 @@ __all__ = [
     "ToolLayer",
     "align",
     "blockwise_precision",
+    "candidate_motions",
+    "expected_gain",
     "find_chain",
     "follow_a_path",
     "kernels_in_use",
     "learning_bases",
     "nearest_rotation",
+    "next_pose",
+    "next_poses",
+    "next_stretch",
     "prediction_errors",
     "resolved_rates",
     "shared_by",
+    "systematic_error",
     "with_refitted_marker",
 ]

@@ -144,6 +144,13 @@ class RecursiveRigidLearner:
         """The parameters (size,) as in `ChainParameters` (a read-only copy)."""
         return frozen(self._change)
 
+    @property
+    def covariance(self) -> FloatArray:
+        """Covariance (size, size) of the parameters [rad², m²] (a read-only copy)."""
+        covariance = np.zeros((self._parameters.size, self._parameters.size))
+        covariance[np.ix_(self._active, self._active)] = self._covariance * np.outer(self._scales, self._scales)
+        return frozen(covariance)
+
     def learn(self, q: ArrayLike, x: ArrayLike, sigma: ArrayLike | None = None) -> None:
         """Pairs q (n, d) [rad, m] and x (n, 3) [m], or one, (d,) and (3,), one after the other.
 

@@ -1,0 +1,244 @@
+"""Pairs saved by choosing the next pose: `python -m benchmarks.active_sampling [--seeds N] [--pairs N] [--only PART]`.
+
+The arm, its drawing and the noise are those of benchmarks.rigid_learner (drawing wrong by 3 degrees an axis, 15 mm a
+point, 30 mm at the marker; 10 mm of noise, told). Both kinds start from the drawing. "chosen" takes the best of 200
+random candidates within the given range, one or (later) a tenth of the pairs so far between two fits. "planned" plans
+ten pairs, later half as many as there are, together and anywhere within the range. The error is the
+mean over the seeds of the mean distance to the truth at poses within +-80 degrees that nothing else has seen. The
+ratio is of the numbers of pairs, all counted, that lead to this error: chosen over random ones (up to `random_times` as
+many were tried, so a ratio of its inverse means "at most"); 95 % interval by bootstrap over the seeds.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from benchmarks.bent_arm import RIGID, bent
+from benchmarks.rough_arm import ROUGH, RoughArm, rough_arm
+from benchmarks.timing import interleaved_medians_us
+from kbmaps import (
+    ChainPosterior,
+    RigidLearner,
+    candidate_motions,
+    expected_gain,
+    next_pose,
+    next_poses,
+    next_stretch,
+)
+from kbmaps.arrays import FloatArray
+
+SIGMA = 0.01
+TEST_DEG = 80.0
+TEST_ROWS, REGION_ROWS, CANDIDATES, GOALS = 500, 200, 200, 30
+LEVELS = (10, 20, 40, 80, 160)
+STEP_RAD, STRETCH = np.radians(2.0), 20
+BOOTSTRAPS = 1000
+
+
+@dataclass(frozen=True)
+class Setup:
+    """Where pairs may be taken.
+
+    Attributes:
+        name: what is printed.
+        joints: number of them.
+        range_deg: half the range of the poses to choose from.
+        first: pairs taken at random within `first_deg` before any choice.
+        bend: as in `bent`.
+        random_times: random pairs tried, over those chosen.
+    """
+
+    name: str
+    joints: int = 7
+    range_deg: float = 80.0
+    first: int = 0
+    first_deg: float = 20.0
+    bend: str = RIGID
+    random_times: int = 2
+
+
+SETUPS = {
+    "wide": Setup("d = 7, poses within +-80 deg"),
+    "six": Setup("d = 6, poses within +-80 deg", joints=6),
+    "local": Setup("d = 7, poses within +-20 deg, tested within +-80", range_deg=20.0, random_times=6),
+    "opened": Setup("d = 7, 30 pairs within +-20 deg, then poses within +-80", first=30),
+    "sag": Setup("d = 7, joints sag by 1 deg, poses within +-80 deg", bend="sag"),
+    "eccentric": Setup("d = 7, encoders eccentric by 1 deg, poses within +-80 deg", bend="eccentric"),
+}
+WALK, COST = "walk", "cost"
+RANDOM, CHOSEN, PLANNED = "random", "chosen", "planned"
+
+
+class Trial:
+    """One arm, its learner and the curve of its errors."""
+
+    def __init__(self, setup: Setup, seed: int, way: str) -> None:
+        self._rng = np.random.default_rng(seed)
+        self.arm: RoughArm = bent(rough_arm(setup.joints, self._rng), setup.bend, self._rng)
+        self._test = self.arm.angles(TEST_ROWS, TEST_DEG, self._rng)
+        self._truth = self.arm.positions(self._test)
+        self._learner = RigidLearner(self.arm.drawing, ROUGH)
+        self._range_deg, self._way = setup.range_deg, way
+        # Pairs and choices have a stream each, so that both ways meet the same arm, test poses and first pairs.
+        if setup.first:
+            self.learn(self.arm.angles(setup.first, setup.first_deg, self._rng))
+
+    @property
+    def pairs(self) -> int:
+        return self._learner.pairs
+
+    def learn(self, q: FloatArray) -> None:
+        self._learner.learn(q, self.arm.measured(q, SIGMA, self._rng), SIGMA)
+
+    def error(self) -> float:
+        return float(np.linalg.norm(self._learner.predict(self._test) - self._truth, axis=1).mean())
+
+    def poses(self, count: int) -> FloatArray:
+        if self._way == RANDOM:
+            return self.arm.angles(count, self._range_deg, self._rng)
+        region = self.arm.angles(REGION_ROWS, TEST_DEG, self._rng)
+        candidates = self.arm.angles(CANDIDATES, self._range_deg, self._rng)
+        limit = np.full(self.arm.drawing.joints, np.radians(self._range_deg))
+        limits = (-limit, limit) if self._way == PLANNED else None
+        posterior = ChainPosterior.of(self._learner, noise=SIGMA)
+        return next_poses(posterior, region, candidates, count, limits=limits)
+
+    def stretch(self, start: FloatArray) -> FloatArray:
+        """Poses on the way to a pose, at least `STRETCH` steps away: to any, or to the best."""
+        goals = self.arm.angles(GOALS, self._range_deg, self._rng)
+        away = goals - start
+        lengths = np.linalg.norm(away, axis=1)
+        goals = goals[lengths >= STRETCH * STEP_RAD]
+        if self._way == RANDOM:
+            goals = goals[:1]
+        region = self.arm.angles(REGION_ROWS, TEST_DEG, self._rng)
+        posterior = ChainPosterior.of(self._learner, noise=SIGMA)
+        return next_stretch(posterior, region, start, goals, pairs=STRETCH, step=STEP_RAD)
+
+
+def curve(setup: Setup, seed: int, way: str, last: int) -> dict[int, float]:
+    """Mean error [m] by number of pairs."""
+    trial = Trial(setup, seed, way)
+    errors = {trial.pairs: trial.error()}
+    while trial.pairs < last:
+        batch = {
+            RANDOM: max(2, trial.pairs // 5),
+            CHOSEN: max(1, trial.pairs // 10),
+            PLANNED: max(10, trial.pairs // 2),
+        }[way]
+        trial.learn(trial.poses(min(batch, last - trial.pairs)))
+        errors[trial.pairs] = trial.error()
+    return errors
+
+
+def walk_curve(seed: int, way: str, last: int) -> dict[int, float]:
+    """The same where the arm has to walk: stretches of 20 steps of 2 degrees."""
+    trial = Trial(Setup(WALK), seed, way)
+    at = np.zeros(7)
+    errors: dict[int, float] = {}
+    while trial.pairs < last:
+        path = trial.stretch(at)
+        trial.learn(path)
+        at, errors[trial.pairs] = path[-1], trial.error()
+    return errors
+
+
+def pairs_to_reach(level: float, pairs: FloatArray, errors: FloatArray) -> float:
+    """Where a curve of mean errors first falls to a level, between its points by a straight line in logarithms.
+
+    The last of them where it does not fall so far: the pairs needed are at least as many.
+    """
+    falling = np.minimum.accumulate(errors)
+    return float(np.exp(np.interp(-np.log(level), -np.log(falling), np.log(np.maximum(pairs, 0.5)))))
+
+
+def compare(name: str, ways: Sequence[str], curves: dict[str, list[dict[int, float]]], first: int) -> None:
+    print(
+        f"\n{name}: pairs; error [mm] at random; error with as many chosen, their ratio to random pairs for it (95 %)"
+    )
+    seeds = len(curves[RANDOM])
+    grids = {way: np.array(list(curves[way][0]), dtype=np.float64) for way in curves}
+    errors = {way: np.array([list(one.values()) for one in curves[way]]) for way in curves}
+    resamples = np.random.default_rng(0).integers(0, seeds, (BOOTSTRAPS, seeds))
+    for pairs in LEVELS:
+        if not max(first, *(grid[0] for grid in grids.values())) < pairs <= min(grid[-1] for grid in grids.values()):
+            continue
+        text = f"  {pairs:4d} {1e3 * _at(pairs, grids[RANDOM], errors[RANDOM].mean(axis=0)):7.2f}"
+        for way in ways:
+            ratios: list[float] = []
+            for rows in (np.arange(seeds), *resamples):
+                level = _at(pairs, grids[way], errors[way][rows].mean(axis=0))
+                ratios.append(pairs / pairs_to_reach(level, grids[RANDOM], errors[RANDOM][rows].mean(axis=0)))
+            low, high = np.quantile(ratios[1:], (0.025, 0.975))
+            error = 1e3 * _at(pairs, grids[way], errors[way].mean(axis=0))
+            text += f"   {way} {error:6.2f}  {ratios[0]:.2f} ({low:.2f}-{high:.2f})"
+        print(text, flush=True)
+
+
+def _at(pairs: float, grid: FloatArray, errors: FloatArray) -> float:
+    """The error at a number of pairs, between those of the grid by a straight line in logarithms."""
+    return float(np.exp(np.interp(np.log(pairs), np.log(np.maximum(grid, 0.5)), np.log(errors))))
+
+
+def cost() -> None:
+    rng = np.random.default_rng(0)
+    arm = rough_arm(7, rng)
+    learner = RigidLearner(arm.drawing, ROUGH)
+    q = arm.angles(40, 20.0, rng)
+    learner.learn(q, arm.measured(q, SIGMA, rng), SIGMA)
+    region, candidates = arm.angles(REGION_ROWS, 80, rng), arm.angles(CANDIDATES, 80, rng)
+    limit = np.full(7, np.radians(80.0))
+    limits = (-limit, limit)
+    posterior = ChainPosterior.of(learner)
+    motions = candidate_motions(q, *limits, rng)
+    costs = interleaved_medians_us(
+        {
+            f"next_pose, {CANDIDATES} candidates": lambda: next_pose(posterior, region, candidates),
+            "the same, improved within limits": lambda: next_pose(posterior, region, candidates, limits=limits),
+            "next_poses, ten planned": lambda: next_poses(posterior, region, candidates, 10, limits=limits),
+            f"expected_gain, {len(motions)} motions": lambda: expected_gain(posterior, region, motions, (300,), rng),
+        },
+        rounds=10,
+        calls=2,
+    )
+    print(f"\nCost at d = 7, a region of {REGION_ROWS} poses [ms]")
+    for name, cost_us in costs.items():
+        print(f"  {name:36s}{1e-3 * cost_us:8.1f}")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seeds", type=int, default=20, help="the goal is over 50")
+    parser.add_argument("--pairs", type=int, default=80, help="most pairs of a curve")
+    parser.add_argument("--only", choices=[*SETUPS, WALK, COST], action="append", default=[])
+    arguments = parser.parse_args()
+    seeds: int = arguments.seeds
+    last: int = arguments.pairs
+    parts: list[str] = arguments.only or [*SETUPS, WALK, COST]
+    ways = (CHOSEN, PLANNED)
+    for part in parts:
+        if part == COST:
+            cost()
+            continue
+        if part == WALK:
+            walks = {
+                w: [walk_curve(seed, w, n) for seed in range(seeds)] for w, n in ((RANDOM, 3 * last), (CHOSEN, last))
+            }
+            compare("d = 7, walking in steps of 2 deg within +-80 deg", (CHOSEN,), walks, 0)
+            continue
+        setup = SETUPS[part]
+        most = {RANDOM: setup.random_times * last, CHOSEN: last, PLANNED: last}
+        curves = {w: [curve(setup, seed, w, n) for seed in range(seeds)] for w, n in most.items()}
+        compare(setup.name, ways, curves, setup.first)
+
+
+if __name__ == "__main__":
+    main()

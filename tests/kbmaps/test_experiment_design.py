@@ -1,0 +1,212 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from planted_chains import random_q
+from rough_arms import ROUGH, rough_arm
+
+from kbmaps import (
+    ChainPosterior,
+    ExperimentDesign,
+    RigidLearner,
+    SettingError,
+    ShapeError,
+    next_pose,
+    next_poses,
+    next_stretch,
+)
+from kbmaps.experiment_design import mean_distances
+
+seeds = st.integers(0, 2**32 - 1)
+
+
+class Waves:
+    """A linear model of two joints: x = B(q) w with a few sines, weights w from N(0, root rootᵀ)."""
+
+    joints = 2
+
+    def __init__(self, rng, noise=0.1, floor=0.0):
+        self.noise, self.floor = noise, floor
+        self.root = rng.normal(size=(12, 12))
+        self._mix = rng.normal(size=(4, 2))
+
+    def features(self, q):
+        basis = np.sin(np.asarray(q) @ self._mix.T + np.arange(4))
+        return np.einsum("nk,ij->nijk", basis, np.eye(3)).reshape(len(basis), 3, 12)
+
+    def roots(self, q):
+        return self.features(q) @ self.root
+
+    def covariances_after(self, q, region):
+        """By the textbook: (Σ⁻¹ + BᵀB/σ²)⁻¹ in the weights themselves."""
+        seen = self.features(q).reshape(-1, 12)
+        covariance = np.linalg.inv(np.linalg.inv(self.root @ self.root.T) + seen.T @ seen / self.noise**2)
+        shown = self.features(region)
+        return shown @ covariance @ shown.transpose(0, 2, 1) + self.floor**2 * np.eye(3)
+
+
+def planted(seed, floor=0.0):
+    rng = np.random.default_rng(seed)
+    return Waves(rng, floor=floor), rng.uniform(-2, 2, (20, 2)), rng.uniform(-2, 2, (15, 2))
+
+
+@given(seed=seeds, floor=st.sampled_from([0.0, 0.2]))
+@settings(max_examples=25, deadline=None)
+def test_the_error_foretold_is_that_of_the_posterior_with_those_pairs(seed, floor):
+    model, region, q = planted(seed, floor)
+    design = ExperimentDesign(model, region)
+    wanted = mean_distances(model.covariances_after(q, region)).mean()
+    assert design.error_after(model.roots(q)) == pytest.approx(wanted, rel=1e-5)
+    design.add(model.roots(q))
+    assert design.error == pytest.approx(wanted, rel=1e-5)
+
+
+@given(seed=seeds)
+@settings(max_examples=25, deadline=None)
+def test_removing_pairs_undoes_adding_them(seed):
+    model, region, q = planted(seed)
+    design = ExperimentDesign(model, region)
+    design.add(model.roots(q[:5]))
+    before = design.error
+    design.add(model.roots(q[5:]))
+    design.remove(model.roots(q[5:]))
+    assert design.error == pytest.approx(before, rel=1e-6)
+
+
+@given(seed=seeds, floor=st.sampled_from([0.0, 0.2]))
+@settings(max_examples=25, deadline=None)
+def test_the_rms_errors_fall_by_at_least_the_gain(seed, floor):
+    model, region, q = planted(seed, floor)
+
+    def rms(covariances):
+        return np.sqrt(np.trace(covariances, axis1=1, axis2=2)).mean()
+
+    before = rms(model.covariances_after(q[:0], region))
+    falls = [before - rms(model.covariances_after(q[k : k + 1], region)) for k in range(len(q))]
+    gains = ExperimentDesign(model, region).gains(model.roots(q))
+    assert (gains > 0.0).all()
+    assert (gains <= np.array(falls) * (1.0 + 1e-6)).all()
+
+
+@given(seed=seeds)
+@settings(max_examples=25, deadline=None)
+def test_gains_are_those_of_the_textbook_to_first_order(seed):
+    """With noise so large that a pair changes little the tangent is the curve."""
+    model, region, q = planted(seed)
+    model.noise = 1e4
+    before = np.sqrt(np.trace(model.covariances_after(q[:0], region), axis1=1, axis2=2)).mean()
+    gains = ExperimentDesign(model, region).gains(model.roots(q))
+    after = [np.trace(model.covariances_after(q[k : k + 1], region), axis1=1, axis2=2) for k in range(len(q))]
+    falls = before - np.sqrt(after).mean(axis=1)
+    np.testing.assert_allclose(gains, falls, rtol=1e-2, atol=1e-12 * before)
+
+
+def test_the_next_pose_is_the_candidate_with_the_greatest_gain():
+    model, region, q = planted(1)
+    gains = ExperimentDesign(model, region).gains(model.roots(q))
+    np.testing.assert_array_equal(next_pose(model, region, q), q[gains.argmax()])
+
+
+def test_a_pose_that_was_measured_often_is_not_chosen_again():
+    rng = np.random.default_rng(2)
+    arm = rough_arm(rng)
+    often, other = random_q(rng, arm.kinds, 2, 80)
+    learner = RigidLearner(arm.nominal, ROUGH)
+    learner.learn(np.tile(often, (30, 1)), arm.real.positions(often) + 0.01 * rng.normal(size=(30, 3)), 0.01)
+    posterior = ChainPosterior.of(learner)
+    np.testing.assert_array_equal(next_pose(posterior, [other, often], [often, other]), other)
+
+
+def test_no_candidate_is_taken_twice():
+    model, region, q = planted(3)
+    chosen = next_poses(model, region, q, len(q))
+    assert len(np.unique(chosen, axis=0)) == len(q)
+
+
+@given(seed=seeds)
+@settings(max_examples=10, deadline=None)
+def test_a_plan_stays_within_the_limits_and_is_no_worse_than_the_candidates(seed):
+    rng = np.random.default_rng(seed)
+    arm = rough_arm(rng)
+    limits = np.full(6, np.radians(80.0))
+    learner = RigidLearner(arm.nominal, ROUGH)
+    learner.learn(*arm.pairs(rng, 10, 0.01, reach_deg=20), 0.01)
+    posterior = ChainPosterior.of(learner)
+    region, candidates = random_q(rng, arm.kinds, 100, 80), random_q(rng, arm.kinds, 50, 80)
+    greedy, plan = (next_poses(posterior, region, candidates, 6, limits=bounds) for bounds in (None, (-limits, limits)))
+    assert (np.abs(plan) <= limits + 1e-12).all()
+    design = ExperimentDesign(posterior, region)
+    assert design.error_after(posterior.roots(plan)) < design.error_after(posterior.roots(greedy))
+
+
+def test_a_stretch_goes_in_even_steps_towards_the_goal_that_teaches_most():
+    model, region, goals = planted(4)
+    start = np.array([0.1, -0.1])
+    goals = goals[np.linalg.norm(goals - start, axis=1) > 0.5]
+    path = next_stretch(model, region, start, goals, pairs=5, step=0.1)
+    assert path.shape == (5, 2)
+    np.testing.assert_allclose(np.linalg.norm(np.diff([start, *path], axis=0), axis=1), 0.1)
+    design = ExperimentDesign(model, region)
+    straight = (
+        start
+        + 0.1 * np.arange(1, 6)[:, None] * ((goals - start) / np.linalg.norm(goals - start, axis=1)[:, None])[:, None]
+    )
+    errors = [design.error_after(model.roots(way)) for way in straight]
+    np.testing.assert_allclose(path, straight[int(np.argmin(errors))])
+
+
+def test_a_stretch_ends_at_its_goal():
+    model, region, _ = planted(5)
+    path = next_stretch(model, region, [0.0, 0.0], [[0.31, 0.0]], pairs=50, step=0.1)
+    np.testing.assert_allclose(path, [[0.1, 0.0], [0.2, 0.0], [0.3, 0.0]])
+
+
+@given(seed=seeds)
+@settings(max_examples=10, deadline=None)
+def test_mean_distances_are_within_a_few_percent_of_sampled_ones(seed):
+    rng = np.random.default_rng(seed)
+    root = rng.normal(size=(3, 3)) * 10.0 ** rng.uniform(-2, 2, 3)
+    lengths = np.linalg.norm(rng.normal(size=(200_000, 3)) @ root.T, axis=1)
+    assert mean_distances((root @ root.T)[None])[0] == pytest.approx(lengths.mean(), rel=0.035)
+
+
+def test_mean_distances_are_exact_along_one_axis_and_in_a_ball():
+    one, ball = np.diag([0.0, 4.0, 0.0]), 4.0 * np.eye(3)
+    wanted = [2.0 * np.sqrt(2.0 / np.pi), 4.0 * np.sqrt(2.0 / np.pi), 0.0]
+    np.testing.assert_allclose(mean_distances(np.stack([one, ball, 0.0 * one])), wanted, rtol=1e-12)
+
+
+def test_what_does_not_fit_is_refused():
+    model, region, q = planted(6)
+    with pytest.raises(ShapeError):
+        ExperimentDesign(model, region[:, :1])
+    for refused in (
+        lambda: ExperimentDesign(model, region[:0]),
+        lambda: next_poses(model, region, q, 0),
+        lambda: next_poses(model, region, q, len(q) + 1),
+        lambda: next_stretch(model, region, q[0], q, pairs=0, step=0.1),
+        lambda: next_stretch(model, region, q[0], q, pairs=1, step=0.0),
+        lambda: next_stretch(model, region, q[0], q[:1], pairs=1, step=0.1),
+    ):
+        with pytest.raises(SettingError):
+            refused()
+
+
+def test_chosen_poses_teach_more_than_random_ones():
+    """The errors that the learner really makes, over arms that none of the choice was made on."""
+    errors = []
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        arm = rough_arm(rng)
+        limits = np.full(6, np.radians(80.0))
+        learners = {way: RigidLearner(arm.nominal, ROUGH) for way in ("random", "chosen")}
+        region = random_q(rng, arm.kinds, 100, 80)
+        posterior = ChainPosterior.of(learners["chosen"], noise=0.01)
+        planned = next_poses(posterior, region, random_q(rng, arm.kinds, 100, 80), 12, limits=(-limits, limits))
+        for way, q in (("random", random_q(rng, arm.kinds, 12, 80)), ("chosen", planned)):
+            learners[way].learn(q, arm.real.positions(q) + 0.01 * rng.normal(size=(12, 3)), 0.01)
+        errors.append([arm.error(learner, rng) for learner in learners.values()])
+    by_random, by_choice = np.mean(errors, axis=0)
+    assert by_choice < 0.85 * by_random
