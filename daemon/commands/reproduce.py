@@ -50,15 +50,15 @@ def reproduce(
     from daemon.reproduce import EXPERIMENTS, Run
     from daemon.reproduce.plot import plot
     from daemon.reproduce.show import show
-    from daemon.wiring import require_simulation
     from interfaces.errors import ConfigError
 
     if importlib.util.find_spec("matplotlib") is None:
         raise ConfigError("the plots need matplotlib", remedy="Type: pip install 'bodyschema[sim]'")
     if seed < 0:
         raise ConfigError(f"--seed is {seed}", remedy="Give 0 or more")
-    if real and name in ("fig5", "fig7", "all"):
-        require_simulation()
+    if real and name in ("fig5", "fig7", "all") and importlib.util.find_spec("pybullet") is None:
+        remedy = "Type: pip install 'bodyschema[sim]', or leave them out with --no-real"
+        raise ConfigError("the measured curves need pybullet, which is not installed", remedy=remedy)
     progress, console = Console(stderr=True), Console()
     try:
         out.mkdir(parents=True, exist_ok=True)

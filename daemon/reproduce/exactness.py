@@ -35,5 +35,5 @@ def exactness(run: Run, *, joints: tuple[int, ...] = (5, 6, 7)) -> Experiment:
             readings.append(Reading(what, "time of the solution", "not stated", took, "s"))
     notes = ["Float64 is the limit: a narrower zone multiplies rounding errors (docs/maths.md)."]
     title = "Exactness: 3^d noise-free samples determine the map"
-    panels = [Panel(f"{', '.join(map(str, joints))} joints, tested within ±80°", curves, largest=True)]
+    panels = [Panel(f"{', '.join(map(str, joints))} joints, tested within ±80°", curves, as_paper=True)]
     return Experiment("exactness", title, "samples", panels, readings, None, notes, floor_m=1e-15)

@@ -89,12 +89,13 @@ class Panel:
     Attributes:
         title: what it shows.
         curves: its lines.
-        largest: whether the largest errors are drawn too, dotted as in the paper.
+        as_paper: drawn as the paper draws it: counts on a linear axis, and the largest errors too, dotted. Otherwise
+            counts are on a logarithmic one, from 1 on.
     """
 
     title: str
     curves: Sequence[Curve]
-    largest: bool = False
+    as_paper: bool = False
 
 
 @dataclass(frozen=True)

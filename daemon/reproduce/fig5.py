@@ -55,7 +55,7 @@ def fig5(run: Run, *, train: int = 1_000, test: int = 500) -> Experiment:
     shown = measured or next(iter(simulated.values()))
     models = _models(run, shown, counts)
     panels = [
-        Panel("as in the paper: test points noisy as the pairs are", paper, largest=True),
+        Panel("as in the paper: test points noisy as the pairs are", paper, as_paper=True),
         Panel(
             f"other models, against true positions ({'measured' if measured else 'simulated'} pairs)",
             [*(of_model[TRUE] for of_model in models.values())],

@@ -12,7 +12,7 @@ from kbmaps import ChainTolerances, RigidChain
 from .arm import JOINTS, arm, beside, longer_tool
 from .experiment import Comparison, Curve, Experiment, Panel, Reading, Run, Tests
 from .models import Knowledge
-from .stream import RULE, Stream, background, bernstein_map, in_stages, learn_stream, papers_rule
+from .stream import EARLY, RULE, Stream, background, bernstein_map, in_stages, learn_stream, papers_rule
 from .walk import WALK_SIGMA, walk
 
 MOVED_M = 0.250
@@ -50,7 +50,7 @@ def fig6(run: Run, *, online: int = 1_700, cycles: int = 3_000) -> Experiment:
     behind = background(bernstein_map(nominal), streams["without noise"])
     panels = [
         Panel(
-            "as in the paper, tested near the walk (pale: anywhere)", [*behind, *_papers_curves(found)], largest=True
+            "as in the paper, tested near the walk (pale: anywhere)", [*behind, *_papers_curves(found)], as_paper=True
         ),
         Panel(f"other models, {NEAR}; solid: σ = 20 mm, dashed: without noise", _models_curves(found)),
     ]
@@ -105,7 +105,7 @@ def _other_readings(
 
 def _across(tool: FloatArray) -> FloatArray:
     """A unit vector (3,) at right angles to the tool."""
-    across = np.cross(tool, np.eye(3)[np.argmin(np.abs(tool))])
+    across: FloatArray = np.cross(tool, np.eye(3)[np.argmin(np.abs(tool))]).astype(np.float64)
     return across / np.linalg.norm(across)
 
 
@@ -121,13 +121,13 @@ def _papers_curves(found: dict[str, dict[str, dict[str, Curve]]]) -> list[Curve]
 def _models_curves(found: dict[str, dict[str, dict[str, Curve]]]) -> list[Curve]:
     return [
         replace(curves[NEAR], style=COLOURS[noise][2])
-        for noise, of_noise in found.items()
+        for noise, of_noise in reversed(found.items())
         for curves in of_noise.values()
     ]
 
 
 def _comparison(found: dict[str, dict[str, dict[str, Curve]]], online: int) -> Comparison:
-    columns = [(noise, test, n) for noise in found for n in (30, online) for test in (NEAR, ANYWHERE)]
+    columns = [(noise, test, n) for noise in found for n in (EARLY, online) for test in (NEAR, ANYWHERE)]
     return Comparison(
         "mean error of other models on the same pairs",
         [f"{noise}, {test}, at {n:,}" for noise, test, n in columns],

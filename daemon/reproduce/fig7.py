@@ -14,7 +14,7 @@ from .arm import CRUDE, JOINTS, arm, beside, crude_estimate
 from .experiment import Comparison, Curve, Experiment, Panel, Reading, Run, Tests
 from .measured import Measured, guided_walk
 from .models import Knowledge
-from .stream import RULE, Stream, background, bernstein_map, in_stages, learn_stream, papers_rule
+from .stream import EARLY, RULE, Stream, background, bernstein_map, in_stages, learn_stream, papers_rule
 from .walk import WALK_SIGMA, walk
 
 TEST_POSES = 1_000
@@ -131,7 +131,7 @@ def _papers_panel(learnt: Found, apart: Curve) -> Panel:
         replace(red, name=names[0], colour="tab:red"),
         replace(orange, name=names[1], colour="tab:orange"),
     ]
-    return Panel("as in the paper", [apart, *curves], largest=True)
+    return Panel("as in the paper", [apart, *curves], as_paper=True)
 
 
 def _models_panel(compared: Found) -> Panel:
@@ -145,12 +145,12 @@ def _models_panel(compared: Found) -> Panel:
 def _readings(learnt: Found, streams: dict[str, Stream], size: _Size) -> list[Reading]:
     return [
         Reading(when, f"{name}; {test}", _PAPER, learnt[name][RULE][test].at(count))
-        for name, stream in streams.items()
-        for test in stream.tests
         for when, count in (
             (f"after {size.online:,} pairs", size.online),
             (f"after {size.cycles:,} cycles", size.cycles),
         )
+        for name, stream in streams.items()
+        for test in stream.tests
     ]
 
 
@@ -159,7 +159,7 @@ def _comparison(compared: Found, online: int) -> Comparison:
         (name, test, count)
         for name, of_model in compared.items()
         for test in of_model[RULE]
-        for count in (30, online)
+        for count in (EARLY, online)
         if test is not ANYWHERE
     ]
     return Comparison(

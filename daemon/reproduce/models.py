@@ -131,6 +131,6 @@ def learn_all(
     return found
 
 
-def spread_counts(first: int, last: int, number: int = 20) -> list[int]:
+def spread_counts(first: int, last: int, number: int = 12) -> list[int]:
     """So many counts at most between two, evenly spread over their logarithms."""
     return sorted({*np.geomspace(first, last, number).round().astype(int).tolist(), last})

@@ -18,6 +18,8 @@ from .models import WITH_DRAWING, Knowledge, learn_all, spread_counts
 
 ALPHA = np.radians(60.0)
 EVERY = 10
+# After so few pairs the models are compared, and at the end of those that came.
+EARLY = 30
 RULE, LEARNER = "paper's rule", "this learner"
 _LEAST_SIGMA_M = 1e-4
 
@@ -117,7 +119,7 @@ def learn_stream(
     found = {RULE: papers_rule(bernstein_map(nominal), stream)}
     say(f"{LEARNER} and {len(WITH_DRAWING)} other models, {stream.name}: {stream.online:,} pairs")
     found[LEARNER] = daemons_learner(nominal, stream, tool_changed=tool_changed)
-    counts = [0, *spread_counts(1, stream.online)]
+    counts = sorted({0, EARLY, *spread_counts(1, stream.online)})
     return found | learn_all(WITH_DRAWING, known, (stream.q, stream.x), counts, stream.tests)
 
 
