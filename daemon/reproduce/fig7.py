@@ -49,7 +49,6 @@ def fig7(run: Run, *, online: int = 600, cycles: int = 2_200, held_out: int = 40
         found = guided_walk(6, online + held_out + onward, run.seed, run.say)
         streams = _measured(run.rng, found, size) | streams
         noise = found.noise_m
-        run.say(f"the tracker's mean error: {1e3 * noise:.2f} mm")
     known = Knowledge(crude, CRUDE, np.pi)
     learnt: Found = {}
     for name, stream in streams.items():
