@@ -85,8 +85,8 @@ def _notes(noise_m: float | None) -> list[str]:
     if noise_m is not None:
         notes.append(
             f"Measured: rendered and tracked in each posture. The tracker errs by {1e3 * noise_m:.2f} mm on average, "
-            "the paper's perception by about 20 mm: the two curves are as far apart. In the postures both cameras see the "
-            "marker, anywhere in the images; the simulated curve in the same postures shows what that costs."
+            "the paper's perception by about 20 mm: the two curves are as far apart. In the postures both cameras see "
+            "the marker, anywhere in the images; the simulated curve in the same postures shows what that costs."
         )
     return notes
 
