@@ -37,7 +37,7 @@ def fig4(run: Run, *, samples: int = 13_000, tests: int = 6_000) -> Experiment:
     title = "Figure 4: batch learning, 6 joints, ±80°, σ = 10 mm"
     drawn = [curve for of_model in models.values() for curve in of_model.values()]
     panels = [
-        Panel("as in the paper", [training, *of_tests.values(), _noise_level(counts)], as_paper=True),
+        Panel("as in the paper", [_noise_level(counts), training, *of_tests.values()], as_paper=True),
         Panel("other models; solid: ±80°, dashed: ±120°", drawn),
     ]
     columns = [(test, n) for test in held for n in compared if n in (30, 100, 300, 2_200, 13_000)]
@@ -82,7 +82,7 @@ def _least_squares(pairs: Pairs, held: Tests, counts: Sequence[int]) -> tuple[Cu
 
 
 def _noise_level(counts: Sequence[int]) -> Curve:
-    level = Curve("mean length of the noise", "grey", thin=True)
+    level = Curve("mean length of the noise", "lightgrey")
     for count in (counts[0], counts[-1]):
         level.add_one(count, MEAN_NOISE * SIGMA_M)
     return level

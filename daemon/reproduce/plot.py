@@ -57,7 +57,7 @@ def _draw(axes: Axes, panel: Panel, floor_m: float) -> None:
 def _line(axes: Axes, curve: Curve, floor_m: float, width: float, *, as_paper: bool) -> None:
     drawn = [place for place, count in enumerate(curve.count) if as_paper or count > 0]
     counts = [curve.count[place] for place in drawn]
-    marker = "o" if len(counts) <= _FEW and not curve.thin else None
+    marker = "o" if 2 < len(counts) <= _FEW and not curve.thin else None
     look = {"color": curve.colour, "alpha": 0.7 if curve.thin else 1.0}
     above = [1e3 * max(curve.mean[place], floor_m) for place in drawn]
     width = _THIN if curve.thin else width

@@ -34,8 +34,8 @@ from kbmaps import ChainTolerances, NonFiniteError
 PAGE = Path(__file__).parents[2] / "docs" / "reproduced.md"
 # Small variants, so that every curve and table is made in seconds.
 SMALL = {
-    "fig4": lambda run: fig4(run, samples=1_400, tests=300),
-    "fig5": lambda run: fig5(run, train=400, test=50),
+    "fig4": lambda run: fig4(run, samples=1_000, tests=200),
+    "fig5": lambda run: fig5(run, train=300, test=30),
     "fig6": lambda run: fig6(run, online=60, cycles=150),
     "fig7": lambda run: fig7(run, online=60, cycles=150),
     "exactness": lambda run: exactness(run, joints=(5,)),
@@ -230,10 +230,10 @@ def test_measured_curves_without_pybullet_name_what_to_install(tmp_path, monkeyp
 
 def test_figure_5_simulates_in_the_very_postures_that_were_measured(monkeypatch) -> None:
     monkeypatch.setattr("daemon.reproduce.fig5.postures", planted)
-    found = fig5(a_run(real=True), train=400, test=50)
+    found = fig5(a_run(real=True), train=300, test=30)
     assert [curve.name for curve in found.panels[0].curves] == ["measured", "simulated, σ = 20 mm"]
     # The tracker's noise planted is a twentieth of the simulated one.
-    ratio = value(found, "the postures measured", "σ per axis", "true") / value(found, "measured, after 400", "true")
+    ratio = value(found, "the postures measured", "σ per axis", "true") / value(found, "measured, after 300", "true")
     assert 10.0 < ratio < 40.0
 
 
