@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 # Curves with so few points get markers.
 _FEW = 15
 # Line widths of a panel's first and last curve: where curves coincide, the earlier one shows beneath.
-_WIDEST, _NARROWEST = 3.4, 1.4
+_WIDEST, _NARROWEST = 2.8, 1.2
 _THIN = 0.5
 
 
