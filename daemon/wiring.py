@@ -8,6 +8,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from interfaces.errors import ConfigError
+from kbmaps import RigidChain
 
 from .config import Config
 from .sources import Sources
@@ -73,6 +74,32 @@ def _simulated(config: Config) -> Iterator[Sources]:
     with SimWorld(config.robot, config.tables.sim) as world:
         marker = TrackedCamera(world.camera, StereoTracker(world.camera.calibration, config.tables.vision))
         yield Sources(world.joints, marker, world.clock, world)
+
+
+@contextmanager
+def open_postures(config: Config, count: int) -> Iterator[Sources]:
+    """The simulation's sources, the robot standing still in so many postures drawn independently.
+
+    Raises:
+        ConfigError: the simulation cannot be made of this description.
+    """
+    require_simulation()
+    from sim_backend.posed import PosedWorld
+    from sim_backend.postures import visible_postures
+    from vision.tracked_camera import TrackedCamera
+    from vision.tracker import StereoTracker
+
+    postures = visible_postures(config.robot, config.tables.sim, count)
+    with PosedWorld(config.robot, config.tables.sim, postures) as world:
+        marker = TrackedCamera(world.camera, StereoTracker(world.camera.calibration, config.tables.vision))
+        yield Sources(world.joints, marker, world.clock)
+
+
+def simulated_truth(config: Config) -> RigidChain:
+    """The true chain of the robot that the simulation makes of this description, for judges."""
+    from sim_backend import true_chain
+
+    return true_chain(config.robot, config.tables.sim)
 
 
 def _recorded(config: Config, file: Path) -> Sources:

@@ -44,6 +44,18 @@ class Scene:
     x_world: FloatArray
 
 
+def scene_of(body: Body, truth: TrueRobot, marker_xyz: FloatArray) -> Scene:
+    """What a frame shows of a body as it stands, with its tool's marker described at `marker_xyz` (3,) [m]."""
+    robot = truth.robot
+    T_world_hand = body.link_pose(robot.robot.marker_link)
+    marker = truth.marker(marker_xyz)
+    return Scene(
+        angles=body.angles(),
+        T_world_camera=body.link_pose(robot.camera.parent_link) @ truth.T_parent_camera,
+        x_world=T_world_hand[:3, :3] @ marker + T_world_hand[:3, 3],
+    )
+
+
 def physics_rate(encoder_hz: int, camera_hz: int) -> int:
     """Steps a second: at least 240, and a whole number between any two readings or frames."""
     common = lcm(encoder_hz, camera_hz)
@@ -114,14 +126,7 @@ class Physics:
 
     def scene(self) -> Scene:
         """What a frame taken now shows."""
-        robot = self._truth.robot
-        T_world_hand = self.body.link_pose(robot.robot.marker_link)
-        marker = self._truth.marker(self.marker_xyz)
-        return Scene(
-            angles=self.body.angles(),
-            T_world_camera=self.body.link_pose(robot.camera.parent_link) @ self._truth.T_parent_camera,
-            x_world=T_world_hand[:3, :3] @ marker + T_world_hand[:3, 3],
-        )
+        return scene_of(self.body, self._truth, self.marker_xyz)
 
     def change_tool(self, marker_xyz: FloatArray) -> None:
         """From now on the hand holds a tool with its marker at `marker_xyz` (3,) [m] in the marker link."""

@@ -70,7 +70,7 @@ class SimWorld:
         self._taken = self._delivered = 0
 
     def __enter__(self) -> Self:
-        calibration = _stereo(self.robot)
+        calibration = stereo_calibration(self.robot)
         self._truth = TrueRobot.draw(self.robot, self.config)
         with ExitStack() as stack:
             self._physics = stack.enter_context(Physics(self._truth, calibration, self.config))
@@ -166,7 +166,7 @@ class SimWorld:
                 self._delivered += 1
                 t = self._frame_times.popleft()
                 self._moved.notify_all()
-            return _frame(t, images)
+            return stereo_frame(t, images)
 
     def _take_frames(self, end: float) -> bool:
         """Move on until there are frames for the renderer to work on ahead; False when there is none at all in time."""
@@ -247,7 +247,8 @@ def true_chain(
     return TrueRobot.draw(robot, config).chain(np.array(described, dtype=np.float64))
 
 
-def _stereo(robot: RobotDescription) -> StereoCalibration:
+def stereo_calibration(robot: RobotDescription) -> StereoCalibration:
+    """What [camera] says of the stereo pair. ConfigError: nothing."""
     if robot.calibration is None:
         raise ConfigError(
             "the simulation renders stereo images, but [camera] describes no stereo pair",
@@ -257,7 +258,8 @@ def _stereo(robot: RobotDescription) -> StereoCalibration:
     return robot.calibration
 
 
-def _frame(t: float, images: tuple[ImageArray, ImageArray]) -> StereoFrame:
+def stereo_frame(t: float, images: tuple[ImageArray, ImageArray]) -> StereoFrame:
+    """A frame of two images (height, width, 3), BGR, which become read-only."""
     for image in images:
         image.setflags(write=False)
     return StereoFrame(t, *images)

@@ -17,32 +17,48 @@ def reproduce(
     /,
     *,
     out: Annotated[Path, Parameter(help="Folder for the plots.")] = Path("reproduced"),
-    seed: Annotated[int, Parameter(help="Other poses, other noise.")] = 0,
+    seed: Annotated[int, Parameter(help="Other poses, other noise, another simulated robot.")] = 0,
+    real: Annotated[
+        bool,
+        Parameter(
+            negative="--no-real",
+            help="The curves measured on the simulated robot: rendered, tracked, sampled. --no-real saves most of the "
+            "time.",
+        ),
+    ] = True,
     as_json: Annotated[bool, flag("Print curves and figures as JSON.", name="--json")] = False,
 ) -> None:
     """Run the experiments of Ulbrich et al. 2009 again, and hold the outcome against the paper's figures.
 
-    The arm is the shipped upper body, simulated; walks go through the sampler's gate, and beside the paper's learning
-    rule runs the daemon's own learner. Half a minute in all.
+    The arm is the shipped upper body, simulated. Walks go through the sampler. Beside the paper's method run the
+    daemon's learner and the other models, on the same pairs. In figures 5 and 7 the marker is also measured: stereo
+    images are rendered and tracked, encoders read in ticks.
 
-    Needs: no hardware. The plots need matplotlib (pip install 'bodyschema[sim]').
+    Needs: no hardware; pybullet and matplotlib (pip install 'bodyschema[sim]').
 
-    Next: docs/reproduced.md tells what the paper leaves open, and how it was read here.
+    Next: docs/reproduced.md tells what the paper leaves open, how it was read here, and what --json prints.
     """
     import importlib.util
     import sys
+    import time
+    from importlib.metadata import version
 
     import msgspec
     import numpy as np
     from rich.console import Console
 
-    from daemon.reproduce import EXPERIMENTS
+    from daemon.reproduce import EXPERIMENTS, Run
     from daemon.reproduce.plot import plot
     from daemon.reproduce.show import show
     from interfaces.errors import ConfigError
 
     if importlib.util.find_spec("matplotlib") is None:
         raise ConfigError("the plots need matplotlib", remedy="Type: pip install 'bodyschema[sim]'")
+    if seed < 0:
+        raise ConfigError(f"--seed is {seed}", remedy="Give 0 or more")
+    if real and name in ("fig5", "fig7", "all") and importlib.util.find_spec("pybullet") is None:
+        remedy = "Type: pip install 'bodyschema[sim]', or leave them out with --no-real"
+        raise ConfigError("the measured curves need pybullet, which is not installed", remedy=remedy)
     progress, console = Console(stderr=True), Console()
     try:
         out.mkdir(parents=True, exist_ok=True)
@@ -52,12 +68,16 @@ def reproduce(
     for number, (key, run) in enumerate(EXPERIMENTS.items()):
         if name not in (key, "all"):
             continue
+        begin = time.perf_counter()
         rng = np.random.default_rng([seed, number])
-        experiment = run(rng, lambda said, key=key: progress.print(f"{key}: {said}", highlight=False))
+        experiment = run(Run(rng, seed, real, lambda said, key=key: progress.print(f"{key}: {said}", highlight=False)))
         file = out / f"{key}.png"
         plot(experiment, file)
+        took = time.perf_counter() - begin
         if not as_json:
             show(console, experiment, file)
-        done.append(experiment)
+            console.print(f"took  {took:.0f} s", highlight=False)
+        done.append({**msgspec.to_builtins(experiment), "plot": str(file), "took_s": round(took, 1)})
     if as_json:
-        sys.stdout.write(msgspec.json.encode({"schema": 1, "experiments": done}).decode() + "\n")
+        told = {"schema": 2, "version": version("bodyschema"), "seed": seed, "real": real, "experiments": done}
+        sys.stdout.write(msgspec.json.encode(told).decode() + "\n")

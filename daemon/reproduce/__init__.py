@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from .experiment import Curve, Experiment, Reading
+from .experiment import Comparison, Curve, Experiment, Panel, Reading, Run
 from .registry import EXPERIMENTS
 
-__all__ = ["EXPERIMENTS", "Curve", "Experiment", "Reading"]
+__all__ = ["EXPERIMENTS", "Comparison", "Curve", "Experiment", "Panel", "Reading", "Run"]

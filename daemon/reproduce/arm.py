@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-import numpy as np
+from collections.abc import Sequence
+from pathlib import Path
 
-from daemon.config import DaemonConfig
-from daemon.gate import Accepted, Gate
+import msgspec
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from daemon.config import Config, DaemonConfig, Tables
 from daemon.wiring import demonstration_model
 from interfaces.records import FloatArray
 from interfaces.robot import RobotDescription
 from interfaces.toml_file import read_toml
-from kbmaps import RigidChain
+from kbmaps import ChainTolerances, RigidChain
 
 # Head and arm joints by their number, in the order from camera to marker; each has at least two of the head.
 JOINTS = {
@@ -26,19 +30,42 @@ JOINTS = {
         "forearm_rotation",
     ),
 }
-# The paper's random walk: normally distributed about zero with this standard deviation [rad].
-WALK_SIGMA = np.radians(22.0)
-WALK_STEP_DEG = (1.0, 3.0)
-FRAME_S = 1 / 30
-FRAME_STEP = np.radians(1.0)
+# Another six: one of the head and five of the arm.
+OTHER_SIX = (
+    "neck_pitch",
+    "shoulder_flexion",
+    "shoulder_abduction",
+    "upperarm_rotation",
+    "elbow_flexion",
+    "forearm_rotation",
+)
+# A crude estimate: 1-sigma of each component of a joint's rotation [rad], of a link [m], and of the marker [m].
+CRUDE_TURN, CRUDE_LINK_M, CRUDE_MARKER_M = np.radians(3.0), 0.015, 0.060
+CRUDE = ChainTolerances(
+    axes=CRUDE_TURN,
+    points=CRUDE_LINK_M,
+    zeros=CRUDE_TURN,
+    tool=CRUDE_MARKER_M,
+    base_rotation=CRUDE_TURN,
+    base_translation=CRUDE_LINK_M,
+)
 
 
-def arm(joints: int) -> RigidChain:
-    """The shipped upper body with so many joints, from the left camera to the ball."""
+def configuration(joints: Sequence[str], state_dir: Path, rules: DaemonConfig, *, sim_seed: int = 0) -> Config:
+    """robot.toml of the shipped upper body, with other joints, another folder for the store and other rules."""
     file = demonstration_model()
     tables, text = read_toml(file)
-    tables["robot"] = {**tables["robot"], "joints": list(JOINTS[joints]), "held_at": {}}
-    return RobotDescription.from_tables(tables, text, file).chain
+    tables["robot"] = {**tables["robot"], "joints": list(joints), "held_at": {}}
+    tables["sim"] = {**tables.get("sim", {}), "seed": sim_seed}
+    robot = RobotDescription.from_tables(tables, text, file)
+    parsed = msgspec.structs.replace(msgspec.convert(tables, Tables), daemon=rules)
+    return Config(file, robot, parsed).with_state_dir(state_dir)
+
+
+def arm(joints: int | Sequence[str]) -> RigidChain:
+    """The shipped upper body with so many joints, or these, from the left camera to the ball."""
+    names = JOINTS[joints] if isinstance(joints, int) else joints
+    return configuration(names, Path(), DaemonConfig()).robot.chain
 
 
 def longer_tool(chain: RigidChain, by_m: float) -> RigidChain:
@@ -47,26 +74,19 @@ def longer_tool(chain: RigidChain, by_m: float) -> RigidChain:
     return chain.with_tool(by_m * marker / np.linalg.norm(marker))
 
 
+def crude_estimate(rng: np.random.Generator, chain: RigidChain) -> RigidChain:
+    """The chain as a crude estimate has it: its errors are drawn from `CRUDE`."""
+    fixed = chain.fixed.copy()
+    for transform in fixed:
+        turn = Rotation.from_rotvec(CRUDE_TURN * rng.normal(size=3))
+        transform[:3, :3] = transform[:3, :3] @ turn.as_matrix()
+        transform[:3, 3] += CRUDE_LINK_M * rng.normal(size=3)
+    return RigidChain(fixed, chain.axes, chain.prismatic).with_tool(CRUDE_MARKER_M * rng.normal(size=3))
+
+
 def uniform(rng: np.random.Generator, count: int, joints: int, range_deg: float) -> FloatArray:
     """Poses (count, joints) [rad], each joint uniform within ± the range."""
     return np.radians(rng.uniform(-range_deg, range_deg, (count, joints)))
-
-
-def walk(rng: np.random.Generator, count: int, chain: RigidChain) -> FloatArray:
-    """A random walk (count, d) [rad] whose poses are normally distributed, in steps of 1 to 3 degrees.
-
-    Metropolis steps; the sampler's own gate decides which poses become pairs.
-    """
-    gate = Gate(DaemonConfig(min_step_deg=WALK_STEP_DEG[0], max_step_deg=WALK_STEP_DEG[1]), chain.prismatic)
-    pose, accepted, t = np.zeros(chain.joints), [], 0.0
-    while len(accepted) < count:
-        proposed = pose + FRAME_STEP / np.sqrt(chain.joints) * rng.normal(size=chain.joints)
-        if rng.random() < np.exp((pose @ pose - proposed @ proposed) / (2.0 * WALK_SIGMA**2)):
-            pose = proposed
-        t += FRAME_S
-        if isinstance(gate.offer(t, pose, chain.positions(pose)), Accepted):
-            accepted.append(pose)
-    return np.array(accepted)
 
 
 def beside(rng: np.random.Generator, q: FloatArray, count: int, sigma_deg: float = 5.0) -> FloatArray:

@@ -2,16 +2,39 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 
 from interfaces.records import FloatArray
-from kbmaps import KBMap
 
-# Lengths below are rounding errors [m].
-ROUNDING_M = 1e-12
+# The mean length of a noise vector with a unit standard deviation per axis: 2 √(2/π).
+MEAN_NOISE = 2.0 * math.sqrt(2.0 / math.pi)
+
+# Poses (n, d) [rad] and positions (n, 3) [m] of the marker in them, to learn.
+Pairs = tuple[FloatArray, FloatArray]
+# Poses (n, d) [rad] and where the marker is in them (n, 3) [m], by name.
+Tests = Mapping[str, Pairs]
+
+
+@dataclass(frozen=True)
+class Run:
+    """How an experiment is to be run.
+
+    Attributes:
+        rng: draws poses, noise and crude estimates.
+        seed: of the simulated robot whose images are rendered.
+        real: whether the measured curves are wanted, which take minutes.
+        say: told what is being done.
+    """
+
+    rng: np.random.Generator
+    seed: int
+    real: bool
+    say: Callable[[str], None]
 
 
 @dataclass
@@ -21,14 +44,16 @@ class Curve:
     Attributes:
         name: as the legend says it.
         colour: the paper's, where it has this curve.
+        style: of the line, as matplotlib calls it.
+        thin: drawn in the background.
         count: samples or cycles (n,).
         mean: mean errors [m] (n,).
         largest: largest errors [m] (n,); empty where the figure has none.
-        thin: drawn in the background.
     """
 
     name: str
     colour: str
+    style: str = "-"
     thin: bool = False
     count: list[int] = field(default_factory=list)
     mean: list[float] = field(default_factory=list)
@@ -45,10 +70,10 @@ class Curve:
         self.count.append(count)
         self.mean.append(error_m)
 
-    def at(self, count: int) -> float:
-        """The mean error [m] at the last count that is not larger."""
-        places = [place for place, known in enumerate(self.count) if known <= count]
-        return self.mean[places[-1]]
+    def at(self, count: int) -> float | None:
+        """The mean error [m] at the last count that is not larger; None before the first."""
+        known = [mean for place, mean in zip(self.count, self.mean, strict=True) if place <= count]
+        return known[-1] if known else None
 
     def first_below(self, limit_m: float) -> int | None:
         """The first count from which on the mean error stays below the limit [m]."""
@@ -58,20 +83,53 @@ class Curve:
 
 
 @dataclass(frozen=True)
+class Panel:
+    """One plot of a figure.
+
+    Attributes:
+        title: what it shows.
+        curves: its lines.
+        as_paper: drawn as the paper draws it: counts on a linear axis, and the largest errors too, dotted. Otherwise
+            counts are on a logarithmic one, from 1 on.
+    """
+
+    title: str
+    curves: Sequence[Curve]
+    as_paper: bool = False
+
+
+@dataclass(frozen=True)
 class Reading:
-    """One figure of the paper beside ours.
+    """One figure of the paper beside ours, under one reading of what the paper leaves open.
 
     Attributes:
         what: what was measured.
+        read_as: how the paper was read here.
         paper: what the paper says.
-        method: what the paper's method gave here.
-        learner: what the daemon's learner gave on the same pairs.
+        value: what its method gave here; None where it was not reached.
+        unit: of the value.
     """
 
     what: str
+    read_as: str
     paper: str
-    method: str
-    learner: str = ""
+    value: float | None
+    unit: Literal["m", "samples", "s"] = "m"
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Other models on the same pairs.
+
+    Attributes:
+        title: what the numbers are.
+        columns: after how many pairs, and where it was tested.
+        rows: mean errors [m], one a column, by model; None where a model says nothing yet.
+    """
+
+    title: str
+    columns: Sequence[str]
+    rows: Mapping[str, Sequence[float | None]]
 
 
 @dataclass(frozen=True)
@@ -82,8 +140,9 @@ class Experiment:
         name: as on the command line.
         title: what it is.
         counted: what the curves' counts are.
-        curves: the lines of the figure.
+        panels: the plots of the figure, the paper's own first.
         readings: the paper's figures beside ours.
+        comparison: other models on the same pairs.
         notes: what the paper leaves open, and how it was read here.
         floor_m: lengths below are drawn as this one [m].
     """
@@ -91,17 +150,13 @@ class Experiment:
     name: str
     title: str
     counted: str
-    curves: Sequence[Curve]
+    panels: Sequence[Panel]
     readings: Sequence[Reading]
+    comparison: Comparison | None
     notes: Sequence[str]
     floor_m: float = 1e-5
 
 
-def distances(kbmap: KBMap, q: FloatArray, x: FloatArray) -> FloatArray:
-    """Distances [m] (n,) between the map's positions at q (n, d) and x (n, 3)."""
-    return np.linalg.norm(kbmap.predict(q) - x, axis=1)
-
-
-def mm(length_m: float) -> str:
-    """A length in mm, in three digits; rounding errors are told as such."""
-    return f"{1e3 * length_m:.3g} mm" if length_m >= ROUNDING_M else f"below {1e3 * ROUNDING_M:.0e} mm"
+def distances(x: FloatArray, other: FloatArray) -> FloatArray:
+    """Distances [m] (n,) between positions, both (n, 3)."""
+    return np.linalg.norm(x - other, axis=1)

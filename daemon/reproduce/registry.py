@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import numpy as np
+from .exactness import exactness
+from .experiment import Experiment, Run
+from .fig4 import fig4
+from .fig5 import fig5
+from .fig6 import fig6
+from .fig7 import fig7
 
-from .batch import exactness, fig4, fig5
-from .experiment import Experiment
-from .incremental import fig6, fig7
-
-EXPERIMENTS: dict[str, Callable[[np.random.Generator, Callable[[str], None]], Experiment]] = {
+EXPERIMENTS: dict[str, Callable[[Run], Experiment]] = {
     "fig4": fig4,
     "fig5": fig5,
     "fig6": fig6,

@@ -1,29 +1,97 @@
 from __future__ import annotations
 
+import io
 import json
+import re
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
+from rich.console import Console
 
 pytest.importorskip("matplotlib")
 
 from daemon.cli import app
-from daemon.reproduce import EXPERIMENTS, Curve, Experiment
-from daemon.reproduce.arm import arm, longer_tool, walk
+from daemon.reproduce import EXPERIMENTS, Comparison, Curve, Experiment, Panel, Reading, Run
+from daemon.reproduce.arm import JOINTS, OTHER_SIX, arm, longer_tool
+from daemon.reproduce.exactness import exactness
+from daemon.reproduce.experiment import MEAN_NOISE
+from daemon.reproduce.fig4 import fig4
+from daemon.reproduce.fig5 import fig5
+from daemon.reproduce.fig6 import fig6
+from daemon.reproduce.fig7 import fig7
+from daemon.reproduce.measured import Measured, guided_walk, postures
+from daemon.reproduce.models import WITH_DRAWING, Contender, Knowledge, learn_all
+from daemon.reproduce.show import show
+from daemon.reproduce.stream import in_stages
+from daemon.reproduce.walk import walk
+from interfaces.errors import ConfigError
+from kbmaps import ChainTolerances, NonFiniteError
+
+PAGE = Path(__file__).parents[2] / "docs" / "reproduced.md"
+# Small variants, so that every curve and table is made in seconds.
+SMALL = {
+    "fig4": lambda run: fig4(run, samples=1_000, tests=200),
+    "fig5": lambda run: fig5(run, train=300, test=30),
+    "fig6": lambda run: fig6(run, online=60, cycles=150),
+    "fig7": lambda run: fig7(run, online=60, cycles=150),
+    "exactness": lambda run: exactness(run, joints=(5,)),
+}
 
 
-def run(name: str, seed: int = 0) -> Experiment:
-    return EXPERIMENTS[name](np.random.default_rng(seed), lambda _said: None)
+def a_run(seed: int = 0, *, real: bool = False) -> Run:
+    return Run(np.random.default_rng(seed), seed, real, lambda _said: None)
 
 
-def curve(experiment: Experiment, name: str) -> Curve:
-    return next(curve for curve in experiment.curves if curve.name.startswith(name))
+def value(experiment: Experiment, *words: str) -> float:
+    """Of the one reading that says all of this."""
+    (found,) = [r for r in experiment.readings if all(word in f"{r.what}; {r.read_as}" for word in words)]
+    assert found.value is not None
+    return found.value
+
+
+def error(experiment: Experiment, model: str, *words: str) -> float:
+    """Of one model, where one column says all of this."""
+    table = experiment.comparison
+    assert table is not None
+    (place,) = [k for k, column in enumerate(table.columns) if all(word in column for word in words)]
+    found = table.rows[model][place]
+    assert found is not None
+    return found
+
+
+def planted(joints: int, count: int, seed: int, say: Callable[[str], None]) -> Measured:
+    """As if measured with 1 mm of noise, in a walk of large steps."""
+    rng, nominal = np.random.default_rng(seed), arm(joints)
+    say("planted")
+    q = np.arctan(np.cumsum(rng.normal(0.0, 0.3, (count, joints)), axis=0))
+    true = longer_tool(nominal, 0.01)
+    return Measured(q, true.positions(q) + 0.001 * rng.normal(size=(count, 3)), true, nominal)
+
+
+@cache
+def small(name: str) -> Experiment:
+    return SMALL[name](a_run())
 
 
 def test_a_walk_takes_steps_between_one_and_three_degrees() -> None:
-    q = walk(np.random.default_rng(0), 300, arm(7))
+    q = walk(np.random.default_rng(0), 200, JOINTS[7])
     steps = np.degrees(np.linalg.norm(np.diff(q, axis=0), axis=1))
     assert (steps.min() >= 1.0, steps.max() <= 3.0) == (True, True)
+
+
+def test_a_walk_with_steps_of_each_joint_takes_them_in_the_root_mean_square() -> None:
+    q = walk(np.random.default_rng(0), 200, JOINTS[7], each_joint=True)
+    steps = np.degrees(np.sqrt(np.square(np.diff(q, axis=0)).mean(axis=1)))
+    assert (steps.min() >= 1.0, steps.max() <= 3.0) == (True, True)
+
+
+def test_the_same_seed_gives_the_same_walk_although_two_threads_read_it() -> None:
+    walks = [walk(np.random.default_rng(3), 100, JOINTS[5]) for _ in range(2)]
+    np.testing.assert_array_equal(*walks)
 
 
 def test_the_longer_tool_moves_the_marker_by_its_length() -> None:
@@ -33,12 +101,10 @@ def test_the_longer_tool_moves_the_marker_by_its_length() -> None:
     np.testing.assert_allclose(moved, 0.25)
 
 
-@pytest.mark.parametrize("joints", [5, 6, 7])
-def test_every_joint_of_the_arm_moves_the_marker(joints: int) -> None:
-    q = np.random.default_rng(0).uniform(-0.5, 0.5, joints)
-    moves = [
-        np.linalg.norm(arm(joints).positions(q + 0.1 * axis) - arm(joints).positions(q)) for axis in np.eye(joints)
-    ]
+@pytest.mark.parametrize("joints", [*JOINTS.values(), OTHER_SIX], ids=len)
+def test_every_joint_of_the_arm_moves_the_marker(joints: tuple[str, ...]) -> None:
+    chain, q = arm(joints), np.random.default_rng(0).uniform(-0.5, 0.5, len(joints))
+    moves = [np.linalg.norm(chain.positions(q + 0.1 * axis) - chain.positions(q)) for axis in np.eye(len(joints))]
     assert min(moves) > 0.003
 
 
@@ -47,42 +113,172 @@ def test_a_curve_tells_from_where_on_it_stays_below_a_limit() -> None:
     assert (found.first_below(2.0), found.first_below(0.5)) == (40, None)
 
 
-def test_with_noise_the_test_error_falls_below_the_training_error_near_the_papers_2200_samples() -> None:
-    found = run("fig4")
-    training, test = curve(found, "training"), curve(found, "test")
-    crossing = next(n for n, a, b in zip(test.count, test.mean, training.mean, strict=True) if a <= b)
-    assert 1_800 <= crossing <= 2_600
+def test_a_curve_says_nothing_before_its_first_point() -> None:
+    found = Curve("", "", count=[10, 20], mean=[5.0, 1.0])
+    assert (found.at(9), found.at(19), found.at(20)) == (None, 5.0, 1.0)
+
+
+def test_the_mean_length_of_unit_noise_is_what_is_drawn() -> None:
+    drawn = np.linalg.norm(np.random.default_rng(0).normal(size=(100_000, 3)), axis=1)
+    assert drawn.mean() == pytest.approx(MEAN_NOISE, rel=0.005)
+
+
+def test_each_stage_of_a_stream_learns_every_pair_once() -> None:
+    order = in_stages(np.random.default_rng(0), 50, 150)
+    assert [sorted(stage) for stage in order.reshape(3, 50)] == [list(range(50))] * 3
+
+
+def test_a_model_of_ones_own_joins_with_one_line() -> None:
+    chain, q = arm(5), np.random.default_rng(0).uniform(-1.0, 1.0, (40, 5))
+    mine = Contender("mine", "black", WITH_DRAWING[0].make)
+    known = Knowledge(longer_tool(chain, 0.1), ChainTolerances(tool=0.1), np.pi)
+    curves = learn_all([mine], known, (q, chain.positions(q)), [0, 20, 40], {"test": (q, chain.positions(q))})
+    assert curves["mine"]["test"].mean[0] == pytest.approx(0.1)
+    assert curves["mine"]["test"].mean[-1] < 1e-6
+
+
+def test_a_contender_that_fails_is_not_passed_over() -> None:
+    chain, q = arm(5), np.zeros((2, 5))
+    known = Knowledge(chain, ChainTolerances(tool=0.1), np.pi)
+    with pytest.raises(NonFiniteError):
+        learn_all(WITH_DRAWING, known, (q, np.full((2, 3), np.nan)), [2], {"test": (q, chain.positions(q))})
+
+
+@pytest.mark.parametrize("name", SMALL)
+def test_every_experiment_has_readings_and_curves_without_gaps(name: str) -> None:
+    curves = [curve for panel in small(name).panels for curve in panel.curves]
+    assert all(np.isfinite(curve.mean).all() and len(curve.mean) == len(curve.count) > 0 for curve in curves)
+    assert small(name).readings
+
+
+@pytest.mark.parametrize("name", ["fig4", "fig5", "fig6", "fig7"])
+def test_every_figure_has_the_new_models_beside_the_papers_method(name: str) -> None:
+    table = small(name).comparison
+    assert table is not None
+    names = [curve.name for panel in small(name).panels for curve in panel.curves]
+    assert {contender.name for contender in WITH_DRAWING} <= set(table.rows) & set(names)
+
+
+def test_on_figure_7s_noisy_pairs_the_rigid_chain_is_ahead_of_the_papers_rule() -> None:
+    where = ("σ = 20 mm", "near", "at 60")
+    assert error(small("fig7"), "rigid chain", *where) < 0.6 * error(small("fig7"), "paper's rule", *where)
 
 
 def test_as_many_noise_free_samples_as_control_points_give_the_arm_back() -> None:
-    found = run("exactness")
-    assert max(curve.mean[0] for curve in found.curves if curve.name.endswith("±80°")) < 1e-9
+    assert value(small("exactness"), "5 joints", "from ±80°", "mean error") < 1e-9
 
 
-def test_on_figure_7s_pairs_the_daemons_learner_is_ahead_of_the_papers_rule() -> None:
-    found = run("fig7")
-    rule, ours = (
-        curve(found, name) for name in ("the paper's rule, near the walk, σ", "this learner, near the walk, σ")
-    )
-    assert ours.mean[-1] < 0.6 * rule.at(600)
+def test_the_terminal_tells_a_quantity_once_and_each_way_to_read_it() -> None:
+    readings = [Reading("error", read_as, "50 mm", given) for read_as, given in (("near", 0.0235), ("far", None))]
+    table = Comparison("others", ["at 30"], {"rigid chain": [1e-15], "tensor train": [0.118]})
+    console = Console(width=120, record=True, file=io.StringIO())
+    show(console, Experiment("x", "X", "cycles", [], readings, table, []), Path("x.png"))
+    text = console.export_text()
+    assert (text.count("error"), text.count("50 mm")) == (1, 1)
+    assert all(words in text for words in ("23.5 mm", "not reached", "< 1e-09", "118"))
+
+
+def test_the_command_draws_the_curves_and_tells_the_papers_figure_beside_ours(tmp_path, capsys, monkeypatch) -> None:
+    def told(run: Run) -> Experiment:
+        run.say("exact learning")
+        return small("fig4")
+
+    monkeypatch.setitem(EXPERIMENTS, "fig4", told)
+    app(["reproduce", "fig4", "--out", str(tmp_path)], result_action="return_value")
+    said = capsys.readouterr()
+    assert "its method, here" in said.out
+    assert "fig4: exact learning" in said.err
+    assert (tmp_path / "fig4.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_the_command_gives_everything_as_json(tmp_path, capsys, monkeypatch) -> None:
+    monkeypatch.setitem(EXPERIMENTS, "fig7", lambda _run: small("fig7"))
+    app(["reproduce", "fig7", "--no-real", "--json", "--out", str(tmp_path)], result_action="return_value")
+    told = json.loads(capsys.readouterr().out)
+    (found,) = told["experiments"]
+    parsed = msgspec.convert({name: found[name] for name in Experiment.__dataclass_fields__}, Experiment)
+    assert parsed.readings
+    assert (told["schema"], told["seed"], told["real"], found["plot"]) == (2, 0, False, str(tmp_path / "fig7.png"))
+
+
+def test_the_page_documents_every_field_of_the_json(tmp_path, capsys, monkeypatch) -> None:
+    monkeypatch.setitem(EXPERIMENTS, "exactness", lambda _run: small("exactness"))
+    app(["reproduce", "exactness", "--json", "--out", str(tmp_path)], result_action="return_value")
+    told = json.loads(capsys.readouterr().out)
+    kinds = (Experiment, Panel, Curve, Reading, Comparison)
+    known = {*told, *told["experiments"][0], *(name for kind in kinds for name in kind.__dataclass_fields__)}
+    documented = set(re.findall(r"`(\w+)`", PAGE.read_text(encoding="utf-8").partition("## What --json prints")[2]))
+    assert known <= documented
+
+
+def test_a_negative_seed_is_refused() -> None:
+    with pytest.raises(ConfigError, match="Give 0 or more"):
+        app(["reproduce", "exactness", "--seed", "-1"], result_action="return_value")
+
+
+def test_a_folder_that_cannot_be_made_is_told(tmp_path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ConfigError, match="--out"):
+        app(["reproduce", "exactness", "--out", str(tmp_path / "file" / "x")], result_action="return_value")
+
+
+def test_measured_curves_without_pybullet_name_what_to_install(tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None if name == "pybullet" else object())
+    with pytest.raises(ConfigError, match="no-real"):
+        app(["reproduce", "fig7", "--out", str(tmp_path)], result_action="return_value")
+
+
+def test_figure_5_simulates_in_the_very_postures_that_were_measured(monkeypatch) -> None:
+    monkeypatch.setattr("daemon.reproduce.fig5.postures", planted)
+    found = fig5(a_run(real=True), train=300, test=30)
+    assert [curve.name for curve in found.panels[0].curves] == ["measured", "simulated, σ = 20 mm"]
+    # The tracker's noise planted is a twentieth of the simulated one.
+    ratio = value(found, "the postures measured", "σ per axis", "true") / value(found, "measured, after 300", "true")
+    assert 10.0 < ratio < 40.0
+
+
+def test_figure_7_tests_on_measured_points_and_on_the_truth(monkeypatch) -> None:
+    monkeypatch.setattr("daemon.reproduce.fig7.guided_walk", planted)
+    found = fig7(a_run(real=True), online=60, cycles=120, held_out=20, onward=20)
+    of_truth = error(found, "rigid chain", "measured", "held out, true", "at 60")
+    assert of_truth < error(found, "rigid chain", "measured", "held out, as measured", "at 60")
+
+
+def test_a_guided_walk_is_measured_in_the_samplers_steps_as_well_as_the_tracker_can() -> None:
+    pytest.importorskip("pybullet")
+    found = guided_walk(6, 20, 0, lambda _said: None)
+    steps = np.degrees(np.linalg.norm(np.diff(found.q, axis=0), axis=1))
+    assert (steps.min() >= 1.0, steps.max() <= 3.0, found.noise_m < 0.003) == (True, True, True)
+
+
+def test_postures_far_apart_are_measured_as_well_as_the_tracker_can() -> None:
+    pytest.importorskip("pybullet")
+    found = postures(5, 10, 0, lambda _said: None)
+    steps = np.degrees(np.linalg.norm(np.diff(found.q, axis=0), axis=1))
+    assert steps.min() > 3.0
+    assert found.noise_m < 0.003
 
 
 @pytest.mark.soak
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(3))
+def test_with_noise_the_test_error_falls_below_the_training_error_near_the_papers_2200_samples(seed: int) -> None:
+    found = fig4(a_run(seed), tests=2_000)
+    assert 1_800 <= value(found, "test error < training") <= 2_600
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("seed", range(3))
 def test_after_figure_6s_tool_change_thirty_pairs_tell_more_than_1800_cycles_of_the_papers_rule(seed: int) -> None:
-    found = run("fig6", seed)
+    found = fig6(a_run(seed))
     for noise in ("without noise", "σ = 20 mm"):
-        rule, ours = (curve(found, f"{name}, near the walk, {noise}") for name in ("the paper's rule", "this learner"))
-        assert ours.at(30) < rule.at(1_800)
+        of_rule = value(found, "1,800", f"; {noise}; near")
+        assert error(found, "this learner", noise, "near", "at 30") < of_rule
 
 
-def test_the_command_shows_the_papers_figure_beside_ours_and_draws_the_curves(tmp_path, capsys) -> None:
-    app(["reproduce", "fig5", "--out", str(tmp_path)], result_action="return_value")
-    assert "its method, here" in capsys.readouterr().out
-    assert (tmp_path / "fig5.png").read_bytes().startswith(b"\x89PNG")
-
-
-def test_the_command_gives_all_curves_as_json(tmp_path, capsys) -> None:
-    app(["reproduce", "fig5", "--json", "--out", str(tmp_path)], result_action="return_value")
-    (found,) = json.loads(capsys.readouterr().out)["experiments"]
-    assert len(found["curves"][0]["count"]) == len(found["curves"][0]["mean"]) > 10
+@pytest.mark.soak
+@pytest.mark.parametrize("seed", range(3))
+def test_figure_7s_measured_curve_falls_with_the_replay_as_the_simulated_one_does(seed: int) -> None:
+    pytest.importorskip("pybullet")
+    found = fig7(a_run(seed, real=True))
+    for curve in ("measured; held out, as", "simulated in the measured poses; held out, true"):
+        assert value(found, "2,200", curve) < 0.5 * value(found, "600", curve)

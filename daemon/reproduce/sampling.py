@@ -1,0 +1,67 @@
+"""Pairs as the daemon's sampler makes them, from sources that run for as long as pairs are wanted."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+
+from daemon.bus import Bus
+from daemon.config import Config
+from daemon.sampler import Sampler
+from daemon.session import session_of
+from daemon.sources import Sources
+from daemon.store import PairReader, PairStore
+from interfaces.clock import SystemClock
+from interfaces.errors import SourceEnded, SourceError
+from interfaces.protocols import MarkerSource
+from interfaces.records import FloatArray, MarkerFix, MarkerMiss
+
+_TELL_EVERY = 200
+
+Progress = Callable[[str], None]
+
+
+class _Enough:
+    """A marker source that ends as soon as the store has enough pairs."""
+
+    def __init__(self, marker: MarkerSource, stored: PairReader, count: int, say: Progress) -> None:
+        self._marker, self._stored, self._count, self._say = marker, stored, count, say
+        self._told = 0
+
+    def __enter__(self) -> Self:
+        self._marker.__enter__()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._marker.__exit__(kind, error, trace)
+
+    def read(self, timeout_s: float) -> MarkerFix | MarkerMiss | None:
+        pairs = self._stored.last_seq()
+        if pairs >= self._count:
+            raise SourceEnded("there are enough pairs")
+        if pairs >= self._told + _TELL_EVERY:
+            self._told = pairs
+            self._say(f"{pairs:,} of {self._count:,} pairs sampled")
+        return self._marker.read(timeout_s)
+
+
+def sampled(config: Config, sources: Sources, count: int, say: Progress) -> tuple[FloatArray, FloatArray]:
+    """The first pairs that the sampler accepts: q (count, d) [rad or m] and x (count, 3) [m].
+
+    Raises:
+        SourceError: the sources ended before.
+        StoreError: the store cannot be written.
+    """
+    with Bus() as bus, PairStore(config.store_file, session_of(config, SystemClock())) as store:
+        counted = replace(sources, marker=_Enough(sources.marker, store.reader, count, say))
+        Sampler(config, counted, bus, store, exit_at_end=True).run()
+        pairs = store.reader.read()
+    if len(pairs) < count:
+        raise SourceError(f"the sampler accepted {len(pairs)} of {count} pairs before the sources ended")
+    return np.array([pair.q for pair in pairs]), np.array([pair.x for pair in pairs])

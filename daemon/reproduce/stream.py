@@ -1,0 +1,128 @@
+"""Learning pair by pair, then again in random order: the paper's rule, the daemon's learner, and other models."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from daemon.config import LearnerConfig
+from daemon.learning import DirectSolver, Learning, NominalModel
+from interfaces.records import FloatArray, Pair, frozen_array
+from kbmaps import NLMS, JointBasis, KBMap, RigidChain
+
+from .experiment import Curve, Tests, distances
+from .models import WITH_DRAWING, Knowledge, learn_all, spread_counts
+
+ALPHA = np.radians(60.0)
+EVERY = 10
+# After so few pairs the models are compared, and at the end of those that came.
+EARLY = 30
+RULE, LEARNER = "paper's rule", "this learner"
+_LEAST_SIGMA_M = 1e-4
+
+
+@dataclass(frozen=True)
+class Stream:
+    """Pairs in the order in which they are learnt: first as they came, then permuted.
+
+    Attributes:
+        name: what the pairs are.
+        q, x: the pairs (n, d) [rad] and (n, 3) [m].
+        sigma: 1-sigma of a coordinate that the daemon's learner is told [m].
+        order: places of the pairs, one a cycle; the first n are 0 … n − 1.
+        tests: where errors are measured.
+    """
+
+    name: str
+    q: FloatArray
+    x: FloatArray
+    sigma: float
+    order: NDArray[np.intp]
+    tests: Tests
+
+    @property
+    def online(self) -> int:
+        """Pairs that came, before the replay."""
+        return len(self.q)
+
+
+def in_stages(rng: np.random.Generator, online: int, cycles: int) -> NDArray[np.intp]:
+    """The order of so many cycles: pairs as they come, then all of them permuted, again and again."""
+    again = [rng.permutation(online) for _ in range(cycles // online + 1)]
+    return np.concatenate([np.arange(online), *again])[:cycles]
+
+
+def bernstein_map(chain: RigidChain, alpha: float = ALPHA) -> KBMap:
+    """The chain in the paper's basis."""
+    return chain.to_kbmap(tuple(JointBasis.bernstein(alpha) for _ in range(chain.joints)))
+
+
+def papers_rule(prior: KBMap, stream: Stream) -> dict[str, Curve]:
+    """The paper's rule (eq. 20) with μ0 = 1 over all cycles: a curve for each test."""
+    learner = NLMS(prior, 1.0)
+    curves = {test: Curve(RULE, "tab:red") for test in stream.tests}
+    for cycle in range(0, len(stream.order), EVERY):
+        _test(learner.map.predict, stream.tests, curves, cycle)
+        chosen = stream.order[cycle : cycle + EVERY]
+        learner.replay(stream.q[chosen], stream.x[chosen])
+    _test(learner.map.predict, stream.tests, curves, len(stream.order))
+    return curves
+
+
+def background(prior: KBMap, stream: Stream) -> tuple[Curve, Curve]:
+    """The error on each pair before the paper's rule learns it, and how far consecutive markers are apart."""
+    learner = NLMS(prior, 1.0)
+    errors = Curve("each pair before it is learnt", "tab:green", thin=True)
+    steps = Curve("distance of consecutive markers", "lightskyblue", thin=True)
+    for cycle, chosen in enumerate(stream.order):
+        q, x = stream.q[chosen], stream.x[chosen]
+        errors.add_one(cycle, float(np.linalg.norm(learner.map.predict(q) - x)))
+        if cycle:
+            steps.add_one(cycle, float(np.linalg.norm(x - stream.x[stream.order[cycle - 1]])))
+        learner.learn(q, x)
+    return errors, steps
+
+
+def daemons_learner(nominal: RigidChain, stream: Stream, *, tool_changed: bool) -> dict[str, Curve]:
+    """The daemon's learner on the same pairs, each once and in their order; it replays by itself."""
+    limit = np.full(nominal.joints, np.pi)
+    learning = Learning(NominalModel(nominal, -limit, limit), LearnerConfig(), DirectSolver())
+    if tool_changed:
+        learning.tool_changed()
+    curves = {test: Curve(LEARNER, "tab:green") for test in stream.tests}
+    cov = frozen_array(max(stream.sigma, _LEAST_SIGMA_M) ** 2 * np.eye(3))
+    for number in range(stream.online):
+        if number % EVERY == 0:
+            _test(lambda q: learning.snapshot.predict(q).x, stream.tests, curves, number)
+        q, x = frozen_array(stream.q[number]), frozen_array(stream.x[number])
+        learning.learn(Pair("reproduced", number + 1, 1, number / 30.0, "", q, x, cov), number / 30.0)
+        while learning.work():
+            pass
+    _test(lambda q: learning.snapshot.predict(q).x, stream.tests, curves, stream.online)
+    return curves
+
+
+def learn_stream(
+    stream: Stream, nominal: RigidChain, known: Knowledge, say: Callable[[str], None], *, tool_changed: bool
+) -> dict[str, dict[str, Curve]]:
+    """Everybody on one stream: curves by model and test.
+
+    Args:
+        nominal: what the paper's rule and the daemon's learner begin with.
+        known: what the other models begin with.
+        tool_changed: whether the daemon's learner is told that the marker was moved.
+    """
+    say(f"{RULE}, {stream.name}: {len(stream.order):,} cycles")
+    found = {RULE: papers_rule(bernstein_map(nominal), stream)}
+    say(f"{LEARNER} and {len(WITH_DRAWING)} other models, {stream.name}: {stream.online:,} pairs")
+    found[LEARNER] = daemons_learner(nominal, stream, tool_changed=tool_changed)
+    counts = sorted({0, EARLY, *spread_counts(1, stream.online)})
+    return found | learn_all(WITH_DRAWING, known, (stream.q, stream.x), counts, stream.tests)
+
+
+def _test(predict: Callable[[FloatArray], FloatArray], tests: Tests, curves: dict[str, Curve], count: int) -> None:
+    for test, (q, x) in tests.items():
+        curves[test].add(count, distances(predict(q), x))

@@ -1,0 +1,126 @@
+"""The simulated robot at rest: put into one posture after the other, read and painted there."""
+
+from __future__ import annotations
+
+import threading
+from contextlib import ExitStack
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+
+from interfaces.clock import SystemClock
+from interfaces.errors import SourceEnded
+from interfaces.records import FloatArray, JointReading, StereoFrame, frozen_array
+from interfaces.robot import RobotDescription
+from kbmaps import RigidChain
+
+from .bullet import Body
+from .config import SimConfig
+from .encoders import Encoders
+from .physics import scene_of
+from .physics_urdf import physics_urdf
+from .randomness import Stream, generator
+from .render_client import RenderProcess
+from .sources import SimClock, SimJoints, SimStereoCamera
+from .truth import TrueRobot
+from .world import stereo_calibration, stereo_frame
+
+# From one posture to the next [s].
+PERIOD_S = 1.0
+# Frames that the renderer works on ahead.
+_AHEAD = 2
+
+
+class PosedWorld:
+    """A robot that stands still in given postures when its encoders are read and its frames are taken.
+
+    One reading and one frame a posture, both at the same time; the same arguments give the same ones, bit by bit.
+
+    Args:
+        robot: the robot as described; it needs a stereo calibration.
+        postures: reported joint angles (n, d) [rad or m] to go to; encoders report them in whole ticks.
+
+    Raises:
+        ConfigError: [camera] has no stereo calibration, or pybullet is not installed (both on entering).
+    """
+
+    def __init__(self, robot: RobotDescription, config: SimConfig, postures: FloatArray) -> None:
+        self.robot, self.config = robot, config
+        self.clock = SimClock(self.now)
+        self._postures = frozen_array(postures)
+        self._fetching = threading.Lock()
+        self._exit = ExitStack()
+        self._read = self._asked = self._delivered = 0
+
+    def __enter__(self) -> Self:
+        calibration = stereo_calibration(self.robot)
+        self._truth = TrueRobot.draw(self.robot, self.config)
+        self._marker = np.array(self.robot.robot.marker_xyz)
+        self._encoders = Encoders(
+            self.config.encoders,
+            self._truth.offsets,
+            self.robot.chain.prismatic,
+            generator(self.config.seed, Stream.ENCODERS),
+        )
+        urdf = physics_urdf(self._truth)
+        with ExitStack() as stack:
+            self._body = stack.enter_context(Body(urdf, self.robot.joints))
+            link = self.robot.robot.marker_link
+            renderer = RenderProcess(urdf, self.robot.joints, link, calibration, self.config)
+            self._renderer = stack.enter_context(renderer)
+            self._renderer.hold_tool(self._truth.marker(self._marker))
+            self._exit = stack.pop_all()
+        self.joints = SimJoints(self)
+        self.camera = SimStereoCamera(self, calibration)
+        self.clock.start(SystemClock())
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        with self._fetching:
+            self._exit.__exit__(kind, error, trace)
+
+    def now(self) -> float:
+        """Time of the posture that was last seen [s]."""
+        return self._delivered * PERIOD_S
+
+    def true_chain(self) -> RigidChain:
+        """The truth, for judges: true left eye to true marker over the angles that the encoders report."""
+        return self._truth.chain(self._marker)
+
+    def open_joints(self, is_open: bool) -> None:
+        """Readings go on with the first posture that was not read."""
+
+    def open_camera(self, is_open: bool) -> None:
+        """Frames go on with the first posture that was not fetched."""
+        with self._fetching:
+            if is_open:
+                self._ask_ahead()
+
+    def next_reading(self, timeout_s: float) -> JointReading:  # noqa: ARG002 - nothing to wait for
+        """The encoders in the next posture. SourceEnded: there is none."""
+        if self._read == len(self._postures):
+            raise SourceEnded("the encoders were read in all postures")
+        q = self._encoders.read(self._postures[self._read] - self._truth.offsets)
+        self._read += 1
+        return JointReading(self._read * PERIOD_S, frozen_array(q))
+
+    def next_frame(self, timeout_s: float) -> StereoFrame | None:
+        """The next posture's frame; None when it is not painted in time. SourceEnded: there is no other posture."""
+        with self._fetching:
+            if self._delivered == len(self._postures):
+                raise SourceEnded("all postures were seen")
+            images = self._renderer.fetch(self._delivered, timeout_s)
+            if images is None:
+                return None
+            self._delivered += 1
+            self._ask_ahead()
+            return stereo_frame(self.now(), images)
+
+    def _ask_ahead(self) -> None:
+        while self._asked < min(self._delivered + _AHEAD, len(self._postures)):
+            self._body.set_angles(self._postures[self._asked] - self._truth.offsets)
+            self._renderer.request(self._asked, scene_of(self._body, self._truth, self._marker))
+            self._asked += 1
