@@ -9,13 +9,13 @@ import msgspec
 import pytest
 
 from daemon.config import DaemonConfig, LearnerConfig
-from daemon.learning.gate import CHANGE, DOUBT
+from daemon.learning.gate import CHANGE, DOUBT, FEWEST_FOR_CHANGE
 from daemon.learning.learning import REGION_RAD
-from daemon.learning.members import EXACT, INSTANT, PRIOR
+from daemon.learning.members import TRUSTED
 from daemon.learning.nominal import PAIRS_TO_REFIT
-from daemon.learning.scores import CHALLENGE
+from daemon.learning.scores import CLEARLY, COMPARED
 from daemon.learning.snapshot import IN_SUPPORT
-from daemon.learning.solver import LARGEST_NET
+from daemon.learning.solver import KEPT, LARGEST_NET
 
 PAGE = (Path(__file__).parents[2] / "docs" / "learner.md").read_text(encoding="utf-8")
 SETTINGS = re.search(r"```toml\n(.*?)```", PAGE, re.DOTALL)[1]
@@ -31,16 +31,19 @@ def test_the_page_s_settings_are_the_defaults_and_all_of_them(table: str, kind: 
 
 
 def test_the_page_has_every_model() -> None:
-    assert re.findall(r"^\| `(\w+)` \|", PAGE, re.MULTILINE) == [PRIOR, INSTANT, EXACT]
+    assert re.findall(r"^\| `(\w+)` \|", PAGE, re.MULTILINE) == list(TRUSTED)
 
 
 def test_the_page_s_numbers_are_the_code_s() -> None:
-    words = {5: "five", 6: "six", 3: "three"}
+    words = {2: "two", 3: "three", 5: "five", 6: "six", 100: "hundred"}
     text = " ".join(PAGE.split())
     assert f"more than {words[round(DOUBT)]} times as far" in text
-    assert f"{words[CHANGE]} doubted pairs in a row" in text
-    assert f"after {words[PAIRS_TO_REFIT]} pairs the tool's three numbers" in text
+    assert f"{words[FEWEST_FOR_CHANGE]} doubted pairs in a row" in text
+    assert f"and {words[CHANGE]} are none in any case" in text
+    assert f"after {words[PAIRS_TO_REFIT]} pairs (a change that was found: at once) the tool's three numbers" in text
     assert f"at {LARGEST_NET:,} control points" in text
     assert f"within {words[round(57.29578 * REGION_RAD)]} degrees a joint" in text
     assert ("less than a quarter of the prior's variance" in text) == (IN_SUPPORT == 0.25)
-    assert ("better by a tenth" in text) == (CHALLENGE == 0.9)
+    assert f"the last {words[COMPARED]} pairs" in text
+    assert f"by {words[round(CLEARLY)]} standard errors" in text
+    assert f"the newest {KEPT:,} pairs" in text
