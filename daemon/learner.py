@@ -1,7 +1,7 @@
 """The process that learns and answers. It needs a sampler for new pairs, but goes on answering without one.
 
 Threads: zenoh's (queries, from an immutable snapshot; published pairs, into a queue), one that learns each pair at
-once, one at low priority for replay and the exact solver's orders, and the main thread for status and checkpoints.
+once, one at low priority for replay and the solver's orders, and the main thread for status and checkpoints.
 """
 
 from __future__ import annotations
@@ -157,7 +157,7 @@ class Learner:
             if problem is not None:
                 yield problem
         if self._nominal.size > LARGEST_NET:
-            yield f"{self._nominal.joints} joints are too many for the exact solver; the others learn without it"
+            yield f"{self._nominal.joints} joints are too many for the exact map; the others learn without it"
 
     def _restore(self) -> None:
         file = self._config.checkpoint_file
