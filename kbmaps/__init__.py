@@ -13,6 +13,7 @@ from kbmaps.chain_belief import ChainBelief
 from kbmaps.chain_parameters import ChainParameters, ChainTolerances
 from kbmaps.chain_report import ChainReport, Interval
 from kbmaps.chain_search import find_chain
+from kbmaps.contest import Contest
 from kbmaps.core_prior import CorePrior
 from kbmaps.errors import (
     BasisError,
@@ -34,6 +35,7 @@ from kbmaps.kbmap import KBMap, prediction_errors
 from kbmaps.kernel_learner import KernelLearner
 from kbmaps.kernels import in_use as kernels_in_use
 from kbmaps.lack_of_fit import systematic_error
+from kbmaps.ladder import Ladder, Rung
 from kbmaps.memory import Memory
 from kbmaps.model import Estimate, Model
 from kbmaps.nlms import NLMS
@@ -64,6 +66,7 @@ __all__ = [
     "ChainPosterior",
     "ChainReport",
     "ChainTolerances",
+    "Contest",
     "CorePrior",
     "DegenerateDataError",
     "Estimate",
@@ -79,6 +82,7 @@ __all__ = [
     "KBMap",
     "KBMapsError",
     "KernelLearner",
+    "Ladder",
     "Memory",
     "Model",
     "ModelFormatError",
@@ -91,6 +95,7 @@ __all__ = [
     "RigidChain",
     "RigidLearner",
     "RotationError",
+    "Rung",
     "SettingError",
     "ShapeError",
     "SingularAlphaError",

@@ -9,11 +9,11 @@ import msgspec
 import numpy as np
 
 from interfaces.records import FloatArray
-from kbmaps import ChainBelief, JointBasis, SupportSet
+from kbmaps import ChainBelief, Contest, JointBasis, SupportSet
 
 from .members import INSTANT, PRIOR, RIGID, TRUSTED
 from .misfit import misfit
-from .scores import Contest, ErrorMemory
+from .scores import ErrorMemory
 from .unknowns import ChainLayer, Layer, Unknowns
 
 # The data leave shapes open that the prior's own error shows little of. Measured on guided paths of simulated arms:
@@ -49,6 +49,7 @@ class ClaimsState(msgspec.Struct, kw_only=True):
     Attributes:
         errors: prequential errors, by model.
         contest: squared prequential errors [m²] of the last pairs.
+        judged: how many pairs there were for it so far.
         residuals: errors of the instant learner on pairs that it has learnt already; None before any.
         misfits: what each solution misses at pairs that it knows, 1-sigma per axis [m].
         prior_errors: those of the prior, over longer.
@@ -59,6 +60,7 @@ class ClaimsState(msgspec.Struct, kw_only=True):
 
     errors: dict[str, ErrorMemory]
     contest: list[dict[str, float]]
+    judged: int
     residuals: ErrorMemory | None
     misfits: dict[str, tuple[float, float, float]]
     misfit_before: tuple[float, float, float]
@@ -199,6 +201,7 @@ class Claims:
         return ClaimsState(
             errors=self.errors,
             contest=self._contest.rows,
+            judged=self._contest.pairs,
             residuals=self._residuals,
             misfits={name: _triple(missed) for name, missed in self._misfits.items()},
             misfit_before=_triple(self._misfit_before),
@@ -216,7 +219,7 @@ class Claims:
         for row in q:
             self._unknowns.add(row)
         self.errors, self._residuals = dict(state.errors), state.residuals
-        self._contest, self._prior_errors = Contest(state.contest), state.prior_errors
+        self._contest, self._prior_errors = Contest(state.contest, state.judged), state.prior_errors
         self._misfits = {name: np.array(missed) for name, missed in state.misfits.items()}
         self._misfit_before = np.array(state.misfit_before)
         self._belief = None if state.belief is None else ChainBelief.from_bytes(state.belief)

@@ -1,10 +1,8 @@
-"""Prequential errors: every pair is predicted before it is learnt. They choose who answers, and say how well."""
+"""Prequential errors: every pair is predicted before it is learnt, which says how well a model does."""
 
 from __future__ import annotations
 
 import math
-from collections import deque
-from collections.abc import Iterable, Mapping, Sequence
 
 import msgspec
 import numpy as np
@@ -15,12 +13,6 @@ from interfaces.records import FloatArray
 DISCOUNT = 0.98
 # Below this many pairs the expectation from before the data counts.
 WARM = 10.0
-# Pairs that two models have to have predicted both before they are compared.
-FEWEST_TO_COMPARE = 3
-# So many of the last pairs are compared.
-COMPARED = 100
-# A model is worse than another when the difference of their squared errors is so many standard errors.
-CLEARLY = 2.0
 
 
 class ErrorMemory(msgspec.Struct):
@@ -88,51 +80,6 @@ class ErrorMemory(msgspec.Struct):
         """How many times larger than claimed the errors were, at least 1."""
         missing = max(WARM - self.weight, 0.0)
         return math.sqrt(max((self.ratio + missing) / max(self.weight, WARM), 1.0))
-
-
-class Contest:
-    """Squared distances between predictions and measurements, pair by pair, for the last pairs.
-
-    Two models meet the same noise at the same pair, so their difference there tells more than their own errors do.
-    """
-
-    def __init__(self, rows: Iterable[Mapping[str, float]] = ()) -> None:
-        self._rows: deque[dict[str, float]] = deque(map(dict, rows), maxlen=COMPARED)
-
-    @property
-    def rows(self) -> list[dict[str, float]]:
-        """By pair and model [m²]."""
-        return list(self._rows)
-
-    def add(self, squares: Mapping[str, float]) -> None:
-        """One more pair: the squared distance [m²] of each model that predicted it."""
-        self._rows.append(dict(squares))
-
-    def forget(self, name: str) -> None:
-        """A model is another one from now on."""
-        for row in self._rows:
-            row.pop(name, None)
-
-    def best(self, trusted: Sequence[str], present: str) -> str:
-        """The model that shall answer: the most trusted one that is not clearly worse than any other.
-
-        Args:
-            trusted: the models, the most trusted first.
-            present: who answers while too few pairs were predicted.
-        """
-        tried = [name for name in trusted if sum(name in row for row in self._rows) >= FEWEST_TO_COMPARE]
-        for name in tried:
-            if not any(self._clearly_worse(name, other) for other in tried if other != name):
-                return name
-        return present
-
-    def _clearly_worse(self, name: str, other: str) -> bool:
-        losses = np.array([row[name] - row[other] for row in self._rows if name in row and other in row])
-        if len(losses) < FEWEST_TO_COMPARE:
-            return False
-        # A few equal losses have a small spread by chance: no smaller than Student's t with so few would allow.
-        error = float(losses.std(ddof=1)) / math.sqrt(len(losses)) * (1.0 + 3.0 / len(losses))
-        return bool(losses.mean() > CLEARLY * error)
 
 
 def _resolution(samples: float) -> float:

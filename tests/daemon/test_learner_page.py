@@ -13,9 +13,9 @@ from daemon.learning.gate import CHANGE, DOUBT, FEWEST_FOR_CHANGE
 from daemon.learning.learning import REGION_RAD
 from daemon.learning.members import TRUSTED
 from daemon.learning.nominal import PAIRS_TO_REFIT
-from daemon.learning.scores import CLEARLY, COMPARED
 from daemon.learning.snapshot import IN_SUPPORT
 from daemon.learning.solver import KEPT, LARGEST_NET
+from kbmaps.contest import CLEARLY, SHORTEST
 
 PAGE = (Path(__file__).parents[2] / "docs" / "learner.md").read_text(encoding="utf-8")
 SETTINGS = re.search(r"```toml\n(.*?)```", PAGE, re.DOTALL)[1]
@@ -44,6 +44,6 @@ def test_the_page_s_numbers_are_the_code_s() -> None:
     assert f"at {LARGEST_NET:,} control points" in text
     assert f"within {words[round(57.29578 * REGION_RAD)]} degrees a joint" in text
     assert ("less than a quarter of the prior's variance" in text) == (IN_SUPPORT == 0.25)
-    assert f"the last {words[COMPARED]} pairs" in text
+    assert f"the last {words[SHORTEST]} pairs" in text
     assert f"by {words[round(CLEARLY)]} standard errors" in text
     assert f"the newest {KEPT:,} pairs" in text

@@ -12,11 +12,13 @@ from rough_arms import ROUGH, Arm, rough_arm
 
 from kbmaps import (
     KernelLearner,
+    Ladder,
     Memory,
     Model,
     ModelFormatError,
     NonFiniteError,
     RecursiveRigidLearner,
+    ResidualLearner,
     RigidLearner,
     SettingError,
     ShapeError,
@@ -36,6 +38,8 @@ MODELS: dict[str, Callable[[Arm], Model]] = {
     "tool layer on a map": lambda arm: ToolLayer(arm.nominal.to_kbmap(bases_for(KINDS), orientation=True)),
     "rigid": lambda arm: RigidLearner(arm.nominal, ROUGH),
     "recursive rigid": lambda arm: RecursiveRigidLearner(arm.nominal, ROUGH),
+    "residual": lambda arm: ResidualLearner(arm.nominal, ROUGH),
+    "ladder": lambda arm: Ladder.around(arm.nominal, ROUGH, np.full(3, -1.4), np.full(3, 1.4)),
     "tensor": lambda arm: TensorLearner.around(arm.nominal, bases_for(KINDS)),
 }
 

@@ -1,0 +1,92 @@
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from kbmaps import Contest
+
+TRUSTED = ("rigid", "bent")
+
+
+def squares(measured: np.ndarray, offsets: tuple[float, float]) -> dict[str, float]:
+    """Of two models that are wrong by so much along x."""
+    return {
+        name: float(np.square(measured + np.array([offset, 0.0, 0.0])).sum())
+        for name, offset in zip(TRUSTED, offsets, strict=True)
+    }
+
+
+def contest(rigid: float, bent: float, pairs: int, noise: float = 0.005, seed: int = 0) -> Contest:
+    rng, held = np.random.default_rng(seed), Contest()
+    for _ in range(pairs):
+        held.add(squares(noise * rng.normal(size=3), (rigid, bent)))
+    return held
+
+
+def test_the_more_trusted_of_two_equal_models_answers():
+    assert contest(0.001, 0.001, 200).best(TRUSTED, "none") == "rigid"
+
+
+def test_a_model_that_is_clearly_better_answers_though_it_is_less_trusted():
+    assert contest(0.01, 0.001, 50).best(TRUSTED, "none") == "bent"
+
+
+def test_a_small_difference_is_seen_below_a_noise_that_both_meet():
+    chosen = [contest(0.003, 0.001, 400, noise=0.005, seed=seed).best(TRUSTED, "none") for seed in range(20)]
+    assert chosen.count("bent") >= 18
+
+
+def test_noise_alone_seldom_unseats_the_more_trusted_model():
+    chosen = []
+    for seed in range(200):
+        rng, held = np.random.default_rng(seed), Contest()
+        for _ in range(100):
+            held.add(dict(zip(TRUSTED, np.square(rng.normal(size=2)).tolist(), strict=True)))
+        chosen.append(held.best(TRUSTED, "none"))
+    assert chosen.count("bent") <= 12
+
+
+@pytest.mark.parametrize("pairs", [0, 2])
+def test_with_too_few_pairs_who_answered_goes_on(pairs):
+    assert contest(0.01, 0.001, pairs).best(TRUSTED, "bent") == "bent"
+
+
+def test_a_prediction_that_is_not_finite_is_none():
+    held = Contest()
+    for _ in range(20):
+        held.add({"rigid": math.nan, "bent": 0.1})
+    assert held.best(TRUSTED, "rigid") == "bent"
+
+
+def test_outliers_that_all_models_meet_do_not_hide_who_is_better():
+    rng, held = np.random.default_rng(1), Contest()
+    for k in range(300):
+        measured = 0.002 * rng.normal(size=3) + (0.3 * rng.normal(size=3) if k % 7 == 0 else 0.0)
+        held.add(squares(measured, (0.004, 0.001)))
+    assert held.best(TRUSTED, "none") == "bent"
+
+
+def test_what_was_long_ago_does_not_count():
+    held = contest(0.001, 0.02, 300)
+    for row in contest(0.02, 0.001, 400).rows * 2:
+        held.add(row)
+    assert held.best(TRUSTED, "none") == "bent"
+
+
+def test_a_model_that_became_another_one_is_judged_anew():
+    held = contest(0.02, 0.001, 50)
+    held.forget("rigid")
+    assert held.best(TRUSTED, "none") == "bent"
+    for row in contest(0.001, 0.001, 10).rows:
+        held.add(row)
+    assert held.best(TRUSTED, "none") == "rigid"
+
+
+def test_a_contest_goes_on_from_its_rows():
+    held = contest(0.01, 0.001, 150)
+    again = Contest(held.rows, held.pairs)
+    held.add({"rigid": 1.0, "bent": 1.0})
+    again.add({"rigid": 1.0, "bent": 1.0})
+    assert again.rows == held.rows
