@@ -38,7 +38,16 @@ from scipy.spatial.transform import Rotation
 from benchmarks.humanoid_arm import NECK_JOINTS
 from benchmarks.rough_arm import RoughArm, rough_arm
 from interfaces.robot import RobotDescription
-from kbmaps import ChainTolerances, Model, ResidualLearner, RigidLearner, TensorLearner, TensorSettings, learning_bases
+from kbmaps import (
+    ChainTolerances,
+    Ladder,
+    Model,
+    ResidualLearner,
+    RigidLearner,
+    TensorLearner,
+    TensorSettings,
+    learning_bases,
+)
 from kbmaps.arrays import FloatArray
 
 ROUGH = ChainTolerances(axes=np.radians(2.0), points=0.01, tool=0.03)
@@ -182,7 +191,12 @@ def residual(arm: RoughArm, _: int) -> Model:
     return ResidualLearner(arm.drawing, ROUGH)
 
 
-MODELS = {"rigid": rigid, "train": train, "residual": residual}
+def ladder(arm: RoughArm, _: int) -> Model:
+    reach = np.full(JOINTS, np.radians(REACH_DEG))
+    return Ladder.around(arm.drawing, ROUGH, -reach, reach)
+
+
+MODELS = {"rigid": rigid, "train": train, "residual": residual, "ladder": ladder}
 
 
 def run(truth: str, model: str, pairs: int, seed: int, told: bool) -> list[float]:
