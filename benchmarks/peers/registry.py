@@ -10,6 +10,7 @@ from benchmarks.peers.competitors import (
     gradient_schema,
     lwpr,
     maps,
+    mixed,
     neural_net,
     psom,
     virtual_robots,
@@ -18,6 +19,7 @@ from benchmarks.peers.problem import Competitor
 
 COMPETITORS: tuple[Competitor, ...] = (
     *chains.COMPETITORS,
+    *mixed.COMPETITORS,
     *maps.COMPETITORS,
     *calibration.COMPETITORS,
     gradient_schema.COMPETITOR,

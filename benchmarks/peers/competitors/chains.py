@@ -9,6 +9,7 @@ from benchmarks.peers.problem import Competitor, Fitted, Problem, any_of, at_mos
 from kbmaps import (
     ChainTolerances,
     RecursiveRigidLearner,
+    RigidChain,
     RigidLearner,
     TensorLearner,
     TensorSettings,
@@ -25,8 +26,9 @@ _ALL = TensorSettings(refit_every=1_000_000)
 def learn_rigid(problem: Problem, earlier: Fitted | None) -> Fitted:
     """The batch learner; after a tool change on from what the earlier one and the tool's move leave open."""
     if isinstance(earlier, RigidLearner):
-        return _recursive_after(RecursiveRigidLearner.continuing(earlier), problem)
-    learner = RigidLearner(*_drawing(problem))
+        learner = _with_other_tool(earlier, problem)
+    else:
+        learner = RigidLearner(*drawing_of(problem))
     learner.learn(problem.q, problem.x, problem.sigma)
     learner.predict(problem.q[0])
     return learner
@@ -34,9 +36,10 @@ def learn_rigid(problem: Problem, earlier: Fitted | None) -> Fitted:
 
 def learn_found(problem: Problem, earlier: Fitted | None) -> Fitted:
     if isinstance(earlier, RigidLearner):
-        return _recursive_after(RecursiveRigidLearner.continuing(earlier), problem)
-    chain = find_chain(problem.q, problem.x, rng=problem.rng, sigma=problem.sigma)
-    learner = RigidLearner(chain, _FREE)
+        learner = _with_other_tool(earlier, problem)
+    else:
+        chain = find_chain(problem.q, problem.x, rng=problem.rng, sigma=problem.sigma)
+        learner = RigidLearner(chain, _FREE)
     learner.learn(problem.q, problem.x, problem.sigma)
     learner.predict(problem.q[0])
     return learner
@@ -44,8 +47,10 @@ def learn_found(problem: Problem, earlier: Fitted | None) -> Fitted:
 
 def learn_recursive(problem: Problem, earlier: Fitted | None) -> Fitted:
     if isinstance(earlier, RecursiveRigidLearner):
-        return _recursive_after(copy.deepcopy(earlier), problem)
-    learner = RecursiveRigidLearner(*_drawing(problem))
+        learner = RecursiveRigidLearner.from_bytes(earlier.to_bytes())
+        learner.tool_changed((problem.tool_move or 0.0) / _PER_AXIS)
+    else:
+        learner = RecursiveRigidLearner(*drawing_of(problem))
     learner.learn(problem.q, problem.x, problem.sigma)
     return learner
 
@@ -73,16 +78,16 @@ def learn_train(problem: Problem, earlier: Fitted | None) -> Fitted:
     return learner
 
 
-def _drawing(problem: Problem):
+def drawing_of(problem: Problem) -> tuple[RigidChain, ChainTolerances]:
+    """The drawing and its tolerances. Raises ValueError where there are none."""
     if problem.drawing is None or problem.tolerances is None:
         raise ValueError("this learner starts from a drawing")
     return problem.drawing, problem.tolerances
 
 
-def _recursive_after(learner: RecursiveRigidLearner, problem: Problem) -> Fitted:
-    learner.tool_changed((problem.tool_move or 0.0) / _PER_AXIS)
-    learner.learn(problem.q, problem.x, problem.sigma)
-    return learner
+def _with_other_tool(earlier: RigidLearner, problem: Problem) -> RigidLearner:
+    moved = earlier.belief.with_other_tool((problem.tool_move or 0.0) / _PER_AXIS)
+    return RigidLearner(earlier.nominal, earlier.tolerances, moved)
 
 
 def _all_turn(problem: Problem) -> str | None:
@@ -109,7 +114,7 @@ COMPETITORS = (
         "Rigid chain, from the drawing",
         "ours",
         learn_rigid,
-        "The most probable rigid chain around the drawing, robust Gauss-Newton; after a tool change on recursively.",
+        "The most probable rigid chain around the drawing; after a tool change on from what it believed.",
         needs_drawing,
     ),
     Competitor(
