@@ -209,7 +209,8 @@ def exact_learner(kbmap: KBMap, rng: np.random.Generator) -> None:
     for cost in costs:
         print(
             f"  {cost.pairs:5d} pairs: learn {cost.learn:6.1f} us a pair; "
-            f"solve with a given ridge {cost.ridge:4.0f} ms, without {cost.plain:4.0f} ms, with the evidence's {cost.evidence:4.0f} ms"
+            f"solve with a given ridge {cost.ridge:4.0f} ms, "
+            f"without {cost.plain:4.0f} ms, with the evidence's {cost.evidence:4.0f} ms"
         )
     print(f"  peak memory of learning and solving {STAGES[-1]} pairs: {megabytes:.0f} MB")
 

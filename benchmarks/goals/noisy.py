@@ -25,6 +25,7 @@ from daemon.reproduce.arm import JOINTS, arm, longer_tool
 from daemon.reproduce.fig6 import MOVED_M
 from daemon.reproduce.walk import WALK_SIGMA, walk
 from kbmaps import ToolLayer
+from kbmaps.arrays import FloatArray
 
 _FEW = (24, 26, 28, 30, 32, 36)
 _FEW_FOUND = (30, 35, 40, 45)
@@ -119,7 +120,7 @@ def _stream(seed: int) -> Values:
     x, noise = true.positions(q), _STREAM_SIGMA * rng.normal(size=(len(q), 3))
     test = WALK_SIGMA * rng.normal(size=(_TEST_ROWS, known.joints))
 
-    def error_mm(pairs: int, measured: np.ndarray[tuple[int, int], np.dtype[np.float64]]) -> float:
+    def error_mm(pairs: int, measured: FloatArray) -> float:
         layer = ToolLayer(known)
         layer.learn(q[:pairs], measured[:pairs])
         return 1e3 * float(np.linalg.norm(layer.predict(test) - true.positions(test), axis=1).mean())

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from kbmaps.arrays import FloatArray
+
 # What one seed of a study gives, by name, in the unit that is shown.
 Values = Mapping[str, float]
 
@@ -58,6 +60,11 @@ def median(name: str) -> Estimate:
     return lambda samples: Measured(float(np.median(_all(name, samples))))
 
 
+def share_below(name: str, level: float) -> Estimate:
+    """The share of seeds at or below a level [%]."""
+    return lambda samples: _mean(100.0 * (_all(name, samples) <= level).astype(np.float64))
+
+
 def ratio(above: str, below: str) -> Estimate:
     """The ratio of two means over the same seeds; its standard error to first order."""
 
@@ -96,10 +103,10 @@ def first_below(names: Mapping[int, str], level: float) -> Estimate:
     return estimate
 
 
-def _all(name: str, samples: Sequence[Sequence[Values]]) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+def _all(name: str, samples: Sequence[Sequence[Values]]) -> FloatArray:
     return np.array([values[name] for one in samples for values in one])
 
 
-def _mean(values: np.ndarray[tuple[int], np.dtype[np.float64]]) -> Measured:
+def _mean(values: FloatArray) -> Measured:
     error = float(values.std(ddof=1) / math.sqrt(len(values))) if len(values) > 1 else None
     return Measured(float(values.mean()), error)
