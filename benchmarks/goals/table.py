@@ -7,6 +7,9 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from benchmarks.goals.goal import Cell, Measured, Row, Verdict, judged, number
 from benchmarks.goals.study import Values
 
+# Values between these are shown with all three digits. Standard errors below this share of the value are not shown.
+_LEAST_PLAIN, _LARGEST_PLAIN = 1e-3, 1e3
+_NEGLIGIBLE = 1e-3
 HEADER = "| what | goal | measured | bound | seeds | |\n| --- | --- | --- | --- | --- | --- |"
 
 
@@ -20,7 +23,7 @@ def _lines(row: Row, results: Mapping[str, Sequence[Values]]) -> Iterator[str]:
     yield f"| **{row.name}**: {row.what} | | | | | {_standing(row, cells)} |"
     for cell in cells:
         yield (
-            f"| – {cell.figure.what} | {cell.goal.text()} | {_shown(cell.measured)} | {_shown(cell.bound)} | "
+            f"| – {cell.figure.what} | {_goal(cell)} | {_shown(cell.measured)} | {_shown(cell.bound)} | "
             f"{cell.seeds} of {cell.wanted} | {_mark(row, cell)} |"
         )
 
@@ -35,6 +38,12 @@ def _standing(row: Row, cells: Sequence[Cell]) -> str:
     return Verdict.MET.value
 
 
+def _goal(cell: Cell) -> str:
+    """The goal, and the number alone where the bound has raised it."""
+    text = cell.goal.text()
+    return text if cell.goal == cell.figure.goal else f"{text} ({cell.figure.goal.text()})"
+
+
 def _mark(row: Row, cell: Cell) -> str:
     if row.waiting:
         return ""
@@ -44,5 +53,6 @@ def _mark(row: Row, cell: Cell) -> str:
 def _shown(measured: Measured | None) -> str:
     if measured is None:
         return ""
-    error = measured.standard_error
-    return number(measured.value) + (f" ± {error:.1g}" if error else "")
+    value, error = measured.value, measured.standard_error
+    text = f"{value:#.3g}".rstrip(".") if _LEAST_PLAIN <= abs(value) < _LARGEST_PLAIN else number(value)
+    return text + (f" ± {error:.1g}" if error and error > _NEGLIGIBLE * abs(value) else "")
