@@ -16,7 +16,6 @@ from benchmarks.goals.goal import Figure, Goal, Row, Verdict, at_least, at_most,
 from benchmarks.goals.results import Results
 from benchmarks.goals.study import (
     Estimate,
-    Measured,
     NotHereError,
     Study,
     Values,
@@ -188,11 +187,10 @@ def test_estimates():
     assert (lowest("a")([one, other]).value, highest("a")([one, other]).value) == (2.0, 6.0)
 
 
-def test_the_size_that_reaches_a_level_lies_between_sizes():
-    names = {10: "n10", 40: "n40"}
-    assert first_below(names, 2.0)([[{"n10": 4.0, "n40": 1.0}]]) == Measured(pytest.approx(20.0))
-    assert first_below(names, 0.5)([[{"n10": 4.0, "n40": 1.0}]]) == Measured(math.inf)
-    assert first_below(names, 5.0)([[{"n10": 4.0, "n40": 1.0}]]) == Measured(pytest.approx(10.0))
+@pytest.mark.parametrize(("level", "size"), [(5.0, 10.0), (2.0, 20.0), (0.5, math.inf)])
+def test_the_size_that_reaches_a_level_lies_between_sizes(level, size):
+    estimate = first_below({10: "n10", 40: "n40"}, level)
+    assert estimate([[{"n10": 4.0, "n40": 1.0}]]).value == pytest.approx(size)
 
 
 def test_an_unknown_row_is_told_with_those_that_there_are(monkeypatch, tmp_path):
