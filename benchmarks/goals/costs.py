@@ -47,7 +47,7 @@ def _speed_rows() -> list[Row]:
             "exact",
             "exact solver, d = 7, CPU time, best run",
             (
-                Figure(f"a pair, up to {many:,} pairs", exact, least(f"learn {many}"), at_most(32.0, "µs")),
+                Figure(f"a pair, {STAGES[-2]:,} to {many:,} pairs", exact, least(f"learn {many}"), at_most(32.0, "µs")),
                 Figure("a solve at 600 pairs, ridge given", exact, least("ridge 600"), at_most(100.0, "ms")),
                 Figure(f"a solve at {many:,} pairs, ridge given", exact, least(f"ridge {many}"), at_most(100.0, "ms")),
                 Figure(
@@ -103,10 +103,10 @@ _GROWTHS = (
 
 
 def _growth_row() -> Row:
-    study = (Study("growth", _growth, seeds=3),)
+    study = (Study("growth, CPU time", _growth, seeds=3),)
     return Row(
         "growth",
-        "factor by which time and memory grow, over theory's (the curves: `python -m benchmarks.peers`)",
+        "factor by which CPU time and memory grow, over theory's (the curves: `python -m benchmarks.peers`)",
         tuple(
             Figure(f"{name}: {quantity}", study, mean(f"{name}: {quantity}"), at_most(_TOLERANCE))
             for name, *_ in _GROWTHS

@@ -55,4 +55,4 @@ def _shown(measured: Measured | None) -> str:
         return ""
     value, error = measured.value, measured.standard_error
     text = f"{value:#.3g}".rstrip(".") if _LEAST_PLAIN <= abs(value) < _LARGEST_PLAIN else number(value)
-    return text + (f" ± {error:.1g}" if error and error > _NEGLIGIBLE * abs(value) else "")
+    return text + (f" ± {number(float(f'{error:.1g}'))}" if error and error > _NEGLIGIBLE * abs(value) else "")
