@@ -64,7 +64,7 @@ def _ladder_row() -> Row:
         every += studies
         figures.append(
             Figure(
-                f"{pairs:,} pairs: {judged} over the best single model, the worst truth",
+                f"{pairs:,} pairs: the model that answers over the best single one, the worst truth",
                 tuple(studies),
                 _most_over_best(tuple(MODELS), judged),
                 at_most(1.2),
@@ -72,7 +72,7 @@ def _ladder_row() -> Row:
         )
     figures.append(
         Figure(
-            f"{judged} over the best single model, geometric mean over truths and sizes",
+            "the same, geometric mean over truths and sizes",
             tuple(every),
             _over_best(tuple(MODELS), judged),
             at_most(1.05),
