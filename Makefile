@@ -6,8 +6,9 @@ STAMP := $(VENV)/.installed
 export OPENBLAS_NUM_THREADS ?= 1
 
 PEERS_BUDGET_S ?= 240
+GOALS_BUDGET_S ?= 3600
 
-.PHONY: help setup demo test check soak bench peers lock wheel clean
+.PHONY: help setup demo test check soak bench peers goals lock wheel clean
 
 help:           ## Show this list
 	@grep -E '^[a-z]+: .*##|^[a-z]+:  *##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 10
@@ -44,6 +45,9 @@ bench: setup    ## Side-by-side figures, as ratios within one run
 
 peers: setup    ## Our learners beside others on one page, peers.html; goes on where the last run stopped
 	@$(BIN)/python -m benchmarks.peers --budget-s $(PEERS_BUDGET_S)
+
+goals: setup    ## What was to be reached beside what is; goes on where the last run stopped
+	@$(BIN)/python -m benchmarks.goals --budget-s $(GOALS_BUDGET_S)
 
 lock:           ## Renew requirements.lock from pyproject.toml
 	@$(BIN)/python -m pip install --disable-pip-version-check --quiet uv

@@ -16,10 +16,11 @@ import os
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from benchmarks.bent_arm import RIGID, bent
 from benchmarks.rough_arm import ROUGH, RoughArm, rough_arm
@@ -160,32 +161,56 @@ def pairs_to_reach(level: float, pairs: FloatArray, errors: FloatArray) -> float
     return float(np.exp(np.interp(-np.log(level), -np.log(falling), np.log(np.maximum(pairs, 0.5)))))
 
 
-def compare(name: str, ways: Sequence[str], curves: dict[str, list[dict[int, float]]], first: int) -> None:
+@dataclass(frozen=True)
+class Curves:
+    """Curves of several seeds, which have the same numbers of pairs.
+
+    Attributes:
+        pairs: (k,).
+        errors: (seeds, k) [m].
+    """
+
+    pairs: FloatArray
+    errors: FloatArray
+
+    @classmethod
+    def of(cls, curves: Sequence[Mapping[int, float]]) -> Curves:
+        return cls(np.array(list(curves[0]), dtype=np.float64), np.array([list(one.values()) for one in curves]))
+
+    def at(self, pairs: float, rows: NDArray[np.intp] | None = None) -> float:
+        """The mean error at a number of pairs, between those of the grid by a straight line in logarithms."""
+        means = np.log(self.errors[slice(None) if rows is None else rows].mean(axis=0))
+        return float(np.exp(np.interp(np.log(pairs), np.log(np.maximum(self.pairs, 0.5)), means)))
+
+
+def share_of_pairs(pairs: float, chosen: Curves, random: Curves) -> tuple[float, FloatArray]:
+    """The pairs chosen over the random ones that lead to the same mean error; the same for resampled seeds."""
+    seeds = len(random.errors)
+    resamples = np.random.default_rng(0).integers(0, seeds, (BOOTSTRAPS, seeds))
+    ratios = [
+        pairs / pairs_to_reach(chosen.at(pairs, rows), random.pairs, random.errors[rows].mean(axis=0))
+        for rows in (np.arange(seeds), *resamples)
+    ]
+    return ratios[0], np.array(ratios[1:])
+
+
+def compare(name: str, ways: Sequence[str], curves: dict[str, Curves], first: int) -> None:
     print(
         f"\n{name}: pairs; error [mm] at random; error with as many chosen, their ratio to random pairs for it (95 %)"
     )
-    seeds = len(curves[RANDOM])
-    grids = {way: np.array(list(curves[way][0]), dtype=np.float64) for way in curves}
-    errors = {way: np.array([list(one.values()) for one in curves[way]]) for way in curves}
-    resamples = np.random.default_rng(0).integers(0, seeds, (BOOTSTRAPS, seeds))
     for pairs in LEVELS:
-        if not max(first, *(grid[0] for grid in grids.values())) < pairs <= min(grid[-1] for grid in grids.values()):
+        if (
+            not max(first, *(one.pairs[0] for one in curves.values()))
+            < pairs
+            <= min(one.pairs[-1] for one in curves.values())
+        ):
             continue
-        text = f"  {pairs:4d} {1e3 * _at(pairs, grids[RANDOM], errors[RANDOM].mean(axis=0)):7.2f}"
+        text = f"  {pairs:4d} {1e3 * curves[RANDOM].at(pairs):7.2f}"
         for way in ways:
-            ratios: list[float] = []
-            for rows in (np.arange(seeds), *resamples):
-                level = _at(pairs, grids[way], errors[way][rows].mean(axis=0))
-                ratios.append(pairs / pairs_to_reach(level, grids[RANDOM], errors[RANDOM][rows].mean(axis=0)))
-            low, high = np.quantile(ratios[1:], (0.025, 0.975))
-            error = 1e3 * _at(pairs, grids[way], errors[way].mean(axis=0))
-            text += f"   {way} {error:6.2f}  {ratios[0]:.2f} ({low:.2f}-{high:.2f})"
+            ratio, ratios = share_of_pairs(pairs, curves[way], curves[RANDOM])
+            low, high = np.quantile(ratios, (0.025, 0.975))
+            text += f"   {way} {1e3 * curves[way].at(pairs):6.2f}  {ratio:.2f} ({low:.2f}-{high:.2f})"
         print(text, flush=True)
-
-
-def _at(pairs: float, grid: FloatArray, errors: FloatArray) -> float:
-    """The error at a number of pairs, between those of the grid by a straight line in logarithms."""
-    return float(np.exp(np.interp(np.log(pairs), np.log(np.maximum(grid, 0.5)), np.log(errors))))
 
 
 def cost() -> None:
@@ -219,25 +244,26 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=20, help="the goal is over 50")
     parser.add_argument("--pairs", type=int, default=80, help="most pairs of a curve")
     parser.add_argument("--only", choices=[*SETUPS, WALK, COST], action="append", default=[])
+    parser.add_argument("--first-seed", type=int, default=0)
     arguments = parser.parse_args()
-    seeds: int = arguments.seeds
+    seeds = range(arguments.first_seed, arguments.first_seed + arguments.seeds)
     last: int = arguments.pairs
     parts: list[str] = arguments.only or [*SETUPS, WALK, COST]
-    ways = (CHOSEN, PLANNED)
     for part in parts:
         if part == COST:
             cost()
             continue
         if part == WALK:
             walks = {
-                w: [walk_curve(seed, w, n) for seed in range(seeds)] for w, n in ((RANDOM, 3 * last), (CHOSEN, last))
+                way: Curves.of([walk_curve(seed, way, n) for seed in seeds])
+                for way, n in ((RANDOM, 3 * last), (CHOSEN, last))
             }
             compare("d = 7, walking in steps of 2 deg within +-80 deg", (CHOSEN,), walks, 0)
             continue
         setup = SETUPS[part]
         most = {RANDOM: setup.random_times * last, CHOSEN: last, PLANNED: last}
-        curves = {w: [curve(setup, seed, w, n) for seed in range(seeds)] for w, n in most.items()}
-        compare(setup.name, ways, curves, setup.first)
+        curves = {way: Curves.of([curve(setup, seed, way, n) for seed in seeds]) for way, n in most.items()}
+        compare(setup.name, (CHOSEN, PLANNED), curves, setup.first)
 
 
 if __name__ == "__main__":

@@ -25,7 +25,15 @@ import numpy as np
 from benchmarks.bent_arm import RIGID, bent
 from benchmarks.humanoid_arm import guided_path
 from benchmarks.rough_arm import ROUGH, RoughArm, rough_arm
-from kbmaps import Model, RecursiveRigidLearner, RigidLearner, TensorLearner, TensorSettings, learning_bases
+from kbmaps import (
+    Model,
+    RecursiveRigidLearner,
+    ResidualLearner,
+    RigidLearner,
+    TensorLearner,
+    TensorSettings,
+    learning_bases,
+)
 from kbmaps.arrays import FloatArray
 from kbmaps.experiment_design import mean_distances
 
@@ -122,6 +130,7 @@ MODELS: dict[str, Entry] = {
     "rigid, batch": Entry(lambda arm, _: RigidLearner(arm.drawing, ROUGH)),
     "rigid, recursive": Entry(lambda arm, _: RecursiveRigidLearner(arm.drawing, ROUGH), _tell_recursive),
     "tensor train": Entry(_tensor, _tell_tensor),
+    "residual": Entry(lambda arm, _: ResidualLearner(arm.drawing, ROUGH)),
 }
 
 

@@ -12,30 +12,26 @@ import os
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from kbmaps import ExactLearner, RigidChain, learning_bases, prediction_errors
+from benchmarks.tensor_train import random_chain
+from kbmaps import ExactLearner, learning_bases, prediction_errors
+from kbmaps.arrays import FloatArray
 
 CASES = [("3^d samples, +-80 deg", 80.0, 1), ("2 x 3^d, +-20 deg", 20.0, 2), ("2 x 3^d, +-5 deg", 5.0, 2)]
 REACH_DEG = 80.0
+TEST_ROWS = 500
 
 
-def random_chain(joints: int, rng: np.random.Generator) -> RigidChain:
-    fixed = np.tile(np.eye(4), (joints + 1, 1, 1))
-    fixed[:, :3, :3] = Rotation.random(joints + 1, rng=rng).as_matrix()
-    fixed[:, :3, 3] = 0.15 * rng.normal(size=(joints + 1, 3))
-    axes = rng.normal(size=(joints, 3))
-    return RigidChain(fixed, axes / np.linalg.norm(axes, axis=1, keepdims=True), np.zeros(joints, dtype=np.bool_))
-
-
-def largest_error(joints: int, cluster_deg: float, times: int, rng: np.random.Generator) -> float:
+def errors(joints: int, cluster_deg: float, times: int, seed: int) -> FloatArray:
+    """Distances (500,) [m] within +-80 degrees after so many times 3^d pairs from a cluster."""
+    rng = np.random.default_rng(seed)
     chain, prior = random_chain(joints, rng), random_chain(joints, rng)
     cluster, reach = (np.full(joints, np.radians(deg)) for deg in (cluster_deg, REACH_DEG))
     q = rng.uniform(-cluster, cluster, (times * 3**joints, joints))
     learner = ExactLearner(prior.to_kbmap(learning_bases(-reach, reach)), learning_bases(-cluster, cluster))
     learner.learn(q, chain.positions(q))
-    test = rng.uniform(-reach, reach, (500, joints))
-    return float(prediction_errors(learner.solve().map, test, chain.positions(test)).max())
+    test = rng.uniform(-reach, reach, (TEST_ROWS, joints))
+    return prediction_errors(learner.solve().map, test, chain.positions(test))
 
 
 def main() -> None:
@@ -46,8 +42,8 @@ def main() -> None:
     for joints in range(1, 8):
         cells: list[str] = []
         for _, cluster_deg, times in CASES:
-            errors = [largest_error(joints, cluster_deg, times, np.random.default_rng(seed)) for seed in range(seeds)]
-            cells.append(f"{np.median(errors):9.1e} ({max(errors):8.1e})")
+            largest = [errors(joints, cluster_deg, times, seed).max() for seed in range(seeds)]
+            cells.append(f"{np.median(largest):9.1e} ({max(largest):8.1e})")
         print(f"{joints:6d}" + "".join(f"{cell:>30s}" for cell in cells))
 
 

@@ -17,6 +17,8 @@ import statistics
 import time
 import tracemalloc
 from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from padasip.filters import FilterNLMS
@@ -119,7 +121,8 @@ def numba_step(kbmap: KBMap, q: FloatArray, x: FloatArray) -> Callable[[], objec
     return lambda: step(net, phases, mixes, one_q, one_x, 0.5)
 
 
-def online(q: FloatArray, x: FloatArray) -> None:
+def online_costs(q: FloatArray, x: FloatArray, rounds: int = 40) -> dict[str, float]:
+    """Times [us] by name, those of `GOALS` with the path before it."""
     rivals: dict[str, Callable[[], object]] = {}
     for path in kernels.available():
         rivals |= {f"{path} {name}": call for name, call in kbmaps_calls(path, q, x).items()}
@@ -133,12 +136,19 @@ def online(q: FloatArray, x: FloatArray) -> None:
     rivals[f"SupportSet.unexplained, {support.size} kept"] = lambda: support.unexplained(q[0])
     of_many = {name for name in rivals if name.endswith(("a pair", "a row of 600"))}
     costs = interleaved_medians_us(
-        {name: call for name, call in rivals.items() if name not in of_many}, calls=100, clock=time.thread_time
+        {name: call for name, call in rivals.items() if name not in of_many},
+        rounds=rounds,
+        calls=100,
+        clock=time.thread_time,
     )
     batches = interleaved_medians_us(
-        {name: rivals[name] for name in of_many}, rounds=20, calls=3, clock=time.thread_time
+        {name: rivals[name] for name in of_many}, rounds=rounds // 2, calls=3, clock=time.thread_time
     )
-    costs |= {name: cost / len(q) for name, cost in batches.items()}
+    return costs | {name: cost / len(q) for name, cost in batches.items()}
+
+
+def online(q: FloatArray, x: FloatArray) -> None:
+    costs = online_costs(q, x)
     print(f"  {'[us]':30s} {'NumPy':>8s} {'goal':>6s} {'compiled':>9s} {'goal':>6s} {'NumPy / compiled':>17s}")
     for name, goals in GOALS.items():
         plain, compiled = (costs.get(f"{path} {name}") for path in ("numpy", "compiled"))
@@ -146,7 +156,7 @@ def online(q: FloatArray, x: FloatArray) -> None:
         print(
             f"  {name:30s}{cell(plain, 9)}{cell(goals[0], 7)}{cell(compiled, 10)}{cell(goals[1], 7)}{cell(ratio, 18)}"
         )
-    for name in (name for name in rivals if not name.startswith(("numpy", "compiled"))):
+    for name in (name for name in costs if not name.startswith(("numpy", "compiled"))):
         print(f"  {name:44s} {costs[name]:8.2f}")
 
 
@@ -154,9 +164,26 @@ def cell(value: float | None, width: int) -> str:
     return f"{'-':>{width}s}" if value is None else f"{value:{width}.2f}"
 
 
-def exact_learner(kbmap: KBMap, rng: np.random.Generator) -> None:
-    print(f"exact learner, {kbmap.size} control points (goals: 32 us a pair, solve 100 ms, 120 MB)")
-    learner = ExactLearner(kbmap)
+@dataclass(frozen=True)
+class ExactCost:
+    """What the exact learner costs at so many pairs: learning [us a pair] and solves [ms].
+
+    Attributes:
+        ridge: with a given one.
+        plain: without.
+        evidence: with the evidence's.
+    """
+
+    pairs: int
+    learn: float
+    ridge: float
+    plain: float
+    evidence: float
+
+
+def exact_costs(kbmap: KBMap, rng: np.random.Generator) -> tuple[list[ExactCost], float]:
+    """At each of `STAGES`, and the most memory [MB] of learning and solving the pairs of the last."""
+    learner, costs = ExactLearner(kbmap), list[ExactCost]()
     q, x = np.empty((0, JOINTS)), np.empty((0, 3))
     for total in STAGES:
         n = total - learner.pairs
@@ -166,33 +193,47 @@ def exact_learner(kbmap: KBMap, rng: np.random.Generator) -> None:
         begin = time.thread_time()
         learner.learn(new_q, new_x)
         per_pair = (time.thread_time() - begin) / n * 1e6
-        fixed, plain, evidence = (solve_ms(learner, precision) for precision in (1.0, None, "evidence"))
-        print(
-            f"  {total:5d} pairs: learn {per_pair:6.1f} us a pair; solve with a given ridge {fixed:4.0f} ms, "
-            f"without {plain:4.0f} ms, with the evidence's {evidence:4.0f} ms"
-        )
+        costs.append(ExactCost(total, per_pair, *(solve_ms(learner, how) for how in (1.0, None, "evidence"))))
     tracemalloc.start()
     again = ExactLearner(kbmap)
     again.learn(q, x)
     again.solve(1.0)
-    print(f"  peak memory of learning and solving {len(q)} pairs: {tracemalloc.get_traced_memory()[1] / 1e6:.0f} MB")
+    megabytes = tracemalloc.get_traced_memory()[1] / 1e6
     tracemalloc.stop()
+    return costs, megabytes
 
 
-def solve_ms(learner: ExactLearner, precision: float | str | None) -> float:
+def exact_learner(kbmap: KBMap, rng: np.random.Generator) -> None:
+    print(f"exact learner, {kbmap.size} control points (goals: 32 us a pair, solve 100 ms, 120 MB)")
+    costs, megabytes = exact_costs(kbmap, rng)
+    for cost in costs:
+        print(
+            f"  {cost.pairs:5d} pairs: learn {cost.learn:6.1f} us a pair; "
+            f"solve with a given ridge {cost.ridge:4.0f} ms, "
+            f"without {cost.plain:4.0f} ms, with the evidence's {cost.evidence:4.0f} ms"
+        )
+    print(f"  peak memory of learning and solving {STAGES[-1]} pairs: {megabytes:.0f} MB")
+
+
+def solve_ms(learner: ExactLearner, precision: float | Literal["evidence"] | None) -> float:
     """Median of three solves."""
     times: list[float] = []
     for _ in range(3):
         begin = time.thread_time()
-        learner.solve(precision)  # pyright: ignore[reportArgumentType]
+        learner.solve(precision)
         times.append(1e3 * (time.thread_time() - begin))
     return statistics.median(times)
 
 
+def some_pairs(rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+    """q (600, 7) [rad] and x (600, 3) [m] of a guided path."""
+    q = guided_path(PAIRS, rng).q
+    return q, nominal_chain().with_tool([0.05, 0.0, 0.0]).positions(q) + NOISE_M * rng.normal(size=(PAIRS, 3))
+
+
 def main() -> None:
     rng = np.random.default_rng(0)
-    q = guided_path(PAIRS, rng).q
-    x = nominal_chain().with_tool([0.05, 0.0, 0.0]).positions(q) + NOISE_M * rng.normal(size=(PAIRS, 3))
+    q, x = some_pairs(rng)
     load = os.getloadavg()[0]
     print(f"{JOINTS} joints (medians of interleaved rounds; {os.cpu_count()} cores, load average {load:.1f})")
     online(q, x)

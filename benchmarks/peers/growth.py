@@ -75,14 +75,14 @@ def _shape(series: Series, size: int) -> tuple[int, int]:
 
 
 def _cost(series: Series, size: int) -> tuple[float, float]:
-    """Time to learn [s], best of several, and the most memory that it holds at once [MiB]."""
+    """CPU time to learn [s], best of several, and the most memory that it holds at once [MiB]."""
     problem = _problem(*_shape(series, size))
     learn = BY_KEY[series.competitor].learn
     best = math.inf
     for _ in range(_REPEATS):
-        begin = time.perf_counter()
+        begin = time.process_time()
         learn(problem, None)
-        best = min(best, time.perf_counter() - begin)
+        best = min(best, time.process_time() - begin)
     tracemalloc.start()
     learnt: Fitted = learn(problem, None)
     _, most = tracemalloc.get_traced_memory()

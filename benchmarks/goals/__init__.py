@@ -1,0 +1,1 @@
+"""What this library set out to reach, measured: `python -m benchmarks.goals`."""

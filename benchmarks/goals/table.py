@@ -1,0 +1,58 @@
+"""The table in Markdown."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+
+from benchmarks.goals.goal import Cell, Measured, Row, Verdict, judged, number
+from benchmarks.goals.study import Values
+
+# Values between these are shown with all three digits. Standard errors below this share of the value are not shown.
+_LEAST_PLAIN, _LARGEST_PLAIN = 1e-3, 1e3
+_NEGLIGIBLE = 1e-3
+HEADER = "| what | goal | measured | bound | seeds | |\n| --- | --- | --- | --- | --- | --- |"
+
+
+def table(rows: Iterable[Row], results: Mapping[str, Sequence[Values]]) -> str:
+    """All rows: each with its name and what it is about, and a line for each figure."""
+    return "\n".join([HEADER, *(line for row in rows for line in _lines(row, results))])
+
+
+def _lines(row: Row, results: Mapping[str, Sequence[Values]]) -> Iterator[str]:
+    cells = [judged(figure, results) for figure in row.figures]
+    yield f"| **{row.name}**: {row.what} | | | | | {_standing(row, cells)} |"
+    for cell in cells:
+        yield (
+            f"| – {cell.figure.what} | {_goal(cell)} | {_shown(cell.measured)} | {_shown(cell.bound)} | "
+            f"{cell.seeds} of {cell.wanted} | {_mark(row, cell)} |"
+        )
+
+
+def _standing(row: Row, cells: Sequence[Cell]) -> str:
+    if row.waiting:
+        return f"waiting for {row.waiting}"
+    verdicts = [cell.verdict for cell in cells]
+    for verdict in (Verdict.NOT_MET, Verdict.OPEN):
+        if verdict in verdicts:
+            return verdict.value
+    return Verdict.MET.value
+
+
+def _goal(cell: Cell) -> str:
+    """The goal, and the number alone where the bound has raised it."""
+    text = cell.goal.text()
+    return text if cell.goal == cell.figure.goal else f"{text} ({cell.figure.goal.text()})"
+
+
+def _mark(row: Row, cell: Cell) -> str:
+    if row.waiting:
+        return ""
+    return cell.verdict.value + (" (within 2 s.e.)" if cell.in_doubt else "")
+
+
+def _shown(measured: Measured | None) -> str:
+    if measured is None:
+        return ""
+    value, error = measured.value, measured.standard_error
+    text = f"{value:#.3g}".rstrip(".") if _LEAST_PLAIN <= abs(value) < _LARGEST_PLAIN else number(value)
+    return text + (f" ± {number(float(f'{error:.1g}'))}" if error and error > _NEGLIGIBLE * abs(value) else "")
