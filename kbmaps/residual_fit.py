@@ -26,6 +26,8 @@ _OUTLIER_SIGMAS, _MEDIAN_NORM = 4.8, 1.538
 _ROUNDS, _SELECTIONS = 6, 2
 # Few enough rows for a processor's cache.
 _ROWS_AT_ONCE = 150
+# With fewer coordinates of pairs on a path no group is taken up: there is no telling it from what neighbours share.
+_FEWEST_ON_PATH = 30
 # Runs of pairs left out in turn on a path.
 _BLOCKS = 8
 # A step that moves the predictions by less than this share of what the weights leave open is the last.
@@ -123,6 +125,8 @@ class _Fitter:
     def _considered(self) -> tuple[str, ...]:
         """All groups with no more features than there are coordinates; the largest only where the one before is in."""
         coordinates = 3 * int(self.inliers.sum())
+        if self._on_path and coordinates < _FEWEST_ON_PATH:
+            return tuple(self.variances)
         largest, before = SMOOTH_GROUPS[2], SMOOTH_GROUPS[1]
 
         def asked(group: str) -> bool:
@@ -148,7 +152,7 @@ class _Fitter:
         self._judge_pairs(residuals)
         rows = np.flatnonzero(self.inliers)
         if self._on_path:
-            parts = min(max(len(rows) // BLOCK_PAIRS, FEWEST_BLOCKS), _BLOCKS)
+            parts = min(max(len(rows) // BLOCK_PAIRS, FEWEST_BLOCKS), _BLOCKS, len(rows))
         else:
             parts = max(len(rows) // _ROWS_AT_ONCE, 1)
         runs = np.array_split(rows, parts)

@@ -99,7 +99,7 @@ class ResidualModel:
         parameters = self.features.parameters
         return ChainBelief(parameters, self.change, self.root[: parameters.size])
 
-    @cached_property
+    @property
     def digest(self) -> str:
         """Sixteen hexadecimal digits that tell this map (not how sure it is) from any other."""
         arrays = self._arrays()
