@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -329,9 +330,13 @@ class GroupedModel:
 
 
 def _cholesky(matrix: FloatArray) -> FloatArray:
-    """Lower factor; where rounding has made the matrix indefinite, of the nearest that it has not (a tighter prior)."""
-    try:
-        return cast(FloatArray, np.linalg.cholesky(matrix))
-    except np.linalg.LinAlgError:
-        rounding = 10.0 * len(matrix) * np.finfo(np.float64).eps * float(np.diag(matrix).max())
-        return cast(FloatArray, np.linalg.cholesky(matrix + rounding * np.eye(len(matrix))))
+    """Lower factor; where rounding has made the matrix indefinite, of the nearest that it has not (a tighter prior).
+
+    Raises:
+        LinAlgError: it is indefinite by more than rounding.
+    """
+    rounding = len(matrix) * np.finfo(np.float64).eps * float(np.diag(matrix).max())
+    for share in (0.0, 10.0, 1e3):
+        with contextlib.suppress(np.linalg.LinAlgError):
+            return cast(FloatArray, np.linalg.cholesky(matrix + share * rounding * np.eye(len(matrix))))
+    return cast(FloatArray, np.linalg.cholesky(matrix + 1e5 * rounding * np.eye(len(matrix))))

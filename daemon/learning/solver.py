@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -15,6 +16,7 @@ from kbmaps import (
     ChainTolerances,
     ExactLearner,
     KBMap,
+    NonFiniteError,
     ResidualLearner,
     ResidualModel,
     RigidLearner,
@@ -26,6 +28,8 @@ from kbmaps import (
 
 from .learnt import LearntModel
 from .members import EXACT, RESIDUAL, RIGID
+
+log = logging.getLogger(__name__)
 
 # Memory and time grow with the square and the cube of the control points: 3^7 take 77 MB and 0.2 s.
 LARGEST_NET = 2187
@@ -132,7 +136,8 @@ class DirectSolver:
         self._q, self._x = np.vstack([self._q, q]), np.vstack([self._x, x])
         while len(self._q) > KEPT:
             self._folded = fitted_belief(self._before, self._q[:FOLDED], self._x[:FOLDED])
-            self._folded_residual = fitted_residual(self._residual_before, self._q[:FOLDED], self._x[:FOLDED])
+            before = self._residual_before
+            self._folded_residual = fitted_residual(before, self._q[:FOLDED], self._x[:FOLDED]) or before
             self._q, self._x = self._q[FOLDED:], self._x[FOLDED:]
 
     def solve(self) -> None:
@@ -157,7 +162,7 @@ class DirectSolver:
         if residual_due:
             self._residual_at = self._pairs
             residual = fitted_residual(self._residual_before, self._q, self._x)
-            yield Solved(task.number, self._pairs, RESIDUAL, residual, residual)
+            yield Solved(task.number, self._pairs, RESIDUAL if residual else "", residual, residual)
 
     def _solve_exact(self, task: Task, learner: ExactLearner, *, last: bool) -> Solved:
         """Least squares around the rigid chain.
@@ -217,13 +222,20 @@ def fitted_belief(prior: ChainBelief, q: FloatArray, x: FloatArray) -> ChainBeli
     return again.belief
 
 
-def fitted_residual(prior: ChainBelief | ResidualModel, q: FloatArray, x: FloatArray) -> ResidualModel:
-    """What is believed of an arm that is no rigid chain after pairs q (n, d) [rad] and x (n, 3) [m] along a path."""
+def fitted_residual(prior: ChainBelief | ResidualModel, q: FloatArray, x: FloatArray) -> ResidualModel | None:
+    """What is believed of an arm that is no rigid chain after pairs q (n, d) [rad] and x (n, 3) [m] along a path.
+
+    None where it was lost in rounding: the other models go on answering.
+    """
     q, x = _spread(q, x)
     parameters = prior.parameters if isinstance(prior, ChainBelief) else prior.features.parameters
     learner = ResidualLearner(parameters.reference, ChainTolerances(), prior)
     learner.learn(q, x)
-    return learner.model
+    try:
+        return learner.model
+    except (np.linalg.LinAlgError, NonFiniteError) as error:
+        log.warning("the chain with residual has no solution for %d pairs: %s", len(q), error)
+        return None
 
 
 def _spread(q: FloatArray, x: FloatArray) -> tuple[FloatArray, FloatArray]:
