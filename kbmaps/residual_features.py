@@ -234,7 +234,7 @@ class ResidualFeatures:
         torques = np.where(self._prismatic[:, None, None], self.scaling.scale * axes[:, :, None], torques)
         if self._still[group]:
             torques = torques @ frames[:, self._still[group], :3, :3][:, None]
-        return torques.reshape(*torques.shape[:2], -1)
+        return torques.reshape(*torques.shape[:2], 3 * torques.shape[2])
 
     def _places(self, points: FloatArray) -> FloatArray:
         """Where loads are supposed for each joint (n, d or 1, loads, 3), of the frames' origins (n, d+1, 3)."""

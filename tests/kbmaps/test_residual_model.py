@@ -246,3 +246,9 @@ def test_shared_noise_does_not_make_the_learner_too_sure_on_a_path(arm):
     estimate = learner.estimate(q)
     inside = np.abs(estimate.x - arm.real.positions(q)) < 2.0 * estimate.sigma
     assert inside.mean() > 0.8
+
+
+def test_an_empty_batch_is_no_trouble(model):
+    none = np.empty((0, 6))
+    assert model.predict(none).shape == (0, 3)
+    assert model.jacobian(none).shape == (0, 3, 6)
