@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from daemon.bus import Request
-from daemon.learning import Learning
+from daemon.learning import Learning, LearntModel
 from daemon.wire import (
     IkReply,
     IkRequest,
@@ -20,7 +20,7 @@ from daemon.wire import (
 from interfaces.errors import RequestError
 from interfaces.protocols import Clock
 from interfaces.robot import RobotDescription
-from kbmaps import InverseKinematics, KBMap
+from kbmaps import InverseKinematics
 
 
 class Answers:
@@ -29,7 +29,7 @@ class Answers:
     def __init__(self, learning: Learning, robot: RobotDescription, clock: Clock) -> None:
         self._learning, self._robot, self._clock = learning, robot, clock
         self._joints = robot.joints
-        self._inverse: tuple[KBMap, InverseKinematics] | None = None
+        self._inverse: tuple[LearntModel, InverseKinematics] | None = None
 
     def predict(self, request: Request) -> bytes:
         """Positions, 1-sigma and support; RequestError for a bad request, or before there is a model."""
@@ -51,7 +51,7 @@ class Answers:
         """Jacobians dx/dq; RequestError as for `predict`."""
         q = joint_angles(decode(request.payload, JointsRequest, request.encoding), self._joints)
         snapshot = self._learning.snapshot
-        jacobians = snapshot.require_map().jacobian(q)
+        jacobians = snapshot.require_model().jacobian(q)
         return encode(JacobianReply(jacobians.tolist(), snapshot.digest, snapshot.pairs), request.encoding)
 
     def ik(self, request: Request) -> bytes:
@@ -61,7 +61,7 @@ class Answers:
             raise RequestError("x is not finite")
         start = None if wanted.start is None else finite_vector("start", wanted.start, self._joints)
         snapshot = self._learning.snapshot
-        inverse = self._inverse_of(snapshot.require_map())
+        inverse = self._inverse_of(snapshot.require_model())
         if wanted.posture is None:
             posture = None
         elif wanted.posture == "middle":
@@ -83,16 +83,17 @@ class Answers:
         )
         return encode(reply, request.encoding)
 
-    def _inverse_of(self, kbmap: KBMap) -> InverseKinematics:
-        """The solver for this map; the last one is kept, since building it costs as much as several answers."""
+    def _inverse_of(self, model: LearntModel) -> InverseKinematics:
+        """The solver for this model; the last one is kept, since building it costs as much as several answers."""
         kept = self._inverse
-        if kept is None or kept[0] is not kbmap:
-            kept = kbmap, InverseKinematics(kbmap, self._robot.lower, self._robot.upper)
+        if kept is None or kept[0] is not model:
+            kept = model, InverseKinematics(model, self._robot.lower, self._robot.upper)
             self._inverse = kept
         return kept[1]
 
     def model(self, _request: Request) -> bytes:
-        """The model as one self-describing file, with the robot's name and joints in its metadata."""
+        """The best KB-Map as one self-describing file; its metadata say of which robot, and which model answers."""
         snapshot = self._learning.snapshot
+        kbmap = snapshot.require_map()
         texts = {"robot": self._robot.name, "joints": " ".join(self._joints), "pairs": str(snapshot.pairs)}
-        return snapshot.require_map().with_metadata(texts | {"model": snapshot.digest}).to_bytes()
+        return kbmap.with_metadata(texts | {"model": kbmap.digest, "answering": snapshot.digest}).to_bytes()

@@ -22,9 +22,10 @@ import msgspec
 import numpy as np
 
 from daemon.learning import DirectSolver, Solved, Task
+from daemon.learning.members import RESIDUAL
 from interfaces.errors import BodyschemaError
 from interfaces.records import FloatArray
-from kbmaps import ChainBelief, KBMap
+from kbmaps import ChainBelief, KBMap, ResidualModel
 
 NICENESS = 5
 LONGEST_REST_S = 5.0
@@ -42,6 +43,7 @@ class StartTask(msgspec.Struct, frozen=True, tag="start"):
     number: int
     prior: bytes
     belief: bytes
+    residual: bytes | None
     prior_stays: bool
 
 
@@ -58,12 +60,15 @@ class Solve(msgspec.Struct, frozen=True, tag="solve"):
 
 
 class Solution(msgspec.Struct, frozen=True):
-    """One answer to `Solve`; without a map when there is no solution."""
+    """One answer to `Solve`; without a model when there is no solution.
+
+    A `ResidualModel` is what is believed of the arm too, and comes as the model alone.
+    """
 
     task: int
     pairs: int
     name: str
-    map: bytes | None
+    model: bytes | None
     belief: bytes | None
     last: bool
 
@@ -104,7 +109,8 @@ class SolverProcess:
             self._child = subprocess.Popen(
                 command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment, process_group=0
             )
-        self._send(StartTask(task.number, task.prior.to_bytes(), task.belief.to_bytes(), task.prior_stays))
+        residual = None if task.residual is None else task.residual.to_bytes()
+        self._send(StartTask(task.number, task.prior.to_bytes(), task.belief.to_bytes(), residual, task.prior_stays))
 
     def learn(self, q: FloatArray, x: FloatArray) -> None:
         """More pairs, q (n, d) [rad] and x (n, 3) [m]."""
@@ -134,9 +140,7 @@ class SolverProcess:
             return None
         solution = _solutions.decode(bytes(self._received[_LENGTH.size : end]))
         del self._received[:end]
-        learnt = None if solution.map is None else KBMap.from_bytes(solution.map)
-        belief = None if solution.belief is None else ChainBelief.from_bytes(solution.belief)
-        return Solved(solution.task, solution.pairs, solution.name, learnt, belief, solution.last)
+        return _unpacked(solution)
 
     def _send(self, order: StartTask | Learn | Solve) -> None:
         if self._child is None or self._child.stdin is None:
@@ -167,13 +171,24 @@ class SolverProcess:
             child.stdout.close()
 
 
+def _unpacked(solution: Solution) -> Solved:
+    model = belief = None
+    if solution.model is not None and solution.name == RESIDUAL:
+        model = belief = ResidualModel.from_bytes(solution.model)
+    elif solution.model is not None:
+        model = KBMap.from_bytes(solution.model)
+        belief = None if solution.belief is None else ChainBelief.from_bytes(solution.belief)
+    return Solved(solution.task, solution.pairs, solution.name, model, belief, solution.last)
+
+
 def serve(orders: IO[bytes], solutions: IO[bytes]) -> None:
     """Carry out orders until they end; before another solve, rest for as long as the last one took."""
     solver, rested_at = DirectSolver(), 0.0
     while (order := _read(orders)) is not None:
         if isinstance(order, StartTask):
             prior, belief = KBMap.from_bytes(order.prior), ChainBelief.from_bytes(order.belief)
-            solver.start(Task(order.number, prior, belief, order.prior_stays))
+            residual = None if order.residual is None else ResidualModel.from_bytes(order.residual)
+            solver.start(Task(order.number, prior, belief, residual, order.prior_stays))
             rested_at = 0.0  # a new task begins with few pairs, and somebody waits for it
         elif isinstance(order, Learn):
             solver.learn(
@@ -189,8 +204,8 @@ def _solve(solver: DirectSolver, solutions: IO[bytes]) -> float:
     """Solve, and answer with each solution as it comes; how long it took [s]."""
     begin = time.monotonic()
     for solved in solver.solutions():
-        learnt = None if solved.map is None else solved.map.to_bytes()
-        belief = None if solved.belief is None else solved.belief.to_bytes()
+        learnt = None if solved.model is None else solved.model.to_bytes()
+        belief = solved.belief.to_bytes() if isinstance(solved.belief, ChainBelief) else None
         _write(solutions, Solution(solved.task, solved.pairs, solved.name, learnt, belief, solved.last))
     return time.monotonic() - begin
 

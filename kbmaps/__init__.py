@@ -42,6 +42,7 @@ from kbmaps.nlms import NLMS
 from kbmaps.posterior import ChainPosterior, Posterior
 from kbmaps.reach import PoseModel, PositionModel
 from kbmaps.residual_learner import ResidualLearner
+from kbmaps.residual_model import ResidualModel
 from kbmaps.resolved_rates import resolved_rates
 from kbmaps.rigid_learner import RigidLearner
 from kbmaps.rigid_recursive import RecursiveRigidLearner
@@ -92,6 +93,7 @@ __all__ = [
     "Posterior",
     "RecursiveRigidLearner",
     "ResidualLearner",
+    "ResidualModel",
     "RigidChain",
     "RigidLearner",
     "RotationError",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -111,6 +112,7 @@ class GroupedModel:
         centre: prior mean of the weights of the group "".
         least_noise: the noise is no smaller [rows' unit].
         noise: where it starts.
+        noise_before: noise [rows' unit] that was seen before, and how many rows that counts for.
         blocks: of runs of neighbouring rows, if a group must also better the prediction of each run from the others.
     """
 
@@ -122,12 +124,13 @@ class GroupedModel:
         *,
         least_noise: float,
         noise: float,
+        noise_before: tuple[float, float] = (0.0, 0.0),
         blocks: Sequence[Moments] = (),
     ) -> None:
         self._moments, self._columns = moments, columns
         self._blocks = blocks
         self._centre = centre
-        self._least_noise = least_noise
+        self._least_noise, self._noise_before = least_noise, noise_before
         self.noise = noise
         self.variances: dict[str, float] = {}
 
@@ -230,12 +233,12 @@ class GroupedModel:
         rows = np.concatenate([rows, roots[:, None] * (means - mean)])
         return Average(groups, mean, cast(FloatArray, np.linalg.qr(rows, mode="r")).T)
 
-    def settle(self) -> None:
+    def settle(self, rounds: int = _ROUNDS) -> None:
         """The noise and the groups' variances that make the data most probable, by MacKay's fixed point."""
-        for _ in range(_ROUNDS):
+        for _ in range(rounds):
             posterior = self.posterior()
             used = sum(posterior.used.values())
-            noise = max(math.sqrt(posterior.square / max(self._moments.count - used, 1.0)), self._least_noise)
+            noise = max(math.sqrt(self._noise_variance(posterior.square, used)), self._least_noise)
             change = abs(math.log(noise / self.noise))
             self.noise = noise
             start = len(self._centre)
@@ -248,6 +251,10 @@ class GroupedModel:
                 self.variances[name] = new
             if change < _SETTLED:
                 return
+
+    def _noise_variance(self, square: float, used: float) -> float:
+        before, rows = self._noise_before
+        return (square + rows * before**2) / max(self._moments.count - used + rows, 1.0)
 
     def _try(self, group: str, variance: float) -> None:
         """Takes up a group unless left-out blocks speak against it."""
@@ -323,9 +330,13 @@ class GroupedModel:
 
 
 def _cholesky(matrix: FloatArray) -> FloatArray:
-    """Lower factor; where rounding has made the matrix indefinite, of the nearest that it has not (a tighter prior)."""
-    try:
-        return cast(FloatArray, np.linalg.cholesky(matrix))
-    except np.linalg.LinAlgError:
-        rounding = 10.0 * len(matrix) * np.finfo(np.float64).eps * float(np.diag(matrix).max())
-        return cast(FloatArray, np.linalg.cholesky(matrix + rounding * np.eye(len(matrix))))
+    """Lower factor; where rounding has made the matrix indefinite, of the nearest that it has not (a tighter prior).
+
+    Raises:
+        LinAlgError: it is indefinite by more than rounding.
+    """
+    rounding = len(matrix) * np.finfo(np.float64).eps * float(np.diag(matrix).max())
+    for share in (0.0, 10.0, 1e3):
+        with contextlib.suppress(np.linalg.LinAlgError):
+            return cast(FloatArray, np.linalg.cholesky(matrix + share * rounding * np.eye(len(matrix))))
+    return cast(FloatArray, np.linalg.cholesky(matrix + 1e5 * rounding * np.eye(len(matrix))))

@@ -49,6 +49,38 @@ class Linearised:
     groups: dict[str, FloatArray]
 
 
+@dataclass(frozen=True, eq=False)
+class ResidualScaling:
+    """What makes features of the order of 1 where data is, and where on the hand the last load acts.
+
+    Attributes:
+        middle, half: of the ranges of the joints' readings (d,) [rad, m].
+        centre: of the positions (3,) [m].
+        scale: their spread [m].
+        load: place of the last load in the frame of the last link (3,) [m]; None: the marker itself.
+    """
+
+    middle: FloatArray
+    half: FloatArray
+    centre: FloatArray
+    scale: float
+    load: FloatArray | None = None
+
+    @classmethod
+    def of(cls, q: FloatArray, x: FloatArray) -> ResidualScaling:
+        """That of pairs (n, d) [rad, m] and (n, 3) [m], at least one."""
+        low, high = q.min(axis=0), q.max(axis=0)
+        half = np.maximum(0.5 * (high - low), _LEAST_RANGE)
+        centre = x.mean(axis=0)
+        spread = math.sqrt(float(np.square(x - centre).mean()))
+        return cls(0.5 * (low + high), half, centre, max(spread, _LEAST_RANGE))
+
+    @classmethod
+    def whole_turns(cls, joints: int) -> ResidualScaling:
+        """That of pairs nobody has seen yet."""
+        return cls(np.zeros(joints), np.full(joints, math.pi), np.zeros(3), 1.0)
+
+
 class ResidualFeatures:
     """A rigid chain with errors of its joints, of what measures it, and of what nobody has thought of.
 
@@ -58,19 +90,14 @@ class ResidualFeatures:
 
     Args:
         parameters: of the chain.
-        q, x: the pairs (n, d) [rad, m] and (n, 3) [m], at least one: their ranges and spread scale the features.
+        scaling: of the features.
     """
 
-    def __init__(self, parameters: ChainParameters, q: FloatArray, x: FloatArray) -> None:
-        self._parameters = parameters
+    def __init__(self, parameters: ChainParameters, scaling: ResidualScaling) -> None:
+        self.parameters, self.scaling = parameters, scaling
         self._prismatic: BoolArray = parameters.reference.prismatic
         self.joints = parameters.reference.joints
-        low, high = q.min(axis=0), q.max(axis=0)
-        self._middle = 0.5 * (low + high)
-        self._half = np.maximum(0.5 * (high - low), _LEAST_RANGE)
-        self._centre = x.mean(axis=0)
-        self._scale = max(math.sqrt(float(np.square(x - self._centre).mean())), _LEAST_RANGE)
-        low, high = self._middle - self._half, self._middle + self._half
+        low, high = scaling.middle - scaling.half, scaling.middle + scaling.half
         self._stack = BasisStack(learning_bases(low, high, self._prismatic.tolist(), 1.0))
         self._products = {name: _products(self._prismatic, order + 1) for order, name in enumerate(SMOOTH_GROUPS)}
         still = range(min(_MOST_NECK_JOINTS, self.joints - 2) + 1)
@@ -116,8 +143,8 @@ class ResidualFeatures:
         derivatives, not of the positions.
         """
         error, shapes = self._angle_errors(chain, weights, q, groups)
-        p, jacobian = self._parameters.linearised(change, q + error)
-        turns = jacobian[:, :, self._parameters.zeros]
+        p, jacobian = self.parameters.linearised(change, q + error)
+        turns = jacobian[:, :, self.parameters.zeros]
         columns: dict[str, FloatArray] = {}
         for group in groups:
             if self._of_places(group):
@@ -125,12 +152,6 @@ class ResidualFeatures:
             else:
                 columns[group] = (turns[:, :, :, None] * shapes[group][:, None])[:, :, self._mask(group)]
         return Linearised(p + self._offsets(p, q, weights), jacobian, columns)
-
-    def effects(self, change: FloatArray, chain: RigidChain, weights: Weights, q: FloatArray) -> dict[str, float]:
-        """By how much each group moves the positions at q (n, d), root mean square of the distances [m]."""
-        point = self.linearised(change, chain, weights, q, tuple(weights))
-        moves = {group: point.groups[group] @ weights[group] for group in weights}
-        return {group: math.sqrt(float(np.square(move).sum(axis=1).mean())) for group, move in moves.items()}
 
     def _angle_errors(
         self, chain: RigidChain, weights: Weights, q: FloatArray, groups: Sequence[str]
@@ -148,10 +169,10 @@ class ResidualFeatures:
         yielding = [group for group in loaded if group in weights]
         there = q + error
         if yielding:
-            frames = chain.frames(there)
-            there = there + self._weighted({g: self._torques(g, frames) for g in yielding}, weights, q)
-        frames = chain.frames(there)
-        torques = {group: self._torques(group, frames) for group in loaded}
+            frames, places = self._loaded_frames(chain, there)
+            there = there + self._weighted({g: self._torques(g, frames, places) for g in yielding}, weights, q)
+        frames, places = self._loaded_frames(chain, there)
+        torques = {group: self._torques(group, frames, places) for group in loaded}
         return error + self._weighted(torques, weights, q), {**shapes, **torques}
 
     def _weighted(self, shapes: Weights, weights: Weights, q: FloatArray) -> FloatArray:
@@ -185,23 +206,35 @@ class ResidualFeatures:
     def _reading_functions(self, group: str, q: FloatArray) -> FloatArray:
         """φ (n, d, m); of the order of 1 for revolute joints, of the positions' spread [m] for others."""
         if group == "gain":
-            return ((q - self._middle) / self._half * np.where(self._prismatic, self._scale, 1.0))[..., None]
+            units = np.where(self._prismatic, self.scaling.scale, 1.0)
+            return ((q - self.scaling.middle) / self.scaling.half * units)[..., None]
         turns = q if group == "eccentricity" else 2.0 * q
         return np.stack([np.cos(turns), np.sin(turns)], axis=-1)
 
-    def _torques(self, group: str, frames: FloatArray) -> FloatArray:
+    def _loaded_frames(self, chain: RigidChain, q: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """The chain's frames (n, d+1, 4, 4), and where loads are supposed for each joint (n, d or 1, loads, 3)."""
+        frames = chain.frames(q)
+        points = frames[:, :, :3, 3]
+        if self.scaling.load is not None:
+            last = chain.fixed[-1]
+            beside = last[:3, :3].T @ (self.scaling.load - last[:3, 3])
+            points = points.copy()
+            points[:, -1] += frames[:, -1, :3, :3] @ beside
+        return frames, self._places(points)
+
+    def _torques(self, group: str, frames: FloatArray, places: FloatArray) -> FloatArray:
         """Torque (force, for a prismatic joint) about each joint of unit weights at each load's place (n, d, 3 loads).
 
         z·((p − o) × e) = e·(z × (p − o)): a weight's torque is a component of the Jacobian of its place p, here along
         x, y, z of the frame where gravity stands still. Positions' spread counts as the unit of length.
         """
-        axes = np.einsum("nkij,kj->nki", frames[:, :-1, :3, :3], self._parameters.reference.axes)
-        origins, places = frames[:, :-1, :3, 3], self._places(frames[:, :, :3, 3])
-        torques = np.cross(axes[:, :, None], places - origins[:, :, None]) / self._scale
-        torques = np.where(self._prismatic[:, None, None], self._scale * axes[:, :, None], torques)
+        axes = np.einsum("nkij,kj->nki", frames[:, :-1, :3, :3], self.parameters.reference.axes)
+        origins = frames[:, :-1, :3, 3]
+        torques = np.cross(axes[:, :, None], places - origins[:, :, None]) / self.scaling.scale
+        torques = np.where(self._prismatic[:, None, None], self.scaling.scale * axes[:, :, None], torques)
         if self._still[group]:
             torques = torques @ frames[:, self._still[group], :3, :3][:, None]
-        return torques.reshape(*torques.shape[:2], -1)
+        return torques.reshape(*torques.shape[:2], 3 * torques.shape[2])
 
     def _places(self, points: FloatArray) -> FloatArray:
         """Where loads are supposed for each joint (n, d or 1, loads, 3), of the frames' origins (n, d+1, 3)."""
@@ -224,7 +257,7 @@ class ResidualFeatures:
         if group in SMOOTH_GROUPS:
             weights = self._stack.joint_weights(q)[:, :, 1:].reshape(len(q), -1)
             return np.multiply.reduce(weights[:, self._products[group]], axis=2)
-        s = (p - self._centre) / self._scale
+        s = (p - self.scaling.centre) / self.scaling.scale
         degree = CAMERA_GROUPS.index(group) + 1
         monomials = [s[:, list(c)].prod(axis=1) for c in itertools.combinations_with_replacement(range(3), degree)]
         return np.stack([np.ones(len(s)), *monomials] if degree == 1 else monomials, axis=1)

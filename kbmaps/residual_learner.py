@@ -3,32 +3,31 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import asdict
-from typing import Self
+from dataclasses import asdict, replace
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import stdtrit  # pyright: ignore[reportMissingTypeStubs, reportUnknownVariableType]
 
-from kbmaps.arrays import BoolArray, FloatArray, rows, rows_or_vector
+from kbmaps.arrays import BoolArray, FloatArray
 from kbmaps.chain import RigidChain
-from kbmaps.chain_parameters import ChainParameters, ChainTolerances
+from kbmaps.chain_belief import ChainBelief
+from kbmaps.chain_parameters import ChainTolerances
 from kbmaps.errors import KBMapsError, ModelFormatError
 from kbmaps.model import Estimate
-from kbmaps.packed import numbers, pack, unpack
+from kbmaps.packed import chain_arrays, chain_from_arrays, numbers, pack, unpack
 from kbmaps.pairs import checked_pairs, with_units
-from kbmaps.residual_features import ResidualFeatures
+from kbmaps.residual_features import ResidualScaling
 from kbmaps.residual_fit import ResidualFit, fit_residual
+from kbmaps.residual_model import ResidualModel
 from kbmaps.rigid_learner import RigidLearner
 
 _KIND = "rigid chain with residual, batch, 1"
 # Configurations where the model is surer than this times the least sure pair (in variance) lie where data was.
 _SUPPORT_FACTOR = 2.0
 _LEAST_FREEDOM = 10.0
-# Lumped loads on linear springs are true to some per cent of the yielding that they explain.
-_LAW_ERROR = 0.03
 _ONE_SIGMA = 0.841344746
-_BLOCK = 1024
 
 
 class ResidualLearner:
@@ -42,22 +41,30 @@ class ResidualLearner:
     Args:
         nominal: the chain as drawn, or as `find_chain` found it.
         tolerances: how far the real one may be from it.
+        prior: what is believed before the first pair, where more is known than the tolerances: of the same chain, or of
+            its deviations too. So an arm that got another tool is learnt on: `learner.model.with_other_tool(0.2)`.
+
+    Raises:
+        ShapeError: the prior is one of another chain.
     """
 
-    def __init__(self, nominal: RigidChain, tolerances: ChainTolerances) -> None:
-        self._parameters = ChainParameters(nominal)
-        self._std = self._parameters.standard_deviations(tolerances)
-        self._rigid = RigidLearner(nominal, tolerances)
+    def __init__(
+        self, nominal: RigidChain, tolerances: ChainTolerances, prior: ChainBelief | ResidualModel | None = None
+    ) -> None:
+        self._prior = prior if isinstance(prior, ResidualModel) else None
+        self._belief = None if isinstance(prior, ResidualModel) else prior
+        belief = prior.belief if isinstance(prior, ResidualModel) else prior
+        self._rigid = RigidLearner(nominal, tolerances, belief)
         self._q, self._x = np.empty((0, nominal.joints)), np.empty((0, 3))
         self._sigma = np.empty(0)
-        self._features: ResidualFeatures | None = None
+        self._model: ResidualModel | None = None
         self._fit: ResidualFit | None = None
         self._widest = 0.0
 
     @property
     def joints(self) -> int:
         """Number of joints d."""
-        return self._parameters.reference.joints
+        return self._rigid.joints
 
     @property
     def pairs(self) -> int:
@@ -70,18 +77,20 @@ class ResidualLearner:
         return self._rigid
 
     @property
+    def model(self) -> ResidualModel:
+        """What has been learnt, as a value that later learning does not touch."""
+        self._fitted()
+        return self._model_before if self._model is None else self._model
+
+    @property
     def chain(self) -> RigidChain:
         """The rigid part of the model."""
-        fit = self._fitted()
-        return self._rigid.chain if fit is None else fit.chain
+        return self.model.chain
 
     @property
     def deviations(self) -> dict[str, float]:
         """By how much each group of deviations that the pairs speak for moves the learnt positions (RMS) [m]."""
-        fit = self._fitted()
-        if fit is None or self._features is None:
-            return {}
-        return self._features.effects(fit.change, fit.chain, fit.weights, self._q)
+        return self.model.effects(self._q) if self.pairs else {}
 
     @property
     def inliers(self) -> BoolArray:
@@ -103,7 +112,7 @@ class ResidualLearner:
         self._q = np.concatenate([self._q, angles])
         self._x = np.concatenate([self._x, positions])
         self._sigma = np.concatenate([self._sigma, sigmas])
-        self._features = self._fit = None
+        self._model = self._fit = None
 
     def predict(self, q: ArrayLike) -> FloatArray:
         """Positions (n, 3) [m] at q (n, d), or (3,) at q (d,).
@@ -112,11 +121,7 @@ class ResidualLearner:
             ShapeError, NonFiniteError
         """
         fit = self._fitted()
-        if fit is None or self._features is None:
-            return self._rigid.predict(q)
-        angles = rows_or_vector("q", q, self.joints)
-        x = self._features.positions(fit.chain, fit.weights, np.atleast_2d(angles))
-        return x[0] if angles.ndim == 1 else x
+        return self._rigid.predict(q) if fit is None and self._prior is None else self.model.predict(q)
 
     def estimate(self, q: ArrayLike) -> Estimate:
         """Positions at q (n, d), their 1-sigma per axis against the truth, and whether data was there.
@@ -127,10 +132,11 @@ class ResidualLearner:
             ShapeError, NonFiniteError
         """
         fit = self._fitted()
-        if fit is None or self._features is None:
+        if fit is None and self._prior is None:
             return self._rigid.estimate(q)
-        angles = rows("q", q, self.joints)
-        x, variance = self._spread(self._features, fit, angles)
+        x, variance = self.model.predict_with_variance(q)
+        if fit is None:
+            return Estimate(x, np.sqrt(variance), np.zeros(len(x), dtype=np.bool_))
         inside = variance.sum(axis=1) <= _SUPPORT_FACTOR * self._widest
         pairs = with_units(self._q, self._x, self._sigma)
         if pairs.known:
@@ -140,25 +146,19 @@ class ResidualLearner:
 
     def to_bytes(self) -> bytes:
         """The learner with all its pairs; `from_bytes` gives the same predictions to the last bit."""
-        chain = self._parameters.reference
-        arrays = {
-            "fixed": chain.fixed,
-            "axes": chain.axes,
-            "prismatic": chain.prismatic.astype(np.float64),
-            "q": self._q,
-            "x": self._x,
-            "sigma": self._sigma,
-        }
-        return pack(_KIND, asdict(self._rigid.tolerances), arrays)
+        arrays = chain_arrays(self._rigid.nominal) | {"q": self._q, "x": self._x, "sigma": self._sigma}
+        prior, belief = self._prior, self._belief
+        priors = {"model": prior.to_bytes().hex()} if prior else {"belief": belief.to_bytes().hex()} if belief else {}
+        return pack(_KIND, asdict(self._rigid.tolerances) | priors, arrays)
 
     @classmethod
     def from_bytes(cls, data: bytes) -> Self:
         """The learner in `data`. Raises ModelFormatError: it is none of this kind, or damaged."""
         fields, arrays = unpack(data, _KIND)
+        prior = _stored_prior(fields)
         settings = numbers(fields)
         try:
-            chain = RigidChain(arrays["fixed"], arrays["axes"], arrays["prismatic"] != 0.0)
-            learner = cls(chain, ChainTolerances(**settings))
+            learner = cls(chain_from_arrays(arrays), ChainTolerances(**settings), prior)
             sigma = arrays["sigma"]
             told = ~np.isnan(sigma)
             for start, end in _runs(told):
@@ -168,34 +168,45 @@ class ResidualLearner:
             raise ModelFormatError(f"the bytes do not describe a rigid chain with residual: {error}") from error
         return learner
 
+    @property
+    def _model_before(self) -> ResidualModel:
+        """What is known without pairs."""
+        return self._prior or ResidualModel.of_belief(self._rigid.belief)
+
     def _fitted(self) -> ResidualFit | None:
         """The fit; None where the rigid chain is all there is."""
-        if self._features is None and self.pairs:
-            features = ResidualFeatures(self._parameters, self._q, self._x)
+        if self._model is None and self.pairs:
             pairs = with_units(self._q, self._x, self._sigma)
-            fit = None
+            before = self._prior
+            if before is None or not before.weights:
+                load = None if before is None else before.features.scaling.load
+                scaling = replace(ResidualScaling.of(self._q, self._x), load=load)
+                before = ResidualModel.of_belief(self._rigid.prior, scaling, 0.0 if before is None else before.noise)
             # Noise that nobody told must be seen in residuals that the chain alone leaves, or anything explains them.
-            if pairs.known or self._rigid.report().freedom >= _LEAST_FREEDOM:
-                fit = fit_residual(features, self._parameters, self._std, pairs, self._rigid.change)
-            if fit is not None:
-                _, variance = self._spread(features, fit, self._q[fit.inliers])
+            if pairs.known or before.noise > 0.0 or self._rigid.report().freedom >= _LEAST_FREEDOM:
+                self._fit = fit_residual(before, pairs, self._rigid.change)
+            self._model = self._rigid_model(before) if self._fit is None else self._fit.model
+            if self._fit is not None:
+                _, variance = self._model.predict_with_variance(self._q[self._fit.inliers])
                 self._widest = float(variance.sum(axis=1).max(initial=0.0))
-            self._features, self._fit = features, fit
         return self._fit
 
-    def _spread(self, features: ResidualFeatures, fit: ResidualFit, q: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Positions and the variance of each coordinate, both (n, 3)."""
-        free = self._std > 0.0
-        x, variance = np.empty((len(q), 3)), np.empty((len(q), 3))
-        for start in range(0, len(q), _BLOCK):
-            part = slice(start, start + _BLOCK)
-            point = features.linearised(fit.change, fit.chain, fit.weights, q[part], tuple(fit.weights))
-            design = np.concatenate([point.chain[:, :, free] * fit.scales, *point.groups.values()], axis=2)
-            x[part], variance[part] = point.x, np.square(design @ fit.spread).sum(axis=2)
-            for group in features.approximate(fit.weights):
-                move = point.groups[group] @ fit.weights[group]
-                variance[part] += _LAW_ERROR**2 / 3.0 * np.square(move).sum(axis=1, keepdims=True)
-        return x, variance
+    def _rigid_model(self, before: ResidualModel) -> ResidualModel:
+        report = self._rigid.report()
+        noise = report.noise * report.misfit if report.freedom >= _LEAST_FREEDOM else before.noise
+        return ResidualModel.of_belief(self._rigid.belief, before.features.scaling, noise)
+
+
+def _stored_prior(fields: dict[str, Any]) -> ChainBelief | ResidualModel | None:
+    """The prior in the fields of stored bytes, taken out of them. Raises ModelFormatError."""
+    kinds = {"model": ResidualModel.from_bytes, "belief": ChainBelief.from_bytes}
+    for name, read in kinds.items():
+        if name in fields:
+            try:
+                return read(bytes.fromhex(fields.pop(name)))
+            except (TypeError, ValueError) as error:
+                raise ModelFormatError(f"the field {name} is not hexadecimal") from error
+    return None
 
 
 def _runs(values: BoolArray) -> list[tuple[int, int]]:

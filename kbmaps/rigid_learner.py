@@ -95,6 +95,11 @@ class RigidLearner:
         return self._tolerances
 
     @property
+    def prior(self) -> ChainBelief:
+        """What was believed before the first pair."""
+        return self._prior
+
+    @property
     def belief(self) -> ChainBelief:
         """What the pairs let believe of the chain; the prior without pairs."""
         fit = self._fitted()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from .learning import Learning
+from .learnt import LearntModel
 from .nominal import NominalModel
 from .snapshot import NoFrameError, Prediction, Snapshot
 from .solver import DirectSolver, Solved, Solver, Task
@@ -12,6 +13,7 @@ __all__ = [
     "DirectSolver",
     "Learning",
     "LearningState",
+    "LearntModel",
     "NoFrameError",
     "NominalModel",
     "Prediction",

@@ -9,9 +9,9 @@ import msgspec
 import numpy as np
 
 from interfaces.records import FloatArray
-from kbmaps import ChainBelief, Contest, JointBasis, SupportSet
+from kbmaps import ChainBelief, Contest, JointBasis, ResidualModel, SupportSet
 
-from .members import INSTANT, PRIOR, RIGID, TRUSTED
+from .members import INSTANT, PRIOR, RESIDUAL, RIGID, TRUSTED
 from .misfit import misfit
 from .scores import ErrorMemory
 from .unknowns import ChainLayer, Layer, Unknowns
@@ -54,8 +54,9 @@ class ClaimsState(msgspec.Struct, kw_only=True):
         misfits: what each solution misses at pairs that it knows, 1-sigma per axis [m].
         prior_errors: those of the prior, over longer.
         arm_sigma: 1-sigma of the prior before the tool was changed [m].
-        misfit_before: what the rigid chain missed with the last tool, 1-sigma per axis [m].
+        misfits_before: what each missed with the last tool, 1-sigma per axis [m].
         belief: what is believed of the chain, as bytes; None before the first solution.
+        residual: the chain with residual, as bytes; None before its first solution.
     """
 
     errors: dict[str, ErrorMemory]
@@ -63,10 +64,11 @@ class ClaimsState(msgspec.Struct, kw_only=True):
     judged: int
     residuals: ErrorMemory | None
     misfits: dict[str, tuple[float, float, float]]
-    misfit_before: tuple[float, float, float]
+    misfits_before: dict[str, tuple[float, float, float]]
     prior_errors: ErrorMemory
     arm_sigma: float | None
     belief: bytes | None
+    residual: bytes | None
 
 
 class Claims:
@@ -79,7 +81,7 @@ class Claims:
 
     def __init__(self, bases: Sequence[JointBasis], expected_m: float) -> None:
         self._unknowns = Unknowns(bases)
-        self._misfit_before = np.zeros(3)
+        self._misfits_before: dict[str, FloatArray] = {}
         self._begin(expected_m)
 
     def _begin(self, expected_m: float) -> None:
@@ -90,12 +92,17 @@ class Claims:
         self._misfits: dict[str, FloatArray] = {}
         self._prior_errors = ErrorMemory(expected_m, discount=PRIOR_DISCOUNT)
         self._asked: SupportSet | None = None
-        self._solved: SupportSet | None = None
+        self._solved: dict[str, SupportSet | None] = {}
         self._belief: ChainBelief | None = None
+        self._residual: ResidualModel | None = None
 
     def best(self, present: str) -> str:
         """The model that shall answer; `present` while there is nothing to compare."""
         return self._contest.best(TRUSTED, present)
+
+    def best_map(self, present: str) -> str:
+        """The best of the models that are KB-Maps; `present` while there is nothing to compare."""
+        return self._contest.best([name for name in TRUSTED if name != RESIDUAL], present)
 
     @property
     def support(self) -> SupportSet | None:
@@ -113,6 +120,11 @@ class Claims:
         return self._belief
 
     @property
+    def residual(self) -> ResidualModel | None:
+        """What the pairs with the present tool let believe of the arm as no rigid chain; None before that is solved."""
+        return self._residual
+
+    @property
     def arm_configurations(self) -> FloatArray:
         """The configurations (n, d) [rad] that stand for all data, with any tool."""
         return self._unknowns.arm_configurations
@@ -120,7 +132,7 @@ class Claims:
     def change_tool(self, expected_m: float) -> None:
         """Another tool: a new prior with other errors, and what was not known of the arm is not known now."""
         self._unknowns.change_tool(self._prior_sigma)
-        self._misfit_before = self._misfits.get(RIGID, self._misfit_before)
+        self._misfits_before |= self._misfits
         self._begin(expected_m)
 
     def predicted(
@@ -160,19 +172,25 @@ class Claims:
         """The solver works on all pairs up to here."""
         self._asked = self._unknowns.support
 
-    def solution_taken(self, name: str, errors: FloatArray, belief: ChainBelief | None, *, neighbours: bool) -> None:
+    def solution_taken(
+        self, name: str, errors: FloatArray, belief: ChainBelief | ResidualModel | None, *, neighbours: bool
+    ) -> None:
         """A solution answers for this model from now on.
 
         Args:
             errors: its errors (n, 3) [m] at pairs that it knows, in their order.
-            belief: what is believed of the chain now; None: as before.
+            belief: what is believed of the arm now; None: as before.
             neighbours: whether these pairs follow a path.
         """
         self.errors.setdefault(name, ErrorMemory(self._expected_m))
-        self._solved = self._asked
-        self._belief = belief or self._belief
+        self._solved[name] = self._asked
+        if isinstance(belief, ResidualModel):
+            self._residual = belief
+        elif belief is not None:
+            self._belief = belief
         noise = self.errors[PRIOR].noise_variance
-        self._misfits[name] = misfit(errors, noise, self._misfit_before, neighbours=neighbours)
+        before = self._misfits_before.get(name, self._misfits_before.get(RIGID, np.zeros(3)))
+        self._misfits[name] = misfit(errors, noise, before, neighbours=neighbours)
 
     def prior_changed(self, errors: FloatArray) -> None:
         """Another prior for the same pairs; its errors (n, 3) [m] at them."""
@@ -189,10 +207,12 @@ class Claims:
         memory = self.errors.get(name, ErrorMemory(self._expected_m))
         if name == PRIOR:
             return Claim(memory.sigma)
-        if name in self._misfits and self._belief is not None:
-            # Where no data was, the arm may be less rigid than it was seen to be by as much again.
-            rest = float(np.sqrt(np.square(self._misfits[RIGID]).mean()))
-            return Claim(self._misfits[name], (ChainLayer(self._belief), Layer(self._solved, rest)), memory.surprise)
+        chain = self._residual if name == RESIDUAL else self._belief
+        if name in self._misfits and chain is not None:
+            # Where no data was, the arm may differ from the chain by as much again as it was seen to.
+            rest = float(np.sqrt(np.square(self._misfits[RESIDUAL if name == RESIDUAL else RIGID]).mean()))
+            layers = ChainLayer(chain), Layer(self._solved.get(name), rest)
+            return Claim(self._misfits[name], layers, memory.surprise)
         inside = memory if self._residuals is None else self._residuals
         return Claim(inside.sigma, self._unknowns.layers(self._prior_sigma), memory.surprise)
 
@@ -204,10 +224,11 @@ class Claims:
             judged=self._contest.pairs,
             residuals=self._residuals,
             misfits={name: _triple(missed) for name, missed in self._misfits.items()},
-            misfit_before=_triple(self._misfit_before),
+            misfits_before={name: _triple(missed) for name, missed in self._misfits_before.items()},
             prior_errors=self._prior_errors,
             arm_sigma=self._unknowns.arm_sigma,
             belief=None if self._belief is None else self._belief.to_bytes(),
+            residual=None if self._residual is None else self._residual.to_bytes(),
         )
 
     def restore(self, state: ClaimsState, arm_configurations: FloatArray, q: FloatArray) -> None:
@@ -221,9 +242,11 @@ class Claims:
         self.errors, self._residuals = dict(state.errors), state.residuals
         self._contest, self._prior_errors = Contest(state.contest, state.judged), state.prior_errors
         self._misfits = {name: np.array(missed) for name, missed in state.misfits.items()}
-        self._misfit_before = np.array(state.misfit_before)
+        self._misfits_before = {name: np.array(missed) for name, missed in state.misfits_before.items()}
         self._belief = None if state.belief is None else ChainBelief.from_bytes(state.belief)
-        self._asked = self._solved = self._unknowns.support
+        self._residual = None if state.residual is None else ResidualModel.from_bytes(state.residual)
+        self._asked = self._unknowns.support
+        self._solved = dict.fromkeys(self._misfits, self._asked)
 
     @property
     def _prior_sigma(self) -> float:

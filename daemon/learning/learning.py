@@ -15,7 +15,7 @@ from daemon.config import LearnerConfig
 from daemon.status import CurvePoint
 from interfaces.errors import RequestError
 from interfaces.records import FloatArray, Pair
-from kbmaps import ChainBelief, ChainTolerances, KBMap, follow_a_path
+from kbmaps import ChainBelief, ChainTolerances, KBMap, ResidualModel, follow_a_path
 
 from .claims import Claims
 from .curve import Curve
@@ -188,6 +188,7 @@ class Learning:
                 first_fit=self._fitting.is_first,
                 replays_due=self._replays_due,
                 belief=None if self._belief is None else self._belief.to_bytes(),
+                residual=None if self._residual is None else self._residual.to_bytes(),
             )
             kept = {"arm_q": self._claims.arm_configurations} | self._fitting.arrays()
         kept |= {"q": q, "x": x, "doubted_q": doubted_q, "doubted_x": doubted_x}
@@ -206,13 +207,15 @@ class Learning:
         with self._lock:
             if nets:
                 belief = None if header.belief is None else ChainBelief.from_bytes(header.belief)
-                self._begin(KBMap(self._nominal.bases, nets[PRIOR]), belief)
-                self._members_now.restore(nets)
+                residual = None if header.residual is None else ResidualModel.from_bytes(header.residual)
+                self._begin(KBMap(self._nominal.bases, nets[PRIOR]), belief, residual)
             else:
                 self._begin_at_nominal()
             self._fitting.restore(header.next_fit, header.first_fit, state.arrays)
             self._claims = Claims(self._nominal.bases, EXPECTED_M)
             self._claims.restore(header.claims, state.arrays["arm_q"], state.arrays["q"])
+            if nets:
+                self._members_now.restore(nets, self._claims.residual)
             self._memory.restore(state.arrays["q"], state.arrays["x"], header.kept_of)
             self._solve_from_what_is_known()
             for q, x in zip(state.arrays["doubted_q"], state.arrays["doubted_x"], strict=True):
@@ -232,10 +235,13 @@ class Learning:
             self._nominal.belief(self._nominal.chain, self._tolerances) if known else None,
         )
 
-    def _begin(self, prior: KBMap | None, belief: ChainBelief | None) -> None:
-        """Start anew from `prior` and what is believed of the chain (None: wait for an alignment), with no pairs."""
+    def _begin(self, prior: KBMap | None, belief: ChainBelief | None, residual: ResidualModel | None = None) -> None:
+        """Start anew from `prior` and what is believed of the chain (None: wait for an alignment), with no pairs.
+
+        `residual`: what is known of the arm beyond that.
+        """
         self._members = Members(prior, self._settings.step_size) if prior is not None else None
-        self._belief = belief
+        self._belief, self._residual = belief, residual
         self._answering = PRIOR
         self._memory.clear()
         self._doubts.clear()
@@ -303,13 +309,21 @@ class Learning:
         if self._gate.in_a_row < FEWEST_FOR_CHANGE:
             return False
         q, x = self._doubted_run()
-        moved = self._fitting.with_other_tool(self._members_now.maps[self._answering], q, x)
+        kbmap = self._best_map(self._members_now)
+        # What the answering model knows beyond the map it knows with any tool.
+        x = x - (self._members_now.models[self._answering].predict(q) - kbmap.predict(q))
+        moved = self._fitting.with_other_tool(kbmap, q, x)
         return belong_together(np.linalg.norm(x - moved.predict(q), axis=1), expected_m)
+
+    def _best_map(self, members: Members) -> KBMap:
+        """The answering model if it is a KB-Map, else the best that is one."""
+        answering = self._answering
+        return members.maps[answering if answering in members.maps else self._claims.best_map(PRIOR)]
 
     def _follow_change(self) -> None:
         """The doubted pairs in a row are the new truth: begin again with them."""
         run_q, run_x = self._doubted_run()
-        distances = np.linalg.norm(self._members_now.maps[self._answering].predict(run_q) - run_x, axis=1)
+        distances = np.linalg.norm(self._members_now.models[self._answering].predict(run_q) - run_x, axis=1)
         self._change_tool(max(float(np.median(distances)), EXPECTED_M), first_fit=len(run_q))
         for q, x in zip(run_q, run_x, strict=True):
             self._keep(q, x)
@@ -322,11 +336,13 @@ class Learning:
         if self._members is None or self._belief is None:
             self._begin_at_nominal()
         else:
-            before = self._members.maps[self._answering]
+            before = self._best_map(self._members)
             belief = (self._claims.belief or self._belief).with_other_tool(OTHER_TOOL_M)
+            known = self._claims.residual or self._residual
+            residual = None if known is None else known.with_other_tool(OTHER_TOOL_M)
             self._claims.change_tool(expected_m)
             self._fitting.change_tool(before, first_fit)
-            self._begin(before, belief)
+            self._begin(before, belief, residual)
 
     def _fit(self) -> bool:
         """Fit what is not known, or a changed tool, when it is due."""
@@ -367,6 +383,7 @@ class Learning:
         members = self._members
         if members is not None and EXACT in members.maps and not self._memory.complete:
             self._solver_prior, self._belief = members.maps[EXACT], self._claims.belief or self._belief
+            self._residual = self._claims.residual or self._residual
 
     def _change_prior(self, members: Members, prior: KBMap) -> None:
         q, x = self._memory.all()
@@ -394,7 +411,8 @@ class Learning:
             if self._members is None or self._belief is None:
                 return False
             known = self._solver_prior
-            task = Task(self._task, known or self._members.prior, self._belief, prior_stays=known is not None)
+            prior = known or self._members.prior
+            task = Task(self._task, prior, self._belief, self._residual, prior_stays=known is not None)
         if solving.busy:
             return self._take_solution()
         if solving.begin(task):
@@ -419,10 +437,10 @@ class Learning:
         if solved is None:
             return False
         with self._lock:
-            if solved.task == self._task and solved.map is not None:
-                self._members_now.take(solved.name, solved.map)
+            if solved.task == self._task and solved.model is not None:
+                self._members_now.take(solved.name, solved.model)
                 q, x = self._memory.some(self._solving.fed, LOOKED_BACK)
-                errors, neighbours = x - solved.map.predict(q), follow_a_path(solved.map, q)
+                errors, neighbours = x - solved.model.predict(q), follow_a_path(self._members_now.prior, q)
                 self._claims.solution_taken(solved.name, errors, solved.belief, neighbours=neighbours)
                 self._publish()
         return True
@@ -445,7 +463,8 @@ class Learning:
         members = self._members
         self._snapshot = Snapshot(
             answering=self._answering,
-            map=members.maps[self._answering] if members is not None else None,
+            model=members.models[self._answering] if members is not None else None,
+            map=self._best_map(members) if members is not None else None,
             claim=self._claims.of(self._answering),
             support=self._claims.support,
             pairs=self._counters.pairs,

@@ -9,14 +9,16 @@ import numpy as np
 from interfaces.records import FloatArray
 from kbmaps import NLMS, KBMap, NonFiniteError
 
-PRIOR, INSTANT, RIGID, EXACT = "prior", "nlms", "rigid", "exact"
-SOLVED = (RIGID, EXACT)
+from .learnt import LearntModel
+
+PRIOR, INSTANT, RIGID, RESIDUAL, EXACT = "prior", "nlms", "rigid", "residual", "exact"
+SOLVED = (RIGID, RESIDUAL, EXACT)
 # Who is believed first when the errors do not tell: what has fewer numbers says more about places without data.
-TRUSTED = (RIGID, EXACT, PRIOR, INSTANT)
+TRUSTED = (RIGID, RESIDUAL, EXACT, PRIOR, INSTANT)
 
 
 class Members:
-    """All in the bases of the prior.
+    """KB-Maps in the bases of the prior, and a chain with residual.
 
     Between two solutions the solved ones stay as they are. Instant steps on top of them would follow the newest pairs,
     and spoil them beside their path: measured, the error a few degrees away grew from 7 to 10 mm within 20 pairs.
@@ -25,6 +27,7 @@ class Members:
     def __init__(self, prior: KBMap, step_size: float) -> None:
         self._step_size = step_size
         self._maps = {PRIOR: prior, INSTANT: prior}
+        self._residual: LearntModel | None = None
         self._instant = NLMS(prior, step_size)
         self._asked: KBMap | None = None
         self._delayed: KBMap | None = None
@@ -36,8 +39,13 @@ class Members:
 
     @property
     def maps(self) -> Mapping[str, KBMap]:
-        """The present models; none of them is touched by later learning."""
+        """Those of the present models that are KB-Maps; none of them is touched by later learning."""
         return self._maps
+
+    @property
+    def models(self) -> Mapping[str, LearntModel]:
+        """The present models."""
+        return self._maps if self._residual is None else {**self._maps, RESIDUAL: self._residual}
 
     @property
     def prior(self) -> KBMap:
@@ -46,7 +54,7 @@ class Members:
 
     def errors(self, q: FloatArray, x: FloatArray) -> dict[str, FloatArray]:
         """Measured minus predicted position (3,) [m] by model, for one pair."""
-        return {name: x - model.predict(q) for name, model in self._maps.items()}
+        return {name: x - model.predict(q) for name, model in self.models.items()}
 
     def learn(self, q: FloatArray, error: FloatArray, limit_m: float) -> None:
         """One step of the instant learner for the pair at q (d,), where its error (3,) [m] counts up to `limit_m`."""
@@ -63,9 +71,12 @@ class Members:
         """The solver works on all pairs up to here."""
         self._asked = self._maps[INSTANT]
 
-    def take(self, name: str, solution: KBMap) -> None:
+    def take(self, name: str, solution: LearntModel) -> None:
         """The solver's solution for one of the models of what it was asked."""
-        self._maps[name] = solution
+        if isinstance(solution, KBMap):
+            self._maps[name] = solution
+        else:
+            self._residual = solution
         self._delayed = self._asked
 
     def start_again(self, prior: KBMap, q: FloatArray, x: FloatArray) -> None:
@@ -77,11 +88,12 @@ class Members:
         self._instant = NLMS(prior, self._step_size)
         self.replay(q, x)
 
-    def restore(self, nets: Mapping[str, FloatArray]) -> None:
-        """The models that `nets` names."""
+    def restore(self, nets: Mapping[str, FloatArray], residual: LearntModel | None) -> None:
+        """The KB-Maps that `nets` names, and the chain with residual."""
+        self._residual = residual
         self._maps |= {name: KBMap(self.prior.bases, net) for name, net in nets.items()}
         self._instant = NLMS(self._maps[INSTANT], self._step_size)
-        if any(name in self._maps for name in SOLVED):
+        if any(name in self.models for name in SOLVED):
             self._delayed = self._maps[INSTANT]
 
     def _renew(self) -> None:

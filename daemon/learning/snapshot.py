@@ -13,6 +13,7 @@ from interfaces.records import FloatArray
 from kbmaps import KBMap, SupportSet
 
 from .claims import Claim
+from .learnt import LearntModel
 from .unknowns import unexplained
 
 # Beyond this share of the prior's variance left open, joint angles do not lie where data was.
@@ -46,15 +47,17 @@ class Snapshot:
 
     Attributes:
         answering: which one it is.
-        map: None while the frame is not known.
+        model: None while the frame is not known.
+        map: the best of the models that are KB-Maps, for whoever wants a file; mostly the same one.
         claim: what is claimed of its error.
         support: where data with the present tool was; None before any.
         pairs: how many pairs it had learnt.
         learnt_at: time of the last of them [s], or None.
-        waiting_for: what is missing while there is no map.
+        waiting_for: what is missing while there is no model.
     """
 
     answering: str
+    model: LearntModel | None
     map: KBMap | None
     claim: Claim
     support: SupportSet | None
@@ -65,17 +68,23 @@ class Snapshot:
     @cached_property
     def digest(self) -> str:
         """Hash of the model, empty while there is none."""
-        return self.map.digest if self.map is not None else ""
+        return self.model.digest if self.model is not None else ""
+
+    def require_model(self) -> LearntModel:
+        """The model; NoFrameError when there is none yet."""
+        if self.model is None:
+            raise NoFrameError(self.waiting_for)
+        return self.model
 
     def require_map(self) -> KBMap:
-        """The map; NoFrameError when there is none yet."""
+        """The best KB-Map; NoFrameError when there is none yet."""
         if self.map is None:
             raise NoFrameError(self.waiting_for)
         return self.map
 
     def predict(self, q: FloatArray) -> Prediction:
-        """Predictions for joint angles q (n, d) [rad]; NoFrameError while there is no map."""
-        x = self.require_map().predict(q)
+        """Predictions for joint angles q (n, d) [rad]; NoFrameError while there is no model."""
+        x = self.require_model().predict(q)
         return Prediction(x, np.sqrt(self.claim.variance(q)), unexplained(self.support, q) < IN_SUPPORT)
 
     def expected_error_m(self, q: FloatArray) -> float:

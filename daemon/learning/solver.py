@@ -1,7 +1,8 @@
-"""What is solved for all pairs at once, beside the instant learner: the rigid chain, and the map around it."""
+"""What is solved for all pairs at once: the rigid chain, the map around it, and the chain with what it errs by."""
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -15,6 +16,9 @@ from kbmaps import (
     ChainTolerances,
     ExactLearner,
     KBMap,
+    NonFiniteError,
+    ResidualLearner,
+    ResidualModel,
     RigidLearner,
     SettingError,
     blockwise_precision,
@@ -22,7 +26,10 @@ from kbmaps import (
     shared_by,
 )
 
-from .members import EXACT, RIGID
+from .learnt import LearntModel
+from .members import EXACT, RESIDUAL, RIGID
+
+log = logging.getLogger(__name__)
 
 # Memory and time grow with the square and the cube of the control points: 3^7 take 77 MB and 0.2 s.
 LARGEST_NET = 2187
@@ -33,6 +40,8 @@ RETUNE = 1.25
 KEPT, FOLDED = 4000, 2000
 # Of so many pairs, evenly spread, a chain is fitted.
 FITTED = 2000
+# The chain with residual takes longest, up to a second: it is solved anew when the pairs have grown by this factor.
+RESIDUAL_GROWTH = 1.15
 # From so many neighbours on that count as one, their errors are no chance.
 SHARED = 1.5
 
@@ -45,6 +54,7 @@ class Task:
         number: tells it from other tasks.
         prior: the map to start from; its bases are what is learnt in.
         belief: what is believed of the chain before the first pair of this task.
+        residual: what is known of the arm beyond that; None: nothing.
         prior_stays: whether the exact map holds to `prior`, and not to the rigid chain: it stands for pairs that are
             no longer kept.
     """
@@ -52,6 +62,7 @@ class Task:
     number: int
     prior: KBMap
     belief: ChainBelief
+    residual: ResidualModel | None = None
     prior_stays: bool = False
 
 
@@ -63,16 +74,16 @@ class Solved:
         task: number of the task it belongs to.
         pairs: how many pairs it is the solution of.
         name: the model; empty when these pairs have no solution.
-        map: None when these pairs have no solution.
-        belief: what is believed of the chain now; None where that is as before.
+        model: None when these pairs have no solution.
+        belief: what is believed of the arm now; None where that is as before.
         last: whether this is all that one `solve` gives.
     """
 
     task: int
     pairs: int
     name: str = ""
-    map: KBMap | None = None
-    belief: ChainBelief | None = None
+    model: LearntModel | None = None
+    belief: ChainBelief | ResidualModel | None = None
     last: bool = True
 
 
@@ -102,6 +113,8 @@ class DirectSolver:
     def __init__(self) -> None:
         self._task: Task | None = None
         self._folded: ChainBelief | None = None
+        self._folded_residual: ChainBelief | ResidualModel | None = None
+        self._residual_at = 0
         self._exact: ExactLearner | None = None
         self._precision: float | None = None
         self._tuned_at = self._pairs = 0
@@ -110,9 +123,9 @@ class DirectSolver:
 
     def start(self, task: Task) -> None:
         """Forget all pairs and begin a new task."""
-        self._task, self._folded = task, task.belief
+        self._task, self._folded, self._folded_residual = task, task.belief, task.residual or task.belief
         self._exact = ExactLearner(task.prior) if task.prior.size <= LARGEST_NET else None
-        self._precision, self._tuned_at, self._pairs, self._solved = None, 0, 0, []
+        self._precision, self._tuned_at, self._residual_at, self._pairs, self._solved = None, 0, 0, 0, []
         self._q, self._x = np.empty((0, task.prior.joints)), np.empty((0, 3))
 
     def learn(self, q: FloatArray, x: FloatArray) -> None:
@@ -123,6 +136,8 @@ class DirectSolver:
         self._q, self._x = np.vstack([self._q, q]), np.vstack([self._x, x])
         while len(self._q) > KEPT:
             self._folded = fitted_belief(self._before, self._q[:FOLDED], self._x[:FOLDED])
+            before = self._residual_before
+            self._folded_residual = fitted_residual(before, self._q[:FOLDED], self._x[:FOLDED]) or before
             self._q, self._x = self._q[FOLDED:], self._x[FOLDED:]
 
     def solve(self) -> None:
@@ -138,13 +153,18 @@ class DirectSolver:
         task = self._started
         belief = fitted_belief(self._before, self._q, self._x)
         rigid = belief.chain.to_kbmap(task.prior.bases)
-        yield Solved(task.number, self._pairs, RIGID, rigid, belief, last=self._exact is None)
+        residual_due = self._pairs >= RESIDUAL_GROWTH * self._residual_at
+        yield Solved(task.number, self._pairs, RIGID, rigid, belief, last=self._exact is None and not residual_due)
         if self._exact is not None:
             if not task.prior_stays:
                 self._exact.rebase(rigid)
-            yield self._solve_exact(task, self._exact)
+            yield self._solve_exact(task, self._exact, last=not residual_due)
+        if residual_due:
+            self._residual_at = self._pairs
+            residual = fitted_residual(self._residual_before, self._q, self._x)
+            yield Solved(task.number, self._pairs, RESIDUAL if residual else "", residual, residual)
 
-    def _solve_exact(self, task: Task, learner: ExactLearner) -> Solved:
+    def _solve_exact(self, task: Task, learner: ExactLearner, *, last: bool) -> Solved:
         """Least squares around the rigid chain.
 
         The evidence finds the prior's precision where pairs are apart. On a guided path neighbours share their
@@ -156,10 +176,10 @@ class DirectSolver:
         except SettingError:
             # The precision was lost in rounding: without a solution the others go on answering.
             self._precision = None
-            return Solved(task.number, learner.pairs)
+            return Solved(task.number, learner.pairs, last=last)
         if retune:
             self._precision, self._tuned_at = solution.prior_precision or None, learner.pairs
-        return Solved(task.number, learner.pairs, EXACT, solution.map)
+        return Solved(task.number, learner.pairs, EXACT, solution.map, last=last)
 
     def _sought_precision(self, prior: KBMap) -> float | Literal["evidence"]:
         return blockwise_precision(prior, self._q, self._x) if follow_a_path(prior, self._q) else "evidence"
@@ -177,14 +197,20 @@ class DirectSolver:
             raise RuntimeError("start a task first")
         return self._folded
 
+    @property
+    def _residual_before(self) -> ChainBelief | ResidualModel:
+        """What is believed of the arm before the pairs that are kept."""
+        if self._folded_residual is None:
+            raise RuntimeError("start a task first")
+        return self._folded_residual
+
 
 def fitted_belief(prior: ChainBelief, q: FloatArray, x: FloatArray) -> ChainBelief:
     """What is believed of a chain after pairs q (n, d) [rad] and x (n, 3) [m] along a path.
 
     Neighbours share part of their errors. So many pairs count as one as do so.
     """
-    chosen = np.linspace(0, len(q) - 1, min(len(q), FITTED)).round().astype(np.intp)
-    q, x = q[chosen], x[chosen]
+    q, x = _spread(q, x)
     learner = RigidLearner(prior.parameters.reference, ChainTolerances(), prior)
     learner.learn(q, x)
     inliers = learner.inliers
@@ -194,3 +220,25 @@ def fitted_belief(prior: ChainBelief, q: FloatArray, x: FloatArray) -> ChainBeli
     again = RigidLearner(prior.parameters.reference, ChainTolerances(), prior)
     again.learn(q[inliers], x[inliers], learner.report().noise * math.sqrt(shared))
     return again.belief
+
+
+def fitted_residual(prior: ChainBelief | ResidualModel, q: FloatArray, x: FloatArray) -> ResidualModel | None:
+    """What is believed of an arm that is no rigid chain after pairs q (n, d) [rad] and x (n, 3) [m] along a path.
+
+    None where it was lost in rounding: the other models go on answering.
+    """
+    q, x = _spread(q, x)
+    parameters = prior.parameters if isinstance(prior, ChainBelief) else prior.features.parameters
+    learner = ResidualLearner(parameters.reference, ChainTolerances(), prior)
+    learner.learn(q, x)
+    try:
+        return learner.model
+    except (np.linalg.LinAlgError, NonFiniteError) as error:
+        log.warning("the chain with residual has no solution for %d pairs: %s", len(q), error)
+        return None
+
+
+def _spread(q: FloatArray, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """At most `FITTED` of the pairs, evenly spread."""
+    chosen = np.linspace(0, len(q) - 1, min(len(q), FITTED)).round().astype(np.intp)
+    return q[chosen], x[chosen]

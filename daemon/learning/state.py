@@ -52,6 +52,7 @@ class LearningHeader(msgspec.Struct, kw_only=True):
         first_fit: whether that is the first one.
         replays_due: replay steps that are still owed.
         belief: what was believed of the chain before the first of these pairs, as bytes; None before the alignment.
+        residual: what was known of the arm beyond that, as bytes; None if nothing was.
     """
 
     fingerprint: str
@@ -66,6 +67,7 @@ class LearningHeader(msgspec.Struct, kw_only=True):
     first_fit: bool
     replays_due: float
     belief: bytes | None
+    residual: bytes | None
 
 
 @dataclass(frozen=True)

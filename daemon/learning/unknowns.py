@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from interfaces.records import FloatArray
-from kbmaps import ChainBelief, JointBasis, SupportSet
+from kbmaps import ChainBelief, JointBasis, ResidualModel, SupportSet
 
 
 @dataclass(frozen=True)
@@ -31,9 +31,9 @@ class Layer:
 
 @dataclass(frozen=True, eq=False)
 class ChainLayer:
-    """What the data leave open of a rigid chain."""
+    """What the data leave open of a chain, rigid or with what it does beside it."""
 
-    belief: ChainBelief
+    belief: ChainBelief | ResidualModel
 
     def variance(self, q: FloatArray) -> FloatArray:
         """Variance of each coordinate that is left open at q (n, d) [rad], shape (n, 3) [m²]."""

@@ -20,7 +20,7 @@ from kbmaps import (
 )
 from kbmaps.chain_parameters import ChainParameters
 from kbmaps.residual_evidence import GroupedModel, Moments
-from kbmaps.residual_features import ResidualFeatures
+from kbmaps.residual_features import ResidualFeatures, ResidualScaling
 
 SIGMA = 0.005
 
@@ -253,7 +253,7 @@ def test_derivatives_of_every_group_agree_with_differences(rng, kinds):
     arm = rough_arm(rng, kinds)
     q = random_q(rng, kinds, 8, 60.0)
     parameters = ChainParameters(arm.nominal)
-    features = ResidualFeatures(parameters, q, arm.real.positions(q))
+    features = ResidualFeatures(parameters, ResidualScaling.of(q, arm.real.positions(q)))
     chain = parameters.chain(arm.change)
     for group in features.groups():
         weights = {group: 1e-6 * rng.normal(size=features.size(group))}

@@ -1,0 +1,121 @@
+"""An arm that sags: the chain with residual answers, survives a restart, and knows the arm with another tool."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from guided_arm import built_chain, make_pair, near, new_learning, nominal_model, path, teach
+
+from daemon.learning import DirectSolver, Learning, LearntModel, Task
+from daemon.learning.members import RESIDUAL
+from daemon.solver_process import SolverProcess
+from interfaces.records import FloatArray, Pair
+from kbmaps import ChainTolerances, KBMap, ResidualModel, RigidChain
+
+SIGMA_M = 0.002
+DOWN = np.array([0.1, 0.2, -0.97])
+TOOL = np.array([0.1, 0.2, -0.1])
+PAIRS = 300
+
+
+class SaggingArm:
+    """Joints that yield by some degrees under a weight where the marker was at first."""
+
+    def __init__(self, seed: int) -> None:
+        self.rng = np.random.default_rng(seed)
+        self.chain = built_chain(self.rng)
+        self.q = path(self.rng, PAIRS + 60)
+
+    def positions(self, q: FloatArray, marker: RigidChain | None = None) -> FloatArray:
+        torques = np.einsum("nij,i->nj", self.chain.jacobian(q), DOWN)
+        return (marker or self.chain).positions(q + 0.3 * torques)
+
+    def pairs(self, part: slice, marker: RigidChain | None = None) -> list[Pair]:
+        x = self.positions(self.q[part], marker)
+        noise = SIGMA_M * self.rng.normal(size=x.shape)
+        return [make_pair(part.start + k + 1, self.q[part][k], x[k] + noise[k], SIGMA_M) for k in range(len(x))]
+
+    def error_m(self, model: LearntModel, marker: RigidChain | None = None) -> float:
+        q = near(np.random.default_rng(0), self.q[:PAIRS])
+        return float(np.linalg.norm(model.predict(q) - self.positions(q, marker), axis=1).mean())
+
+
+@pytest.fixture(scope="module")
+def arm() -> SaggingArm:
+    return SaggingArm(0)
+
+
+@pytest.fixture(scope="module")
+def taught(arm: SaggingArm) -> Learning:
+    learning = new_learning()
+    teach(learning, arm.pairs(slice(0, PAIRS)))
+    return learning
+
+
+def test_it_answers_for_an_arm_that_sags(arm: SaggingArm, taught: Learning) -> None:
+    assert taught.snapshot.answering == RESIDUAL
+    snapshot = taught.snapshot
+    assert arm.error_m(snapshot.require_model()) < 0.6 * arm.error_m(snapshot.require_map())
+
+
+def test_its_claim_holds_near_the_path(arm: SaggingArm, taught: Learning) -> None:
+    q = near(np.random.default_rng(1), arm.q[:PAIRS])
+    prediction = taught.snapshot.predict(q)
+    ratios = np.abs(prediction.x - arm.positions(q)) / prediction.sigma
+    assert (ratios < 2.0).mean() > 0.9
+
+
+def test_the_file_to_publish_is_the_best_map_while_it_answers(taught: Learning) -> None:
+    snapshot = taught.snapshot
+    assert isinstance(snapshot.require_model(), ResidualModel)
+    assert isinstance(snapshot.require_map(), KBMap)
+    assert snapshot.digest == snapshot.require_model().digest != snapshot.require_map().digest
+
+
+def test_a_restored_learner_answers_with_it_bit_by_bit(arm: SaggingArm, taught: Learning) -> None:
+    restored = new_learning()
+    restored.restore(taught.state())
+    assert restored.snapshot.digest == taught.snapshot.digest
+    one, other = (learning.snapshot.predict(arm.q) for learning in (taught, restored))
+    np.testing.assert_array_equal(one.x, other.x)
+    np.testing.assert_allclose(one.sigma, other.sigma, rtol=1e-9)
+
+
+def test_what_the_arm_yields_stays_known_with_another_tool(arm: SaggingArm, taught: Learning) -> None:
+    learning = new_learning()
+    learning.restore(taught.state())
+    learning.tool_changed()
+    marker = arm.chain.with_tool(TOOL)
+    teach(learning, arm.pairs(slice(PAIRS, PAIRS + 60), marker))
+    assert learning.snapshot.answering == RESIDUAL
+    snapshot = learning.snapshot
+    assert arm.error_m(snapshot.require_model(), marker) < 0.6 * arm.error_m(snapshot.require_map(), marker)
+
+
+def test_another_tool_is_found_while_it_answers(arm: SaggingArm, taught: Learning) -> None:
+    learning = new_learning()
+    learning.restore(taught.state())
+    teach(learning, arm.pairs(slice(PAIRS, PAIRS + 10), arm.chain.with_tool(TOOL)))
+    assert learning.counters.changes == taught.counters.changes + 1
+
+
+def test_the_solver_s_process_gives_the_solution_that_a_direct_one_gives(arm: SaggingArm) -> None:
+    nominal = nominal_model()
+    tolerances = ChainTolerances(axes=0.05, points=0.015, tool=0.03)
+    task = Task(1, nominal.prior(), nominal.belief(nominal.chain, tolerances))
+    q = arm.q[:100]
+    found: list[str] = []
+    with SolverProcess() as process:
+        direct = DirectSolver()
+        for solver in (direct, process):
+            solver.start(task)
+            solver.learn(q, arm.positions(q))
+            solver.solve()
+            last = False
+            while not last:
+                solved = solver.poll()
+                if solved is not None and solved.name == RESIDUAL:
+                    assert solved.belief is solved.model
+                    found.append(solved.model.digest)
+                last = solved is not None and solved.last
+    assert found[0] == found[1]
