@@ -90,7 +90,7 @@ class BasisStack:
             share = (q - self._start) / self._span
             stroke = np.stack([1.0 - share, share, np.zeros_like(share)], axis=-2)
             products = np.where(self._slides, stroke, products)
-        return products.reshape(*q.shape[:-1], -1)
+        return products.reshape(*q.shape[:-1], 3 * self.joints)
 
     def halves(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Left (left_size,) and right (right_size,) weights for q (d,); for q (n, d) with a leading n."""
