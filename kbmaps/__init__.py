@@ -13,7 +13,7 @@ from kbmaps.chain_belief import ChainBelief
 from kbmaps.chain_parameters import ChainParameters, ChainTolerances
 from kbmaps.chain_report import ChainReport, Interval
 from kbmaps.chain_search import find_chain
-from kbmaps.core_prior import CorePrior
+from kbmaps.core_prior import CoreFamily, CorePrior
 from kbmaps.errors import (
     BasisError,
     ChainError,
@@ -48,6 +48,7 @@ from kbmaps.step_size import StepSize
 from kbmaps.structured_learner import StructuredLearner
 from kbmaps.support import SUPPORT_LIMIT, SupportSet
 from kbmaps.tensor_learner import TensorLearner
+from kbmaps.tensor_posterior import TensorPosterior
 from kbmaps.tensor_settings import TensorSettings
 from kbmaps.tensor_train import TensorTrain
 from kbmaps.tool import with_refitted_marker
@@ -64,6 +65,7 @@ __all__ = [
     "ChainPosterior",
     "ChainReport",
     "ChainTolerances",
+    "CoreFamily",
     "CorePrior",
     "DegenerateDataError",
     "Estimate",
@@ -98,6 +100,7 @@ __all__ = [
     "StructuredLearner",
     "SupportSet",
     "TensorLearner",
+    "TensorPosterior",
     "TensorSettings",
     "TensorTrain",
     "ToolLayer",
