@@ -14,7 +14,7 @@ from kbmaps.tensor_train import TensorTrain
 _STDS = np.geomspace(1e-5, 1e-1, 17)
 _SWEEPS = 2
 _ROUNDING = 1e-10
-# Twice the gain in log evidence that speaks for errors at all; chance alone brings as much to one arm in ten.
+# Twice the gain in log evidence that speaks for a kind of errors; by chance one arm in twelve has as much.
 _TELLING = 2.0
 
 
