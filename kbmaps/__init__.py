@@ -14,7 +14,7 @@ from kbmaps.chain_parameters import ChainParameters, ChainTolerances
 from kbmaps.chain_report import ChainReport, Interval
 from kbmaps.chain_search import find_chain
 from kbmaps.contest import Contest
-from kbmaps.core_prior import CorePrior
+from kbmaps.core_prior import CoreFamily, CorePrior
 from kbmaps.errors import (
     BasisError,
     ChainError,
@@ -51,6 +51,7 @@ from kbmaps.step_size import StepSize
 from kbmaps.structured_learner import StructuredLearner
 from kbmaps.support import SUPPORT_LIMIT, SupportSet
 from kbmaps.tensor_learner import TensorLearner
+from kbmaps.tensor_posterior import TensorPosterior
 from kbmaps.tensor_settings import TensorSettings
 from kbmaps.tensor_train import TensorTrain
 from kbmaps.tool import with_refitted_marker
@@ -68,6 +69,7 @@ __all__ = [
     "ChainReport",
     "ChainTolerances",
     "Contest",
+    "CoreFamily",
     "CorePrior",
     "DegenerateDataError",
     "Estimate",
@@ -105,6 +107,7 @@ __all__ = [
     "StructuredLearner",
     "SupportSet",
     "TensorLearner",
+    "TensorPosterior",
     "TensorSettings",
     "TensorTrain",
     "ToolLayer",

@@ -53,6 +53,19 @@ class ChainBelief:
         std = np.minimum(parameters.standard_deviations(tolerances), WIDE)
         return cls(parameters, np.zeros(parameters.size), np.diag(std))
 
+    @classmethod
+    def from_covariance(cls, parameters: ChainParameters, mean: FloatArray, covariance: FloatArray) -> Self:
+        """A Gaussian with this covariance (size, size); a row of zeros holds its parameter.
+
+        Scaled to correlations first: lengths and angles, known and unknown ones, differ by many orders of magnitude.
+        """
+        std = np.sqrt(np.diag(covariance))
+        free = np.flatnonzero(std > 0.0)
+        values, vectors = np.linalg.eigh(covariance[np.ix_(free, free)] / np.outer(std[free], std[free]))
+        root = np.zeros((len(std), len(free)))
+        root[free] = std[free, None] * vectors * np.sqrt(np.maximum(values, 0.0))
+        return cls(parameters, mean, root)
+
     @property
     def chain(self) -> RigidChain:
         """The most probable chain."""

@@ -14,6 +14,8 @@ from kbmaps.errors import SettingError, ShapeError
 from kbmaps.tensor_train import TensorTrain
 
 CORE_NUMBERS = 36
+# Six of a link and three of the marker.
+_MOTIONS = 9
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,26 +75,10 @@ class CorePrior:
         Raises:
             SettingError: a standard deviation or the length is not positive. BasisError: bases do not fit the chain.
         """
-        settings = {
-            "turn_std": turn_std,
-            "shift_std": shift_std,
-            "marker_std": marker_std,
-            "ellipse_std": ellipse_std,
-            "length": length,
-        }
-        for name, value in settings.items():
-            if not value > 0.0:
-                raise SettingError(f"{name} must be greater than 0, got {value!r}")
-        train = TensorTrain.from_chain(chain, bases)
-        sizes = ellipse_std * np.tile([1.0, 1.0, 1.0, length], 9)
-        spread = np.empty((chain.joints, CORE_NUMBERS, CORE_NUMBERS))
-        for k in range(chain.joints):
-            directions = _motions(train.cores[k], chain.fixed[k, :3, 3], bases[k], turn_std, shift_std)
-            if k == chain.joints - 1:
-                directions += [marker_std * motion.ravel() for motion in _marker_shifts(train.cores[k])]
-            factor = np.column_stack(directions)
-            spread[k] = np.linalg.cholesky(factor @ factor.T + np.diag(sizes**2))
-        return cls(train.cores.reshape(chain.joints, CORE_NUMBERS), spread)
+        family = CoreFamily.around(
+            chain, bases, turn_std=turn_std, shift_std=shift_std, marker_std=marker_std, length=length
+        )
+        return family.prior(ellipse_std)
 
     @property
     def joints(self) -> int:
@@ -109,6 +95,72 @@ class CorePrior:
         off = cores.reshape(self.joints, CORE_NUMBERS, 1) - self.mean[:, :, None]
         z: FloatArray = np.linalg.solve(self.spread, off).astype(np.float64, copy=False)
         return z.ravel()
+
+
+@dataclass(frozen=True, eq=False)
+class CoreFamily:
+    """Priors around one nominal chain that differ in how far the arm may be from rigid.
+
+    Attributes:
+        mean: (d, 36), the cores of the nominal chain.
+        motions: (d, 36, m), what rigid motions of a link do to its core, each of one standard deviation.
+        length: of a typical link [m].
+    """
+
+    mean: FloatArray
+    motions: FloatArray
+    length: float
+
+    def __post_init__(self) -> None:
+        mean, motions = frozen(self.mean), frozen(self.motions)
+        if mean.ndim != 2 or mean.shape[1] != CORE_NUMBERS:
+            raise ShapeError("mean", f"(d, {CORE_NUMBERS})", mean.shape)
+        if motions.ndim != 3 or motions.shape[:2] != mean.shape:
+            raise ShapeError("motions", f"({len(mean)}, {CORE_NUMBERS}, m)", motions.shape)
+        object.__setattr__(self, "mean", mean)
+        object.__setattr__(self, "motions", motions)
+
+    @classmethod
+    def around(
+        cls,
+        chain: RigidChain,
+        bases: Sequence[JointBasis],
+        *,
+        turn_std: float,
+        shift_std: float,
+        marker_std: float,
+        length: float,
+    ) -> CoreFamily:
+        """The family of `CorePrior.around`.
+
+        Raises:
+            SettingError: a standard deviation or the length is not positive. BasisError: bases do not fit the chain.
+        """
+        settings = {"turn_std": turn_std, "shift_std": shift_std, "marker_std": marker_std, "length": length}
+        for name, value in settings.items():
+            if not value > 0.0:
+                raise SettingError(f"{name} must be greater than 0, got {value!r}")
+        train = TensorTrain.from_chain(chain, bases)
+        motions = np.zeros((chain.joints, CORE_NUMBERS, _MOTIONS))
+        for k in range(chain.joints):
+            directions = _motions(train.cores[k], chain.fixed[k, :3, 3], bases[k], turn_std, shift_std)
+            if k == chain.joints - 1:
+                directions += [marker_std * motion.ravel() for motion in _marker_shifts(train.cores[k])]
+            motions[k, :, : len(directions)] = np.column_stack(directions)
+        return cls(train.cores.reshape(chain.joints, CORE_NUMBERS), motions, length)
+
+    def prior(self, ellipse_std: float) -> CorePrior:
+        """The prior whose cores have `ellipse_std` of their own in each number, times `length` in translations.
+
+        Raises:
+            SettingError: ellipse_std is not positive.
+        """
+        if not ellipse_std > 0.0:
+            raise SettingError(f"ellipse_std must be greater than 0, got {ellipse_std!r}")
+        sizes = ellipse_std * np.tile([1.0, 1.0, 1.0, self.length], 9)
+        covariances = self.motions @ self.motions.swapaxes(1, 2) + np.diag(np.square(sizes))
+        spread: FloatArray = np.linalg.cholesky(covariances).astype(np.float64, copy=False)
+        return CorePrior(self.mean, spread)
 
 
 def _motions(

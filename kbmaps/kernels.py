@@ -35,7 +35,7 @@ class NetKernel(Protocol):
 
 
 class FilterKernel(Protocol):
-    """Takes pairs into the state of a `RecursiveRigidLearner`; returns how many, its noise² and what that rests on."""
+    """Takes pairs into the state of a `RigidFilter`; returns how many, its noise² and what that rests on."""
 
     def learn(
         self,
@@ -119,7 +119,7 @@ def net_kernel(stack: BasisStack, planes: FloatArray, check_q: Check, check_x: C
 
 
 def filter_kernel(*arrays: FloatArray) -> FilterKernel | None:
-    """The compiled loop of `RecursiveRigidLearner`, if that is the path."""
+    """The compiled loop of `RigidFilter`, if that is the path."""
     compiled = _chosen.get()
     return None if compiled is None else compiled.RigidFilter(*(np.ascontiguousarray(array) for array in arrays))
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kbmaps.arrays import FloatArray, rows_or_vector
+from kbmaps.arrays import BoolArray, FloatArray, rows_or_vector
 from kbmaps.errors import NonFiniteError, SettingError, ShapeError
 
 
@@ -28,6 +28,10 @@ class Pairs:
 
     def __len__(self) -> int:
         return len(self.q)
+
+    def chosen(self, mask: BoolArray) -> Pairs:
+        """Those of the mask (n,), in the same units."""
+        return Pairs(self.q[mask], self.x[mask], self.unit[mask], self.known)
 
 
 def with_units(q: FloatArray, x: FloatArray, sigma: FloatArray) -> Pairs:

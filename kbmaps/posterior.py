@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from kbmaps.arrays import FloatArray, rows
 from kbmaps.chain import RigidChain
+from kbmaps.chain_belief import ChainBelief
 from kbmaps.chain_parameters import ChainParameters
 from kbmaps.errors import DegenerateDataError, SettingError, ShapeError
 from kbmaps.rigid_learner import RigidLearner
@@ -66,7 +67,7 @@ class ChainPosterior:
             if array.shape != shape:
                 raise ShapeError(name, str(shape), array.shape)
         self._change = np.array(change)
-        self._spread = _square_root(covariance)
+        self._spread = ChainBelief.from_covariance(self._parameters, change, covariance).root
         self.noise, self.floor = noise, _checked_floor(floor)
 
     @classmethod
@@ -124,16 +125,3 @@ def _checked_floor(floor: float) -> float:
     if not (floor >= 0.0 and math.isfinite(floor)):
         raise SettingError(f"floor must be finite and at least 0 m, got {floor!r}")
     return floor
-
-
-def _square_root(covariance: FloatArray) -> FloatArray:
-    """W (size, p) with W Wᵀ the covariance; p counts the parameters that are free.
-
-    Scaled to correlations first: lengths and angles, known and unknown ones, differ by many orders of magnitude.
-    """
-    std = np.sqrt(np.diag(covariance))
-    free = np.flatnonzero(std > 0.0)
-    values, vectors = np.linalg.eigh(covariance[np.ix_(free, free)] / np.outer(std[free], std[free]))
-    root = np.zeros((len(std), len(free)))
-    root[free] = std[free, None] * vectors * np.sqrt(np.maximum(values, 0.0))
-    return root

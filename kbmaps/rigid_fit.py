@@ -15,8 +15,11 @@ from kbmaps.pairs import Pairs
 
 # Noise that is estimated is never below this [m]: there rounding begins.
 _ROUNDING_M = 1e-9
-# A pair beyond this many sigma is an outlier: of good ones 3 in 100,000 are as far out (chi, three dimensions).
+# A pair this many sigma from where the others predict it is an outlier: of good ones 4 in 100,000 are as far out
+# (chi, three dimensions).
 _OUTLIER_SIGMAS = 4.8
+# A residual's variance is never taken for less than this share of the noise: below, the pair explains itself.
+_LEAST_SHARE = 1e-4
 # A residual norm of noise σ per axis has the median 1.538 σ in three dimensions.
 _MEDIAN_NORM = 1.538
 _SCALES_PER_SIGMA = 3.0
@@ -26,6 +29,26 @@ _ROUNDS = 80
 _FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-3, 1e-12, 1e8
 # A step that changes the fit by less than this share of what the noise leaves open is the last.
 _SMALL_STEP = 1e-4
+
+
+@dataclass(frozen=True)
+class NoiseKnowledge:
+    """What is known beforehand of a noise that is not told: as if found from so many coordinates.
+
+    Attributes:
+        coordinates: how many, 0 where nothing is known.
+        square: their mean square [m²].
+    """
+
+    coordinates: float = 0.0
+    square: float = 0.0
+
+    def found(self, square: float, freedom: float) -> float:
+        """Variance after residuals with a sum of squares [m²] and so many degrees of freedom, above 0 in all."""
+        return (square + self.coordinates * self.square) / (freedom + self.coordinates)
+
+
+NOTHING_KNOWN = NoiseKnowledge()
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,6 +91,21 @@ class _Point:
         """Triangular factor (f+1, f+1) of the rows [J, residual], each pair's multiplied by its root (n,)."""
         rows = np.concatenate([self.jacobian, self.residuals[:, :, None]], axis=2) * roots[:, None, None]
         return cast(FloatArray, np.linalg.qr(rows.reshape(-1, rows.shape[2]), mode="r"))
+
+    def deletion_distances(self, inliers: BoolArray, sigma: FloatArray) -> FloatArray:
+        """How far (n,) each pair lies from where the other inliers predict it, in standard deviations of that.
+
+        Mahalanobis lengths: an inlier's residual has the covariance σ² − J P Jᵀ, another's σ² + J P Jᵀ (Cook and
+        Weisberg 1982, section 2.2). Whether a pair takes part does not change what is said of it.
+        """
+        factor = self.reduced(inliers / sigma)
+        _, singular, vt = np.linalg.svd(factor[:, :-1])
+        singular = np.concatenate([singular, np.zeros(len(vt) - len(singular))])
+        spread = self.jacobian @ (vt.T / np.sqrt(1.0 + np.square(singular))) / sigma[:, None, None]
+        values, vectors = np.linalg.eigh(spread @ spread.swapaxes(1, 2))
+        shares = 1.0 + np.where(inliers, -1.0, 1.0)[:, None] * values
+        along = (vectors.swapaxes(1, 2) @ (self.residuals / sigma[:, None])[:, :, None])[:, :, 0]
+        return np.sqrt((np.square(along) / np.maximum(shares, _LEAST_SHARE)).sum(axis=1))
 
     def cost(self, roots: FloatArray) -> float:
         residuals = np.einsum("ni,ni,n->", self.residuals, self.residuals, roots * roots)
@@ -127,16 +165,46 @@ class _Fitter:
         return _Point(change, residuals, norms, jacobian[:, :, self.free] @ self.root, offset)
 
 
-def fit_chain(prior: ChainBelief, pairs: Pairs, start: FloatArray) -> RigidFit:
+def fit_chain(
+    prior: ChainBelief,
+    pairs: Pairs,
+    start: FloatArray,
+    *,
+    near: bool = False,
+    noise: NoiseKnowledge = NOTHING_KNOWN,
+) -> RigidFit:
     """The most probable change for at least one pair, on the way from `start` (size,).
 
     Graduated non-convexity (Yang et al. 2020): Geman-McClure weights, and with them the noise that weighs data against
     prior, shrink from the largest residual to what is typical, so that neither outliers nor a marker far from its
     place stop the way. Then least squares on all pairs that are no outliers, with the noise estimated from them.
+
+    Args:
+        near: the start is a fit to most of these pairs, so that least squares will do.
+        noise: what is known beforehand of a noise that is not told.
     """
     fitter = _Fitter(prior, pairs, start)
-    _anneal(fitter)
-    return _polish(fitter)
+    if not near:
+        _anneal(fitter)
+    return _polish(fitter, noise)
+
+
+def folded(prior: ChainBelief, pairs: Pairs, change: FloatArray, noise: float) -> ChainBelief:
+    """What is believed after pairs, all good, that are linearised at a change (size,).
+
+    Args:
+        noise: over the pairs' unit.
+    """
+    point = _Fitter(prior, pairs, change).point
+    factor = point.reduced(1.0 / (pairs.unit * noise))
+    free, root = squared(prior.root)
+    held = np.concatenate([np.eye(len(free)), -point.offset[:, None]], axis=1)
+    joined = cast(FloatArray, np.linalg.qr(np.concatenate([factor, held]), mode="r"))
+    triangle, target = joined[: len(free), :-1], joined[: len(free), -1]
+    mean, spread = prior.mean.copy(), np.zeros((len(prior.mean), len(free)))
+    mean[free] += root @ (point.offset + np.linalg.solve(triangle, target))
+    spread[free] = np.linalg.solve(triangle.T, root.T).T
+    return ChainBelief(prior.parameters, mean, spread)
 
 
 def _anneal(fitter: _Fitter) -> None:
@@ -150,7 +218,7 @@ def _anneal(fitter: _Fitter) -> None:
             return
 
 
-def _polish(fitter: _Fitter) -> RigidFit:
+def _polish(fitter: _Fitter, before: NoiseKnowledge) -> RigidFit:
     pairs = fitter.pairs
     typical = fitter.typical()
     inliers = fitter.point.norms <= _OUTLIER_SIGMAS * typical
@@ -161,8 +229,9 @@ def _polish(fitter: _Fitter) -> RigidFit:
         step = fitter.improve(inliers.astype(np.float64), noise)
         freedom = max(3.0 * float(inliers.sum()) - fitter.used, 0.0)
         square = float(np.square(fitter.point.norms[inliers]).sum())
-        estimate = _noise(square, freedom, pairs.known, fitter.least_noise)
-        chosen = fitter.point.norms <= _OUTLIER_SIGMAS * max(estimate, fitter.typical())
+        estimate = _told_noise(square, freedom) if pairs.known else _found_noise(square, freedom, before, fitter)
+        distances = fitter.point.deletion_distances(inliers, pairs.unit * max(estimate, fitter.typical()))
+        chosen = distances <= _OUTLIER_SIGMAS
         settled = bool((chosen == inliers).all()) and abs(estimate - noise) <= 1e-3 * noise
         inliers, noise = chosen, estimate
         if settled and step < _SMALL_STEP * math.sqrt(1.0 + freedom):
@@ -170,10 +239,14 @@ def _polish(fitter: _Fitter) -> RigidFit:
     return _summary(fitter, inliers, noise, freedom)
 
 
-def _noise(square: float, freedom: float, known: bool, least: float) -> float:
-    if not known:
-        return max(math.sqrt(square / freedom), least) if freedom > 0.0 else least
-    # Residuals by chance above what the known noise explains are no sign of a chain that does not fit.
+def _found_noise(square: float, freedom: float, before: NoiseKnowledge, fitter: _Fitter) -> float:
+    if freedom + before.coordinates == 0.0:
+        return fitter.least_noise
+    return max(math.sqrt(before.found(square, freedom)), fitter.least_noise)
+
+
+def _told_noise(square: float, freedom: float) -> float:
+    """1 unless the residuals are more than chance makes them: then the chain does not fit."""
     if freedom == 0.0 or chdtrc(freedom, square) >= _MISFIT_CHANCE:
         return 1.0
     return max(math.sqrt(square / freedom), 1.0)

@@ -10,16 +10,16 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import stdtrit  # pyright: ignore[reportMissingTypeStubs, reportUnknownVariableType]
 
-from kbmaps.align import align
 from kbmaps.arrays import BoolArray, FloatArray, frozen, rows, rows_or_vector
 from kbmaps.chain import RigidChain
 from kbmaps.chain_belief import ChainBelief
-from kbmaps.chain_parameters import ChainParameters, ChainTolerances, rotation_vector
+from kbmaps.chain_parameters import ChainParameters, ChainTolerances
 from kbmaps.chain_report import ChainReport, chain_report
 from kbmaps.errors import DegenerateDataError, KBMapsError, ModelFormatError
 from kbmaps.model import Estimate
 from kbmaps.packed import chain_arrays, chain_from_arrays, numbers, pack, unpack
 from kbmaps.pairs import Pairs, checked_pairs, with_units
+from kbmaps.placed_start import PlacedStart
 from kbmaps.rigid_fit import RigidFit, fit_chain
 
 _KIND = "rigid chain, batch, 1"
@@ -64,6 +64,7 @@ class RigidLearner:
             self._prior = ChainBelief.from_tolerances(self._parameters, tolerances)
         else:
             self._prior = ChainBelief(self._parameters, prior.mean, prior.root)
+        self._place = PlacedStart(self._parameters, tolerances)
         self._q, self._x = np.empty((0, nominal.joints)), np.empty((0, 3))
         self._sigma = np.empty(0)
         self._fit: RigidFit | None = None
@@ -170,7 +171,7 @@ class RigidLearner:
         if pairs.known:
             variance = variance + (fit.noise**2 - 1.0) * float(np.square(pairs.unit).mean())
             return Estimate(x, np.sqrt(variance), inside)
-        return Estimate(x, np.sqrt(variance) * _student(fit.freedom), inside)
+        return Estimate(x, np.sqrt(variance) * student(fit.freedom), inside)
 
     def report(self) -> ChainReport:
         """Hand-eye, tool centre point and joint zeros with 95 % intervals.
@@ -182,7 +183,7 @@ class RigidLearner:
         if fit is None:
             raise DegenerateDataError("there is nothing to report before the first pair was learnt")
         pairs = self._units()
-        std = np.sqrt(np.square(fit.belief.root).sum(axis=1)) * (1.0 if pairs.known else _student(fit.freedom))
+        std = np.sqrt(np.square(fit.belief.root).sum(axis=1)) * (1.0 if pairs.known else student(fit.freedom))
         unit = math.sqrt(float(np.square(pairs.unit).mean()))
         return chain_report(
             self._parameters,
@@ -237,23 +238,9 @@ class RigidLearner:
         return self._fit
 
     def _start(self) -> FloatArray:
-        """The nominal chain, placed where it fits best if its place is anyone's guess."""
-        start = self._prior.mean.copy()
-        if self._told_prior:
-            return start
-        if math.isfinite(self._tolerances.base_rotation) and math.isfinite(self._tolerances.base_translation):
-            return start
-        marker_known = math.isfinite(self._tolerances.tool)
-        try:
-            placed = align(self.nominal, self._q, self._x, pose_known=False, marker_known=marker_known)
-        except DegenerateDataError:
-            return start
-        start[self._parameters.base_turn] = rotation_vector(placed.T_measured_nominal[:3, :3])
-        start[self._parameters.base_shift] = placed.T_measured_nominal[:3, 3]
-        start[self._parameters.tool] = placed.marker_shift
-        return start
+        return self._prior.mean if self._told_prior else self._place.change(self._q, self._x)
 
 
-def _student(freedom: float) -> float:
+def student(freedom: float) -> float:
     """What a sigma with an estimated noise must be multiplied by to cover as a Gaussian one does."""
     return float(stdtrit(max(freedom, 1.0), _ONE_SIGMA))

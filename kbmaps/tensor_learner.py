@@ -13,24 +13,24 @@ from numpy.typing import ArrayLike
 from kbmaps.arrays import BoolArray, FloatArray, rows, rows_or_vector, vector
 from kbmaps.basis import JointBasis
 from kbmaps.chain import RigidChain
-from kbmaps.core_prior import CORE_NUMBERS, CorePrior
-from kbmaps.errors import DegenerateDataError, KBMapsError, ModelFormatError, NonFiniteError, SettingError, ShapeError
+from kbmaps.core_evidence import USUAL_ELLIPSE_STD, core_information, likely_ellipse_std
+from kbmaps.core_prior import CORE_NUMBERS, CoreFamily, CorePrior
+from kbmaps.errors import DegenerateDataError, KBMapsError, ModelFormatError, SettingError, ShapeError
 from kbmaps.model import Estimate
 from kbmaps.packed import describe_bases, named, pack, parse_bases, unpack
+from kbmaps.pairs import checked_pairs
 from kbmaps.stack import BasisStack
-from kbmaps.tensor_fit import whitened_jacobian
+from kbmaps.tensor_misfit import misfit_sizes
+from kbmaps.tensor_posterior import TensorPosterior
 from kbmaps.tensor_search import PLAUSIBLE, Fit, Pairs, information, refine, search
 from kbmaps.tensor_settings import TensorSettings
 from kbmaps.tensor_train import TensorTrain
 
 KIND = "tensor learner"
-_BATCH_ROWS = 512
 # Relative to the residuals under the prior: the noise that the first fit around a prior starts with.
 _FIRST_NOISE = 0.1
 # A refit that leaves this many times the noise of the fit before has lost its way and is searched anew.
 _LOST = 3.0
-# By how much the axes of the last frame may be off, as a share of a marker's move.
-_FRAME_ERROR = 0.05
 _SHARE_BEFORE_REFIT = 4
 # Times the pairs that could just determine a train: to search at all, and until a search has found what it should.
 _PAIRS_TO_SEARCH = 1.5
@@ -46,7 +46,8 @@ class TensorLearner:
 
     Args:
         bases: one a joint; orthonormal over the joints' ranges (`learning_bases`) are advised.
-        prior: what is known of the cores, in these bases; None where nothing is.
+        prior: what is known of the cores, in these bases; None where nothing is. Of a family every fit takes the
+            member that its pairs speak for.
 
     Raises:
         ShapeError: the prior has another number of joints.
@@ -65,7 +66,10 @@ class TensorLearner:
     """
 
     def __init__(
-        self, bases: Sequence[JointBasis], prior: CorePrior | None = None, settings: TensorSettings | None = None
+        self,
+        bases: Sequence[JointBasis],
+        prior: CorePrior | CoreFamily | None = None,
+        settings: TensorSettings | None = None,
     ) -> None:
         self.bases = tuple(bases)
         self.settings = TensorSettings() if settings is None else settings
@@ -75,12 +79,15 @@ class TensorLearner:
         self._sigma = np.empty(0)
         self._pairs = self._waiting = 0
         self._searches = prior is None
-        self._prior = prior
+        self._prior: CorePrior | None = None
         self._fit: Fit | None = None
         self._train: TensorTrain | None = None
-        self._information: FloatArray | None = None
-        self._root: FloatArray | None = None
-        if prior is not None:
+        self._posterior: TensorPosterior | None = None
+        self._family: CoreFamily | None = None
+        if isinstance(prior, CoreFamily):
+            self.rebase(prior.prior(USUAL_ELLIPSE_STD))
+            self._family = prior
+        elif prior is not None:
             self.rebase(prior)
 
     @classmethod
@@ -93,24 +100,21 @@ class TensorLearner:
         turn_std: float = math.radians(3.0),
         shift_std: float = 0.015,
         marker_std: float = 0.03,
-        ellipse_std: float = 0.003,
+        ellipse_std: float | None = None,
     ) -> TensorLearner:
         """A learner with a nominal chain as prior; the standard deviations as in `CorePrior.around`.
+
+        Args:
+            ellipse_std: how far from rigid the arm is; None finds it by the evidence of the pairs at every fit.
 
         Raises:
             SettingError: a standard deviation is not positive. BasisError: bases do not fit the chain.
         """
-        length = float(np.linalg.norm(chain.fixed[:, :3, 3], axis=1).mean())
-        prior = CorePrior.around(
-            chain,
-            bases,
-            turn_std=turn_std,
-            shift_std=shift_std,
-            marker_std=marker_std,
-            ellipse_std=ellipse_std,
-            length=max(length, 1e-3),
+        length = max(float(np.linalg.norm(chain.fixed[:, :3, 3], axis=1).mean()), 1e-3)
+        family = CoreFamily.around(
+            chain, bases, turn_std=turn_std, shift_std=shift_std, marker_std=marker_std, length=length
         )
-        return cls(bases, prior, settings)
+        return cls(bases, family if ellipse_std is None else family.prior(ellipse_std), settings)
 
     @property
     def joints(self) -> int:
@@ -171,11 +175,7 @@ class TensorLearner:
         Raises:
             ShapeError, NonFiniteError, SettingError (a sigma that is not positive): nothing has changed.
         """
-        angles = np.atleast_2d(rows_or_vector("q", q, self.joints))
-        positions = np.atleast_2d(rows_or_vector("x", x, 3))
-        if len(angles) != len(positions):
-            raise ShapeError("x", f"({len(angles)}, 3) to go with q", positions.shape)
-        sigmas = _checked_sigma(sigma, len(angles))
+        angles, positions, sigmas = checked_pairs(q, x, sigma, self.joints)
         self._q = np.concatenate([self._q, angles])
         self._x = np.concatenate([self._x, positions])
         self._sigma = np.concatenate([self._sigma, sigmas])
@@ -213,19 +213,9 @@ class TensorLearner:
         """
         if not std > 0.0:
             raise SettingError(f"std must be greater than 0, got {std!r}")
-        cores, prior = self.train.cores.reshape(self.joints, CORE_NUMBERS), self._known_prior()
-        spread = prior.spread
-        if self._information is not None:
-            blocks = range(0, CORE_NUMBERS * self.joints, CORE_NUMBERS)
-            told = np.stack([self._information[k : k + CORE_NUMBERS, k : k + CORE_NUMBERS] for k in blocks])
-            spread = spread @ _inverse_roots(told)
-        spread = spread.copy()
-        moves = _marker_moves(cores[-1].reshape(3, 3, 4), std)
-        widened = spread[-1] @ spread[-1].T + moves @ moves.T
-        values, vectors = np.linalg.eigh(widened)
-        spread[-1] = vectors * np.sqrt(np.maximum(values, 0.0))
+        prior = self.posterior.with_moved_marker(std)
         self._keep(0)
-        self.rebase(CorePrior(cores, spread))
+        self.rebase(prior)
 
     def rebase(self, prior: CorePrior) -> None:
         """Another prior for the same pairs; the next fit starts from its mean.
@@ -236,7 +226,7 @@ class TensorLearner:
         if prior.joints != self.joints:
             raise ShapeError("prior.mean", f"({self.joints}, {CORE_NUMBERS})", prior.mean.shape)
         self._prior, self._searches = prior, False
-        self._fit = self._information = self._root = None
+        self._fit = self._posterior = self._family = None
         self._train = TensorTrain(self.bases, prior.cores(np.zeros(CORE_NUMBERS * self.joints)))
         self._waiting = self.kept
 
@@ -245,11 +235,24 @@ class TensorLearner:
         if self.kept < (self.pairs_needed if self._searches else 1):
             return
         data = Pairs(self._stack.joint_weights(self._q), self._x, self._sigma)
-        fit = self._fitted(data)
+        fit = self._with_likely_prior(data, self._fitted(data))
         prior = self._known_prior()
-        train = TensorTrain(self.bases, prior.cores(fit.z))
-        self._information, self._root = information(data, prior, fit), None
-        self._fit, self._train, self._waiting = fit, train, 0
+        self._fit, self._train, self._waiting = fit, TensorTrain(self.bases, prior.cores(fit.z)), 0
+        known, std = information(data, prior, fit)
+        self._posterior = TensorPosterior(self._train, prior, known, noise=fit.noise)
+        used = self._q[fit.used]
+        self._posterior.judge(used, self._x[fit.used] - self.predict(used), std)
+
+    @property
+    def posterior(self) -> TensorPosterior:
+        """How sure the train is, as fitted last; the prior before.
+
+        Raises:
+            DegenerateDataError: there is neither a prior nor enough pairs.
+        """
+        if self._posterior is None:
+            self._posterior = TensorPosterior(self.train, self._known_prior(), None)
+        return self._posterior
 
     def predict(self, q: ArrayLike) -> FloatArray:
         """Positions (n, 3) [m] at q (n, d), or (3,) at q (d,).
@@ -263,36 +266,39 @@ class TensorLearner:
     def estimate(self, q: ArrayLike) -> Estimate:
         """Positions at q (n, d) with the standard deviation that Gauss and Newton's posterior leaves them.
 
+        Where residuals show joints or an instrument that err as no train does, what that leaves open adds to it
+        (`kbmaps.tensor_misfit`).
+
         A configuration is in support while its prediction is no less certain than one measurement (leverage ≤ 1).
 
         Raises:
             ShapeError, NonFiniteError
             DegenerateDataError: there is neither a prior nor enough pairs.
         """
-        angles = np.atleast_2d(rows_or_vector("q", q, self.joints))
-        train, prior, root = self.train, self._known_prior(), self._posterior_root()
-        variance = np.empty((len(angles), 3))
-        for start in range(0, len(angles), _BATCH_ROWS):
-            part = angles[start : start + _BATCH_ROWS]
-            jacobian = whitened_jacobian(self._stack.joint_weights(part), train.maps(part), prior)
-            variance[start : start + len(part)] = np.square(jacobian @ root).sum(axis=1).reshape(-1, 3)
-        noise = 0.0 if self._fit is None else self._fit.noise
-        return Estimate(train.predict(angles), np.sqrt(variance), variance.mean(axis=1) <= noise**2)
+        angles, posterior = np.atleast_2d(rows_or_vector("q", q, self.joints)), self.posterior
+        variance = posterior.variance(angles)
+        inside = variance.mean(axis=1) <= posterior.noise**2
+        return Estimate(self.predict(angles), np.sqrt(variance), inside)
 
     def to_bytes(self) -> bytes:
         """The train, its prior, the kept pairs and the settings as one self-describing byte string."""
         arrays = {"q": self._q, "x": self._x, "sigma": self._sigma}
         if self._prior is not None:
             arrays |= {"mean": self._prior.mean, "spread": self._prior.spread}
-        if self._fit is not None and self._information is not None:
+        if self._family is not None:
+            arrays |= {"family_mean": self._family.mean, "motions": self._family.motions}
+        known = None if self._posterior is None else self._posterior.information
+        if self._fit is not None and self._posterior is not None and known is not None:
             used = self._fit.used.astype(np.float64)
-            noise = np.array([self._fit.noise])
-            arrays |= {"z": self._fit.z, "noise": noise, "used": used, "information": self._information}
+            sure = np.array([self._fit.noise, *self._posterior.misfit])
+            arrays |= {"z": self._fit.z, "sure": sure, "used": used, "information": known}
+            arrays |= {"absorbed": self._posterior.absorbed}
         content = {
             "bases": describe_bases(self.bases),
             "settings": [getattr(self.settings, name) for name in _SETTINGS],
             "counts": [self._pairs, self._waiting],
             "searches": self._searches,
+            "length": 0.0 if self._family is None else self._family.length,
         }
         return pack(KIND, content, arrays)
 
@@ -304,7 +310,7 @@ class TensorLearner:
             ModelFormatError: the bytes are damaged, truncated, or something else.
         """
         content, arrays = unpack(data, KIND)
-        named(content, "the fields", ("bases", "settings", "counts", "searches"))
+        named(content, "the fields", ("bases", "settings", "counts", "searches", "length"))
         try:
             return cls._restored(content, arrays)
         except ModelFormatError:
@@ -327,9 +333,15 @@ class TensorLearner:
         if prior is not None and "z" in arrays:
             size = CORE_NUMBERS * learner.joints
             z = vector("z", arrays["z"], size)
-            learner._fit = Fit(z, float(vector("noise", arrays["noise"], 1)[0]), arrays["used"].astype(np.bool_))
-            learner._information = rows("information", arrays["information"], size)
+            noise, *misfit = (float(number) for number in vector("sure", arrays["sure"], 4))
+            learner._fit = Fit(z, noise, arrays["used"].astype(np.bool_))
             learner._train = TensorTrain(learner.bases, prior.cores(z))
+            known = rows("information", arrays["information"], size)
+            learner._posterior = TensorPosterior(learner._train, prior, known, noise=noise)
+            absorbed = rows("absorbed", arrays["absorbed"], sum(misfit_sizes(learner.joints)))
+            learner._posterior.take(np.array(misfit), absorbed)
+        if "motions" in arrays:
+            learner._family = CoreFamily(arrays["family_mean"], arrays["motions"], float(content["length"]))
         return learner
 
     def _keep(self, count: int) -> None:
@@ -341,6 +353,19 @@ class TensorLearner:
         if self._prior is None:
             raise DegenerateDataError("there is no prior yet; learn more pairs")
         return self._prior
+
+    def _with_likely_prior(self, data: Pairs, fit: Fit) -> Fit:
+        """The fit under the member of the family that the pairs speak for."""
+        if self._family is None:
+            return fit
+        prior = self._known_prior()
+        problem = data.chosen(fit.used).problem(prior, fit.noise)
+        std = likely_ellipse_std(self._family, *core_information(problem, fit.z))
+        self._prior = self._family.prior(std)
+        if np.array_equal(self._prior.spread, prior.spread):
+            return fit
+        z = self._prior.whitened(prior.cores(fit.z))
+        return refine(data, self._prior, z, fit.noise, robust=self.settings.robust)
 
     def _fitted(self, data: Pairs) -> Fit:
         """The fit to all kept pairs; gives a learner without a prior a vague one of the pairs' size."""
@@ -361,46 +386,5 @@ class TensorLearner:
             fit = min(fit, again, key=lambda candidate: candidate.noise)
         return fit
 
-    def _posterior_root(self) -> FloatArray:
-        """A square root (36 d, 36 d) of the covariance of z: of (JᵀJ + I)⁻¹ at the last fit, or of the prior's I."""
-        if self._root is None:
-            size = CORE_NUMBERS * self.joints
-            if self._information is None:
-                self._root = np.eye(size)
-            else:
-                self._root = _inverse_roots(self._information)
-        return self._root
-
 
 _SETTINGS = tuple(field.name for field in fields(TensorSettings))
-
-
-def _marker_moves(last_core: FloatArray, std: float) -> FloatArray:
-    """Changes (36, moves) of the last core when the marker moves by `std` [m] each way."""
-    free = np.diag(np.tile([0.0, 0.0, 0.0, std], 9))
-    if not last_core[:, :, :3].any():
-        return free
-    along = np.zeros((3, 3, 4, 3))
-    along[:, :, 3, :] = std * last_core[:, :, :3]
-    return np.column_stack([along.reshape(CORE_NUMBERS, 3), _FRAME_ERROR * free])
-
-
-def _inverse_roots(information: FloatArray) -> FloatArray:
-    """Square roots of (H + I)⁻¹ (..., m, m) for H (..., m, m), positive semidefinite up to rounding."""
-    values, vectors = np.linalg.eigh(information)
-    roots: FloatArray = vectors / np.sqrt(1.0 + np.maximum(values, 0.0))[..., None, :]
-    return roots
-
-
-def _checked_sigma(sigma: ArrayLike | None, count: int) -> FloatArray:
-    """A sigma for each of `count` pairs, NaN where there is none. Raises ShapeError, NonFiniteError, SettingError."""
-    if sigma is None:
-        return np.full(count, np.nan)
-    values = np.asarray(sigma, dtype=np.float64)
-    if values.shape not in ((), (count,)):
-        raise ShapeError("sigma", f"() or ({count},)", values.shape)
-    if not np.isfinite(values).all():
-        raise NonFiniteError("sigma")
-    if not (values > 0.0).all():
-        raise SettingError(f"sigma must be greater than 0, got {float(values.min())!r}")
-    return np.broadcast_to(values, (count,)).copy()

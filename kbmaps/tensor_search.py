@@ -163,20 +163,22 @@ def random_chain(bases: Sequence[JointBasis], length: float, rng: np.random.Gene
     return RigidChain(fixed, axes, np.array([basis.is_prismatic for basis in bases]))
 
 
-def information(pairs: Pairs, prior: CorePrior, fit: Fit) -> FloatArray:
+def information(pairs: Pairs, prior: CorePrior, fit: Fit) -> tuple[FloatArray, FloatArray]:
     """JᵀJ (36 d, 36 d) of the pairs that a fit used, by z: what they tell beyond the prior's unit matrix.
 
-    Where every sigma was given but the residuals are larger, it shrinks as if the sigmas were larger too.
+    Also the standard deviation of a coordinate of each (n,) [m] that it counts with. Where every sigma was given but
+    the residuals are larger, they count as if the sigmas were larger too.
     """
     good = pairs.chosen(fit.used)
     problem = good.problem(prior, fit.noise)
     jacobian = problem.scaled_jacobian(fit.z)
     matrix = jacobian.T @ jacobian
     if good.unknown.any():
-        return matrix
+        return matrix, problem.std
     square = float(np.square(problem.residuals(fit.z) / problem.std[:, None]).sum())
     freedom = 3.0 * len(good.x) - effective_parameters(problem, fit.z)
-    return matrix / max(square / freedom, 1.0) if freedom > 1.0 else matrix
+    excess = max(square / freedom, 1.0) if freedom > 1.0 else 1.0
+    return matrix / excess, problem.std * math.sqrt(excess)
 
 
 def effective_parameters(problem: TensorProblem, z: FloatArray) -> float:

@@ -1,4 +1,4 @@
-/* kbmaps._kernels.RigidFilter: the loop of kbmaps.rigid_recursive over kbmaps.chain_parameters.linearised. */
+/* kbmaps._kernels.RigidFilter: the loop of kbmaps.rigid_filter over kbmaps.chain_parameters.linearised. */
 #include "common.h"
 #include "vectors.h"
 
@@ -168,7 +168,7 @@ INLINE void move(const Filter *self, const double *change, const double *step, d
     }
 }
 
-/* RecursiveRigidLearner._curvature */
+/* RigidFilter._curvature */
 INLINE double curvature(const Filter *self, const double *covariance, const Work *work)
 {
     index_t p = self->active;
@@ -183,7 +183,7 @@ INLINE double curvature(const Filter *self, const double *covariance, const Work
     return 0.25 * share * share;
 }
 
-/* RecursiveRigidLearner._update, linearised at work.change, to which work.present led; 0 if it is singular. */
+/* RigidFilter._update, linearised at work.change, to which work.present led; 0 if it is singular. */
 INLINE int make_update(const Filter *self, const double *covariance, const double *q, const double *x,
                        double noise_square, double weight, const Work *work, Update *update)
 {
@@ -218,7 +218,7 @@ INLINE int make_update(const Filter *self, const double *covariance, const doubl
     return 1;
 }
 
-/* RecursiveRigidLearner._learn_one; 0 if the innovation's covariance is singular, and then nothing has changed. */
+/* RigidFilter._learn_one; 0 if the innovation's covariance is singular, and then nothing has changed. */
 FAST static int learn_pair(const Filter *self, double *change, double *covariance, const double *q, const double *x,
                            double sigma, double *noise_square, double *coordinates, const Work *work)
 {

@@ -21,6 +21,8 @@ from kbmaps import (
     RigidLearner,
     SettingError,
     ShapeError,
+    align,
+    placed_start,
 )
 
 seeds = st.integers(0, 2**32 - 1)
@@ -121,6 +123,50 @@ def test_gross_outliers_are_left_out(told):
     assert not spoilt.inliers[:30].any()
     assert spoilt.inliers[30:].all()
     np.testing.assert_allclose(spoilt.predict(q), clean.predict(q), atol=1e-4)
+
+
+@pytest.mark.parametrize("told", [True, False])
+@pytest.mark.parametrize("pairs", [8, 12])
+def test_no_good_pair_is_taken_for_an_outlier_while_they_are_few(told, pairs):
+    for seed in range(30):
+        rng = np.random.default_rng(seed)
+        arm = rough_arm(rng)
+        learner = RigidLearner(arm.nominal, ROUGH)
+        learner.learn(*arm.pairs(rng, pairs, 0.01), 0.01 if told else None)
+        assert learner.inliers.all()
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("told", [True, False])
+@pytest.mark.parametrize("pairs", [30, 100, 300])
+def test_outliers_cost_at_most_a_twentieth(told, pairs):
+    spoilt, clean = [], []
+    for seed in range(50):
+        rng = np.random.default_rng(seed)
+        arm = rough_arm(rng)
+        q, x = arm.pairs(rng, pairs, 0.01)
+        wrong = round(0.15 * pairs)
+        directions = rng.normal(size=(wrong, 3))
+        x[:wrong] += 0.2 * directions / np.linalg.norm(directions, axis=1, keepdims=True)
+        for begin, errors in ((0, spoilt), (wrong, clean)):
+            learner = RigidLearner(arm.nominal, ROUGH)
+            learner.learn(q[begin:], x[begin:], 0.01 if told else None)
+            errors.append(arm.error(learner, rng))
+    assert np.mean(spoilt) <= 1.05 * np.mean(clean)
+
+
+def test_where_an_arm_stands_is_looked_for_only_when_the_pairs_have_doubled(monkeypatch):
+    rng = np.random.default_rng(32)
+    arm = rough_arm(rng, "RRR", ChainTolerances(tool=0.1, base_rotation=0.9, base_translation=1.0))
+    asked = []
+    monkeypatch.setattr(placed_start, "align", lambda *args, **known: asked.append(1) or align(*args, **known))
+    learner = RigidLearner(arm.nominal, ChainTolerances(tool=0.1, base_rotation=math.inf, base_translation=math.inf))
+    q, x = arm.pairs(rng, 40, 0.001)
+    for k in range(40):
+        learner.learn(q[k], x[k])
+        learner.predict(q[k])
+    assert len(asked) == 6  # with 1, 2, 4, 8, 16 and 32 pairs
+    assert arm.error(learner, rng) < 0.001
 
 
 def test_a_marker_far_off_its_place_is_found_without_noise():

@@ -138,6 +138,73 @@ def test_the_claimed_sigma_holds_two_thirds_of_the_errors():
     assert 0.6 < np.mean(inside) < 0.85
 
 
+def stretched(q):
+    """What the joints really do: encoders eccentric by 2 degrees, as joints read them."""
+    return q + np.radians(2.0) * np.sin(q + np.arange(q.shape[1]))
+
+
+@pytest.mark.parametrize("bend", ["eccentric", "elastic", "lens"])
+def test_the_claimed_sigma_holds_where_the_truth_is_no_train(bend):
+    inside, inside_twice = [], []
+    for seed in range(4):
+        chain, prior, q, _ = case("RRRR", 400, seed)
+
+        def truth(q, chain=chain):
+            if bend == "eccentric":
+                return chain.positions(stretched(q))
+            x = chain.positions(q)
+            if bend == "lens":
+                return x + 0.1 * np.square(x).sum(axis=1, keepdims=True) * x
+            # The marker weighs 5 N, each joint gives 0.01 rad/Nm.
+            lever = chain.jacobian(q)
+            return x - 0.05 * np.einsum("nik,nk->ni", lever, lever[:, 2])
+
+        x = truth(q) + 0.003 * np.random.default_rng(seed).normal(size=(*q.shape[:1], 3))
+        learner = TensorLearner.around(prior, bases_for("RRRR"), TensorSettings(refit_every=500))
+        learner.learn(q, x)
+        learner.refit()
+        test = random_q(np.random.default_rng(50 + seed), "RRRR", 300, 80.0)
+        off = np.abs(learner.predict(test) - truth(test)) / learner.estimate(test).sigma
+        inside.append((off < 1.0).mean())
+        inside_twice.append((off < 1.96).mean())
+        assert learner.posterior.misfit.any()
+    assert np.mean(inside) > 0.6
+    assert np.mean(inside_twice) > 0.85
+
+
+def test_a_rigid_arm_is_seldom_taken_for_another():
+    found = 0
+    for seed in range(20):
+        _, prior, q, x = case("RRR", 100, seed, SIGMA_M)
+        learner = TensorLearner.around(prior, bases_for("RRR"), TensorSettings(refit_every=100))
+        learner.learn(q, x)
+        learner.refit()
+        found += learner.posterior.misfit.any()
+    assert found <= 5
+
+
+def test_the_pairs_say_how_far_from_rigid_an_arm_is():
+    errors: dict[float | None, list[float]] = {None: [], 0.003: [], 0.03: []}
+    for seed in range(4):
+        for ellipse_std, found in errors.items():
+            chain, prior, q, x = case("RRRRR", 300, seed, SIGMA_M)
+            settings = TensorSettings(refit_every=300)
+            learner = TensorLearner.around(prior, bases_for("RRRRR"), settings, ellipse_std=ellipse_std)
+            learner.learn(q, x)
+            learner.refit()
+            found.append(largest_error(learner, chain, "RRRRR"))
+    assert np.mean(errors[None]) < min(np.mean(errors[0.003]), np.mean(errors[0.03]))
+
+
+def test_what_a_train_does_not_follow_is_carried_over_in_bytes():
+    chain, prior, q, _ = case("RRR", 200, 3)
+    learner = TensorLearner.around(prior, bases_for("RRR"), AT_ONCE)
+    learner.learn(q, chain.positions(stretched(q)), 0.001)
+    twin = TensorLearner.from_bytes(learner.to_bytes())
+    assert learner.posterior.misfit.any()
+    np.testing.assert_array_equal(twin.estimate(q).sigma, learner.estimate(q).sigma)
+
+
 def test_sigma_grows_away_from_the_data():
     _, prior, q, x = case("RRRR", 200, 3, SIGMA_M, revolute_deg=20.0)
     learner = TensorLearner.around(prior, bases_for("RRRR"))
