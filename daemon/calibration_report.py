@@ -11,7 +11,6 @@ from daemon.calibration import Calibration
 from interfaces.recording import Recording
 from interfaces.records import FloatArray
 from interfaces.robot import RobotDescription
-from interfaces.rpy import rpy_of
 
 # A joint that moved less is named [rad, m].
 STILL_RAD, STILL_M = math.radians(10.0), 0.02
@@ -84,11 +83,11 @@ class CalibrationReport(msgspec.Struct, frozen=True, kw_only=True):
         """The answers of `calibration`; `source` is what the recording is called."""
         robot, recording, learner = calibration.robot, calibration.recording, calibration.learner
         report, tolerances, slides = learner.report(), learner.tolerances, robot.chain.prismatic
-        values, halves = calibration.figures, calibration.half_widths
-        drawn = [*robot.camera.xyz, *rpy_of(robot.camera.pose[:3, :3]), *robot.robot.marker_xyz]
+        named = calibration.figures
+        values, halves = named.values, named.half_widths
         figures = [
             Figure(*(float(unit * number) for number in numbers))
-            for unit, *numbers in zip(_UNITS, drawn, values[:9], halves[:9], strict=True)
+            for unit, *numbers in zip(_UNITS, named.drawn[:9], values[:9], halves[:9], strict=True)
         ]
         return cls(
             robot=robot.name,
@@ -122,7 +121,7 @@ def _zeros(calibration: Calibration, values: FloatArray, halves: FloatArray) -> 
     return [
         Zero(name, "mm" if slides else "°", float(unit * value), float(unit * half) if shown else None)
         for name, slides, unit, value, half, shown in zip(
-            robot.joints, robot.chain.prismatic, units, values, halves, calibration.shown, strict=True
+            robot.joints, robot.chain.prismatic, units, values, halves, calibration.figures.shown, strict=True
         )
     ]
 

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from kbmaps.arrays import FloatArray, rows
 from kbmaps.chain import RigidChain
+from kbmaps.chain_belief import ChainBelief
 from kbmaps.chain_parameters import ChainParameters
 from kbmaps.errors import DegenerateDataError, SettingError, ShapeError
 from kbmaps.rigid_learner import RigidLearner
@@ -94,6 +95,19 @@ class ChainPosterior:
         else:
             raise DegenerateDataError("without pairs there is no noise to go by; give the noise of further pairs")
         return cls(learner.nominal, learner.change, learner.covariance, noise=found, floor=floor)
+
+    @classmethod
+    def of_belief(cls, belief: ChainBelief, *, noise: float, floor: float = 0.0) -> ChainPosterior:
+        """What is believed of a chain.
+
+        Args:
+            noise: 1-sigma of a coordinate of a further pair [m].
+            floor: 1-sigma of a coordinate that no rigid chain explains [m].
+
+        Raises:
+            SettingError: noise is not positive, or floor is negative.
+        """
+        return cls(belief.parameters.reference, belief.mean, belief.covariance, noise=noise, floor=floor)
 
     @property
     def joints(self) -> int:

@@ -67,7 +67,7 @@ def calibrate(
     written = None
     if out is not None:
         heading = f"Calibrated by bodyschema from {report.pairs} pairs of {source.name}"
-        written = write_calibrated(description, found.geometry, out, heading)
+        written = write_calibrated(description, found.figures.geometry, out, heading)
     if as_json:
         sys.stdout.write(encode(report).decode() + "\n")
         return

@@ -89,8 +89,8 @@ def covered(seeds: range) -> float:
     inside: list[bool] = []
     for seed in seeds:
         arm = planted(seed)
-        found = arm.calibrated()
-        off = found.figures - figures_of(arm)
+        found = arm.calibrated().figures
+        off = found.values - figures_of(arm)
         told = np.append(np.ones(9, dtype=bool), found.shown)
         inside += (np.abs(off) < found.half_widths)[told].tolist()
     return float(np.mean(inside))
@@ -215,7 +215,7 @@ def test_the_simulation_takes_a_calibrated_robot(tmp_path) -> None:
     q = np.random.default_rng(5).uniform(robot.lower, robot.upper, (60, len(robot.joints)))
     x = TrueRobot.draw(robot, SimConfig()).chain(np.array(robot.robot.marker_xyz)).positions(q)
     found = Calibration.of(robot, Recording(joints=robot.joints, q=q, x=x), sigma_m=1e-4, zeros_rad=ZEROS_RAD)
-    calibrated = RobotDescription.load(write_calibrated(robot, found.geometry, tmp_path, "From a test"))
+    calibrated = RobotDescription.load(write_calibrated(robot, found.figures.geometry, tmp_path, "From a test"))
     exact = ErrorConfig(
         joint_offset_rad=0, link_length_m=0, link_axis_rad=0, camera_position_m=0, camera_rotation_rad=0, tool_m=0
     )
