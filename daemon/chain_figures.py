@@ -112,8 +112,8 @@ class ChainFigures:
 
     def _derivatives(self, change: FloatArray) -> FloatArray:
         steps = _STEP * np.eye(len(change))
-        columns = [_unwound(self._figures(change + step) - self._figures(change - step)) for step in steps]
-        return np.array(columns).T / (2.0 * _STEP)
+        here = self._figures(change)
+        return np.array([_unwound(self._figures(change + step) - here) for step in steps]).T / _STEP
 
 
 def probable(evidence: FloatArray) -> tuple[IntArray, FloatArray]:
