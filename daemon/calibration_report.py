@@ -8,6 +8,7 @@ import msgspec
 import numpy as np
 
 from daemon.calibration import Calibration
+from daemon.tool_jump import tool_jump
 from interfaces.recording import Recording
 from interfaces.records import FloatArray
 from interfaces.robot import RobotDescription
@@ -54,6 +55,10 @@ class CalibrationReport(msgspec.Struct, frozen=True, kw_only=True):
         axes_deg, points_mm: how well the arm is made, by the pairs: 1-sigma of an axis' tilt and shift.
         shown: independent numbers of the arm that the pairs determine, of `showable` that positions can.
         still: joints that hardly moved.
+        first: number of the first row (of a store: pair) that was learnt.
+        other_tool_from: number of the row from which on the marker sits elsewhere on the hand, or null: the figures
+            are then of neither tool.
+        other_tool_mm: how far from there, or null.
     """
 
     robot: str
@@ -76,11 +81,16 @@ class CalibrationReport(msgspec.Struct, frozen=True, kw_only=True):
     shown: int
     showable: int
     still: list[str]
+    first: int
+    other_tool_from: int | None
+    other_tool_mm: float | None
     schema: int = 1
 
     @classmethod
-    def of(cls, calibration: Calibration, source: str) -> CalibrationReport:
-        """The answers of `calibration`; `source` is what the recording is called."""
+    def of(cls, calibration: Calibration, source: str, first: int = 1) -> CalibrationReport:
+        """The answers of `calibration`; `source` is what the recording is called, `first` the number of its first row.
+        """
+        jump = tool_jump(calibration.learner, calibration.recording)
         robot, recording, learner = calibration.robot, calibration.recording, calibration.learner
         report, tolerances, slides = learner.report(), learner.tolerances, robot.chain.prismatic
         named = calibration.figures
@@ -112,6 +122,9 @@ class CalibrationReport(msgspec.Struct, frozen=True, kw_only=True):
             # chain, less the three turns of the marker that its place does not show.
             showable=4 * int((~slides).sum()) + 2 * int(slides.sum()) + 3,
             still=_still(robot, recording),
+            first=first,
+            other_tool_from=None if jump is None else first + jump.row - 1,
+            other_tool_mm=None if jump is None else 1e3 * jump.distance_m,
         )
 
 

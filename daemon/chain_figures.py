@@ -74,7 +74,7 @@ class ChainFigures:
             covariance = _given(belief.covariance, self._zeros[~self.shown])
             apart = _unwound(self._figures(belief.mean) - self.values)
             variance += share * (np.einsum("ij,jk,ik->i", jacobian, covariance, jacobian) + np.square(apart))
-        return HALF_WIDTH_95 * np.sqrt(variance)
+        return HALF_WIDTH_95 * np.sqrt(np.maximum(variance, 0.0))  # of a zero that is given, rounding is left
 
     @cached_property
     def shown(self) -> BoolArray:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from guided_arm import Scene, make_pair, near, new_learning, nominal_model, teach
+from guided_arm import Scene, make_pair, near, new_learning, teach
 from test_calibration import DESK_ARM, figures_of
 
 import daemon.findings
@@ -99,7 +99,7 @@ def findings_of(arm: Planted, clock: Ticking | None = None) -> Findings:
 
 
 def test_the_intervals_cover_what_was_planted() -> None:
-    assert np.mean([inside for seed in range(5) for inside in Planted.of(seed, 80).covered()]) > 0.8
+    assert np.mean([inside for seed in range(4) for inside in Planted.of(seed, 60).covered()]) > 0.8
 
 
 @pytest.mark.soak
@@ -115,7 +115,8 @@ def test_zeros_that_no_motion_shows_are_null_and_the_others_are_not() -> None:
 
 
 def test_the_arm_is_found_to_be_better_made_than_the_learner_s_tolerances() -> None:
-    _, (axes, points) = figures(Planted.of(2, 100).robot, Planted.of(2, 100).known())
+    arm = Planted.of(2, 60)
+    _, (axes, points) = figures(arm.robot, arm.known())
     assert axes < 0.02
     assert points < 0.005
 
@@ -259,12 +260,13 @@ def test_a_failure_to_find_them_does_not_stop_the_learner(monkeypatch, caplog) -
     assert "status has no calibration for now: Eigenvalues did not converge" in caplog.text
 
 
-def test_while_no_solution_answers_there_is_no_outlook() -> None:
-    learning = new_learning()
-    teach(learning, Scene.draw(0, 1).pairs)
-    assert learning.known() is None or not learning.known().solved
-
-
-def test_the_nominal_model_of_the_tests_is_the_one_that_learning_started_from() -> None:
-    learning, _ = guided(0, 30)
-    assert learning.known().nominal.fingerprint == nominal_model().fingerprint
+def test_while_no_solution_answers_there_is_a_calibration_but_no_outlook() -> None:
+    arm = Planted.of(1, 40)
+    arm.learning.tool_changed()
+    q = arm.robot.lower / 2.0
+    arm.learning.learn(make_pair(42, q, arm.parameters.positions(arm.change, q), SIGMA_M), 0.0)
+    arm.solve()  # a solution that has not met a pair yet
+    findings = findings_of(arm)
+    findings.renew()
+    assert findings.calibration is not None
+    assert findings.outlook is None
