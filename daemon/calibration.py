@@ -12,7 +12,7 @@ from interfaces.errors import BodyschemaError
 from interfaces.recording import Recording
 from interfaces.records import FloatArray
 from interfaces.robot import RobotDescription
-from kbmaps import Alignment, ChainBelief, ChainTolerances, KBMapsError, RigidChain, RigidLearner, align
+from kbmaps import Alignment, ChainBelief, ChainParameters, ChainTolerances, KBMapsError, RigidChain, RigidLearner, align
 
 from .chain_figures import HALF_WIDTH_95, WORKMANSHIP, ChainFigures, probable
 
@@ -85,9 +85,8 @@ class Calibration:
     @cached_property
     def figures(self) -> ChainFigures:
         """What was learnt, in the numbers that have names; not knowing how well the arm is made is part of them."""
-        tolerances = self.learner.tolerances
-        zeros_std = np.where(self.robot.chain.prismatic, tolerances.slide_zeros, tolerances.zeros)
-        return ChainFigures(self.robot, tuple(map(_claimed, self.learners)), self.shares, zeros_std)
+        prior = ChainBelief.from_tolerances(ChainParameters(self.placed.chain), self.learner.tolerances)
+        return ChainFigures(self.robot, tuple(map(_claimed, self.learners)), self.shares, prior)
 
 
 def _learners(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -28,6 +28,8 @@ HALF_WIDTH_95 = 1.959964
 NOT_SHOWN = 0.9
 # Of the numerical derivatives by tilts, shifts and zeros [rad, m].
 _STEP = 1e-6
+# Poses that stand for all, and the noise of exact pairs [m].
+_POSES, _EXACT_M = 100, 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,23 +40,23 @@ class ChainFigures:
         robot: the nominal model.
         beliefs: in its chain, or in that chain placed elsewhere; the most probable first. They change one chain.
         shares: how probable each is (m,); they add up to 1.
-        zeros_std: how far each joint's zero may be off before any pair (d,), 1-sigma [rad, m].
+        prior: what was believed of that chain before any pair.
     """
 
     robot: RobotDescription
     beliefs: tuple[ChainBelief, ...]
     shares: FloatArray
-    zeros_std: FloatArray
+    prior: ChainBelief
 
     @property
     def geometry(self) -> CalibratedGeometry:
         """The most probable chain in the terms of the robot's files."""
-        return self._geometry(self.beliefs[0].mean)
+        return self._geometry(self.beliefs[0].mean, self._split(self.beliefs[0]))
 
     @cached_property
     def values(self) -> FloatArray:
         """The figures (9 + d,) of the most probable chain."""
-        return self._figures(self.beliefs[0].mean)
+        return self._figures(self.beliefs[0].mean, self._split(self.beliefs[0]))
 
     @property
     def drawn(self) -> FloatArray:
@@ -70,22 +72,49 @@ class ChainFigures:
         """
         variance = np.zeros(len(self.values))
         for belief, share in zip(self.beliefs, self.shares, strict=True):
-            jacobian = self._derivatives(belief.mean)
+            split = self._split(belief)
+            jacobian = self._derivatives(split)
             covariance = _given(belief.covariance, self._zeros[~self.shown])
-            apart = _unwound(self._figures(belief.mean) - self.values)
+            apart = _unwound(self._figures(belief.mean, split) - self.values)
             variance += share * (np.einsum("ij,jk,ik->i", jacobian, covariance, jacobian) + np.square(apart))
         return HALF_WIDTH_95 * np.sqrt(np.maximum(variance, 0.0))  # of a zero that is given, rounding is left
 
     @cached_property
     def shown(self) -> BoolArray:
-        """Which joints' zeros (d,) the pairs show; a turn of the camera or of the marker may do what others do."""
-        left = np.sqrt(np.square(self.beliefs[0].root[self._zeros]).sum(axis=1))
-        return left < NOT_SHOWN * self.zeros_std
+        """Which joints' zeros (d,) the pairs show; a turn of the camera or of the marker may do what others do.
+
+        What exact pairs of all poses would not show, nothing has shown: along such directions a belief that was
+        linearised at several places seems surer than it is.
+        """
+        zeros = self._zeros
+        return (_spread(self.beliefs[0], zeros) < self._unsure) & (_spread(self._best, zeros) < self._unsure)
 
     @property
     def moved(self) -> FloatArray:
         """`values` less `drawn` (9 + d,), angles the shorter way round."""
         return _unwound(self.values - self.drawn)
+
+    @property
+    def _unsure(self) -> FloatArray:
+        return NOT_SHOWN * _spread(self.prior, self._zeros)
+
+    @property
+    def _best(self) -> ChainBelief:
+        """What exact pairs of all poses would let believe."""
+        poses = np.random.default_rng(0).uniform(self.robot.lower, self.robot.upper, (_POSES, len(self.robot.joints)))
+        _, jacobian = self._parameters.linearised(self.beliefs[0].mean, poses)
+        rows = (jacobian @ self.prior.root).reshape(-1, self.prior.root.shape[1]) / _EXACT_M
+        _, singular, vt = np.linalg.svd(rows, full_matrices=False)
+        return replace(self.prior, root=self.prior.root @ (vt.T / np.sqrt(1.0 + np.square(singular))))
+
+    def _split(self, belief: ChainBelief) -> FloatArray:
+        """The most probable change (size,) given that the zeros which nothing shows are as drawn."""
+        drawn = self._zeros[~self.shown]
+        covariance = belief.covariance
+        gain = np.linalg.solve(covariance[np.ix_(drawn, drawn)], covariance[drawn])
+        split = belief.mean - belief.mean[drawn] @ gain
+        split[drawn] = 0.0
+        return split
 
     @property
     def _zeros(self) -> IntArray:
@@ -95,25 +124,26 @@ class ChainFigures:
     def _parameters(self) -> ChainParameters:
         return self.beliefs[0].parameters
 
-    def _geometry(self, change: FloatArray) -> CalibratedGeometry:
+    def _geometry(self, change: FloatArray, split: FloatArray) -> CalibratedGeometry:
+        """The chain of one change, with the move of the camera and the zeros of another that makes nearly the same."""
         parameters = self._parameters
         T_placed_nominal = parameters.reference.fixed[0] @ inverse(self.robot.chain.fixed[0])
         return CalibratedGeometry.of(
             self.robot,
             parameters.chain(change),
-            T_measured_nominal=parameters.base_pose(change) @ T_placed_nominal,
-            zeros=change[parameters.zeros],
+            T_measured_nominal=parameters.base_pose(split) @ T_placed_nominal,
+            zeros=split[parameters.zeros],
         )
 
-    def _figures(self, change: FloatArray) -> FloatArray:
-        geometry = self._geometry(change)
+    def _figures(self, change: FloatArray, split: FloatArray) -> FloatArray:
+        geometry = self._geometry(change, split)
         camera = geometry.T_parent_camera
-        return np.concatenate([camera[:3, 3], rpy_of(camera[:3, :3]), geometry.marker_xyz, change[self._zeros]])
+        return np.concatenate([camera[:3, 3], rpy_of(camera[:3, :3]), geometry.marker_xyz, split[self._zeros]])
 
     def _derivatives(self, change: FloatArray) -> FloatArray:
         steps = _STEP * np.eye(len(change))
-        here = self._figures(change)
-        return np.array([_unwound(self._figures(change + step) - here) for step in steps]).T / _STEP
+        here = self._figures(change, change)
+        return np.array([_unwound(self._figures(moved, moved) - here) for moved in change + steps]).T / _STEP
 
 
 def probable(evidence: FloatArray) -> tuple[IntArray, FloatArray]:
@@ -126,6 +156,11 @@ def probable(evidence: FloatArray) -> tuple[IntArray, FloatArray]:
     shares /= shares.sum()
     kept = np.array([k for k in np.argsort(-shares) if shares[k] > LEAST_SHARE], dtype=np.intp)
     return kept, shares[kept] / shares[kept].sum()
+
+
+def _spread(belief: ChainBelief, which: IntArray) -> FloatArray:
+    """1-sigma (k,) of some of the parameters."""
+    return np.sqrt(np.square(belief.root[which]).sum(axis=1))
 
 
 def _given(covariance: FloatArray, known: IntArray) -> FloatArray:

@@ -25,14 +25,16 @@ EVERY_S = 1.0
 
 
 class Findings:
-    """Finds calibration and outlook anew when the solver has found a new chain. For the background thread alone.
+    """Finds calibration and outlook anew when there is a new chain, or another model answers.
+
+    For the background thread alone.
 
     What was found may be read by any thread.
     """
 
     def __init__(self, learning: Learning, robot: RobotDescription, clock: Clock) -> None:
         self._learning, self._robot, self._clock = learning, robot, clock
-        self._belief: ChainBelief | None = None
+        self._found_of: tuple[ChainBelief | None, str] = None, ""
         self._due_at = clock.now()
         self._found: tuple[ChainCalibration | None, Outlook | None] = None, None
 
@@ -47,15 +49,14 @@ class Findings:
         return self._found[1] if self._learning.belief is not None else None
 
     def renew(self) -> None:
-        """Find both again if there is a new chain and it is time to."""
-        begin = self._clock.now()
-        if self._learning.belief is self._belief or begin < self._due_at:
+        """Find both again if what they rest on has changed, and it is time to."""
+        begin, present = self._clock.now(), (self._learning.belief, self._learning.snapshot.answering)
+        if present == self._found_of or begin < self._due_at:
             return
-        known = self._learning.known()
+        self._found_of, known = present, self._learning.known()
         if known is None:
-            self._belief, self._found = None, (None, None)
+            self._found = None, None
             return
-        self._belief = known.belief
         try:
             self._found = _found(self._robot, known)
         except (KBMapsError, np.linalg.LinAlgError) as error:
@@ -107,5 +108,5 @@ def figures(robot: RobotDescription, known: Known) -> tuple[ChainFigures, tuple[
     made += [(axes, points) for axes, points in WORKMANSHIP if axes < wide.axes and points < wide.points]
     beliefs = [known.belief.tightened(wide, replace(wide, axes=axes, points=points)) for axes, points in made]
     kept, shares = probable(np.array([evidence for _, evidence in beliefs]))
-    zeros_std = np.where(robot.chain.prismatic, wide.slide_zeros, wide.zeros)
-    return ChainFigures(robot, tuple(beliefs[k][0] for k in kept), shares, zeros_std), made[kept[0]]
+    prior = known.nominal.belief(known.belief.parameters.reference, wide)
+    return ChainFigures(robot, tuple(beliefs[k][0] for k in kept), shares, prior), made[kept[0]]
