@@ -12,7 +12,16 @@ from interfaces.errors import BodyschemaError
 from interfaces.recording import Recording
 from interfaces.records import FloatArray
 from interfaces.robot import RobotDescription
-from kbmaps import Alignment, ChainBelief, ChainParameters, ChainTolerances, KBMapsError, RigidChain, RigidLearner, align
+from kbmaps import (
+    Alignment,
+    ChainBelief,
+    ChainParameters,
+    ChainTolerances,
+    KBMapsError,
+    RigidChain,
+    RigidLearner,
+    align,
+)
 
 from .chain_figures import HALF_WIDTH_95, WORKMANSHIP, ChainFigures, probable
 

@@ -88,7 +88,11 @@ class CalibrationReport(msgspec.Struct, frozen=True, kw_only=True):
 
     @classmethod
     def of(cls, calibration: Calibration, source: str, first: int = 1) -> CalibrationReport:
-        """The answers of `calibration`; `source` is what the recording is called, `first` the number of its first row.
+        """The answers of `calibration`.
+
+        Args:
+            source: what the recording is called.
+            first: the number of its first row.
         """
         jump = tool_jump(calibration.learner, calibration.recording)
         robot, recording, learner = calibration.robot, calibration.recording, calibration.learner

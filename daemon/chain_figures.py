@@ -98,14 +98,9 @@ class ChainFigures:
     def _unsure(self) -> FloatArray:
         return NOT_SHOWN * _spread(self.prior, self._zeros)
 
-    @property
+    @cached_property
     def _best(self) -> ChainBelief:
-        """What exact pairs of all poses would let believe."""
-        poses = np.random.default_rng(0).uniform(self.robot.lower, self.robot.upper, (_POSES, len(self.robot.joints)))
-        _, jacobian = self._parameters.linearised(self.beliefs[0].mean, poses)
-        rows = (jacobian @ self.prior.root).reshape(-1, self.prior.root.shape[1]) / _EXACT_M
-        _, singular, vt = np.linalg.svd(rows, full_matrices=False)
-        return replace(self.prior, root=self.prior.root @ (vt.T / np.sqrt(1.0 + np.square(singular))))
+        return after_exact_pairs(self.prior, self.beliefs[0].mean, self.robot)
 
     def _split(self, belief: ChainBelief) -> FloatArray:
         """The most probable change (size,) given that the zeros which nothing shows are as drawn."""
@@ -144,6 +139,38 @@ class ChainFigures:
         steps = _STEP * np.eye(len(change))
         here = self._figures(change, change)
         return np.array([_unwound(self._figures(moved, moved) - here) for moved in change + steps]).T / _STEP
+
+
+def after_exact_pairs(prior: ChainBelief, change: FloatArray, robot: RobotDescription) -> ChainBelief:
+    """The prior with what exact pairs of all poses would leave open, linearised at a change (size,)."""
+    poses = np.random.default_rng(0).uniform(robot.lower, robot.upper, (_POSES, len(robot.joints)))
+    _, jacobian = prior.parameters.linearised(change, poses)
+    rows = (jacobian @ prior.root).reshape(-1, prior.root.shape[1]) / _EXACT_M
+    _, singular, vt = np.linalg.svd(rows, full_matrices=False)
+    return replace(prior, root=prior.root @ (vt.T / np.sqrt(1.0 + np.square(singular))))
+
+
+def no_surer_than_possible(belief: ChainBelief, prior: ChainBelief, robot: RobotDescription) -> ChainBelief:
+    """A belief made in several linearisations, with what no pair can show left to the prior.
+
+    What one chain does as well as another lies along a curve, and its tangents differ from place to place. Pairs
+    that were linearised at one place therefore seem to tell something about the tangents at another (Huang, Mourikis
+    and Roumeliotis 2010, on the consistency of the extended Kalman filter). In no direction may a belief be surer
+    than exact pairs would make it.
+    """
+    best = after_exact_pairs(prior, belief.mean, robot)
+    free = np.flatnonzero(prior.root.any(axis=1))
+    std = _spread(prior, free)
+    own, least = (scaled @ scaled.T for scaled in (each.root[free] / std[:, None] for each in (belief, best)))
+    mean = belief.mean[free] / std
+    mean = (mean - least @ mean) * std  # along what exact pairs leave open, to where the prior is most probable
+    factor = np.linalg.cholesky(own + least)
+    half = np.linalg.solve(factor, np.linalg.solve(factor, least).T)
+    shares, vectors = np.linalg.eigh((half + half.T) / 2.0)
+    root, change = np.zeros((len(belief.mean), len(free))), belief.mean.copy()
+    root[free] = std[:, None] * (factor @ vectors) * np.sqrt(np.maximum(shares, 1.0 - shares))
+    change[free] = mean
+    return replace(belief, mean=change, root=root)
 
 
 def probable(evidence: FloatArray) -> tuple[IntArray, FloatArray]:

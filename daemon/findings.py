@@ -11,7 +11,7 @@ from interfaces.protocols import Clock
 from interfaces.robot import RobotDescription
 from kbmaps import ChainBelief, KBMapsError
 
-from .chain_figures import WORKMANSHIP, ChainFigures, probable
+from .chain_figures import WORKMANSHIP, ChainFigures, no_surer_than_possible, probable
 from .learning import Learning
 from .learning.learning import REGION_RAD
 from .learning.outlook import Known, Scatter, foreseen
@@ -106,7 +106,8 @@ def figures(robot: RobotDescription, known: Known) -> tuple[ChainFigures, tuple[
     wide = known.tolerances
     made = [(wide.axes, wide.points)]
     made += [(axes, points) for axes, points in WORKMANSHIP if axes < wide.axes and points < wide.points]
-    beliefs = [known.belief.tightened(wide, replace(wide, axes=axes, points=points)) for axes, points in made]
-    kept, shares = probable(np.array([evidence for _, evidence in beliefs]))
     prior = known.nominal.belief(known.belief.parameters.reference, wide)
+    belief = no_surer_than_possible(known.belief, prior, robot)
+    beliefs = [belief.tightened(wide, replace(wide, axes=axes, points=points)) for axes, points in made]
+    kept, shares = probable(np.array([evidence for _, evidence in beliefs]))
     return ChainFigures(robot, tuple(beliefs[k][0] for k in kept), shares, prior), made[kept[0]]

@@ -65,7 +65,11 @@ def calibration_table(calibration: ChainCalibration, slides: Collection[str] = (
         facts.add_row("left as drawn", f"{', '.join(drawn)}: no motion shows {_such_zeros(drawn)}")
     facts.add_row("arm made to", f"about {_DEG * calibration.axes_rad:.2g}° and {1e3 * calibration.points_m:.2g} mm")
     facts.add_row("noise", f"{mm(calibration.noise_m)} a coordinate, {_outliers(calibration.outliers)}")
-    return Group(Text(f"calibration: from robot.toml to what {calibration.pairs} pairs show, ± for 95 %", style="bold"), table, facts)
+    return Group(
+        Text(f"calibration: from robot.toml to what {calibration.pairs} pairs show, ± for 95 %", style="bold"),
+        table,
+        facts,
+    )
 
 
 def _such_zeros(joints: list[str]) -> str:

@@ -15,6 +15,8 @@ FEWEST = 6
 EXPLAINED = 0.5
 # Residuals beyond so many times the middle one count less: single outliers are no change.
 FAR = 5.0
+# Keeps splits apart from which nothing can be told, e.g. of poses that are all alike.
+_RIDGE = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +70,7 @@ def _splits(learner: RigidLearner, recording: Recording) -> tuple[FloatArray, Fl
     in_basis = _after(np.einsum("nip,nij->npj", basis.reshape(*residuals.shape, -1), columns))
     square = _after(columns.swapaxes(1, 2) @ columns) - in_basis.swapaxes(1, 2) @ in_basis
     product = _after(np.einsum("nij,ni->nj", columns, target))
-    shifts = np.linalg.solve(square + 1e-9 * np.eye(3), product[..., None])[..., 0]
+    shifts: FloatArray = np.linalg.solve(square + _RIDGE * np.eye(3), product[..., None])[..., 0].astype(np.float64)
     return np.einsum("nj,nj->n", shifts, product) / np.square(target).sum(), shifts
 
 

@@ -31,8 +31,10 @@ def calibrate(
     ] = 3.0,
     first: Annotated[
         int | None,
-        Parameter(help="Number of the first row to learn; of a store, else the first with the present tool.",
-                  validator=Number(gte=1)),
+        Parameter(
+            help="Number of the first row to learn; of a store, else the first with the present tool.",
+            validator=Number(gte=1),
+        ),
     ] = None,
     last: Annotated[int | None, Parameter(help="Number of the last row to learn.", validator=Number(gte=1))] = None,
     out: Annotated[
@@ -42,14 +44,16 @@ def calibrate(
 ) -> None:
     """Where camera and tool are and what the joint zeros are, with 95 % intervals; writes a calibrated URDF.
 
-    Learns a rigid chain from all pairs, around the nominal one. Outliers are left out. All pairs have to be of the
-    same tool: from a store those are learnt that the learner beside it counts since the tool was last changed, and
-    where residuals jump as with another tool, this is said, with the row, and nothing is written. The URDF opens in pybullet, Pinocchio and ROS: it has the camera and the marker as links of their own,
-    and takes its positions from them to rounding as the learnt chain does. Meshes, masses and limits stay.
+    Learns a rigid chain from all pairs, around the nominal one. Outliers are left out. All pairs have to be of one
+    tool: from a store those are learnt that the learner beside it counts since the tool was last changed. Where
+    residuals jump as with another tool, this is said, with the row, and nothing is written.
 
-    Needs: a recording or a store, and its robot.toml; neither hardware nor a running daemon, but the store may be one
-    that a sampler is writing. What robot.toml calls
-    not known (`pose_known`, `marker_known`) is taken from the pairs alone, the rest is trusted to 1° and 10 mm.
+    The URDF opens in pybullet, Pinocchio and ROS: it has the camera and the marker as links of their own, and takes
+    its positions from them to rounding as the learnt chain does. Meshes, masses and limits stay.
+
+    Needs: a recording or a store, and its robot.toml; no hardware. The daemon may be running: its store is read. What
+    robot.toml calls not known (`pose_known`, `marker_known`) is taken from the pairs alone, the rest is trusted to
+    1° and 10 mm.
 
     Next: `bodyschema run --robot OUT/robot.toml` starts from what was learnt.
     """

@@ -107,6 +107,23 @@ def test_the_95_percent_intervals_cover_95_percent() -> None:
     assert 0.93 < np.mean([inside for seed in range(100) for inside in Planted.of(seed, 100).covered()]) < 0.99
 
 
+def covered_after_another_tool(seed: int) -> list[bool]:
+    arm = Planted.of(seed, 80)
+    arm.change[arm.parameters.tool] += OTHER_TOOL
+    arm.learning.tool_changed()
+    arm.teach(np.random.default_rng(seed + 1000), 40)
+    return arm.covered()
+
+
+def test_the_intervals_cover_what_was_planted_after_a_tool_change_too() -> None:
+    assert np.mean([inside for seed in range(3) for inside in covered_after_another_tool(seed)]) > 0.8
+
+
+@pytest.mark.soak
+def test_the_95_percent_intervals_cover_95_percent_after_a_tool_change_too() -> None:
+    assert 0.93 < np.mean([inside for seed in range(60) for inside in covered_after_another_tool(seed)]) < 0.995
+
+
 def test_zeros_that_no_motion_shows_are_null_and_the_others_are_not() -> None:
     findings = findings_of(Planted.of(1, 100))
     findings.renew()
@@ -182,7 +199,7 @@ def test_what_is_foreseen_of_further_pairs_comes(after_60) -> None:
 
 
 def test_after_few_pairs_there_is_not_enough_data_and_after_many_there_is() -> None:
-    learning, scene = guided(1, 30)
+    learning, _ = guided(1, 30)
     assert not outlook_of(learning).enough
     rest = Scene.draw(1, 700)
     teach(learning, rest.pairs[30:], background=False)
