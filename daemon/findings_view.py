@@ -22,7 +22,7 @@ def outlook_lines(outlook: Outlook | None) -> list[str]:
     pairs = outlook.further_pairs[-1]
     like = f"{pairs} more pairs like these: {mm(outlook.like_so_far_m[-1])}"
     return [
-        f"{'yes' if outlook.enough else 'no'}: {mm(outlook.error_m)} expected where the arm was, "
+        f"{'yes' if outlook.enough else 'no'}: {mm(outlook.error_m)} off where the arm was, "
         f"{mm(outlook.anywhere_m)} in its whole range",
         like if _other_is_better(outlook) else f"{like}; no other motion gains more",
         *([f"{pairs} of {outlook.best_motion}: {mm(outlook.best_motion_m[-1])}"] if _other_is_better(outlook) else []),
@@ -51,9 +51,9 @@ def calibration_table(calibration: ChainCalibration, slides: Collection[str] = (
     table.add_column("")
     for name in ("x, roll", "y, pitch", "z, yaw"):
         table.add_column(name, justify="right", no_wrap=True)
-    table.add_row(f"camera on {calibration.camera_link} [mm]", *_moves(calibration.camera_xyz, 1e3))
-    table.add_row("turned by [°]", *_moves(calibration.camera_rpy, _DEG))
-    table.add_row(f"marker on {calibration.marker_link} [mm]", *_moves(calibration.marker_xyz, 1e3))
+    table.add_row(Text(f"camera on {calibration.camera_link} [mm]"), *_moves(calibration.camera_xyz, 1e3))
+    table.add_row(Text("turned by [°]"), *_moves(calibration.camera_rpy, _DEG))
+    table.add_row(Text(f"marker on {calibration.marker_link} [mm]"), *_moves(calibration.marker_xyz, 1e3))
     facts = Table.grid(padding=(0, 2))
     facts.add_column(no_wrap=True)
     shown = {name: zero for name, zero in calibration.zeros.items() if zero is not None}

@@ -118,13 +118,16 @@ class Learning:
         return snapshot.expected_error_m(q + rng.normal(0.0, 1.0, q.shape) * self._nominal.reach(REGION_RAD))
 
     def known(self) -> Known | None:
-        """What is known of the chain now; None before the first solution with the present tool."""
+        """What is known of the chain now; None before the first solution with the present tool.
+
+        For the thread that calls `work`.
+        """
         with self._lock:
             claims, memory = self._claims, self._memory
-            if claims.belief is None or not len(memory):
+            if claims.belief is None or not self._solving.fed:
                 return None
             seen, _ = memory.some(memory.count, LOOKED_BACK)
-            q, x, _ = memory.since(memory.count - LOOKED_BACK)
+            q, x, _ = memory.since(self._solving.fed - LOOKED_BACK, LOOKED_BACK)  # those that the solver knows
             return Known(
                 nominal=self._nominal,
                 belief=claims.belief,

@@ -43,7 +43,7 @@ class Known:
         solved: whether that is a solution, of whose error the belief tells.
         pairs: how many pairs with the present tool were learnt.
         seen: poses (n, d) [rad, m] of some of them, evenly spread.
-        q, x: the newest of them, (m, d) [rad, m] and (m, 3) [m].
+        q, x: the newest that the solver knows, (m, d) [rad, m] and (m, 3) [m].
     """
 
     nominal: NominalModel
@@ -78,7 +78,7 @@ class Scatter:
         missed = known.x - predicted
         distances = np.linalg.norm(missed, axis=1)
         # What the fit takes from the residuals is what it is still unsure of at the same places.
-        noise = math.hypot(MEDIAN_TO_SIGMA * float(np.median(distances)), math.sqrt(float(variance.mean())))
+        noise = math.hypot(MEDIAN_TO_SIGMA * float(np.median(distances)), math.sqrt(float(np.median(variance))))
         noise = max(noise, LEAST_NOISE_M)
         inliers = distances <= OUTLIER_SIGMAS * noise
         return cls(noise, int((~inliers).sum()), shared_by(missed[inliers]))

@@ -103,8 +103,9 @@ def test_the_intervals_cover_what_was_planted() -> None:
 
 
 @pytest.mark.soak
+@pytest.mark.timeout(900)
 def test_the_95_percent_intervals_cover_95_percent() -> None:
-    assert 0.93 < np.mean([inside for seed in range(100) for inside in Planted.of(seed, 100).covered()]) < 0.99
+    assert 0.93 < np.mean([inside for seed in range(60) for inside in Planted.of(seed, 60).covered()]) < 0.995
 
 
 def covered_after_another_tool(seed: int) -> list[bool]:
@@ -120,8 +121,9 @@ def test_the_intervals_cover_what_was_planted_after_a_tool_change_too() -> None:
 
 
 @pytest.mark.soak
+@pytest.mark.timeout(900)
 def test_the_95_percent_intervals_cover_95_percent_after_a_tool_change_too() -> None:
-    assert 0.93 < np.mean([inside for seed in range(60) for inside in covered_after_another_tool(seed)]) < 0.995
+    assert 0.93 < np.mean([inside for seed in range(30) for inside in covered_after_another_tool(seed)]) < 0.995
 
 
 def test_zeros_that_no_motion_shows_are_null_and_the_others_are_not() -> None:

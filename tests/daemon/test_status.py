@@ -145,6 +145,11 @@ def sampler_running(config: Config) -> Iterator[None]:
         "prior 40.1 mm, exact 2.0 mm",
         "exact, model 6b6f",
         "none yet",
+        "enough? no: 0.60 mm off where the arm was, 4.2 mm in its whole range 300 more pairs like these: 0.50 mm",
+        "300 of moving shoulder over its range: 0.30 mm",
+        "camera on base_link [mm] -11 ± 11 +20 ± 33 +10 ± 43",
+        "zeros to add shoulder +3.7 ± 3.5°",
+        "left as drawn waist: no motion shows its zero",
     ],
 )
 def test_the_screen_shows_both_processes(config, said) -> None:
