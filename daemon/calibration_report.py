@@ -8,10 +8,10 @@ import msgspec
 import numpy as np
 
 from daemon.calibration import Calibration
+from daemon.tool_jump import tool_jump
 from interfaces.recording import Recording
 from interfaces.records import FloatArray
 from interfaces.robot import RobotDescription
-from interfaces.rpy import rpy_of
 
 # A joint that moved less is named [rad, m].
 STILL_RAD, STILL_M = math.radians(10.0), 0.02
@@ -55,6 +55,10 @@ class CalibrationReport(msgspec.Struct, frozen=True, kw_only=True):
         axes_deg, points_mm: how well the arm is made, by the pairs: 1-sigma of an axis' tilt and shift.
         shown: independent numbers of the arm that the pairs determine, of `showable` that positions can.
         still: joints that hardly moved.
+        first: number of the first row (of a store: pair) that was learnt.
+        other_tool_from: number of the row from which on the marker sits elsewhere on the hand, or null: the figures
+            are then of neither tool.
+        other_tool_mm: how far from there, or null.
     """
 
     robot: str
@@ -77,18 +81,27 @@ class CalibrationReport(msgspec.Struct, frozen=True, kw_only=True):
     shown: int
     showable: int
     still: list[str]
+    first: int
+    other_tool_from: int | None
+    other_tool_mm: float | None
     schema: int = 1
 
     @classmethod
-    def of(cls, calibration: Calibration, source: str) -> CalibrationReport:
-        """The answers of `calibration`; `source` is what the recording is called."""
+    def of(cls, calibration: Calibration, source: str, first: int = 1) -> CalibrationReport:
+        """The answers of `calibration`.
+
+        Args:
+            source: what the recording is called.
+            first: the number of its first row.
+        """
+        jump = tool_jump(calibration.learner, calibration.recording)
         robot, recording, learner = calibration.robot, calibration.recording, calibration.learner
         report, tolerances, slides = learner.report(), learner.tolerances, robot.chain.prismatic
-        values, halves = calibration.figures, calibration.half_widths
-        drawn = [*robot.camera.xyz, *rpy_of(robot.camera.pose[:3, :3]), *robot.robot.marker_xyz]
+        named = calibration.figures
+        values, halves = named.values, named.half_widths
         figures = [
             Figure(*(float(unit * number) for number in numbers))
-            for unit, *numbers in zip(_UNITS, drawn, values[:9], halves[:9], strict=True)
+            for unit, *numbers in zip(_UNITS, named.drawn[:9], values[:9], halves[:9], strict=True)
         ]
         return cls(
             robot=robot.name,
@@ -113,6 +126,9 @@ class CalibrationReport(msgspec.Struct, frozen=True, kw_only=True):
             # chain, less the three turns of the marker that its place does not show.
             showable=4 * int((~slides).sum()) + 2 * int(slides.sum()) + 3,
             still=_still(robot, recording),
+            first=first,
+            other_tool_from=None if jump is None else first + jump.row - 1,
+            other_tool_mm=None if jump is None else 1e3 * jump.distance_m,
         )
 
 
@@ -122,7 +138,7 @@ def _zeros(calibration: Calibration, values: FloatArray, halves: FloatArray) -> 
     return [
         Zero(name, "mm" if slides else "°", float(unit * value), float(unit * half) if shown else None)
         for name, slides, unit, value, half, shown in zip(
-            robot.joints, robot.chain.prismatic, units, values, halves, calibration.shown, strict=True
+            robot.joints, robot.chain.prismatic, units, values, halves, calibration.figures.shown, strict=True
         )
     ]
 

@@ -52,6 +52,10 @@ def sentences(report: CalibrationReport) -> list[str]:
             "the camera, of the marker, or of a neighbouring joint, and nothing needs to: the positions are the same. "
             "The other figures are given that."
         )
+    if report.first > 1:
+        said.insert(0, f"Learnt from number {report.first} on.")
+    if report.other_tool_from is not None:
+        said.insert(0, two_tools(report))
     if report.misfit > MISFIT:
         said.append(
             f"The residuals are {report.misfit:.1f} times what the noise explains: the arm is not quite a rigid chain "
@@ -60,6 +64,15 @@ def sentences(report: CalibrationReport) -> list[str]:
     if report.noise_mm > FAR_MM:
         said.append("That is very far off. Are positions in metres, angles in radians, and both of this robot?")
     return said
+
+
+def two_tools(report: CalibrationReport) -> str:
+    """What to do where the pairs are of two tools."""
+    return (
+        f"From number {report.other_tool_from} on the marker sits about {report.other_tool_mm:.0f} mm elsewhere on the "
+        "hand: these are pairs of two tools, and no figure is right for both. Calibrate them apart: "
+        f"--first {report.other_tool_from}, or --last {(report.other_tool_from or 0) - 1}."
+    )
 
 
 def _advice(report: CalibrationReport) -> str:

@@ -21,6 +21,7 @@ from daemon.bus import Bus, Request
 from daemon.checkpoint import CheckpointError, read_checkpoint, set_aside, write_checkpoint
 from daemon.config import Config
 from daemon.feed import PairFeed
+from daemon.findings import Findings
 from daemon.keys import Keys
 from daemon.learning import Learning, NominalModel, StateError
 from daemon.learning.solver import LARGEST_NET
@@ -54,6 +55,7 @@ class Learner:
         self._set_aside: str | None = None
         self._restore()
         self._feed = PairFeed(self._learning, self._history, clock)
+        self._findings = Findings(self._learning, config.robot, clock)
         self._answers = Answers(self._learning, config.robot, clock)
         self._sampler_alive = False
         self._started_at = clock.now()
@@ -130,6 +132,8 @@ class Learner:
             claimed_error_m=self._learning.claimed_error_m(),
             curve=self._learning.curve,
             model=snapshot.digest,
+            calibration=self._findings.calibration,
+            outlook=self._findings.outlook,
             gaps_recovered=counters.gaps_recovered,
             refused=counters.refused,
             doubted=counters.doubted,
@@ -255,6 +259,7 @@ class Learner:
         idle_since = self._clock.now()
         while not self._stop.is_set():
             try:
+                self._findings.renew()
                 worked = self._learning.work()
             except SolverLostError as error:
                 log.warning("%s", error)

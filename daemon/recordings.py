@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -39,7 +40,25 @@ def from_pairs(pairs: Sequence[Pair], joints: tuple[str, ...]) -> Recording:
     )
 
 
+@dataclass(frozen=True)
+class StoredPairs:
+    """The pairs of a store.
+
+    Attributes:
+        store: its identity.
+        recording: all pairs in it; the first has the number 1.
+    """
+
+    store: str
+    recording: Recording
+
+
 def from_store(file: Path) -> Recording:
+    """All pairs of a store, as `stored_pairs`."""
+    return stored_pairs(file).recording
+
+
+def stored_pairs(file: Path) -> StoredPairs:
     """All pairs of a store, which a sampler may be writing meanwhile.
 
     Raises:
@@ -50,7 +69,7 @@ def from_store(file: Path) -> Recording:
         pairs = reader.read()
         if not pairs:
             raise RecordingError("the store has no pairs yet", file=file, remedy="Move the arm in front of the camera")
-        return from_pairs(pairs, reader.joints)
+        return StoredPairs(pairs[0].store, from_pairs(pairs, reader.joints))
 
 
 def of_robot(recording: Recording, joints: tuple[str, ...], file: Path) -> Recording:
@@ -62,6 +81,20 @@ def of_robot(recording: Recording, joints: tuple[str, ...], file: Path) -> Recor
             remedy=f"Give the robot.toml that they were taken with; this one has {', '.join(joints)}",
         )
     return recording
+
+
+def between(recording: Recording, first: int, last: int | None, file: Path) -> Recording:
+    """The rows with the numbers from `first` to `last`, counted from 1; RecordingError when there are none."""
+    numbers = np.arange(1, len(recording) + 1)
+    chosen = (numbers >= first) & (numbers <= (last or len(recording)))
+    if not chosen.any():
+        upto = "" if last is None else f" to number {last}"
+        raise RecordingError(
+            f"there are no pairs from number {first} on{upto}; the last one is {len(recording)}",
+            file=file,
+            remedy="Move the arm in front of the camera, or give another --first",
+        )
+    return recording.rows(chosen)
 
 
 def check_target(out: Path, *, force: bool) -> None:

@@ -18,7 +18,7 @@ def mm(metres: float | None, unit: str = " mm") -> str:
     if metres is None or not math.isfinite(metres):
         return "-"
     value = 1e3 * metres
-    return f"{value:.{0 if value >= 100 else 1 if value >= 1 else 2}f}{unit}"
+    return f"{value:.{0 if value >= 100 else 1 if value >= 1 else 2 if value >= 0.1 else 3}f}{unit}"
 
 
 def titled_table(title: str, *, numbers: bool = True) -> Table:

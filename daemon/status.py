@@ -55,6 +55,74 @@ class CurvePoint(msgspec.Struct, frozen=True, array_like=True):
     error_m: float
 
 
+class LearntFigure(msgspec.Struct, frozen=True):
+    """One number of the robot's files: as drawn and as learnt, with half the width of its 95 % interval."""
+
+    drawn: float
+    learnt: float
+    half_width: float
+
+
+class JointZero(msgspec.Struct, frozen=True):
+    """What has to be added to a joint's reading, with half the width of its 95 % interval [rad or m]."""
+
+    value: float
+    half_width: float
+
+
+class ChainCalibration(msgspec.Struct, frozen=True, kw_only=True):
+    """Where camera and tool are and the joints' zeros, as the learnt rigid chain has them.
+
+    Attributes:
+        pairs: pairs with the present tool that it was found from.
+        camera_link, camera_xyz, camera_rpy: pose of the measurement frame in this link (URDF convention) [m, rad].
+        marker_link, marker_xyz: the marker in this link [m].
+        zeros: by joint; null where no motion shows it and it is left as drawn. The other figures are given that.
+        axes_rad, points_m: how well the arm seems to be made: 1-sigma of an axis' tilt and of its shift.
+        noise_m: 1-sigma of a measured coordinate.
+        outliers: of the last 500 pairs, those too far from the chain for this noise.
+    """
+
+    pairs: int
+    camera_link: str
+    camera_xyz: list[LearntFigure]
+    camera_rpy: list[LearntFigure]
+    marker_link: str
+    marker_xyz: list[LearntFigure]
+    zeros: dict[str, JointZero | None]
+    axes_rad: float
+    points_m: float
+    noise_m: float
+    outliers: int
+
+
+class Outlook(msgspec.Struct, frozen=True, kw_only=True):
+    """What further pairs would still gain.
+
+    Attributes:
+        pairs: pairs with the present tool that it was foreseen from.
+        error_m: expected mean distance to the truth where the arm has been [m].
+        least_error_m: the part of it that no further pair mends [m].
+        anywhere_m: expected mean distance to the truth over the whole ranges of all joints [m].
+        further_pairs: numbers of further pairs, ascending.
+        like_so_far_m: what `error_m` would be after so many, moving as so far [m].
+        best_motion: the motion that would gain most, in words.
+        best_motion_m: what `error_m` would be after so many of it [m].
+        enough: whether no motion, with as many pairs as the last of `further_pairs`, would lower `error_m` by a tenth,
+            or by a tenth of the noise of a measurement.
+    """
+
+    pairs: int
+    error_m: float
+    least_error_m: float
+    anywhere_m: float
+    further_pairs: list[int]
+    like_so_far_m: list[float]
+    best_motion: str
+    best_motion_m: list[float]
+    enough: bool
+
+
 class LearnerStatus(msgspec.Struct, frozen=True, kw_only=True):
     """State of the learner.
 
@@ -70,6 +138,8 @@ class LearnerStatus(msgspec.Struct, frozen=True, kw_only=True):
         claimed_error_m: the error [m] that the learner claims for predictions where data is.
         curve: the learning curve of the answering model.
         model: hash of the model that answers.
+        calibration: camera, tool and joint zeros; null before the first solution with the present tool.
+        outlook: whether there is enough data; null while no solution with the present tool answers.
         gaps_recovered: pairs that had to be fetched from the sampler's history.
         refused: pairs that could not be taken.
         doubted: pairs that looked like gross outliers and were learnt with care.
@@ -91,6 +161,8 @@ class LearnerStatus(msgspec.Struct, frozen=True, kw_only=True):
     claimed_error_m: float | None
     curve: list[CurvePoint]
     model: str
+    calibration: ChainCalibration | None
+    outlook: Outlook | None
     gaps_recovered: int
     refused: int
     doubted: int

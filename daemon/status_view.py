@@ -17,6 +17,7 @@ from interfaces.errors import BusError, RequestError
 
 from .bus import Bus
 from .config import Config
+from .findings_view import calibration_table, outlook_lines
 from .keys import Keys
 from .screen import coverage_table, mm, rejected
 from .status import LearnerStatus, SamplerStatus
@@ -96,9 +97,11 @@ def screen(seen: Seen, config: Config) -> RenderableType:
     parts: list[RenderableType] = []
     parts += _absent("sampler", zenoh.sampler) if seen.sampler is None else _sampler(seen.sampler)
     parts.append(Text())
+    slides = {name for name, slides in zip(config.robot.joints, chain.prismatic, strict=True) if slides}
     parts += _absent("learner", zenoh.learner) if seen.learner is None else _learner(seen.learner)
+    if seen.learner is not None and seen.learner.calibration is not None:
+        parts += [Text(), calibration_table(seen.learner.calibration, slides)]
     if seen.sampler is not None and seen.sampler.coverage:
-        slides = {name for name, slides in zip(config.robot.joints, chain.prismatic, strict=True) if slides}
         parts += [Text(), coverage_table(seen.sampler, slides)]
     return Group(*parts)
 
@@ -127,6 +130,8 @@ def _learner(status: LearnerStatus) -> list[RenderableType]:
     facts.add_row("pairs", f"{status.pairs} learnt, {status.replayed} replay steps{doubted}{refused}")
     facts.add_row("next pair", f"missed by: {errors}")
     facts.add_row("claimed", f"{mm(status.claimed_error_m)} mean error where data is")
+    for name, line in zip(("enough?", "", ""), outlook_lines(status.outlook), strict=False):
+        facts.add_row(name, line)
     facts.add_row("answering", f"{status.answering}, model {status.model or 'none yet'}")
     facts.add_row("checkpoint", saved)
     return [_head("learner", status), facts, *_health(status.health)]

@@ -111,6 +111,35 @@ class ChainBelief:
         except (KeyError, KBMapsError) as error:
             raise ModelFormatError(f"the bytes do not describe a belief in a chain: {error}") from error
 
+    def tightened(self, before: ChainTolerances, after: ChainTolerances) -> tuple[Self, float]:
+        """The same pairs' belief had it begun with narrower tolerances, and its evidence.
+
+        Only what is narrower is exchanged; so what is believed may come from several tools, if that of the tool is not.
+        Both are exact where positions are linear in the parameters.
+
+        Args:
+            before: the tolerances that the belief began with.
+            after: those that it shall have begun with, none of them wider.
+
+        Returns:
+            The belief, and the logarithm of how many times as probable the narrower tolerances make the pairs.
+
+        Raises:
+            SettingError: a tolerance would be wider than it was, or held.
+        """
+        wide, narrow = (np.minimum(self.parameters.standard_deviations(each), WIDE) for each in (before, after))
+        if (narrow > wide).any() or ((narrow == 0.0) & (wide > 0.0)).any():
+            raise SettingError("tolerances can only be made narrower, and not 0")
+        free = np.flatnonzero(narrow < wide)
+        added = np.zeros(self.parameters.size)
+        added[free] = narrow[free] ** -2.0 - wide[free] ** -2.0
+        # C' = (C⁻¹ + D)⁻¹ with C = W Wᵀ is W (1 + Wᵀ D W)⁻¹ Wᵀ, and C'⁻¹ m' = C⁻¹ m gives m' = m - C' D m.
+        factor = np.linalg.cholesky(np.eye(self.root.shape[1]) + (self.root.T * added) @ self.root)
+        root = cast(FloatArray, np.linalg.solve(factor, self.root.T)).T
+        mean = self.mean - root @ (root.T @ (added * self.mean))
+        evidence = float(np.log(wide[free] / narrow[free]).sum() - np.log(np.diag(factor)).sum())
+        return type(self)(self.parameters, mean, root), evidence - 0.5 * float(self.mean @ (added * mean))
+
     def with_other_tool(self, tolerance: float) -> Self:
         """The same arm with a marker that was moved, by `tolerance` (1-sigma of each component [m]).
 

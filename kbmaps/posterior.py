@@ -96,6 +96,19 @@ class ChainPosterior:
             raise DegenerateDataError("without pairs there is no noise to go by; give the noise of further pairs")
         return cls(learner.nominal, learner.change, learner.covariance, noise=found, floor=floor)
 
+    @classmethod
+    def of_belief(cls, belief: ChainBelief, *, noise: float, floor: float = 0.0) -> ChainPosterior:
+        """What is believed of a chain.
+
+        Args:
+            noise: 1-sigma of a coordinate of a further pair [m].
+            floor: 1-sigma of a coordinate that no rigid chain explains [m].
+
+        Raises:
+            SettingError: noise is not positive, or floor is negative.
+        """
+        return cls(belief.parameters.reference, belief.mean, belief.covariance, noise=noise, floor=floor)
+
     @property
     def joints(self) -> int:
         """Number of joints d."""

@@ -8,11 +8,14 @@ from typing import Annotated
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
-from daemon.commands.options import flag, robot_file
+from daemon.commands.options import HERE, flag, robot_file
 
 
 def calibrate(
-    source: Annotated[Path, Parameter(help="A recording (.csv, .parquet) or a pair store (.sqlite).")],
+    source: Annotated[
+        Path | None,
+        Parameter(help="A recording (.csv, .parquet) or a pair store (.sqlite); else the robot's own store."),
+    ] = None,
     /,
     *,
     robot: Annotated[Path | None, Parameter(help="robot.toml; else the one beside the source, or here.")] = None,
@@ -26,6 +29,14 @@ def calibrate(
     zeros_deg: Annotated[
         float, Parameter(help="How far joint zeros may be off, 1-sigma [°].", validator=Number(gt=0, lte=60))
     ] = 3.0,
+    first: Annotated[
+        int | None,
+        Parameter(
+            help="Number of the first row to learn; of a store, else the first with the present tool.",
+            validator=Number(gte=1),
+        ),
+    ] = None,
+    last: Annotated[int | None, Parameter(help="Number of the last row to learn.", validator=Number(gte=1))] = None,
     out: Annotated[
         Path | None, Parameter(help="Write the calibrated robot into this folder: a URDF and a robot.toml.")
     ] = None,
@@ -33,12 +44,16 @@ def calibrate(
 ) -> None:
     """Where camera and tool are and what the joint zeros are, with 95 % intervals; writes a calibrated URDF.
 
-    Learns a rigid chain from all pairs, around the nominal one. Outliers are left out. All pairs have to be of the
-    same tool. The URDF opens in pybullet, Pinocchio and ROS: it has the camera and the marker as links of their own,
-    and takes its positions from them to rounding as the learnt chain does. Meshes, masses and limits stay.
+    Learns a rigid chain from all pairs, around the nominal one. Outliers are left out. All pairs have to be of one
+    tool: from a store those are learnt that the learner beside it counts since the tool was last changed. Where
+    residuals jump as with another tool, this is said, with the row, and nothing is written.
 
-    Needs: a recording or a store, and its robot.toml; neither hardware nor a running daemon. What robot.toml calls
-    not known (`pose_known`, `marker_known`) is taken from the pairs alone, the rest is trusted to 1° and 10 mm.
+    The URDF opens in pybullet, Pinocchio and ROS: it has the camera and the marker as links of their own, and takes
+    its positions from them to rounding as the learnt chain does. Meshes, masses and limits stay.
+
+    Needs: a recording or a store, and its robot.toml; no hardware. The daemon may be running: its store is read. What
+    robot.toml calls not known (`pose_known`, `marker_known`) is taken from the pairs alone, the rest is trusted to
+    1° and 10 mm.
 
     Next: `bodyschema run --robot OUT/robot.toml` starts from what was learnt.
     """
@@ -48,26 +63,34 @@ def calibrate(
     from rich.console import Console
 
     from daemon import recordings
-    from daemon.calibration import Calibration
+    from daemon.calibration import Calibration, CalibrationError
     from daemon.calibration_report import CalibrationReport
-    from daemon.calibration_view import view
+    from daemon.calibration_view import two_tools, view
     from daemon.config import Config
+    from daemon.present_tool import first_pair
     from daemon.wire import encode
     from interfaces.calibrated_files import write_calibrated
     from interfaces.recording import Recording
 
-    description = Config.load(robot_file(robot, source)).robot
+    config = Config.load(HERE if robot is None else robot) if source is None else Config.load(robot_file(robot, source))
+    description, source = config.robot, source or config.store_file
     if source.suffix.lower() in recordings.STORE_ENDINGS:
-        recording = recordings.of_robot(recordings.from_store(source), description.joints, source)
+        stored = recordings.stored_pairs(source)
+        recording = recordings.of_robot(stored.recording, description.joints, source)
+        first = first or first_pair(stored, source.with_name(config.checkpoint_file.name), description.name)
     else:
         recording = Recording.read(source, description.joints)
+    first = first or 1
+    recording = recordings.between(recording, first, last, source)
     sigma_m = None if sigma_mm is None else 1e-3 * sigma_mm
     found = Calibration.of(description, recording, sigma_m=sigma_m, zeros_rad=math.radians(zeros_deg))
-    report = CalibrationReport.of(found, source.name)
+    report = CalibrationReport.of(found, source.name, first)
     written = None
     if out is not None:
+        if report.other_tool_from is not None:
+            raise CalibrationError(f"nothing was written. {two_tools(report)}")
         heading = f"Calibrated by bodyschema from {report.pairs} pairs of {source.name}"
-        written = write_calibrated(description, found.geometry, out, heading)
+        written = write_calibrated(description, found.figures.geometry, out, heading)
     if as_json:
         sys.stdout.write(encode(report).decode() + "\n")
         return

@@ -13,7 +13,7 @@ import numpy as np
 from daemon.bus import Bus
 from daemon.config import Config
 from daemon.keys import Keys
-from daemon.status import LearnerStatus, SamplerStatus
+from daemon.status import LearnerStatus, Outlook, SamplerStatus
 from daemon.wire import CommandRequest, decode, encode
 from interfaces.errors import BusError
 
@@ -49,11 +49,13 @@ class Chapter:
         pairs: pairs learnt with this part's tool.
         verdict: what the judge found.
         claimed_m: the error that the learner claimed [m], or None.
+        outlook: what the learner expected of further pairs, or None.
     """
 
     pairs: int
     verdict: Verdict
     claimed_m: float | None
+    outlook: Outlook | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,7 +132,8 @@ class _Stage:
             self.asker.update()
             self.show(snapshot)
             if done and snapshot.verdict is not None:
-                return Chapter(snapshot.learner.pairs - begin, snapshot.verdict, snapshot.learner.claimed_error_m)
+                told = snapshot.learner
+                return Chapter(told.pairs - begin, snapshot.verdict, told.claimed_error_m, told.outlook)
             if time.monotonic() - progress_at > STALL_LIMIT_S:
                 raise BusError(f"no new pair for {STALL_LIMIT_S:.0f} s; the scene's daemon.log says why")
             time.sleep(GLANCE_S)

@@ -14,6 +14,7 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
+from daemon.findings_view import outlook_sentence
 from daemon.screen import coverage_table, mm, rejected, titled_table
 from daemon.status import SamplerStatus
 
@@ -131,6 +132,8 @@ def show_outcome(console: Console, outcome: Outcome, scene: Scene) -> None:
         "The claim is the learner's own, who does not know the truth. A third process asked for "
         f"{outcome.answers + outcome.unanswered} predictions meanwhile; {outcome.unanswered} went unanswered."
     )
+    if second.outlook is not None:
+        console.print(f"\n{outlook_sentence(second.outlook)}")
     console.print()
     for what, file in (("recording", scene.recording_file), ("curve", scene.curve_file), ("plot", scene.plot_file)):
         console.print(f"{what:10s}{_short(file)}", soft_wrap=True)

@@ -21,9 +21,10 @@ from .claims import Claims
 from .curve import Curve
 from .fitting import Fit, Fitting
 from .gate import CHANGE, DOUBT, FEWEST_FOR_CHANGE, Gate, belong_together, limit_m, sound
-from .members import EXACT, INSTANT, PRIOR, Members
+from .members import EXACT, INSTANT, PRIOR, SOLVED, Members
 from .memory import PairMemory, Permutations
 from .nominal import PAIRS_TO_REFIT, NominalModel
+from .outlook import Known
 from .snapshot import Snapshot
 from .solver import Solver, Task
 from .solving import Solving
@@ -71,6 +72,11 @@ class Learning:
         return self._snapshot
 
     @property
+    def belief(self) -> ChainBelief | None:
+        """What the pairs with the present tool let believe of the chain; None before the first solution."""
+        return self._claims.belief
+
+    @property
     def nominal(self) -> NominalModel:
         """Where learning starts."""
         return self._nominal
@@ -110,6 +116,29 @@ class Learning:
             rng = np.random.default_rng(0)
             q, _ = self._memory.at(rng.integers(count, size=REGION_SAMPLES))
         return snapshot.expected_error_m(q + rng.normal(0.0, 1.0, q.shape) * self._nominal.reach(REGION_RAD))
+
+    def known(self) -> Known | None:
+        """What is known of the chain now; None before the first solution with the present tool.
+
+        For the thread that calls `work`.
+        """
+        with self._lock:
+            claims, memory = self._claims, self._memory
+            if claims.belief is None or not self._solving.fed:
+                return None
+            seen, _ = memory.some(memory.count, LOOKED_BACK)
+            q, x, _ = memory.since(self._solving.fed - LOOKED_BACK, LOOKED_BACK)  # those that the solver knows
+            return Known(
+                nominal=self._nominal,
+                belief=claims.belief,
+                tolerances=self._tolerances,
+                claim=claims.of(self._answering),
+                solved=self._answering in SOLVED,
+                pairs=self._counters.since_change,
+                seen=seen,
+                q=q,
+                x=x,
+            )
 
     def learn(self, pair: Pair, now: float) -> None:
         """Learn one pair at once.

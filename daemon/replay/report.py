@@ -5,7 +5,9 @@ from __future__ import annotations
 import msgspec
 
 from daemon.evaluate import BLOCKS, ErrorFigures
+from daemon.findings_view import outlook_sentence
 from daemon.screen import mm
+from daemon.status import Outlook
 
 # No arm is described that badly: rather another unit, or another robot [mm].
 FAR_MM = 1000.0
@@ -44,6 +46,7 @@ class ReplayReport(msgspec.Struct, frozen=True, kw_only=True):
         in_support_share: share of held-out rows that the learner says lie where data was.
         within_sigma_share: share of held-out coordinates within the 1-sigma claimed for them and the recording's noise.
         replayed: replay steps of the instant learner.
+        outlook: what the learner expects of further pairs, or null.
         learning_s: time from the first pair to the end of learning [s].
     """
 
@@ -66,6 +69,7 @@ class ReplayReport(msgspec.Struct, frozen=True, kw_only=True):
     within_sigma_share: float
     doubted: int
     replayed: int
+    outlook: Outlook | None
     learning_s: float
     schema: int = 1
 
@@ -93,6 +97,7 @@ def as_text(report: ReplayReport) -> str:
         f"the learner claims {mm(_metres(report.claimed_mm))} where data is; its 1-sigma covers "
         f"{report.within_sigma_share:.0%} of the held-out coordinates (68 % is right); "
         f"{report.in_support_share:.0%} of the held-out rows lie where data was",
+        *([] if report.outlook is None else [outlook_sentence(report.outlook)]),
         f"{report.replayed} replay steps, {report.doubted} pairs doubted, {report.learning_s:.1f} s",
     ]
     return "\n".join(lines)

@@ -130,6 +130,7 @@ def _report(job: Job, before: FloatArray, learnt: Learnt, prediction: PredictRep
         within_sigma_share=coverage(x, held_out.x, sigma, noise),
         doubted=learner.doubted,
         replayed=learner.replayed,
+        outlook=learner.outlook,
         learning_s=learnt.seconds,
     )
 
@@ -150,7 +151,8 @@ class _Live:
         while True:
             sampler, learner = self._status()
             report(sampler, learner)
-            now, state = time.monotonic(), (sampler.frames, learner.pairs, learner.replayed, learner.model)
+            now = time.monotonic()
+            state = sampler.frames, learner.pairs, learner.replayed, learner.model, learner.outlook
             if state != last:
                 last, changed = state, now
             through = sampler.state == "ended"

@@ -14,13 +14,19 @@ import pytest
 from daemon.calibration import Calibration, CalibrationError
 from daemon.calibration_report import CalibrationReport
 from daemon.calibration_view import sentences
+from daemon.checkpoint import write_checkpoint
 from daemon.cli import app
 from daemon.config import Config
+from daemon.learning import DirectSolver, Learning, NominalModel
 from daemon.recordings import of_robot
+from daemon.session import session_of
+from daemon.store import PairStore
 from interfaces.calibrated import CalibratedGeometry
 from interfaces.calibrated_files import write_calibrated
+from interfaces.clock import SystemClock
 from interfaces.errors import RecordingError
 from interfaces.recording import Recording
+from interfaces.records import MarkerFix
 from interfaces.robot import RobotDescription
 from interfaces.rpy import rpy_of
 from kbmaps import ChainParameters, ChainTolerances
@@ -89,8 +95,8 @@ def covered(seeds: range) -> float:
     inside: list[bool] = []
     for seed in seeds:
         arm = planted(seed)
-        found = arm.calibrated()
-        off = found.figures - figures_of(arm)
+        found = arm.calibrated().figures
+        off = found.values - figures_of(arm)
         told = np.append(np.ones(9, dtype=bool), found.shown)
         inside += (np.abs(off) < found.half_widths)[told].tolist()
     return float(np.mean(inside))
@@ -215,7 +221,7 @@ def test_the_simulation_takes_a_calibrated_robot(tmp_path) -> None:
     q = np.random.default_rng(5).uniform(robot.lower, robot.upper, (60, len(robot.joints)))
     x = TrueRobot.draw(robot, SimConfig()).chain(np.array(robot.robot.marker_xyz)).positions(q)
     found = Calibration.of(robot, Recording(joints=robot.joints, q=q, x=x), sigma_m=1e-4, zeros_rad=ZEROS_RAD)
-    calibrated = RobotDescription.load(write_calibrated(robot, found.geometry, tmp_path, "From a test"))
+    calibrated = RobotDescription.load(write_calibrated(robot, found.figures.geometry, tmp_path, "From a test"))
     exact = ErrorConfig(
         joint_offset_rad=0, link_length_m=0, link_axis_rad=0, camera_position_m=0, camera_rotation_rad=0, tool_m=0
     )
@@ -226,3 +232,112 @@ def test_the_simulation_takes_a_calibrated_robot(tmp_path) -> None:
         scene = physics.scene()
     seen = (np.linalg.inv(scene.T_world_camera) @ np.append(scene.x_world, 1.0))[:3]
     np.testing.assert_allclose(seen, found.learner.predict(scene.angles), rtol=0, atol=1e-6)
+
+
+# --- pairs of two tools
+
+
+def retooled(seed: int, at: int, move_m: float, *, walk: bool = False) -> Planted:
+    """An arm whose tool was changed after `at` of its pairs."""
+    arm = planted(seed, pairs=200)
+    q, rng = arm.recording.q, np.random.default_rng(seed)
+    if walk:
+        q = np.cumsum(np.radians(3.0) * rng.normal(size=(200, 4)), axis=0) + 0.5 * q[:1]
+    change = arm.change.copy()
+    change[arm.parameters.tool] += [0.0, 0.6 * move_m, 0.8 * move_m]
+    x = np.vstack([arm.parameters.positions(arm.change, q[:at]), arm.parameters.positions(change, q[at:])])
+    x += SIGMA_M * rng.normal(size=x.shape)
+    return dataclasses.replace(arm, recording=Recording(joints=arm.robot.joints, q=q, x=x))
+
+
+@pytest.mark.parametrize(("at", "walk"), [(100, False), (40, False), (165, False), (100, True)])
+def test_the_row_from_which_on_there_is_another_tool_is_found(at: int, walk: bool) -> None:
+    report = report_on(retooled(5, at, 0.05, walk=walk))
+    assert report.other_tool_from == at + 1
+    assert report.other_tool_mm == pytest.approx(50.0, rel=0.35)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_one_tool_is_not_taken_for_two(seed: int) -> None:
+    assert report_on(planted(seed, pairs=24 + 60 * seed, outliers=2 * seed)).other_tool_from is None
+
+
+def test_pairs_of_two_tools_are_told_with_what_to_do() -> None:
+    text = said(planted(1), other_tool_from=601, other_tool_mm=248.0)
+    assert "From number 601 on the marker sits about 248 mm elsewhere on the hand" in text
+    assert "--first 601, or --last 600" in text
+
+
+def test_of_two_tools_nothing_is_written(pairs_file, tmp_path) -> None:
+    retooled(5, 100, 0.05).recording.write_csv(pairs_file)
+    with pytest.raises(CalibrationError, match=r"nothing was written. From number 101 on"):
+        called(pairs_file, "--out", tmp_path / "calibrated")
+    assert not (tmp_path / "calibrated").exists()
+
+
+def test_each_tool_can_be_calibrated_alone(pairs_file, capsys) -> None:
+    retooled(5, 100, 0.05).recording.write_csv(pairs_file)
+    found = []
+    for rows in (("--last", 100), ("--first", 101)):
+        called(pairs_file, "--json", *rows)
+        found.append(msgspec.json.decode(capsys.readouterr().out, type=CalibrationReport))
+    assert [(report.pairs, report.first, report.other_tool_from) for report in found] == [
+        (100, 1, None),
+        (100, 101, None),
+    ]
+
+
+def test_rows_that_are_not_there_are_told(pairs_file) -> None:
+    with pytest.raises(RecordingError, match=r"no pairs from number 101 on; the last one is 100"):
+        called(pairs_file, "--first", 101)
+
+
+# --- the store of a running robot
+
+
+@pytest.fixture
+def robot_with_store(tmp_path) -> Path:
+    """robot.toml of an arm whose store has 60 pairs with one tool and 80 with another, as its learner knows."""
+    shutil.copytree(DESK_ARM.parent, tmp_path / "arm")
+    robot = tmp_path / "arm" / "robot.toml"
+    robot.write_text(robot.read_text() + '\n[daemon]\nstate_dir = "state"\n')
+    config = Config.load(robot, {})
+    arm = retooled(5, 100, 0.05)
+    learning = Learning(NominalModel.of(config.robot), config.tables.learner, DirectSolver())
+    with PairStore(config.store_file, session_of(config, SystemClock())) as store:
+        for row in range(40, 180):
+            if row == 100:
+                learning.tool_changed()
+            fix = MarkerFix(t=float(row), x=arm.recording.x[row], cov=1e-6 * np.eye(3))
+            learning.learn(store.append(1, "", arm.recording.q[row], fix), 0.0)
+    write_checkpoint(config.checkpoint_file, learning.state(), robot=config.robot.name, utc="")
+    return robot
+
+
+def report_of(capsys, *arguments: object) -> CalibrationReport:
+    called("--json", *arguments)
+    return msgspec.json.decode(capsys.readouterr().out, type=CalibrationReport)
+
+
+def test_of_a_store_only_pairs_with_the_present_tool_are_learnt(robot_with_store, capsys) -> None:
+    report = report_of(capsys, robot_with_store.parent / "state" / "pairs.sqlite", "--robot", robot_with_store)
+    assert (report.first, report.pairs, report.other_tool_from) == (61, 80, None)
+
+
+def test_without_a_source_the_robot_s_own_store_is_learnt(robot_with_store, capsys) -> None:
+    assert report_of(capsys, "--robot", robot_with_store).source == "pairs.sqlite"
+
+
+def test_all_pairs_of_a_store_can_be_asked_for(robot_with_store, capsys) -> None:
+    report = report_of(capsys, "--robot", robot_with_store, "--first", 1)
+    assert (report.pairs, report.other_tool_from) == (140, 61)
+
+
+def test_a_store_without_its_learner_s_checkpoint_is_learnt_from_the_first_pair(robot_with_store, capsys) -> None:
+    (robot_with_store.parent / "state" / "learner.ckpt").unlink()
+    assert report_of(capsys, "--robot", robot_with_store).first == 1
+
+
+def test_a_checkpoint_that_cannot_be_read_is_none(robot_with_store, capsys) -> None:
+    (robot_with_store.parent / "state" / "learner.ckpt").write_bytes(b"nothing")
+    assert report_of(capsys, "--robot", robot_with_store).first == 1

@@ -121,6 +121,7 @@ def test_a_guided_recording_is_learnt_by_the_two_processes(tmp_path: Path, robot
     assert report["accepted"] + sum(report["rejected"].values()) == 112
     assert report["accepted"] > 90
     assert report["after"]["mean_mm"] < 0.3 * report["before"]["mean_mm"]
+    assert report["outlook"]["like_so_far_m"][-1] < report["outlook"]["error_m"]
     assert {"pairs.sqlite", "learner.ckpt", "sampler.log", "learner.log"} <= {
         file.name for file in (tmp_path / "kept").iterdir()
     }

@@ -1,0 +1,202 @@
+"""What is believed of a chain, in the numbers that have names: pose of the camera, place of the marker, joint zeros."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from interfaces.calibrated import CalibratedGeometry
+from interfaces.records import FloatArray
+from interfaces.robot import RobotDescription
+from interfaces.rpy import rpy_of
+from interfaces.urdf import inverse
+from kbmaps import ChainBelief, ChainParameters
+
+BoolArray = NDArray[np.bool_]
+IntArray = NDArray[np.intp]
+
+# How well arms are made: tilt of an axis [rad] and its shift [m], 1-sigma, from a milled arm to a kit. Which of them
+# an arm is, its pairs tell.
+WORKMANSHIP = ((0.0003, 0.0001), (0.001, 0.0005), (0.003, 0.001), (0.01, 0.003), (0.03, 0.01), (0.06, 0.03))
+# Workmanship that is less probable than this is not considered.
+LEAST_SHARE = 0.01
+HALF_WIDTH_95 = 1.959964
+# A zero that is still as uncertain as it was before is nothing that the pairs show.
+NOT_SHOWN = 0.9
+# Of the numerical derivatives by tilts, shifts and zeros [rad, m].
+_STEP = 1e-6
+# Poses that stand for all, and the noise of exact pairs [m].
+_POSES, _EXACT_M = 100, 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class ChainFigures:
+    """Camera xyz [m] and rpy [rad] in its link, marker xyz [m] in its own, joint zeros [rad, m]: (9 + d,) figures.
+
+    Attributes:
+        robot: the nominal model.
+        beliefs: in its chain, or in that chain placed elsewhere; the most probable first. They change one chain.
+        shares: how probable each is (m,); they add up to 1.
+        prior: what was believed of that chain before any pair.
+    """
+
+    robot: RobotDescription
+    beliefs: tuple[ChainBelief, ...]
+    shares: FloatArray
+    prior: ChainBelief
+
+    @property
+    def geometry(self) -> CalibratedGeometry:
+        """The most probable chain in the terms of the robot's files."""
+        return self._geometry(self.beliefs[0].mean, self._split(self.beliefs[0]))
+
+    @cached_property
+    def values(self) -> FloatArray:
+        """The figures (9 + d,) of the most probable chain."""
+        return self._figures(self.beliefs[0].mean, self._split(self.beliefs[0]))
+
+    @property
+    def drawn(self) -> FloatArray:
+        """The figures (9 + d,) of robot.toml and URDF."""
+        camera, marker = self.robot.camera, self.robot.robot.marker_xyz
+        return np.array([*camera.xyz, *rpy_of(camera.pose[:3, :3]), *marker, *np.zeros(len(self.robot.joints))])
+
+    @cached_property
+    def half_widths(self) -> FloatArray:
+        """Half the 95 % intervals (9 + d,) of `values`, given that zeros which are not `shown` are right.
+
+        Not knowing how well the arm is made is part of them: they are of the mixture of the beliefs.
+        """
+        variance = np.zeros(len(self.values))
+        for belief, share in zip(self.beliefs, self.shares, strict=True):
+            split = self._split(belief)
+            jacobian = self._derivatives(split)
+            covariance = _given(belief.covariance, self._zeros[~self.shown])
+            apart = _unwound(self._figures(belief.mean, split) - self.values)
+            variance += share * (np.einsum("ij,jk,ik->i", jacobian, covariance, jacobian) + np.square(apart))
+        return HALF_WIDTH_95 * np.sqrt(np.maximum(variance, 0.0))  # of a zero that is given, rounding is left
+
+    @cached_property
+    def shown(self) -> BoolArray:
+        """Which joints' zeros (d,) the pairs show; a turn of the camera or of the marker may do what others do.
+
+        What exact pairs of all poses would not show, nothing has shown: along such directions a belief that was
+        linearised at several places seems surer than it is.
+        """
+        zeros = self._zeros
+        return (_spread(self.beliefs[0], zeros) < self._unsure) & (_spread(self._best, zeros) < self._unsure)
+
+    @property
+    def moved(self) -> FloatArray:
+        """`values` less `drawn` (9 + d,), angles the shorter way round."""
+        return _unwound(self.values - self.drawn)
+
+    @property
+    def _unsure(self) -> FloatArray:
+        return NOT_SHOWN * _spread(self.prior, self._zeros)
+
+    @cached_property
+    def _best(self) -> ChainBelief:
+        return after_exact_pairs(self.prior, self.beliefs[0].mean, self.robot)
+
+    def _split(self, belief: ChainBelief) -> FloatArray:
+        """The most probable change (size,) given that the zeros which nothing shows are as drawn."""
+        drawn = self._zeros[~self.shown]
+        covariance = belief.covariance
+        gain = np.linalg.solve(covariance[np.ix_(drawn, drawn)], covariance[drawn])
+        split = belief.mean - belief.mean[drawn] @ gain
+        split[drawn] = 0.0
+        return split
+
+    @property
+    def _zeros(self) -> IntArray:
+        return np.arange(self._parameters.size)[self._parameters.zeros]
+
+    @property
+    def _parameters(self) -> ChainParameters:
+        return self.beliefs[0].parameters
+
+    def _geometry(self, change: FloatArray, split: FloatArray) -> CalibratedGeometry:
+        """The chain of one change, with the move of the camera and the zeros of another that makes nearly the same."""
+        parameters = self._parameters
+        T_placed_nominal = parameters.reference.fixed[0] @ inverse(self.robot.chain.fixed[0])
+        return CalibratedGeometry.of(
+            self.robot,
+            parameters.chain(change),
+            T_measured_nominal=parameters.base_pose(split) @ T_placed_nominal,
+            zeros=split[parameters.zeros],
+        )
+
+    def _figures(self, change: FloatArray, split: FloatArray) -> FloatArray:
+        geometry = self._geometry(change, split)
+        camera = geometry.T_parent_camera
+        return np.concatenate([camera[:3, 3], rpy_of(camera[:3, :3]), geometry.marker_xyz, split[self._zeros]])
+
+    def _derivatives(self, change: FloatArray) -> FloatArray:
+        steps = _STEP * np.eye(len(change))
+        here = self._figures(change, change)
+        return np.array([_unwound(self._figures(moved, moved) - here) for moved in change + steps]).T / _STEP
+
+
+def after_exact_pairs(prior: ChainBelief, change: FloatArray, robot: RobotDescription) -> ChainBelief:
+    """The prior with what exact pairs of all poses would leave open, linearised at a change (size,)."""
+    poses = np.random.default_rng(0).uniform(robot.lower, robot.upper, (_POSES, len(robot.joints)))
+    _, jacobian = prior.parameters.linearised(change, poses)
+    rows = (jacobian @ prior.root).reshape(-1, prior.root.shape[1]) / _EXACT_M
+    _, singular, vt = np.linalg.svd(rows, full_matrices=False)
+    return replace(prior, root=prior.root @ (vt.T / np.sqrt(1.0 + np.square(singular))))
+
+
+def no_surer_than_possible(belief: ChainBelief, prior: ChainBelief, robot: RobotDescription) -> ChainBelief:
+    """A belief made in several linearisations, with what no pair can show left to the prior.
+
+    What one chain does as well as another lies along a curve, and its tangents differ from place to place. Pairs
+    that were linearised at one place therefore seem to tell something about the tangents at another (Huang, Mourikis
+    and Roumeliotis 2010, on the consistency of the extended Kalman filter). In no direction may a belief be surer
+    than exact pairs would make it.
+    """
+    best = after_exact_pairs(prior, belief.mean, robot)
+    free = np.flatnonzero(prior.root.any(axis=1))
+    std = _spread(prior, free)
+    own, least = (scaled @ scaled.T for scaled in (each.root[free] / std[:, None] for each in (belief, best)))
+    mean = belief.mean[free] / std
+    mean = (mean - least @ mean) * std  # along what exact pairs leave open, to where the prior is most probable
+    factor = np.linalg.cholesky(own + least)
+    half = np.linalg.solve(factor, np.linalg.solve(factor, least).T)
+    shares, vectors = np.linalg.eigh((half + half.T) / 2.0)
+    root, change = np.zeros((len(belief.mean), len(free))), belief.mean.copy()
+    root[free] = std[:, None] * (factor @ vectors) * np.sqrt(np.maximum(shares, 1.0 - shares))
+    change[free] = mean
+    return replace(belief, mean=change, root=root)
+
+
+def probable(evidence: FloatArray) -> tuple[IntArray, FloatArray]:
+    """Which of several explanations are probable at all, the most probable first, and their shares.
+
+    Args:
+        evidence: log marginal likelihood of each (m,) (MacKay 1992, "Bayesian interpolation").
+    """
+    shares = np.exp(evidence - evidence.max())
+    shares /= shares.sum()
+    kept = np.array([k for k in np.argsort(-shares) if shares[k] > LEAST_SHARE], dtype=np.intp)
+    return kept, shares[kept] / shares[kept].sum()
+
+
+def _spread(belief: ChainBelief, which: IntArray) -> FloatArray:
+    """1-sigma (k,) of some of the parameters."""
+    return np.sqrt(np.square(belief.root[which]).sum(axis=1))
+
+
+def _given(covariance: FloatArray, known: IntArray) -> FloatArray:
+    """The covariance (m, m) of a Gaussian once some of its components are known."""
+    across = covariance[:, known]
+    return covariance - across @ np.linalg.solve(covariance[np.ix_(known, known)], across.T)
+
+
+def _unwound(difference: FloatArray) -> FloatArray:
+    """A difference of figures (9 + d,) whose camera angles go the shorter way round."""
+    difference[3:6] = np.remainder(difference[3:6] + np.pi, 2.0 * np.pi) - np.pi
+    return difference

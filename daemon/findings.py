@@ -1,0 +1,113 @@
+"""What people want to know of a learner: where camera and tool are, and whether there is enough data."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+
+import numpy as np
+
+from interfaces.protocols import Clock
+from interfaces.robot import RobotDescription
+from kbmaps import ChainBelief, KBMapsError
+
+from .chain_figures import WORKMANSHIP, ChainFigures, no_surer_than_possible, probable
+from .learning import Learning
+from .learning.learning import REGION_RAD
+from .learning.outlook import Known, Scatter, foreseen
+from .status import ChainCalibration, JointZero, LearntFigure, Outlook
+
+log = logging.getLogger(__name__)
+
+# Finding them takes at most one part in so many of the background thread's time, and comes no more often than this.
+SHARE = 10.0
+EVERY_S = 1.0
+
+
+class Findings:
+    """Finds calibration and outlook anew when there is a new chain, or another model answers.
+
+    For the background thread alone.
+
+    What was found may be read by any thread.
+    """
+
+    def __init__(self, learning: Learning, robot: RobotDescription, clock: Clock) -> None:
+        self._learning, self._robot, self._clock = learning, robot, clock
+        self._found_of: tuple[ChainBelief | None, str] = None, ""
+        self._due_at = clock.now()
+        self._found: tuple[ChainCalibration | None, Outlook | None] = None, None
+
+    @property
+    def calibration(self) -> ChainCalibration | None:
+        """Where camera and tool are and the joints' zeros; None before the first solution with the present tool."""
+        return self._found[0] if self._learning.belief is not None else None
+
+    @property
+    def outlook(self) -> Outlook | None:
+        """What further pairs would gain; None while no solution with the present tool answers."""
+        return self._found[1] if self._learning.belief is not None else None
+
+    def renew(self) -> None:
+        """Find both again if what they rest on has changed, and it is time to."""
+        begin, present = self._clock.now(), (self._learning.belief, self._learning.snapshot.answering)
+        if present == self._found_of or begin < self._due_at:
+            return
+        self._found_of, known = present, self._learning.known()
+        if known is None:
+            self._found = None, None
+            return
+        try:
+            self._found = _found(self._robot, known)
+        except (KBMapsError, np.linalg.LinAlgError) as error:
+            log.warning("status has no calibration for now: %s", error)
+            self._found = None, None
+        end = self._clock.now()
+        self._due_at = begin + max(SHARE * (end - begin), EVERY_S)
+
+
+def _found(robot: RobotDescription, known: Known) -> tuple[ChainCalibration, Outlook | None]:
+    scatter = Scatter.of(known)
+    outlook = foreseen(known, scatter, robot.joints, REGION_RAD) if known.solved else None
+    return calibrated(robot, known, scatter), outlook
+
+
+def calibrated(robot: RobotDescription, known: Known, scatter: Scatter) -> ChainCalibration:
+    """The chain in the terms of robot.toml."""
+    found, workmanship = figures(robot, known)
+    numbers = [
+        LearntFigure(*(float(part) for part in parts))
+        for parts in zip(found.drawn, found.drawn + found.moved, found.half_widths, strict=True)
+    ]
+    return ChainCalibration(
+        pairs=known.pairs,
+        camera_link=robot.camera.parent_link,
+        camera_xyz=numbers[:3],
+        camera_rpy=numbers[3:6],
+        marker_link=robot.robot.marker_link,
+        marker_xyz=numbers[6:9],
+        zeros={
+            name: JointZero(number.learnt, number.half_width) if shown else None
+            for name, number, shown in zip(robot.joints, numbers[9:], found.shown, strict=True)
+        },
+        axes_rad=workmanship[0],
+        points_m=workmanship[1],
+        noise_m=scatter.noise_m,
+        outliers=scatter.outliers,
+    )
+
+
+def figures(robot: RobotDescription, known: Known) -> tuple[ChainFigures, tuple[float, float]]:
+    """The figures, and how well the arm seems to be made: 1-sigma of an axis' tilt [rad] and its shift [m].
+
+    The learner begins with wide tolerances, which cost it little, but with which a tilted axis could be any zero. How
+    well the arm is made, the pairs tell.
+    """
+    wide = known.tolerances
+    made = [(wide.axes, wide.points)]
+    made += [(axes, points) for axes, points in WORKMANSHIP if axes < wide.axes and points < wide.points]
+    prior = known.nominal.belief(known.belief.parameters.reference, wide)
+    belief = no_surer_than_possible(known.belief, prior, robot)
+    beliefs = [belief.tightened(wide, replace(wide, axes=axes, points=points)) for axes, points in made]
+    kept, shares = probable(np.array([evidence for _, evidence in beliefs]))
+    return ChainFigures(robot, tuple(beliefs[k][0] for k in kept), shares, prior), made[kept[0]]

@@ -1,0 +1,99 @@
+"""Calibration and outlook of the learner's status, for a terminal of 80 columns."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection
+
+from rich.console import Group
+from rich.table import Table
+from rich.text import Text
+
+from .screen import mm
+from .status import ChainCalibration, JointZero, LearntFigure, Outlook
+
+_DEG = math.degrees(1.0)
+
+
+def outlook_lines(outlook: Outlook | None) -> list[str]:
+    """Whether there is enough data, in at most three lines."""
+    if outlook is None:
+        return ["not known yet"]
+    pairs = outlook.further_pairs[-1]
+    like = f"{pairs} more pairs like these: {mm(outlook.like_so_far_m[-1])}"
+    return [
+        f"{'yes' if outlook.enough else 'no'}: {mm(outlook.error_m)} off where the arm was, "
+        f"{mm(outlook.anywhere_m)} in its whole range",
+        like if _other_is_better(outlook) else f"{like}; no other motion gains more",
+        *([f"{pairs} of {outlook.best_motion}: {mm(outlook.best_motion_m[-1])}"] if _other_is_better(outlook) else []),
+    ]
+
+
+def outlook_sentence(outlook: Outlook) -> str:
+    """The same in words."""
+    now, after = mm(outlook.error_m), mm(outlook.like_so_far_m[-1])
+    best = "no other motion gains more"
+    if _other_is_better(outlook):
+        best = f"{outlook.best_motion} gains most: {mm(outlook.best_motion_m[-1])}"
+    return (
+        f"{outlook.further_pairs[-1]} more pairs like these would take the error that the learner expects where the "
+        f"arm was from {now} to {after}; {best}. {'Enough data.' if outlook.enough else 'More data would help.'}"
+    )
+
+
+def calibration_table(calibration: ChainCalibration, slides: Collection[str] = ()) -> Group:
+    """Where camera and tool are and the joints' zeros, against robot.toml.
+
+    Args:
+        slides: names of the prismatic joints.
+    """
+    table = Table(box=None, pad_edge=False, header_style="dim")
+    table.add_column("")
+    for name in ("x, roll", "y, pitch", "z, yaw"):
+        table.add_column(name, justify="right", no_wrap=True)
+    table.add_row(Text(f"camera on {calibration.camera_link} [mm]"), *_moves(calibration.camera_xyz, 1e3))
+    table.add_row(Text("turned by [°]"), *_moves(calibration.camera_rpy, _DEG))
+    table.add_row(Text(f"marker on {calibration.marker_link} [mm]"), *_moves(calibration.marker_xyz, 1e3))
+    facts = Table.grid(padding=(0, 2))
+    facts.add_column(no_wrap=True)
+    shown = {name: zero for name, zero in calibration.zeros.items() if zero is not None}
+    drawn = [name for name in calibration.zeros if name not in shown]
+    if shown:
+        zeros = ", ".join(f"{name} {_zero(zero, slides=name in slides)}" for name, zero in shown.items())
+        facts.add_row("zeros to add", zeros)
+    if drawn:
+        facts.add_row("left as drawn", f"{', '.join(drawn)}: no motion shows {_such_zeros(drawn)}")
+    facts.add_row("arm made to", f"about {_DEG * calibration.axes_rad:.2g}° and {1e3 * calibration.points_m:.2g} mm")
+    facts.add_row("noise", f"{mm(calibration.noise_m)} a coordinate, {_outliers(calibration.outliers)}")
+    return Group(
+        Text(f"calibration: from robot.toml to what {calibration.pairs} pairs show, ± for 95 %", style="bold"),
+        table,
+        facts,
+    )
+
+
+def _such_zeros(joints: list[str]) -> str:
+    return "its zero" if len(joints) == 1 else "their zeros"
+
+
+def _other_is_better(outlook: Outlook) -> bool:
+    return outlook.best_motion_m != outlook.like_so_far_m
+
+
+def _outliers(count: int) -> str:
+    return f"{count or 'no'} outlier{'' if count == 1 else 's'} among the last pairs"
+
+
+def _moves(figures: list[LearntFigure], unit: float) -> list[str]:
+    return [_rounded(unit * (figure.learnt - figure.drawn), unit * figure.half_width) for figure in figures]
+
+
+def _zero(zero: JointZero, *, slides: bool) -> str:
+    unit, name = (1e3, " mm") if slides else (_DEG, "°")
+    return _rounded(unit * zero.value, unit * zero.half_width) + name
+
+
+def _rounded(value: float, half_width: float) -> str:
+    """With two digits of the half width."""
+    digits = min(max(1 - math.floor(math.log10(max(half_width, 1e-9))), 0), 4)
+    return f"{round(value, digits) + 0.0:+.{digits}f} ± {half_width:.{digits}f}"

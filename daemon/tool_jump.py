@@ -1,0 +1,86 @@
+"""Whether the tool was changed in the course of a recording, as its residuals tell."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from interfaces.recording import Recording
+from interfaces.records import FloatArray
+from kbmaps import ChainBelief, ChainParameters, RigidLearner
+
+# On either side of a change there have to be so many pairs, and it has to explain so much of all residuals.
+FEWEST = 6
+EXPLAINED = 0.5
+# Residuals beyond so many times the middle one count less: single outliers are no change.
+FAR = 5.0
+# Keeps splits apart from which nothing can be told, e.g. of poses that are all alike.
+_RIDGE = 1e-9
+
+
+@dataclass(frozen=True, slots=True)
+class ToolJump:
+    """A change of the tool.
+
+    Attributes:
+        row: the first row with the other tool, counted from 1.
+        distance_m: how far apart the two tools hold the marker.
+    """
+
+    row: int
+    distance_m: float
+
+
+def tool_jump(learner: RigidLearner, recording: Recording) -> ToolJump | None:
+    """The row from which on the marker sits elsewhere on the hand; None where the recording seems to be of one tool.
+
+    Two places of the marker in the place of one (a change point, Page 1955), with all else that may be wrong about the
+    chain fitted along with them, to first order. The chain is distorted by having been fitted to both, so the distance
+    is about right, and the row nearly.
+
+    Args:
+        learner: of all pairs in the recording.
+    """
+    if len(recording) < 2 * FEWEST:
+        return None
+    explained, shifts = _splits(learner, recording)
+    allowed = slice(FEWEST - 1, len(recording) - FEWEST)
+    best = FEWEST - 1 + int(explained[allowed].argmax())
+    if explained[best] < EXPLAINED:
+        return None
+    return ToolJump(best + 2, float(np.linalg.norm(shifts[best])))
+
+
+def _splits(learner: RigidLearner, recording: Recording) -> tuple[FloatArray, FloatArray]:
+    """Share of the residuals' squares that another tool after each row but the last explains (n - 1,), and how far it
+    is from the first tool (n - 1, 3) [m]."""
+    parameters = ChainParameters(learner.nominal)
+    x, jacobian = parameters.linearised(learner.change, recording.q)
+    residuals, tools = recording.x - x, jacobian[:, :, parameters.tool]
+    roots = _weights(residuals)[:, None]
+    prior = ChainBelief.from_tolerances(parameters, learner.tolerances)
+    noise = np.sqrt(np.square(roots * residuals).mean())
+    free = (roots[:, :, None] * jacobian).reshape(-1, parameters.size) @ prior.root / noise
+    basis = np.linalg.qr(np.concatenate([free, np.eye(parameters.size)]))[0][: len(free)]
+    target = (roots * residuals).ravel()
+    target = (target - basis @ (basis.T @ target)).reshape(residuals.shape)
+    columns = roots[:, :, None] * tools
+    # Sums over all rows after each split, of what is left of the columns once all else has been fitted.
+    in_basis = _after(np.einsum("nip,nij->npj", basis.reshape(*residuals.shape, -1), columns))
+    square = _after(columns.swapaxes(1, 2) @ columns) - in_basis.swapaxes(1, 2) @ in_basis
+    product = _after(np.einsum("nij,ni->nj", columns, target))
+    shifts: FloatArray = np.linalg.solve(square + _RIDGE * np.eye(3), product[..., None])[..., 0].astype(np.float64)
+    return np.einsum("nj,nj->n", shifts, product) / np.square(target).sum(), shifts
+
+
+def _weights(residuals: FloatArray) -> FloatArray:
+    """Square roots of the weights (n,) of residuals (n, 3)."""
+    squares = np.square(residuals).sum(axis=1)
+    far = FAR**2 * max(float(np.median(squares)), np.finfo(float).tiny)
+    return np.sqrt(far / (far + squares))
+
+
+def _after(values: FloatArray) -> FloatArray:
+    """Sums of all values (n, ...) after each but the last: (n - 1, ...)."""
+    return np.cumsum(values[::-1], axis=0)[::-1][1:]

@@ -1,0 +1,291 @@
+"""Camera, tool and zeros that the learner tells while it runs, and its outlook, against planted arms."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from guided_arm import Scene, make_pair, near, new_learning, teach
+from test_calibration import DESK_ARM, figures_of
+
+import daemon.findings
+from daemon.config import LearnerConfig
+from daemon.findings import EVERY_S, Findings, figures
+from daemon.learning import DirectSolver, Learning, NominalModel
+from daemon.learning.learning import REGION_RAD
+from daemon.learning.outlook import Known, Scatter, foreseen
+from daemon.status import Outlook
+from interfaces.records import FloatArray
+from interfaces.robot import RobotDescription
+from kbmaps import ChainParameters, ChainTolerances
+
+SIGMA_M = 0.0005
+OTHER_TOOL = np.array([0.0, 0.02, 0.15])
+NAMES = ("a", "b", "c", "d")
+
+
+class Ticking:
+    """A clock that stands until it is moved."""
+
+    def __init__(self) -> None:
+        self.time = 0.0
+
+    def now(self) -> float:
+        return self.time
+
+    def utc(self) -> str:
+        return "2026-11-21T12:00:00.000+00:00"
+
+
+@dataclass
+class Planted:
+    """A desk arm that is not as drawn, and a learner that has pairs of it."""
+
+    robot: RobotDescription
+    parameters: ChainParameters
+    change: FloatArray
+    learning: Learning
+
+    @classmethod
+    def of(cls, seed: int, pairs: int) -> Planted:
+        rng = np.random.default_rng(seed)
+        robot = RobotDescription.load(DESK_ARM)
+        parameters = ChainParameters(robot.chain)
+        made = ChainTolerances(0.003, 0.001, 0.05, tool=0.03, base_rotation=0.5, base_translation=0.5)
+        change = parameters.standard_deviations(made) * rng.normal(size=parameters.size)
+        zeros = change[parameters.zeros]
+        zeros[[0, -1]] = 0.0  # no motion tells them from a turn of camera and marker
+        arm = cls(robot, parameters, change, Learning(NominalModel.of(robot), LearnerConfig(), DirectSolver()))
+        arm.teach(rng, pairs)
+        return arm
+
+    def teach(self, rng: np.random.Generator, pairs: int) -> None:
+        """Pairs all over the joints' ranges; then everything that the background has to do but replay."""
+        first = self.learning.counters.last_seq + 1
+        q = rng.uniform(self.robot.lower, self.robot.upper, (pairs, 4))
+        x = self.parameters.positions(self.change, q) + SIGMA_M * rng.normal(size=(pairs, 3))
+        for k in range(pairs):
+            self.learning.learn(make_pair(first + k, q[k], x[k], SIGMA_M), 0.0)
+            if k < 20:
+                self.solve()
+        self.solve()
+        self.learning.learn(make_pair(first + pairs, q[0], x[0], SIGMA_M), 0.0)
+
+    def solve(self) -> None:
+        self.learning.solve_soon()
+        while self.learning.work():
+            pass
+
+    def known(self) -> Known:
+        known = self.learning.known()
+        assert known is not None
+        return known
+
+    def covered(self) -> list[bool]:
+        """Which of the figures that are told lie inside their intervals."""
+        found, _ = figures(self.robot, self.known())
+        off = found.values - figures_of(self)
+        off[3:6] = np.remainder(off[3:6] + np.pi, 2.0 * np.pi) - np.pi
+        told = np.append(np.ones(9, dtype=bool), found.shown)
+        return (np.abs(off) < found.half_widths)[told].tolist()
+
+
+def findings_of(arm: Planted, clock: Ticking | None = None) -> Findings:
+    return Findings(arm.learning, arm.robot, clock or Ticking())
+
+
+# --- calibration
+
+
+def test_the_intervals_cover_what_was_planted() -> None:
+    assert np.mean([inside for seed in range(4) for inside in Planted.of(seed, 60).covered()]) > 0.8
+
+
+@pytest.mark.soak
+@pytest.mark.timeout(900)
+def test_the_95_percent_intervals_cover_95_percent() -> None:
+    assert 0.93 < np.mean([inside for seed in range(60) for inside in Planted.of(seed, 60).covered()]) < 0.995
+
+
+def covered_after_another_tool(seed: int) -> list[bool]:
+    arm = Planted.of(seed, 80)
+    arm.change[arm.parameters.tool] += OTHER_TOOL
+    arm.learning.tool_changed()
+    arm.teach(np.random.default_rng(seed + 1000), 40)
+    return arm.covered()
+
+
+def test_the_intervals_cover_what_was_planted_after_a_tool_change_too() -> None:
+    assert np.mean([inside for seed in range(3) for inside in covered_after_another_tool(seed)]) > 0.8
+
+
+@pytest.mark.soak
+@pytest.mark.timeout(900)
+def test_the_95_percent_intervals_cover_95_percent_after_a_tool_change_too() -> None:
+    assert 0.93 < np.mean([inside for seed in range(30) for inside in covered_after_another_tool(seed)]) < 0.995
+
+
+def test_zeros_that_no_motion_shows_are_null_and_the_others_are_not() -> None:
+    findings = findings_of(Planted.of(1, 100))
+    findings.renew()
+    zeros = findings.calibration.zeros
+    assert [name for name, zero in zeros.items() if zero is None] == ["base_yaw", "wrist_roll"]
+
+
+def test_the_arm_is_found_to_be_better_made_than_the_learner_s_tolerances() -> None:
+    arm = Planted.of(2, 60)
+    _, (axes, points) = figures(arm.robot, arm.known())
+    assert axes < 0.02
+    assert points < 0.005
+
+
+def test_what_is_known_of_the_zeros_outlives_a_tool_change() -> None:
+    arm = Planted.of(3, 100)
+    before, _ = figures(arm.robot, arm.known())
+    arm.change[arm.parameters.tool] += OTHER_TOOL
+    arm.learning.tool_changed()
+    arm.teach(np.random.default_rng(7), 15)
+    after, _ = figures(arm.robot, arm.known())
+    assert (after.half_widths[10:12] < 1.2 * before.half_widths[10:12]).all()
+    assert np.linalg.norm((after.values - before.values)[6:9] - OTHER_TOOL) < 0.02
+
+
+def test_the_noise_is_the_scatter_of_the_pairs() -> None:
+    assert Scatter.of(Planted.of(4, 200).known()).noise_m == pytest.approx(SIGMA_M, rel=0.15)
+
+
+# --- outlook
+
+
+def outlook_of(learning: Learning) -> Outlook:
+    known = learning.known()
+    assert known is not None
+    return foreseen(known, Scatter.of(known), NAMES, REGION_RAD)
+
+
+def guided(seed: int, pairs: int) -> tuple[Learning, Scene]:
+    scene, learning = Scene.draw(seed, pairs), new_learning()
+    teach(learning, scene.pairs)
+    return learning, scene
+
+
+@pytest.fixture(scope="module")
+def after_60() -> list[tuple[Learning, Scene, Outlook]]:
+    """Learners that know the first 60 pairs of a path of 160, and their outlook then."""
+    found = []
+    for seed in range(5):
+        scene, learning = Scene.draw(seed, 160), new_learning()
+        teach(learning, scene.pairs[:60])
+        found.append((learning, scene, outlook_of(learning)))
+    return found
+
+
+def true_error_m(learning: Learning, scene: Scene, pairs: int) -> float:
+    """Near the first `pairs` of the path."""
+    q = near(np.random.default_rng(0), scene.q[:pairs])
+    return float(np.linalg.norm(learning.snapshot.predict(q).x - scene.chain.positions(q), axis=1).mean())
+
+
+def test_the_expected_error_is_the_true_one(after_60) -> None:
+    ratios = [outlook.error_m / true_error_m(learning, scene, 60) for learning, scene, outlook in after_60]
+    assert 0.6 < np.exp(np.mean(np.log(ratios))) < 1.7
+
+
+def test_what_is_foreseen_of_further_pairs_comes(after_60) -> None:
+    ratios = []
+    for learning, scene, outlook in after_60:
+        teach(learning, scene.pairs[60:])
+        ratios.append(outlook.like_so_far_m[0] / true_error_m(learning, scene, 60))
+    assert 0.5 < np.exp(np.mean(np.log(ratios))) < 2.0
+
+
+def test_after_few_pairs_there_is_not_enough_data_and_after_many_there_is() -> None:
+    learning, _ = guided(1, 30)
+    assert not outlook_of(learning).enough
+    rest = Scene.draw(1, 700)
+    teach(learning, rest.pairs[30:], background=False)
+    learning.solve_soon()
+    while learning.work():
+        pass
+    assert outlook_of(learning).enough
+
+
+def test_of_an_arm_that_moved_few_joints_other_motions_gain_more() -> None:
+    scene, learning = Scene.draw(2, 80), new_learning()
+    q = scene.q * np.array([1.0, 1.0, 0.05, 1.0])
+    rng = np.random.default_rng(0)
+    x = scene.chain.positions(q) + 0.002 * rng.normal(size=(80, 3))
+    teach(learning, [make_pair(k + 1, q[k], x[k]) for k in range(80)])
+    outlook = outlook_of(learning)
+    assert outlook.best_motion != "going on as so far"
+    assert outlook.best_motion_m[-1] < outlook.like_so_far_m[-1]
+
+
+def test_the_error_expected_over_the_whole_ranges_is_larger_than_where_the_arm_was() -> None:
+    outlook = outlook_of(guided(3, 60)[0])
+    assert outlook.anywhere_m > outlook.error_m
+
+
+# --- when they are found
+
+
+def test_before_the_first_solution_nothing_is_told() -> None:
+    robot = RobotDescription.load(DESK_ARM)
+    findings = Findings(Learning(NominalModel.of(robot), LearnerConfig(), DirectSolver()), robot, Ticking())
+    findings.renew()
+    assert (findings.calibration, findings.outlook) == (None, None)
+
+
+def test_they_are_found_again_when_a_new_chain_was_found_and_not_too_soon() -> None:
+    arm, clock = Planted.of(1, 40), Ticking()
+    findings = findings_of(arm, clock)
+    findings.renew()
+    first = findings.calibration
+    arm.teach(np.random.default_rng(8), 30)
+    findings.renew()
+    assert findings.calibration is first
+    clock.time += EVERY_S
+    findings.renew()
+    assert findings.calibration.pairs > first.pairs
+
+
+def test_the_same_chain_is_not_gone_through_twice() -> None:
+    arm, clock = Planted.of(1, 40), Ticking()
+    findings = findings_of(arm, clock)
+    findings.renew()
+    first = findings.calibration
+    clock.time += 10.0 * EVERY_S
+    findings.renew()
+    assert findings.calibration is first
+
+
+def test_with_another_tool_nothing_is_told_before_its_first_solution() -> None:
+    arm = Planted.of(1, 40)
+    findings = findings_of(arm)
+    findings.renew()
+    arm.learning.tool_changed()
+    assert (findings.calibration, findings.outlook) == (None, None)
+
+
+def test_a_failure_to_find_them_does_not_stop_the_learner(monkeypatch, caplog) -> None:
+    def failing(*_: object) -> None:
+        raise np.linalg.LinAlgError("Eigenvalues did not converge")
+
+    monkeypatch.setattr(daemon.findings, "figures", failing)
+    findings = findings_of(Planted.of(1, 40))
+    findings.renew()
+    assert findings.calibration is None
+    assert "status has no calibration for now: Eigenvalues did not converge" in caplog.text
+
+
+def test_while_no_solution_answers_there_is_a_calibration_but_no_outlook() -> None:
+    arm = Planted.of(1, 40)
+    arm.learning.tool_changed()
+    q = arm.robot.lower / 2.0
+    arm.learning.learn(make_pair(42, q, arm.parameters.positions(arm.change, q), SIGMA_M), 0.0)
+    arm.solve()  # a solution that has not met a pair yet
+    findings = findings_of(arm)
+    findings.renew()
+    assert findings.calibration is not None
+    assert findings.outlook is None
