@@ -44,23 +44,28 @@ class Fitting:
         """Whether nothing has been fitted yet."""
         return self._is_first
 
+    @property
+    def chain(self) -> RigidChain:
+        """The nominal chain in its frame; after a tool change what says how the hand is turned."""
+        return self._chain
+
     def due(self, pairs: int) -> bool:
         """Whether it is time to fit."""
         return self._due_at is not None and pairs >= self._due_at
 
-    def change_tool(self, before: KBMap, first_at: int = PAIRS_TO_REFIT) -> None:
-        """From now on another tool is fitted on top of the map `before`, at first to so many pairs."""
-        self._before, self._due_at, self._is_first = before, first_at, True
+    def change_tool(self, before: KBMap, hand: RigidChain, first_at: int = PAIRS_TO_REFIT) -> None:
+        """From now on another tool is fitted on top of the map `before`, at first to so many pairs.
 
-    def with_other_tool(self, kbmap: KBMap, q: FloatArray, x: FloatArray) -> KBMap:
-        """A learnt map with its marker moved to where pairs q (n, d) [rad] and x (n, 3) [m] see it."""
-        return self._nominal.with_other_tool(kbmap, self._chain, q, x)
+        Args:
+            hand: a chain that says how the hand is turned.
+        """
+        self._before, self._chain, self._due_at, self._is_first = before, hand, first_at, True
 
     def fit(self, q: FloatArray, x: FloatArray) -> Fit | None:
         """The prior that fits pairs q (n, d) [rad] and x (n, 3) [m] best; None when they do not determine it."""
         try:
             if self._before is not None:
-                return Fit(self.with_other_tool(self._before, q, x), self._chain)
+                return Fit(self._nominal.with_other_tool(self._before, self._chain, q, x), self._chain)
             aligned = self._nominal.aligned(q, x)
         except DegenerateDataError:
             return None

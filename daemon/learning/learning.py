@@ -13,17 +13,19 @@ import numpy as np
 
 from daemon.config import LearnerConfig
 from daemon.status import CurvePoint
-from interfaces.errors import RequestError
 from interfaces.records import FloatArray, Pair
-from kbmaps import ChainBelief, ChainTolerances, KBMap, ResidualModel, follow_a_path
+from kbmaps import ChainBelief, KBMap, ResidualModel, RigidChain, follow_a_path
 
+from .arm import KnownArm
 from .claims import Claims
 from .curve import Curve
+from .doubts import Doubts
 from .fitting import Fit, Fitting
-from .gate import CHANGE, DOUBT, FEWEST_FOR_CHANGE, Gate, belong_together, limit_m, sound
+from .gate import DOUBT, belong_together, limit_m, sound
+from .incoming import check_pair
 from .members import EXACT, INSTANT, PRIOR, SOLVED, Members
 from .memory import PairMemory, Permutations
-from .nominal import PAIRS_TO_REFIT, NominalModel
+from .nominal import PAIRS_TO_REFIT, NominalModel, chain_tolerances
 from .outlook import Known
 from .snapshot import Snapshot
 from .solver import Solver, Task
@@ -32,10 +34,6 @@ from .state import Counters, LearningHeader, LearningState, StateError
 
 # RMS distance between a nominal model and reality that surprises nobody [m].
 EXPECTED_M = 0.1
-# A measurement farther away than this is not one in metres [m].
-FARTHEST_M = 1000.0
-# How far another tool may hold the marker from where the last one did, 1-sigma of each coordinate [m].
-OTHER_TOOL_M = 0.25
 # Pairs that a model has to have predicted before its errors say what is to be expected.
 FEWEST_TO_CLAIM = 5.0
 # So many of the learnt pairs say how well a model fits what it knows.
@@ -44,7 +42,6 @@ LOOKED_BACK = 500
 RECENT = 200
 REPLAY_STEPS = 64
 FEED_PAIRS = 256
-KEPT_DOUBTS = 64
 REGION_RAD = np.radians(3.0)
 REGION_SAMPLES = 256
 LOOKED_BACK_IN_REPLAY = 4
@@ -59,10 +56,10 @@ class Learning:
         self._lock = threading.Lock()
         self._counters, self._curve = Counters(), Curve()
         self._memory = PairMemory(nominal.joints, settings.replay_capacity)
-        self._doubts = PairMemory(nominal.joints, KEPT_DOUBTS)
+        self._doubts = Doubts(nominal.joints)
         self._learnt_at: float | None = None
         self._task = 0
-        self._tolerances = _tolerances(settings)
+        self._tolerances = chain_tolerances(settings)
         self._begin_at_nominal()
         self._publish()
 
@@ -147,7 +144,7 @@ class Learning:
             RequestError: it is not a pair of this robot and store, or not newer than the last one; nothing changed.
         """
         with self._lock:
-            self._check(pair)
+            check_pair(pair, self._counters, self._nominal.joints)
             self._counters.store, self._counters.last_seq = pair.store, pair.seq
             self._counters.pairs += 1
             self._counters.since_change += 1
@@ -203,6 +200,7 @@ class Learning:
         with self._lock:
             q, x = self._memory.all()
             doubted_q, doubted_x = self._doubts.all()
+            arm = self._arm
             nets = {} if self._members is None else {name: m.net for name, m in self._members.maps.items()}
             header = LearningHeader(
                 fingerprint=self._nominal.fingerprint,
@@ -211,13 +209,13 @@ class Learning:
                 claims=copy.deepcopy(self._claims.state()),
                 curve=self._curve.points,
                 curve_stride=self._curve.stride,
-                doubted_in_a_row=self._gate.in_a_row,
+                doubted_in_a_row=self._doubts.in_a_row,
                 kept_of=self._memory.count,
                 next_fit=self._fitting.due_at,
                 first_fit=self._fitting.is_first,
                 replays_due=self._replays_due,
-                belief=None if self._belief is None else self._belief.to_bytes(),
-                residual=None if self._residual is None else self._residual.to_bytes(),
+                belief=None if arm is None else arm.chain.to_bytes(),
+                residual=None if arm is None or arm.residual is None else arm.residual.to_bytes(),
             )
             kept = {"arm_q": self._claims.arm_configurations} | self._fitting.arrays()
         kept |= {"q": q, "x": x, "doubted_q": doubted_q, "doubted_x": doubted_x}
@@ -235,9 +233,7 @@ class Learning:
         nets = {name[4:]: net for name, net in state.arrays.items() if name.startswith("net_")}
         with self._lock:
             if nets:
-                belief = None if header.belief is None else ChainBelief.from_bytes(header.belief)
-                residual = None if header.residual is None else ResidualModel.from_bytes(header.residual)
-                self._begin(KBMap(self._nominal.bases, nets[PRIOR]), belief, residual)
+                self._begin(KBMap(self._nominal.bases, nets[PRIOR]), _stored_arm(header))
             else:
                 self._begin_at_nominal()
             self._fitting.restore(header.next_fit, header.first_fit, state.arrays)
@@ -247,35 +243,31 @@ class Learning:
                 self._members_now.restore(nets, self._claims.residual)
             self._memory.restore(state.arrays["q"], state.arrays["x"], header.kept_of)
             self._solve_from_what_is_known()
-            for q, x in zip(state.arrays["doubted_q"], state.arrays["doubted_x"], strict=True):
-                self._doubts.append(q, x)
+            self._doubts.restore(state.arrays["doubted_q"], state.arrays["doubted_x"], header.doubted_in_a_row)
             self._counters, self._answering = header.counters, header.answering
             self._curve = Curve(header.curve, header.curve_stride)
-            self._gate = Gate(header.doubted_in_a_row)
             self._replays_due = header.replays_due
             self._publish()
 
     def _begin_at_nominal(self) -> None:
         self._fitting = Fitting(self._nominal)
         self._claims = Claims(self._nominal.bases, EXPECTED_M)
-        known = self._nominal.frame_known
-        self._begin(
-            self._nominal.prior() if known else None,
-            self._nominal.belief(self._nominal.chain, self._tolerances) if known else None,
-        )
+        if self._nominal.frame_known:
+            self._begin(self._nominal.prior(), self._drawn(self._nominal.chain))
+        else:
+            self._begin(None, None)
 
-    def _begin(self, prior: KBMap | None, belief: ChainBelief | None, residual: ResidualModel | None = None) -> None:
-        """Start anew from `prior` and what is believed of the chain (None: wait for an alignment), with no pairs.
+    def _drawn(self, chain: RigidChain) -> KnownArm:
+        return KnownArm(self._nominal.belief(chain, self._tolerances))
 
-        `residual`: what is known of the arm beyond that.
-        """
+    def _begin(self, prior: KBMap | None, arm: KnownArm | None) -> None:
+        """Start anew from `prior` and what is known of the arm (None: wait for an alignment), with no pairs."""
         self._members = Members(prior, self._settings.step_size) if prior is not None else None
-        self._belief, self._residual = belief, residual
+        self._arm = arm
         self._answering = PRIOR
         self._memory.clear()
         self._doubts.clear()
         self._order = Permutations(self._settings.seed)
-        self._gate = Gate()
         self._replays_due = 0.0
         self._solver_prior: KBMap | None = None
         self._task += 1
@@ -286,29 +278,13 @@ class Learning:
             raise RuntimeError("there are no models before the alignment")
         return self._members
 
-    def _check(self, pair: Pair) -> None:
-        counters = self._counters
-        if counters.store not in (None, pair.store):
-            raise RequestError(
-                f"pair {pair.seq} comes from the store {pair.store}, this learner learnt from {counters.store}"
-            )
-        if pair.seq <= counters.last_seq:
-            raise RequestError(f"pair {pair.seq} has been learnt already; the last one was {counters.last_seq}")
-        if len(pair.q) != self._nominal.joints:
-            raise RequestError(f"pair {pair.seq} has {len(pair.q)} joint angles, this robot has {self._nominal.joints}")
-        if not all(np.isfinite(part).all() for part in (pair.q, pair.x, pair.cov)):
-            raise RequestError(f"pair {pair.seq} has a number that is not finite")
-        if np.abs(pair.x).max() > FARTHEST_M:
-            raise RequestError(f"pair {pair.seq} lies {np.abs(pair.x).max():.0f} m away; positions are in metres")
-
     def _learn_online(self, members: Members, pair: Pair) -> None:
         errors, variance = members.errors(pair.q, pair.x), np.diag(pair.cov)
         limit = self._limit_m(pair.q, variance)
-        if self._gate.doubts(float(np.linalg.norm(errors[self._answering])), limit):
+        if self._doubts.doubt(pair.q, pair.x, float(np.linalg.norm(errors[self._answering])), limit):
             self._counters.doubted += 1
-            self._doubts.append(pair.q, pair.x)
             members.learn(pair.q, errors[INSTANT], limit / DOUBT)  # a step no longer than any other
-            if self._gate.changed or self._moved_together(limit / DOUBT):
+            if self._doubts.changed or (self._doubts.perhaps_changed and self._moved_together(limit / DOUBT)):
                 self._follow_change()
             return
         delayed = None if members.delayed is None else pair.x - members.delayed.predict(pair.q)
@@ -328,21 +304,20 @@ class Learning:
         self._memory.append(q, x)
         self._claims.learnt(q)
 
-    def _doubted_run(self) -> tuple[FloatArray, FloatArray]:
-        """The doubted pairs in a row up to now: q (n, d), x (n, 3)."""
-        q, x, _ = self._doubts.since(self._doubts.count - min(self._gate.in_a_row, CHANGE))
-        return q, x
-
     def _moved_together(self, expected_m: float) -> bool:
         """Whether one other place of the marker on the hand explains the doubted pairs in a row."""
-        if self._gate.in_a_row < FEWEST_FOR_CHANGE:
-            return False
-        q, x = self._doubted_run()
+        q, x = self._doubts.run()
         kbmap = self._best_map(self._members_now)
         # What the answering model knows beyond the map it knows with any tool.
         x = x - (self._members_now.models[self._answering].predict(q) - kbmap.predict(q))
-        moved = self._fitting.with_other_tool(kbmap, q, x)
+        moved = self._nominal.with_other_tool(kbmap, self._hand, q, x)
         return belong_together(np.linalg.norm(x - moved.predict(q), axis=1), expected_m)
+
+    @property
+    def _hand(self) -> RigidChain:
+        """The chain that knows best how the hand is turned."""
+        belief = self._claims.belief
+        return self._fitting.chain if belief is None else belief.chain
 
     def _best_map(self, members: Members) -> KBMap:
         """The answering model if it is a KB-Map, else the best that is one."""
@@ -351,7 +326,7 @@ class Learning:
 
     def _follow_change(self) -> None:
         """The doubted pairs in a row are the new truth: begin again with them."""
-        run_q, run_x = self._doubted_run()
+        run_q, run_x = self._doubts.run()
         distances = np.linalg.norm(self._members_now.models[self._answering].predict(run_q) - run_x, axis=1)
         self._change_tool(max(float(np.median(distances)), EXPECTED_M), first_fit=len(run_q))
         for q, x in zip(run_q, run_x, strict=True):
@@ -362,16 +337,14 @@ class Learning:
     def _change_tool(self, expected_m: float, first_fit: int = PAIRS_TO_REFIT) -> None:
         self._counters.changes += 1
         self._counters.since_change = 0
-        if self._members is None or self._belief is None:
+        if self._members is None or self._arm is None:
             self._begin_at_nominal()
         else:
             before = self._best_map(self._members)
-            belief = (self._claims.belief or self._belief).with_other_tool(OTHER_TOOL_M)
-            known = self._claims.residual or self._residual
-            residual = None if known is None else known.with_other_tool(OTHER_TOOL_M)
+            arm = self._arm.updated(self._claims.belief, self._claims.residual)
+            self._fitting.change_tool(before, self._hand, first_fit)
             self._claims.change_tool(expected_m)
-            self._fitting.change_tool(before, first_fit)
-            self._begin(before, belief, residual)
+            self._begin(before, arm.with_other_tool())
 
     def _fit(self) -> bool:
         """Fit what is not known, or a changed tool, when it is due."""
@@ -403,16 +376,16 @@ class Learning:
         self._counters.doubted += int((~belongs).sum())
         self._memory.clear()
         for row_q, row_x, belonging in zip(q, x, belongs, strict=True):
-            (self._memory if belonging else self._doubts).append(row_q, row_x)
+            (self._memory.append if belonging else self._doubts.set_aside)(row_q, row_x)
         self._order.restart()
         self._task += 1
 
     def _solve_from_what_is_known(self) -> None:
         """Where pairs are no longer kept, the last solutions stand for them in the place of what was before."""
         members = self._members
-        if members is not None and EXACT in members.maps and not self._memory.complete:
-            self._solver_prior, self._belief = members.maps[EXACT], self._claims.belief or self._belief
-            self._residual = self._claims.residual or self._residual
+        if self._arm is not None and members is not None and EXACT in members.maps and not self._memory.complete:
+            self._solver_prior = members.maps[EXACT]
+            self._arm = self._arm.updated(self._claims.belief, self._claims.residual)
 
     def _change_prior(self, members: Members, prior: KBMap) -> None:
         q, x = self._memory.all()
@@ -423,7 +396,7 @@ class Learning:
     def _start_members(self, fit: Fit) -> None:
         """The first alignment: the pairs that waited for it are learnt now, each once, in their order."""
         q, x = self._memory.all()
-        self._begin(fit.prior, self._nominal.belief(fit.chain, self._tolerances))
+        self._begin(fit.prior, self._drawn(fit.chain))
         members = self._members_now
         for row_q, row_x in zip(q, x, strict=True):
             errors = members.errors(row_q, row_x)
@@ -437,11 +410,11 @@ class Learning:
         """Give the solver its pairs, ask it from time to time, take what it found."""
         solving = self._solving
         with self._lock:
-            if self._members is None or self._belief is None:
+            if self._members is None or self._arm is None:
                 return False
             known = self._solver_prior
             prior = known or self._members.prior
-            task = Task(self._task, prior, self._belief, self._residual, prior_stays=known is not None)
+            task = Task(self._task, prior, self._arm.chain, self._arm.residual, prior_stays=known is not None)
         if solving.busy:
             return self._take_solution()
         if solving.begin(task):
@@ -509,14 +482,8 @@ class Learning:
         )
 
 
-def _tolerances(settings: LearnerConfig) -> ChainTolerances:
-    angle, place = np.radians(settings.angle_tolerance_deg), settings.place_tolerance_m
-    return ChainTolerances(
-        axes=angle,
-        points=settings.length_tolerance_m,
-        zeros=angle,
-        slide_zeros=settings.length_tolerance_m,
-        tool=place,
-        base_rotation=angle,
-        base_translation=place,
-    )
+def _stored_arm(header: LearningHeader) -> KnownArm | None:
+    if header.belief is None:
+        return None
+    residual = None if header.residual is None else ResidualModel.from_bytes(header.residual)
+    return KnownArm(ChainBelief.from_bytes(header.belief), residual)

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from daemon.config import LearnerConfig
 from interfaces.records import FloatArray, frozen_array
 from interfaces.robot import RobotDescription
 from kbmaps import (
@@ -135,6 +136,20 @@ class NominalModel:
         """
         chosen = _spread(len(q))
         return with_refitted_marker(kbmap, chain, q[chosen], x[chosen])
+
+
+def chain_tolerances(settings: LearnerConfig) -> ChainTolerances:
+    """How far a real chain, its frame and its marker may be from what is drawn."""
+    angle, place = math.radians(settings.angle_tolerance_deg), settings.place_tolerance_m
+    return ChainTolerances(
+        axes=angle,
+        points=settings.length_tolerance_m,
+        zeros=angle,
+        slide_zeros=settings.length_tolerance_m,
+        tool=place,
+        base_rotation=angle,
+        base_translation=place,
+    )
 
 
 def _spread(pairs: int) -> NDArray[np.intp]:

@@ -1,0 +1,32 @@
+"""What is believed of the arm itself, whatever its tool."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from kbmaps import ChainBelief, ResidualModel
+
+# How far another tool may hold the marker from where the last one did, 1-sigma of each coordinate [m].
+OTHER_TOOL_M = 0.25
+
+
+@dataclass(frozen=True, eq=False)
+class KnownArm:
+    """The arm as far as it is known.
+
+    Attributes:
+        chain: as a rigid chain.
+        residual: as a chain and what it errs by; None: nothing is known of that.
+    """
+
+    chain: ChainBelief
+    residual: ResidualModel | None = None
+
+    def updated(self, chain: ChainBelief | None, residual: ResidualModel | None) -> KnownArm:
+        """With what was found since; None: as before."""
+        return KnownArm(chain or self.chain, residual or self.residual)
+
+    def with_other_tool(self) -> KnownArm:
+        """The same arm with a marker that is elsewhere on the hand."""
+        residual = None if self.residual is None else self.residual.with_other_tool(OTHER_TOOL_M)
+        return KnownArm(self.chain.with_other_tool(OTHER_TOOL_M), residual)
