@@ -50,6 +50,18 @@ class Contest:
         while len(self._rows) > max(SHORTEST, SHARE * self._pairs):
             self._rows.popleft()
 
+    def add_late(self, name: str, squares: Sequence[float], fresher: Sequence[str] = ()) -> None:
+        """The squared distances [m²] of a model found only now for the last pairs, none of which it has learnt.
+
+        They take the place of those of an older model by this name. The models `fresher` had learnt the pair just
+        before each of these; what that gained them is no merit, and they are not compared there.
+        """
+        for row, square in zip(reversed(self._rows), reversed(squares), strict=False):
+            for other in (name, *fresher):
+                row.pop(other, None)
+            if math.isfinite(square):
+                row[name] = square
+
     def forget(self, name: str) -> None:
         """A model is another one from now on."""
         for row in self._rows:

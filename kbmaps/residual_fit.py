@@ -111,7 +111,7 @@ class _Fitter:
         moved = model.square_of(step) / model.noise**2
         self.variances, self.noise = dict(model.variances), model.noise
         self._take(posterior.mean, tuple(model.variances))
-        return math.sqrt(moved / max(self.used, 1.0))
+        return math.sqrt(max(moved, 0.0) / max(self.used, 1.0))
 
     def average(self) -> Average:
         """The last step: to the mean over all probable sets of groups."""

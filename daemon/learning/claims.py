@@ -192,6 +192,27 @@ class Claims:
         before = self._misfits_before.get(name, self._misfits_before.get(RIGID, np.zeros(3)))
         self._misfits[name] = misfit(errors, noise, before, neighbours=neighbours)
 
+    def predicted_late(self, name: str, q: FloatArray, errors: FloatArray, *, anew: bool) -> None:
+        """A solution that was found only now predicts the last pairs, of which it knows none.
+
+        Args:
+            anew: whether it knows so much more than the last one that what that predicted says nothing of it.
+            q: where (n, d) [rad], in their order.
+            errors: measured minus predicted (n, 3) [m].
+        """
+        if anew:
+            self._contest.forget(name)
+            self.errors[name] = ErrorMemory(self._expected_m)
+        self._contest.add_late(name, np.square(errors).sum(axis=1).tolist(), fresher=(INSTANT,))
+        noise = self.errors[PRIOR].noise_variance
+        claimed = self.of(name).variance(q) + noise
+        for error, variance in zip(errors, claimed, strict=True):
+            self.errors[name].add(error, noise, float(np.square(error).sum() / variance.sum()))
+
+    def forget_contest(self) -> None:
+        """Some pairs were no pairs of this tool after all."""
+        self._contest = Contest()
+
     def prior_changed(self, errors: FloatArray) -> None:
         """Another prior for the same pairs; its errors (n, 3) [m] at them."""
         noise = self.errors[PRIOR].noise_variance

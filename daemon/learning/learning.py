@@ -23,6 +23,7 @@ from .doubts import Doubts
 from .fitting import Fit, Fitting
 from .gate import DOUBT, belong_together, limit_m, sound
 from .incoming import check_pair
+from .learnt import LearntModel
 from .members import EXACT, INSTANT, PRIOR, SOLVED, Members
 from .memory import PairMemory, Permutations
 from .nominal import PAIRS_TO_REFIT, NominalModel, chain_tolerances
@@ -41,6 +42,10 @@ LOOKED_BACK = 500
 # Pairs from which the errors of a prior that was fitted anew are taken, and that are replayed on top of it.
 RECENT = 200
 REPLAY_STEPS = 64
+# So many of the pairs that came while the solver worked judge its solution.
+JUDGED_LATE = 100
+# With so many new pairs for each that a solution knows, the last solution was another one.
+MANY_NEW = 0.25
 FEED_PAIRS = 256
 REGION_RAD = np.radians(3.0)
 REGION_SAMPLES = 256
@@ -378,6 +383,7 @@ class Learning:
         for row_q, row_x, belonging in zip(q, x, belongs, strict=True):
             (self._memory.append if belonging else self._doubts.set_aside)(row_q, row_x)
         self._order.restart()
+        self._claims.forget_contest()
         self._task += 1
 
     def _solve_from_what_is_known(self) -> None:
@@ -444,8 +450,16 @@ class Learning:
                 q, x = self._memory.some(self._solving.fed, LOOKED_BACK)
                 errors, neighbours = x - solved.model.predict(q), follow_a_path(self._members_now.prior, q)
                 self._claims.solution_taken(solved.name, errors, solved.belief, neighbours=neighbours)
+                self._judge_late(solved.name, solved.model, solved.pairs)
                 self._publish()
         return True
+
+    def _judge_late(self, name: str, model: LearntModel, pairs: int) -> None:
+        """What came while the solver worked is new to its solution: a pair that it had not learnt judges it fairly."""
+        q, x, _ = self._memory.since(max(pairs, self._memory.count - JUDGED_LATE))
+        if len(q):
+            self._claims.predicted_late(name, q, x - model.predict(q), anew=len(q) >= MANY_NEW * pairs)
+            self._answering = self._claims.best(self._answering)
 
     def _replay(self) -> bool:
         with self._lock:

@@ -42,6 +42,8 @@ KEPT, FOLDED = 4000, 2000
 FITTED = 2000
 # The chain with residual takes longest, up to a second: it is solved anew when the pairs have grown by this factor.
 RESIDUAL_GROWTH = 1.15
+# With so many times the pairs of the last solution, this share of them is solved for first, if it is so many.
+MANY_NEW, FIRST_SHARE, FEWEST_FIRST = 1.5, 0.75, 5
 # From so many neighbours on that count as one, their errors are no chance.
 SHARED = 1.5
 
@@ -112,6 +114,7 @@ class DirectSolver:
 
     def __init__(self) -> None:
         self._task: Task | None = None
+        self._solved_at = 0
         self._folded: ChainBelief | None = None
         self._folded_residual: ChainBelief | ResidualModel | None = None
         self._residual_at = 0
@@ -123,6 +126,7 @@ class DirectSolver:
 
     def start(self, task: Task) -> None:
         """Forget all pairs and begin a new task."""
+        self._solved_at = 0
         self._task, self._folded, self._folded_residual = task, task.belief, task.residual or task.belief
         self._exact = ExactLearner(task.prior) if task.prior.size <= LARGEST_NET else None
         self._precision, self._tuned_at, self._residual_at, self._pairs, self._solved = None, 0, 0, 0, []
@@ -151,6 +155,9 @@ class DirectSolver:
     def solutions(self) -> Iterator[Solved]:
         """Each model's solution as it is found, the rigid chain first: it is the quickest."""
         task = self._started
+        if self._pairs >= MANY_NEW * self._solved_at:
+            yield from self._solved_of_some(task)
+        self._solved_at = self._pairs
         belief = fitted_belief(self._before, self._q, self._x)
         rigid = belief.chain.to_kbmap(task.prior.bases)
         residual_due = self._pairs >= RESIDUAL_GROWTH * self._residual_at
@@ -163,6 +170,14 @@ class DirectSolver:
             self._residual_at = self._pairs
             residual = fitted_residual(self._residual_before, self._q, self._x)
             yield Solved(task.number, self._pairs, RESIDUAL if residual else "", residual, residual)
+
+    def _solved_of_some(self, task: Task) -> Iterator[Solved]:
+        """The chain of the first pairs only: the others can judge it, even if none come after them."""
+        some = int(len(self._q) * FIRST_SHARE)
+        if some >= FEWEST_FIRST:
+            belief = fitted_belief(self._before, self._q[:some], self._x[:some])
+            rigid = belief.chain.to_kbmap(task.prior.bases)
+            yield Solved(task.number, self._pairs - len(self._q) + some, RIGID, rigid, belief, last=False)
 
     def _solve_exact(self, task: Task, learner: ExactLearner, *, last: bool) -> Solved:
         """Least squares around the rigid chain.

@@ -19,7 +19,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from daemon.config import LearnerConfig
-from daemon.learning import Learning
+from daemon.learning import DirectSolver, Learning, Solved
 from daemon.learning.members import SOLVED
 from interfaces.errors import RequestError
 from interfaces.records import Pair
@@ -317,3 +317,25 @@ def test_predictions_are_finite_whatever_is_measured(seed: int, wild: dict[int, 
     prediction = learning.snapshot.predict(rng.uniform(-np.pi, np.pi, (50, JOINTS)))
     assert np.isfinite(prediction.x).all()
     assert np.isfinite(prediction.sigma).all()
+
+
+class SlowSolver(DirectSolver):
+    """Answers only when the test lets it."""
+
+    waiting = True
+
+    def poll(self) -> Solved | None:
+        return None if self.waiting else super().poll()
+
+
+def test_a_solution_that_comes_after_the_last_pair_answers_if_it_predicts_those_that_it_did_not_know() -> None:
+    scene, solver = Scene.draw(0, 100), SlowSolver()
+    learning = Learning(nominal_model(), LearnerConfig(), solver)
+    teach(learning, scene.pairs[:40])
+    teach(learning, scene.pairs[40:], background=False)
+    before = learning.snapshot.answering
+    solver.waiting = False
+    while learning.work():
+        pass
+    assert before not in SOLVED
+    assert learning.snapshot.answering in SOLVED

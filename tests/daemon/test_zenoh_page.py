@@ -23,7 +23,7 @@ from daemon import history, simulation, status, wire
 from daemon.bus import Bus, client
 from daemon.config import Config
 from daemon.keys import Keys
-from daemon.learning import curve, learning
+from daemon.learning import curve, incoming
 from daemon.sampler import Sampler
 from daemon.session import session_of
 from daemon.sources import Sources
@@ -88,7 +88,7 @@ def test_the_page_s_limits_are_the_code_s() -> None:
     assert f"| rows in a request | {wire.LARGEST_BATCH:,} |" in limits
     assert f"| pairs in a reply | {history.LARGEST_REPLY} |" in limits
     assert f"| points of the learning curve | {curve.LARGEST} |" in limits
-    assert f"| within {learning.FARTHEST_M:.0f} m, else" in limits
+    assert f"| within {incoming.FARTHEST_M:.0f} m, else" in limits
 
 
 def test_the_page_shows_the_example_as_it_is() -> None:

@@ -90,3 +90,11 @@ def test_a_contest_goes_on_from_its_rows():
     held.add({"rigid": 1.0, "bent": 1.0})
     again.add({"rigid": 1.0, "bent": 1.0})
     assert again.rows == held.rows
+
+
+def test_a_model_that_was_found_late_is_judged_on_pairs_that_it_had_not_learnt():
+    held = contest(0.01, 0.001, 50)
+    for row in held.rows:
+        held.add({"rigid": row["rigid"]})
+    held.add_late("bent", [1e-8] * 160)
+    assert held.best(TRUSTED, "none") == "bent"
