@@ -17,10 +17,11 @@ MEDIAN_TO_SIGMA = 0.6501
 SMALLEST_M = 1e-3
 # So many doubted pairs in a row are no outliers: the world has changed.
 CHANGE = 6
-# So many are enough where one other place of the marker explains them, and their distances from it are at most so many
-# times what is expected.
+# So many are enough where one other place of the marker explains them: their distances from it are at most so many
+# times what is expected, and at most this share of those from the prediction.
 FEWEST_FOR_CHANGE = 3
 TOGETHER = 2.0
+LEFT_OVER = 0.2
 
 
 class Gate:
@@ -51,9 +52,10 @@ def sound(distances_m: FloatArray, noise_m: float) -> NDArray[np.bool_]:
     return np.asarray(distances_m <= DOUBT * max(math.hypot(rms, noise_m), SMALLEST_M))
 
 
-def belong_together(distances_m: FloatArray, expected_m: float) -> bool:
-    """Whether one explanation fits a run of pairs that lie at these distances (n,) [m] from it."""
-    return bool(np.sqrt(np.square(distances_m).mean()) <= TOGETHER * expected_m)
+def explained(before_m: FloatArray, after_m: FloatArray, expected_m: float) -> bool:
+    """Whether an explanation takes a run of pairs from the distances `before_m` (n,) [m] to `after_m` (n,) [m]."""
+    before, after = (float(np.sqrt(np.square(distances).mean())) for distances in (before_m, after_m))
+    return after <= min(TOGETHER * expected_m, LEFT_OVER * before)
 
 
 def limit_m(inside_m: float, open_m: float) -> float:

@@ -21,7 +21,7 @@ from .claims import Claims
 from .curve import Curve
 from .doubts import Doubts
 from .fitting import Fit, Fitting
-from .gate import DOUBT, belong_together, limit_m, sound
+from .gate import DOUBT, explained, limit_m, sound
 from .incoming import check_pair
 from .learnt import LearntModel
 from .members import EXACT, INSTANT, PRIOR, SOLVED, Members
@@ -312,11 +312,12 @@ class Learning:
     def _moved_together(self, expected_m: float) -> bool:
         """Whether one other place of the marker on the hand explains the doubted pairs in a row."""
         q, x = self._doubts.run()
-        kbmap = self._best_map(self._members_now)
-        # What the answering model knows beyond the map it knows with any tool.
-        x = x - (self._members_now.models[self._answering].predict(q) - kbmap.predict(q))
-        moved = self._nominal.with_other_tool(kbmap, self._hand, q, x)
-        return belong_together(np.linalg.norm(x - moved.predict(q), axis=1), expected_m)
+        kbmap, answer = self._best_map(self._members_now), self._members_now.models[self._answering].predict(q)
+        # Without what the answering model knows beyond the map: it knows that with any tool.
+        of_map = x - (answer - kbmap.predict(q))
+        moved = self._nominal.with_other_tool(kbmap, self._hand, q, of_map)
+        left = np.linalg.norm(of_map - moved.predict(q), axis=1)
+        return explained(np.linalg.norm(x - answer, axis=1), left, expected_m)
 
     @property
     def _hand(self) -> RigidChain:
