@@ -8,6 +8,8 @@ from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
+from kbmaps.autocorrelation import shared_by
+
 # Pairs that two models have to have predicted both before they are compared.
 FEWEST = 3
 # The last pairs that are compared: so many, or this share of all so far where that is more, up to a bound.
@@ -91,4 +93,6 @@ def _clearly_worse(errors: np.ndarray, others: np.ndarray) -> bool:
     losses = np.minimum(errors[both], cap) - np.minimum(others[both], cap)
     # A few losses are alike by chance: their spread is taken for no smaller than so few can tell.
     error = float(losses.std(ddof=1)) / math.sqrt(count) * (1.0 + 3.0 / count)
+    # Neighbours on a path lose alike, and tell as much as one.
+    error *= math.sqrt(shared_by((losses - losses.mean())[:, None]))
     return bool(losses.mean() > CLEARLY * error)

@@ -11,7 +11,7 @@ import numpy as np
 from interfaces.records import FloatArray
 from kbmaps import ChainBelief, Contest, JointBasis, ResidualModel, SupportSet
 
-from .members import INSTANT, PRIOR, RESIDUAL, RIGID, TRUSTED
+from .members import INSTANT, PRIOR, RESIDUAL, RIGID, SOLVED, TRUSTED
 from .misfit import misfit
 from .scores import ErrorMemory
 from .unknowns import ChainLayer, Layer, Unknowns
@@ -50,6 +50,7 @@ class ClaimsState(msgspec.Struct, kw_only=True):
         errors: prequential errors, by model.
         contest: squared prequential errors [m²] of the last pairs.
         judged: how many pairs there were for it so far.
+        trusted: the models, the most trusted first.
         residuals: errors of the instant learner on pairs that it has learnt already; None before any.
         misfits: what each solution misses at pairs that it knows, 1-sigma per axis [m].
         prior_errors: those of the prior, over longer.
@@ -62,6 +63,7 @@ class ClaimsState(msgspec.Struct, kw_only=True):
     errors: dict[str, ErrorMemory]
     contest: list[dict[str, float]]
     judged: int
+    trusted: tuple[str, ...]
     residuals: ErrorMemory | None
     misfits: dict[str, tuple[float, float, float]]
     misfits_before: dict[str, tuple[float, float, float]]
@@ -82,6 +84,7 @@ class Claims:
     def __init__(self, bases: Sequence[JointBasis], expected_m: float) -> None:
         self._unknowns = Unknowns(bases)
         self._misfits_before: dict[str, FloatArray] = {}
+        self._trusted = TRUSTED
         self._begin(expected_m)
 
     def _begin(self, expected_m: float) -> None:
@@ -98,11 +101,11 @@ class Claims:
 
     def best(self, present: str) -> str:
         """The model that shall answer; `present` while there is nothing to compare."""
-        return self._contest.best(TRUSTED, present)
+        return self._contest.best(self._trusted, present)
 
     def best_map(self, present: str) -> str:
         """The best of the models that are KB-Maps; `present` while there is nothing to compare."""
-        return self._contest.best([name for name in TRUSTED if name != RESIDUAL], present)
+        return self._contest.best([name for name in self._trusted if name != RESIDUAL], present)
 
     @property
     def support(self) -> SupportSet | None:
@@ -129,8 +132,13 @@ class Claims:
         """The configurations (n, d) [rad] that stand for all data, with any tool."""
         return self._unknowns.arm_configurations
 
-    def change_tool(self, expected_m: float) -> None:
-        """Another tool: a new prior with other errors, and what was not known of the arm is not known now."""
+    def change_tool(self, expected_m: float, answered: str = PRIOR) -> None:
+        """Another tool: a new prior with other errors, and what was not known of the arm is not known now.
+
+        The solved model that answered with the last tool is trusted first with this one: the arm is the same.
+        """
+        if answered in SOLVED:
+            self._trusted = (answered, *(name for name in TRUSTED if name != answered))
         self._unknowns.change_tool(self._prior_sigma)
         self._misfits_before |= self._misfits
         self._begin(expected_m)
@@ -243,6 +251,7 @@ class Claims:
             errors=self.errors,
             contest=self._contest.rows,
             judged=self._contest.pairs,
+            trusted=self._trusted,
             residuals=self._residuals,
             misfits={name: _triple(missed) for name, missed in self._misfits.items()},
             misfits_before={name: _triple(missed) for name, missed in self._misfits_before.items()},
@@ -263,6 +272,7 @@ class Claims:
         self.errors, self._residuals = dict(state.errors), state.residuals
         self._contest, self._prior_errors = Contest(state.contest, state.judged), state.prior_errors
         self._misfits = {name: np.array(missed) for name, missed in state.misfits.items()}
+        self._trusted = state.trusted
         self._misfits_before = {name: np.array(missed) for name, missed in state.misfits_before.items()}
         self._belief = None if state.belief is None else ChainBelief.from_bytes(state.belief)
         self._residual = None if state.residual is None else ResidualModel.from_bytes(state.residual)

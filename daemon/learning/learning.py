@@ -349,7 +349,7 @@ class Learning:
             before = self._best_map(self._members)
             arm = self._arm.updated(self._claims.belief, self._claims.residual)
             self._fitting.change_tool(before, self._hand, first_fit)
-            self._claims.change_tool(expected_m)
+            self._claims.change_tool(expected_m, self._answering)
             self._begin(before, arm.with_other_tool())
 
     def _fit(self) -> bool:
