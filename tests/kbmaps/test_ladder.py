@@ -67,10 +67,15 @@ def test_the_model_that_predicts_best_answers(arm):
     assert held.answering == "rigid"
 
 
+def bent(arm: Arm, q: np.ndarray) -> np.ndarray:
+    """Positions of an arm that no rigid chain follows."""
+    return arm.real.positions(q) + 0.05 * np.sin(2.0 * q)
+
+
 def test_a_less_trusted_model_that_is_better_answers(arm):
-    held = ladder(arm, Scripted(lambda q: 1.1 * arm.real.positions(q)))
+    held = ladder(arm, Scripted(lambda q: bent(arm, q)))
     q, x = arm.pairs(np.random.default_rng(3), 60, 0.002)
-    held.learn(q, 1.1 * x)
+    held.learn(q, x - arm.real.positions(q) + bent(arm, q))
     assert held.answering == "other"
 
 
@@ -91,14 +96,11 @@ def test_a_model_that_breaks_is_out_and_says_why(arm):
 
 
 def test_where_it_had_no_data_a_model_that_may_not_extrapolate_does_not_answer(arm):
-    def bent(q):
-        return arm.real.positions(q) + 0.05 * np.sin(2.0 * q)
-
-    held = ladder(arm, Scripted(bent), extrapolates=False)
+    held = ladder(arm, Scripted(lambda q: bent(arm, q)), extrapolates=False)
     q, x = arm.pairs(np.random.default_rng(6), 60, 0.002)
-    held.learn(q, x - arm.real.positions(q) + bent(q))
+    held.learn(q, x - arm.real.positions(q) + bent(arm, q))
     inside, outside = np.full((1, 3), 0.1), np.full((1, 3), 1.2)
-    np.testing.assert_allclose(held.predict(inside), bent(inside))
+    np.testing.assert_allclose(held.predict(inside), bent(arm, inside))
     np.testing.assert_array_equal(held.predict(outside), held.models["rigid"].predict(outside))
 
 
