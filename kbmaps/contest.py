@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections import deque
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from kbmaps.arrays import FloatArray
 from kbmaps.autocorrelation import shared_by
+from kbmaps.errors import ShapeError
 
 # Pairs that two models have to have predicted both before they are compared.
 FEWEST = 3
@@ -27,18 +29,25 @@ class Contest:
     prequential errors (Dawid 1984), compared in pairs.
 
     Args:
-        rows: where to go on: by pair and model, the oldest first [m²].
-        pairs: how many pairs there were so far, the rows included.
+        errors: where to go on: by model, the squared distances (k,) [m²] of the last k pairs, NaN where there was none.
+        pairs: how many pairs there were so far.
+
+    Raises:
+        ShapeError: the models have squared distances of different numbers of pairs.
     """
 
-    def __init__(self, rows: Iterable[Mapping[str, float]] = (), pairs: int = 0) -> None:
-        self._rows: deque[dict[str, float]] = deque(map(dict, rows), maxlen=LONGEST)
-        self._pairs = max(pairs, len(self._rows))
+    def __init__(self, errors: Mapping[str, ArrayLike] | None = None, pairs: int = 0) -> None:
+        self._errors = {name: np.array(values, dtype=np.float64) for name, values in (errors or {}).items()}
+        lengths = {values.shape for values in self._errors.values()} or {(0,)}
+        self._length = max(lengths)[0] if len(lengths) == 1 else 0
+        if lengths != {(self._length,)}:
+            raise ShapeError("errors", "(k,) for each model", max(lengths))
+        self._pairs = max(pairs, self._length)
 
     @property
-    def rows(self) -> list[dict[str, float]]:
-        """By pair and model [m²]."""
-        return [dict(row) for row in self._rows]
+    def errors(self) -> Mapping[str, FloatArray]:
+        """By model, the squared distances (k,) [m²] of the last k pairs, NaN where there was none."""
+        return self._errors
 
     @property
     def pairs(self) -> int:
@@ -47,27 +56,31 @@ class Contest:
 
     def add(self, squares: Mapping[str, float]) -> None:
         """One more pair: the squared distance [m²] of each model that predicted it. One that is not finite is none."""
-        self._rows.append({name: square for name, square in squares.items() if math.isfinite(square)})
+        for name in squares:
+            self._errors.setdefault(name, np.full(self._length, math.nan))
         self._pairs += 1
-        while len(self._rows) > max(SHORTEST, SHARE * self._pairs):
-            self._rows.popleft()
+        self._length = min(self._length + 1, LONGEST, int(max(SHORTEST, SHARE * self._pairs)))
+        for name, values in self._errors.items():
+            square = squares.get(name, math.nan)
+            self._errors[name] = np.append(values, square if math.isfinite(square) else math.nan)[-self._length :]
 
-    def add_late(self, name: str, squares: Sequence[float], fresher: Sequence[str] = ()) -> None:
-        """The squared distances [m²] of a model found only now for the last pairs, none of which it has learnt.
+    def add_late(self, name: str, squares: ArrayLike, fresher: Sequence[str] = ()) -> None:
+        """The squared distances (n,) [m²] of a model found only now for the last pairs, none of which it has learnt.
 
         They take the place of those of an older model by this name. The models `fresher` had learnt the pair just
         before each of these; what that gained them is no merit, and they are not compared there.
         """
-        for row, square in zip(reversed(self._rows), reversed(squares), strict=False):
-            for other in (name, *fresher):
-                row.pop(other, None)
-            if math.isfinite(square):
-                row[name] = square
+        late = np.asarray(squares, dtype=np.float64)[-self._length :] if self._length else np.empty(0)
+        begin = self._length - len(late)
+        for other in fresher:
+            if other in self._errors:
+                self._errors[other][begin:] = math.nan
+        values = self._errors.setdefault(name, np.full(self._length, math.nan))
+        values[begin:] = np.where(np.isfinite(late), late, math.nan)
 
     def forget(self, name: str) -> None:
         """A model is another one from now on."""
-        for row in self._rows:
-            row.pop(name, None)
+        self._errors.pop(name, None)
 
     def best(self, trusted: Sequence[str], present: str) -> str:
         """The model that shall answer: the most trusted one that is not clearly worse than any other.
@@ -76,23 +89,29 @@ class Contest:
             trusted: the models, the most trusted first.
             present: who answers while too few pairs were predicted.
         """
-        errors = {name: np.array([row.get(name, math.nan) for row in self._rows]) for name in trusted}
-        tried = {name: values for name, values in errors.items() if np.isfinite(values).sum() >= FEWEST}
+        errors = ((name, self._errors.get(name)) for name in trusted)
+        tried = {name: values for name, values in errors if values is not None and _count(values) >= FEWEST}
         for name, values in tried.items():
             if not any(_clearly_worse(values, other) for rival, other in tried.items() if rival != name):
                 return name
         return present
 
 
-def _clearly_worse(errors: np.ndarray, others: np.ndarray) -> bool:
+def _count(errors: FloatArray) -> int:
+    return int(np.isfinite(errors).sum())
+
+
+def _clearly_worse(errors: FloatArray, others: FloatArray) -> bool:
     both = np.isfinite(errors) & np.isfinite(others)
-    count = int(both.sum())
+    errors, others, count = errors[both], others[both], int(both.sum())
     if count < FEWEST:
         return False
-    cap = _CAP * min(float(np.median(errors[both])), float(np.median(others[both])))
-    losses = np.minimum(errors[both], cap) - np.minimum(others[both], cap)
+    cap = _CAP * min(float(np.median(errors)), float(np.median(others)))
+    losses = np.minimum(errors, cap) - np.minimum(others, cap)
+    mean = float(losses.mean())
     # A few losses are alike by chance: their spread is taken for no smaller than so few can tell.
     error = float(losses.std(ddof=1)) / math.sqrt(count) * (1.0 + 3.0 / count)
+    if mean <= CLEARLY * error:
+        return False
     # Neighbours on a path lose alike, and tell as much as one.
-    error *= math.sqrt(shared_by((losses - losses.mean())[:, None]))
-    return bool(losses.mean() > CLEARLY * error)
+    return mean > CLEARLY * error * math.sqrt(shared_by((losses - mean)[:, None]))

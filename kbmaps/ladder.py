@@ -168,8 +168,11 @@ class Ladder:
 
     def errors(self) -> dict[str, float]:
         """RMS distance between prediction and measurement on the last pairs, before learning them [m], by model."""
-        table = {name: [row[name] for row in self._contest.rows if name in row] for name in self._rungs}
-        return {name: math.sqrt(sum(squares) / len(squares)) for name, squares in table.items() if squares}
+        return {
+            name: math.sqrt(float(np.nanmean(squares)))
+            for name, squares in self._contest.errors.items()
+            if np.isfinite(squares).any()
+        }
 
     def learn(self, q: ArrayLike, x: ArrayLike, sigma: ArrayLike | None = None) -> None:
         """Pairs q (n, d) [rad, m] and x (n, 3) [m], or one, (d,) and (3,), in the order in which they came.
@@ -241,13 +244,12 @@ class Ladder:
             for name, rung in self._rungs.items()
         ]
         fields = {"rungs": entries, "answering": self._answering, "judged": self._contest.pairs}
-        judged = [[row.get(name, math.nan) for name in self._rungs] for row in self._contest.rows]
         arrays = {
             "q": self._q,
             "x": self._x,
             "sigma": self._sigma,
-            "contest": np.array(judged).reshape(len(judged), len(self._rungs)),
         }
+        arrays |= {f"errors of {name}": squares for name, squares in self._contest.errors.items()}
         return pack(_KIND, fields, arrays)
 
     @classmethod
@@ -286,10 +288,8 @@ class Ladder:
         self._q, self._x, self._sigma = arrays["q"], arrays["x"], arrays["sigma"]
         self._learnt = {entry["name"]: int(entry["learnt"]) for entry in entries}
         self._failures = {entry["name"]: entry["failure"] for entry in entries if entry["failure"] is not None}
-        judged = [
-            {name: square for name, square in zip(self._rungs, row, strict=True) if not math.isnan(square)}
-            for row in arrays["contest"].tolist()
-        ]
+        stored = {name: arrays.get(f"errors of {name}") for name in self._rungs}
+        judged = {name: squares for name, squares in stored.items() if squares is not None}
         self._contest = Contest(judged, int(fields["judged"]))
         self._answering = str(fields["answering"])
         if self._answering not in self._rungs:

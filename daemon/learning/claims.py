@@ -48,7 +48,7 @@ class ClaimsState(msgspec.Struct, kw_only=True):
 
     Attributes:
         errors: prequential errors, by model.
-        contest: squared prequential errors [m²] of the last pairs.
+        contest: squared prequential errors [m²] of the last pairs, by model.
         judged: how many pairs there were for it so far.
         trusted: the models, the most trusted first.
         residuals: errors of the instant learner on pairs that it has learnt already; None before any.
@@ -61,7 +61,7 @@ class ClaimsState(msgspec.Struct, kw_only=True):
     """
 
     errors: dict[str, ErrorMemory]
-    contest: list[dict[str, float]]
+    contest: dict[str, list[float]]
     judged: int
     trusted: tuple[str, ...]
     residuals: ErrorMemory | None
@@ -211,7 +211,7 @@ class Claims:
         if anew:
             self._contest.forget(name)
             self.errors[name] = ErrorMemory(self._expected_m)
-        self._contest.add_late(name, np.square(errors).sum(axis=1).tolist(), fresher=(INSTANT,))
+        self._contest.add_late(name, np.square(errors).sum(axis=1), fresher=(INSTANT,))
         noise = self.errors[PRIOR].noise_variance
         claimed = self.of(name).variance(q) + noise
         for error, variance in zip(errors, claimed, strict=True):
@@ -249,7 +249,7 @@ class Claims:
         """Everything needed to go on from here, but `arm_configurations`."""
         return ClaimsState(
             errors=self.errors,
-            contest=self._contest.rows,
+            contest={name: squares.tolist() for name, squares in self._contest.errors.items()},
             judged=self._contest.pairs,
             trusted=self._trusted,
             residuals=self._residuals,

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from kbmaps import Contest
+from kbmaps import Contest, ShapeError
 
 TRUSTED = ("rigid", "bent")
 
@@ -69,9 +69,9 @@ def test_outliers_that_all_models_meet_do_not_hide_who_is_better():
 
 
 def test_what_was_long_ago_does_not_count():
-    held = contest(0.001, 0.02, 300)
-    for row in contest(0.02, 0.001, 400).rows * 2:
-        held.add(row)
+    held, rng = contest(0.001, 0.02, 300), np.random.default_rng(1)
+    for _ in range(800):
+        held.add(squares(0.005 * rng.normal(size=3), (0.02, 0.001)))
     assert held.best(TRUSTED, "none") == "bent"
 
 
@@ -79,22 +79,41 @@ def test_a_model_that_became_another_one_is_judged_anew():
     held = contest(0.02, 0.001, 50)
     held.forget("rigid")
     assert held.best(TRUSTED, "none") == "bent"
-    for row in contest(0.001, 0.001, 10).rows:
-        held.add(row)
+    rng = np.random.default_rng(1)
+    for _ in range(10):
+        held.add(squares(0.005 * rng.normal(size=3), (0.001, 0.001)))
     assert held.best(TRUSTED, "none") == "rigid"
 
 
-def test_a_contest_goes_on_from_its_rows():
-    held = contest(0.01, 0.001, 150)
-    again = Contest(held.rows, held.pairs)
-    held.add({"rigid": 1.0, "bent": 1.0})
-    again.add({"rigid": 1.0, "bent": 1.0})
-    assert again.rows == held.rows
+def test_a_contest_goes_on_from_its_errors():
+    held = contest(0.01, 0.001, 350)
+    held.add({"rigid": math.nan, "bent": 1.0})
+    again = Contest(held.errors, held.pairs)
+    for one in (held, again):
+        one.add({"rigid": 1.0})
+    assert again.pairs == held.pairs
+    for name in TRUSTED:
+        np.testing.assert_array_equal(again.errors[name], held.errors[name])
+
+
+def test_errors_of_different_numbers_of_pairs_are_refused():
+    with pytest.raises(ShapeError):
+        Contest({"rigid": [0.1], "bent": [0.1, 0.2]})
+
+
+def test_neighbours_that_fare_alike_count_as_one():
+    """One stretch of a path where a model does better is no proof, however many pairs were taken there."""
+    held = Contest()
+    for k in range(60):
+        held.add({"rigid": 1.0 + 0.01 * k, "bent": 1.0})
+    for _ in range(60):
+        held.add({"rigid": 1.0, "bent": 1.0})
+    assert held.best(TRUSTED, "none") == "rigid"
 
 
 def test_a_model_that_was_found_late_is_judged_on_pairs_that_it_had_not_learnt():
     held = contest(0.01, 0.001, 50)
-    for row in held.rows:
-        held.add({"rigid": row["rigid"]})
+    for square in held.errors["rigid"]:
+        held.add({"rigid": float(square)})
     held.add_late("bent", [1e-8] * 160)
     assert held.best(TRUSTED, "none") == "bent"
