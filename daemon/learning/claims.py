@@ -21,6 +21,7 @@ from .unknowns import ChainLayer, Layer, Unknowns
 OPEN_SHARE = 1.1
 # The prior stays: its error is remembered for a thousand pairs.
 PRIOR_DISCOUNT = 0.999
+_ARM, _CONTEST = "arm_q", "squares_"
 
 
 @dataclass(frozen=True)
@@ -48,8 +49,7 @@ class ClaimsState(msgspec.Struct, kw_only=True):
 
     Attributes:
         errors: prequential errors, by model.
-        contest: squared prequential errors [m²] of the last pairs, by model.
-        judged: how many pairs there were for it so far.
+        judged: how many pairs there were for the contest so far.
         trusted: the models, the most trusted first.
         residuals: errors of the instant learner on pairs that it has learnt already; None before any.
         misfits: what each solution misses at pairs that it knows, 1-sigma per axis [m].
@@ -61,7 +61,6 @@ class ClaimsState(msgspec.Struct, kw_only=True):
     """
 
     errors: dict[str, ErrorMemory]
-    contest: dict[str, list[float]]
     judged: int
     trusted: tuple[str, ...]
     residuals: ErrorMemory | None
@@ -126,11 +125,6 @@ class Claims:
     def residual(self) -> ResidualModel | None:
         """What the pairs with the present tool let believe of the arm as no rigid chain; None before that is solved."""
         return self._residual
-
-    @property
-    def arm_configurations(self) -> FloatArray:
-        """The configurations (n, d) [rad] that stand for all data, with any tool."""
-        return self._unknowns.arm_configurations
 
     def change_tool(self, expected_m: float, answered: str = PRIOR) -> None:
         """Another tool: a new prior with other errors, and what was not known of the arm is not known now.
@@ -246,10 +240,9 @@ class Claims:
         return Claim(inside.sigma, self._unknowns.layers(self._prior_sigma), memory.surprise)
 
     def state(self) -> ClaimsState:
-        """Everything needed to go on from here, but `arm_configurations`."""
+        """Everything needed to go on from here that is not in `arrays`."""
         return ClaimsState(
             errors=self.errors,
-            contest={name: squares.tolist() for name, squares in self._contest.errors.items()},
             judged=self._contest.pairs,
             trusted=self._trusted,
             residuals=self._residuals,
@@ -261,16 +254,22 @@ class Claims:
             residual=None if self._residual is None else self._residual.to_bytes(),
         )
 
-    def restore(self, state: ClaimsState, arm_configurations: FloatArray, q: FloatArray) -> None:
-        """Go on from a state; q (n, d) [rad] are the pairs with the present tool."""
-        for row in arm_configurations:
+    def arrays(self) -> dict[str, FloatArray]:
+        """The configurations (n, d) [rad] that stand for all data, and squared errors (k,) [m²] by model."""
+        squares = {_CONTEST + name: values.copy() for name, values in self._contest.errors.items()}
+        return {_ARM: self._unknowns.arm_configurations} | squares
+
+    def restore(self, state: ClaimsState, arrays: Mapping[str, FloatArray], q: FloatArray) -> None:
+        """Go on from a state and its `arrays`; q (n, d) [rad] are the pairs with the present tool."""
+        for row in arrays[_ARM]:
             self._unknowns.add(row)
         if state.arm_sigma is not None:
             self._unknowns.change_tool(state.arm_sigma)
         for row in q:
             self._unknowns.add(row)
         self.errors, self._residuals = dict(state.errors), state.residuals
-        self._contest, self._prior_errors = Contest(state.contest, state.judged), state.prior_errors
+        squares = {name.removeprefix(_CONTEST): v for name, v in arrays.items() if name.startswith(_CONTEST)}
+        self._contest, self._prior_errors = Contest(squares, state.judged), state.prior_errors
         self._misfits = {name: np.array(missed) for name, missed in state.misfits.items()}
         self._trusted = state.trusted
         self._misfits_before = {name: np.array(missed) for name, missed in state.misfits_before.items()}

@@ -222,7 +222,7 @@ class Learning:
                 belief=None if arm is None else arm.chain.to_bytes(),
                 residual=None if arm is None or arm.residual is None else arm.residual.to_bytes(),
             )
-            kept = {"arm_q": self._claims.arm_configurations} | self._fitting.arrays()
+            kept = self._claims.arrays() | self._fitting.arrays()
         kept |= {"q": q, "x": x, "doubted_q": doubted_q, "doubted_x": doubted_x}
         return LearningState(header, kept | {f"net_{name}": net for name, net in nets.items()})
 
@@ -243,7 +243,7 @@ class Learning:
                 self._begin_at_nominal()
             self._fitting.restore(header.next_fit, header.first_fit, state.arrays)
             self._claims = Claims(self._nominal.bases, EXPECTED_M)
-            self._claims.restore(header.claims, state.arrays["arm_q"], state.arrays["q"])
+            self._claims.restore(header.claims, state.arrays, state.arrays["q"])
             if nets:
                 self._members_now.restore(nets, self._claims.residual)
             self._memory.restore(state.arrays["q"], state.arrays["x"], header.kept_of)

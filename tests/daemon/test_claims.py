@@ -107,7 +107,7 @@ def test_claims_are_the_same_after_a_restart(walk: FloatArray) -> None:
     claims.change_tool(0.1)
     learnt(claims, walk[:30], prior_error_m=0.01, error_m=0.02)
     state = msgspec.msgpack.decode(msgspec.msgpack.encode(claims.state()), type=ClaimsState)
-    again.restore(state, claims.arm_configurations, walk[:30])
+    again.restore(state, claims.arrays(), walk[:30])
     anywhere = np.vstack([walk, FAR])
     for name in (PRIOR, INSTANT):
         np.testing.assert_allclose(again.of(name).variance(anywhere), claims.of(name).variance(anywhere), rtol=0.05)

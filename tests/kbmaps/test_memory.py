@@ -52,6 +52,18 @@ def test_a_window_of_the_exact_learner_is_a_fresh_one_on_the_last_pairs(seed, wi
     assert found.log_evidence == pytest.approx(expected.log_evidence, rel=1e-9, abs=1e-6)
 
 
+def test_what_leaves_a_window_leaves_the_sums_too():
+    rng = np.random.default_rng(6)
+    prior = random_map(rng, bases_for(KINDS))
+    q, x = stream(rng, 1700)
+    windowed, fresh = ExactLearner(prior, memory=Memory(1200)), ExactLearner(prior)
+    for part in np.array_split(np.arange(1700), 17):
+        windowed.learn(q[part], x[part])
+        windowed.solve(0.1)
+    fresh.learn(q[-1200:], x[-1200:])
+    np.testing.assert_allclose(windowed.solve(0.1).map.net, fresh.solve(0.1).map.net, rtol=0, atol=1e-12)
+
+
 def test_a_window_stays_exact_over_a_long_run():
     rng = np.random.default_rng(5)
     prior = random_map(rng, bases_for(KINDS))
