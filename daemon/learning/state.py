@@ -72,7 +72,10 @@ class LearningHeader(msgspec.Struct, kw_only=True):
 
 @dataclass(frozen=True)
 class LearningState:
-    """A learner's state; `arrays` are the nets by model, kept and doubted pairs, those of the claims, and what a tool is fitted to."""
+    """A learner's state.
+
+    `arrays` are the nets by model, kept and doubted pairs, those of the claims, and what a tool is fitted to.
+    """
 
     header: LearningHeader
     arrays: Mapping[str, FloatArray]
