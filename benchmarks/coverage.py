@@ -35,7 +35,7 @@ from kbmaps import (
     learning_bases,
 )
 from kbmaps.arrays import FloatArray
-from kbmaps.experiment_design import mean_distances
+from kbmaps.planning.design import mean_distances
 
 SIGMA = 0.01
 TEST_ROWS = 500

@@ -36,7 +36,7 @@ from kbmaps import (
     learning_bases,
 )
 from kbmaps.arrays import FloatArray
-from kbmaps.carried import ChainModel, Predictor
+from kbmaps.chains.carried import ChainModel, Predictor
 
 SIGMA = 0.01
 TEST_ROWS = 400

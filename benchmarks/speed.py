@@ -32,10 +32,10 @@ from kbmaps import (
     KBMap,
     RecursiveRigidLearner,
     SupportSet,
-    kernels,
     learning_bases,
 )
 from kbmaps.arrays import FloatArray
+from kbmaps.maps import kernels
 
 ROUGH = ChainTolerances(axes=0.05, points=0.015, tool=0.03)
 PAIRS = 600

@@ -4,17 +4,18 @@ Numpy and scipy only; no I/O, no clock, no logging. Angles [rad], lengths [m], f
 where a C compiler was there on installation: `kernels_in_use()` tells; BODYSCHEMA_PURE=1 goes without them.
 """
 
-from kbmaps.align import Alignment, align
 from kbmaps.autocorrelation import shared_by
-from kbmaps.basis import JointBasis, learning_bases
-from kbmaps.block_choice import blockwise_precision, follow_a_path
-from kbmaps.chain import RigidChain
-from kbmaps.chain_belief import ChainBelief
-from kbmaps.chain_parameters import ChainParameters, ChainTolerances
-from kbmaps.chain_report import ChainReport, Interval
-from kbmaps.chain_search import find_chain
+from kbmaps.chains.align import Alignment, align
+from kbmaps.chains.belief import ChainBelief
+from kbmaps.chains.chain import RigidChain
+from kbmaps.chains.parameters import ChainParameters, ChainTolerances
+from kbmaps.chains.refitted_marker import with_refitted_marker
+from kbmaps.chains.report import ChainReport, Interval
+from kbmaps.chains.rigid_learner import RigidLearner
+from kbmaps.chains.rigid_recursive import RecursiveRigidLearner
+from kbmaps.chains.search import find_chain
+from kbmaps.chains.tool_layer import ToolLayer
 from kbmaps.contest import Contest
-from kbmaps.core_prior import CoreFamily, CorePrior
 from kbmaps.errors import (
     BasisError,
     ChainError,
@@ -27,35 +28,34 @@ from kbmaps.errors import (
     ShapeError,
     SingularAlphaError,
 )
-from kbmaps.exact import ExactLearner, ExactSolution
-from kbmaps.expected_gain import ExpectedError, Forecast, candidate_motions, expected_gain
-from kbmaps.experiment_design import ExperimentDesign, next_pose, next_poses, next_stretch
-from kbmaps.inverse import InverseKinematics, InverseSolution
-from kbmaps.kbmap import KBMap, prediction_errors
-from kbmaps.kernel_learner import KernelLearner
-from kbmaps.kernels import in_use as kernels_in_use
-from kbmaps.lack_of_fit import systematic_error
+from kbmaps.inverse.kinematics import InverseKinematics, InverseSolution
+from kbmaps.inverse.reach import PoseModel, PositionModel
+from kbmaps.inverse.resolved_rates import resolved_rates
+from kbmaps.kernel.kernel_learner import KernelLearner
+from kbmaps.kernel.structured_learner import StructuredLearner
 from kbmaps.ladder import Ladder, Rung
+from kbmaps.maps.basis import JointBasis, learning_bases
+from kbmaps.maps.block_choice import blockwise_precision, follow_a_path
+from kbmaps.maps.exact import ExactLearner, ExactSolution
+from kbmaps.maps.kbmap import KBMap, prediction_errors
+from kbmaps.maps.kernels import in_use as kernels_in_use
+from kbmaps.maps.nlms import NLMS
+from kbmaps.maps.step_size import StepSize
+from kbmaps.maps.support import SUPPORT_LIMIT, SupportSet
 from kbmaps.memory import Memory
 from kbmaps.model import Estimate, Model
-from kbmaps.nlms import NLMS
-from kbmaps.posterior import ChainPosterior, Posterior
-from kbmaps.reach import PoseModel, PositionModel
-from kbmaps.residual_learner import ResidualLearner
-from kbmaps.residual_model import ResidualModel
-from kbmaps.resolved_rates import resolved_rates
-from kbmaps.rigid_learner import RigidLearner
-from kbmaps.rigid_recursive import RecursiveRigidLearner
+from kbmaps.planning.design import ExperimentDesign, next_pose, next_poses, next_stretch
+from kbmaps.planning.expected_gain import ExpectedError, Forecast, candidate_motions, expected_gain
+from kbmaps.planning.lack_of_fit import systematic_error
+from kbmaps.planning.posterior import ChainPosterior, Posterior
+from kbmaps.residual.learner import ResidualLearner
+from kbmaps.residual.model import ResidualModel
 from kbmaps.rotations import nearest_rotation
-from kbmaps.step_size import StepSize
-from kbmaps.structured_learner import StructuredLearner
-from kbmaps.support import SUPPORT_LIMIT, SupportSet
-from kbmaps.tensor_learner import TensorLearner
-from kbmaps.tensor_posterior import TensorPosterior
-from kbmaps.tensor_settings import TensorSettings
-from kbmaps.tensor_train import TensorTrain
-from kbmaps.tool import with_refitted_marker
-from kbmaps.tool_layer import ToolLayer
+from kbmaps.trains.core_prior import CoreFamily, CorePrior
+from kbmaps.trains.learner import TensorLearner
+from kbmaps.trains.posterior import TensorPosterior
+from kbmaps.trains.settings import TensorSettings
+from kbmaps.trains.train import TensorTrain
 
 __all__ = [
     "NLMS",

@@ -14,21 +14,21 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from kbmaps.arrays import FloatArray, rows, rows_or_vector
-from kbmaps.basis import learning_bases
-from kbmaps.chain import RigidChain
-from kbmaps.chain_parameters import ChainTolerances
+from kbmaps.chains.chain import RigidChain
+from kbmaps.chains.parameters import ChainTolerances
+from kbmaps.chains.rigid_learner import RigidLearner
+from kbmaps.chains.rigid_recursive import RecursiveRigidLearner
+from kbmaps.chains.tool_layer import ToolLayer
 from kbmaps.contest import Contest
 from kbmaps.errors import KBMapsError, ModelFormatError, SettingError
-from kbmaps.kernel_learner import KernelLearner
+from kbmaps.kernel.kernel_learner import KernelLearner
+from kbmaps.kernel.structured_learner import StructuredLearner
+from kbmaps.maps.basis import learning_bases
 from kbmaps.model import Estimate, Model
 from kbmaps.packed import pack, unpack
 from kbmaps.pairs import checked_pairs
-from kbmaps.residual_learner import ResidualLearner
-from kbmaps.rigid_learner import RigidLearner
-from kbmaps.rigid_recursive import RecursiveRigidLearner
-from kbmaps.structured_learner import StructuredLearner
-from kbmaps.tensor_learner import TensorLearner
-from kbmaps.tool_layer import ToolLayer
+from kbmaps.residual.learner import ResidualLearner
+from kbmaps.trains.learner import TensorLearner
 
 _KIND = "ladder, 1"
 _STORED: tuple[type[Model], ...] = (

@@ -22,9 +22,7 @@ from typing import Any, cast
 import numpy as np
 
 from kbmaps.arrays import FloatArray
-from kbmaps.basis import PARAMETER_NAMES, BasisKind, JointBasis
-from kbmaps.chain import RigidChain
-from kbmaps.errors import BasisError, ModelFormatError
+from kbmaps.errors import ModelFormatError
 
 MAGIC = b"KBPACK\r\n"
 VERSION = 1
@@ -74,42 +72,6 @@ def numbers(fields: Mapping[str, Any]) -> dict[str, float]:
         if type(value) not in (int, float):
             raise ModelFormatError(f"the field {name} is not a number")
     return {name: float(value) for name, value in fields.items()}
-
-
-def chain_arrays(chain: RigidChain) -> dict[str, FloatArray]:
-    """A chain as arrays to pack."""
-    return {"fixed": chain.fixed, "axes": chain.axes, "prismatic": chain.prismatic.astype(np.float64)}
-
-
-def chain_from_arrays(arrays: Mapping[str, FloatArray]) -> RigidChain:
-    """The chain in unpacked arrays. Raises KeyError (one is missing), ChainError, ShapeError, NonFiniteError."""
-    return RigidChain(arrays["fixed"], arrays["axes"], arrays["prismatic"] != 0.0)
-
-
-def describe_bases(bases: Sequence[JointBasis]) -> list[list[Any]]:
-    """Bases as JSON holds them: [kind, parameters...] each."""
-    return [[basis.kind, *basis.parameters] for basis in bases]
-
-
-def parse_bases(value: Any) -> tuple[JointBasis, ...]:
-    """The bases that `describe_bases` gave. Raises ModelFormatError."""
-    if not isinstance(value, list) or not value:
-        raise ModelFormatError("the bases are not a list of at least one")
-    return tuple(_parse_basis(entry) for entry in cast(list[Any], value))
-
-
-def _parse_basis(entry: Any) -> JointBasis:
-    parts = cast(list[Any], entry) if isinstance(entry, list) else []
-    kind: Any = parts[0] if parts else None
-    numbers = parts[1:]
-    if not isinstance(kind, str) or kind not in PARAMETER_NAMES:
-        raise ModelFormatError("a basis is of no known kind")
-    if not all(isinstance(number, float) for number in numbers):
-        raise ModelFormatError(f"the parameters of a {kind} basis are not all floating-point numbers")
-    try:
-        return JointBasis(cast(BasisKind, kind), tuple(numbers))
-    except BasisError as error:
-        raise ModelFormatError(f"the header describes an impossible basis: {error}") from error
 
 
 def _split(view: memoryview) -> tuple[bytes, memoryview]:

@@ -10,7 +10,7 @@ import numpy as np
 from daemon.status import Outlook
 from interfaces.records import FloatArray
 from kbmaps import ChainBelief, ChainPosterior, ChainTolerances, candidate_motions, expected_gain, shared_by
-from kbmaps.expected_gain import ALL, SAME
+from kbmaps.planning.expected_gain import ALL, SAME
 
 from .claims import Claim
 from .gate import MEDIAN_TO_SIGMA

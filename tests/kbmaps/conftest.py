@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from kbmaps import kernels
+from kbmaps.maps import kernels
 
 
 @pytest.fixture(scope="module", params=["compiled", "numpy"])

@@ -6,7 +6,7 @@ from planted_chains import random_q
 from rough_arms import ROUGH, rough_arm
 
 from kbmaps import ChainPosterior, Forecast, RigidLearner, SettingError, candidate_motions, expected_gain
-from kbmaps.expected_gain import ALL, SAME
+from kbmaps.planning.expected_gain import ALL, SAME
 
 LIMIT = np.radians(80.0)
 

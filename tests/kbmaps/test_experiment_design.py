@@ -17,7 +17,7 @@ from kbmaps import (
     next_poses,
     next_stretch,
 )
-from kbmaps.experiment_design import mean_distances
+from kbmaps.planning.design import mean_distances
 
 seeds = st.integers(0, 2**32 - 1)
 

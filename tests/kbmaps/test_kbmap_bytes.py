@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from planted_chains import bases_for, random_map
 
 from kbmaps import KBMap, ModelFormatError
-from kbmaps.serial import MAGIC
+from kbmaps.maps.serial import MAGIC
 
 MAP = random_map(np.random.default_rng(7), bases_for("RPR")).with_metadata({"robot": "left arm", "pairs": "612"})
 STORED = MAP.to_bytes()

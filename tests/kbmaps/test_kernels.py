@@ -16,7 +16,8 @@ from hypothesis import strategies as st
 from planted_chains import bases_for, random_map, random_q
 from rough_arms import ROUGH, rough_arm
 
-from kbmaps import NLMS, KBMap, KBMapsError, RecursiveRigidLearner, SettingError, kernels, kernels_in_use
+from kbmaps import NLMS, KBMap, KBMapsError, RecursiveRigidLearner, SettingError, kernels_in_use
+from kbmaps.maps import kernels
 
 seeds = st.integers(0, 2**32 - 1)
 kinds = st.text("RP", min_size=1, max_size=6)

@@ -14,8 +14,8 @@ import pytest
 from planted_chains import random_chain, random_q
 
 from kbmaps import JointBasis, KBMap
-from kbmaps.basis import PARAMETER_NAMES
-from kbmaps.serial import MAGIC
+from kbmaps.maps.basis import PARAMETER_NAMES
+from kbmaps.maps.serial import MAGIC
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "model_file.md").read_text(encoding="utf-8")

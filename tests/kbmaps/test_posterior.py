@@ -6,7 +6,7 @@ from planted_chains import random_q
 from rough_arms import ROUGH, rough_arm
 
 from kbmaps import ChainPosterior, DegenerateDataError, RecursiveRigidLearner, RigidLearner, SettingError, ShapeError
-from kbmaps.chain_parameters import ChainParameters
+from kbmaps.chains.parameters import ChainParameters
 
 
 @pytest.mark.parametrize("kind", [RigidLearner, RecursiveRigidLearner])

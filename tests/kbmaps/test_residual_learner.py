@@ -18,9 +18,9 @@ from kbmaps import (
     SettingError,
     ShapeError,
 )
-from kbmaps.chain_parameters import ChainParameters
-from kbmaps.residual_evidence import GroupedModel, Moments
-from kbmaps.residual_features import ResidualFeatures, ResidualScaling
+from kbmaps.chains.parameters import ChainParameters
+from kbmaps.residual.evidence import GroupedModel, Moments
+from kbmaps.residual.features import ResidualFeatures, ResidualScaling
 
 SIGMA = 0.005
 

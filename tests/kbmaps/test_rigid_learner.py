@@ -22,8 +22,8 @@ from kbmaps import (
     SettingError,
     ShapeError,
     align,
-    placed_start,
 )
+from kbmaps.chains import placed_start
 
 seeds = st.integers(0, 2**32 - 1)
 

@@ -1,0 +1,262 @@
+"""Best rigid fit of a nominal chain to measurements: instrument pose, marker offset, or both."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import cast
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from kbmaps.arrays import BoolArray, FloatArray, frozen, rows
+from kbmaps.chains.chain import RigidChain, cross_matrix
+from kbmaps.errors import DegenerateDataError, SettingError, ShapeError
+
+# A residual norm of noise σ per axis has the median 1.538 σ in three dimensions.
+_MEDIAN_NORM = 1.538
+# Pairs beyond this many σ are outliers. Far out, since the errors of an uncalibrated arm have long tails themselves
+# and must not be rejected.
+_OUTLIER_SIGMAS = 15.0
+_ROUNDS = 60
+_START_PAIRS = 300
+_STEP_TOLERANCE = 1e-12
+# Singular values below this share of the largest are directions that the data do not determine.
+_RANK_TOLERANCE = 1e-7
+# No residual below a nanometre makes an outlier: on noise-free data that is rounding.
+_ROUNDING_M = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Alignment:
+    """A nominal chain fitted to measured pairs by rigid motion alone.
+
+    Attributes:
+        chain: the nominal chain with what was fitted built in.
+        T_measured_nominal: pose (4, 4) of the nominal measurement frame in the real one; identity if it was known.
+        marker_shift: move of the marker (3,) [m] in the marker frame; zero if it was known.
+        rms: RMS distance [m] between the fitted chain and the pairs that are no outliers.
+        inliers: which pairs (n,) are no outliers.
+    """
+
+    chain: RigidChain
+    T_measured_nominal: FloatArray
+    marker_shift: FloatArray
+    rms: float
+    inliers: BoolArray
+
+
+@dataclass
+class _Fit:
+    """The present estimate for nominal poses: x ≈ rotation (p + R δ) + translation."""
+
+    nominal_rotations: FloatArray
+    nominal_positions: FloatArray
+    x: FloatArray
+    fit_pose: bool
+    fit_marker: bool
+    rotation: FloatArray = field(default_factory=lambda: np.eye(3))
+    translation: FloatArray = field(default_factory=lambda: np.zeros(3))
+    shift: FloatArray = field(default_factory=lambda: np.zeros(3))
+
+    def markers(self) -> FloatArray:
+        """Marker positions (n, 3) in the nominal frame."""
+        return self.nominal_positions + self.nominal_rotations @ self.shift
+
+    def errors(self) -> FloatArray:
+        return self.x - (self.markers() @ self.rotation.T + self.translation)
+
+    def norms(self) -> FloatArray:
+        return np.linalg.norm(self.errors(), axis=1)
+
+    def spread(self, least: float) -> float:
+        """Standard deviation [m] of one coordinate's error, from the middle distance, at least `least`.
+
+        The middle lies above the median by the pairs that what is fitted can explain whatever they are (Rousseeuw and
+        Leroy 1987, least median of squares): else a few pairs would look perfect and the others be outliers.
+        """
+        free_pairs = 2 * self.fit_pose + self.fit_marker
+        rank = min(len(self.x) // 2 + free_pairs, len(self.x) - 1)
+        return max(float(np.partition(self.norms(), rank)[rank]) / _MEDIAN_NORM, least)
+
+    def place(self, weights: FloatArray) -> None:
+        """The best pose for the present marker."""
+        self.rotation, self.translation = rigid_motion(self.markers(), self.x, weights)
+
+    def improve(self, weights: FloatArray) -> float:
+        """One weighted Gauss-Newton step in all that is fitted; returns its size (rad and m added)."""
+        turned = self.markers() @ self.rotation.T
+        columns: list[FloatArray] = []
+        if self.fit_pose:
+            # rotation ← exp(ω) rotation moves a point by ω × point = −[point]× ω.
+            columns += [-cross_matrix(turned), np.broadcast_to(np.eye(3), (len(turned), 3, 3))]
+        if self.fit_marker:
+            columns.append(self.rotation @ self.nominal_rotations)
+        root = np.sqrt(weights)[:, None]
+        design = (np.concatenate(columns, axis=2) * root[:, :, None]).reshape(3 * len(turned), -1)
+        target = (self.errors() * root).ravel()
+        step = cast(FloatArray, np.linalg.lstsq(design, target, rcond=_RANK_TOLERANCE)[0])
+        if self.fit_pose:
+            self.rotation = _exp(step[:3]) @ self.rotation
+            self.translation = self.translation + step[3:6]
+        if self.fit_marker:
+            self.shift = self.shift + step[-3:]
+        return float(np.abs(step).sum())
+
+
+def align(
+    chain: RigidChain,
+    q: ArrayLike,
+    x: ArrayLike,
+    *,
+    pose_known: bool,
+    marker_known: bool,
+    sigma: float | None = None,
+) -> Alignment:
+    """Fits what is not known of the instrument's pose and the marker's place to measured pairs.
+
+    Needs no first guess and withstands gross outliers. The final fit is plain least squares over the pairs that are
+    no outliers. Where pose and marker can make up for each other (a chain whose last frame hardly turns), the
+    combination that changes the nominal chain least is returned.
+
+    Args:
+        chain: the nominal chain.
+        q: joint angles (n, d) [rad, m].
+        x: measured marker positions (n, 3) [m].
+        pose_known: the instrument stands where the chain says.
+        marker_known: the marker sits where the chain says.
+        sigma: noise of one coordinate [m], if known: nothing within 15 sigma is ever called an outlier.
+
+    Raises:
+        ShapeError, NonFiniteError
+        SettingError: sigma is not positive.
+        DegenerateDataError: too few pairs, or positions on one line.
+
+    Example:
+        >>> import numpy as np
+        >>> from kbmaps import RigidChain, align
+        >>> fixed = np.tile(np.eye(4), (3, 1, 1))
+        >>> fixed[1:, 0, 3] = 0.3, 0.2  # links [m]
+        >>> arm = RigidChain(fixed, axes=[[0, 0, 1], [0, 1, 0]], prismatic=[False, False])
+        >>> q = np.random.default_rng(0).uniform(-1, 1, (20, 2))
+        >>> x = arm.positions(q) + [0.0, 0.0, 1.0]  # the camera stands one metre lower
+        >>> align(arm, q, x, pose_known=False, marker_known=True).T_measured_nominal[:3, 3].round(6) + 0.0
+        array([0., 0., 1.])
+    """
+    angles, positions = rows("q", q, chain.joints), rows("x", x, 3)
+    if len(angles) != len(positions):
+        raise ShapeError("x", f"({len(angles)}, 3) to go with q", positions.shape)
+    if sigma is not None and not (sigma > 0.0 and math.isfinite(sigma)):
+        raise SettingError(f"sigma must be finite and greater than 0, got {sigma!r}")
+    _check_enough(len(angles), pose_known, marker_known)
+    poses = chain.poses(angles)
+    fit = _Fit(poses[:, :3, :3], poses[:, :3, 3], positions, not pose_known, not marker_known)
+    if fit.fit_pose:
+        _check_spread(positions, "the measured positions x")
+        if marker_known:
+            _check_spread(fit.nominal_positions, "the nominal marker positions at q")
+    inliers = np.ones(len(angles), dtype=np.bool_)
+    if fit.fit_pose and fit.fit_marker:
+        fit.shift = _start_shift(fit, sigma or 0.0)
+    if fit.fit_pose or fit.fit_marker:
+        inliers = _fit_robustly(fit, sigma or 0.0)
+    return _alignment(chain, fit, inliers)
+
+
+def rigid_motion(points: FloatArray, targets: FloatArray, weights: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """The proper rotation (3, 3) and translation (3,) that take points (n, 3) nearest to targets, in closed form.
+
+    Kabsch 1976, "A solution for the best rotation to relate two sets of vectors".
+    """
+    share = weights / weights.sum()
+    centre_points, centre_targets = share @ points, share @ targets
+    covariance = (points - centre_points).T @ ((targets - centre_targets) * share[:, None])
+    u, _, vt = np.linalg.svd(covariance)
+    handed = np.diag([1.0, 1.0, float(np.sign(np.linalg.det(u @ vt)))])
+    rotation = vt.T @ handed @ u.T
+    return rotation, centre_targets - rotation @ centre_points
+
+
+def _start_shift(fit: _Fit, sigma: float) -> FloatArray:
+    """Marker shift (3,) whose fit explains a sample of the pairs best, of several starting points.
+
+    Pose and marker together have local minima, mostly with few joints or small ranges.
+    """
+    chosen = np.unique(np.linspace(0, len(fit.x) - 1, _START_PAIRS).astype(np.intp))
+    reach = float(np.linalg.norm(fit.x - np.median(fit.x, axis=0), axis=1).mean())
+    best, best_spread = np.zeros(3), math.inf
+    for start in reach * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)]):
+        trial = _Fit(fit.nominal_rotations[chosen], fit.nominal_positions[chosen], fit.x[chosen], True, True)
+        trial.shift = start
+        _fit_robustly(trial, sigma)
+        spread = trial.spread(0.0)
+        # A better start must be clearly better, so that rounding does not choose among equals.
+        if spread < 0.9 * best_spread - _ROUNDING_M:
+            best, best_spread = trial.shift, spread
+    return best
+
+
+def _fit_robustly(fit: _Fit, sigma: float) -> BoolArray:
+    """Improves `fit` by graduated non-convexity, then by least squares on the inliers, which it returns (n,).
+
+    Geman-McClure weights whose scale shrinks from the largest residual to the bulk's (Yang et al. 2020, "Graduated
+    Non-Convexity for Robust Spatial Perception"): the first fits are nearly least squares and need no good guess.
+    """
+    weights = np.ones(len(fit.x))
+    if fit.fit_pose:
+        fit.place(weights)
+    norms = fit.norms()
+    scale = float(norms.max())
+    for _ in range(_ROUNDS):
+        goal = 3.0 * fit.spread(sigma)
+        scale = max(scale / 1.4, goal)
+        weights = (scale**2 / (scale**2 + norms**2)) ** 2 if scale > 0.0 else weights
+        step = fit.improve(weights)
+        norms = fit.norms()
+        if scale == goal and step < _STEP_TOLERANCE:
+            break
+    inliers = np.ones(len(fit.x), dtype=np.bool_)
+    for _ in range(_ROUNDS):
+        chosen = norms <= max(_OUTLIER_SIGMAS * fit.spread(sigma), _ROUNDING_M)
+        step = fit.improve(chosen.astype(np.float64))
+        norms = fit.norms()
+        settled = bool((chosen == inliers).all()) and step < _STEP_TOLERANCE
+        inliers = chosen
+        if settled:
+            break
+    return inliers
+
+
+def _alignment(chain: RigidChain, fit: _Fit, inliers: BoolArray) -> Alignment:
+    transform = np.eye(4)
+    transform[:3, :3], transform[:3, 3] = fit.rotation, fit.translation
+    square = np.square(fit.errors()).sum(axis=1)[inliers]
+    inliers.flags.writeable = False
+    fitted = chain.with_tool(fit.shift).transformed(transform)
+    return Alignment(fitted, frozen(transform), frozen(fit.shift), math.sqrt(float(square.mean())), inliers)
+
+
+def _check_enough(pairs: int, pose_known: bool, marker_known: bool) -> None:
+    needed = 1 if pose_known else 3 if marker_known else 4
+    if pairs < needed:
+        raise DegenerateDataError(
+            f"aligning needs at least {needed} pairs when pose_known = {pose_known} and marker_known = {marker_known}, "
+            f"got {pairs}; record more"
+        )
+
+
+def _check_spread(points: FloatArray, what: str) -> None:
+    singular = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    if not singular[1] > 1e-6 * max(float(singular[0]), 1e-6):
+        raise DegenerateDataError(
+            f"{what} lie on one line or in one place, so no pose can be fitted to them; record pairs that spread out"
+        )
+
+
+def _exp(rotation_vector: FloatArray) -> FloatArray:
+    """Rotation matrix (3, 3) of a rotation vector (3,) [rad] (Rodrigues)."""
+    angle = float(np.linalg.norm(rotation_vector))
+    k = cross_matrix(rotation_vector)
+    sinc = float(np.sinc(angle / np.pi))
+    half_sinc = float(np.sinc(0.5 * angle / np.pi))
+    return np.eye(3) + sinc * k + 0.5 * half_sinc**2 * (k @ k)

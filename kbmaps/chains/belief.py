@@ -1,0 +1,166 @@
+"""What is believed of a rigid chain: a Gaussian over the changes of a reference chain."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Self, cast
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from kbmaps.arrays import FloatArray, IntArray, frozen, rows, rows_or_vector
+from kbmaps.chains.chain import RigidChain
+from kbmaps.chains.packed import chain_arrays, chain_from_arrays
+from kbmaps.chains.parameters import WIDE, ChainParameters, ChainTolerances
+from kbmaps.errors import KBMapsError, ModelFormatError, NonFiniteError, SettingError, ShapeError
+from kbmaps.packed import pack, unpack
+
+_KIND = "belief in a rigid chain, 1"
+_BLOCK = 2048
+
+
+@dataclass(frozen=True, eq=False)
+class ChainBelief:
+    """Mean and covariance of the parameters of a chain.
+
+    Attributes:
+        parameters: what they are, and the reference chain that they change.
+        mean: (size,) [rad, m].
+        root: matrix W (size, k) with the covariance W Wᵀ; a row of zeros holds its parameter.
+
+    Raises:
+        ShapeError, NonFiniteError
+    """
+
+    parameters: ChainParameters
+    mean: FloatArray
+    root: FloatArray
+
+    def __post_init__(self) -> None:
+        size = self.parameters.size
+        if self.mean.shape != (size,):
+            raise ShapeError("mean", f"({size},)", self.mean.shape)
+        if self.root.ndim != 2 or len(self.root) != size:
+            raise ShapeError("root", f"({size}, k)", self.root.shape)
+        for name in ("mean", "root"):
+            if not np.isfinite(getattr(self, name)).all():
+                raise NonFiniteError(name)
+            object.__setattr__(self, name, frozen(getattr(self, name)))
+
+    @classmethod
+    def from_tolerances(cls, parameters: ChainParameters, tolerances: ChainTolerances) -> Self:
+        """The reference chain, as far as its tolerances let believe in it."""
+        std = np.minimum(parameters.standard_deviations(tolerances), WIDE)
+        return cls(parameters, np.zeros(parameters.size), np.diag(std))
+
+    @classmethod
+    def from_covariance(cls, parameters: ChainParameters, mean: FloatArray, covariance: FloatArray) -> Self:
+        """A Gaussian with this covariance (size, size); a row of zeros holds its parameter.
+
+        Scaled to correlations first: lengths and angles, known and unknown ones, differ by many orders of magnitude.
+        """
+        std = np.sqrt(np.diag(covariance))
+        free = np.flatnonzero(std > 0.0)
+        values, vectors = np.linalg.eigh(covariance[np.ix_(free, free)] / np.outer(std[free], std[free]))
+        root = np.zeros((len(std), len(free)))
+        root[free] = std[free, None] * vectors * np.sqrt(np.maximum(values, 0.0))
+        return cls(parameters, mean, root)
+
+    @property
+    def chain(self) -> RigidChain:
+        """The most probable chain."""
+        return self.parameters.chain(self.mean)
+
+    @property
+    def covariance(self) -> FloatArray:
+        """Covariance (size, size) of the parameters [rad², m²]."""
+        return self.root @ self.root.T
+
+    def predict(self, q: ArrayLike) -> FloatArray:
+        """Positions (n, 3) [m] of the most probable chain at q (n, d), or (3,) at q (d,).
+
+        Raises:
+            ShapeError, NonFiniteError
+        """
+        return self.parameters.positions(self.mean, rows_or_vector("q", q, self.parameters.reference.joints))
+
+    def predict_with_variance(self, q: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """Positions at q (n, d) and the variance of each coordinate to first order, both (n, 3) [m, m²].
+
+        Raises:
+            ShapeError, NonFiniteError
+        """
+        angles = rows("q", q, self.parameters.reference.joints)
+        x, variance = np.empty((len(angles), 3)), np.empty((len(angles), 3))
+        for start in range(0, len(angles), _BLOCK):
+            part = slice(start, start + _BLOCK)
+            x[part], jacobian = self.parameters.linearised(self.mean, angles[part])
+            variance[part] = np.square(jacobian @ self.root).sum(axis=2)
+        return x, variance
+
+    def to_bytes(self) -> bytes:
+        """The belief and its reference chain, as one self-describing byte string."""
+        return pack(_KIND, {}, chain_arrays(self.parameters.reference) | {"mean": self.mean, "root": self.root})
+
+    @classmethod
+    def from_bytes(cls, data: bytes) -> Self:
+        """The belief in `data`. Raises ModelFormatError: it is none, or damaged."""
+        _, arrays = unpack(data, _KIND)
+        try:
+            return cls(ChainParameters(chain_from_arrays(arrays)), arrays["mean"], arrays["root"])
+        except (KeyError, KBMapsError) as error:
+            raise ModelFormatError(f"the bytes do not describe a belief in a chain: {error}") from error
+
+    def tightened(self, before: ChainTolerances, after: ChainTolerances) -> tuple[Self, float]:
+        """The same pairs' belief had it begun with narrower tolerances, and its evidence.
+
+        Only what is narrower is exchanged; so what is believed may come from several tools, if that of the tool is not.
+        Both are exact where positions are linear in the parameters.
+
+        Args:
+            before: the tolerances that the belief began with.
+            after: those that it shall have begun with, none of them wider.
+
+        Returns:
+            The belief, and the logarithm of how many times as probable the narrower tolerances make the pairs.
+
+        Raises:
+            SettingError: a tolerance would be wider than it was, or held.
+        """
+        wide, narrow = (np.minimum(self.parameters.standard_deviations(each), WIDE) for each in (before, after))
+        if (narrow > wide).any() or ((narrow == 0.0) & (wide > 0.0)).any():
+            raise SettingError("tolerances can only be made narrower, and not 0")
+        free = np.flatnonzero(narrow < wide)
+        added = np.zeros(self.parameters.size)
+        added[free] = narrow[free] ** -2.0 - wide[free] ** -2.0
+        # C' = (C⁻¹ + D)⁻¹ with C = W Wᵀ is W (1 + Wᵀ D W)⁻¹ Wᵀ, and C'⁻¹ m' = C⁻¹ m gives m' = m - C' D m.
+        factor = np.linalg.cholesky(np.eye(self.root.shape[1]) + (self.root.T * added) @ self.root)
+        root = cast(FloatArray, np.linalg.solve(factor, self.root.T)).T
+        mean = self.mean - root @ (root.T @ (added * self.mean))
+        evidence = float(np.log(wide[free] / narrow[free]).sum() - np.log(np.diag(factor)).sum())
+        return type(self)(self.parameters, mean, root), evidence - 0.5 * float(self.mean @ (added * mean))
+
+    def with_other_tool(self, tolerance: float) -> Self:
+        """The same arm with a marker that was moved, by `tolerance` (1-sigma of each component [m]).
+
+        Raises:
+            SettingError: the tolerance is not positive.
+        """
+        if not (tolerance > 0.0 and math.isfinite(tolerance)):
+            raise SettingError(f"tolerance must be finite and greater than 0 m, got {tolerance!r}")
+        moved = np.zeros((self.parameters.size, 3))
+        moved[self.parameters.tool] = tolerance * np.eye(3)
+        free, root = squared(np.concatenate([self.root, moved], axis=1))
+        full = np.zeros((self.parameters.size, self.parameters.size))
+        full[np.ix_(free, free)] = root
+        return type(self)(self.parameters, self.mean, full)
+
+
+def squared(root: FloatArray) -> tuple[IntArray, FloatArray]:
+    """Which rows of a root (size, k) are free, as indices (f,), and their lower triangular root (f, f)."""
+    free = np.flatnonzero(root.any(axis=1))
+    held = root[free]
+    if held.shape[1] < len(free):
+        held = np.concatenate([held, np.zeros((len(free), len(free) - held.shape[1]))], axis=1)
+    return free, cast(FloatArray, np.linalg.qr(held.T, mode="r")).T

@@ -1,0 +1,99 @@
+"""Models that stand behind another one, and travel inside its bytes where they can."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Protocol, cast
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from kbmaps.arrays import FloatArray, rows_or_vector
+from kbmaps.chains.chain import RigidChain
+from kbmaps.errors import ModelFormatError
+from kbmaps.maps.kbmap import KBMap
+from kbmaps.maps.packed import describe_bases, parse_bases
+
+
+class Predictor(Protocol):
+    """Anything that gives positions."""
+
+    def predict(self, q: ArrayLike) -> FloatArray:
+        """Positions (n, 3) [m] at q (n, d) [rad, m], or (3,) at q (d,)."""
+        ...
+
+
+class ChainModel:
+    """A rigid chain under the names that models have: positions and orientations of its marker frame."""
+
+    def __init__(self, chain: RigidChain) -> None:
+        self.chain = chain
+
+    @property
+    def joints(self) -> int:
+        """Number of joints d."""
+        return self.chain.joints
+
+    def predict(self, q: ArrayLike) -> FloatArray:
+        """Positions (n, 3) [m] at q (n, d), or (3,) at q (d,)."""
+        return self.chain.positions(q)
+
+    def orientation(self, q: ArrayLike) -> FloatArray:
+        """Rotations (n, 3, 3), or (3, 3) at q (d,)."""
+        return self.chain.poses(q)[..., :3, :3]
+
+
+class Origin:
+    """Predicts the origin of the measurement frame everywhere: the prior of who knows nothing."""
+
+    def __init__(self, joints: int) -> None:
+        self.joints = joints
+
+    def predict(self, q: ArrayLike) -> FloatArray:
+        """Zeros (n, 3), or (3,) at q (d,)."""
+        return np.zeros((*rows_or_vector("q", q, self.joints).shape[:-1], 3))
+
+
+def packable(model: object) -> tuple[dict[str, Any], dict[str, FloatArray]]:
+    """Fields and arrays for `kbmaps.packed` from which `unpacked` makes the model again.
+
+    Of a model that is no `KBMap`, `ChainModel` or `Origin`, its type's name only.
+    """
+    if isinstance(model, KBMap):
+        bases = describe_bases(model.bases)
+        return {"type": "KBMap", "bases": bases, "outputs": len(model.net)}, {"net": model.net.reshape(-1)}
+    if isinstance(model, ChainModel):
+        chain = model.chain
+        prismatic = chain.prismatic.astype(np.float64)
+        return {"type": "RigidChain"}, {"fixed": chain.fixed, "axes": chain.axes, "prismatic": prismatic}
+    if isinstance(model, Origin):
+        return {"type": "Origin", "joints": model.joints}, {}
+    return {"type": type(model).__name__}, {}
+
+
+def unpacked(fields: Any, arrays: Mapping[str, FloatArray], given: object | None) -> Any:
+    """The model that `packable` described, or the one `given`, where it is of a type that does not travel.
+
+    Raises:
+        ModelFormatError: it does not travel, and none or one of another type was given.
+        KeyError, TypeError, ValueError, KBMapsError: the description is damaged.
+    """
+    described = cast(dict[str, Any], fields) if isinstance(fields, dict) else {}
+    name = described.get("type")
+    if name == "KBMap":
+        bases = parse_bases(described["bases"])
+        return KBMap(bases, arrays["net"].reshape(described["outputs"], *(basis.size for basis in bases)))
+    if name == "RigidChain":
+        return ChainModel(RigidChain(arrays["fixed"], arrays["axes"], arrays["prismatic"] != 0.0))
+    if name == "Origin":
+        return Origin(int(described["joints"]))
+    if given is None or type(given).__name__ != name:
+        raise ModelFormatError(
+            f"the model behind this one, a {name}, does not travel in its bytes: restore it and pass it in"
+        )
+    return given
+
+
+def as_model(model: RigidChain | object) -> Any:
+    """A rigid chain as a `ChainModel`, anything else as it is."""
+    return ChainModel(model) if isinstance(model, RigidChain) else model

@@ -1,0 +1,231 @@
+"""Rigid serial chains: the nominal model that learning starts from."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from kbmaps.arrays import BoolArray, FloatArray, frozen, rows_or_vector, vector
+from kbmaps.errors import BasisError, ChainError, NonFiniteError, ShapeError
+from kbmaps.maps.basis import JointBasis
+from kbmaps.maps.kbmap import KBMap
+
+_RIGID_TOLERANCE = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class RigidChain:
+    """A serial chain from the measurement frame to the marker frame.
+
+    T(q) = F_0 · J_1(q_1) · F_1 · J_2(q_2) · … · J_d(q_d) · F_d, where J_k turns about (or, prismatic, slides along)
+    its axis. The marker is the origin of the last frame.
+
+    Attributes:
+        fixed: the constant transforms F_0 ... F_d (d+1, 4, 4), lengths [m].
+        axes: unit axes (d, 3) in each joint's own frame, the frame after F_{k-1}.
+        prismatic: which joints slide (d,).
+
+    Raises:
+        ShapeError, NonFiniteError
+        ChainError: a transform is not rigid or an axis is not of unit length.
+
+    Example:
+        >>> import numpy as np
+        >>> from kbmaps import RigidChain
+        >>> fixed = np.tile(np.eye(4), (3, 1, 1))
+        >>> fixed[1:, 0, 3] = 0.3, 0.2  # links [m]
+        >>> arm = RigidChain(fixed, axes=[[0, 0, 1], [0, 1, 0]], prismatic=[False, False])
+        >>> arm.positions([0.0, -np.pi / 2]).round(9)
+        array([0.3, 0. , 0.2])
+    """
+
+    fixed: FloatArray
+    axes: FloatArray
+    prismatic: BoolArray
+
+    def __post_init__(self) -> None:
+        fixed, axes = frozen(self.fixed), frozen(self.axes)
+        prismatic = np.array(self.prismatic, dtype=np.bool_)
+        prismatic.flags.writeable = False
+        if axes.ndim != 2 or axes.shape[1] != 3 or len(axes) == 0:
+            raise ShapeError("axes", "(d, 3) with d of at least 1", axes.shape)
+        if fixed.shape != (len(axes) + 1, 4, 4):
+            raise ShapeError("fixed", f"({len(axes) + 1}, 4, 4)", fixed.shape)
+        if prismatic.shape != (len(axes),):
+            raise ShapeError("prismatic", f"({len(axes)},)", prismatic.shape)
+        for name, array in (("fixed", fixed), ("axes", axes)):
+            if not np.isfinite(array).all():
+                raise NonFiniteError(name)
+        for k, transform in enumerate(fixed):
+            check_rigid(f"fixed[{k}]", transform)
+        lengths = np.linalg.norm(axes, axis=1)
+        if np.abs(lengths - 1.0).max() > _RIGID_TOLERANCE:
+            worst = int(np.abs(lengths - 1.0).argmax())
+            raise ChainError(f"axes[{worst}] has length {lengths[worst]:.6g}; axes must be unit vectors")
+        object.__setattr__(self, "fixed", fixed)
+        object.__setattr__(self, "axes", axes)
+        object.__setattr__(self, "prismatic", prismatic)
+
+    @property
+    def joints(self) -> int:
+        """Number of joints d."""
+        return len(self.axes)
+
+    def poses(self, q: ArrayLike) -> FloatArray:
+        """Pose of the marker frame (4, 4) in the measurement frame for q (d,) [rad, m]; (n, 4, 4) for (n, d).
+
+        Raises:
+            ShapeError, NonFiniteError
+        """
+        checked = rows_or_vector("q", q, self.joints)
+        return self._frames(checked)[-1]
+
+    def positions(self, q: ArrayLike) -> FloatArray:
+        """Marker position (3,) [m] for q (d,), or (n, 3) for (n, d).
+
+        Raises:
+            ShapeError, NonFiniteError
+        """
+        return self.poses(q)[..., :3, 3]
+
+    def frames(self, q: ArrayLike) -> FloatArray:
+        """Poses in the measurement frame of joints 1..d before they move and of the marker: (d+1, 4, 4) for q (d,).
+
+        For q (n, d): (n, d+1, 4, 4).
+
+        Raises:
+            ShapeError, NonFiniteError
+        """
+        return np.stack(self._frames(rows_or_vector("q", q, self.joints)), axis=-3)
+
+    def jacobian(self, q: ArrayLike) -> FloatArray:
+        """Derivative (3, d) of the position [m/rad, or m/m], or (n, 3, d) for q (n, d).
+
+        Raises:
+            ShapeError, NonFiniteError
+        """
+        checked = rows_or_vector("q", q, self.joints)
+        frames = self._frames(checked)
+        marker = frames[-1][..., :3, 3]
+        columns = np.empty((*checked.shape[:-1], 3, self.joints))
+        for k, frame in enumerate(frames[:-1]):
+            axis = frame[..., :3, :3] @ self.axes[k]
+            lever = marker - frame[..., :3, 3]
+            columns[..., k] = axis if self.prismatic[k] else np.cross(axis, lever)
+        return columns
+
+    def to_kbmap(self, bases: Sequence[JointBasis], *, orientation: bool = False) -> KBMap:
+        """The chain as a KB-Map, exact up to rounding, without any sampling.
+
+        Each joint's 4x4 matrix is affine in its basis functions, so the product of the chain is a tensor product of
+        them and its last column is the control net.
+
+        Args:
+            bases: one a joint.
+            orientation: also the nine planes of the rotation matrix.
+
+        Raises:
+            BasisError: another number of bases, or a revolute basis for a prismatic joint.
+        """
+        net = self._net(bases, 3)
+        return KBMap(tuple(bases), np.concatenate([net, self.orientation_maps(bases)]) if orientation else net)
+
+    def orientation_maps(self, bases: Sequence[JointBasis]) -> FloatArray:
+        """Planes (9, m1, ..., md) of the unit vectors e1, e2, e3 of the marker frame (three planes each).
+
+        A tool moved by δ [m] in the marker frame is G + E1 δ1 + E2 δ2 + E3 δ3 exactly.
+
+        Raises:
+            BasisError: another number of bases, or a revolute basis for a prismatic joint.
+        """
+        return np.concatenate([self._net(bases, column) for column in range(3)])
+
+    def with_tool(self, marker_shift: ArrayLike) -> RigidChain:
+        """The chain with its marker moved by a vector (3,) [m] given in the marker frame.
+
+        Raises:
+            ShapeError, NonFiniteError
+        """
+        fixed = self.fixed.copy()
+        fixed[-1, :3, 3] += fixed[-1, :3, :3] @ vector("marker_shift", marker_shift, 3)
+        return RigidChain(fixed, self.axes, self.prismatic)
+
+    def transformed(self, T_new_old: ArrayLike) -> RigidChain:
+        """The chain as seen from another measurement frame, in which the old one has the pose T_new_old (4, 4).
+
+        Raises:
+            ShapeError, ChainError: not a rigid transform.
+        """
+        transform = np.asarray(T_new_old, dtype=np.float64)
+        check_rigid("T_new_old", transform)
+        fixed = self.fixed.copy()
+        fixed[0] = transform @ fixed[0]
+        return RigidChain(fixed, self.axes, self.prismatic)
+
+    def _frames(self, q: FloatArray) -> list[FloatArray]:
+        """Frames of joints 1..d (before they move), then the marker frame, each (..., 4, 4)."""
+        constant, first, second = self._moved_links
+        pose = np.broadcast_to(self.fixed[0], (*q.shape[:-1], 4, 4))
+        cosines = np.where(self.prismatic, q, np.cos(q))[..., None, None]
+        links = constant + cosines * first + np.sin(q)[..., None, None] * second
+        frames = [pose]
+        for k in range(self.joints):
+            pose = pose @ links[..., k, :, :]
+            frames.append(pose)
+        return frames
+
+    @cached_property
+    def _moved_links(self) -> FloatArray:
+        """Matrices (3, d, 4, 4): J_k(q) F_k of every joint, in the terms of `_joint_terms`."""
+        terms = np.stack([self._joint_terms(k) for k in range(self.joints)], axis=1)
+        return frozen(terms @ self.fixed[1:])
+
+    def _joint_terms(self, k: int) -> FloatArray:
+        """Matrices A (3, 4, 4): J_k(q) = A0 + cos q·A1 + sin q·A2 (Rodrigues), or A0 + q·A1 for a prismatic joint."""
+        axis = self.axes[k]
+        terms = np.zeros((3, 4, 4))
+        if self.prismatic[k]:
+            terms[0] = np.eye(4)
+            terms[1, :3, 3] = axis
+            return terms
+        along = np.outer(axis, axis)
+        terms[0, :3, :3], terms[0, 3, 3] = along, 1.0
+        terms[1, :3, :3] = np.eye(3) - along
+        terms[2, :3, :3] = cross_matrix(axis)
+        return terms
+
+    def _net(self, bases: Sequence[JointBasis], column: int) -> FloatArray:
+        """Coefficients (3, m1, ..., md) of the upper part of one column of T(q)."""
+        if len(bases) != self.joints:
+            raise BasisError(f"need {self.joints} bases, one a joint; got {len(bases)}")
+        tensor: FloatArray = self.fixed[-1][:, column]
+        for k in range(self.joints - 1, -1, -1):
+            basis = bases[k]
+            if basis.is_prismatic != bool(self.prismatic[k]):
+                wanted = "prismatic" if self.prismatic[k] else "revolute"
+                raise BasisError(f"joint {k} is {wanted} but its basis is {basis.kind}")
+            # monomials = weights @ inv(matrix), so Σ_i monomial_i A_i = Σ_j weight_j Σ_i inv(matrix)_ji A_i
+            terms = self._joint_terms(k)[: basis.size]
+            by_weight = np.einsum("ji,irc->rjc", np.linalg.inv(basis.matrix), self.fixed[k] @ terms)
+            tensor = np.tensordot(by_weight, tensor, axes=(2, 0)).astype(np.float64, copy=False)
+        return tensor[:3]
+
+
+def check_rigid(name: str, transform: FloatArray) -> None:
+    """Raises ShapeError or ChainError unless `transform` (4, 4) is a proper rigid transform."""
+    if transform.shape != (4, 4):
+        raise ShapeError(name, "(4, 4)", transform.shape)
+    rotation = transform[:3, :3]
+    off = np.abs(rotation @ rotation.T - np.eye(3)).max()
+    if not (off <= _RIGID_TOLERANCE and np.linalg.det(rotation) > 0.0 and (transform[3] == (0, 0, 0, 1)).all()):
+        raise ChainError(f"{name} is not a rigid transform: a proper rotation, a translation and the row 0 0 0 1")
+
+
+def cross_matrix(vectors: FloatArray) -> FloatArray:
+    """The matrices K (..., 3, 3) with K @ y = vectors × y, for vectors (..., 3)."""
+    # Column i of K is vector × e_i, row i of this cross product.
+    return np.cross(vectors[..., None, :], np.eye(3)).swapaxes(-1, -2)

@@ -1,0 +1,185 @@
+"""Where a marker sits on the last link, in closed form: x = f(q) + R(q) δ is linear in δ."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Self
+
+import numpy as np
+
+from kbmaps.arrays import BoolArray, FloatArray
+from kbmaps.maps.noise_evidence import LinearEvidence
+
+# A residual norm of noise σ per axis has the median 1.538 σ in three dimensions.
+_MEDIAN_NORM = 1.538
+_ROUNDS = 20
+# No residual below a nanometre makes an outlier: on noise-free data that is rounding.
+_ROUNDING_M = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Residuals:
+    """What a model leaves to explain at n configurations.
+
+    Attributes:
+        rotations: R(q) (n, 3, 3), as the model has them.
+        errors: x − f(q) (n, 3) [m].
+        sigma: 1-sigma of each (n,) [m], NaN where it was not told.
+    """
+
+    rotations: FloatArray
+    errors: FloatArray
+    sigma: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.errors)
+
+    def __getitem__(self, chosen: slice | BoolArray) -> Residuals:
+        return Residuals(self.rotations[chosen], self.errors[chosen], self.sigma[chosen])
+
+    def joined(self, more: Residuals) -> Residuals:
+        """These and then more."""
+        # In C order, whatever the model's: sums must not depend on a layout that is lost in bytes.
+        return Residuals(
+            np.ascontiguousarray(np.concatenate([self.rotations, more.rotations])),
+            np.concatenate([self.errors, more.errors]),
+            np.concatenate([self.sigma, more.sigma]),
+        )
+
+    def norms(self, shift: FloatArray) -> FloatArray:
+        """Distances (n,) [m] that a shift (3,) leaves."""
+        return np.linalg.norm(self.errors - self.rotations @ shift, axis=1)
+
+
+@dataclass(frozen=True, eq=False)
+class MarkerKnowledge:
+    """All that pairs and a prior say about δ and the noise, as sums: the order of the pairs does not matter.
+
+    Attributes:
+        information, pull: Λ (3, 3) [1/m²] and Λ m (3,) [1/m] of a Gaussian N(m, Λ⁻¹) of δ: the prior, and the pairs
+            whose sigma was told.
+        square, inner, count: of the pairs whose noise is not known, Σ Rᵀ R (3, 3), Σ Rᵀ e (3,) and their number.
+        errors: Σ eᵀ e of these [m²].
+        noise_count, noise_square: what is known of their noise beforehand, as so many coordinates and the sum of
+            their squares.
+    """
+
+    information: FloatArray
+    pull: FloatArray
+    square: FloatArray
+    inner: FloatArray
+    errors: float
+    count: float
+    noise_count: float
+    noise_square: float
+
+    @classmethod
+    def before(cls, shift: FloatArray, covariance: FloatArray, noise: float, noise_count: float) -> Self:
+        """A prior: shift (3,) [m], its covariance (3, 3), and the noise [m] as if found from so many coordinates."""
+        information: FloatArray = np.asarray(np.linalg.inv(covariance), dtype=np.float64)
+        return cls(
+            information,
+            information @ shift,
+            np.zeros((3, 3)),
+            np.zeros(3),
+            0.0,
+            0.0,
+            noise_count,
+            noise_count * noise**2,
+        )
+
+    def given(self, pairs: Residuals) -> MarkerKnowledge:
+        """What is known after these pairs too."""
+        told = ~np.isnan(pairs.sigma)
+        known, other = pairs[told], pairs[~told]
+        weights = 1.0 / np.square(known.sigma)
+        return replace(
+            self,
+            information=self.information + np.einsum("n,nki,nkj->ij", weights, known.rotations, known.rotations),
+            pull=self.pull + np.einsum("n,nki,nk->i", weights, known.rotations, known.errors),
+            square=self.square + np.einsum("nki,nkj->ij", other.rotations, other.rotations),
+            inner=self.inner + np.einsum("nki,nk->i", other.rotations, other.errors),
+            errors=self.errors + float(np.vdot(other.errors, other.errors)),
+            count=self.count + len(other),
+        )
+
+    def posterior(self) -> MarkerPosterior:
+        """The shift and the noise that the evidence speaks for."""
+        covariance = np.linalg.inv(self.information)
+        centre = covariance @ self.pull
+        root = np.linalg.cholesky(0.5 * (covariance + covariance.T))
+        eigenvalues, directions = np.linalg.eigh(root.T @ self.square @ root)
+        left = self.inner - self.square @ centre
+        misfit = max(self.errors - float(centre @ (self.inner + left)), 0.0)
+        noise = LinearEvidence(
+            3.0 * self.count + self.noise_count,
+            misfit + self.noise_square,
+            np.maximum(eigenvalues, 0.0),
+            directions.T @ root.T @ left,
+        )
+        variance = noise.best_variance()
+        axes = root @ directions
+        shrunk = 1.0 / (variance + noise.eigenvalues)
+        return MarkerPosterior(
+            shift=centre + axes @ (shrunk * noise.components),
+            covariance=(axes * (variance * shrunk)) @ axes.T,
+            noise=math.sqrt(variance),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class MarkerPosterior:
+    """δ (3,) [m], its covariance (3, 3) [m²], and the noise of a coordinate [m] where it was not told."""
+
+    shift: FloatArray
+    covariance: FloatArray
+    noise: float
+
+
+def fit_marker(
+    before: MarkerKnowledge, pairs: Residuals, outlier_sigmas: float
+) -> tuple[MarkerKnowledge, MarkerPosterior, BoolArray]:
+    """Least squares over the pairs that are no outliers: what is then known, the posterior, and which pairs (n,).
+
+    Begins from the median of what single pairs say, so that up to half of them may be anything. With fewer than five
+    pairs there is no majority, and all count.
+    """
+    inliers = np.ones(len(pairs), dtype=np.bool_)
+    if len(pairs):
+        singles = (pairs.rotations.swapaxes(1, 2) @ pairs.errors[..., None])[..., 0]
+        inliers = _near(pairs, np.median(singles, axis=0), outlier_sigmas)
+    for _ in range(_ROUNDS):
+        known = before.given(pairs[inliers])
+        posterior = known.posterior()
+        chosen = _near(pairs, posterior.shift, outlier_sigmas)
+        if (chosen == inliers).all():
+            break
+        inliers = chosen
+    else:
+        known = before.given(pairs[inliers])
+        posterior = known.posterior()
+    return known, posterior, inliers
+
+
+def _near(pairs: Residuals, shift: FloatArray, outlier_sigmas: float) -> BoolArray:
+    """Which pairs (n,) lie within so many robust standard deviations, and no fewer than their sigma says."""
+    norms = pairs.norms(shift)
+    told = ~np.isnan(pairs.sigma)
+    limits = np.full(len(norms), _ROUNDING_M)
+    if told.any():
+        sigma = pairs.sigma[told]
+        limits[told] += outlier_sigmas * sigma * max(_spread(norms[told] / sigma), 1.0)
+    if not told.all():
+        limits[~told] += outlier_sigmas * _spread(norms[~told])
+    return norms <= limits
+
+
+def _spread(norms: FloatArray) -> float:
+    """Standard deviation of a coordinate from the middle norm.
+
+    The middle lies above the median by one pair, which a shift can explain whatever it is (Rousseeuw and Leroy 1987,
+    least median of squares): else a few pairs would look perfect and the others be outliers.
+    """
+    rank = min(len(norms) // 2 + 1, len(norms) - 1)
+    return float(np.partition(norms, rank)[rank]) / _MEDIAN_NORM

@@ -1,0 +1,328 @@
+"""What may be wrong about a rigid chain, as one vector of small changes, and what each change does to the marker."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from kbmaps.arrays import BoolArray, FloatArray, frozen, rows_or_vector, vector
+from kbmaps.chains.chain import RigidChain
+from kbmaps.errors import SettingError
+
+# What an infinite tolerance is taken for [rad, m]: far beyond anything real, and still a proper prior.
+WIDE = 10.0
+_FIXED_PARAMETERS = 9
+_JOINT_PARAMETERS = 5
+# Below this angle [rad] the quotients of the exponential map are taken from their series.
+SMALL_ANGLE = 1e-3
+_EYE = np.eye(3)
+
+
+def _cross_tensor() -> FloatArray:
+    """(3, 9): a vector times it is the matrix K (3, 3), flattened, with K y = vector × y."""
+    return np.stack([np.cross(unit, _EYE).T.ravel() for unit in _EYE])
+
+
+_CROSS = _cross_tensor()
+
+
+@dataclass(frozen=True, eq=False)
+class ChainTolerances:
+    """How far a real arm may be from its nominal chain: standard deviations of each component.
+
+    Zero holds a parameter at its nominal value; infinity leaves it to the data alone.
+
+    Attributes:
+        axes: tilt of a joint's axis [rad].
+        points: shift of a joint's axis across itself [m].
+        zeros: zero position of a revolute joint [rad].
+        slide_zeros: zero position of a prismatic joint [m].
+        tool: place of the marker [m].
+        base_rotation: turn of the whole arm about the origin of the measurement frame [rad].
+        base_translation: shift of the whole arm in the measurement frame [m].
+
+    Raises:
+        SettingError: one is negative or NaN.
+
+    Example:
+        >>> from kbmaps import ChainTolerances
+        >>> ChainTolerances(zeros=0.05, tool=0.03).axes  # what is not named is held as drawn
+        0.0
+    """
+
+    axes: float = 0.0
+    points: float = 0.0
+    zeros: float = 0.0
+    slide_zeros: float = 0.0
+    tool: float = 0.0
+    base_rotation: float = 0.0
+    base_translation: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in self.__dataclass_fields__:
+            value = getattr(self, name)
+            if not value >= 0.0:
+                raise SettingError(f"the tolerance {name} must be 0 or greater (infinity included), got {value!r}")
+            object.__setattr__(self, name, float(value))
+
+
+@dataclass(frozen=True, eq=False)
+class _Geometry:
+    """The chain after a change, at q = 0 and before the base has moved."""
+
+    base: FloatArray
+    base_turns: FloatArray
+    axes: FloatArray
+    points: FloatArray
+    tilt_turns: FloatArray
+    rotations: FloatArray
+    zeros: FloatArray
+    tip: FloatArray
+
+
+class ChainParameters:
+    """Small changes of a reference chain, as vectors (size,), and the marker positions that result.
+
+    The product of exponentials of screws that are given where all joints are at zero (Brockett 1984): a change of one
+    axis leaves the others where they are. In this order, with d joints:
+
+        base turn (3) [rad]    rotation vector of the arm about the origin of the measurement frame
+        base shift (3) [m]     move of the arm in the measurement frame, after the turn
+        tilts (2 d) [rad]      of each axis, about two directions across it
+        shifts (2 d) [m]       of each axis, along the same two directions; without effect for a prismatic joint
+        zeros (d) [rad, m]     added to the joint's reading
+        tool (3) [m]           move of the marker in the marker frame
+
+    Turns of an axis about itself and shifts along itself would change nothing and are left out. What remains is
+    over-complete on purpose: base and zeros can be made up for by axes and tool, and only a prior tells them apart.
+
+    Example:
+        >>> import numpy as np
+        >>> from kbmaps import ChainParameters, RigidChain
+        >>> fixed = np.tile(np.eye(4), (3, 1, 1))
+        >>> fixed[1:, 0, 3] = 0.3, 0.2  # links [m]
+        >>> arm = RigidChain(fixed, axes=[[0, 0, 1], [0, 1, 0]], prismatic=[False, False])
+        >>> parameters = ChainParameters(arm)
+        >>> change = np.zeros(parameters.size)
+        >>> change[parameters.zeros] = 0.0, -np.pi / 2
+        >>> parameters.positions(change, [0.0, 0.0]).round(9)
+        array([0.3, 0. , 0.2])
+    """
+
+    def __init__(self, reference: RigidChain) -> None:
+        d = reference.joints
+        self.reference = reference
+        self.size = _FIXED_PARAMETERS + _JOINT_PARAMETERS * d
+        self.base_turn, self.base_shift = slice(0, 3), slice(3, 6)
+        self.tilts, self.shifts = slice(6, 6 + 2 * d), slice(6 + 2 * d, 6 + 4 * d)
+        self.zeros, self.tool = slice(6 + 4 * d, 6 + 5 * d), slice(6 + 5 * d, self.size)
+        frames = [reference.fixed[0]]
+        for transform in reference.fixed[1:]:
+            frames.append(frames[-1] @ transform)
+        self._frames = np.stack(frames)
+        self._axes = np.einsum("kij,kj->ki", self._frames[:-1, :3, :3], reference.axes)
+        self._points = self._frames[:-1, :3, 3]
+        self._tangents = _tangents(self._axes)
+        self._slides = np.flatnonzero(reference.prismatic)
+
+    @property
+    def tables(self) -> tuple[FloatArray, ...]:
+        """What `linearised` computes with: axes and points of the reference at q = 0 (d, 3), the tangents (d, 3, 2),
+        1 where prismatic (d,), and the marker's frame (4, 4)."""
+        return self._axes, self._points, self._tangents, self.reference.prismatic.astype(np.float64), self._frames[-1]
+
+    def standard_deviations(self, tolerances: ChainTolerances) -> FloatArray:
+        """Standard deviation (size,) of each parameter; 0 where it is held."""
+        prismatic = self.reference.prismatic
+        std = np.empty(self.size)
+        std[self.base_turn], std[self.base_shift] = tolerances.base_rotation, tolerances.base_translation
+        std[self.tilts], std[self.tool] = tolerances.axes, tolerances.tool
+        std[self.shifts] = np.repeat(np.where(prismatic, 0.0, tolerances.points), 2)
+        std[self.zeros] = np.where(prismatic, tolerances.slide_zeros, tolerances.zeros)
+        return std
+
+    def names(self) -> tuple[str, ...]:
+        """What each parameter is, in words; joints are counted from 1."""
+        joints = range(1, self.reference.joints + 1)
+        return (
+            *(f"base turn {axis}" for axis in "xyz"),
+            *(f"base shift {axis}" for axis in "xyz"),
+            *(f"joint {k} axis tilt {side}" for k in joints for side in (1, 2)),
+            *(f"joint {k} axis shift {side}" for k in joints for side in (1, 2)),
+            *(f"joint {k} zero" for k in joints),
+            *(f"tool {axis}" for axis in "xyz"),
+        )
+
+    def base_pose(self, change: FloatArray) -> FloatArray:
+        """T_measured_nominal (4, 4) of a change (size,)."""
+        pose = np.eye(4)
+        pose[:3, :3] = _exponentials(change[None, self.base_turn])[0][0]
+        pose[:3, 3] = change[self.base_shift]
+        return pose
+
+    def chain(self, change: ArrayLike) -> RigidChain:
+        """The reference chain with a change (size,) built in; the axes stay what they are in their own frames.
+
+        Raises:
+            ShapeError, NonFiniteError
+        """
+        geometry = self._geometry(vector("change", change, self.size))
+        frames = self._frames.copy()
+        frames[:-1, :3, :3] = geometry.rotations @ frames[:-1, :3, :3]
+        frames[:-1, :3, 3], frames[-1, :3, 3] = geometry.points, geometry.tip
+        fixed = np.empty_like(frames)
+        fixed[0] = geometry.base @ frames[0]
+        # J(q + zero) = J(q) J(zero), and T_a J(zero) T_a⁻¹ is the motion that `_motions` gives at q = 0.
+        motions = self._motions(geometry, geometry.zeros[None])[:, 0]
+        fixed[1:] = np.linalg.inv(frames[:-1]) @ motions @ frames[1:]
+        fixed[1:, 3] = (0.0, 0.0, 0.0, 1.0)
+        return RigidChain(_reorthonormalised(fixed), self.reference.axes, self.reference.prismatic)
+
+    def positions(self, change: ArrayLike, q: ArrayLike) -> FloatArray:
+        """Marker positions [m] (3,) at q (d,), or (n, 3) at (n, d).
+
+        Raises:
+            ShapeError, NonFiniteError
+        """
+        angles = rows_or_vector("q", q, self.reference.joints)
+        geometry = self._geometry(vector("change", change, self.size))
+        placed = self._placed(geometry, np.atleast_2d(angles) + geometry.zeros)
+        x = placed[-1, :, :3, :3] @ geometry.tip + placed[-1, :, :3, 3]
+        return x[0] if angles.ndim == 1 else x
+
+    def linearised(self, change: FloatArray, q: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Positions (n, 3) and their derivatives (n, 3, size) by the change, at q (n, d); the inputs are trusted.
+
+        With R_k the rotation before and R_{k+1} the one after joint k, and r the lever from its axis to the marker, a
+        tilt of the axis about u moves the marker by (R_k u − R_{k+1} u) × r, a shift by v moves it by
+        R_k v − R_{k+1} v.
+        """
+        geometry = self._geometry(change)
+        angles = q + geometry.zeros
+        placed = self._placed(geometry, angles)
+        rotations = placed[..., :3, :3]
+        x = rotations[-1] @ geometry.tip + placed[-1, :, :3, 3]
+        jacobian = np.empty((len(q), 3, self.size))
+        before, after = rotations[:-1], rotations[1:]
+        across = (before - after) @ np.concatenate([self._tangents, geometry.tilt_turns], axis=2)[:, None]
+        axes = before @ geometry.axes[:, None, :, None]
+        centres = (before @ geometry.points[:, None, :, None])[..., 0] + placed[:-1, :, :3, 3]
+        turning = np.concatenate([across[..., 2:], axes], axis=3)
+        moved = _cross_matrices(centres - x) @ turning
+        for k in self._slides:
+            turned_axis = _cross_matrices(-geometry.axes[k]) @ geometry.tilt_turns[k]
+            moved[k, ..., :2] = angles[:, k, None, None] * (before[k] @ turned_axis)
+            moved[k, ..., 2] = axes[k, ..., 0]
+        jacobian[:, :, self.base_turn] = _cross_matrices(geometry.base[:3, 3] - x) @ geometry.base_turns
+        jacobian[:, :, self.base_shift] = _EYE
+        by_joint = (len(q), 3, len(moved), 2)
+        jacobian[:, :, self.tilts].reshape(by_joint)[...] = moved[..., :2].transpose(1, 2, 0, 3)
+        jacobian[:, :, self.shifts].reshape(by_joint)[...] = across[..., :2].transpose(1, 2, 0, 3)
+        jacobian[:, :, self.zeros] = moved[..., 2].transpose(1, 2, 0)
+        jacobian[:, :, self.tool] = rotations[-1] @ self._frames[-1, :3, :3]
+        return x, jacobian
+
+    def _geometry(self, change: FloatArray) -> _Geometry:
+        d = self.reference.joints
+        tilts = (self._tangents @ change[self.tilts].reshape(d, 2, 1))[..., 0]
+        rotations, derivatives = _exponentials(np.concatenate([change[None, self.base_turn], tilts]))
+        base = np.eye(4)
+        base[:3, :3], base[:3, 3] = rotations[0], change[self.base_shift]
+        return _Geometry(
+            base=base,
+            base_turns=derivatives[0],
+            axes=(rotations[1:] @ self._axes[..., None])[..., 0],
+            points=self._points + (self._tangents @ change[self.shifts].reshape(d, 2, 1))[..., 0],
+            tilt_turns=derivatives[1:] @ self._tangents,
+            rotations=rotations[1:],
+            zeros=change[self.zeros],
+            tip=self._frames[-1, :3, 3] + self._frames[-1, :3, :3] @ change[self.tool],
+        )
+
+    def _motions(self, geometry: _Geometry, angles: FloatArray) -> FloatArray:
+        """What each joint alone does (d, n, 4, 4) at its angles (n, d), in the frame of q = 0."""
+        axes = geometry.axes
+        along = axes[:, :, None] * axes[:, None, :]
+        values = angles.T[..., None, None]
+        motions = np.zeros((*angles.T.shape, 4, 4))
+        motions[..., 3, 3] = 1.0
+        turns = motions[..., :3, :3]
+        # Rodrigues: R = a aᵀ + cos q (1 − a aᵀ) + sin q [a]×
+        turns[...] = np.cos(values) * (_EYE - along)[:, None]
+        turns += np.sin(values) * _cross_matrices(axes)[:, None]
+        turns += along[:, None]
+        motions[..., :3, 3] = geometry.points[:, None] - (turns @ geometry.points[:, None, :, None])[..., 0]
+        for k in self._slides:
+            turns[k] = _EYE
+            motions[k, :, :3, 3] = angles[:, k, None] * axes[k]
+        return motions
+
+    def _placed(self, geometry: _Geometry, angles: FloatArray) -> FloatArray:
+        """Motion (d+1, n, 4, 4) of everything before joint k, the base first, and of the marker last."""
+        motions = self._motions(geometry, angles)
+        placed = np.empty((len(motions) + 1, *motions.shape[1:]))
+        placed[0] = geometry.base
+        for k, motion in enumerate(motions):
+            np.matmul(placed[k], motion, out=placed[k + 1])
+        return placed
+
+
+def rotation_vector(rotation: FloatArray) -> FloatArray:
+    """The rotation vector (3,) [rad] of a rotation matrix (3, 3), of an angle up to π."""
+    # The quaternion's largest component is found first, so that none is divided by a small one (Shepperd 1978).
+    r = rotation
+    trace = float(np.trace(r))
+    squares = np.array([trace, r[0, 0], r[1, 1], r[2, 2]])
+    largest = int(squares.argmax())
+    if largest == 0:
+        quaternion = np.array([1.0 + trace, r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]])
+    else:
+        i = largest - 1
+        j, k = (i + 1) % 3, (i + 2) % 3
+        quaternion = np.empty(4)
+        quaternion[0] = r[k, j] - r[j, k]
+        quaternion[1 + i] = 1.0 + 2.0 * r[i, i] - trace
+        quaternion[1 + j], quaternion[1 + k] = r[j, i] + r[i, j], r[k, i] + r[i, k]
+    quaternion *= np.copysign(1.0 / np.linalg.norm(quaternion), quaternion[0])
+    sine = float(np.linalg.norm(quaternion[1:]))
+    angle = 2.0 * float(np.arctan2(sine, quaternion[0]))
+    return quaternion[1:] * (angle / sine if sine > 0.0 else 2.0)
+
+
+def _exponentials(turns: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Rotations exp([φ]×) (n, 3, 3) of rotation vectors (n, 3), and their left Jacobians.
+
+    exp([φ + δ]×) = exp([J δ]×) exp([φ]×) to first order, with the left Jacobian J (Chirikjian 2012, section 10.8).
+    """
+    angles: FloatArray = np.sqrt(np.einsum("ki,ki->k", turns, turns))[:, None, None]
+    safe: FloatArray = np.maximum(angles, SMALL_ANGLE)
+    small: BoolArray = angles < SMALL_ANGLE
+    squares = angles * angles
+    sine: FloatArray = np.where(small, 1.0 - squares / 6.0, np.sin(safe) / safe)
+    cosine: FloatArray = np.where(small, 0.5 - squares / 24.0, (1.0 - np.cos(safe)) / (safe * safe))
+    rest: FloatArray = np.where(small, 1.0 / 6.0 - squares / 120.0, (1.0 - np.sin(safe) / safe) / (safe * safe))
+    k = _cross_matrices(turns)
+    kk = k @ k
+    return _EYE + sine * k + cosine * kk, _EYE + cosine * k + rest * kk
+
+
+def _cross_matrices(vectors: FloatArray) -> FloatArray:
+    """Matrices K (..., 3, 3) with K y = vector × y. One product, since this is called for every pair that comes."""
+    return (vectors @ _CROSS).reshape(*vectors.shape, 3)
+
+
+def _tangents(axes: FloatArray) -> FloatArray:
+    """Two unit vectors across each axis and each other, as columns (d, 3, 2)."""
+    helper = np.eye(3)[np.abs(axes).argmin(axis=1)]
+    first = np.cross(axes, helper)
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    return frozen(np.stack([first, np.cross(axes, first)], axis=2))
+
+
+def _reorthonormalised(transforms: FloatArray) -> FloatArray:
+    """The nearest proper rotations in place of products that have gathered rounding errors."""
+    u, _, vt = np.linalg.svd(transforms[:, :3, :3])
+    transforms[:, :3, :3] = u @ vt
+    return transforms

@@ -1,0 +1,206 @@
+"""An iterated extended Kalman filter over the parameters of a rigid chain."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import cast
+
+import numpy as np
+
+from kbmaps.arrays import FloatArray
+from kbmaps.chains.belief import ChainBelief
+from kbmaps.chains.parameters import SMALL_ANGLE, WIDE, ChainParameters, ChainTolerances
+from kbmaps.errors import NonFiniteError, ShapeError
+from kbmaps.maps.kernels import FilterKernel, filter_kernel
+
+# Unit of the marker's place where its tolerance is 0, so that a tool change can loosen it [m].
+_TOOL_UNIT = 0.1
+_ITERATIONS = 5
+# Linearise anew when the curvature of the last step may have moved the marker by this share of the noise.
+_SMALL_BEND = 0.1
+# Squared Mahalanobis distance of an innovation beyond which a pair counts for less (chi², 3 degrees: 1 in 10,000).
+_GATE = 21.0
+# The estimate of the noise starts as if it had seen this many coordinates, and forgets those before the last ones.
+NOISE_COORDINATES, NOISE_MEMORY = 6.0, 900.0
+LEAST_NOISE_M = 1e-6
+_EYE = np.eye(3)
+
+
+@dataclass(frozen=True, eq=False)
+class _Update:
+    """A step of the filter (p,), its gains P Jᵀ (p, 3) and the innovation's inverse covariance (3, 3).
+
+    `distance` is the squared Mahalanobis length of the innovation, `bend` how far [m] the step's curvature may have
+    moved the marker at most.
+    """
+
+    step: FloatArray
+    gains: FloatArray
+    precision: FloatArray
+    variance: float
+    distance: float
+    bend: float
+
+
+class RigidFilter:
+    """Takes one pair after the other into a chain's change and its covariance, at a constant cost.
+
+    Each pair is linearised once, where the chain is when the pair comes; the curvature left out is taken for noise, so
+    that early pairs do not make it too sure.
+
+    Attributes:
+        change: the parameters (size,) as in `ChainParameters`.
+        noise_square: the estimated variance [m²] of a coordinate of the pairs that came without their sigma.
+        noise_coordinates: how many coordinates that rests on.
+    """
+
+    def __init__(self, parameters: ChainParameters, tolerances: ChainTolerances, noise: float) -> None:
+        self.parameters = parameters
+        std = np.minimum(parameters.standard_deviations(tolerances), WIDE)
+        tool = np.zeros(parameters.size, dtype=np.bool_)
+        tool[parameters.tool] = True
+        self._active = (std > 0.0) | tool
+        self._scales = np.where((std == 0.0) & tool, _TOOL_UNIT, std)[self._active]
+        self._bends = self._turning()[self._active]
+        self._reach = max(float(np.linalg.norm(parameters.reference.fixed[1:, :3, 3], axis=1).sum()) / 2.0, 1e-3)
+        self._kernel = self._filter_kernel()
+        self.change = np.zeros(parameters.size)
+        self._covariance: FloatArray = np.diag(np.square(std[self._active] / self._scales))
+        self.noise_square = noise**2
+        self.noise_coordinates = NOISE_COORDINATES
+
+    @property
+    def covariance(self) -> FloatArray:
+        """Covariance (size, size) of the parameters [rad², m²]."""
+        covariance = np.zeros((self.parameters.size, self.parameters.size))
+        covariance[np.ix_(self._active, self._active)] = self._covariance * np.outer(self._scales, self._scales)
+        return covariance
+
+    def learn(self, q: FloatArray, x: FloatArray, sigma: FloatArray) -> None:
+        """Trusted pairs q (n, d), x (n, 3) and sigma (n,), NaN where it is to be estimated."""
+        if self._kernel is not None:
+            self._learn_compiled(self._kernel, q, x, sigma)
+            return
+        for k in range(len(q)):
+            self._learn_one(q[k : k + 1], x[k], float(sigma[k]))
+
+    def go_on_from(self, belief: ChainBelief) -> None:
+        """Takes what is believed of the same chain for what the pairs so far say."""
+        active = self._active
+        self.change = np.array(belief.mean)
+        self._covariance = belief.covariance[np.ix_(active, active)] / np.outer(self._scales, self._scales)
+
+    def with_variance(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Positions at q (n, d) and the variance of each coordinate to first order, both (n, 3) [m, m²]."""
+        x, jacobian = self._linearised(self.change, q)
+        variance = np.einsum("nip,pr,nir->ni", jacobian, self._covariance, jacobian, optimize=True)
+        return x, np.maximum(variance, 0.0)
+
+    def arrays(self) -> dict[str, FloatArray]:
+        """For `kbmaps.packed`."""
+        noise = np.array([self.noise_square, self.noise_coordinates])
+        return {"change": self.change, "covariance": self._covariance, "noise": noise}
+
+    def restore(self, arrays: Mapping[str, FloatArray]) -> None:
+        """The state that `arrays` gave. Raises KeyError, ShapeError, NonFiniteError."""
+        present = self.arrays()
+        for name in present:
+            if arrays[name].shape != present[name].shape:
+                raise ShapeError(name, str(present[name].shape), arrays[name].shape)
+            if not np.isfinite(arrays[name]).all():
+                raise NonFiniteError(name)
+        self.change, self._covariance = np.array(arrays["change"]), np.array(arrays["covariance"])
+        self.noise_square, self.noise_coordinates = (float(number) for number in arrays["noise"])
+
+    def _filter_kernel(self) -> FilterKernel | None:
+        scales = np.zeros(self.parameters.size)
+        scales[self._active] = self._scales
+        constants = [_ITERATIONS, _SMALL_BEND, _GATE, NOISE_MEMORY, LEAST_NOISE_M**2, SMALL_ANGLE, self._reach]
+        return filter_kernel(*self.parameters.tables, scales, self._turning(), np.array(constants))
+
+    def _learn_compiled(self, kernel: FilterKernel, q: FloatArray, x: FloatArray, sigma: FloatArray) -> None:
+        """What `_learn_one` does with each pair."""
+        taken, self.noise_square, self.noise_coordinates = kernel.learn(
+            self.change,
+            self._covariance,
+            np.ascontiguousarray(q),
+            np.ascontiguousarray(x),
+            np.ascontiguousarray(sigma),
+            self.noise_square,
+            self.noise_coordinates,
+        )
+        if taken < len(q):
+            raise np.linalg.LinAlgError("Singular matrix")
+
+    def _turning(self) -> FloatArray:
+        """1 for the parameters (size,) that are angles and so bend the marker's way, 0 for lengths."""
+        bends = np.zeros(self.parameters.size)
+        bends[self.parameters.base_turn] = bends[self.parameters.tilts] = 1.0
+        bends[self.parameters.zeros] = ~self.parameters.reference.prismatic
+        return bends
+
+    def _linearised(self, change: FloatArray, q: FloatArray) -> tuple[FloatArray, FloatArray]:
+        x, jacobian = self.parameters.linearised(change, q)
+        return x, jacobian[:, :, self._active] * self._scales
+
+    def _learn_one(self, q: FloatArray, x: FloatArray, sigma: float) -> None:
+        """An iterated update (Bell and Cathey 1993): the gain is that of the point it leads to."""
+        told = not math.isnan(sigma)
+        noise_square = sigma**2 if told else self.noise_square
+        update = self._update(self.change, np.zeros(len(self._scales)), q, x, noise_square, 1.0)
+        # An outlier gets the weight with which it would be at the gate (Huber's influence).
+        distance = min(update.distance, _GATE)
+        weight = distance / update.distance if distance > 0.0 else 1.0
+        if weight < 1.0:
+            update = self._update(self.change, np.zeros(len(self._scales)), q, x, noise_square, weight)
+        for _ in range(_ITERATIONS):
+            if update.bend <= _SMALL_BEND * math.sqrt(update.variance):
+                break
+            update = self._update(self._moved(update.step), update.step, q, x, noise_square, weight)
+        self.change = self._moved(update.step)
+        self._covariance -= update.gains @ update.precision @ update.gains.T
+        if not told:
+            self._reestimate(distance, update.precision)
+
+    def _update(
+        self, change: FloatArray, present: FloatArray, q: FloatArray, x: FloatArray, noise_square: float, weight: float
+    ) -> _Update:
+        """The step (p,) from where the filter is, with the measurement linearised at the step `present` (p,)."""
+        positions, jacobians = self._linearised(change, q)
+        jacobian, innovation = jacobians[0], x - positions[0] + jacobians[0] @ present
+        gains = self._covariance @ jacobian.T
+        variance = noise_square + self._curvature(jacobian)
+        precision = cast(FloatArray, np.linalg.inv(jacobian @ gains + _EYE * (variance / weight)))
+        weighted = precision @ innovation
+        step = gains @ weighted
+        moved = step - present
+        turn = float(np.linalg.norm(moved * self._scales * self._bends))
+        bend = turn * float(np.linalg.norm(jacobian @ moved))
+        return _Update(step, gains, precision, variance, float(innovation @ weighted), bend)
+
+    def _moved(self, step: FloatArray) -> FloatArray:
+        change = self.change.copy()
+        change[self._active] += self._scales * step
+        return change
+
+    def _curvature(self, jacobian: FloatArray) -> float:
+        """Variance [m²] that the linearisation leaves out.
+
+        An uncertainty s of the position from angles alone, at the reach L, bends the marker's way by s² / (2 L).
+        """
+        turning = jacobian * self._bends
+        square = float(np.vdot(turning @ self._covariance, turning)) / 3.0
+        return 0.25 * (square / self._reach) ** 2
+
+    def _reestimate(self, distance: float, precision: FloatArray) -> None:
+        """Noise² from the squared Mahalanobis distance of an innovation, which is 3 on average when it is right.
+
+        Fisher scoring: an innovation tells of the noise by the share that noise has in its variance.
+        """
+        share = self.noise_square * float(np.trace(precision)) / 3.0
+        total = self.noise_coordinates + 3.0 * share**2
+        square = self.noise_square * (1.0 + share * (distance - 3.0) / total)
+        self.noise_square = max(square, LEAST_NOISE_M**2)
+        self.noise_coordinates = min(total, NOISE_MEMORY)

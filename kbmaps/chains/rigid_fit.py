@@ -1,0 +1,281 @@
+"""The most probable chain for a set of pairs: robust Gauss-Newton with a Gaussian prior."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import cast
+
+import numpy as np
+from scipy.special import chdtrc  # pyright: ignore[reportMissingTypeStubs, reportUnknownVariableType]
+
+from kbmaps.arrays import BoolArray, FloatArray
+from kbmaps.chains.belief import ChainBelief, squared
+from kbmaps.pairs import Pairs
+
+# Noise that is estimated is never below this [m]: there rounding begins.
+_ROUNDING_M = 1e-9
+# A pair this many sigma from where the others predict it is an outlier: of good ones 4 in 100,000 are as far out
+# (chi, three dimensions).
+_OUTLIER_SIGMAS = 4.8
+# A residual's variance is never taken for less than this share of the noise: below, the pair explains itself.
+_LEAST_SHARE = 1e-4
+# A residual norm of noise σ per axis has the median 1.538 σ in three dimensions.
+_MEDIAN_NORM = 1.538
+_SCALES_PER_SIGMA = 3.0
+# Told noise explains a sum of squared residuals that is not less probable than this (χ²).
+_MISFIT_CHANCE = 1e-3
+_ROUNDS = 80
+_FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-3, 1e-12, 1e8
+# A step that changes the fit by less than this share of what the noise leaves open is the last.
+_SMALL_STEP = 1e-4
+
+
+@dataclass(frozen=True)
+class NoiseKnowledge:
+    """What is known beforehand of a noise that is not told: as if found from so many coordinates.
+
+    Attributes:
+        coordinates: how many, 0 where nothing is known.
+        square: their mean square [m²].
+    """
+
+    coordinates: float = 0.0
+    square: float = 0.0
+
+    def found(self, square: float, freedom: float) -> float:
+        """Variance after residuals with a sum of squares [m²] and so many degrees of freedom, above 0 in all."""
+        return (square + self.coordinates * self.square) / (freedom + self.coordinates)
+
+
+NOTHING_KNOWN = NoiseKnowledge()
+
+
+@dataclass(frozen=True, eq=False)
+class RigidFit:
+    """A change of the chain and how sure it is.
+
+    Attributes:
+        belief: the posterior of the parameters.
+        noise: estimated noise over unit; at least 1 where the units are the noise (more: the chain does not fit).
+        freedom: residual coordinates minus those that the parameters have used up.
+        inliers: which pairs (n,) are no outliers.
+        rank: how many independent directions of the parameters the data determine.
+        loose: how far (size,) each free parameter takes part in directions that the data do not show, in 0..1.
+        log_evidence: log marginal likelihood of the inliers (Laplace's approximation).
+    """
+
+    belief: ChainBelief
+    noise: float
+    freedom: float
+    inliers: BoolArray
+    rank: int
+    loose: FloatArray
+    log_evidence: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Point:
+    """Residuals (n, 3), their norms in units (n,), and Jacobian (n, 3, f) at one change (size,).
+
+    The f free parameters are counted from the prior's mean in columns of its root; `offset` (f,) is where they are.
+    """
+
+    change: FloatArray
+    residuals: FloatArray
+    norms: FloatArray
+    jacobian: FloatArray
+    offset: FloatArray
+
+    def reduced(self, roots: FloatArray) -> FloatArray:
+        """Triangular factor (f+1, f+1) of the rows [J, residual], each pair's multiplied by its root (n,)."""
+        rows = np.concatenate([self.jacobian, self.residuals[:, :, None]], axis=2) * roots[:, None, None]
+        return cast(FloatArray, np.linalg.qr(rows.reshape(-1, rows.shape[2]), mode="r"))
+
+    def deletion_distances(self, inliers: BoolArray, sigma: FloatArray) -> FloatArray:
+        """How far (n,) each pair lies from where the other inliers predict it, in standard deviations of that.
+
+        Mahalanobis lengths: an inlier's residual has the covariance σ² − J P Jᵀ, another's σ² + J P Jᵀ (Cook and
+        Weisberg 1982, section 2.2). Whether a pair takes part does not change what is said of it.
+        """
+        factor = self.reduced(inliers / sigma)
+        _, singular, vt = np.linalg.svd(factor[:, :-1])
+        singular = np.concatenate([singular, np.zeros(len(vt) - len(singular))])
+        spread = self.jacobian @ (vt.T / np.sqrt(1.0 + np.square(singular))) / sigma[:, None, None]
+        values, vectors = np.linalg.eigh(spread @ spread.swapaxes(1, 2))
+        shares = 1.0 + np.where(inliers, -1.0, 1.0)[:, None] * values
+        along = (vectors.swapaxes(1, 2) @ (self.residuals / sigma[:, None])[:, :, None])[:, :, 0]
+        return np.sqrt((np.square(along) / np.maximum(shares, _LEAST_SHARE)).sum(axis=1))
+
+    def cost(self, roots: FloatArray) -> float:
+        residuals = np.einsum("ni,ni,n->", self.residuals, self.residuals, roots * roots)
+        return float(residuals + self.offset @ self.offset)
+
+
+class _Fitter:
+    """One fit on its way: what is minimised is Σ (root ‖residual‖)² + ‖offset‖² with the roots of the present noise."""
+
+    def __init__(self, prior: ChainBelief, pairs: Pairs, start: FloatArray) -> None:
+        self.prior, self.pairs = prior, pairs
+        self.free, self.root = squared(prior.root)
+        self.point = self._at(cast(FloatArray, np.linalg.solve(self.root, (start - prior.mean)[self.free])))
+        self.least_noise = 1.0 if pairs.known else _ROUNDING_M / float(pairs.unit.min())
+        self._damping = _FIRST_DAMPING
+        # Residual coordinates that the parameters use up.
+        self.used = float(min(len(self.free), 3 * len(pairs)))
+
+    def typical(self) -> float:
+        """Noise over unit as the middle residual shows it (Rousseeuw and Leroy 1987, least median of squares).
+
+        The middle lies above the median by the pairs that the parameters can explain whatever they are.
+        """
+        norms = self.point.norms
+        rank = min(int(0.5 * (len(norms) + self.used / 3.0)), len(norms) - 1)
+        return max(float(np.partition(norms, rank)[rank]) / _MEDIAN_NORM, self.least_noise)
+
+    def improve(self, weights: FloatArray, noise: float) -> float:
+        """A Levenberg-Marquardt step; returns its length in units of what is left open (0: none was found)."""
+        point, roots = self.point, np.sqrt(weights) / (self.pairs.unit * noise)
+        factor = point.reduced(roots)
+        design, target = factor[:, :-1], factor[:, -1]
+        before, columns = point.cost(roots), np.einsum("ij,ij->j", design, design)
+        squares = np.square(np.linalg.svd(design, compute_uv=False))
+        self.used = float((squares / (1.0 + squares)).sum())  # γ of MacKay 1992, "Bayesian interpolation"
+        while self._damping <= _MOST_DAMPING:
+            held = np.sqrt(1.0 + self._damping * columns)
+            q, r = np.linalg.qr(np.concatenate([design, np.diag(held)]))
+            projected = q.T @ np.concatenate([target, -point.offset / held])
+            length = float(np.linalg.norm(projected))
+            tried = self._at(point.offset + np.linalg.solve(r, projected))
+            if tried.cost(roots) <= before:
+                self.point, self._damping = tried, max(self._damping * 0.1, _LEAST_DAMPING)
+                return length
+            if length < _SMALL_STEP:
+                return 0.0
+            self._damping = max(self._damping * 10.0, _FIRST_DAMPING)
+        self._damping = _FIRST_DAMPING
+        return 0.0
+
+    def _at(self, offset: FloatArray) -> _Point:
+        change = self.prior.mean.copy()
+        change[self.free] += self.root @ offset
+        x, jacobian = self.prior.parameters.linearised(change, self.pairs.q)
+        residuals = self.pairs.x - x
+        norms = np.linalg.norm(residuals, axis=1) / self.pairs.unit
+        return _Point(change, residuals, norms, jacobian[:, :, self.free] @ self.root, offset)
+
+
+def fit_chain(
+    prior: ChainBelief,
+    pairs: Pairs,
+    start: FloatArray,
+    *,
+    near: bool = False,
+    noise: NoiseKnowledge = NOTHING_KNOWN,
+) -> RigidFit:
+    """The most probable change for at least one pair, on the way from `start` (size,).
+
+    Graduated non-convexity (Yang et al. 2020): Geman-McClure weights, and with them the noise that weighs data against
+    prior, shrink from the largest residual to what is typical, so that neither outliers nor a marker far from its
+    place stop the way. Then least squares on all pairs that are no outliers, with the noise estimated from them.
+
+    Args:
+        near: the start is a fit to most of these pairs, so that least squares will do.
+        noise: what is known beforehand of a noise that is not told.
+    """
+    fitter = _Fitter(prior, pairs, start)
+    if not near:
+        _anneal(fitter)
+    return _polish(fitter, noise)
+
+
+def folded(prior: ChainBelief, pairs: Pairs, change: FloatArray, noise: float) -> ChainBelief:
+    """What is believed after pairs, all good, that are linearised at a change (size,).
+
+    Args:
+        noise: over the pairs' unit.
+    """
+    point = _Fitter(prior, pairs, change).point
+    factor = point.reduced(1.0 / (pairs.unit * noise))
+    free, root = squared(prior.root)
+    held = np.concatenate([np.eye(len(free)), -point.offset[:, None]], axis=1)
+    joined = cast(FloatArray, np.linalg.qr(np.concatenate([factor, held]), mode="r"))
+    triangle, target = joined[: len(free), :-1], joined[: len(free), -1]
+    mean, spread = prior.mean.copy(), np.zeros((len(prior.mean), len(free)))
+    mean[free] += root @ (point.offset + np.linalg.solve(triangle, target))
+    spread[free] = np.linalg.solve(triangle.T, root.T).T
+    return ChainBelief(prior.parameters, mean, spread)
+
+
+def _anneal(fitter: _Fitter) -> None:
+    scale = math.inf
+    for _ in range(_ROUNDS):
+        norms = fitter.point.norms
+        goal = _SCALES_PER_SIGMA * fitter.typical()
+        scale = max(min(scale / 1.4, float(norms.max())), goal)
+        step = fitter.improve((scale**2 / (scale**2 + norms**2)) ** 2, scale / _SCALES_PER_SIGMA)
+        if scale == goal and (step < 1.0 or scale <= 2.0 * _SCALES_PER_SIGMA * fitter.least_noise):
+            return
+
+
+def _polish(fitter: _Fitter, before: NoiseKnowledge) -> RigidFit:
+    pairs = fitter.pairs
+    typical = fitter.typical()
+    inliers = fitter.point.norms <= _OUTLIER_SIGMAS * typical
+    # Few pairs can be fitted with much noise or with little; what was told has the first say.
+    noise = 1.0 if pairs.known else typical
+    freedom = 0.0
+    for _ in range(_ROUNDS):
+        step = fitter.improve(inliers.astype(np.float64), noise)
+        freedom = max(3.0 * float(inliers.sum()) - fitter.used, 0.0)
+        square = float(np.square(fitter.point.norms[inliers]).sum())
+        estimate = _told_noise(square, freedom) if pairs.known else _found_noise(square, freedom, before, fitter)
+        distances = fitter.point.deletion_distances(inliers, pairs.unit * max(estimate, fitter.typical()))
+        chosen = distances <= _OUTLIER_SIGMAS
+        settled = bool((chosen == inliers).all()) and abs(estimate - noise) <= 1e-3 * noise
+        inliers, noise = chosen, estimate
+        if settled and step < _SMALL_STEP * math.sqrt(1.0 + freedom):
+            break
+    return _summary(fitter, inliers, noise, freedom)
+
+
+def _found_noise(square: float, freedom: float, before: NoiseKnowledge, fitter: _Fitter) -> float:
+    if freedom + before.coordinates == 0.0:
+        return fitter.least_noise
+    return max(math.sqrt(before.found(square, freedom)), fitter.least_noise)
+
+
+def _told_noise(square: float, freedom: float) -> float:
+    """1 unless the residuals are more than chance makes them: then the chain does not fit."""
+    if freedom == 0.0 or chdtrc(freedom, square) >= _MISFIT_CHANCE:
+        return 1.0
+    return max(math.sqrt(square / freedom), 1.0)
+
+
+def _summary(fitter: _Fitter, inliers: BoolArray, noise: float, freedom: float) -> RigidFit:
+    point, free, root = fitter.point, fitter.free, fitter.root
+    parameters, size = fitter.prior.parameters, fitter.prior.parameters.size
+    factor = point.reduced(inliers / (fitter.pairs.unit * noise))
+    _, singular, vt = np.linalg.svd(factor[:, :-1])
+    singular = np.concatenate([singular, np.zeros(len(vt) - len(singular))])
+    loose, rank = _undetermined(cast(FloatArray, np.linalg.solve(root.T, factor[:, :-1].T)).T)
+    spread = np.zeros((size, size))
+    spread[np.ix_(free, free)] = root @ (vt.T / np.sqrt(1.0 + np.square(singular)))
+    looseness = np.zeros(size)
+    looseness[free] = loose
+    square = float(np.square(point.norms[inliers]).sum()) / noise**2 + float(point.offset @ point.offset)
+    spans = 6.0 * float(np.log(noise * fitter.pairs.unit[inliers]).sum())
+    evidence = -0.5 * (square + spans + 3.0 * float(inliers.sum()) * math.log(2.0 * math.pi))
+    evidence -= 0.5 * float(np.log1p(np.square(singular)).sum())
+    return RigidFit(ChainBelief(parameters, point.change, spread), noise, freedom, inliers, rank, looseness, evidence)
+
+
+def _undetermined(design: FloatArray) -> tuple[FloatArray, int]:
+    """How far each parameter lies in directions that no row shows, and how many directions the rows do show."""
+    lengths = np.linalg.norm(design, axis=0)
+    seen = lengths > 1e-12 * max(float(lengths.max(initial=0.0)), 1e-300)
+    _, singular, vt = np.linalg.svd(design[:, seen] / lengths[seen])
+    rank = int((singular > 1e-8 * singular.max(initial=0.0)).sum())
+    loose = np.ones(design.shape[1])
+    loose[seen] = np.linalg.norm(vt[rank:], axis=0)
+    return loose, rank

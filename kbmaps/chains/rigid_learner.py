@@ -1,0 +1,247 @@
+"""Learning a rigid chain from all pairs at once: the most probable chain and how sure it is."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict
+from typing import Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.special import stdtrit  # pyright: ignore[reportMissingTypeStubs, reportUnknownVariableType]
+
+from kbmaps.arrays import BoolArray, FloatArray, frozen, rows, rows_or_vector
+from kbmaps.chains.belief import ChainBelief
+from kbmaps.chains.chain import RigidChain
+from kbmaps.chains.packed import chain_arrays, chain_from_arrays
+from kbmaps.chains.parameters import ChainParameters, ChainTolerances
+from kbmaps.chains.placed_start import PlacedStart
+from kbmaps.chains.report import ChainReport, chain_report
+from kbmaps.chains.rigid_fit import RigidFit, fit_chain
+from kbmaps.errors import DegenerateDataError, KBMapsError, ModelFormatError
+from kbmaps.model import Estimate
+from kbmaps.packed import numbers, pack, unpack
+from kbmaps.pairs import Pairs, checked_pairs, with_units
+
+_KIND = "rigid chain, batch, 1"
+_ONE_SIGMA = 0.841344746
+# Configurations where the chain is surer than this times the least sure pair (in variance) lie where data was.
+_SUPPORT_FACTOR = 2.0
+
+
+class RigidLearner:
+    """Fits a rigid chain to all pairs, around a nominal one whose tolerances are the prior.
+
+    The result depends on the pairs only, not on their order or how they came in. It is fitted when first asked for
+    after `learn` (7 joints: 10 ms at 30 pairs, 0.1 s at 2,200). Outliers are left out.
+
+    Args:
+        nominal: the chain as drawn, or as `find_chain` found it.
+        tolerances: how far the real one may be from it.
+        prior: what is believed before the first pair, where more is known than the tolerances; it changes the same
+            nominal chain. So an arm that got another tool is learnt on: `learner.belief.with_other_tool(0.2)`.
+
+    Raises:
+        ShapeError: the prior is one of another chain.
+
+    Example:
+        >>> import numpy as np
+        >>> from kbmaps import ChainTolerances, RigidChain, RigidLearner
+        >>> fixed = np.tile(np.eye(4), (3, 1, 1))
+        >>> fixed[1:, 0, 3] = 0.3, 0.2  # links [m]
+        >>> arm = RigidChain(fixed, axes=[[0, 0, 1], [0, 1, 0]], prismatic=[False, False])
+        >>> learner = RigidLearner(arm.with_tool([0.0, 0.0, 0.1]), ChainTolerances(tool=0.1))
+        >>> q = np.random.default_rng(0).uniform(-1, 1, (5, 2))
+        >>> learner.learn(q, arm.positions(q))
+        >>> learner.report().tool_shift.value.round(6) + 0.0
+        array([ 0. ,  0. , -0.1])
+    """
+
+    def __init__(self, nominal: RigidChain, tolerances: ChainTolerances, prior: ChainBelief | None = None) -> None:
+        self._parameters = ChainParameters(nominal)
+        self._tolerances = tolerances
+        self._told_prior = prior is not None
+        if prior is None:
+            self._prior = ChainBelief.from_tolerances(self._parameters, tolerances)
+        else:
+            self._prior = ChainBelief(self._parameters, prior.mean, prior.root)
+        self._place = PlacedStart(self._parameters, tolerances)
+        self._q, self._x = np.empty((0, nominal.joints)), np.empty((0, 3))
+        self._sigma = np.empty(0)
+        self._fit: RigidFit | None = None
+        self._widest = 0.0
+
+    @property
+    def joints(self) -> int:
+        """Number of joints d."""
+        return self.nominal.joints
+
+    @property
+    def pairs(self) -> int:
+        """How many pairs have been learnt."""
+        return len(self._q)
+
+    @property
+    def nominal(self) -> RigidChain:
+        """The chain that learning started from."""
+        return self._parameters.reference
+
+    @property
+    def chain(self) -> RigidChain:
+        """The most probable chain."""
+        return self.belief.chain
+
+    @property
+    def tolerances(self) -> ChainTolerances:
+        """How far the real chain may be from the nominal one."""
+        return self._tolerances
+
+    @property
+    def prior(self) -> ChainBelief:
+        """What was believed before the first pair."""
+        return self._prior
+
+    @property
+    def belief(self) -> ChainBelief:
+        """What the pairs let believe of the chain; the prior without pairs."""
+        fit = self._fitted()
+        return self._prior if fit is None else fit.belief
+
+    @property
+    def change(self) -> FloatArray:
+        """The most probable parameters (size,) as in `ChainParameters` (read-only)."""
+        return self.belief.mean
+
+    @property
+    def covariance(self) -> FloatArray:
+        """Posterior covariance (size, size) of the parameters [rad², m²]; the prior's without pairs (read-only)."""
+        return frozen(self.belief.covariance)
+
+    @property
+    def inliers(self) -> BoolArray:
+        """Which pairs (n,), as they came, are no outliers."""
+        fit = self._fitted()
+        return np.zeros(0, dtype=np.bool_) if fit is None else fit.inliers.copy()
+
+    @property
+    def log_evidence(self) -> float:
+        """Log marginal likelihood of the inliers (Laplace's approximation); 0 without pairs."""
+        fit = self._fitted()
+        return 0.0 if fit is None else fit.log_evidence
+
+    def learn(self, q: ArrayLike, x: ArrayLike, sigma: ArrayLike | None = None) -> None:
+        """Pairs q (n, d) [rad, m] and x (n, 3) [m], or one, (d,) and (3,).
+
+        Args:
+            sigma: 1-sigma of the positions [m], () or (n,); None where it is to be estimated. Once one pair came
+                without, the noise is estimated for all, and those told count relative to their median.
+
+        Raises:
+            ShapeError, NonFiniteError, SettingError (a sigma that is not positive): nothing has changed.
+        """
+        angles, positions, sigmas = checked_pairs(q, x, sigma, self.joints)
+        self._q = np.concatenate([self._q, angles])
+        self._x = np.concatenate([self._x, positions])
+        self._sigma = np.concatenate([self._sigma, sigmas])
+        self._fit = None
+
+    def predict(self, q: ArrayLike) -> FloatArray:
+        """Positions (n, 3) [m] at q (n, d), or (3,) at q (d,).
+
+        Raises:
+            ShapeError, NonFiniteError
+        """
+        angles = rows_or_vector("q", q, self.joints)
+        return self._parameters.positions(self.belief.mean, angles)
+
+    def estimate(self, q: ArrayLike) -> Estimate:
+        """Positions at q (n, d), their 1-sigma per axis against the truth, and whether data was there.
+
+        Where the told noise does not explain the residuals, what is left over adds to sigma everywhere.
+
+        Raises:
+            ShapeError, NonFiniteError
+        """
+        angles = rows("q", q, self.joints)
+        fit = self._fitted()
+        x, variance = self.belief.predict_with_variance(angles)
+        if fit is None:
+            return Estimate(x, np.sqrt(variance), np.zeros(len(angles), dtype=np.bool_))
+        inside = variance.sum(axis=1) <= _SUPPORT_FACTOR * self._widest
+        pairs = self._units()
+        if pairs.known:
+            variance = variance + (fit.noise**2 - 1.0) * float(np.square(pairs.unit).mean())
+            return Estimate(x, np.sqrt(variance), inside)
+        return Estimate(x, np.sqrt(variance) * student(fit.freedom), inside)
+
+    def report(self) -> ChainReport:
+        """Hand-eye, tool centre point and joint zeros with 95 % intervals.
+
+        Raises:
+            DegenerateDataError: no pairs have been learnt.
+        """
+        fit = self._fitted()
+        if fit is None:
+            raise DegenerateDataError("there is nothing to report before the first pair was learnt")
+        pairs = self._units()
+        std = np.sqrt(np.square(fit.belief.root).sum(axis=1)) * (1.0 if pairs.known else student(fit.freedom))
+        unit = math.sqrt(float(np.square(pairs.unit).mean()))
+        return chain_report(
+            self._parameters,
+            fit.belief.mean,
+            std,
+            fit.loose,
+            noise=unit if pairs.known else unit * fit.noise,
+            misfit=fit.noise if pairs.known else 1.0,
+            freedom=fit.freedom,
+            outliers=int((~fit.inliers).sum()),
+            determined=fit.rank,
+        )
+
+    def to_bytes(self) -> bytes:
+        """The learner with all its pairs; `from_bytes` gives the same predictions to the last bit."""
+        arrays = chain_arrays(self.nominal) | {
+            "q": self._q,
+            "x": self._x,
+            "sigma": self._sigma,
+        }
+        if self._told_prior:
+            arrays |= {"prior_mean": self._prior.mean, "prior_root": self._prior.root}
+        return pack(_KIND, asdict(self._tolerances), arrays)
+
+    @classmethod
+    def from_bytes(cls, data: bytes) -> Self:
+        """The learner in `data`. Raises ModelFormatError: it is none of this kind, or damaged."""
+        fields, arrays = unpack(data, _KIND)
+        settings = numbers(fields)
+        try:
+            chain = chain_from_arrays(arrays)
+            prior = None
+            if "prior_mean" in arrays:
+                prior = ChainBelief(ChainParameters(chain), arrays["prior_mean"], arrays["prior_root"])
+            learner = cls(chain, ChainTolerances(**settings), prior)
+            sigma = arrays["sigma"]
+            learner.learn(arrays["q"], arrays["x"], np.where(np.isnan(sigma), 1.0, sigma))
+        except (KeyError, TypeError, KBMapsError) as error:
+            raise ModelFormatError(f"the bytes do not describe a rigid learner: {error}") from error
+        learner._sigma = sigma
+        return learner
+
+    def _units(self) -> Pairs:
+        return with_units(self._q, self._x, self._sigma)
+
+    def _fitted(self) -> RigidFit | None:
+        if self._fit is None and self.pairs:
+            fit = fit_chain(self._prior, self._units(), self._start())
+            _, variance = fit.belief.predict_with_variance(self._q[fit.inliers])
+            self._widest = float(variance.sum(axis=1).max(initial=0.0))
+            self._fit = fit
+        return self._fit
+
+    def _start(self) -> FloatArray:
+        return self._prior.mean if self._told_prior else self._place.change(self._q, self._x)
+
+
+def student(freedom: float) -> float:
+    """What a sigma with an estimated noise must be multiplied by to cover as a Gaussian one does."""
+    return float(stdtrit(max(freedom, 1.0), _ONE_SIGMA))

@@ -1,0 +1,121 @@
+"""The last pairs of a rigid chain, refitted together, and what those before them let believe."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+
+from kbmaps.arrays import FloatArray
+from kbmaps.chains.belief import ChainBelief
+from kbmaps.chains.parameters import ChainParameters, ChainTolerances
+from kbmaps.chains.placed_start import PlacedStart
+from kbmaps.chains.rigid_fit import NOTHING_KNOWN, NoiseKnowledge, RigidFit, fit_chain, folded
+from kbmaps.errors import ModelFormatError, SettingError
+from kbmaps.pairs import checked_pairs, with_units
+
+LEAST_WINDOW = 16
+# With so few pairs, and nothing before them, an earlier fit may be far off: look from the drawing on.
+_FRESH = 200
+# What older pairs tell of the noise counts for no more coordinates than this.
+_NOISE_MEMORY = 900.0
+
+
+class RigidWindow:
+    """Keeps at most `size` pairs. Older ones are folded: linearised at the fit that knew those after them too.
+
+    Attributes:
+        belief: of the chain before the pairs that are kept.
+        noise: what is known of the noise before them, of pairs that come without their sigma.
+        excess: variance [m²] of a coordinate that the chain did not explain at the last fit, the noise being told.
+
+    Raises:
+        SettingError: size below 16.
+    """
+
+    def __init__(self, parameters: ChainParameters, tolerances: ChainTolerances, size: int) -> None:
+        if size < LEAST_WINDOW:
+            raise SettingError(f"a window must hold at least {LEAST_WINDOW} pairs, got {size}")
+        self.size = size
+        self.belief = ChainBelief.from_tolerances(parameters, tolerances)
+        self.noise = NOTHING_KNOWN
+        self.excess = 0.0
+        self._begun = False
+        self._place = PlacedStart(parameters, tolerances)
+        self._joints, self._count = parameters.reference.joints, 0
+        # q, x and sigma side by side.
+        self._rows = np.empty((size, self._joints + 4))
+
+    def __len__(self) -> int:
+        return self._count
+
+    @property
+    def finds_noise(self) -> bool:
+        """Whether a pair came without its sigma."""
+        return bool(np.isnan(self._rows[: self._count, -1]).any())
+
+    def add(self, q: FloatArray, x: FloatArray, sigma: FloatArray) -> None:
+        """Trusted pairs q (n, d), x (n, 3) and sigma (n,), NaN where it was not told; no more than there is room."""
+        rows = self._rows[self._count : self._count + len(q)]
+        rows[:, : self._joints], rows[:, self._joints : -1], rows[:, -1] = q, x, sigma
+        self._count += len(q)
+
+    def fitted(self, near: FloatArray) -> RigidFit:
+        """The fit to at least one pair; `near` (size,) is where the chain is supposed to be."""
+        q, x, sigma = self._pairs()
+        pairs = with_units(q, x, sigma)
+        if self._count > _FRESH:
+            fit = fit_chain(self.belief, pairs, near, near=True, noise=self.noise)
+        else:
+            start = self.belief.mean if self._begun else self._place.change(q, x)
+            fit = fit_chain(self.belief, pairs, start, noise=self.noise)
+        self.excess = (fit.noise**2 - 1.0) * float(np.square(pairs.unit).mean()) if pairs.known else 0.0
+        return fit
+
+    def fold(self, fit: RigidFit, count: int) -> None:
+        """Lets go of the oldest pairs, so many, after a fit to all that are kept."""
+        q, x, sigma = self._pairs()
+        # The units are those of the fit, hence of all pairs.
+        pairs = with_units(q, x, sigma)
+        good = fit.inliers & (np.arange(self._count) < count)
+        self.belief = folded(self.belief, pairs.chosen(good), fit.belief.mean, fit.noise)
+        if not pairs.known:
+            told = self.noise.coordinates + fit.freedom * count / self._count
+            self.noise = NoiseKnowledge(min(told, _NOISE_MEMORY), fit.noise**2)
+        self._begun = True
+        self._count -= count
+        self._rows[: self._count] = self._rows[count : count + self._count].copy()
+
+    def begin_with(self, belief: ChainBelief) -> None:
+        """Lets go of all pairs; `belief` is what is believed of the chain from now on."""
+        self.belief, self._begun, self._count = belief, True, 0
+
+    def arrays(self) -> dict[str, FloatArray]:
+        """For `kbmaps.packed`."""
+        q, x, sigma = self._pairs()
+        known = np.array([self.noise.coordinates, self.noise.square, self.excess])
+        arrays = {"q": q, "x": x, "sigma": sigma, "known": known}
+        return arrays | ({"before_mean": self.belief.mean, "before_root": self.belief.root} if self._begun else {})
+
+    def restore(self, arrays: Mapping[str, FloatArray]) -> None:
+        """The state that `arrays` gave.
+
+        Raises:
+            ModelFormatError, KeyError, ValueError, ShapeError, NonFiniteError, SettingError: it is none.
+        """
+        sigma = arrays["sigma"]
+        q, x, _ = checked_pairs(arrays["q"], arrays["x"], np.where(np.isnan(sigma), 1.0, sigma), self._joints)
+        coordinates, square, excess = (float(number) for number in arrays["known"])
+        if len(q) > self.size or not all(0.0 <= number < math.inf for number in (coordinates, square, excess)):
+            raise ModelFormatError("the stored pairs do not fit their window, or their noise is none")
+        if "before_mean" in arrays:
+            self.begin_with(ChainBelief(self.belief.parameters, arrays["before_mean"], arrays["before_root"]))
+        self.noise, self.excess = NoiseKnowledge(coordinates, square), excess
+        self.add(q, x, sigma)
+
+    def _pairs(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        rows = self._rows[: self._count]
+        # In C order, as it comes back from bytes: sums must not depend on the layout.
+        q, x, sigma = rows[:, : self._joints], rows[:, self._joints : -1], rows[:, -1]
+        return np.ascontiguousarray(q), np.ascontiguousarray(x), np.ascontiguousarray(sigma)

@@ -1,0 +1,281 @@
+"""A tool or marker on a known arm: three numbers that are learnt from single pairs."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any, Protocol, Self, cast, runtime_checkable
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from kbmaps.arrays import BoolArray, FloatArray, frozen, rows, rows_or_vector
+from kbmaps.chains.carried import ChainModel, as_model, packable, unpacked
+from kbmaps.chains.chain import RigidChain
+from kbmaps.chains.marker_fit import MarkerKnowledge, MarkerPosterior, Residuals, fit_marker
+from kbmaps.errors import KBMapsError, ModelFormatError, SettingError
+from kbmaps.maps.kbmap import KBMap
+from kbmaps.model import Estimate
+from kbmaps.packed import named, numbers, pack, unpack
+from kbmaps.pairs import checked_pairs
+
+_KIND = "tool layer, 1"
+DEFAULT_OUTLIER_SIGMAS = 6.0
+# What an infinite spread is taken for [m].
+_WIDE = 1e6
+# The noise is guessed as if it had been found from this many coordinates.
+_NOISE_COORDINATES = 6.0
+# So many pairs are kept to judge outliers among; older ones live on in sums.
+_RECENT = 128
+_SUPPORT_FACTOR = 1.0
+_SUMS = ("information", "pull", "square", "inner")
+_NUMBERS = ("errors", "count", "noise_count", "noise_square")
+
+
+class OrientedModel(Protocol):
+    """A map to positions and orientations."""
+
+    @property
+    def joints(self) -> int:
+        """Number of joints d."""
+        ...
+
+    def predict(self, q: ArrayLike) -> FloatArray:
+        """Positions (n, 3) [m] at q (n, d), or (3,) at q (d,)."""
+        ...
+
+    def orientation(self, q: ArrayLike) -> FloatArray:
+        """Orientations (n, 3, 3), or (3, 3) at q (d,)."""
+        ...
+
+
+@runtime_checkable
+class _Estimating(Protocol):
+    """A model that says how sure it is."""
+
+    def estimate(self, q: ArrayLike) -> Estimate:
+        """Positions at q (n, d) with their uncertainty."""
+        ...
+
+
+class ToolLayer:
+    """f(q) + R(q) δ on a model that is taken as it is, with δ in the marker's frame learnt by least squares. A `Model`.
+
+    The pairs enter through sums, at a constant cost and memory; outliers are judged among the last 128 or more. What is
+    learnt is the posterior of a Gaussian δ, with the most evident noise where none was told. The order of the pairs
+    does not matter, but for outliers older than that.
+
+    Args:
+        model: an arm with orientations: a `RigidChain`, a `KBMap` that has them, or any `PoseModel`; it must not
+            change.
+        spread: 1-sigma of each component of δ before the first pair [m]; infinity leaves it to the pairs alone.
+        noise: 1-sigma of a coordinate to start from where pairs come without [m].
+        outlier_sigmas: pairs farther off than so many robust standard deviations do not count.
+
+    Raises:
+        SettingError: one of these is not positive. ShapeError: a `KBMap` without orientation.
+    """
+
+    def __init__(
+        self,
+        model: RigidChain | OrientedModel,
+        *,
+        spread: float = 1.0,
+        noise: float = 0.01,
+        outlier_sigmas: float = DEFAULT_OUTLIER_SIGMAS,
+    ) -> None:
+        if not (noise > 0.0 and math.isfinite(noise)):
+            raise SettingError(f"noise must be finite and greater than 0 m, got {noise!r}")
+        if not outlier_sigmas > 0.0:
+            raise SettingError(f"outlier_sigmas must be greater than 0, got {outlier_sigmas!r}")
+        self._model: OrientedModel = as_model(model)
+        self._outlier_sigmas = float(outlier_sigmas)
+        covariance = np.eye(3) * _checked_spread(spread) ** 2
+        self._before = MarkerKnowledge.before(np.zeros(3), covariance, noise, _NOISE_COORDINATES)
+        self._recent = self._residuals(np.empty((0, self.joints)), np.empty((0, 3)), np.empty(0))
+        self._pairs = 0
+        self._fit: tuple[MarkerKnowledge, MarkerPosterior, BoolArray] | None = None
+
+    @property
+    def joints(self) -> int:
+        """Number of joints d."""
+        return self._model.joints
+
+    @property
+    def pairs(self) -> int:
+        """How many pairs have been learnt, those before a tool change included."""
+        return self._pairs
+
+    @property
+    def shift(self) -> FloatArray:
+        """δ (3,) [m] in the marker's frame (read-only)."""
+        return frozen(self._posterior().shift)
+
+    @property
+    def covariance(self) -> FloatArray:
+        """Covariance (3, 3) [m²] of δ (read-only)."""
+        return frozen(self._posterior().covariance)
+
+    @property
+    def noise(self) -> float:
+        """Estimated 1-sigma of a coordinate [m] of the pairs that came without theirs."""
+        return self._posterior().noise
+
+    @property
+    def inliers(self) -> BoolArray:
+        """Which of the recent pairs (n,) are no outliers."""
+        return self._fitted()[2].copy()
+
+    def learn(self, q: ArrayLike, x: ArrayLike, sigma: ArrayLike | None = None) -> None:
+        """Pairs q (n, d) [rad, m] and x (n, 3) [m], or one, (d,) and (3,).
+
+        Args:
+            sigma: 1-sigma of the positions [m], () or (n,); None where it is to be estimated.
+
+        Raises:
+            ShapeError, NonFiniteError, SettingError (a sigma that is not positive): nothing has changed.
+        """
+        angles, positions, sigmas = checked_pairs(q, x, sigma, self.joints)
+        self._recent = self._recent.joined(self._residuals(angles, positions, sigmas))
+        self._pairs += len(angles)
+        self._fit = None
+        if len(self._recent) >= 2 * _RECENT:
+            self._sum_up()
+
+    def tool_changed(self, spread: float) -> None:
+        """Tells that the marker was moved, by `spread` (1-sigma of each component [m]); the noise stays known.
+
+        Raises:
+            SettingError: the spread is not positive.
+        """
+        moved = np.eye(3) * _checked_spread(spread) ** 2
+        known, posterior, _ = self._fitted()
+        coordinates = known.noise_count + 3.0 * known.count
+        self._before = MarkerKnowledge.before(
+            posterior.shift, posterior.covariance + moved, posterior.noise, coordinates
+        )
+        self._recent, self._fit = self._recent[:0], None
+
+    def predict(self, q: ArrayLike) -> FloatArray:
+        """Positions (n, 3) [m] at q (n, d), or (3,) at q (d,).
+
+        Raises:
+            ShapeError, NonFiniteError
+        """
+        angles = rows_or_vector("q", q, self.joints)
+        return self._model.predict(angles) + self._model.orientation(angles) @ self._posterior().shift
+
+    def orientation(self, q: ArrayLike) -> FloatArray:
+        """The model's orientations (n, 3, 3), or (3, 3) at q (d,): a tool does not turn the marker's frame."""
+        return self._model.orientation(q)
+
+    def estimate(self, q: ArrayLike) -> Estimate:
+        """Positions at q (n, d), their 1-sigma per axis against the truth, and whether data was there.
+
+        What the model itself claims adds to what is open about δ, and where it is in no support, this is not either.
+        Of a model without claims, the noise tells how well it fits.
+
+        Raises:
+            ShapeError, NonFiniteError
+        """
+        angles = rows("q", q, self.joints)
+        posterior, rotations = self._posterior(), self._model.orientation(angles)
+        variance = np.einsum("nij,jk,nik->ni", rotations, posterior.covariance, rotations)
+        inside = (variance.mean(axis=1) <= _SUPPORT_FACTOR * self._noise_square()) & (self._pairs > 0)
+        if isinstance(self._model, _Estimating):
+            behind = self._model.estimate(angles)
+            variance, inside = variance + np.square(behind.sigma), inside & behind.in_support
+        return Estimate(self.predict(angles), np.sqrt(variance), inside)
+
+    def baked(self) -> KBMap | RigidChain:
+        """The model with the marker moved for good, exactly: of a KB-Map G + E1 δ1 + E2 δ2 + E3 δ3.
+
+        Raises:
+            SettingError: the model is neither a `KBMap` nor a `RigidChain`.
+        """
+        if isinstance(self._model, KBMap):
+            return self._model.with_tool(self.shift)
+        if isinstance(self._model, ChainModel):
+            return self._model.chain.with_tool(self.shift)
+        raise SettingError(f"a {type(self._model).__name__} cannot take in a tool; only a KBMap or a RigidChain can")
+
+    def to_bytes(self) -> bytes:
+        """The layer as it is; `from_bytes` gives the same predictions to the last bit.
+
+        A model that is neither a `KBMap` nor a `RigidChain` stays behind.
+        """
+        behind, arrays = packable(self._model)
+        fields: dict[str, Any] = {
+            "outlier_sigmas": self._outlier_sigmas if math.isfinite(self._outlier_sigmas) else None,
+            "pairs": self._pairs,
+            "known": {name: getattr(self._before, name) for name in _NUMBERS},
+            "model": behind,
+        }
+        recent = {"rotations": self._recent.rotations, "residuals": self._recent.errors, "sigma": self._recent.sigma}
+        return pack(_KIND, fields, {name: getattr(self._before, name) for name in _SUMS} | recent | arrays)
+
+    @classmethod
+    def from_bytes(cls, data: bytes, model: OrientedModel | None = None) -> Self:
+        """The layer in `data`.
+
+        Args:
+            model: the one it had, where that does not travel.
+
+        Raises:
+            ModelFormatError: it is none of this kind, or damaged, or its model is missing.
+        """
+        fields, arrays = unpack(data, _KIND)
+        try:
+            outlier_sigmas = math.inf if fields["outlier_sigmas"] is None else fields["outlier_sigmas"]
+            layer = cls(unpacked(fields["model"], arrays, model), outlier_sigmas=outlier_sigmas)
+            sums = {name: _shaped(arrays[name], getattr(layer._before, name)) for name in _SUMS}
+            scalars = numbers(named(fields["known"], "what is known", _NUMBERS))
+            layer._before = replace(layer._before, **cast(dict[str, Any], sums | scalars))
+            rotations, errors, sigma = arrays["rotations"], arrays["residuals"], arrays["sigma"]
+            layer._recent = Residuals(
+                _shaped(rotations, np.empty((len(sigma), 3, 3))), _shaped(errors, np.empty((len(sigma), 3))), sigma
+            )
+            layer._pairs = int(fields["pairs"])
+        except ModelFormatError:
+            raise
+        except (KeyError, TypeError, ValueError, KBMapsError) as error:
+            raise ModelFormatError(f"the bytes do not describe a tool layer: {error}") from error
+        return layer
+
+    def _residuals(self, q: FloatArray, x: FloatArray, sigma: FloatArray) -> Residuals:
+        return Residuals(self._model.orientation(q), x - self._model.predict(q), sigma)
+
+    def _sum_up(self) -> None:
+        """Lets all but the last pairs live on in sums only, without those that were outliers."""
+        _, _, inliers = self._fitted()
+        old = len(self._recent) - _RECENT
+        self._before = self._before.given(self._recent[:old][inliers[:old]])
+        self._recent, self._fit = self._recent[old:], None
+
+    def _fitted(self) -> tuple[MarkerKnowledge, MarkerPosterior, BoolArray]:
+        if self._fit is None:
+            self._fit = fit_marker(self._before, self._recent, self._outlier_sigmas)
+        return self._fit
+
+    def _posterior(self) -> MarkerPosterior:
+        return self._fitted()[1]
+
+    def _noise_square(self) -> float:
+        """Variance of a measured coordinate [m²]: as estimated, or as told where all that was recent was told."""
+        told = self._recent.sigma[~np.isnan(self._recent.sigma)]
+        if len(told) and len(told) == len(self._recent):
+            return float(np.square(told).mean())
+        return self.noise**2
+
+
+def _checked_spread(spread: float) -> float:
+    if not spread > 0.0:
+        raise SettingError(f"spread must be greater than 0 m (infinity included), got {spread!r}")
+    return min(float(spread), _WIDE)
+
+
+def _shaped(array: FloatArray, like: FloatArray) -> FloatArray:
+    """The array if it is finite and of this shape. Raises ModelFormatError."""
+    if array.shape != like.shape or not np.isfinite(array).all():
+        raise ModelFormatError(f"an array of finite numbers of shape {like.shape} was expected, got {array.shape}")
+    return array

@@ -1,0 +1,1 @@
+"""Inverse kinematics of any model that predicts positions or poses."""

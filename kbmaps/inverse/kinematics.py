@@ -1,0 +1,254 @@
+"""Inverse kinematics: joint values that put the marker where it is wanted, on any model with a derivative."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from kbmaps.arrays import FloatArray, IntArray, frozen, vector
+from kbmaps.errors import NonFiniteError, SettingError, ShapeError
+from kbmaps.inverse.descent import Descent, JointRange, descend, settle
+from kbmaps.inverse.reach import PoseGoal, PoseModel, PositionGoal, PositionModel
+from kbmaps.rotations import rotation_matrices
+
+Reason = Literal["reached", "out_of_reach", "steps_ran_out"]
+
+SAMPLES = 4096
+STARTS, POSE_STARTS = 16, 48
+MAX_STEPS = 3000
+TOLERANCE_M = 1e-7
+TOLERANCE_RAD = 1e-7
+# Starts are chosen among so many times as many samples near the target.
+_CANDIDATES = 8
+
+
+@dataclass(frozen=True, eq=False)
+class InverseSolution:
+    """Joint values for one target, and what is missing.
+
+    Attributes:
+        q: joint values (d,) [rad, m] within the limits: of all that was found, the nearest to the target.
+        x: where the model puts the marker there (3,) [m].
+        distance: from x to the target [m].
+        angle: between the orientation there and the target's [rad]; None where none was asked for.
+        converged: whether distance and angle are within the tolerance.
+        reason: "reached"; "out_of_reach": no start leads to the target, and from q no small move leads nearer;
+            "steps_ran_out": it may be in reach.
+        steps: derivatives that were evaluated.
+        starts: configurations that were started from.
+    """
+
+    q: FloatArray
+    x: FloatArray
+    distance: float
+    angle: float | None
+    converged: bool
+    reason: Reason
+    steps: int
+    starts: int
+
+
+class InverseKinematics:
+    """Finds joint values for positions, or poses, of a model.
+
+    Resolved motion rate control (Whitney 1969), damped (Levenberg–Marquardt), within joint limits, from several
+    starts: the configuration at hand, then samples of the whole range that come near the target, as far apart from
+    each other as they can be. The same arguments give the same answer. A model that changes needs a new one (about
+    10 ms at d = 7).
+
+    Args:
+        model: positions and their derivative; for poses also the orientation (`PoseModel`).
+        lower, upper: joint limits (d,) [rad, m]. A joint without a limit (infinite) may go anywhere; its samples are
+            taken from one turn.
+        seed: of the samples.
+        samples: how many.
+        starts: how many configurations are tried at most; None: 16 for a position, 48 for a pose.
+        max_steps: of all starts together; each takes about one evaluation of `model.jacobian`.
+        tolerance, angle_tolerance: distance [m] and angle [rad] that count as reached.
+
+    Raises:
+        ShapeError, SettingError (limits the wrong way round, or a setting that is not positive)
+
+    Example:
+        >>> import numpy as np
+        >>> from kbmaps import InverseKinematics, RigidChain, learning_bases
+        >>> fixed = np.tile(np.eye(4), (3, 1, 1))
+        >>> fixed[1:, 0, 3] = 0.3, 0.2  # links [m]
+        >>> arm = RigidChain(fixed, axes=[[0, 0, 1], [0, 1, 0]], prismatic=[False, False])
+        >>> kbmap = arm.to_kbmap(learning_bases([-3, -2], [3, 2]))
+        >>> inverse = InverseKinematics(kbmap, lower=[-3, -2], upper=[3, 2])
+        >>> inverse.solve([0.3, 0.0, 0.2]).q.round(4) + 0.0
+        array([ 0.    , -1.5708])
+        >>> inverse.solve([0.6, 0.0, 0.0]).reason
+        'out_of_reach'
+    """
+
+    def __init__(
+        self,
+        model: PositionModel,
+        lower: ArrayLike,
+        upper: ArrayLike,
+        *,
+        seed: int = 0,
+        samples: int = SAMPLES,
+        starts: int | None = None,
+        max_steps: int = MAX_STEPS,
+        tolerance: float = TOLERANCE_M,
+        angle_tolerance: float = TOLERANCE_RAD,
+    ) -> None:
+        if min(samples, 1 if starts is None else starts, max_steps) < 1 or not min(tolerance, angle_tolerance) > 0.0:
+            raise SettingError("samples, starts, max_steps and both tolerances must be greater than 0")
+        self._model = model
+        low, high = _limits("lower", lower, model.joints), _limits("upper", upper, model.joints)
+        if not (low <= high).all():
+            raise SettingError(f"joint {int((low > high).argmax())}'s lower limit is above its upper one")
+        begin, end = _one_turn(low, high)
+        half = 0.5 * (end - begin)
+        self._joints = JointRange(low, high, np.where(half > 0.0, half, 1.0))
+        self._starts, self._max_steps = starts, max_steps
+        self._tolerance, self._angle_tolerance = float(tolerance), float(angle_tolerance)
+        self._samples = np.random.default_rng(seed).uniform(begin, end, (samples, model.joints))
+        self._positions = model.predict(self._samples)
+        self._features: FloatArray | None = None
+        self._middle = frozen(0.5 * (begin + end))
+
+    @property
+    def middle(self) -> FloatArray:
+        """The middle of each joint's range (d,): a posture that keeps away from the limits."""
+        return self._middle
+
+    @cached_property
+    def lever(self) -> float:
+        """Length [m] at which a radian counts as much as a metre: RMS distance of what is in reach to its middle."""
+        return max(float(np.sqrt(np.square(self._positions - self._positions.mean(axis=0)).sum(axis=1).mean())), 1e-6)
+
+    def solve(
+        self,
+        x: ArrayLike,
+        rotation: ArrayLike | None = None,
+        *,
+        start: ArrayLike | None = None,
+        posture: ArrayLike | None = None,
+    ) -> InverseSolution:
+        """Joint values that put the marker at x (3,) [m].
+
+        Args:
+            rotation: its orientation too: a rotation matrix (3, 3) or a unit quaternion x, y, z, w (4,).
+            start: where the arm is (d,); tried first, so that the answer is near to it where that leads to the target.
+            posture: a configuration (d,) to be near to, each joint measured in its half range, as far as the target
+                leaves a choice; `middle` keeps away from the limits. Locally the nearest to the solution found first.
+
+        Raises:
+            ShapeError, NonFiniteError, RotationError
+            SettingError: a rotation is asked for of a model without orientation.
+        """
+        goal = self._goal(vector("x", x, 3), rotation)
+        first = None if start is None else vector("start", start, self._model.joints)
+        wanted = None if posture is None else vector("posture", posture, self._model.joints)
+        best, steps, tried = self._search(goal, first)
+        if wanted is not None and goal.reached(best.error):
+            before, best = best, settle(goal, best, wanted, self._joints, self._max_steps)
+            steps += best.steps - before.steps
+        return self._solution(goal, best, steps, tried)
+
+    def _goal(self, x: FloatArray, rotation: ArrayLike | None) -> PositionGoal | PoseGoal:
+        if rotation is None:
+            return PositionGoal(self._model, x, self._tolerance)
+        wanted = rotation_matrices("rotation", rotation)
+        if wanted.shape != (3, 3):
+            raise ShapeError("rotation", "(3, 3), or (4,) for a quaternion", wanted.shape)
+        if not isinstance(self._model, PoseModel):
+            raise SettingError(f"a {type(self._model).__name__} gives no orientation; ask for the position alone")
+        return PoseGoal(self._model, x, wanted, self.lever, self._tolerance, self._angle_tolerance)
+
+    def _search(self, goal: PositionGoal | PoseGoal, first: FloatArray | None) -> tuple[Descent, int, int]:
+        """The best descent, the steps of all, and how many starts were tried."""
+        starts = self._spread_starts(goal, first)
+        best = descend(goal, next(starts), self._joints, self._max_steps)
+        steps, tried = best.steps, 1
+        for start in starts:
+            if goal.reached(best.error) or steps >= self._max_steps:
+                break
+            found = descend(goal, start, self._joints, self._max_steps - steps)
+            steps, tried = steps + found.steps, tried + 1
+            if float(found.error @ found.error) < float(best.error @ best.error):
+                best = found
+        return best, steps, tried
+
+    def _spread_starts(self, goal: PositionGoal | PoseGoal, first: FloatArray | None) -> Iterator[FloatArray]:
+        """`first`, then samples near the goal: the nearest, then always the one farthest from all before."""
+        if first is not None:
+            yield first
+        near = self._samples[self._nearest(goal)]
+        apart = np.full(len(near), np.inf)
+        chosen = 0
+        for _ in range(min(self._most_starts(goal) - (first is not None), len(near))):
+            yield near[chosen]
+            apart = np.minimum(apart, np.abs((near - near[chosen]) / self._joints.scale).max(axis=1))
+            chosen = int(apart.argmax())
+
+    def _most_starts(self, goal: PositionGoal | PoseGoal) -> int:
+        if self._starts is not None:
+            return self._starts
+        return POSE_STARTS if isinstance(goal, PoseGoal) else STARTS
+
+    def _nearest(self, goal: PositionGoal | PoseGoal) -> IntArray:
+        """Indices of the samples nearest to the goal, the nearest first."""
+        count = min(_CANDIDATES * self._most_starts(goal), len(self._samples))
+        # Among some thousand points a search tree would not be faster.
+        if isinstance(goal, PoseGoal):
+            far = self._pose_features(goal.model) - _pose_features(goal.x, goal.rotation, goal.lever)
+        else:
+            far = self._positions - goal.x
+        square = np.einsum("ij,ij->i", far, far)
+        nearest = np.argpartition(square, count - 1)[:count]
+        return nearest[np.argsort(square[nearest], kind="stable")]
+
+    def _pose_features(self, model: PoseModel) -> FloatArray:
+        """Those of the samples; made when the first pose is asked for."""
+        if self._features is None:
+            rotations = model.orientation(self._samples, orthonormal=True)
+            self._features = _pose_features(self._positions, rotations, self.lever)
+        return self._features
+
+    def _solution(self, goal: PositionGoal | PoseGoal, found: Descent, steps: int, tried: int) -> InverseSolution:
+        converged = goal.reached(found.error)
+        everywhere = found.ended and steps < self._max_steps
+        reason: Reason = "reached" if converged else "out_of_reach" if everywhere else "steps_ran_out"
+        angle = float(np.linalg.norm(found.error[3:])) / goal.lever if isinstance(goal, PoseGoal) else None
+        return InverseSolution(
+            q=frozen(found.q),
+            x=frozen(goal.x - found.error[:3]),
+            distance=float(np.linalg.norm(found.error[:3])),
+            angle=angle,
+            converged=converged,
+            reason=reason,
+            steps=steps,
+            starts=tried,
+        )
+
+
+def _pose_features(x: FloatArray, rotations: FloatArray, lever: float) -> FloatArray:
+    """Points (..., 12) whose distances are those of poses: for small angles metres, and radians times lever."""
+    turned = rotations.reshape(*x.shape[:-1], 9) * (lever / np.sqrt(2.0))
+    return np.concatenate([x, turned], axis=-1)
+
+
+def _limits(name: str, values: ArrayLike, joints: int) -> FloatArray:
+    limits = np.array(values, dtype=np.float64)
+    if limits.shape != (joints,):
+        raise ShapeError(name, f"({joints},)", limits.shape)
+    if np.isnan(limits).any():
+        raise NonFiniteError(name)
+    return limits
+
+
+def _one_turn(low: FloatArray, high: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """The limits; where there are none, one turn from the one there is, or about 0."""
+    begin = np.where(np.isfinite(low), low, np.where(np.isfinite(high), high - 2.0 * np.pi, -np.pi))
+    return begin, np.where(np.isfinite(high), high, begin + 2.0 * np.pi)

@@ -1,0 +1,94 @@
+"""The pairs that a learner goes by, as far as its memory reaches."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from kbmaps.arrays import FloatArray
+from kbmaps.chains.carried import Predictor
+from kbmaps.errors import ModelFormatError
+from kbmaps.kernel.kernel_fit import Observations
+from kbmaps.kernel.product_kernel import ProductKernel
+from kbmaps.memory import Memory
+from kbmaps.pairs import checked_pairs, with_units
+
+
+class KeptPairs:
+    """The last pairs, with what a model that stands behind the learner predicts for them.
+
+    Attributes:
+        q, x, sigma, behind: configurations (n, d), positions (n, 3), their 1-sigma (n,), NaN where it was not told, and
+            the model's positions (n, 3).
+        total: how many pairs have come.
+    """
+
+    def __init__(self, joints: int, memory: Memory) -> None:
+        self._memory = memory
+        self.q, self.x = np.empty((0, joints)), np.empty((0, 3))
+        self.sigma, self.behind = np.empty(0), np.empty((0, 3))
+        self.total = 0
+
+    def __len__(self) -> int:
+        return len(self.q)
+
+    def checked(self, q: ArrayLike, x: ArrayLike, sigma: ArrayLike | None) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Pairs as `add` takes them. Raises ShapeError, NonFiniteError, SettingError."""
+        return checked_pairs(q, x, sigma, self.q.shape[1])
+
+    def add(self, q: FloatArray, x: FloatArray, sigma: FloatArray, model: Predictor) -> None:
+        """Takes in checked pairs; the oldest go as the memory says."""
+        behind = model.predict(q)
+        kept = self._memory.kept(len(self.q) + len(q))
+        self.q = _last(self.q, q, kept)
+        self.x = _last(self.x, x, kept)
+        self.sigma = _last(self.sigma, sigma, kept)
+        self.behind = _last(self.behind, behind, kept)
+        self.total += len(q)
+
+    def replace_model(self, model: Predictor) -> None:
+        """Another model behind the same pairs."""
+        self.behind = model.predict(self.q)
+
+    def observations(self, kernel: ProductKernel, features: FloatArray) -> Observations:
+        """The pairs, weighted by their sigma and their age, with features (n, 3, p)."""
+        pairs = with_units(self.q, self.x, self.sigma)
+        shares = self._memory.weights(len(self.q))
+        weights = shares / np.square(pairs.unit)
+        scale = np.sqrt(weights)
+        return Observations(
+            weights=kernel.joint_weights(self.q),
+            scale=scale,
+            errors=(self.x - self.behind) * scale[:, None],
+            features=features * scale[:, None, None],
+            count=float(shares.sum()),
+            log_weights=-2.0 * float(shares @ np.log(pairs.unit)),
+            noise_known=pairs.known,
+        )
+
+    @property
+    def mean_unit(self) -> float:
+        """Root mean square of the pairs' units: with an estimated noise of 1, the noise of a coordinate [m]."""
+        return float(np.sqrt(np.square(with_units(self.q, self.x, self.sigma).unit).mean()))
+
+    def arrays(self) -> dict[str, FloatArray]:
+        """For `kbmaps.packed`."""
+        return {"q": self.q, "x": self.x, "sigma": self.sigma, "behind": self.behind}
+
+    def restore(self, arrays: Mapping[str, FloatArray], total: int) -> None:
+        """The pairs that `arrays` gave.
+
+        Raises:
+            ModelFormatError: they do not fit each other. KeyError, ShapeError, NonFiniteError, SettingError.
+        """
+        sigma, behind = arrays["sigma"], arrays["behind"]
+        q, x, _ = self.checked(arrays["q"], arrays["x"], np.where(np.isnan(sigma), 1.0, sigma))
+        if behind.shape != x.shape or not np.isfinite(behind).all() or total < len(q):
+            raise ModelFormatError("the stored pairs and what was predicted for them do not fit each other")
+        self.q, self.x, self.sigma, self.behind, self.total = q, x, sigma, behind, total
+
+
+def _last(old: FloatArray, new: FloatArray, kept: int) -> FloatArray:
+    return np.concatenate([old, new])[-kept:] if kept else old

@@ -1,0 +1,221 @@
+"""Gaussian inference on KB-Maps with as many unknowns as pairs: no vector of 3^d numbers is formed.
+
+Positions are y = H β + r + e with features H whose coefficients are β ~ N(0, 1), a KB-Map r whose coefficients are
+N(0, τ²) each, so that r has the covariance τ² k(q, q'), and noise e of variance s². With λ = s² / τ² all of it
+follows from one Cholesky factorisation of K + λ I (Rasmussen and Williams, Gaussian Processes for Machine Learning,
+2006, sections 2.2 and 2.7).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from kbmaps.arrays import FloatArray
+from kbmaps.errors import SettingError
+from kbmaps.kernel.product_kernel import ProductKernel
+from kbmaps.maps.evidence import most_evident
+from kbmaps.maps.factor import ShiftedGram
+from kbmaps.maps.noise_evidence import VARIANCE_FLOOR, LinearEvidence
+
+Precision = float | Literal["evidence"] | None
+
+# Limits of the search for λ and where it begins, relative to the mean diagonal of the Gram matrix.
+_SEARCH_LIMITS, _SEARCH_START = (1e-12, 1e6), 1e-4
+# Relative to the trace of the Gram matrix: just enough to keep its Cholesky factorisation alive.
+_VANISHING_RIDGE = 1e-15
+# The refinement of the exact solution ends when a step no longer lessens what is left to this share.
+_REFINEMENTS, _PROGRESS = 200, 0.95
+_BLOCK = 256
+
+
+@dataclass(frozen=True, eq=False)
+class Observations:
+    """Pairs as the inference sees them: rows multiplied by `scale`, so that their noise is equal.
+
+    Attributes:
+        weights: of every joint (n, d, 3).
+        scale: roots (n,) of the pairs' weights.
+        errors: what the prior's mean leaves to explain, scaled (n, 3).
+        features: H, scaled (n, 3, p).
+        count: how many pairs the scaled ones are worth; less than n where some are partly forgotten.
+        log_weights: logarithms of the pairs' inverse variances, summed.
+        noise_known: whether the noise of the scaled errors is 1, or to be estimated.
+    """
+
+    weights: FloatArray
+    scale: FloatArray
+    errors: FloatArray
+    features: FloatArray
+    count: float
+    log_weights: float
+    noise_known: bool
+
+
+class KernelFit:
+    """The posterior after some observations.
+
+    Args:
+        precision: λ; "evidence" takes the most probable one; None explains the pairs exactly by the smallest
+            coefficients (without features, where no pair contradicts another).
+
+    Attributes:
+        precision: λ; 0 for the exact one.
+        noise_variance: s² of the scaled errors [m², or 1 where known].
+        prior_variance: τ² of the map's coefficients [m²].
+        change: posterior mean of β (p,).
+        covariance: of β (p, p).
+        log_evidence: log marginal likelihood at λ; None for the exact one.
+
+    Raises:
+        SettingError: λ is below rounding for these pairs.
+    """
+
+    def __init__(self, kernel: ProductKernel, observations: Observations, precision: Precision) -> None:
+        self._kernel = kernel
+        self._seen = observations
+        self._gram = ShiftedGram(self._scaled_gram())
+        self._flat = observations.features.reshape(len(observations.scale), -1)
+        if precision is None:
+            self._explain_exactly()
+            return
+        if isinstance(precision, str):
+            mean = self._gram.trace / len(observations.scale)
+            low, high = (limit * mean for limit in _SEARCH_LIMITS)
+            # Where pairs are few, evidence may be level towards τ = 0, a prior mean that is right everywhere. A density
+            # of τ that is level there (Gelman 2006) stops at what the pairs speak for, and the claim with it.
+            precision = most_evident(
+                lambda tried: self._log_evidence(tried) - 0.5 * math.log1p(tried / mean),
+                _SEARCH_START * mean,
+                low,
+                high,
+            )
+        self._condition(precision)
+
+    def mean(self, weights: FloatArray, features: FloatArray) -> FloatArray:
+        """What the posterior adds to the prior's mean (m, 3), for joint weights (m, d, 3) and features (m, 3, p)."""
+        added = features @ self.change
+        for start in range(0, len(weights), _BLOCK):
+            part = slice(start, start + _BLOCK)
+            added[part] += self._kernel_rows(weights[part]) @ self._multipliers
+        return added
+
+    def variance(self, weights: FloatArray, features: FloatArray) -> FloatArray:
+        """Posterior variance (m, 3) of each coordinate without noise [m²]."""
+        variance = np.empty((len(weights), 3))
+        for start in range(0, len(weights), _BLOCK):
+            part = slice(start, start + _BLOCK)
+            rows = self._kernel_rows(weights[part])
+            left = self.prior_variance * self._left_open(weights[part], rows)
+            unexplained = features[part] - (rows @ self._solved_features).reshape(features[part].shape)
+            spread = np.einsum("nip,pr,nir->ni", unexplained, self.covariance, unexplained, optimize=True)
+            variance[part] = left[:, None] + np.maximum(spread, 0.0)
+        return variance
+
+    def unexplained(self, weights: FloatArray) -> FloatArray:
+        """Share (m,) in 0..1 of the map's prior variance that the pairs leave open."""
+        shares = [
+            self._left_open(part, self._kernel_rows(part)) / self._kernel.diagonal(part) for part in _parts(weights)
+        ]
+        return np.concatenate(shares)
+
+    def _left_open(self, weights: FloatArray, rows: FloatArray) -> FloatArray:
+        """k(q, q) − kᵀ (K + λ I)⁻¹ k (m,)."""
+        taken = np.einsum("mn,nm->m", rows, self._gram.solve(rows.T))
+        return np.clip(self._kernel.diagonal(weights) - taken, 0.0, None)
+
+    def _kernel_rows(self, weights: FloatArray) -> FloatArray:
+        return self._kernel.between(weights, self._seen.weights) * self._seen.scale
+
+    def _scaled_gram(self) -> FloatArray:
+        """K (n, n) of the scaled rows, its upper triangle, Fortran-ordered."""
+        weights, scale = self._seen.weights, self._seen.scale
+        size = len(scale)
+        gram = np.zeros((size, size), order="F")
+        for start in range(0, size, _BLOCK):
+            end = min(start + _BLOCK, size)
+            block = self._kernel.between(weights[:end], weights[start:end])
+            gram[:end, start:end] = block * scale[:end, None] * scale[start:end]
+        return gram
+
+    def _times_gram(self, multipliers: FloatArray) -> FloatArray:
+        """K @ multipliers, from K's entries anew: the factorisation has taken their place."""
+        products = [self._kernel_rows(part) @ multipliers for part in _parts(self._seen.weights)]
+        return np.concatenate(products) * self._seen.scale[:, None]
+
+    def _evidence_of_noise(self, precision: float) -> tuple[LinearEvidence, FloatArray]:
+        """Of s² at λ, with K + λ I factorised; and the eigenvectors of β's directions (p, p)."""
+        seen = self._seen
+        solved = self._gram.solve(seen.errors)
+        # Whitened by (K / λ + I)^(-1/2), the pairs are H β + e with equal independent noise.
+        inner = precision * np.einsum("nip,nir->pr", seen.features, self._solved(seen.features), optimize=True)
+        eigenvalues, directions = np.linalg.eigh(0.5 * (inner + inner.T))
+        shown = precision * np.einsum("nip,ni->p", seen.features, solved)
+        square = precision * float(np.vdot(seen.errors, solved))
+        evidence = LinearEvidence(3.0 * seen.count, square, np.maximum(eigenvalues, 0.0), directions.T @ shown)
+        return evidence, directions
+
+    def _solved(self, features: FloatArray) -> FloatArray:
+        return self._gram.solve(features.reshape(len(features), -1)).reshape(features.shape)
+
+    def _log_evidence(self, precision: float) -> float:
+        if not self._gram.factorise(precision):
+            return -math.inf
+        evidence, _ = self._evidence_of_noise(precision)
+        return self._complete(evidence, precision, self._noise_variance(evidence))
+
+    def _noise_variance(self, evidence: LinearEvidence) -> float:
+        return 1.0 if self._seen.noise_known else evidence.best_variance()
+
+    def _complete(self, evidence: LinearEvidence, precision: float, noise_variance: float) -> float:
+        """The log evidence with the determinants that whitening and scaling left out."""
+        spread = self._gram.log_determinant - len(self._seen.scale) * math.log(precision)
+        return float(evidence.at(np.array([noise_variance]))[0]) + 1.5 * (self._seen.log_weights - spread)
+
+    def _condition(self, precision: float) -> None:
+        """The posterior at λ."""
+        if not self._gram.factorise(precision):
+            raise SettingError(f"precision = {precision:.3g} is below rounding here; use None or a larger one")
+        evidence, directions = self._evidence_of_noise(precision)
+        variance = self._noise_variance(evidence)
+        self.precision, self.noise_variance = precision, variance
+        self.prior_variance = variance / precision
+        self.log_evidence: float | None = self._complete(evidence, precision, variance)
+        self.change: FloatArray = directions @ (evidence.components / (variance + evidence.eigenvalues))
+        self.covariance: FloatArray = (directions * (variance / (variance + evidence.eigenvalues))) @ directions.T
+        self._solved_features = self._gram.solve(self._flat)
+        errors = self._seen.errors - self._seen.features @ self.change
+        multipliers = self._gram.solve(errors)
+        # One step of refinement mends the rounding of the factorisation.
+        remaining = errors - self._times_gram(multipliers) - precision * multipliers
+        self._multipliers = multipliers + self._gram.solve(remaining)
+
+    def _explain_exactly(self) -> None:
+        """The smallest coefficients that explain the errors: iterated Tikhonov, as `ExactLearner` without λ."""
+        errors = self._seen.errors
+        ridge = _VANISHING_RIDGE * self._gram.trace
+        while not self._gram.factorise(ridge):
+            ridge *= 10.0
+        self._multipliers = self._gram.solve(errors)
+        left = math.inf
+        for _ in range(_REFINEMENTS):
+            remaining = errors - self._times_gram(self._multipliers)
+            size = float(np.linalg.norm(remaining))
+            if not size < _PROGRESS * left:
+                break
+            left = size
+            self._multipliers = self._multipliers + self._gram.solve(remaining)
+        self.precision, self.noise_variance, self.log_evidence = 0.0, 0.0, None
+        # At λ = 0 the evidence is greatest at this variance of the coefficients.
+        square = float(np.vdot(errors, self._multipliers)) / (3.0 * self._seen.count)
+        self.prior_variance = max(square, VARIANCE_FLOOR)
+        self.change, self.covariance = np.zeros(0), np.zeros((0, 0))
+        self._solved_features = self._flat
+
+
+def _parts(weights: FloatArray) -> list[FloatArray]:
+    """Blocks of rows; one empty block for none."""
+    return [weights[start : start + _BLOCK] for start in range(0, max(len(weights), 1), _BLOCK)]

@@ -1,0 +1,240 @@
+"""KB-Maps of any number of joints, learnt through their kernel. Ulbrich et al. 2009, eqs. (16)-(18), in dual form."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from kbmaps.arrays import FloatArray, rows, rows_or_vector
+from kbmaps.chains.carried import Origin, Predictor, as_model, packable, unpacked
+from kbmaps.chains.chain import RigidChain
+from kbmaps.errors import DegenerateDataError, KBMapsError, ModelFormatError, SettingError
+from kbmaps.kernel.grid import sampled_map
+from kbmaps.kernel.kept_pairs import KeptPairs
+from kbmaps.kernel.kernel_fit import KernelFit, Precision
+from kbmaps.kernel.product_kernel import ProductKernel
+from kbmaps.kernel.slopes import slopes
+from kbmaps.maps.basis import JointBasis
+from kbmaps.maps.kbmap import KBMap
+from kbmaps.maps.packed import describe_bases, parse_bases
+from kbmaps.maps.support import SUPPORT_LIMIT
+from kbmaps.memory import Memory
+from kbmaps.model import Estimate
+from kbmaps.packed import pack, unpack
+
+_KIND = "kernel learner, 1"
+
+
+class KernelLearner:
+    """Learns a KB-Map around a prior from n pairs with n² numbers instead of 3^d control points. A `Model`.
+
+    The same solution as `ExactLearner` where both can be computed; this one for fewer pairs than control points, and
+    for more joints than a net has room for. It is fitted when first asked after `learn`, at n³ / 3 multiplications for
+    each λ that is tried (0.3 s at 1,000 pairs), and depends on the pairs that the memory keeps only.
+
+    Args:
+        bases: what "nearest to the prior" means; scaled orthonormal ones (`learning_bases`) are advised.
+        prior: what is predicted far from all pairs: a `RigidChain`, a `KBMap`, or anything with `predict`, which must
+            not change meanwhile (`rebase`); None for the origin of the measurement frame.
+        precision: λ = (noise / standard deviation of the control points)² as in `ExactLearner.solve`; "evidence" takes
+            the most evident one; None explains noise-free pairs exactly, up to as many as there are control points.
+        memory: which of the old pairs count.
+
+    Raises:
+        SettingError: a precision that is neither None, "evidence", nor a number above 0.
+    """
+
+    def __init__(
+        self,
+        bases: Sequence[JointBasis],
+        prior: RigidChain | Predictor | None = None,
+        *,
+        precision: Precision = "evidence",
+        memory: Memory | None = None,
+    ) -> None:
+        if isinstance(precision, float | int):
+            if not (precision > 0.0 and math.isfinite(precision)):
+                raise SettingError(f"precision must be finite and greater than 0, got {precision!r}")
+        elif precision not in (None, "evidence"):
+            raise SettingError(f'precision must be None, "evidence" or a number, got {precision!r}')
+        self._kernel = ProductKernel(bases)
+        self._precision: Precision = precision
+        self._memory = Memory() if memory is None else memory
+        self._prior: Predictor = Origin(self.joints) if prior is None else as_model(prior)
+        self._pairs = KeptPairs(self.joints, self._memory)
+        self._fit: KernelFit | None = None
+
+    @property
+    def joints(self) -> int:
+        """Number of joints d."""
+        return self._kernel.joints
+
+    @property
+    def bases(self) -> tuple[JointBasis, ...]:
+        return self._kernel.bases
+
+    @property
+    def pairs(self) -> int:
+        """How many pairs have been learnt, those that no longer count included."""
+        return self._pairs.total
+
+    @property
+    def kept(self) -> int:
+        """How many pairs count."""
+        return len(self._pairs)
+
+    @property
+    def prior_precision(self) -> float:
+        """λ of the present fit; 0 for the exact one.
+
+        Raises:
+            DegenerateDataError: no pair has been learnt.
+        """
+        return self._fitted().precision
+
+    @property
+    def prior_std(self) -> float:
+        """Standard deviation of the control points around the prior [m]. Raises DegenerateDataError."""
+        return math.sqrt(self._fitted().prior_variance)
+
+    @property
+    def noise(self) -> float:
+        """1-sigma of a measured coordinate [m]: as estimated, or as told with the pairs. Raises DegenerateDataError."""
+        return math.sqrt(self._fitted().noise_variance) * self._pairs.mean_unit
+
+    @property
+    def log_evidence(self) -> float | None:
+        """Log marginal likelihood at λ; None for the exact solution. Raises DegenerateDataError."""
+        return self._fitted().log_evidence
+
+    def learn(self, q: ArrayLike, x: ArrayLike, sigma: ArrayLike | None = None) -> None:
+        """Pairs q (n, d) [rad, m] and x (n, 3) [m], or one, (d,) and (3,).
+
+        Args:
+            sigma: 1-sigma of the positions [m], () or (n,); None where it is to be estimated.
+
+        Raises:
+            ShapeError, NonFiniteError, SettingError (a sigma that is not positive)
+            DegenerateDataError: more pairs than control points, and no precision to weigh them. Nothing has changed.
+        """
+        angles, positions, sigmas = self._pairs.checked(q, x, sigma)
+        kept = self._memory.kept(self.kept + len(angles))
+        points = math.prod(basis.size for basis in self.bases)
+        if self._precision is None and kept > points:
+            raise DegenerateDataError(
+                f"{kept} pairs cannot all be explained by {points} control points; give a precision, a window of at "
+                f"most {points} pairs, or use ExactLearner"
+            )
+        self._pairs.add(angles, positions, sigmas, self._prior)
+        self._fit = None
+
+    def rebase(self, prior: RigidChain | Predictor) -> None:
+        """Another prior for the same pairs, or the same one after it has changed."""
+        model: Predictor = as_model(prior)
+        self._pairs.replace_model(model)
+        self._prior, self._fit = model, None
+
+    def predict(self, q: ArrayLike) -> FloatArray:
+        """Positions (n, 3) [m] at q (n, d), or (3,) at q (d,).
+
+        Raises:
+            ShapeError, NonFiniteError
+        """
+        angles = rows_or_vector("q", q, self.joints)
+        x = self._prior.predict(angles)
+        if not self.kept:
+            return x
+        weights = self._kernel.joint_weights(np.atleast_2d(angles))
+        return x + self._fitted().mean(weights, _no_features(len(weights))).reshape(x.shape)
+
+    def jacobian(self, q: ArrayLike) -> FloatArray:
+        """Derivative (3, d) of the position [m/rad, or m/m], or (n, 3, d) at q (n, d).
+
+        Exact where the prior is a KB-Map, also one in another form, as a chain is.
+
+        Raises:
+            ShapeError, NonFiniteError
+        """
+        return slopes(self, q, self._kernel.bases)
+
+    def estimate(self, q: ArrayLike) -> Estimate:
+        """Positions at q (n, d), their 1-sigma per axis against the truth, and whether data was there.
+
+        A configuration is in support while the pairs leave at most `SUPPORT_LIMIT` of its prior variance open. Before
+        the first pair sigma is infinite: how good the prior is, only pairs can tell.
+
+        Raises:
+            ShapeError, NonFiniteError
+        """
+        angles = rows("q", q, self.joints)
+        if not self.kept:
+            return Estimate(
+                self._prior.predict(angles), np.full((len(angles), 3), np.inf), np.zeros(len(angles), dtype=np.bool_)
+            )
+        weights = self._kernel.joint_weights(angles)
+        fit, features = self._fitted(), _no_features(len(angles))
+        sigma = np.sqrt(fit.variance(weights, features))
+        return Estimate(self.predict(angles), sigma, fit.unexplained(weights) <= SUPPORT_LIMIT)
+
+    def to_kbmap(self) -> KBMap:
+        """The learnt map with its 3^d control points, exact where the prior is a KB-Map or a rigid chain."""
+        return sampled_map(self, self.bases)
+
+    def to_bytes(self) -> bytes:
+        """The learner with the pairs that count; `from_bytes` gives the same predictions to the last bit.
+
+        A prior that is neither a `KBMap` nor a `RigidChain` stays behind.
+        """
+        behind, arrays = packable(self._prior)
+        fields: dict[str, Any] = {
+            "bases": describe_bases(self.bases),
+            "precision": self._precision,
+            "memory": asdict(self._memory),
+            "pairs": self.pairs,
+            "prior": behind,
+        }
+        return pack(_KIND, fields, self._pairs.arrays() | arrays)
+
+    @classmethod
+    def from_bytes(cls, data: bytes, prior: Predictor | None = None) -> Self:
+        """The learner in `data`.
+
+        Args:
+            prior: the one it had, where that does not travel.
+
+        Raises:
+            ModelFormatError: it is none of this kind, or damaged, or its prior is missing or predicts otherwise.
+        """
+        fields, arrays = unpack(data, _KIND)
+        try:
+            learner = cls(
+                parse_bases(fields["bases"]),
+                unpacked(fields["prior"], arrays, prior),
+                precision=fields["precision"],
+                memory=Memory(**fields["memory"]),
+            )
+            learner._pairs.restore(arrays, int(fields["pairs"]))
+        except ModelFormatError:
+            raise
+        except (KeyError, TypeError, ValueError, KBMapsError) as error:
+            raise ModelFormatError(f"the bytes do not describe a kernel learner: {error}") from error
+        if learner.kept and not np.allclose(learner._prior.predict(learner._pairs.q), learner._pairs.behind):
+            raise ModelFormatError("the prior predicts otherwise than the one that the stored learner had")
+        return learner
+
+    def _fitted(self) -> KernelFit:
+        if not self.kept:
+            raise DegenerateDataError("there is nothing to tell before the first pair was learnt")
+        if self._fit is None:
+            observations = self._pairs.observations(self._kernel, _no_features(self.kept))
+            self._fit = KernelFit(self._kernel, observations, self._precision)
+        return self._fit
+
+
+def _no_features(count: int) -> FloatArray:
+    return np.zeros((count, 3, 0))

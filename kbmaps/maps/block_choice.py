@@ -1,0 +1,106 @@
+"""How far to trust the prior, asked of the data in blocks.
+
+Neighbouring pairs of a guided arm share their errors (time stamps, shading of the marker, play), so that the evidence,
+which takes noise for independent, mistakes shared errors for shape. A block of pairs that was left out as a whole
+shares none of its errors with the others.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import cast
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from kbmaps.arrays import FloatArray, rows
+from kbmaps.errors import ShapeError
+from kbmaps.maps.kbmap import POSITION_OUTPUTS, KBMap
+from kbmaps.maps.stack import BasisStack
+
+MOST_BLOCKS = 20
+FEWEST_BLOCKS = 4
+# Along a guided path, pairs this far apart share little of their errors any more.
+BLOCK_PAIRS = 30
+# The precisions tried, relative to the kernel's mean diagonal: from next to nothing to hardly any learning.
+PRECISIONS = 10.0 ** np.arange(-13.0, 3.25, 0.5)
+# What is taken while there are too few pairs to ask.
+FIRST_PRECISION = 1e-3
+# Neighbours of a path are nearly the same configuration: so much of their prior variance is shared.
+PATH_CORRELATION = 0.9
+# Relative to the largest eigenvalue of the kernel: what lies below is rounding.
+_SMALLEST_EIGENVALUE = 1e-15
+
+
+def follow_a_path(prior: KBMap, q: ArrayLike) -> bool:
+    """Whether the configurations q (n, d) [rad, m], in their order, are neighbours on a path rather than apart.
+
+    Raises:
+        ShapeError, NonFiniteError.
+    """
+    left, right = BasisStack(prior.bases).halves(rows("q", q, len(prior.bases)))
+    square = (left * left).sum(axis=1) * (right * right).sum(axis=1)
+    inner = (left[:-1] * left[1:]).sum(axis=1) * (right[:-1] * right[1:]).sum(axis=1)
+    return bool(len(inner)) and bool(np.median(inner / np.sqrt(square[:-1] * square[1:])) > PATH_CORRELATION)
+
+
+def blockwise_precision(prior: KBMap, q: ArrayLike, x: ArrayLike) -> float:
+    """The precision λ of the prior for `ExactLearner.solve` that left-out blocks of pairs speak for.
+
+    The pairs are cut into runs of neighbours, and those of each run, at most `BLOCK_PAIRS`, are predicted from all
+    other runs. Of the precisions that do this equally well, to one standard error, the largest is taken: the data do
+    not ask for a more flexible map (Breiman et al., Classification and Regression Trees, 1984, section 3.4.3).
+
+    Args:
+        prior: in the bases that the learner works in.
+        q, x: pairs in the order in which they came, (n, d) [rad, m] and (n, 3) [m].
+
+    Returns:
+        λ as in `ExactLearner.solve`; with too few pairs for `FEWEST_BLOCKS`, one that trusts the prior.
+
+    Raises:
+        ShapeError, NonFiniteError.
+    """
+    angles, positions = rows("q", q, len(prior.bases)), rows("x", x, POSITION_OUTPUTS)
+    if len(angles) != len(positions):
+        raise ShapeError("x", f"({len(angles)}, 3) to go with q", positions.shape)
+    count = min(len(angles) // BLOCK_PAIRS, MOST_BLOCKS)
+    if count < FEWEST_BLOCKS:
+        return FIRST_PRECISION * float(np.diag(_kernel(prior, angles)).mean()) if len(angles) else FIRST_PRECISION
+    runs = [run[:BLOCK_PAIRS] for run in np.array_split(np.arange(len(angles)), count)]
+    chosen = np.concatenate(runs)
+    kernel = _kernel(prior, angles[chosen])
+    errors = positions[chosen] - prior.predict(angles[chosen])
+    precisions = PRECISIONS * float(np.diag(kernel).mean())
+    left_out = _left_out_errors(kernel, errors, count, precisions)
+    means = left_out.mean(axis=1)
+    best = int(means.argmin())
+    spread = float(left_out[best].std(ddof=1)) / math.sqrt(count)
+    return float(precisions[np.flatnonzero(means <= means[best] + spread)[-1]])
+
+
+def _kernel(prior: KBMap, q: FloatArray) -> FloatArray:
+    """Inner products of the weight vectors: a product over the joints (n, n)."""
+    left, right = BasisStack(prior.bases).halves(q)
+    return (left @ left.T) * (right @ right.T)
+
+
+def _left_out_errors(kernel: FloatArray, errors: FloatArray, blocks: int, precisions: FloatArray) -> FloatArray:
+    """Mean distance between left-out positions and their predictions from all other blocks [m]: (λ, block).
+
+    With C = K + λI, the errors of block B predicted from the others are ([C⁻¹]_BB)⁻¹ (C⁻¹ e)_B: Rasmussen and Williams,
+    Gaussian Processes for Machine Learning, 2006, eq. (5.12), for blocks. One eigendecomposition of K serves all λ.
+    """
+    variances, directions = np.linalg.eigh(kernel)
+    parts = directions.reshape(blocks, -1, len(kernel))
+    components = directions.T @ errors
+    means = np.full((len(precisions), blocks), math.inf)
+    for row, precision in enumerate(precisions):
+        if variances[0] + precision <= _SMALLEST_EIGENVALUE * variances[-1]:
+            continue
+        inverses = 1.0 / (variances + precision)
+        multipliers = parts @ (inverses[:, None] * components)
+        corners = (parts * inverses) @ parts.transpose(0, 2, 1)
+        left_out = cast(FloatArray, np.linalg.solve(corners, multipliers))
+        means[row] = np.linalg.norm(left_out, axis=2).mean(axis=1)
+    return means

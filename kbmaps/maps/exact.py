@@ -1,0 +1,297 @@
+"""Exact least squares: the best control points for all pairs so far. Ulbrich et al. 2009, eqs. (16)-(18)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from kbmaps.arrays import FloatArray, rows_or_vector
+from kbmaps.errors import BasisError, NonFiniteError, SettingError, ShapeError
+from kbmaps.maps.basis import JointBasis
+from kbmaps.maps.design import Design
+from kbmaps.maps.evidence import most_evident
+from kbmaps.maps.factor import ShiftedGram
+from kbmaps.maps.kbmap import POSE_OUTPUTS, POSITION_OUTPUTS, KBMap
+from kbmaps.maps.least_squares import nearest_solution
+from kbmaps.maps.targets import pose_targets
+from kbmaps.memory import Memory
+
+# Evidence: limits of the search for lambda, relative to the mean diagonal of the Gram matrix.
+_SEARCH_LIMITS = (1e-12, 1e6)
+_FIRST_PRECISION = 1e-2
+# Variances below (1 pm)² are rounding.
+_VARIANCE_FLOOR = 1e-24
+
+
+@dataclass(frozen=True)
+class ExactSolution:
+    """A fitted map and what the fit says about it.
+
+    Attributes:
+        map: in the bases of the prior that the learner was given.
+        noise_std: estimated noise of one coordinate at weight 1 [m]; None where the data do not tell.
+        orientation_noise_std: the same of one entry of the rotation matrices; None also where none were learnt.
+        prior_precision: λ = (noise_std / spread of the prior's coefficients)²; 0 for the unregularised solution.
+        log_evidence: log marginal likelihood of all that was learnt at λ; None for the unregularised solution.
+        residual_rms: weighted RMS distance between the map's positions and those it was fitted to [m].
+    """
+
+    map: KBMap
+    noise_std: float | None
+    prior_precision: float
+    log_evidence: float | None
+    residual_rms: float
+    orientation_noise_std: float | None = None
+
+    @property
+    def prior_std(self) -> float | None:
+        """Standard deviation of the coefficients around the prior [m]; None for the unregularised solution.
+
+        Times `SupportSet.spread` (in the learner's bases) it is the 1-sigma of a predicted coordinate.
+        """
+        if self.noise_std is None or self.prior_precision == 0.0:
+            return None
+        return self.noise_std / math.sqrt(self.prior_precision)
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """One λ: the change of the coefficients (m, outputs) before refinement, noise variances of positions and of
+    orientations, and evidence. The multipliers (n, outputs) are what it comes from with fewer pairs than unknowns."""
+
+    change: FloatArray
+    multipliers: FloatArray | None
+    variances: list[float]
+    log_evidence: float
+
+
+class ExactLearner:
+    """Collects pairs, and solves for the map when asked.
+
+    The pairs are kept as they came, and with more of them than control points the sums for their Gram matrix; the prior
+    is no part of either, so it may change (`rebase`). At d = 7 a pair takes 88 bytes, 6 µs to learn and 5 µs of each
+    solve, of which the rest is one Cholesky factorisation of at most (3^d)², within 8 · 9^d bytes (38 MB).
+    Where the data are too one-sided for it, the solution comes from a QR factorisation of all pairs: exact, and slow.
+
+    Args:
+        prior: where the solution stays in the directions that the data do not show. With an orientation, that is learnt
+            too: its nine planes have a noise of their own and share λ with the position's.
+        bases: what the solution is computed in; it decides what "nearest to the prior" means. None takes the prior's.
+            Scaled orthonormal bases over the joints' ranges (`learning_bases`) are advised.
+        memory: what becomes of old pairs; all count by default.
+
+    Raises:
+        BasisError: bases do not fit the prior.
+
+    Example:
+        >>> import numpy as np
+        >>> from kbmaps import ExactLearner, RigidChain, learning_bases
+        >>> fixed = np.tile(np.eye(4), (3, 1, 1))
+        >>> fixed[1:, 0, 3] = 0.3, 0.2  # links [m]
+        >>> arm = RigidChain(fixed, axes=[[0, 0, 1], [0, 1, 0]], prismatic=[False, False])
+        >>> drawing = arm.with_tool([0.0, 0.0, 0.1])  # wrong about the marker
+        >>> learner = ExactLearner(drawing.to_kbmap(learning_bases([-1, -1], [1, 1])))
+        >>> q = np.random.default_rng(0).uniform(-1, 1, (9, 2))
+        >>> learner.learn(q, arm.positions(q))
+        >>> learner.solve().map.predict([0.0, -np.pi / 2]).round(9) + 0.0
+        array([0.3, 0. , 0.2])
+    """
+
+    def __init__(
+        self, prior: KBMap, bases: Sequence[JointBasis] | None = None, *, memory: Memory | None = None
+    ) -> None:
+        self._memory = Memory() if memory is None else memory
+        self._bases = prior.bases if bases is None else tuple(bases)
+        self._outputs = len(prior.net)
+        self._design = Design(self._bases, self._outputs)
+        self._pairs = 0
+        # The weights that the kept pairs came with; what is forgotten of them is in the design.
+        self._told = np.empty(0)
+        self._last_precision = _FIRST_PRECISION
+        self.rebase(prior)
+
+    @property
+    def pairs(self) -> int:
+        """How many pairs have been learnt, forgotten ones included."""
+        return self._pairs
+
+    @property
+    def prior(self) -> KBMap:
+        return self._prior
+
+    def rebase(self, prior: KBMap) -> None:
+        """Another prior for the same data.
+
+        Raises:
+            ShapeError: the prior has an orientation and the one before had none, or the other way round.
+            BasisError: it has other joints.
+        """
+        if len(prior.net) != self._outputs:
+            raise ShapeError("prior.net", f"({self._outputs}, ...) as before", prior.net.shape)
+        if len(prior.bases) != len(self._bases):
+            raise BasisError(f"the prior has {len(prior.bases)} joints, the learner {len(self._bases)}")
+        self._prior_coefficients = prior.in_basis(self._bases).net.reshape(self._outputs, -1).T
+        self._prior = prior
+
+    def learn(
+        self, q: ArrayLike, x: ArrayLike, weight: ArrayLike | None = None, rotation: ArrayLike | None = None
+    ) -> None:
+        """One pair, q (d,) [rad] and x (3,) [m], or many, (n, d) and (n, 3).
+
+        Args:
+            weight: relative inverse variance of each pair, () or (n,), greater than 0; None means 1.
+            rotation: the orientations, rotation matrices (n, 3, 3) or quaternions x, y, z, w (n, 4), for one pair also
+                (3, 3) or (4,); where the prior has an orientation, and only there.
+
+        Raises:
+            ShapeError, NonFiniteError, RotationError
+            SettingError: a weight that is not positive, rotations too many or too few. Nothing has changed.
+        """
+        angles = np.atleast_2d(rows_or_vector("q", q, len(self._bases)))
+        positions = np.atleast_2d(rows_or_vector("x", x, POSITION_OUTPUTS))
+        if len(angles) != len(positions):
+            raise ShapeError("x", f"({len(angles)}, 3) to go with q", positions.shape)
+        targets = pose_targets(positions, rotation, self._outputs)
+        weights = _checked_weights(weight, len(angles))
+        shares = self._memory.weights(len(angles) + 1)
+        self._design.fade(float(shares[0]))
+        self._design.add(angles, targets, weights * shares[1:])
+        kept = self._memory.kept(len(self._design))
+        self._design.keep(kept)
+        self._told = np.concatenate([self._told, weights])[-kept:]
+        self._pairs += len(angles)
+
+    def solve(self, prior_precision: float | Literal["evidence"] | None = None) -> ExactSolution:
+        """The map for all pairs so far.
+
+        Args:
+            prior_precision: None: least squares without regularisation; where the pairs do not determine it, the
+                solution nearest to the prior in the learner's bases. λ > 0: minimises
+                Σ weight ‖f(q) − x‖² + λ ‖g − g0‖² over the coefficients g, the posterior mean for a Gaussian prior of
+                variance noise² / λ around g0. "evidence": λ of the greatest marginal likelihood.
+
+        Raises:
+            SettingError: prior_precision is neither None, "evidence", nor a number above 0.
+        """
+        if isinstance(prior_precision, str):
+            if prior_precision != "evidence":
+                raise SettingError(f'prior_precision must be None, "evidence" or a number, got {prior_precision!r}')
+        elif prior_precision is not None and not (prior_precision > 0.0 and math.isfinite(prior_precision)):
+            raise SettingError(f"prior_precision must be finite and greater than 0, got {prior_precision!r}")
+        if self.pairs == 0:
+            return ExactSolution(self._prior, None, 0.0, None, 0.0)
+        errors = self._design.errors(self._prior_coefficients)
+        if prior_precision is None:
+            return self._solve_unregularised(errors)
+        gram = ShiftedGram(self._design.gram())
+        if isinstance(prior_precision, str):
+            prior_precision = self._most_evident(gram, errors)
+            self._last_precision = prior_precision
+        return self._solve_ridge(gram, errors, prior_precision)
+
+    def _solve_unregularised(self, errors: FloatArray) -> ExactSolution:
+        change = nearest_solution(self._design, errors)
+        freedom = self._count - self._design.unknowns
+        squares = self._residual_squares(errors, change)
+        noises = [math.sqrt(float(squares[part].mean()) / freedom) if freedom > 0 else None for part in self._parts]
+        return self._solution(change, noises, 0.0, None, squares)
+
+    def _solve_ridge(self, gram: ShiftedGram, errors: FloatArray, precision: float) -> ExactSolution:
+        fit = self._fit(gram, errors, precision)
+        # One step of refinement through the pairs themselves mends the rounding of the Gram matrix.
+        remaining = errors - self._design.times(fit.change)
+        if fit.multipliers is None:
+            rest = self._design.transposed_times(remaining) - precision * fit.change
+            change = fit.change + gram.solve(rest)
+        else:
+            correction = gram.solve(remaining - precision * fit.multipliers)
+            change = self._design.transposed_times(fit.multipliers + correction)
+        squares = self._residual_squares(errors, change)
+        noises = [math.sqrt(variance) for variance in fit.variances]
+        return self._solution(change, noises, precision, fit.log_evidence, squares)
+
+    def _fit(self, gram: ShiftedGram, errors: FloatArray, precision: float) -> _Fit:
+        """Evidence of λ. The errors of one coordinate are N(0, s² (A Aᵀ / λ + I)).
+
+        With fewer pairs than unknowns through A Aᵀ, else through AᵀA, of the same determinant but for powers of λ.
+        """
+        if not gram.factorise(precision):
+            raise SettingError(f"prior_precision = {precision:.3g} is below rounding here; use None or a larger one")
+        if self._design.overdetermined:
+            multipliers, change = None, gram.solve(self._design.transposed_times(errors))
+            squares = self._residual_squares(errors, change) + precision * np.square(change).sum(axis=0)
+        else:
+            multipliers = gram.solve(errors)
+            change = self._design.transposed_times(multipliers)
+            squares = precision * np.einsum("ko,ko->o", errors, multipliers)
+        spread = gram.log_determinant - gram.size * math.log(precision)
+        variances = [max(float(squares[part].mean()) / self._count, _VARIANCE_FLOOR) for part in self._parts]
+        log_evidence = 0.0
+        for part, variance in zip(self._parts, variances, strict=True):
+            outputs = part.stop - part.start
+            log_evidence -= 0.5 * outputs * self._count * (math.log(2.0 * math.pi * variance) + 1.0)
+            log_evidence += 0.5 * outputs * (self._log_weights - spread)
+        return _Fit(change, multipliers, variances, log_evidence)
+
+    @property
+    def _count(self) -> float:
+        """How many pairs there are, each for as much as is not forgotten of it."""
+        return float(self._memory.weights(len(self._told)).sum())
+
+    @property
+    def _log_weights(self) -> float:
+        return float(self._memory.weights(len(self._told)) @ np.log(self._told))
+
+    @property
+    def _parts(self) -> list[slice]:
+        """The outputs that share a noise: the positions, and the orientations where there are any."""
+        positions = slice(0, POSITION_OUTPUTS)
+        return [positions] if self._outputs == POSITION_OUTPUTS else [positions, slice(POSITION_OUTPUTS, POSE_OUTPUTS)]
+
+    def _most_evident(self, gram: ShiftedGram, errors: FloatArray) -> float:
+        """λ of the greatest evidence: climbs from the last one in steps, then takes the vertex of a parabola."""
+        mean = gram.trace / gram.size
+        low, high = (limit * mean for limit in _SEARCH_LIMITS)
+        return most_evident(
+            lambda precision: self._fit(gram, errors, precision).log_evidence, self._last_precision, low, high
+        )
+
+    def _residual_squares(self, errors: FloatArray, change: FloatArray) -> FloatArray:
+        return np.square(errors - self._design.times(change)).sum(axis=0)
+
+    def _solution(
+        self,
+        change: FloatArray,
+        noises: Sequence[float | None],
+        precision: float,
+        log_evidence: float | None,
+        squares: FloatArray,
+    ) -> ExactSolution:
+        shape = (self._outputs, *(basis.size for basis in self._bases))
+        learnt = KBMap(self._bases, (self._prior_coefficients + change).T.reshape(shape), self._prior.metadata)
+        return ExactSolution(
+            map=learnt.in_basis(self._prior.bases),
+            noise_std=noises[0],
+            prior_precision=precision,
+            log_evidence=log_evidence,
+            residual_rms=math.sqrt(float(squares[:POSITION_OUTPUTS].sum()) / self._count),
+            orientation_noise_std=noises[1] if len(noises) > 1 else None,
+        )
+
+
+def _checked_weights(weight: ArrayLike | None, pairs: int) -> FloatArray:
+    if weight is None:
+        return np.ones(pairs)
+    weights = np.asarray(weight, dtype=np.float64)
+    if weights.shape not in ((), (pairs,)):
+        raise ShapeError("weight", f"() or ({pairs},)", weights.shape)
+    if not np.isfinite(weights).all():
+        raise NonFiniteError("weight")
+    if weights.size and weights.min() <= 0.0:
+        raise SettingError("every weight must be greater than 0; leave a pair out instead of weighting it 0")
+    return np.broadcast_to(weights, (pairs,))

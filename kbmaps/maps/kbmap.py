@@ -1,0 +1,284 @@
+"""The Kinematic Bézier Map: forward kinematics that is linear in its control points."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from types import MappingProxyType
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from kbmaps.arrays import FloatArray, frozen, rows, rows_or_vector, vector
+from kbmaps.errors import BasisError, NonFiniteError, ShapeError
+from kbmaps.maps import serial
+from kbmaps.maps.basis import JointBasis
+from kbmaps.maps.kernels import NetKernel, net_kernel
+from kbmaps.maps.stack import BasisStack
+from kbmaps.rotations import nearest_rotation, nearest_rotation_rates
+
+POSITION_OUTPUTS = 3
+POSE_OUTPUTS = 12
+
+
+@dataclass(frozen=True, eq=False)
+class KBMap:
+    """Position (and orientation, when learnt) of the marker in the measurement frame, of d joints.
+
+    f(q) = Σ_i w_i(q) b_i with w = w_1(q_1) ⊗ … ⊗ w_d(q_d). Ulbrich et al. 2009, eqs. (10) and (15).
+
+    Attributes:
+        bases: one basis a joint, in the order of q.
+        net: the coefficients as planes (outputs, m1, ..., md), m = 3 for a revolute joint and 2 for a prismatic one;
+            control points [m] where the bases are Bernstein. Read-only. Outputs 0..2 are the position x, y, z [m];
+            a map of 12 outputs continues with the columns e1, e2, e3 of the marker's rotation matrix.
+        metadata: short texts that travel with the map; no part of `digest`.
+
+    Raises:
+        ShapeError, NonFiniteError, BasisError
+
+    Example:
+        >>> import numpy as np
+        >>> from kbmaps import JointBasis, RigidChain
+        >>> fixed = np.tile(np.eye(4), (3, 1, 1))
+        >>> fixed[1:, 0, 3] = 0.3, 0.2  # links [m]
+        >>> arm = RigidChain(fixed, axes=[[0, 0, 1], [0, 1, 0]], prismatic=[False, False])
+        >>> kbmap = arm.to_kbmap([JointBasis.trigonometric()] * 2)
+        >>> kbmap.net.shape, kbmap.predict([0.0, -np.pi / 2]).round(9)
+        ((3, 3, 3), array([0.3, 0. , 0.2]))
+    """
+
+    bases: tuple[JointBasis, ...]
+    net: FloatArray
+    metadata: Mapping[str, str] = field(default_factory=dict[str, str])
+    _stack: BasisStack = field(init=False, repr=False)
+    _kernel: NetKernel = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        bases = tuple(self.bases)
+        if not bases:
+            raise BasisError("a map needs at least one joint")
+        net = frozen(self.net)
+        sizes = tuple(basis.size for basis in bases)
+        if net.ndim != len(bases) + 1 or net.shape[1:] != sizes or net.shape[0] not in (POSITION_OUTPUTS, POSE_OUTPUTS):
+            raise ShapeError("net", f"(3 or 12, {', '.join(map(str, sizes))})", net.shape)
+        if not np.isfinite(net).all():
+            raise NonFiniteError("net")
+        stack = BasisStack(bases)
+        object.__setattr__(self, "bases", bases)
+        object.__setattr__(self, "net", net)
+        object.__setattr__(self, "metadata", MappingProxyType(dict(self.metadata)))
+        object.__setattr__(self, "_stack", stack)
+        check_q = partial(rows_or_vector, "q", width=len(bases))
+        check_x = partial(vector, "x", width=len(net))
+        kernel = net_kernel(stack, net.reshape(-1, stack.right_size), check_q, check_x)
+        object.__setattr__(self, "_kernel", kernel)
+
+    @property
+    def joints(self) -> int:
+        """Number of joints d."""
+        return len(self.bases)
+
+    @property
+    def size(self) -> int:
+        """Number of control points: 3^d for d revolute joints."""
+        return math.prod(basis.size for basis in self.bases)
+
+    @property
+    def has_orientation(self) -> bool:
+        return self.net.shape[0] == POSE_OUTPUTS
+
+    def predict(self, q: ArrayLike) -> FloatArray:
+        """Marker position (3,) [m] for joint angles q (d,) [rad], or (n, 3) for (n, d).
+
+        Raises:
+            ShapeError, NonFiniteError
+        """
+        return self._kernel.outputs(q, 0, POSITION_OUTPUTS)
+
+    def orientation(self, q: ArrayLike, *, orthonormal: bool = False) -> FloatArray:
+        """The marker's axes e1, e2, e3 as columns of (3, 3), or (n, 3, 3).
+
+        Args:
+            orthonormal: the nearest rotation to what was learnt, which by itself is orthonormal as far as it is exact.
+
+        Raises:
+            ShapeError: the map holds positions only, or q has the wrong length. NonFiniteError.
+        """
+        self._require_orientation()
+        axes = _as_columns(self._kernel.outputs(q, POSITION_OUTPUTS, POSE_OUTPUTS))
+        return nearest_rotation(axes) if orthonormal else axes
+
+    def jacobian(self, q: ArrayLike) -> FloatArray:
+        """Derivative (3, d) of the position [m/rad, or m/m], or (n, 3, d) for q (n, d).
+
+        Raises:
+            ShapeError, NonFiniteError
+        """
+        return self._kernel.derivatives(q, 0, POSITION_OUTPUTS)
+
+    def angular_jacobian(self, q: ArrayLike) -> FloatArray:
+        """Angular velocity (3, d) of the orthonormal orientation R [rad/rad, or rad/m], or (n, 3, d) for q (n, d).
+
+        In the measurement frame: dR/dq_k = [column k]× R.
+
+        Raises:
+            ShapeError: the map holds positions only, or q has the wrong length. NonFiniteError.
+        """
+        self._require_orientation()
+        checked = rows_or_vector("q", q, self.joints)
+        axes = self._kernel.outputs(checked, POSITION_OUTPUTS, POSE_OUTPUTS)
+        slopes = self._kernel.derivatives(checked, POSITION_OUTPUTS, POSE_OUTPUTS)
+        turning = slopes.reshape(*checked.shape[:-1], 3, 3, self.joints).swapaxes(-3, -2)
+        return nearest_rotation_rates(_as_columns(axes), turning)
+
+    def weights(self, q: ArrayLike) -> FloatArray:
+        """The full weight vector (3^d,) for q (d,), or (n, 3^d): the Kronecker product over the joints.
+
+        Raises:
+            ShapeError, NonFiniteError
+        """
+        checked = rows_or_vector("q", q, self.joints)
+        full = self._stack.full(np.atleast_2d(checked))
+        return full[0] if checked.ndim == 1 else full
+
+    def in_basis(self, bases: Sequence[JointBasis]) -> KBMap:
+        """The same map with its net expressed in other bases; exact up to rounding.
+
+        Raises:
+            BasisError: another number of joints, or a prismatic basis for a revolute joint.
+        """
+        target = tuple(bases)
+        if len(target) != self.joints:
+            raise BasisError(f"need {self.joints} bases, one a joint; got {len(target)}")
+        net = self.net
+        for k, (old, new) in enumerate(zip(self.bases, target, strict=True)):
+            if old != new:
+                net = np.moveaxis(np.tensordot(old.change_to(new), net, axes=(1, k + 1)), 0, k + 1)
+        return KBMap(target, net, self.metadata)
+
+    def with_metadata(self, metadata: Mapping[str, str]) -> KBMap:
+        """The same map with other texts."""
+        return KBMap(self.bases, self.net, metadata)
+
+    def with_tool(self, marker_shift: ArrayLike) -> KBMap:
+        """The map with its marker moved by a vector δ (3,) [m] given in the marker frame: G + E1 δ1 + E2 δ2 + E3 δ3.
+
+        Raises:
+            ShapeError: the map holds positions only, or δ has the wrong length. NonFiniteError.
+        """
+        self._require_orientation()
+        shift = vector("marker_shift", marker_shift, 3)
+        axes = self.net[POSITION_OUTPUTS:].reshape(3, POSITION_OUTPUTS, *self.net.shape[1:])
+        net = self.net.copy()
+        net[:POSITION_OUTPUTS] += np.einsum("a,a...->...", shift, axes)
+        return KBMap(self.bases, net, self.metadata)
+
+    def with_alpha(self, alpha: ArrayLike, centre: ArrayLike = 0.0) -> KBMap:
+        """The same map with Bézier control points for another α; exact up to rounding.
+
+        Args:
+            alpha: α [rad], one for all revolute joints or one a joint (d,); prismatic joints keep their Bézier basis.
+            centre: the angle that −α and α are counted from [rad], likewise.
+
+        Raises:
+            BasisError: an α that is not within 0..180 degrees (SingularAlphaError: within 80..100).
+            ShapeError, NonFiniteError
+        """
+        alphas, centres = _one_a_joint("alpha", alpha, self.joints), _one_a_joint("centre", centre, self.joints)
+        return self.in_basis(
+            [
+                basis.to_bernstein() if basis.is_prismatic else JointBasis.bernstein(a, c)
+                for basis, a, c in zip(self.bases, alphas, centres, strict=True)
+            ]
+        )
+
+    @classmethod
+    def from_control_points(cls, bases: Sequence[JointBasis], points: ArrayLike) -> KBMap:
+        """The map of Bézier control points (m1, ..., md, 3) [m], as `control_points` gives them.
+
+        Args:
+            bases: one a joint, Bernstein or prismatic.
+
+        Raises:
+            BasisError: a basis whose coefficients are no control points. ShapeError, NonFiniteError.
+        """
+        for k, basis in enumerate(bases):
+            if basis.to_bernstein() != basis:
+                raise BasisError(
+                    f"joint {k} has a {basis.kind} basis; control points need a Bernstein or prismatic one"
+                )
+        given = np.asarray(points, dtype=np.float64)
+        if given.ndim == 0 or given.shape[-1] != POSITION_OUTPUTS:
+            raise ShapeError("points", f"(m1, ..., md, {POSITION_OUTPUTS})", given.shape)
+        return cls(tuple(bases), np.moveaxis(given, -1, 0))
+
+    @property
+    def control_points(self) -> FloatArray:
+        """Bézier control points (m1, ..., md, 3) [m], in the bases that `JointBasis.to_bernstein` names.
+
+        `with_alpha` chooses other bases first.
+        """
+        bernstein = self.in_basis([basis.to_bernstein() for basis in self.bases])
+        return frozen(np.moveaxis(bernstein.net[:POSITION_OUTPUTS], 0, -1))
+
+    @property
+    def digest(self) -> str:
+        """Sixteen hexadecimal digits that tell this map (bases and net) from any other."""
+        state = hashlib.blake2b(repr([(b.kind, b.parameters) for b in self.bases]).encode(), digest_size=8)
+        state.update(self.net.astype("<f8", copy=False).tobytes())
+        return state.hexdigest()
+
+    def to_bytes(self) -> bytes:
+        """The map as one self-describing byte string (see `kbmaps.maps.serial`)."""
+        return serial.encode(self.bases, self.net, self.metadata)
+
+    @classmethod
+    def from_bytes(cls, data: bytes) -> KBMap:
+        """The map that `to_bytes` wrote.
+
+        Raises:
+            ModelFormatError: the bytes are damaged, truncated, or something else.
+        """
+        return cls(*serial.decode(data))
+
+    def _require_orientation(self) -> None:
+        if not self.has_orientation:
+            raise ShapeError("net", f"({POSE_OUTPUTS}, ...) to give an orientation", self.net.shape)
+
+
+def _as_columns(axes: FloatArray) -> FloatArray:
+    """Outputs (..., 9), three a unit vector, as matrices (..., 3, 3) with the unit vectors as columns."""
+    return axes.reshape(*axes.shape[:-1], 3, 3).swapaxes(-1, -2)
+
+
+def _one_a_joint(name: str, values: ArrayLike, joints: int) -> list[float]:
+    given = np.asarray(values, dtype=np.float64)
+    if given.shape not in ((), (joints,)):
+        raise ShapeError(name, f"() or ({joints},)", given.shape)
+    if not np.isfinite(given).all():
+        raise NonFiniteError(name)
+    return np.broadcast_to(given, (joints,)).tolist()
+
+
+def prediction_errors(kbmap: KBMap, q: ArrayLike, x: ArrayLike) -> FloatArray:
+    """Distances (n,) [m] between predicted and given positions x (n, 3) [m] at q (n, d) [rad].
+
+    Raises:
+        ShapeError, NonFiniteError
+
+    Example:
+        >>> import numpy as np
+        >>> from kbmaps import JointBasis, KBMap, prediction_errors
+        >>> still = KBMap((JointBasis.trigonometric(),), np.zeros((3, 3)))
+        >>> prediction_errors(still, [[0.0]], [[0.0, 0.3, 0.4]])
+        array([0.5])
+    """
+    angles = rows("q", q, kbmap.joints)
+    positions = rows("x", x, POSITION_OUTPUTS)
+    if len(angles) != len(positions):
+        raise ShapeError("x", f"({len(angles)}, 3) to go with q", positions.shape)
+    return np.linalg.norm(kbmap.predict(angles) - positions, axis=1)

@@ -1,0 +1,128 @@
+"""Which of two paths the innermost loops take: compiled, or NumPy. Both do the same to rounding.
+
+The compiled one is there when a C compiler was at hand as kbmaps was built. BODYSCHEMA_PURE=1 in the environment
+of a process leaves it aside.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Generator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from functools import partial
+from importlib import import_module
+from typing import Literal, Protocol, cast
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from kbmaps.arrays import FloatArray, IntArray
+from kbmaps.errors import SettingError
+from kbmaps.maps.contraction import Check, NumpyNet
+from kbmaps.maps.stack import BasisStack
+
+KernelPath = Literal["compiled", "numpy"]
+
+
+class NetKernel(Protocol):
+    """Works on a net as `NumpyNet` says."""
+
+    def outputs(self, q: ArrayLike, begin: int, end: int, /) -> FloatArray: ...
+    def derivatives(self, q: ArrayLike, begin: int, end: int, /) -> FloatArray: ...
+    def step(self, q: ArrayLike, x: ArrayLike, mu0: float, /) -> None: ...
+    def replay(self, q: FloatArray, x: FloatArray, order: IntArray, mu0: FloatArray, /) -> None: ...
+
+
+class FilterKernel(Protocol):
+    """Takes pairs into the state of a `RigidFilter`; returns how many, its noise² and what that rests on."""
+
+    def learn(
+        self,
+        change: FloatArray,
+        covariance: FloatArray,
+        q: FloatArray,
+        x: FloatArray,
+        sigma: FloatArray,
+        noise_square: float,
+        noise_coordinates: float,
+        /,
+    ) -> tuple[int, float, float]: ...
+
+
+class _Compiled(Protocol):
+    """The module kbmaps._kernels, built from csrc."""
+
+    def Net(
+        self,
+        half_phases: FloatArray,
+        mix: FloatArray,
+        slides: FloatArray,
+        planes: FloatArray,
+        check_q: Check,
+        check_x: Check,
+        empty: object,
+        /,
+    ) -> NetKernel: ...
+
+    def RigidFilter(self, *arrays: FloatArray) -> FilterKernel: ...
+
+
+def _load() -> _Compiled | None:
+    if os.environ.get("BODYSCHEMA_PURE", "") not in ("", "0"):
+        return None
+    try:
+        return cast(_Compiled, import_module("kbmaps._kernels"))
+    except ImportError:
+        return None
+
+
+_available = _load()
+_chosen = ContextVar("_chosen", default=_available)
+
+
+def in_use() -> KernelPath:
+    """The path of maps and learners that are made now."""
+    return "numpy" if _chosen.get() is None else "compiled"
+
+
+def available() -> tuple[KernelPath, ...]:
+    """The paths that this process can take."""
+    return ("numpy",) if _available is None else ("numpy", "compiled")
+
+
+@contextmanager
+def using(path: KernelPath) -> Generator[None]:
+    """Maps and learners made within take this path for good; for comparing the two.
+
+    Raises:
+        SettingError: there are no compiled kernels.
+    """
+    if path not in available():
+        raise SettingError(
+            f"the {path} kernels are not there; have a C compiler when installing, and no BODYSCHEMA_PURE"
+        )
+    before = _chosen.set(_available if path == "compiled" else None)
+    try:
+        yield
+    finally:
+        _chosen.reset(before)
+
+
+def net_kernel(stack: BasisStack, planes: FloatArray, check_q: Check, check_x: Check) -> NetKernel:
+    """The chosen path's kernel for a net; the arguments are those of `NumpyNet`."""
+    compiled = _chosen.get()
+    if compiled is None:
+        return NumpyNet(stack, planes, check_q, check_x)
+    checks = partial(_contiguous, check_q), partial(_contiguous, check_x)
+    return compiled.Net(*stack.tables, planes, *checks, np.empty)
+
+
+def filter_kernel(*arrays: FloatArray) -> FilterKernel | None:
+    """The compiled loop of `RigidFilter`, if that is the path."""
+    compiled = _chosen.get()
+    return None if compiled is None else compiled.RigidFilter(*(np.ascontiguousarray(array) for array in arrays))
+
+
+def _contiguous(check: Check, values: ArrayLike) -> FloatArray:
+    return np.ascontiguousarray(check(values))

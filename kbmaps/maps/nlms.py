@@ -1,0 +1,155 @@
+"""Normalised least-mean-squares: the instant learner."""
+
+from __future__ import annotations
+
+import math
+from functools import partial
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from kbmaps.arrays import IntArray, rows, vector
+from kbmaps.errors import KBMapsError, ModelFormatError, SettingError, ShapeError
+from kbmaps.maps.kbmap import POSITION_OUTPUTS, KBMap
+from kbmaps.maps.kernels import net_kernel
+from kbmaps.maps.packed import describe_bases, parse_bases
+from kbmaps.maps.stack import BasisStack
+from kbmaps.maps.step_size import DEFAULT_MU0, StepSize
+from kbmaps.maps.targets import pose_targets
+from kbmaps.packed import pack, unpack
+
+_KIND = "nlms, 1"
+
+
+class NLMS:
+    """Moves the control points a step towards each new pair, the least that mends the share mu0 of its error.
+
+    Learns what the map it starts from has, the position or position and orientation, in that map's bases; scaled
+    orthonormal ones (`learning_bases`) are advised.
+
+    Args:
+        mu0: the share, constant or as a `StepSize` of the pairs learnt so far.
+
+    Raises:
+        SettingError: mu0 is not between 0 and 2.
+
+    Example:
+        >>> import numpy as np
+        >>> from kbmaps import NLMS, RigidChain, learning_bases
+        >>> fixed = np.tile(np.eye(4), (3, 1, 1))
+        >>> fixed[1:, 0, 3] = 0.3, 0.2  # links [m]
+        >>> arm = RigidChain(fixed, axes=[[0, 0, 1], [0, 1, 0]], prismatic=[False, False])
+        >>> learner = NLMS(arm.to_kbmap(learning_bases([-1, -1], [1, 1])), mu0=1.0)
+        >>> learner.learn([0.1, 0.2], [0.5, 0.0, 0.0])
+        >>> learner.map.predict([0.1, 0.2]).round(9) + 0.0  # a full step: the pair is met
+        array([0.5, 0. , 0. ])
+    """
+
+    def __init__(self, kbmap: KBMap, mu0: float | StepSize = DEFAULT_MU0) -> None:
+        self._bases = kbmap.bases
+        self._step_size = mu0 if isinstance(mu0, StepSize) else StepSize(mu0)
+        self._pairs = 0
+        self._stack = BasisStack(kbmap.bases)
+        self._outputs = len(kbmap.net)
+        self._planes = np.array(kbmap.net.reshape(-1, self._stack.right_size))
+        check_q = partial(vector, "q", width=self._stack.joints)
+        check_x = partial(vector, "x", width=self._outputs)
+        self._kernel = net_kernel(self._stack, self._planes, check_q, check_x)
+
+    @property
+    def step_size(self) -> StepSize:
+        return self._step_size
+
+    @property
+    def joints(self) -> int:
+        """Number of joints d."""
+        return self._stack.joints
+
+    @property
+    def pairs(self) -> int:
+        """How many steps have been made, replayed ones included."""
+        return self._pairs
+
+    @property
+    def map(self) -> KBMap:
+        """What has been learnt so far: a snapshot that later learning does not touch."""
+        sizes = [basis.size for basis in self._bases]
+        return KBMap(self._bases, self._planes.reshape(self._outputs, *sizes))
+
+    def learn(self, q: ArrayLike, x: ArrayLike, rotation: ArrayLike | None = None) -> None:
+        """One step for marker position x (3,) [m] at joint angles q (d,) [rad].
+
+        Args:
+            rotation: the orientation, (3, 3) or a quaternion x, y, z, w (4,); for a map with orientation only.
+
+        Raises:
+            ShapeError, NonFiniteError, RotationError
+            SettingError: a rotation too many or too few. Nothing has changed.
+        """
+        mu = self._step_size.at(self._pairs)
+        if rotation is None and self._outputs == POSITION_OUTPUTS:
+            self._kernel.step(q, x, mu)
+        else:
+            angles, position = vector("q", q, self._stack.joints), vector("x", x, POSITION_OUTPUTS)
+            self._kernel.step(angles, pose_targets(position[None], rotation, self._outputs)[0], mu)
+        self._pairs += 1
+
+    def replay(
+        self, q: ArrayLike, x: ArrayLike, order: ArrayLike | None = None, rotation: ArrayLike | None = None
+    ) -> None:
+        """Steps for the pairs q (n, d) [rad], x (n, 3) [m] in the sequence `order` (indices), else as they stand.
+
+        Equal to `learn` on each of them up to rounding, at a fraction of its cost.
+
+        Args:
+            rotation: the orientations, (n, 3, 3) or quaternions (n, 4), as for `learn`.
+
+        Raises:
+            ShapeError, NonFiniteError, RotationError
+            SettingError: an index outside the pairs, rotations too many or too few. Nothing has changed.
+        """
+        angles = rows("q", q, self._stack.joints)
+        positions = rows("x", x, POSITION_OUTPUTS)
+        if len(angles) != len(positions):
+            raise ShapeError("x", f"({len(angles)}, 3) to go with q", positions.shape)
+        targets = pose_targets(positions, rotation, self._outputs)
+        sequence = np.arange(len(angles)) if order is None else _checked_order(order, len(angles))
+        steps = self._step_size.run(self._pairs, len(sequence))
+        self._kernel.replay(np.ascontiguousarray(angles), np.ascontiguousarray(targets), sequence, steps)
+        self._pairs += len(sequence)
+
+    def to_bytes(self) -> bytes:
+        """The learner as it is; `from_bytes` learns on to the last bit as this one would."""
+        settings = self._step_size
+        fields: dict[str, Any] = {
+            "bases": describe_bases(self._bases),
+            "mu0": settings.mu0,
+            "decay": settings.decay if math.isfinite(settings.decay) else None,
+            "floor": settings.floor,
+            "pairs": self._pairs,
+        }
+        return pack(_KIND, fields, {"planes": self._planes})
+
+    @classmethod
+    def from_bytes(cls, data: bytes) -> Self:
+        """The learner in `data`. Raises ModelFormatError: it is none of this kind, or damaged."""
+        fields, arrays = unpack(data, _KIND)
+        try:
+            bases = parse_bases(fields["bases"])
+            decay = math.inf if fields["decay"] is None else fields["decay"]
+            net = arrays["planes"].reshape(-1, *(basis.size for basis in bases))
+            learner = cls(KBMap(bases, net), StepSize(fields["mu0"], decay, fields["floor"]))
+            learner._pairs = int(fields["pairs"])
+        except (KeyError, TypeError, ValueError, KBMapsError) as error:
+            raise ModelFormatError(f"the bytes do not describe an NLMS learner: {error}") from error
+        return learner
+
+
+def _checked_order(order: ArrayLike, pairs: int) -> IntArray:
+    sequence = np.asarray(order)
+    if sequence.ndim != 1 or not np.issubdtype(sequence.dtype, np.integer):
+        raise ShapeError("order", "(k,) integers", sequence.shape)
+    if len(sequence) and (int(sequence.min()) < 0 or int(sequence.max()) >= pairs):
+        raise SettingError(f"order holds indices outside 0..{pairs - 1}")
+    return sequence.astype(np.intp)

@@ -1,0 +1,1 @@
+"""What the pairs leave open, what more of them would gain, and where to measure next."""

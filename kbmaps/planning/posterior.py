@@ -1,0 +1,140 @@
+"""What is known about a model's parameters, as far as it shows in positions."""
+
+from __future__ import annotations
+
+import math
+from copy import copy
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from kbmaps.arrays import FloatArray, rows
+from kbmaps.chains.belief import ChainBelief
+from kbmaps.chains.chain import RigidChain
+from kbmaps.chains.parameters import ChainParameters
+from kbmaps.chains.rigid_learner import RigidLearner
+from kbmaps.chains.rigid_recursive import RecursiveRigidLearner
+from kbmaps.errors import DegenerateDataError, SettingError, ShapeError
+
+
+class Posterior(Protocol):
+    """A Gaussian posterior of a model that is linear, or linearised, in its parameters."""
+
+    @property
+    def joints(self) -> int:
+        """Number of joints d."""
+        ...
+
+    @property
+    def noise(self) -> float:
+        """1-sigma of each coordinate of a further pair [m]; what the model cannot follow counts as noise."""
+        ...
+
+    @property
+    def floor(self) -> float:
+        """1-sigma of a coordinate [m] by which the model errs however many pairs there are; 0 where it fits."""
+        ...
+
+    def roots(self, q: ArrayLike) -> FloatArray:
+        """Matrices R (n, 3, p) [m] at q (n, d): R_i R_jᵀ is the covariance of the positions at q_i and q_j."""
+        ...
+
+
+class ChainPosterior:
+    """A rigid chain's posterior, linearised at the most probable chain.
+
+    Args:
+        nominal: the chain that the parameters change.
+        change: its most probable change (size,) as in `ChainParameters`.
+        covariance: of the change (size, size) [rad², m²].
+        noise: 1-sigma of a coordinate of a further pair [m].
+        floor: 1-sigma of a coordinate that no rigid chain explains [m].
+
+    Raises:
+        ShapeError: change or covariance are of another size.
+        SettingError: noise is not positive, or floor is negative.
+    """
+
+    def __init__(
+        self, nominal: RigidChain, change: FloatArray, covariance: FloatArray, *, noise: float, floor: float = 0.0
+    ) -> None:
+        if not (noise > 0.0 and math.isfinite(noise)):
+            raise SettingError(f"noise must be finite and greater than 0 m, got {noise!r}")
+        self._parameters = ChainParameters(nominal)
+        size = self._parameters.size
+        for name, array, shape in (("change", change, (size,)), ("covariance", covariance, (size, size))):
+            if array.shape != shape:
+                raise ShapeError(name, str(shape), array.shape)
+        self._change = np.array(change)
+        self._spread = ChainBelief.from_covariance(self._parameters, change, covariance).root
+        self.noise, self.floor = noise, _checked_floor(floor)
+
+    @classmethod
+    def of(cls, learner: RigidLearner | RecursiveRigidLearner, *, noise: float | None = None) -> ChainPosterior:
+        """What a learner knows now. Its floor is 0 unless the pairs were told a noise that does not explain them.
+
+        Args:
+            noise: 1-sigma of a coordinate of further pairs [m]; None takes that of the pairs so far. A recursive
+                learner knows only the noise of pairs that came without their sigma.
+
+        Raises:
+            DegenerateDataError: no noise was given and the learner has none, being without pairs.
+            SettingError: noise is not positive.
+        """
+        floor = 0.0
+        if isinstance(learner, RigidLearner) and learner.pairs:
+            report = learner.report()
+            told = report.noise if noise is None else noise
+            floor = report.noise * math.sqrt(max(report.misfit**2 - 1.0, 0.0))
+            found = math.hypot(told, floor)
+        elif noise is not None:
+            found = noise
+        elif isinstance(learner, RecursiveRigidLearner):
+            found = learner.noise
+        else:
+            raise DegenerateDataError("without pairs there is no noise to go by; give the noise of further pairs")
+        return cls(learner.nominal, learner.change, learner.covariance, noise=found, floor=floor)
+
+    @classmethod
+    def of_belief(cls, belief: ChainBelief, *, noise: float, floor: float = 0.0) -> ChainPosterior:
+        """What is believed of a chain.
+
+        Args:
+            noise: 1-sigma of a coordinate of a further pair [m].
+            floor: 1-sigma of a coordinate that no rigid chain explains [m].
+
+        Raises:
+            SettingError: noise is not positive, or floor is negative.
+        """
+        return cls(belief.parameters.reference, belief.mean, belief.covariance, noise=noise, floor=floor)
+
+    @property
+    def joints(self) -> int:
+        """Number of joints d."""
+        return self._parameters.reference.joints
+
+    def with_floor(self, floor: float) -> ChainPosterior:
+        """The same with another floor [m], e.g. one found by `systematic_error` where the noise was not told.
+
+        Raises:
+            SettingError: floor is negative.
+        """
+        changed = copy(self)
+        changed.floor = _checked_floor(floor)
+        return changed
+
+    def roots(self, q: ArrayLike) -> FloatArray:
+        """Matrices R (n, 3, p) [m] at q (n, d): R_i R_jᵀ is the covariance of the positions at q_i and q_j.
+
+        Raises:
+            ShapeError, NonFiniteError
+        """
+        _, jacobian = self._parameters.linearised(self._change, rows("q", q, self.joints))
+        return jacobian @ self._spread
+
+
+def _checked_floor(floor: float) -> float:
+    if not (floor >= 0.0 and math.isfinite(floor)):
+        raise SettingError(f"floor must be finite and at least 0 m, got {floor!r}")
+    return floor

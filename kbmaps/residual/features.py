@@ -1,0 +1,283 @@
+"""How real arms differ from rigid chains, as small groups of features with a shape but no size yet."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from kbmaps.arrays import BoolArray, FloatArray, IntArray
+from kbmaps.chains.chain import RigidChain
+from kbmaps.chains.parameters import ChainParameters
+from kbmaps.maps.basis import learning_bases
+from kbmaps.maps.block_choice import PATH_CORRELATION
+from kbmaps.maps.stack import BasisStack
+
+# Errors of a joint's angle [rad], as functions of its own reading or of gravity's torque about it.
+READING_GROUPS = ("eccentricity", "second harmonic", "gain")
+COMPLIANCE = "compliance"
+# Errors of a position [m], as polynomials of the position (the camera's) or functions of the readings.
+CAMERA_GROUPS = ("affine", "quadratic", "cubic")
+SMOOTH_GROUPS = ("one joint", "two joints", "three joints")
+# Groups with more features than this are left out: arms of many joints then do with the lower orders.
+MOST_FEATURES = 500
+# With more joints, loads are lumped into two points: the marker and the middle of all joints beyond.
+_JOINTS_WITH_OWN_LOADS = 8
+# Ranges of a joint narrower than this [rad, m] would blow its functions up.
+_LEAST_RANGE = 1e-3
+# A camera may ride on a head with so many joints, behind which stands the link where gravity is constant.
+_MOST_NECK_JOINTS = 3
+
+Weights = Mapping[str, FloatArray]
+
+
+@dataclass(frozen=True, eq=False)
+class Linearised:
+    """A distorted chain around a change and weights, at n configurations.
+
+    Attributes:
+        x: positions (n, 3) [m].
+        chain: derivative (n, 3, size) by the chain's parameters.
+        groups: derivative (n, 3, features) by each group's weights.
+    """
+
+    x: FloatArray
+    chain: FloatArray
+    groups: dict[str, FloatArray]
+
+
+@dataclass(frozen=True, eq=False)
+class ResidualScaling:
+    """What makes features of the order of 1 where data is, and where on the hand the last load acts.
+
+    Attributes:
+        middle, half: of the ranges of the joints' readings (d,) [rad, m].
+        centre: of the positions (3,) [m].
+        scale: their spread [m].
+        load: place of the last load in the frame of the last link (3,) [m]; None: the marker itself.
+    """
+
+    middle: FloatArray
+    half: FloatArray
+    centre: FloatArray
+    scale: float
+    load: FloatArray | None = None
+
+    @classmethod
+    def of(cls, q: FloatArray, x: FloatArray) -> ResidualScaling:
+        """That of pairs (n, d) [rad, m] and (n, 3) [m], at least one."""
+        low, high = q.min(axis=0), q.max(axis=0)
+        half = np.maximum(0.5 * (high - low), _LEAST_RANGE)
+        centre = x.mean(axis=0)
+        spread = math.sqrt(float(np.square(x - centre).mean()))
+        return cls(0.5 * (low + high), half, centre, max(spread, _LEAST_RANGE))
+
+    @classmethod
+    def whole_turns(cls, joints: int) -> ResidualScaling:
+        """That of pairs nobody has seen yet."""
+        return cls(np.zeros(joints), np.full(joints, math.pi), np.zeros(3), 1.0)
+
+
+class ResidualFeatures:
+    """A rigid chain with errors of its joints, of what measures it, and of what nobody has thought of.
+
+        x(q) = p + Σ_g ψ_g w_g,     p = f(c, q + Σ_g φ_g(q) w_g)
+
+    with the chain f at the change c, the angle groups' φ, and ψ of p (camera groups) or of q (smooth groups).
+
+    Args:
+        parameters: of the chain.
+        scaling: of the features.
+    """
+
+    def __init__(self, parameters: ChainParameters, scaling: ResidualScaling) -> None:
+        self.parameters, self.scaling = parameters, scaling
+        self._prismatic: BoolArray = parameters.reference.prismatic
+        self.joints = parameters.reference.joints
+        low, high = scaling.middle - scaling.half, scaling.middle + scaling.half
+        self._stack = BasisStack(learning_bases(low, high, self._prismatic.tolist(), 1.0))
+        self._products = {name: _products(self._prismatic, order + 1) for order, name in enumerate(SMOOTH_GROUPS)}
+        still = range(min(_MOST_NECK_JOINTS, self.joints - 2) + 1)
+        self._still = {f"{COMPLIANCE} behind joint {k}" if k else COMPLIANCE: k for k in still}
+        self._loads = {group: self._load_mask(k) for group, k in self._still.items()}
+
+    def size(self, group: str) -> int:
+        """Number of features of a group."""
+        if group in CAMERA_GROUPS:
+            return 3 * (4, 6, 10)[CAMERA_GROUPS.index(group)]
+        if group in SMOOTH_GROUPS:
+            return 3 * len(self._products[group])
+        return int(self._mask(group).sum())
+
+    def groups(self) -> tuple[str, ...]:
+        """The groups that there are for this arm."""
+        names = (*READING_GROUPS, *self._still, *CAMERA_GROUPS, *SMOOTH_GROUPS)
+        return tuple(group for group in names if 0 < self.size(group) <= MOST_FEATURES)
+
+    def approximate(self, groups: Iterable[str]) -> tuple[str, ...]:
+        """Those groups whose law is one of engineering and not of geometry."""
+        return tuple(group for group in groups if group in self._still)
+
+    def follow_a_path(self, q: FloatArray) -> bool:
+        """Whether configurations (n, d), in their order, are neighbours on a path: as `kbmaps.follow_a_path`."""
+        weights = self._stack.joint_weights(q)
+        inner, square = np.einsum("nkm,nkm->nk", weights[:-1], weights[1:]), np.square(weights).sum(axis=2)
+        shared = (inner / np.sqrt(square[:-1] * square[1:])).prod(axis=1)
+        return bool(len(shared)) and bool(np.median(shared) > PATH_CORRELATION)
+
+    def positions(self, chain: RigidChain, weights: Weights, q: FloatArray) -> FloatArray:
+        """Positions (n, 3) [m] at q (n, d)."""
+        error, _ = self._angle_errors(chain, weights, q, ())
+        p = chain.positions(q + error)
+        return p + self._offsets(p, q, weights)
+
+    def linearised(
+        self, change: FloatArray, chain: RigidChain, weights: Weights, q: FloatArray, groups: Sequence[str]
+    ) -> Linearised:
+        """Positions at q (n, d) and their derivatives by the change, of which `chain` is the chain, and by weights.
+
+        That the camera magnifies moves of p by a little, and yielding changes the torque, is left out of the
+        derivatives, not of the positions.
+        """
+        error, shapes = self._angle_errors(chain, weights, q, groups)
+        p, jacobian = self.parameters.linearised(change, q + error)
+        turns = jacobian[:, :, self.parameters.zeros]
+        columns: dict[str, FloatArray] = {}
+        for group in groups:
+            if self._of_places(group):
+                columns[group] = _for_each_axis(self._offset_functions(group, p, q))
+            else:
+                columns[group] = (turns[:, :, :, None] * shapes[group][:, None])[:, :, self._mask(group)]
+        return Linearised(p + self._offsets(p, q, weights), jacobian, columns)
+
+    def _angle_errors(
+        self, chain: RigidChain, weights: Weights, q: FloatArray, groups: Sequence[str]
+    ) -> tuple[FloatArray, dict[str, FloatArray]]:
+        """What is added to the readings (n, d) [rad, m], and φ (n, d, m) of the angle groups with weights or asked for.
+
+        Torques are those where the joints have yielded to the torques of the readings.
+        """
+        names = [g for g in (*READING_GROUPS, *self._still) if g in weights or g in groups]
+        shapes = {group: self._reading_functions(group, q) for group in names if group in READING_GROUPS}
+        error = self._weighted(shapes, weights, q)
+        loaded = [group for group in names if group in self._still]
+        if not loaded:
+            return error, shapes
+        yielding = [group for group in loaded if group in weights]
+        there = q + error
+        if yielding:
+            frames, places = self._loaded_frames(chain, there)
+            there = there + self._weighted({g: self._torques(g, frames, places) for g in yielding}, weights, q)
+        frames, places = self._loaded_frames(chain, there)
+        torques = {group: self._torques(group, frames, places) for group in loaded}
+        return error + self._weighted(torques, weights, q), {**shapes, **torques}
+
+    def _weighted(self, shapes: Weights, weights: Weights, q: FloatArray) -> FloatArray:
+        """Σ_m φ_jm w_jm over those groups that have weights (n, d)."""
+        total = np.zeros_like(q)
+        for group, functions in shapes.items():
+            if group in weights:
+                table = np.zeros(functions.shape[1:])
+                table[self._mask(group)] = weights[group]
+                total += (functions * table).sum(axis=2)
+        return total
+
+    def _of_places(self, group: str) -> bool:
+        return group in CAMERA_GROUPS or group in SMOOTH_GROUPS
+
+    def _offsets(self, p: FloatArray, q: FloatArray, weights: Weights) -> FloatArray:
+        total = np.zeros_like(p)
+        for group, values in weights.items():
+            if self._of_places(group):
+                total += self._offset_functions(group, p, q) @ values.reshape(-1, 3)
+        return total
+
+    def _mask(self, group: str) -> BoolArray:
+        """Which of a group's functions (d, m) there are."""
+        if group in self._still:
+            return self._loads[group]
+        if group == "gain":
+            return np.ones((self.joints, 1), dtype=np.bool_)
+        return np.repeat(~self._prismatic[:, None], 2, axis=1)
+
+    def _reading_functions(self, group: str, q: FloatArray) -> FloatArray:
+        """φ (n, d, m); of the order of 1 for revolute joints, of the positions' spread [m] for others."""
+        if group == "gain":
+            units = np.where(self._prismatic, self.scaling.scale, 1.0)
+            return ((q - self.scaling.middle) / self.scaling.half * units)[..., None]
+        turns = q if group == "eccentricity" else 2.0 * q
+        return np.stack([np.cos(turns), np.sin(turns)], axis=-1)
+
+    def _loaded_frames(self, chain: RigidChain, q: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """The chain's frames (n, d+1, 4, 4), and where loads are supposed for each joint (n, d or 1, loads, 3)."""
+        frames = chain.frames(q)
+        points = frames[:, :, :3, 3]
+        if self.scaling.load is not None:
+            last = chain.fixed[-1]
+            beside = last[:3, :3].T @ (self.scaling.load - last[:3, 3])
+            points = points.copy()
+            points[:, -1] += frames[:, -1, :3, :3] @ beside
+        return frames, self._places(points)
+
+    def _torques(self, group: str, frames: FloatArray, places: FloatArray) -> FloatArray:
+        """Torque (force, for a prismatic joint) about each joint of unit weights at each load's place (n, d, 3 loads).
+
+        z·((p − o) × e) = e·(z × (p − o)): a weight's torque is a component of the Jacobian of its place p, here along
+        x, y, z of the frame where gravity stands still. Positions' spread counts as the unit of length.
+        """
+        axes = np.einsum("nkij,kj->nki", frames[:, :-1, :3, :3], self.parameters.reference.axes)
+        origins = frames[:, :-1, :3, 3]
+        torques = np.cross(axes[:, :, None], places - origins[:, :, None]) / self.scaling.scale
+        torques = np.where(self._prismatic[:, None, None], self.scaling.scale * axes[:, :, None], torques)
+        if self._still[group]:
+            torques = torques @ frames[:, self._still[group], :3, :3][:, None]
+        return torques.reshape(*torques.shape[:2], 3 * torques.shape[2])
+
+    def _places(self, points: FloatArray) -> FloatArray:
+        """Where loads are supposed for each joint (n, d or 1, loads, 3), of the frames' origins (n, d+1, 3)."""
+        if self.joints <= _JOINTS_WITH_OWN_LOADS:
+            return points[:, None, 1:]
+        beyond = np.cumsum(points[:, :0:-1], axis=1)[:, ::-1] / np.arange(self.joints, 0, -1)[:, None]
+        return np.stack([beyond, np.broadcast_to(points[:, -1:], beyond.shape)], axis=2)
+
+    def _load_mask(self, still: int) -> BoolArray:
+        """Which loads (d, 3 loads) act on which joint: those beyond it; on none before the link that stands still."""
+        if self.joints <= _JOINTS_WITH_OWN_LOADS:
+            acts = np.triu(np.ones((self.joints, self.joints), dtype=np.bool_))
+        else:
+            acts = np.ones((self.joints, 2), dtype=np.bool_)
+        acts[:still] = False
+        return np.repeat(acts, 3, axis=1)
+
+    def _offset_functions(self, group: str, p: FloatArray, q: FloatArray) -> FloatArray:
+        """ψ (n, m) of a camera or a smooth group."""
+        if group in SMOOTH_GROUPS:
+            weights = self._stack.joint_weights(q)[:, :, 1:].reshape(len(q), -1)
+            return np.multiply.reduce(weights[:, self._products[group]], axis=2)
+        s = (p - self.scaling.centre) / self.scaling.scale
+        degree = CAMERA_GROUPS.index(group) + 1
+        monomials = [s[:, list(c)].prod(axis=1) for c in itertools.combinations_with_replacement(range(3), degree)]
+        return np.stack([np.ones(len(s)), *monomials] if degree == 1 else monomials, axis=1)
+
+
+def _for_each_axis(functions: FloatArray) -> FloatArray:
+    """Derivatives (n, 3, 3 m) of Σ_m ψ_m w_m by the weights w (m, 3), flattened, from ψ (n, m)."""
+    n, m = functions.shape
+    derivatives = np.zeros((n, 3, 3 * m))
+    for axis in range(3):
+        derivatives[:, axis, axis::3] = functions
+    return derivatives
+
+
+def _products(prismatic: BoolArray, order: int) -> IntArray:
+    """Which joint functions (two a joint) multiply to each product of `order` different joints (count, order)."""
+    sizes = [1 if slides else 2 for slides in prismatic]
+    chosen = [
+        [2 * joint + part for joint, part in zip(joints, parts, strict=True)]
+        for joints in itertools.combinations(range(len(sizes)), order)
+        for parts in itertools.product(*(range(sizes[joint]) for joint in joints))
+    ]
+    return np.array(chosen, dtype=np.intp).reshape(-1, order)

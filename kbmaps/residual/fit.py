@@ -1,0 +1,275 @@
+"""The most probable distorted chain: which distortions the pairs pay for, of what size, and how sure all of it is."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import cast
+
+import numpy as np
+
+from kbmaps.arrays import BoolArray, FloatArray, IntArray
+from kbmaps.chains.belief import squared
+from kbmaps.maps.block_choice import BLOCK_PAIRS, FEWEST_BLOCKS
+from kbmaps.pairs import Pairs
+from kbmaps.residual.correlation import innovations, most_probable
+from kbmaps.residual.evidence import Average, GroupedModel, Moments
+from kbmaps.residual.features import SMOOTH_GROUPS
+from kbmaps.residual.model import ResidualModel
+
+# Noise that is estimated is never below this [m]: there rounding begins.
+_ROUNDING_M = 1e-9
+# Of the chi distribution in three dimensions: 3 of 100,000 good pairs are further out; its median.
+_OUTLIER_SIGMAS, _MEDIAN_NORM = 4.8, 1.538
+_ROUNDS, _SELECTIONS = 6, 2
+# Few enough rows for a processor's cache.
+_ROWS_AT_ONCE = 150
+# With fewer coordinates of pairs on a path no group is taken up: there is no telling it from what neighbours share.
+_FEWEST_ON_PATH = 30
+# Runs of pairs left out in turn on a path.
+_BLOCKS = 8
+# A step that moves the predictions by less than this share of what the weights leave open is the last.
+_SMALL_STEP = 0.05
+# Fixed-point rounds in which the noise settles well enough to compare correlations.
+_NOISE_ROUNDS = 4
+# The noise that a prior has seen counts as so many coordinates.
+_NOISE_ROWS = 10.0
+# Told noise explains a sum of squared residuals up to so many of its standard deviations (χ²) above its mean.
+_MISFIT_SIGMAS = 3.0
+
+
+@dataclass(frozen=True, eq=False)
+class ResidualFit:
+    """A distorted chain and how sure it is.
+
+    Attributes:
+        model: what was found.
+        noise: estimated noise over unit; at least 1 where the units are the noise.
+        freedom: residual coordinates minus those that all weights have used up.
+        shared: correlation of the errors of neighbours on a path; 0 where pairs are apart.
+        inliers: which pairs (n,) are no outliers.
+    """
+
+    model: ResidualModel
+    noise: float
+    freedom: float
+    shared: float
+    inliers: BoolArray
+
+
+class _Fitter:
+    """One fit on its way: Gauss-Newton rounds around which groups and variances are found anew.
+
+    What the prior knows, the chain's change and the weights of its groups, are the weights of the group "", counted
+    in columns of the prior's root. Other weights, of the same groups or others, come on top of them.
+    """
+
+    def __init__(self, prior: ResidualModel, pairs: Pairs, change: FloatArray) -> None:
+        self._prior, self._features, self._pairs = prior, prior.features, pairs
+        self._parameters = prior.features.parameters
+        self._known = tuple(prior.weights)
+        self._free, self._root = squared(prior.root)
+        self._unit = math.sqrt(float(np.square(pairs.unit).mean()))
+        self._least_noise = 1.0 if pairs.known else _ROUNDING_M / float(pairs.unit.min())
+        self._on_path = self._features.follow_a_path(pairs.q)
+        self._present = np.concatenate([change, *prior.weights.values()])
+        self._fresh: dict[str, FloatArray] = {}
+        self.variances: dict[str, float] = {}
+        self.noise, self.used, self.shared = math.inf, 0.0, 0.0
+        self.inliers = np.ones(len(pairs), dtype=np.bool_)
+        self._unfold()
+
+    def _unfold(self) -> None:
+        """The chain and all weights at the present place."""
+        size = self._parameters.size
+        self.change = self._present[:size]
+        self.chain = self._parameters.chain(self.change)
+        self.weights: dict[str, FloatArray] = {}
+        for group in dict.fromkeys((*self._known, *self._fresh)):
+            self.weights[group] = self._fresh.get(group, np.zeros(self._features.size(group)))
+        start = size
+        for group in self._known:
+            end = start + self._features.size(group)
+            self.weights[group] = self.weights[group] + self._present[start:end]
+            start = end
+
+    def step(self, select: bool) -> float:
+        """To the most probable weights; how far that moves predictions, over what the weights leave open of them."""
+        groups = self._considered() if select else tuple(self.variances)
+        model = self._model(groups, select)
+        model.variances = dict(self.variances)
+        if select:
+            model.select(groups)
+        else:
+            model.settle()
+            model.prune()
+        posterior = model.posterior()
+        self.used = sum(posterior.used.values())
+        step = posterior.mean - self._before_step(model.variances)
+        moved = model.square_of(step) / model.noise**2
+        self.variances, self.noise = dict(model.variances), model.noise
+        self._take(posterior.mean, tuple(model.variances))
+        return math.sqrt(max(moved, 0.0) / max(self.used, 1.0))
+
+    def average(self) -> Average:
+        """The last step: to the mean over all probable sets of groups."""
+        groups = self._considered()
+        model = self._model(groups, ask_correlation=True)
+        model.variances = dict(self.variances)
+        average = model.average(() if self._on_path else groups)
+        self._take(average.mean, average.groups)
+        return average
+
+    def _considered(self) -> tuple[str, ...]:
+        """All groups with no more features than there are coordinates; the largest only where the one before is in."""
+        coordinates = 3 * int(self.inliers.sum())
+        if self._on_path and coordinates < _FEWEST_ON_PATH:
+            return tuple(self.variances)
+        largest, before = SMOOTH_GROUPS[2], SMOOTH_GROUPS[1]
+
+        def asked(group: str) -> bool:
+            if group in self.variances:
+                return True
+            return self._features.size(group) <= coordinates and (group != largest or before in self.variances)
+
+        return tuple(group for group in self._features.groups() if asked(group))
+
+    def _judge_pairs(self, residuals: FloatArray) -> None:
+        """The middle residual tells what is typical, the noise of the last round what is meant to be."""
+        norms = np.linalg.norm(residuals, axis=1)
+        typical = max(float(np.median(norms)) / _MEDIAN_NORM, self._least_noise)
+        bound = typical if math.isinf(self.noise) else max(typical, self.noise)
+        self.inliers = norms <= _OUTLIER_SIGMAS * bound
+        if math.isinf(self.noise):
+            self.noise = typical
+
+    def _model(self, groups: Sequence[str], ask_correlation: bool) -> GroupedModel:
+        """The linear model around the present weights; those of the group "" are steps, the others' whole."""
+        x = self._features.positions(self.chain, self.weights, self._pairs.q)
+        residuals = (self._pairs.x - x) / self._pairs.unit[:, None]
+        self._judge_pairs(residuals)
+        rows = np.flatnonzero(self.inliers)
+        if self._on_path:
+            parts = min(max(len(rows) // BLOCK_PAIRS, FEWEST_BLOCKS), _BLOCKS, len(rows))
+        else:
+            parts = max(len(rows) // _ROWS_AT_ONCE, 1)
+        runs = np.array_split(rows, parts)
+        if self._on_path and ask_correlation:
+            self.shared = self._correlation(runs)
+        sums = [_moments(*self._rows(run, groups), self.shared) for run in runs]
+        return self._grouped(sums, groups, blocks=sums if self._on_path else ())
+
+    def _grouped(self, sums: Sequence[Moments], groups: Sequence[str], blocks: Sequence[Moments] = ()) -> GroupedModel:
+        sizes = [len(self._free), *(self._features.size(group) for group in groups)]
+        ends = np.cumsum([0, *sizes]).tolist()
+        spans = itertools.starmap(slice, itertools.pairwise(ends))
+        away = (self._prior.mean - self._present)[self._free]
+        seen = 0.0 if self._pairs.known else self._prior.noise / self._unit
+        return GroupedModel(
+            Moments.total(sums),
+            dict(zip(("", *groups), spans, strict=True)),
+            cast(FloatArray, np.linalg.solve(self._root, away)),
+            least_noise=self._least_noise,
+            noise=self.noise,
+            noise_before=(seen, _NOISE_ROWS if seen > 0.0 else 0.0),
+            blocks=blocks,
+        )
+
+    def _correlation(self, runs: Sequence[IntArray]) -> float:
+        """The most probable correlation of neighbours' errors in runs of pairs, with the present groups.
+
+        The weights are integrated out: residuals show less of it, for the weights follow what neighbours share.
+        """
+        groups = tuple(self.variances)
+        rows = [self._rows(run, groups) for run in runs]
+        pairs = sum(len(run) - 1 for run in runs)
+
+        def evidence(correlation: float) -> float:
+            model = self._grouped([_moments(*part, correlation) for part in rows], groups)
+            model.variances = dict(self.variances)
+            model.settle(_NOISE_ROUNDS)
+            return model.posterior().log_evidence - 1.5 * pairs * math.log1p(-(correlation**2))
+
+        return most_probable(evidence, self.shared)
+
+    def _rows(self, run: IntArray, groups: Sequence[str]) -> tuple[FloatArray, FloatArray]:
+        """Rows (n, 3, P) and targets (n, 3) of some pairs, in units.
+
+        What the groups on top explain at present is added to the target, for their weights are whole.
+        """
+        needed = tuple(dict.fromkeys((*groups, *self._known)))
+        point = self._features.linearised(self.change, self.chain, self.weights, self._pairs.q[run], needed)
+        target = self._pairs.x[run] - point.x
+        for group, weights in self._fresh.items():
+            target += point.groups[group] @ weights
+        known = np.concatenate([point.chain, *(point.groups[group] for group in self._known)], axis=2)
+        design = np.concatenate(
+            [known[:, :, self._free] @ self._root, *(point.groups[group] for group in groups)], axis=2
+        )
+        unit = self._pairs.unit[run, None]
+        return design / unit[:, :, None], target / unit
+
+    def _before_step(self, groups: Iterable[str]) -> FloatArray:
+        """Where the weights are before the step."""
+        parts = [np.zeros(len(self._free))]
+        parts += [self._fresh.get(g, np.zeros(self._features.size(g))) for g in groups]
+        return np.concatenate(parts)
+
+    def _take(self, mean: FloatArray, groups: Sequence[str]) -> None:
+        start = len(self._free)
+        self._present[self._free] += self._root @ mean[:start]
+        self._fresh = {}
+        for group in groups:
+            self._fresh[group] = mean[start : start + self._features.size(group)]
+            start += self._features.size(group)
+        self._unfold()
+
+    def model(self, spread: FloatArray) -> ResidualModel:
+        """The present weights, and how sure they are by the spread of the model's."""
+        ends = np.cumsum([self._parameters.size, *map(len, self.weights.values())]).tolist()
+        places = dict(zip(self.weights, itertools.pairwise(ends), strict=True))
+        root = np.zeros((ends[-1], spread.shape[1]))
+        # The prior's groups come first, in its order.
+        root[self._free] = self._root @ spread[: len(self._free)]
+        start = len(self._free)
+        for group, weights in self._fresh.items():
+            begin, end = places[group]
+            root[begin:end] += spread[start : start + len(weights)]
+            start += len(weights)
+        return ResidualModel(self._features, self.change, self.weights, root, self.noise * self._unit)
+
+
+def fit_residual(prior: ResidualModel, pairs: Pairs, change: FloatArray) -> ResidualFit | None:
+    """The fit around the chain at `change`, the most probable rigid one; None if nothing speaks for more than that."""
+    fitter = _Fitter(prior, pairs, change)
+    for turn in range(_ROUNDS):
+        length = fitter.step(turn < _SELECTIONS)
+        rigid = not fitter.weights and fitter.shared == 0.0
+        if rigid or (turn >= _SELECTIONS - 1 and length < _SMALL_STEP):
+            break
+    average = fitter.average()
+    if not fitter.weights and fitter.shared == 0.0:
+        return None
+    freedom = max(3.0 * float(fitter.inliers.sum()) - fitter.used, 0.0)
+    return ResidualFit(
+        model=fitter.model(average.spread),
+        noise=_beyond_chance(fitter.noise, freedom) if pairs.known else fitter.noise,
+        freedom=freedom,
+        shared=fitter.shared,
+        inliers=fitter.inliers,
+    )
+
+
+def _moments(design: FloatArray, target: FloatArray, correlation: float) -> Moments:
+    """Of rows (n, 3, P) and targets (n, 3), freed of what neighbours share."""
+    return Moments.of(
+        innovations(design, correlation).reshape(-1, design.shape[2]), innovations(target, correlation).ravel()
+    )
+
+
+def _beyond_chance(noise: float, freedom: float) -> float:
+    """Told noise, 1, unless the residuals are larger than what chance can make of it."""
+    explained = freedom + _MISFIT_SIGMAS * math.sqrt(2.0 * freedom)
+    return 1.0 if noise**2 * freedom <= explained else noise

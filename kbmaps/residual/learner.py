@@ -1,0 +1,216 @@
+"""Learning an arm that is nearly a rigid chain: the chain, and what it errs by, from all pairs at once."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import asdict, replace
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.special import stdtrit  # pyright: ignore[reportMissingTypeStubs, reportUnknownVariableType]
+
+from kbmaps.arrays import BoolArray, FloatArray
+from kbmaps.chains.belief import ChainBelief
+from kbmaps.chains.chain import RigidChain
+from kbmaps.chains.packed import chain_arrays, chain_from_arrays
+from kbmaps.chains.parameters import ChainTolerances
+from kbmaps.chains.rigid_learner import RigidLearner
+from kbmaps.errors import KBMapsError, ModelFormatError
+from kbmaps.model import Estimate
+from kbmaps.packed import numbers, pack, unpack
+from kbmaps.pairs import checked_pairs, with_units
+from kbmaps.residual.features import ResidualScaling
+from kbmaps.residual.fit import ResidualFit, fit_residual
+from kbmaps.residual.model import ResidualModel
+
+_KIND = "rigid chain with residual, batch, 1"
+# Configurations where the model is surer than this times the least sure pair (in variance) lie where data was.
+_SUPPORT_FACTOR = 2.0
+_LEAST_FREEDOM = 10.0
+_ONE_SIGMA = 0.841344746
+
+
+class ResidualLearner:
+    """A rigid chain around a nominal one, and smooth deviations from it where the pairs ask for them.
+
+    Deviations come in groups: eccentric encoders, gear gains, joints that yield under load, a distorting camera, and
+    smooth functions of one to three joints. The chain's tolerances and each group's variance are the prior; the
+    variances are those that make the pairs most probable, and what is predicted is the average over those sets of
+    groups that the pairs speak for. Where they speak for none, this is `RigidLearner` to the last bit.
+
+    Args:
+        nominal: the chain as drawn, or as `find_chain` found it.
+        tolerances: how far the real one may be from it.
+        prior: what is believed before the first pair, where more is known than the tolerances: of the same chain, or of
+            its deviations too. So an arm that got another tool is learnt on: `learner.model.with_other_tool(0.2)`.
+
+    Raises:
+        ShapeError: the prior is one of another chain.
+    """
+
+    def __init__(
+        self, nominal: RigidChain, tolerances: ChainTolerances, prior: ChainBelief | ResidualModel | None = None
+    ) -> None:
+        self._prior = prior if isinstance(prior, ResidualModel) else None
+        self._belief = None if isinstance(prior, ResidualModel) else prior
+        belief = prior.belief if isinstance(prior, ResidualModel) else prior
+        self._rigid = RigidLearner(nominal, tolerances, belief)
+        self._q, self._x = np.empty((0, nominal.joints)), np.empty((0, 3))
+        self._sigma = np.empty(0)
+        self._model: ResidualModel | None = None
+        self._fit: ResidualFit | None = None
+        self._widest = 0.0
+
+    @property
+    def joints(self) -> int:
+        """Number of joints d."""
+        return self._rigid.joints
+
+    @property
+    def pairs(self) -> int:
+        """How many pairs have been learnt."""
+        return len(self._q)
+
+    @property
+    def rigid(self) -> RigidLearner:
+        """The rigid chain that explains the same pairs best; its report has hand-eye, tool centre point and zeros."""
+        return self._rigid
+
+    @property
+    def model(self) -> ResidualModel:
+        """What has been learnt, as a value that later learning does not touch."""
+        self._fitted()
+        return self._model_before if self._model is None else self._model
+
+    @property
+    def chain(self) -> RigidChain:
+        """The rigid part of the model."""
+        return self.model.chain
+
+    @property
+    def deviations(self) -> dict[str, float]:
+        """By how much each group of deviations that the pairs speak for moves the learnt positions (RMS) [m]."""
+        return self.model.effects(self._q) if self.pairs else {}
+
+    @property
+    def inliers(self) -> BoolArray:
+        """Which pairs (n,), as they came, are no outliers."""
+        fit = self._fitted()
+        return self._rigid.inliers if fit is None else fit.inliers.copy()
+
+    def learn(self, q: ArrayLike, x: ArrayLike, sigma: ArrayLike | None = None) -> None:
+        """Pairs q (n, d) [rad, m] and x (n, 3) [m], or one, (d,) and (3,).
+
+        Args:
+            sigma: 1-sigma of the positions [m], () or (n,); None where it is to be estimated, as in `RigidLearner`.
+
+        Raises:
+            ShapeError, NonFiniteError, SettingError (a sigma that is not positive): nothing has changed.
+        """
+        angles, positions, sigmas = checked_pairs(q, x, sigma, self.joints)
+        self._rigid.learn(q, x, sigma)
+        self._q = np.concatenate([self._q, angles])
+        self._x = np.concatenate([self._x, positions])
+        self._sigma = np.concatenate([self._sigma, sigmas])
+        self._model = self._fit = None
+
+    def predict(self, q: ArrayLike) -> FloatArray:
+        """Positions (n, 3) [m] at q (n, d), or (3,) at q (d,).
+
+        Raises:
+            ShapeError, NonFiniteError
+        """
+        fit = self._fitted()
+        return self._rigid.predict(q) if fit is None and self._prior is None else self.model.predict(q)
+
+    def estimate(self, q: ArrayLike) -> Estimate:
+        """Positions at q (n, d), their 1-sigma per axis against the truth, and whether data was there.
+
+        Where the told noise does not explain the residuals, what is left over adds to sigma everywhere.
+
+        Raises:
+            ShapeError, NonFiniteError
+        """
+        fit = self._fitted()
+        if fit is None and self._prior is None:
+            return self._rigid.estimate(q)
+        x, variance = self.model.predict_with_variance(q)
+        if fit is None:
+            return Estimate(x, np.sqrt(variance), np.zeros(len(x), dtype=np.bool_))
+        inside = variance.sum(axis=1) <= _SUPPORT_FACTOR * self._widest
+        pairs = with_units(self._q, self._x, self._sigma)
+        if pairs.known:
+            variance = variance + (fit.noise**2 - 1.0) * float(np.square(pairs.unit).mean())
+            return Estimate(x, np.sqrt(variance), inside)
+        return Estimate(x, np.sqrt(variance) * float(stdtrit(max(fit.freedom, 1.0), _ONE_SIGMA)), inside)
+
+    def to_bytes(self) -> bytes:
+        """The learner with all its pairs; `from_bytes` gives the same predictions to the last bit."""
+        arrays = chain_arrays(self._rigid.nominal) | {"q": self._q, "x": self._x, "sigma": self._sigma}
+        prior, belief = self._prior, self._belief
+        priors = {"model": prior.to_bytes().hex()} if prior else {"belief": belief.to_bytes().hex()} if belief else {}
+        return pack(_KIND, asdict(self._rigid.tolerances) | priors, arrays)
+
+    @classmethod
+    def from_bytes(cls, data: bytes) -> Self:
+        """The learner in `data`. Raises ModelFormatError: it is none of this kind, or damaged."""
+        fields, arrays = unpack(data, _KIND)
+        prior = _stored_prior(fields)
+        settings = numbers(fields)
+        try:
+            learner = cls(chain_from_arrays(arrays), ChainTolerances(**settings), prior)
+            sigma = arrays["sigma"]
+            told = ~np.isnan(sigma)
+            for start, end in _runs(told):
+                part = slice(start, end)
+                learner.learn(arrays["q"][part], arrays["x"][part], sigma[part] if told[start] else None)
+        except (KeyError, TypeError, IndexError, KBMapsError) as error:
+            raise ModelFormatError(f"the bytes do not describe a rigid chain with residual: {error}") from error
+        return learner
+
+    @property
+    def _model_before(self) -> ResidualModel:
+        """What is known without pairs."""
+        return self._prior or ResidualModel.of_belief(self._rigid.belief)
+
+    def _fitted(self) -> ResidualFit | None:
+        """The fit; None where the rigid chain is all there is."""
+        if self._model is None and self.pairs:
+            pairs = with_units(self._q, self._x, self._sigma)
+            before = self._prior
+            if before is None or not before.weights:
+                load = None if before is None else before.features.scaling.load
+                scaling = replace(ResidualScaling.of(self._q, self._x), load=load)
+                before = ResidualModel.of_belief(self._rigid.prior, scaling, 0.0 if before is None else before.noise)
+            # Noise that nobody told must be seen in residuals that the chain alone leaves, or anything explains them.
+            if pairs.known or before.noise > 0.0 or self._rigid.report().freedom >= _LEAST_FREEDOM:
+                self._fit = fit_residual(before, pairs, self._rigid.change)
+            self._model = self._rigid_model(before) if self._fit is None else self._fit.model
+            if self._fit is not None:
+                _, variance = self._model.predict_with_variance(self._q[self._fit.inliers])
+                self._widest = float(variance.sum(axis=1).max(initial=0.0))
+        return self._fit
+
+    def _rigid_model(self, before: ResidualModel) -> ResidualModel:
+        report = self._rigid.report()
+        noise = report.noise * report.misfit if report.freedom >= _LEAST_FREEDOM else before.noise
+        return ResidualModel.of_belief(self._rigid.belief, before.features.scaling, noise)
+
+
+def _stored_prior(fields: dict[str, Any]) -> ChainBelief | ResidualModel | None:
+    """The prior in the fields of stored bytes, taken out of them. Raises ModelFormatError."""
+    kinds = {"model": ResidualModel.from_bytes, "belief": ChainBelief.from_bytes}
+    for name, read in kinds.items():
+        if name in fields:
+            try:
+                return read(bytes.fromhex(fields.pop(name)))
+            except (TypeError, ValueError) as error:
+                raise ModelFormatError(f"the field {name} is not hexadecimal") from error
+    return None
+
+
+def _runs(values: BoolArray) -> list[tuple[int, int]]:
+    """Begin and end of each run of equal values."""
+    ends = [0, *(np.flatnonzero(values[1:] != values[:-1]) + 1).tolist(), len(values)]
+    return list(itertools.pairwise(ends)) if len(values) else []

@@ -1,0 +1,212 @@
+"""A rigid chain with what the arm does beside it, as learnt: an immutable map from joint values to positions."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from types import MappingProxyType
+from typing import Self, cast
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from kbmaps.arrays import FloatArray, frozen, rows, rows_or_vector
+from kbmaps.chains.belief import ChainBelief
+from kbmaps.chains.chain import RigidChain
+from kbmaps.chains.packed import chain_arrays, chain_from_arrays
+from kbmaps.chains.parameters import ChainParameters
+from kbmaps.errors import KBMapsError, ModelFormatError, NonFiniteError, SettingError, ShapeError
+from kbmaps.packed import numbers, pack, unpack
+from kbmaps.residual.features import ResidualFeatures, ResidualScaling
+
+_KIND = "rigid chain with residual, fitted, 1"
+_GROUP = "group "
+# Lumped loads on linear springs are true to some per cent of the yielding that they explain.
+_LAW_ERROR = 0.03
+_BLOCK = 1024
+# Differences of fourth order [rad, m]: what is left out and what is rounded are both some 1e-13 of the derivative.
+_STEP = 1e-3
+_STENCIL = np.array([-2.0, -1.0, 1.0, 2.0])
+_SLOPES = np.array([1.0, -8.0, 8.0, -1.0]) / 12.0
+
+
+@dataclass(frozen=True, eq=False)
+class ResidualModel:
+    """A chain and the weights of the groups of deviations that pairs spoke for, as a Gaussian.
+
+    What `ResidualLearner` has learnt, without its pairs. It can be what another learner begins with.
+
+    Attributes:
+        features: the chain's parameters and the groups' functions.
+        change: of the chain's parameters, most probable (size,) [rad, m].
+        weights: of each group, most probable (features,).
+        root: W (size + features of all groups, k) with the covariance W Wᵀ of the change, then the weights.
+        noise: 1-sigma of a coordinate of what was measured [m], as the pairs showed it; 0 where none did.
+
+    Raises:
+        ShapeError, NonFiniteError
+    """
+
+    features: ResidualFeatures
+    change: FloatArray
+    weights: Mapping[str, FloatArray]
+    root: FloatArray
+    noise: float = 0.0
+
+    def __post_init__(self) -> None:
+        parameters = self.features.parameters
+        object.__setattr__(self, "weights", MappingProxyType({g: frozen(w) for g, w in self.weights.items()}))
+        arrays = {"change": (self.change, parameters.size)}
+        arrays |= {group: (weights, self.features.size(group)) for group, weights in self.weights.items()}
+        for name, (array, size) in arrays.items():
+            if array.shape != (size,):
+                raise ShapeError(name, f"({size},)", array.shape)
+        total = sum(size for _, size in arrays.values())
+        if self.root.ndim != 2 or len(self.root) != total:
+            raise ShapeError("root", f"({total}, k)", self.root.shape)
+        for name, array in (("root", self.root), *((name, array) for name, (array, _) in arrays.items())):
+            if not np.isfinite(array).all():
+                raise NonFiniteError(name)
+        object.__setattr__(self, "change", frozen(self.change))
+        object.__setattr__(self, "root", frozen(self.root))
+
+    @classmethod
+    def of_belief(cls, belief: ChainBelief, scaling: ResidualScaling | None = None, noise: float = 0.0) -> Self:
+        """A rigid chain and nothing else."""
+        scaling = scaling or ResidualScaling.whole_turns(belief.parameters.reference.joints)
+        return cls(ResidualFeatures(belief.parameters, scaling), belief.mean, {}, belief.root, noise)
+
+    @property
+    def joints(self) -> int:
+        """Number of joints d."""
+        return self.features.joints
+
+    @cached_property
+    def chain(self) -> RigidChain:
+        """The rigid part."""
+        return self.features.parameters.chain(self.change)
+
+    @property
+    def mean(self) -> FloatArray:
+        """The change, then the weights."""
+        return np.concatenate([self.change, *self.weights.values()])
+
+    @property
+    def belief(self) -> ChainBelief:
+        """What is believed of the rigid part, whatever the deviations are."""
+        parameters = self.features.parameters
+        return ChainBelief(parameters, self.change, self.root[: parameters.size])
+
+    @property
+    def digest(self) -> str:
+        """Sixteen hexadecimal digits that tell this map (not how sure it is) from any other."""
+        arrays = self._arrays()
+        del arrays["root"]
+        return hashlib.blake2b(pack(_KIND, {"scale": self.features.scaling.scale}, arrays), digest_size=8).hexdigest()
+
+    def predict(self, q: ArrayLike) -> FloatArray:
+        """Positions (n, 3) [m] at q (n, d) [rad, m], or (3,) at q (d,).
+
+        Raises:
+            ShapeError, NonFiniteError
+        """
+        angles = rows_or_vector("q", q, self.joints)
+        x = self.features.positions(self.chain, self.weights, np.atleast_2d(angles))
+        return x[0] if angles.ndim == 1 else x
+
+    def jacobian(self, q: ArrayLike) -> FloatArray:
+        """Derivative (n, 3, d) of the positions [m/rad, or m/m], or (3, d) at q (d,).
+
+        Raises:
+            ShapeError, NonFiniteError
+        """
+        angles = rows_or_vector("q", q, self.joints)
+        if not self.weights:
+            return self.chain.jacobian(angles)
+        around = np.atleast_2d(angles)[:, None, None] + _STEP * _STENCIL[:, None] * np.eye(self.joints)[:, None]
+        x = self.features.positions(self.chain, self.weights, around.reshape(-1, self.joints))
+        x = x.reshape(*around.shape[:3], 3)
+        slopes = np.einsum("njsi,s->nij", x, _SLOPES / _STEP)
+        return slopes[0] if angles.ndim == 1 else slopes
+
+    def predict_with_variance(self, q: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """Positions at q (n, d) and the variance of each coordinate to first order, both (n, 3) [m, m²].
+
+        Raises:
+            ShapeError, NonFiniteError
+        """
+        angles = rows("q", q, self.joints)
+        x, variance = np.empty((len(angles), 3)), np.empty((len(angles), 3))
+        for start in range(0, len(angles), _BLOCK):
+            part = slice(start, start + _BLOCK)
+            point = self.features.linearised(self.change, self.chain, self.weights, angles[part], tuple(self.weights))
+            design = np.concatenate([point.chain, *point.groups.values()], axis=2)
+            x[part], variance[part] = point.x, np.square(design @ self.root).sum(axis=2)
+            for group in self.features.approximate(self.weights):
+                move = point.groups[group] @ self.weights[group]
+                variance[part] += _LAW_ERROR**2 / 3.0 * np.square(move).sum(axis=1, keepdims=True)
+        return x, variance
+
+    def effects(self, q: ArrayLike) -> dict[str, float]:
+        """By how much each group moves the positions at q (n, d), root mean square of the distances [m].
+
+        Raises:
+            ShapeError, NonFiniteError
+        """
+        angles = rows("q", q, self.joints)
+        point = self.features.linearised(self.change, self.chain, self.weights, angles, tuple(self.weights))
+        moves = {group: point.groups[group] @ weights for group, weights in self.weights.items()}
+        return {group: math.sqrt(float(np.square(move).sum(axis=1).mean())) for group, move in moves.items()}
+
+    def with_other_tool(self, tolerance: float) -> Self:
+        """The same arm with a marker that was moved, by `tolerance` (1-sigma of each component [m]).
+
+        The arm's joints yield and err as before; the hand's load stays where it was.
+
+        Raises:
+            SettingError: the tolerance is not positive.
+        """
+        if not (tolerance > 0.0 and math.isfinite(tolerance)):
+            raise SettingError(f"tolerance must be finite and greater than 0 m, got {tolerance!r}")
+        parameters, scaling = self.features.parameters, self.features.scaling
+        moved = np.zeros((len(self.root), 3))
+        moved[parameters.tool] = tolerance * np.eye(3)
+        root = cast(FloatArray, np.linalg.qr(np.concatenate([self.root, moved], axis=1).T, mode="r")).T
+        if scaling.load is None:
+            scaling = replace(scaling, load=self.chain.fixed[-1, :3, 3])
+        return type(self)(ResidualFeatures(parameters, scaling), self.change, self.weights, root, self.noise)
+
+    def to_bytes(self) -> bytes:
+        """The model as one self-describing byte string; `from_bytes` gives the same predictions to the last bit."""
+        return pack(_KIND, {"scale": self.features.scaling.scale, "noise": self.noise}, self._arrays())
+
+    @classmethod
+    def from_bytes(cls, data: bytes) -> Self:
+        """The model in `data`. Raises ModelFormatError: it is none of this kind, or damaged."""
+        fields, arrays = unpack(data, _KIND)
+        settings = numbers(fields)
+        try:
+            scaling = ResidualScaling(
+                arrays["middle"], arrays["half"], arrays["centre"], settings["scale"], arrays.get("load")
+            )
+            features = ResidualFeatures(ChainParameters(chain_from_arrays(arrays)), scaling)
+            weights = {name.removeprefix(_GROUP): w for name, w in arrays.items() if name.startswith(_GROUP)}
+            return cls(features, arrays["change"], weights, arrays["root"], settings["noise"])
+        except (KeyError, ValueError, KBMapsError) as error:
+            raise ModelFormatError(f"the bytes do not describe a rigid chain with residual: {error}") from error
+
+    def _arrays(self) -> dict[str, FloatArray]:
+        scaling = self.features.scaling
+        arrays = chain_arrays(self.features.parameters.reference) | {
+            "middle": scaling.middle,
+            "half": scaling.half,
+            "centre": scaling.centre,
+            "change": self.change,
+            "root": self.root,
+        }
+        if scaling.load is not None:
+            arrays["load"] = scaling.load
+        return arrays | {_GROUP + group: weights for group, weights in self.weights.items()}

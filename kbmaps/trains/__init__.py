@@ -1,0 +1,1 @@
+"""Tensor trains: maps of many joints in a few numbers each, and what learns them."""

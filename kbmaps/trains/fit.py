@@ -1,0 +1,164 @@
+"""The most likely tensor train for given pairs: alternating least squares, then Levenberg–Marquardt."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from kbmaps import lapack
+from kbmaps.arrays import FloatArray
+from kbmaps.trains.core_prior import CORE_NUMBERS, CorePrior
+from kbmaps.trains.train import apply, prefixes, suffixes
+
+_FIRST_DAMPING = 1e-3
+_SMALLEST_DAMPING = 1e-15
+_LARGEST_DAMPING = 1e6
+# A step that gains less than this share of the objective ends the search.
+_SMALLEST_GAIN = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class TensorProblem:
+    """Pairs and what is known beforehand: the objective Σ ‖(x − f(q)) / std‖² + ‖z‖² over the whitened cores z.
+
+    Attributes:
+        weights: basis functions (n, d, 3).
+        x: positions (n, 3) [m].
+        std: of one coordinate of each pair (n,) [m].
+        prior: the Gaussian that z is the standard form of.
+    """
+
+    weights: FloatArray
+    x: FloatArray
+    std: FloatArray
+    prior: CorePrior
+
+    def maps(self, z: FloatArray) -> FloatArray:
+        cores = self.prior.cores(z)
+        flat = self.weights.swapaxes(0, 1) @ cores.reshape(len(cores), 3, 12)
+        return flat.reshape(*flat.shape[:2], 3, 4)
+
+    def residuals(self, z: FloatArray) -> FloatArray:
+        """x − f(q) (n, 3) [m]."""
+        return self.x - suffixes(self.maps(z))[0]
+
+    def objective(self, z: FloatArray) -> float:
+        scaled = self.residuals(z) / self.std[:, None]
+        return float(np.square(scaled).sum() + z @ z)
+
+    def scaled_jacobian(self, z: FloatArray) -> FloatArray:
+        """Derivative of f / std by z (3 n, 36 d)."""
+        return whitened_jacobian(self.weights, self.maps(z), self.prior) / np.repeat(self.std, 3)[:, None]
+
+
+def whitened_jacobian(weights: FloatArray, maps: FloatArray, prior: CorePrior) -> FloatArray:
+    """Derivative of the positions by z (3 n, 36 d), for basis functions (n, d, 3) and maps (d, n, 3, 4)."""
+    linear, points = prefixes(maps), suffixes(maps)
+    count, joints = weights.shape[:2]
+    jacobian = np.empty((3 * count, CORE_NUMBERS * joints))
+    for k in range(joints):
+        block = _core_jacobian(linear[k], weights[:, k], points[k + 1])
+        jacobian[:, CORE_NUMBERS * k : CORE_NUMBERS * (k + 1)] = block @ prior.spread[k]
+    return jacobian
+
+
+def _core_jacobian(linear: FloatArray, weights: FloatArray, points: FloatArray) -> FloatArray:
+    """Derivative of the positions by one core (3 n, 36): rows L[o, a] w[j] (r, 1)[b] at (pair, o), (j, a, b)."""
+    count = len(weights)
+    right = np.empty((count, 3, 4))
+    right[:, :, :3] = weights[:, :, None] * points[:, None, :]
+    right[:, :, 3] = weights
+    block = linear[:, :, None, :, None] * right[:, None, :, None, :]
+    return block.reshape(3 * count, CORE_NUMBERS)
+
+
+def alternate(problem: TensorProblem, z: FloatArray, sweeps: int) -> FloatArray:
+    """Alternating least squares: each core in turn at its best while the others rest.
+
+    Grasedyck, Kluge, Krämer 2015, section 3, for an affine train and with the prior as ridge.
+    """
+    z = z.copy()
+    scale = np.repeat(1.0 / problem.std, 3)[:, None]
+    spread = problem.prior.spread
+    for _ in range(sweeps):
+        maps = problem.maps(z)
+        points = suffixes(maps)
+        linear = np.broadcast_to(np.eye(3), (len(problem.x), 3, 3))
+        ahead = np.zeros_like(problem.x)
+        for k in range(maps.shape[0]):
+            part = slice(CORE_NUMBERS * k, CORE_NUMBERS * (k + 1))
+            rows = _core_jacobian(linear, problem.weights[:, k], points[k + 1]) @ spread[k]
+            rows *= scale
+            miss = problem.x - ahead - (linear @ apply(maps[k], points[k + 1])[:, :, None])[:, :, 0]
+            normal = rows.T @ rows
+            normal[np.diag_indices(CORE_NUMBERS)] += 1.0 + _SMALLEST_DAMPING * normal.trace()
+            factor, _ = lapack.cholesky_lower(np.asfortranarray(normal))
+            step = lapack.cholesky_solve(factor, rows.T @ (miss.ravel() * scale[:, 0]) - z[part])
+            z[part] += step
+            change = (spread[k] @ step).reshape(3, 12)
+            maps[k] += (problem.weights[:, k] @ change).reshape(-1, 3, 4)
+            ahead = ahead + (linear @ maps[k][:, :, 3:])[:, :, 0]
+            linear = linear @ maps[k][:, :, :3]
+    return z
+
+
+@dataclass
+class LevenbergMarquardt:
+    """Damped Gauss–Newton on a TensorProblem.
+
+    The damping is a multiple of the identity in whitened cores. Gauge freedoms (an affine change of the frame between
+    two cores) need nothing else: the step has no part along them but what the prior asks for.
+    """
+
+    damping: float = _FIRST_DAMPING
+    iterations: int = 0
+    converged: bool = field(default=False, init=False)
+
+    def run(self, problem: TensorProblem, z: FloatArray, limit: int) -> tuple[FloatArray, float]:
+        """z and its objective after at most `limit` steps."""
+        value = problem.objective(z)
+        self.converged = False
+        for _ in range(limit):
+            self.iterations += 1
+            jacobian = problem.scaled_jacobian(z)
+            residual = (problem.residuals(z) / problem.std[:, None]).ravel()
+            normal, dual = _normal_matrix(jacobian)
+            before = value
+            while self.damping <= _LARGEST_DAMPING:
+                step = _damped_step(jacobian, normal, dual, residual, z, self.damping)
+                trial = np.inf if step is None else problem.objective(z + step)
+                if step is not None and trial < value:
+                    z, value = z + step, trial
+                    self.damping = max(0.1 * self.damping, _SMALLEST_DAMPING)
+                    break
+                self.damping *= 10.0
+            else:
+                self.damping = _FIRST_DAMPING
+                self.converged = True
+                return z, value
+            if before - value <= _SMALLEST_GAIN * before:
+                self.converged = True
+                return z, value
+        return z, value
+
+
+def _normal_matrix(jacobian: FloatArray) -> tuple[FloatArray, bool]:
+    """The smaller of JᵀJ and JJᵀ, and whether it is the latter."""
+    dual = jacobian.shape[0] < jacobian.shape[1]
+    return (jacobian @ jacobian.T if dual else jacobian.T @ jacobian), dual
+
+
+def _damped_step(
+    jacobian: FloatArray, normal: FloatArray, dual: bool, residual: FloatArray, z: FloatArray, damping: float
+) -> FloatArray | None:
+    """Minimises ‖residual − J δ‖² + ‖z + δ‖² + damping·mean(diag JᵀJ) ‖δ‖²; None if not positive definite."""
+    shift = 1.0 + damping * float(normal.trace()) / jacobian.shape[1]
+    shifted = np.array(normal, order="F")
+    shifted[np.diag_indices(len(normal))] += shift
+    factor, positive = lapack.cholesky_lower(shifted)
+    if not positive:
+        return None
+    if not dual:
+        return lapack.cholesky_solve(factor, jacobian.T @ residual - z)
+    return jacobian.T @ lapack.cholesky_solve(factor, residual + jacobian @ z / shift) - z / shift

@@ -1,0 +1,391 @@
+"""A tensor train that learns from pairs, in one go or as a stream."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import fields
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from kbmaps.arrays import BoolArray, FloatArray, rows, rows_or_vector, vector
+from kbmaps.chains.chain import RigidChain
+from kbmaps.errors import DegenerateDataError, KBMapsError, ModelFormatError, SettingError, ShapeError
+from kbmaps.maps.basis import JointBasis
+from kbmaps.maps.packed import describe_bases, parse_bases
+from kbmaps.maps.stack import BasisStack
+from kbmaps.model import Estimate
+from kbmaps.packed import named, pack, unpack
+from kbmaps.pairs import checked_pairs
+from kbmaps.trains.core_evidence import USUAL_ELLIPSE_STD, core_information, likely_ellipse_std
+from kbmaps.trains.core_prior import CORE_NUMBERS, CoreFamily, CorePrior
+from kbmaps.trains.misfit import misfit_sizes
+from kbmaps.trains.posterior import TensorPosterior
+from kbmaps.trains.search import PLAUSIBLE, Fit, Pairs, information, refine, search
+from kbmaps.trains.settings import TensorSettings
+from kbmaps.trains.train import TensorTrain
+
+KIND = "tensor learner"
+# Relative to the residuals under the prior: the noise that the first fit around a prior starts with.
+_FIRST_NOISE = 0.1
+# A refit that leaves this many times the noise of the fit before has lost its way and is searched anew.
+_LOST = 3.0
+_SHARE_BEFORE_REFIT = 4
+# Times the pairs that could just determine a train: to search at all, and until a search has found what it should.
+_PAIRS_TO_SEARCH = 1.5
+_SEARCHES_UNTIL = 1.5
+
+
+class TensorLearner:
+    """Learns a TensorTrain. A `kbmaps.model.Model`.
+
+    With a prior, every fit is the most likely train under it (`TensorLearner.around` makes one of a nominal chain).
+    Without, the first fits search from random chains once there are `pairs_needed`; later ones go on from the one
+    before. Where no sigma is given the noise is found from the residuals.
+
+    Args:
+        bases: one a joint; orthonormal over the joints' ranges (`learning_bases`) are advised.
+        prior: what is known of the cores, in these bases; None where nothing is. Of a family every fit takes the
+            member that its pairs speak for.
+
+    Raises:
+        ShapeError: the prior has another number of joints.
+
+    Example:
+        >>> import numpy as np
+        >>> from kbmaps import RigidChain, TensorLearner, learning_bases
+        >>> fixed = np.tile(np.eye(4), (3, 1, 1))
+        >>> fixed[1:, 0, 3] = 0.3, 0.2  # links [m]
+        >>> arm = RigidChain(fixed, axes=[[0, 0, 1], [0, 1, 0]], prismatic=[False, False])
+        >>> learner = TensorLearner(learning_bases([-1, -1], [1, 1]))
+        >>> q = np.random.default_rng(0).uniform(-1, 1, (40, 2))
+        >>> learner.learn(q, arm.positions(q))
+        >>> bool(np.abs(learner.predict(q) - arm.positions(q)).max() < 1e-9)
+        True
+    """
+
+    def __init__(
+        self,
+        bases: Sequence[JointBasis],
+        prior: CorePrior | CoreFamily | None = None,
+        settings: TensorSettings | None = None,
+    ) -> None:
+        self.bases = tuple(bases)
+        self.settings = TensorSettings() if settings is None else settings
+        self._stack = BasisStack(self.bases)
+        self._q = np.empty((0, self.joints))
+        self._x = np.empty((0, 3))
+        self._sigma = np.empty(0)
+        self._pairs = self._waiting = 0
+        self._searches = prior is None
+        self._prior: CorePrior | None = None
+        self._fit: Fit | None = None
+        self._train: TensorTrain | None = None
+        self._posterior: TensorPosterior | None = None
+        self._family: CoreFamily | None = None
+        if isinstance(prior, CoreFamily):
+            self.rebase(prior.prior(USUAL_ELLIPSE_STD))
+            self._family = prior
+        elif prior is not None:
+            self.rebase(prior)
+
+    @classmethod
+    def around(
+        cls,
+        chain: RigidChain,
+        bases: Sequence[JointBasis],
+        settings: TensorSettings | None = None,
+        *,
+        turn_std: float = math.radians(3.0),
+        shift_std: float = 0.015,
+        marker_std: float = 0.03,
+        ellipse_std: float | None = None,
+    ) -> TensorLearner:
+        """A learner with a nominal chain as prior; the standard deviations as in `CorePrior.around`.
+
+        Args:
+            ellipse_std: how far from rigid the arm is; None finds it by the evidence of the pairs at every fit.
+
+        Raises:
+            SettingError: a standard deviation is not positive. BasisError: bases do not fit the chain.
+        """
+        length = max(float(np.linalg.norm(chain.fixed[:, :3, 3], axis=1).mean()), 1e-3)
+        family = CoreFamily.around(
+            chain, bases, turn_std=turn_std, shift_std=shift_std, marker_std=marker_std, length=length
+        )
+        return cls(bases, family if ellipse_std is None else family.prior(ellipse_std), settings)
+
+    @property
+    def joints(self) -> int:
+        """Number of joints d."""
+        return len(self.bases)
+
+    @property
+    def pairs(self) -> int:
+        """How many pairs have been learnt."""
+        return self._pairs
+
+    @property
+    def kept(self) -> int:
+        """How many pairs are in the window."""
+        return len(self._q)
+
+    @property
+    def pairs_needed(self) -> int:
+        """Pairs before the first fit where there is no prior: half as many again as three numbers each could do with.
+
+        The train has Σ 12 m_k numbers over all joints but the last and 3 m_d of that, less 12 for the frame between
+        any two cores: 24 d − 15 for revolute joints.
+        """
+        sizes = [basis.size for basis in self.bases]
+        numbers = 12 * sum(sizes[:-1]) + 3 * sizes[-1] - 12 * (self.joints - 1)
+        return math.ceil(_PAIRS_TO_SEARCH * numbers / 3)
+
+    @property
+    def train(self) -> TensorTrain:
+        """The train as fitted last.
+
+        Raises:
+            DegenerateDataError: there is no prior, and fewer than `pairs_needed` pairs so far.
+        """
+        if self._train is None:
+            raise DegenerateDataError(
+                f"without a prior a train of {self.joints} joints needs {self.pairs_needed} pairs; "
+                f"{self.kept} are kept, {self._waiting} of them wait for the next fit"
+            )
+        return self._train
+
+    @property
+    def noise(self) -> float | None:
+        """Noise of a coordinate at the last fit [m]: as found, or the RMS of the given sigmas; None before."""
+        return None if self._fit is None else self._fit.noise
+
+    @property
+    def outliers(self) -> BoolArray:
+        """Which of the pairs of the last fit, oldest first, were left out as wrong."""
+        return np.zeros(0, dtype=np.bool_) if self._fit is None else ~self._fit.used
+
+    def learn(self, q: ArrayLike, x: ArrayLike, sigma: ArrayLike | None = None) -> None:
+        """Pairs q (n, d) [rad, m] and x (n, 3) [m], or one, (d,) and (3,).
+
+        Args:
+            sigma: 1-sigma of a coordinate [m], () or (n,); None where the learner has to find it out.
+
+        Raises:
+            ShapeError, NonFiniteError, SettingError (a sigma that is not positive): nothing has changed.
+        """
+        angles, positions, sigmas = checked_pairs(q, x, sigma, self.joints)
+        self._q = np.concatenate([self._q, angles])
+        self._x = np.concatenate([self._x, positions])
+        self._sigma = np.concatenate([self._sigma, sigmas])
+        self._pairs += len(angles)
+        self._waiting += len(angles)
+        if self.settings.window is not None:
+            self._keep(self.settings.window)
+        # A quarter more pairs may change much while they are few.
+        if self._waiting >= min(self.settings.refit_every, max(1, self.kept // _SHARE_BEFORE_REFIT)):
+            self.refit()
+
+    def forget(self, keep: int) -> None:
+        """Drops all but the last `keep` pairs. The train stays until the next fit.
+
+        Raises:
+            SettingError: keep below 0.
+        """
+        if keep < 0:
+            raise SettingError(f"keep must be at least 0, got {keep}")
+        self._keep(keep)
+
+    def move_marker(self, std: float) -> None:
+        """The marker has been moved: keeps what is known of all other cores, and forgets the pairs.
+
+        The train so far becomes the prior's mean. Each core's covariance is the one it has while the others rest,
+        which pins the frames between them. The last core is as free as a marker moved by `std` makes it: along the
+        axes of its frame where a nominal chain gave them, and any way where nothing did.
+
+        Args:
+            std: standard deviation of each component of the move [m].
+
+        Raises:
+            SettingError: std is not positive.
+            DegenerateDataError: there is neither a prior nor enough pairs.
+        """
+        if not std > 0.0:
+            raise SettingError(f"std must be greater than 0, got {std!r}")
+        prior = self.posterior.with_moved_marker(std)
+        self._keep(0)
+        self.rebase(prior)
+
+    def rebase(self, prior: CorePrior) -> None:
+        """Another prior for the same pairs; the next fit starts from its mean.
+
+        Raises:
+            ShapeError: it has another number of joints.
+        """
+        if prior.joints != self.joints:
+            raise ShapeError("prior.mean", f"({self.joints}, {CORE_NUMBERS})", prior.mean.shape)
+        self._prior, self._searches = prior, False
+        self._fit = self._posterior = self._family = None
+        self._train = TensorTrain(self.bases, prior.cores(np.zeros(CORE_NUMBERS * self.joints)))
+        self._waiting = self.kept
+
+    def refit(self) -> None:
+        """Fits to all kept pairs now; without a prior only once there are `pairs_needed` of them."""
+        if self.kept < (self.pairs_needed if self._searches else 1):
+            return
+        data = Pairs(self._stack.joint_weights(self._q), self._x, self._sigma)
+        fit = self._with_likely_prior(data, self._fitted(data))
+        prior = self._known_prior()
+        self._fit, self._train, self._waiting = fit, TensorTrain(self.bases, prior.cores(fit.z)), 0
+        known, std = information(data, prior, fit)
+        self._posterior = TensorPosterior(self._train, prior, known, noise=fit.noise)
+        used = self._q[fit.used]
+        self._posterior.judge(used, self._x[fit.used] - self.predict(used), std)
+
+    @property
+    def posterior(self) -> TensorPosterior:
+        """How sure the train is, as fitted last; the prior before.
+
+        Raises:
+            DegenerateDataError: there is neither a prior nor enough pairs.
+        """
+        if self._posterior is None:
+            self._posterior = TensorPosterior(self.train, self._known_prior(), None)
+        return self._posterior
+
+    def predict(self, q: ArrayLike) -> FloatArray:
+        """Positions (n, 3) [m] at q (n, d), or (3,) at q (d,).
+
+        Raises:
+            ShapeError, NonFiniteError
+            DegenerateDataError: there is neither a prior nor enough pairs.
+        """
+        return self.train.predict(q)
+
+    def estimate(self, q: ArrayLike) -> Estimate:
+        """Positions at q (n, d) with the standard deviation that Gauss and Newton's posterior leaves them.
+
+        Where residuals show joints or an instrument that err as no train does, what that leaves open adds to it
+        (`kbmaps.trains.misfit`).
+
+        A configuration is in support while its prediction is no less certain than one measurement (leverage ≤ 1).
+
+        Raises:
+            ShapeError, NonFiniteError
+            DegenerateDataError: there is neither a prior nor enough pairs.
+        """
+        angles, posterior = np.atleast_2d(rows_or_vector("q", q, self.joints)), self.posterior
+        variance = posterior.variance(angles)
+        inside = variance.mean(axis=1) <= posterior.noise**2
+        return Estimate(self.predict(angles), np.sqrt(variance), inside)
+
+    def to_bytes(self) -> bytes:
+        """The train, its prior, the kept pairs and the settings as one self-describing byte string."""
+        arrays = {"q": self._q, "x": self._x, "sigma": self._sigma}
+        if self._prior is not None:
+            arrays |= {"mean": self._prior.mean, "spread": self._prior.spread}
+        if self._family is not None:
+            arrays |= {"family_mean": self._family.mean, "motions": self._family.motions}
+        known = None if self._posterior is None else self._posterior.information
+        if self._fit is not None and self._posterior is not None and known is not None:
+            used = self._fit.used.astype(np.float64)
+            sure = np.array([self._fit.noise, *self._posterior.misfit])
+            arrays |= {"z": self._fit.z, "sure": sure, "used": used, "information": known}
+            arrays |= {"absorbed": self._posterior.absorbed}
+        content = {
+            "bases": describe_bases(self.bases),
+            "settings": [getattr(self.settings, name) for name in _SETTINGS],
+            "counts": [self._pairs, self._waiting],
+            "searches": self._searches,
+            "length": 0.0 if self._family is None else self._family.length,
+        }
+        return pack(KIND, content, arrays)
+
+    @classmethod
+    def from_bytes(cls, data: bytes) -> Self:
+        """The learner that `to_bytes` wrote.
+
+        Raises:
+            ModelFormatError: the bytes are damaged, truncated, or something else.
+        """
+        content, arrays = unpack(data, KIND)
+        named(content, "the fields", ("bases", "settings", "counts", "searches", "length"))
+        try:
+            return cls._restored(content, arrays)
+        except ModelFormatError:
+            raise
+        except (KBMapsError, KeyError, TypeError, ValueError) as error:
+            raise ModelFormatError(f"the parts of the stored learner do not fit each other: {error}") from error
+
+    @classmethod
+    def _restored(cls, content: dict[str, Any], arrays: dict[str, FloatArray]) -> Self:
+        values = dict(zip(_SETTINGS, content["settings"], strict=True))
+        prior = CorePrior(arrays["mean"], arrays["spread"]) if "mean" in arrays else None
+        learner = cls(parse_bases(content["bases"]), prior, TensorSettings(**values))
+        learner._q = rows("q", arrays["q"], learner.joints)
+        learner._x = rows("x", arrays["x"], 3)
+        learner._sigma = arrays["sigma"]
+        if not len(learner._q) == len(learner._x) == len(learner._sigma) or learner._sigma.ndim != 1:
+            raise ModelFormatError("the stored learner's pairs are of different numbers")
+        learner._pairs, learner._waiting = (int(number) for number in content["counts"])
+        learner._searches = bool(content["searches"])
+        if prior is not None and "z" in arrays:
+            size = CORE_NUMBERS * learner.joints
+            z = vector("z", arrays["z"], size)
+            noise, *misfit = (float(number) for number in vector("sure", arrays["sure"], 4))
+            learner._fit = Fit(z, noise, arrays["used"].astype(np.bool_))
+            learner._train = TensorTrain(learner.bases, prior.cores(z))
+            known = rows("information", arrays["information"], size)
+            learner._posterior = TensorPosterior(learner._train, prior, known, noise=noise)
+            absorbed = rows("absorbed", arrays["absorbed"], sum(misfit_sizes(learner.joints)))
+            learner._posterior.take(np.array(misfit), absorbed)
+        if "motions" in arrays:
+            learner._family = CoreFamily(arrays["family_mean"], arrays["motions"], float(content["length"]))
+        return learner
+
+    def _keep(self, count: int) -> None:
+        begin = max(len(self._q) - count, 0)
+        self._q, self._x, self._sigma = self._q[begin:], self._x[begin:], self._sigma[begin:]
+        self._waiting = min(self._waiting, len(self._q))
+
+    def _known_prior(self) -> CorePrior:
+        if self._prior is None:
+            raise DegenerateDataError("there is no prior yet; learn more pairs")
+        return self._prior
+
+    def _with_likely_prior(self, data: Pairs, fit: Fit) -> Fit:
+        """The fit under the member of the family that the pairs speak for."""
+        if self._family is None:
+            return fit
+        prior = self._known_prior()
+        problem = data.chosen(fit.used).problem(prior, fit.noise)
+        std = likely_ellipse_std(self._family, *core_information(problem, fit.z))
+        self._prior = self._family.prior(std)
+        if np.array_equal(self._prior.spread, prior.spread):
+            return fit
+        z = self._prior.whitened(prior.cores(fit.z))
+        return refine(data, self._prior, z, fit.noise, robust=self.settings.robust)
+
+    def _fitted(self, data: Pairs) -> Fit:
+        """The fit to all kept pairs; gives a learner without a prior a vague one of the pairs' size."""
+        rng = np.random.default_rng(self.settings.seed)
+        if self._prior is None:
+            self._prior = CorePrior.vague(self.joints, data.size / math.sqrt(self.joints))
+        before, robust = self._fit, self.settings.robust
+        if before is None and not self._searches:
+            z = np.zeros(CORE_NUMBERS * self.joints)
+            guess = _FIRST_NOISE * math.sqrt(float(np.square(data.problem(self._prior, 1.0).residuals(z)).mean()))
+            return refine(data, self._prior, z, max(guess, data.noise_floor), robust=robust)
+        if before is None or (self._searches and self.kept < _SEARCHES_UNTIL * self.pairs_needed):
+            return search(data, self._prior, self.bases, rng, self.settings.starts, robust=robust)
+        fit = refine(data, self._prior, before.z, before.noise, robust=robust)
+        lost = fit.noise > _LOST * max(before.noise, data.noise_floor) or fit.noise > PLAUSIBLE * data.size
+        if self._searches and lost:
+            again = search(data, self._prior, self.bases, rng, self.settings.starts, robust=robust)
+            fit = min(fit, again, key=lambda candidate: candidate.noise)
+        return fit
+
+
+_SETTINGS = tuple(field.name for field in fields(TensorSettings))

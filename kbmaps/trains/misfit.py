@@ -1,0 +1,91 @@
+"""What no tensor train follows: joints that turn by a little more or less than they say, an instrument that bends."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from kbmaps.arrays import FloatArray
+from kbmaps.maps.basis import JointBasis
+from kbmaps.trains.train import TensorTrain
+
+# Standard deviations that are tried: of a joint's errors [rad], or in prismatic joints and 1 m away [m].
+_STDS = np.geomspace(1e-5, 1e-1, 17)
+_SWEEPS = 2
+_ROUNDING = 1e-10
+# Twice the gain in log evidence that speaks for a kind of errors; by chance one arm in twelve has as much.
+_TELLING = 2.0
+
+
+def misfit_directions(train: TensorTrain, q: FloatArray) -> FloatArray:
+    """What errors of joints and instrument do to the marker (n, 3, 5 d + 18) [m/rad, m/m], for trusted q (n, d).
+
+    A joint's error is a second harmonic of its reading (a train has the constant and the first: so do eccentric
+    encoders, gears and what else repeats err), or proportional to the moment of a force on the marker, along each axis
+    of the measurement frame (so do elastic joints err). The instrument's is any quadratic function of the position
+    (so do lenses err; a train follows the linear ones).
+    """
+    slopes = train.jacobian(q)
+    phases = _phases(train.bases, q)
+    errors = [np.cos(phases), np.sin(phases)]
+    # By as much at a lever of 1 m as by a harmonic; so does the instrument 1 m away.
+    errors += [slopes[:, axis] for axis in range(3)]
+    x = train.predict(q)
+    squares = (x[:, :, None] * x[:, None, :])[:, *np.triu_indices(3)]
+    bends = np.einsum("ij,nk->nijk", np.eye(3), squares).reshape(len(q), 3, -1)
+    return np.concatenate([*(slopes * error[:, None] for error in errors), bends], axis=2)
+
+
+def misfit_sizes(joints: int) -> tuple[int, int, int]:
+    """How many directions are harmonics of joints, joints under load, and the instrument's."""
+    return 2 * joints, 3 * joints, 18
+
+
+def likely_misfit(
+    directions: FloatArray, absorbed: FloatArray, residuals: FloatArray, sizes: tuple[int, ...]
+) -> FloatArray:
+    """The most likely standard deviation of each group of errors; 0 where the pairs speak for none.
+
+    With y = J z + G w + e in units of the noise, z ~ N(0, I), w ~ N(0, D²) and z marginalised, what counts of w is
+    C = Gᵀ (I + J Jᵀ)⁻¹ G, and Gᵀ r of the residuals r at the best z:
+
+        2 log p(D) - 2 log p(0) = rᵀ G D (I + D C D)⁻¹ D Gᵀ r - log |I + D C D|.
+
+    Args:
+        directions: G (m, k).
+        absorbed: Rᵀ G (p, k), with R Rᵀ = J (JᵀJ + I)⁻¹ Jᵀ.
+        residuals: r (m,).
+        sizes: of the groups, k in all.
+    """
+    values, vectors = np.linalg.eigh(directions.T @ directions - absorbed.T @ absorbed)
+    # What the cores make up for all but rounding shows nothing; without noise the rounding would be taken for much.
+    values = np.maximum(values, _ROUNDING * max(float(values.max(initial=0.0)), 1e-300))
+    matrix = (vectors * values) @ vectors.T
+    pull = directions.T @ residuals
+    stds = np.zeros(len(sizes))
+    for _ in range(_SWEEPS):
+        for group in range(len(sizes)):
+            trials = np.tile(stds, (len(_STDS) + 1, 1))
+            trials[:, group] = 0.0, *_STDS
+            gains = np.array([_gain(matrix, pull, np.repeat(trial, sizes)) for trial in trials])
+            gains[0] += _TELLING
+            stds = trials[int(gains.argmax())]
+    return stds
+
+
+def _gain(matrix: FloatArray, pull: FloatArray, spread: FloatArray) -> float:
+    some = np.flatnonzero(spread)
+    scaled = spread[some] * pull[some]
+    factor = np.linalg.cholesky(np.eye(len(some)) + matrix[np.ix_(some, some)] * np.outer(spread[some], spread[some]))
+    return float(np.square(np.linalg.solve(factor, scaled)).sum() - 2.0 * np.log(np.diag(factor)).sum())
+
+
+def _phases(bases: Sequence[JointBasis], q: FloatArray) -> FloatArray:
+    """Twice the angle of a revolute joint; a prismatic one's stroke counts as a turn."""
+    phases = 2.0 * q
+    for k, basis in enumerate(bases):
+        if basis.is_prismatic:
+            start, span = basis.terms.phases
+            phases[:, k] = 2.0 * np.pi * (q[:, k] - start) / span
+    return phases

@@ -1,0 +1,117 @@
+"""How sure a tensor train is, and what it cannot follow."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from kbmaps.arrays import FloatArray, rows
+from kbmaps.maps.stack import BasisStack
+from kbmaps.trains.core_prior import CORE_NUMBERS, CorePrior
+from kbmaps.trains.fit import whitened_jacobian
+from kbmaps.trains.misfit import likely_misfit, misfit_directions, misfit_sizes
+from kbmaps.trains.train import TensorTrain
+
+_BATCH_ROWS = 512
+# By how much the axes of the last frame may be off, as a share of a marker's move.
+_FRAME_ERROR = 0.05
+
+
+class TensorPosterior:
+    """Gauss and Newton's posterior of a train's cores. A `kbmaps.planning.posterior.Posterior`.
+
+    Args:
+        train: the most likely one.
+        prior: of its cores.
+        information: JᵀJ (36 d, 36 d) of the pairs by whitened cores; None before any pair.
+        noise: 1-sigma of each coordinate of a further pair [m].
+    """
+
+    floor = 0.0
+
+    def __init__(
+        self, train: TensorTrain, prior: CorePrior, information: FloatArray | None, *, noise: float = 0.0
+    ) -> None:
+        self._train, self._prior, self.information = train, prior, information
+        self._stack = BasisStack(train.bases)
+        size = CORE_NUMBERS * prior.joints
+        self._root = np.eye(size) if information is None else inverse_roots(information)
+        self.noise = noise
+        self._sizes = misfit_sizes(prior.joints)
+        self.misfit, self.absorbed = np.zeros(len(self._sizes)), np.zeros((size, sum(self._sizes)))
+
+    def judge(self, q: FloatArray, residuals: FloatArray, std: FloatArray) -> None:
+        """Finds what the train does not follow from what it leaves of its pairs.
+
+        Args:
+            q: configurations (n, d) of the pairs that the fit used; residuals: (n, 3) [m] there.
+            std: of a coordinate of each (n,) [m], as in `information`.
+        """
+        scale = np.repeat(std, 3)[:, None]
+        directions = misfit_directions(self._train, q).reshape(len(scale), -1) / scale
+        absorbed = (self._linear_roots(q).reshape(len(scale), -1) / scale).T @ directions
+        self.take(likely_misfit(directions, absorbed, residuals.ravel() / scale[:, 0], self._sizes), absorbed)
+
+    def take(self, misfit: FloatArray, absorbed: FloatArray) -> None:
+        """Standard deviations (3,) [rad, m] of the errors, and how the cores make up for them (36 d, 5 d + 18)."""
+        self.misfit, self.absorbed = misfit, absorbed
+
+    @property
+    def joints(self) -> int:
+        """Number of joints d."""
+        return self._prior.joints
+
+    def roots(self, q: ArrayLike) -> FloatArray:
+        """Matrices R (n, 3, p) [m] at q (n, d): R_i R_jᵀ is the covariance of the positions at q_i and q_j.
+
+        Raises:
+            ShapeError, NonFiniteError
+        """
+        angles = rows("q", q, self.joints)
+        linear = self._linear_roots(angles)
+        if not self.misfit.any():
+            return linear
+        left = misfit_directions(self._train, angles) - linear @ self.absorbed
+        return np.concatenate([linear, np.repeat(self.misfit, self._sizes) * left], axis=2)
+
+    def variance(self, q: FloatArray) -> FloatArray:
+        """Variance (n, 3) [m²] of each coordinate at q (n, d)."""
+        variance = np.empty((len(q), 3))
+        for start in range(0, len(q), _BATCH_ROWS):
+            part = slice(start, start + _BATCH_ROWS)
+            variance[part] = np.square(self.roots(q[part])).sum(axis=2)
+        return variance
+
+    def with_moved_marker(self, std: float) -> CorePrior:
+        """The cores' own posteriors, each while the others rest; the last as free as a marker moved by `std` [m]."""
+        cores, spread = self._train.cores.reshape(self.joints, CORE_NUMBERS), self._prior.spread
+        if self.information is not None:
+            blocks = range(0, CORE_NUMBERS * self.joints, CORE_NUMBERS)
+            told = np.stack([self.information[k : k + CORE_NUMBERS, k : k + CORE_NUMBERS] for k in blocks])
+            spread = spread @ inverse_roots(told)
+        spread = spread.copy()
+        moves = _marker_moves(cores[-1].reshape(3, 3, 4), std)
+        values, vectors = np.linalg.eigh(spread[-1] @ spread[-1].T + moves @ moves.T)
+        spread[-1] = vectors * np.sqrt(np.maximum(values, 0.0))
+        return CorePrior(cores, spread)
+
+    def _linear_roots(self, q: FloatArray) -> FloatArray:
+        jacobian = whitened_jacobian(self._stack.joint_weights(q), self._train.maps(q), self._prior)
+        return (jacobian @ self._root).reshape(len(q), 3, -1)
+
+
+def inverse_roots(information: FloatArray) -> FloatArray:
+    """Square roots of (H + I)⁻¹ (..., m, m) for H (..., m, m), positive semidefinite up to rounding."""
+    values, vectors = np.linalg.eigh(information)
+    roots: FloatArray = vectors / np.sqrt(1.0 + np.maximum(values, 0.0))[..., None, :]
+    return roots
+
+
+def _marker_moves(last_core: FloatArray, std: float) -> FloatArray:
+    """Changes (36, moves) of the last core when the marker moves by `std` [m] each way."""
+    free = np.diag(np.tile([0.0, 0.0, 0.0, std], 9))
+    if not last_core[:, :, :3].any():
+        return free
+    along = np.zeros((3, 3, 4, 3))
+    along[:, :, 3, :] = std * last_core[:, :, :3]
+    return np.column_stack([along.reshape(CORE_NUMBERS, 3), _FRAME_ERROR * free])

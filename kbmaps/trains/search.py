@@ -1,0 +1,250 @@
+"""Fits of a tensor train with what the data say themselves: their noise, and which pairs are wrong."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation  # pyright: ignore[reportMissingTypeStubs]
+
+from kbmaps.arrays import BoolArray, FloatArray
+from kbmaps.chains.chain import RigidChain
+from kbmaps.maps.basis import JointBasis
+from kbmaps.trains.core_prior import CorePrior
+from kbmaps.trains.fit import LevenbergMarquardt, TensorProblem, alternate
+from kbmaps.trains.train import TensorTrain
+
+# Relative to the spread of the positions: below it, residuals are rounding.
+_NOISE_FLOOR = 1e-13
+# Residuals below this share of the positions' spread: the pairs are explained, no further start is needed.
+_EXPLAINED = 1e-4
+_FIRST_NOISE = 2e-2
+_SWEEPS = 40
+_FIRST_STEPS = 30
+_ROUND_STEPS = 6
+_ROUNDS = 40
+_SAME_NOISE = 0.02
+# Starts that failed leave a tenth or more of the spread, and may agree on it by chance.
+PLAUSIBLE = 0.1
+# The median of |r| for r ~ N(0, I) in three dimensions.
+_MEDIAN_DISTANCE = 1.538
+# Farther than this many robust standard deviations a pair is wrong: 1.5e-5 of good pairs are.
+_OUTLIER_DISTANCE = 5.0
+_WEIGHT_SCALE = 4.0
+# Reweighting ends when no residual moves by more than this many standard deviations.
+_SAME_LENGTHS = 0.05
+# Random starts are tried on at most so many pairs a joint.
+_SEARCH_PAIRS = 40
+# With fewer degrees of freedom a pair, residuals do not tell noise from outliers.
+_LEAST_FREEDOM = 0.2
+
+
+@dataclass(frozen=True, eq=False)
+class Pairs:
+    """Trusted pairs.
+
+    Attributes:
+        weights: basis functions (n, d, 3).
+        x: positions (n, 3) [m].
+        sigma: 1-sigma of a coordinate (n,) [m]; NaN where it is not known.
+    """
+
+    weights: FloatArray
+    x: FloatArray
+    sigma: FloatArray
+
+    @property
+    def unknown(self) -> BoolArray:
+        """Which pairs come without a sigma (n,)."""
+        return np.isnan(self.sigma)
+
+    @property
+    def size(self) -> float:
+        """RMS distance of the positions from their mean [m]; 1 m where they are all the same."""
+        spread = math.sqrt(float(self.x.var(axis=0).sum()))
+        return spread if spread > 0.0 else 1.0
+
+    @property
+    def noise_floor(self) -> float:
+        """Where residuals are rounding [m]."""
+        return _NOISE_FLOOR * self.size
+
+    def chosen(self, mask: BoolArray) -> Pairs:
+        return Pairs(self.weights[mask], self.x[mask], self.sigma[mask])
+
+    def problem(self, prior: CorePrior, noise: float, trust: FloatArray | None = None) -> TensorProblem:
+        """The problem with `noise` [m] where no sigma is given, and variances divided by `trust` (n,)."""
+        std = np.where(self.unknown, noise, self.sigma)
+        return TensorProblem(self.weights, self.x, std if trust is None else std / np.sqrt(trust), prior)
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """Whitened cores z, the noise of a coordinate [m], and which pairs were used (n,)."""
+
+    z: FloatArray
+    noise: float
+    used: BoolArray
+
+
+def refine(pairs: Pairs, prior: CorePrior, z: FloatArray, noise: float, *, robust: bool = True) -> Fit:
+    """The most likely train near z, with the noise found out in turn, and without the pairs that are wrong."""
+    plain = _settle(pairs, prior, z, noise)
+    everything = np.ones(len(pairs.x), dtype=np.bool_)
+    if not robust:
+        return replace(plain, used=everything)
+    good = _good(pairs, prior, plain)
+    if good.all():
+        return replace(plain, used=everything)
+    fit = _reweighted(pairs, prior, plain)
+    good = _good(pairs, prior, fit)
+    for _ in range(10):
+        fit = _settle(pairs.chosen(good), prior, fit.z, fit.noise)
+        now = _good(pairs, prior, fit)
+        if (now == good).all():
+            break
+        good = now
+    return replace(fit, used=good)
+
+
+def search(
+    pairs: Pairs,
+    prior: CorePrior,
+    bases: Sequence[JointBasis],
+    rng: np.random.Generator,
+    starts: int,
+    *,
+    robust: bool = True,
+) -> Fit:
+    """The best of several fits from random rigid chains. Ends early when a start explains the pairs, or two agree."""
+    some = pairs
+    if len(pairs.x) > _SEARCH_PAIRS * len(bases):
+        mask = np.zeros(len(pairs.x), dtype=np.bool_)
+        mask[rng.permutation(len(pairs.x))[: _SEARCH_PAIRS * len(bases)]] = True
+        some = pairs.chosen(mask)
+    best = _from_a_random_chain(some, prior, bases, rng)
+    for _ in range(starts - 1):
+        if best.noise < _EXPLAINED * pairs.size:
+            break
+        fit = _from_a_random_chain(some, prior, bases, rng)
+        plausible = best.noise < PLAUSIBLE * pairs.size
+        agrees = plausible and abs(fit.noise / best.noise - 1.0) < _SAME_NOISE
+        best = min(best, fit, key=lambda candidate: candidate.noise)
+        if agrees:
+            break
+    return refine(pairs, prior, best.z, best.noise, robust=robust)
+
+
+def _from_a_random_chain(pairs: Pairs, prior: CorePrior, bases: Sequence[JointBasis], rng: np.random.Generator) -> Fit:
+    noise = _FIRST_NOISE * pairs.size
+    chain = random_chain(bases, pairs.size / math.sqrt(len(bases)), rng)
+    # A given sigma would make the first steps as rugged as the data are exact.
+    problem = TensorProblem(pairs.weights, pairs.x, np.full(len(pairs.x), noise), prior)
+    z = alternate(problem, prior.whitened(TensorTrain.from_chain(chain, bases).cores), _SWEEPS)
+    z, _ = LevenbergMarquardt().run(problem, z, _FIRST_STEPS)
+    left = math.sqrt(float(np.square(problem.residuals(z)).mean()))
+    if left > PLAUSIBLE * pairs.size:
+        # Most failed starts show by now; settling them would take longer than the next start.
+        return Fit(z, left, np.ones(len(pairs.x), dtype=np.bool_))
+    blind = Pairs(pairs.weights, pairs.x, np.full(len(pairs.x), np.nan))
+    return _settle(blind, prior, z, noise)
+
+
+def random_chain(bases: Sequence[JointBasis], length: float, rng: np.random.Generator) -> RigidChain:
+    """A chain with random axes and links of about `length` [m] for joints of the bases' kinds."""
+    joints = len(bases)
+    fixed = np.tile(np.eye(4), (joints + 1, 1, 1))
+    fixed[:, :3, :3] = Rotation.random(joints + 1, rng=rng).as_matrix()
+    fixed[:, :3, 3] = length * rng.normal(size=(joints + 1, 3))
+    axes = rng.normal(size=(joints, 3))
+    axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+    return RigidChain(fixed, axes, np.array([basis.is_prismatic for basis in bases]))
+
+
+def information(pairs: Pairs, prior: CorePrior, fit: Fit) -> tuple[FloatArray, FloatArray]:
+    """JᵀJ (36 d, 36 d) of the pairs that a fit used, by z: what they tell beyond the prior's unit matrix.
+
+    Also the standard deviation of a coordinate of each (n,) [m] that it counts with. Where every sigma was given but
+    the residuals are larger, they count as if the sigmas were larger too.
+    """
+    good = pairs.chosen(fit.used)
+    problem = good.problem(prior, fit.noise)
+    jacobian = problem.scaled_jacobian(fit.z)
+    matrix = jacobian.T @ jacobian
+    if good.unknown.any():
+        return matrix, problem.std
+    square = float(np.square(problem.residuals(fit.z) / problem.std[:, None]).sum())
+    freedom = 3.0 * len(good.x) - effective_parameters(problem, fit.z)
+    excess = max(square / freedom, 1.0) if freedom > 1.0 else 1.0
+    return matrix / excess, problem.std * math.sqrt(excess)
+
+
+def effective_parameters(problem: TensorProblem, z: FloatArray) -> float:
+    """How many numbers the pairs determine against the prior: Σ λ / (1 + λ) over the eigenvalues of JᵀJ."""
+    jacobian = problem.scaled_jacobian(z)
+    gram = jacobian @ jacobian.T if jacobian.shape[0] < jacobian.shape[1] else jacobian.T @ jacobian
+    values = np.maximum(np.linalg.eigvalsh(gram), 0.0)
+    return float((values / (1.0 + values)).sum())
+
+
+def _settle(pairs: Pairs, prior: CorePrior, z: FloatArray, noise: float) -> Fit:
+    """z and noise in turn until neither moves. The noise follows MacKay 1992: rss / (3 n − effective parameters)."""
+    optimiser = LevenbergMarquardt()
+    used = np.ones(len(pairs.x), dtype=np.bool_)
+    for _ in range(_ROUNDS):
+        problem = pairs.problem(prior, noise)
+        z, _ = optimiser.run(problem, z, _ROUND_STEPS)
+        if not pairs.unknown.any():
+            noise = math.sqrt(float(np.square(pairs.sigma).mean()))
+            if optimiser.converged:
+                break
+            continue
+        found = max(_noise(pairs, problem, z), pairs.noise_floor)
+        steady = abs(found / noise - 1.0) < _SAME_NOISE
+        noise = found
+        if (optimiser.converged and steady) or found == pairs.noise_floor:
+            break
+    return Fit(z, noise, used)
+
+
+def _noise(pairs: Pairs, problem: TensorProblem, z: FloatArray) -> float:
+    """Noise of a coordinate of the pairs that came without a sigma [m]."""
+    freedom = 1.0 - effective_parameters(problem, z) / (3.0 * len(pairs.x))
+    mean_square = float(np.square(problem.residuals(z))[pairs.unknown].mean())
+    return math.sqrt(mean_square / max(freedom, 1e-9))
+
+
+def _distances(pairs: Pairs, prior: CorePrior, fit: Fit) -> tuple[FloatArray, bool]:
+    """Residuals' lengths (n,) in robust standard deviations, and whether these mean anything.
+
+    Where every sigma is given the unit is the larger of it and what the median says.
+    """
+    problem = pairs.problem(prior, fit.noise)
+    freedom = 1.0 - effective_parameters(problem, fit.z) / (3.0 * len(pairs.x))
+    lengths = np.linalg.norm(problem.residuals(fit.z), axis=1) / problem.std
+    unit = float(np.median(lengths)) / (_MEDIAN_DISTANCE * math.sqrt(max(freedom, _LEAST_FREEDOM)))
+    rounding = fit.noise <= 2.0 * pairs.noise_floor
+    return lengths / max(unit, 1e-300), freedom >= _LEAST_FREEDOM and not rounding
+
+
+def _good(pairs: Pairs, prior: CorePrior, fit: Fit) -> BoolArray:
+    """Which pairs (n,) lie no farther from the fit than noise takes them."""
+    lengths, telling = _distances(pairs, prior, fit)
+    return lengths <= _OUTLIER_DISTANCE if telling else np.ones(len(lengths), dtype=np.bool_)
+
+
+def _reweighted(pairs: Pairs, prior: CorePrior, fit: Fit) -> Fit:
+    """Iteratively reweighted fit with Geman and McClure's weights (1 + r²)⁻²."""
+    optimiser = LevenbergMarquardt()
+    z = fit.z
+    for _ in range(_ROUNDS):
+        lengths, _ = _distances(pairs, prior, replace(fit, z=z))
+        trust = 1.0 / np.square(1.0 + np.square(lengths / _WEIGHT_SCALE))
+        problem = pairs.problem(prior, fit.noise, trust)
+        z, _ = optimiser.run(problem, z, _ROUND_STEPS)
+        moved = float(np.abs(_distances(pairs, prior, replace(fit, z=z))[0] - lengths).max())
+        if optimiser.converged and moved < _SAME_LENGTHS:
+            break
+    return replace(fit, z=z)

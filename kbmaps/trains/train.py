@@ -1,0 +1,211 @@
+"""Forward kinematics as a tensor train: one affine core a joint instead of 3^d control points."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from kbmaps.arrays import FloatArray, frozen, rows_or_vector
+from kbmaps.chains.chain import RigidChain
+from kbmaps.errors import BasisError, ModelFormatError, NonFiniteError, ShapeError
+from kbmaps.maps.basis import JointBasis
+from kbmaps.maps.kbmap import KBMap
+from kbmaps.maps.packed import describe_bases, parse_bases
+from kbmaps.maps.stack import BasisStack
+from kbmaps.packed import named, pack, unpack
+
+KIND = "tensor train"
+
+
+@dataclass(frozen=True, eq=False)
+class TensorTrain:
+    """Marker positions as a product of affine maps, one a joint.
+
+    M_k(q_k) = Σ_j w_kj(q_k) B_kj with B_kj the upper three rows of an affine 4x4 matrix, and
+    x(q) = M_1(q_1) ∘ … ∘ M_d(q_d) applied to the origin. The control net of this map is a tensor train
+    (Oseledets 2011) of rank 4. Every rigid chain is one, and so is every chain whose joints move on ellipses.
+
+    Attributes:
+        bases: one basis a joint, in the order of q.
+        cores: B (d, 3, 3, 4): joint, basis function, row, column; the last column of a core is a translation [m].
+            A prismatic joint has two functions, its third slice is 0. The first three columns of the last core
+            move no position. Read-only.
+
+    Raises:
+        ShapeError, NonFiniteError, BasisError
+
+    Example:
+        >>> import numpy as np
+        >>> from kbmaps import RigidChain, TensorTrain, learning_bases
+        >>> fixed = np.tile(np.eye(4), (3, 1, 1))
+        >>> fixed[1:, 0, 3] = 0.3, 0.2  # links [m]
+        >>> arm = RigidChain(fixed, axes=[[0, 0, 1], [0, 1, 0]], prismatic=[False, False])
+        >>> train = TensorTrain.from_chain(arm, learning_bases([-1, -1], [1, 1]))
+        >>> train.predict([0.0, -np.pi / 2]).round(9)
+        array([0.3, 0. , 0.2])
+    """
+
+    bases: tuple[JointBasis, ...]
+    cores: FloatArray
+    _stack: BasisStack = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        bases, cores = tuple(self.bases), frozen(self.cores)
+        if not bases:
+            raise BasisError("a tensor train needs at least one joint")
+        if cores.shape != (len(bases), 3, 3, 4):
+            raise ShapeError("cores", f"({len(bases)}, 3, 3, 4)", cores.shape)
+        if not np.isfinite(cores).all():
+            raise NonFiniteError("cores")
+        for k, basis in enumerate(bases):
+            if cores[k, basis.size :].any():
+                raise BasisError(f"joint {k} is prismatic: the third slice of its core must be 0")
+        object.__setattr__(self, "bases", bases)
+        object.__setattr__(self, "cores", cores)
+        object.__setattr__(self, "_stack", BasisStack(bases))
+
+    @classmethod
+    def from_chain(cls, chain: RigidChain, bases: Sequence[JointBasis]) -> TensorTrain:
+        """The chain as a tensor train, exact up to rounding.
+
+        Raises:
+            BasisError: another number of bases, or a revolute basis for a prismatic joint.
+        """
+        if len(bases) != chain.joints:
+            raise BasisError(f"need {chain.joints} bases, one a joint; got {len(bases)}")
+        cores = np.zeros((chain.joints, 3, 3, 4))
+        for k, basis in enumerate(bases):
+            if basis.is_prismatic != bool(chain.prismatic[k]):
+                wanted = "prismatic" if chain.prismatic[k] else "revolute"
+                raise BasisError(f"joint {k} is {wanted} but its basis is {basis.kind}")
+            last = chain.fixed[k + 1] if k == chain.joints - 1 else np.eye(4)
+            link = RigidChain(np.stack([chain.fixed[k], last]), chain.axes[k : k + 1], chain.prismatic[k : k + 1])
+            # monomials = weights @ inv(matrix), so Σ_i monomial_i A_i = Σ_j weight_j Σ_i inv(matrix)_ji A_i
+            cores[k, : basis.size] = np.tensordot(
+                np.linalg.inv(basis.matrix), _monomial_terms(link)[:, :3], axes=(1, 0)
+            )
+        return cls(tuple(bases), cores)
+
+    @property
+    def joints(self) -> int:
+        """Number of joints d."""
+        return len(self.bases)
+
+    def predict(self, q: ArrayLike) -> FloatArray:
+        """Marker position (3,) [m] for joint values q (d,) [rad, m], or (n, 3) for (n, d).
+
+        Raises:
+            ShapeError, NonFiniteError
+        """
+        checked = rows_or_vector("q", q, self.joints)
+        positions = suffixes(self.maps(np.atleast_2d(checked)))[0]
+        return positions[0] if checked.ndim == 1 else positions
+
+    def jacobian(self, q: ArrayLike) -> FloatArray:
+        """Derivative (3, d) of the position [m/rad, or m/m], or (n, 3, d) for q (n, d).
+
+        Raises:
+            ShapeError, NonFiniteError
+        """
+        checked = rows_or_vector("q", q, self.joints)
+        angles = np.atleast_2d(checked)
+        maps = self.maps(angles)
+        slopes = _mixed(self._stack.joint_derivatives(angles), self.cores)
+        linear, points = prefixes(maps), suffixes(maps)
+        columns = np.empty((len(angles), 3, self.joints))
+        for k in range(self.joints):
+            columns[:, :, k] = (linear[k] @ apply(slopes[k], points[k + 1])[:, :, None])[:, :, 0]
+        return columns[0] if checked.ndim == 1 else columns
+
+    def in_basis(self, bases: Sequence[JointBasis]) -> TensorTrain:
+        """The same map with its cores expressed in other bases; exact up to rounding.
+
+        Raises:
+            BasisError: another number of joints, or a prismatic basis for a revolute joint.
+        """
+        if len(bases) != self.joints:
+            raise BasisError(f"need {self.joints} bases, one a joint; got {len(bases)}")
+        cores = np.zeros_like(self.cores)
+        for k, (old, new) in enumerate(zip(self.bases, bases, strict=True)):
+            cores[k, : new.size] = np.tensordot(old.change_to(new), self.cores[k, : old.size], axes=(1, 0))
+        return TensorTrain(tuple(bases), cores)
+
+    def to_kbmap(self) -> KBMap:
+        """The same map with its full control net: 3^d control points, so for few joints only."""
+        tensor: FloatArray = np.array([0.0, 0.0, 0.0, 1.0])
+        for k in range(self.joints - 1, -1, -1):
+            size = self.bases[k].size
+            block = np.zeros((4, size, 4))
+            block[:3] = self.cores[k, :size].swapaxes(0, 1)
+            # The last row is 1 for every q: the coefficients of the constant function.
+            block[3, :, 3] = np.linalg.solve(self.bases[k].matrix, np.eye(size)[0])
+            tensor = np.tensordot(block, tensor, axes=(2, 0)).astype(np.float64, copy=False)
+        return KBMap(self.bases, tensor[:3])
+
+    def maps(self, q: FloatArray) -> FloatArray:
+        """The affine maps M_k(q_k) as (d, n, 3, 4) for q (n, d); q is trusted."""
+        return _mixed(self._stack.joint_weights(q), self.cores)
+
+    def to_bytes(self) -> bytes:
+        """The map as one self-describing byte string (see `kbmaps.packed`)."""
+        return pack(KIND, {"bases": describe_bases(self.bases)}, {"cores": self.cores})
+
+    @classmethod
+    def from_bytes(cls, data: bytes) -> TensorTrain:
+        """The map that `to_bytes` wrote.
+
+        Raises:
+            ModelFormatError: the bytes are damaged, truncated, or something else.
+        """
+        fields, arrays = unpack(data, KIND)
+        bases = parse_bases(named(fields, "the fields", ("bases",))["bases"])
+        return restored(bases, named(arrays, "the arrays", ("cores",))["cores"])
+
+
+def restored(bases: tuple[JointBasis, ...], cores: FloatArray) -> TensorTrain:
+    """A train out of stored parts. Raises ModelFormatError where they do not fit each other."""
+    try:
+        return TensorTrain(bases, cores)
+    except (ShapeError, NonFiniteError, BasisError) as error:
+        raise ModelFormatError(f"the stored cores are no tensor train: {error}") from error
+
+
+def apply(maps: FloatArray, points: FloatArray) -> FloatArray:
+    """Points (n, 3) moved by affine maps (n, 3, 4)."""
+    return (maps[:, :, :3] @ points[:, :, None])[:, :, 0] + maps[:, :, 3]
+
+
+def suffixes(maps: FloatArray) -> FloatArray:
+    """For affine maps (d, n, 3, 4): the marker (d+1, n, 3) as seen before each joint; the last is the origin."""
+    points = np.zeros((len(maps) + 1, maps.shape[1], 3))
+    for k in range(len(maps) - 1, -1, -1):
+        points[k] = apply(maps[k], points[k + 1])
+    return points
+
+
+def prefixes(maps: FloatArray) -> FloatArray:
+    """For affine maps (d, n, 3, 4): the linear part (d, n, 3, 3) of the product of all maps before each joint."""
+    linear = np.empty((len(maps), maps.shape[1], 3, 3))
+    linear[0] = np.eye(3)
+    for k in range(1, len(maps)):
+        linear[k] = linear[k - 1] @ maps[k - 1][:, :, :3]
+    return linear
+
+
+def _mixed(weights: FloatArray, cores: FloatArray) -> FloatArray:
+    """Σ_j weights[:, k, j] cores[k, j] for weights (n, d, 3): (d, n, 3, 4)."""
+    flat = weights.swapaxes(0, 1) @ cores.reshape(len(cores), 3, 12)
+    return flat.reshape(*flat.shape[:2], 3, 4)
+
+
+def _monomial_terms(link: RigidChain) -> FloatArray:
+    """A (3 or 2, 4, 4) of a chain of one joint: T = A0 + cos q·A1 + sin q·A2, or A0 + q·A1 for a prismatic joint."""
+    if link.prismatic[0]:
+        start, end = link.poses([[0.0], [1.0]])
+        return np.stack([start, end - start])
+    start, quarter, half = link.poses([[0.0], [0.5 * np.pi], [np.pi]])
+    middle = 0.5 * (start + half)
+    return np.stack([middle, 0.5 * (start - half), quarter - middle])
