@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from kbmaps.arrays import FloatArray, rows_or_vector
 from kbmaps.chains.chain import RigidChain
+from kbmaps.chains.packed import chain_arrays, chain_from_arrays
 from kbmaps.errors import ModelFormatError
 from kbmaps.maps.kbmap import KBMap
 from kbmaps.maps.packed import describe_bases, parse_bases
@@ -63,9 +64,7 @@ def packable(model: object) -> tuple[dict[str, Any], dict[str, FloatArray]]:
         bases = describe_bases(model.bases)
         return {"type": "KBMap", "bases": bases, "outputs": len(model.net)}, {"net": model.net.reshape(-1)}
     if isinstance(model, ChainModel):
-        chain = model.chain
-        prismatic = chain.prismatic.astype(np.float64)
-        return {"type": "RigidChain"}, {"fixed": chain.fixed, "axes": chain.axes, "prismatic": prismatic}
+        return {"type": "RigidChain"}, chain_arrays(model.chain)
     if isinstance(model, Origin):
         return {"type": "Origin", "joints": model.joints}, {}
     return {"type": type(model).__name__}, {}
@@ -84,7 +83,7 @@ def unpacked(fields: Any, arrays: Mapping[str, FloatArray], given: object | None
         bases = parse_bases(described["bases"])
         return KBMap(bases, arrays["net"].reshape(described["outputs"], *(basis.size for basis in bases)))
     if name == "RigidChain":
-        return ChainModel(RigidChain(arrays["fixed"], arrays["axes"], arrays["prismatic"] != 0.0))
+        return ChainModel(chain_from_arrays(arrays))
     if name == "Origin":
         return Origin(int(described["joints"]))
     if given is None or type(given).__name__ != name:

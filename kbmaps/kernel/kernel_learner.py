@@ -10,17 +10,13 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kbmaps.arrays import FloatArray, rows, rows_or_vector
+from kbmaps.arrays import FloatArray, rows
 from kbmaps.chains.carried import Origin, Predictor, as_model, packable, unpacked
 from kbmaps.chains.chain import RigidChain
 from kbmaps.errors import DegenerateDataError, KBMapsError, ModelFormatError, SettingError
-from kbmaps.kernel.grid import sampled_map
-from kbmaps.kernel.kept_pairs import KeptPairs
-from kbmaps.kernel.kernel_fit import KernelFit, Precision
-from kbmaps.kernel.product_kernel import ProductKernel
-from kbmaps.kernel.slopes import slopes
+from kbmaps.kernel.kernel_fit import Precision
+from kbmaps.kernel.regression import KernelRegression
 from kbmaps.maps.basis import JointBasis
-from kbmaps.maps.kbmap import KBMap
 from kbmaps.maps.packed import describe_bases, parse_bases
 from kbmaps.maps.support import SUPPORT_LIMIT
 from kbmaps.memory import Memory
@@ -30,7 +26,7 @@ from kbmaps.packed import pack, unpack
 _KIND = "kernel learner, 1"
 
 
-class KernelLearner:
+class KernelLearner(KernelRegression):
     """Learns a KB-Map around a prior from n pairs with n² numbers instead of 3^d control points. A `Model`.
 
     The same solution as `ExactLearner` where both can be computed; this one for fewer pairs than control points, and
@@ -62,31 +58,8 @@ class KernelLearner:
                 raise SettingError(f"precision must be finite and greater than 0, got {precision!r}")
         elif precision not in (None, "evidence"):
             raise SettingError(f'precision must be None, "evidence" or a number, got {precision!r}')
-        self._kernel = ProductKernel(bases)
-        self._precision: Precision = precision
-        self._memory = Memory() if memory is None else memory
+        super().__init__(bases, precision, memory)
         self._prior: Predictor = Origin(self.joints) if prior is None else as_model(prior)
-        self._pairs = KeptPairs(self.joints, self._memory)
-        self._fit: KernelFit | None = None
-
-    @property
-    def joints(self) -> int:
-        """Number of joints d."""
-        return self._kernel.joints
-
-    @property
-    def bases(self) -> tuple[JointBasis, ...]:
-        return self._kernel.bases
-
-    @property
-    def pairs(self) -> int:
-        """How many pairs have been learnt, those that no longer count included."""
-        return self._pairs.total
-
-    @property
-    def kept(self) -> int:
-        """How many pairs count."""
-        return len(self._pairs)
 
     @property
     def prior_precision(self) -> float:
@@ -101,16 +74,6 @@ class KernelLearner:
     def prior_std(self) -> float:
         """Standard deviation of the control points around the prior [m]. Raises DegenerateDataError."""
         return math.sqrt(self._fitted().prior_variance)
-
-    @property
-    def noise(self) -> float:
-        """1-sigma of a measured coordinate [m]: as estimated, or as told with the pairs. Raises DegenerateDataError."""
-        return math.sqrt(self._fitted().noise_variance) * self._pairs.mean_unit
-
-    @property
-    def log_evidence(self) -> float | None:
-        """Log marginal likelihood at λ; None for the exact solution. Raises DegenerateDataError."""
-        return self._fitted().log_evidence
 
     def learn(self, q: ArrayLike, x: ArrayLike, sigma: ArrayLike | None = None) -> None:
         """Pairs q (n, d) [rad, m] and x (n, 3) [m], or one, (d,) and (3,).
@@ -139,29 +102,6 @@ class KernelLearner:
         self._pairs.replace_model(model)
         self._prior, self._fit = model, None
 
-    def predict(self, q: ArrayLike) -> FloatArray:
-        """Positions (n, 3) [m] at q (n, d), or (3,) at q (d,).
-
-        Raises:
-            ShapeError, NonFiniteError
-        """
-        angles = rows_or_vector("q", q, self.joints)
-        x = self._prior.predict(angles)
-        if not self.kept:
-            return x
-        weights = self._kernel.joint_weights(np.atleast_2d(angles))
-        return x + self._fitted().mean(weights, _no_features(len(weights))).reshape(x.shape)
-
-    def jacobian(self, q: ArrayLike) -> FloatArray:
-        """Derivative (3, d) of the position [m/rad, or m/m], or (n, 3, d) at q (n, d).
-
-        Exact where the prior is a KB-Map, also one in another form, as a chain is.
-
-        Raises:
-            ShapeError, NonFiniteError
-        """
-        return slopes(self, q, self._kernel.bases)
-
     def estimate(self, q: ArrayLike) -> Estimate:
         """Positions at q (n, d), their 1-sigma per axis against the truth, and whether data was there.
 
@@ -180,10 +120,6 @@ class KernelLearner:
         fit, features = self._fitted(), _no_features(len(angles))
         sigma = np.sqrt(fit.variance(weights, features))
         return Estimate(self.predict(angles), sigma, fit.unexplained(weights) <= SUPPORT_LIMIT)
-
-    def to_kbmap(self) -> KBMap:
-        """The learnt map with its 3^d control points, exact where the prior is a KB-Map or a rigid chain."""
-        return sampled_map(self, self.bases)
 
     def to_bytes(self) -> bytes:
         """The learner with the pairs that count; `from_bytes` gives the same predictions to the last bit.
@@ -227,13 +163,11 @@ class KernelLearner:
             raise ModelFormatError("the prior predicts otherwise than the one that the stored learner had")
         return learner
 
-    def _fitted(self) -> KernelFit:
-        if not self.kept:
-            raise DegenerateDataError("there is nothing to tell before the first pair was learnt")
-        if self._fit is None:
-            observations = self._pairs.observations(self._kernel, _no_features(self.kept))
-            self._fit = KernelFit(self._kernel, observations, self._precision)
-        return self._fit
+    def _behind(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
+        return self._prior.predict(q), _no_features(len(q))
+
+    def _features(self) -> FloatArray:
+        return _no_features(self.kept)
 
 
 def _no_features(count: int) -> FloatArray:
