@@ -8,7 +8,7 @@ from typing import Annotated
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
-from daemon.commands.options import HERE, flag, robot_file
+from daemon.commands.options import SourceRobotFile, flag, robot_file
 
 
 def calibrate(
@@ -18,7 +18,7 @@ def calibrate(
     ] = None,
     /,
     *,
-    robot: Annotated[Path | None, Parameter(help="robot.toml; else the one beside the source, or here.")] = None,
+    robot: SourceRobotFile = None,
     sigma_mm: Annotated[
         float | None,
         Parameter(
@@ -72,7 +72,7 @@ def calibrate(
     from interfaces.calibrated_files import write_calibrated
     from interfaces.recording import Recording
 
-    config = Config.load(HERE if robot is None else robot) if source is None else Config.load(robot_file(robot, source))
+    config = Config.load(robot_file(robot, source))
     description, source = config.robot, source or config.store_file
     if source.suffix.lower() in recordings.STORE_ENDINGS:
         stored = recordings.stored_pairs(source)

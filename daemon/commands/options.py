@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Annotated
 
 from cyclopts import Parameter
 
 HERE = Path("robot.toml")
-RobotFile = Annotated[Path, Parameter(env_var="BODYSCHEMA_ROBOT", help="The robot's description.")]
+VARIABLE = "BODYSCHEMA_ROBOT"
+RobotFile = Annotated[Path, Parameter(env_var=VARIABLE, help="The robot's description.")]
+
+SourceRobotFile = Annotated[
+    Path | None,
+    Parameter(show_default=False, help=f"robot.toml; else the one beside the source, {VARIABLE}, or here."),
+]
 
 
 def flag(text: str, *, name: str | None = None) -> Parameter:
@@ -16,9 +23,10 @@ def flag(text: str, *, name: str | None = None) -> Parameter:
     return Parameter(name=name, help=text, negative="", show_default=False)
 
 
-def robot_file(given: Path | None, source: Path) -> Path:
-    """The robot.toml that was given; else the one beside `source`, or in the working directory."""
+def robot_file(given: Path | None, source: Path | None) -> Path:
+    """The robot.toml that was given; else the one beside `source`, else what the environment or the folder has."""
     if given is not None:
         return given
-    beside = source.parent / HERE
-    return beside if beside.exists() else HERE
+    if source is not None and (beside := source.parent / HERE).exists():
+        return beside
+    return Path(os.environ.get(VARIABLE, HERE))

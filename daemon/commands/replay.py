@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
-from daemon.commands.options import flag, robot_file
+from daemon.commands.options import SourceRobotFile, flag, robot_file
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -26,7 +26,7 @@ def replay(
     recording: Annotated[Path, Parameter(help="A recording (.csv, .parquet).")],
     /,
     *,
-    robot: Annotated[Path | None, Parameter(help="robot.toml; else the one beside the recording, or here.")] = None,
+    robot: SourceRobotFile = None,
     speed: Annotated[
         float | None,
         Parameter(

@@ -328,6 +328,11 @@ def test_without_a_source_the_robot_s_own_store_is_learnt(robot_with_store, caps
     assert report_of(capsys, "--robot", robot_with_store).source == "pairs.sqlite"
 
 
+def test_the_robot_that_the_environment_names_is_calibrated(robot_with_store, capsys, monkeypatch) -> None:
+    monkeypatch.setenv("BODYSCHEMA_ROBOT", str(robot_with_store))
+    assert report_of(capsys).source == "pairs.sqlite"
+
+
 def test_all_pairs_of_a_store_can_be_asked_for(robot_with_store, capsys) -> None:
     report = report_of(capsys, "--robot", robot_with_store, "--first", 1)
     assert (report.pairs, report.other_tool_from) == (140, 61)
