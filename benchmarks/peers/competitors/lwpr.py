@@ -8,6 +8,7 @@ the leave-one-out error. All fields of all outputs are updated at once, as array
 from __future__ import annotations
 
 import copy
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,6 +22,10 @@ _MOST_LEVERAGE = 0.9
 _LARGEST_STEP = 0.1
 # The paper: a few projections do, whatever the number of inputs.
 _MOST_PROJECTIONS = 4
+_FIRST_ROWS = 64
+_NOWHERE = -1
+# What is one number a field and does not decay.
+_KEPT = ("mean_y", "seen", "used", "forgetting")
 
 
 @dataclass(frozen=True)
@@ -48,36 +53,36 @@ class Settings:
 
 
 class LWPR:
-    """Inputs (d,), several outputs at once; every output has its own fields."""
+    """Inputs (d,), several outputs at once; every output has its own fields.
+
+    A field's sums are one row of a table: a pair costs one gather and one scatter of the active fields. In between they
+    are columns, so that what is one number a field lies side by side.
+    """
 
     def __init__(self, inputs: int, outputs: int, settings: Settings | None = None) -> None:
         self.settings = Settings() if settings is None else settings
         self.inputs, self.outputs = inputs, outputs
         self.projections = min(inputs, _MOST_PROJECTIONS)
-        d, r = inputs, self.projections
-        self.output = np.empty(0, dtype=np.intp)
-        self.centre, self.root = np.empty((0, d)), np.empty((0, d, d))
-        self.mean_x, self.mean_y = np.empty((0, d)), np.empty(0)
-        self.weight, self.seen, self.used = np.empty(0), np.empty(0), np.empty(0, dtype=np.intp)
-        self.u, self.sz = np.empty((0, r, d)), np.empty((0, r, d))
-        self.ss, self.sr, self.mse = np.empty((0, r)), np.empty((0, r)), np.empty((0, r + 1))
-        self.h, self.r2 = np.empty((0, r + 1)), np.empty((0, r + 1))
-        self.cv, self.forgetting = np.empty(0), np.empty(0)
-
-    @property
-    def fields(self) -> int:
-        return len(self.output)
+        self.fields = 0
+        self._layout = _layout(inputs, self.projections)
+        self._table = np.empty((_FIRST_ROWS, sum(math.prod(shape) for shape in self._layout.values())))
+        self._output, self._centre = np.empty(_FIRST_ROWS, dtype=np.intp), np.empty((_FIRST_ROWS, inputs))
+        # Most fields never see enough pairs to change their metric: the first one serves them all. Those that do, the
+        # Cholesky roots of their metrics, and where in these a field's is.
+        self._moved, self._root = np.empty(0, dtype=np.intp), np.empty((0, inputs, inputs))
+        self._place = np.empty(_FIRST_ROWS, dtype=np.intp)
+        self._upper = np.triu(np.ones((inputs, inputs)))
 
     def learn(self, x: FloatArray, y: FloatArray) -> None:
         """One pair: x (d,) and y (outputs,)."""
-        activation = self._activations(x[None])[0]
-        for output in range(self.outputs):
-            own = activation[self.output == output]
-            if own.size == 0 or own.max() < self.settings.generate:
-                self._add(x, y[output], output)
-                activation = np.append(activation, 1.0)
+        activation = self._activations(x)
+        closest = np.zeros(self.outputs)
+        np.maximum.at(closest, self._output[: self.fields], activation)
+        for output in np.flatnonzero(closest < self.settings.generate):
+            self._add(x, float(y[output]), output)
+            activation = np.append(activation, 1.0)
         active = np.flatnonzero(activation > _SLIGHT)
-        self._update(active, activation[active], x, y[self.output[active]])
+        self._update(active, activation[active], x, y[self._output[active]])
 
     def predict(self, x: FloatArray) -> FloatArray:
         """Outputs (n, outputs) at x (n, d): the fields' local predictions, weighted by activation."""
@@ -88,122 +93,182 @@ class LWPR:
         return out
 
     def _blended(self, x: FloatArray) -> FloatArray:
-        activation = self._activations(x)
-        local = self.mean_y + np.zeros_like(activation)
-        z = x[:, None, :] - self.mean_x
+        every = self._named(self._table[: self.fields].T)
+        activation = self._activations(x[:, None])
+        local = every["mean_y"] + np.zeros_like(activation)
+        z = x[:, None, :] - every["mean_x"].T
+        known = every["seen"] > self.settings.trusted_pairs * self.inputs
         for k in range(self.projections):
-            in_use = (k < self.used) & (self.seen > self.settings.trusted_pairs * self.inputs)
-            s, beta, p = self._projection(k, z)
-            local += np.where(in_use, s * beta, 0.0)
-            z = z - s[..., None] * p
+            u, square = every["u"][k], np.maximum(every["ss"][k + 1], _TINY)
+            s = np.einsum("nkd,dk->nk", z, u / np.maximum(np.linalg.norm(u, axis=0), _TINY))
+            local += np.where(known & (k < every["used"]), s * (every["sr"][k] / square), 0.0)
+            z -= s[..., None] * (every["sz"][k] / square).T
         out = np.zeros((len(x), self.outputs))
         for output in range(self.outputs):
-            own = self.output == output
+            own = self._output[: self.fields] == output
             if own.any():
                 weights = activation[:, own] + np.finfo(np.float64).tiny
                 out[:, output] = (weights * local[:, own]).sum(axis=1) / weights.sum(axis=1)
         return out
 
     def _activations(self, x: FloatArray) -> FloatArray:
-        off = np.einsum("kij,nkj->nki", self.root, x[:, None] - self.centre)
-        return np.exp(-0.5 * np.einsum("nki,nki->nk", off, off))
-
-    def _projection(self, k: int, z: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Projected input s, slope and direction to take out, of projection k."""
-        u = self.u[:, k]
-        u = u / np.maximum(np.linalg.norm(u, axis=-1, keepdims=True), _TINY)
-        ss = np.maximum(self.ss[:, k], _TINY)
-        return (z * u).sum(axis=-1), self.sr[:, k] / ss, self.sz[:, k] / ss[:, None]
+        """Activations (..., fields) at x (d,) or (n, 1, d)."""
+        off = x - self._centre[: self.fields]
+        distances = self.settings.first_metric * np.einsum("...i,...i->...", off, off)
+        if len(self._moved):
+            turned = self._root @ off[..., self._moved, :, None]
+            distances[..., self._moved] = np.square(turned[..., 0]).sum(axis=-1)
+        return np.exp(-0.5 * distances)
 
     def _add(self, x: FloatArray, y: float, output: int) -> None:
-        d, r = self.inputs, self.projections
-        root = np.sqrt(self.settings.first_metric) * np.eye(d)
-        fresh: dict[str, object] = {
-            "output": output, "centre": x, "root": root, "mean_x": x, "mean_y": y, "weight": _TINY, "seen": 0.0,
-            "used": min(2, r), "u": np.zeros((r, d)), "sz": np.zeros((r, d)), "ss": np.zeros(r), "sr": np.zeros(r),
-            "mse": np.zeros(r + 1), "h": np.zeros(r + 1), "r2": np.zeros(r + 1), "cv": 0.0,
-            "forgetting": self.settings.forgetting,
-        }  # fmt: skip
-        for name, value in fresh.items():
-            old = getattr(self, name)
-            setattr(self, name, np.concatenate([old, np.asarray(value, dtype=old.dtype)[None]]))
+        if self.fields == len(self._table):
+            self._table, self._output, self._centre, self._place = (
+                np.concatenate([array, np.empty_like(array)])
+                for array in (self._table, self._output, self._centre, self._place)
+            )
+        at = self.fields
+        self.fields += 1
+        self._table[at] = 0.0
+        fresh = self._named(self._table[at])
+        fresh["mean_x"][...], fresh["mean_y"][...], fresh["used"][...] = x, y, min(2, self.projections)
+        fresh["ss"][0] = _TINY
+        fresh["forgetting"][...] = self.settings.forgetting
+        self._output[at], self._centre[at], self._place[at] = output, x, _NOWHERE
+
+    def _named(self, columns: FloatArray) -> dict[str, FloatArray]:
+        """The same memory (numbers, ...) by name."""
+        named: dict[str, FloatArray] = {}
+        begin = 0
+        for name, shape in self._layout.items():
+            end = begin + math.prod(shape)
+            named[name] = columns[begin:end].reshape(shape + columns.shape[1:])
+            begin = end
+        return named
 
     def _update(self, at: IntArray, w: FloatArray, x: FloatArray, y: FloatArray) -> None:
         """Recursive sums of the local models (table 3 of the paper), then the metric."""
-        keep = self.forgetting[at]
-        self.seen[at] += 1.0
-        weight = keep * self.weight[at] + w
-        self.mean_x[at] += (w / weight)[:, None] * (x - self.mean_x[at])
-        self.mean_y[at] += w / weight * (y - self.mean_y[at])
-        self.weight[at] = weight
-        z, rest = x - self.mean_x[at], y - self.mean_y[at]
-        self.mse[at, 0] = keep * self.mse[at, 0] + w * rest**2
-        projected = np.zeros((len(at), self.projections))
-        residual = rest.copy()
-        for k in range(self.projections):
-            in_use = k < self.used[at]
-            self.u[at, k] = keep[:, None] * self.u[at, k] + np.where(in_use, w * rest, 0.0)[:, None] * z
-            u = self.u[at, k] / np.maximum(np.linalg.norm(self.u[at, k], axis=1, keepdims=True), _TINY)
-            s = np.where(in_use, np.einsum("kd,kd->k", z, u), 0.0)
-            self.ss[at, k] = keep * self.ss[at, k] + w * s * s
-            self.sr[at, k] = keep * self.sr[at, k] + w * s * rest
-            self.sz[at, k] = keep[:, None] * self.sz[at, k] + (w * s)[:, None] * z
-            ss = np.maximum(self.ss[at, k], _TINY)
-            projected[:, k] = s
-            rest = rest - s * self.sr[at, k] / ss
-            z = z - (s / ss)[:, None] * self.sz[at, k]
-            self.mse[at, k + 1] = keep * self.mse[at, k + 1] + w * rest**2
-            residual = np.where(in_use, rest, residual)
-        self._move_metric(at, w, x, residual, projected, keep)
-        self._grow(at)
-        final = self.settings.last_forgetting
-        self.forgetting[at] = self.settings.annealing * keep + (1.0 - self.settings.annealing) * final
+        columns = self._table.take(at, axis=0).T.copy()
+        field = self._named(columns)
+        keep, settings = field["forgetting"].copy(), self.settings
+        sums = columns[: len(columns) - self.inputs - len(_KEPT)]
+        before = {name: field[name].copy() for name in ("h", "r2", "cv")}
+        sums *= keep
+        field["seen"] += 1.0
+        field["ss"][0] += w
+        share = w / field["ss"][0]
+        mean_x, mean_y = field["mean_x"], field["mean_y"]
+        mean_x += share * (x[:, None] - mean_x)
+        mean_y += share * (y - mean_y)
+        projected = np.zeros((self.projections + 1, len(at)))
+        projected[0] = 1.0  # the mean counts as one more regression, on a constant
+        error = self._project(field, w, x[:, None] - mean_x, y - mean_y, projected)
+        self._learn_metric(at, field, before, w, x, error, projected)
+        self._grow(field)
+        field["forgetting"][...] = settings.annealing * keep + (1.0 - settings.annealing) * settings.last_forgetting
+        self._table[at] = columns.T
 
-    def _grow(self, at: IntArray) -> None:
+    def _project(
+        self, field: dict[str, FloatArray], w: FloatArray, z: FloatArray, rest: FloatArray, projected: FloatArray
+    ) -> FloatArray:
+        """Partial least squares of inputs z (d, k) and outputs rest (k,); fills `projected`, returns what is left."""
+        used, mse = field["used"], field["mse"]
+        least, most = int(used.min()), int(used.max())
+        weighted = w * rest
+        mse[0] += weighted * rest
+        for k in range(most):
+            u, ss, sr, sz = field["u"][k], field["ss"][k + 1], field["sr"][k], field["sz"][k]
+            in_use = None if k < least else k < used
+            u += (weighted if in_use is None else np.where(in_use, weighted, 0.0)) * z
+            s = (z * u).sum(axis=0) / np.maximum(np.sqrt((u * u).sum(axis=0)), _TINY)
+            if in_use is not None:
+                s = np.where(in_use, s, 0.0)
+            projected[k + 1] = s
+            ws = w * s
+            ss += ws * s
+            sr += weighted * s
+            sz += ws * z
+            ratio = s / np.maximum(ss, _TINY)
+            rest = rest - ratio * sr
+            weighted = w * rest
+            mse[k + 1] += weighted * rest
+            if k + 1 < most:
+                z = z - ratio * sz
+        mse[most + 1 :] += weighted * rest
+        return rest
+
+    def _grow(self, field: dict[str, FloatArray]) -> None:
         """Another projection where the last one paid, with enough pairs to tell."""
-        rows = np.arange(len(at))
-        last, before = self.mse[at][rows, self.used[at]], self.mse[at][rows, self.used[at] - 1]
-        ready = self.seen[at] > self.settings.trusted_pairs * self.inputs
-        more = ready & (last < self.settings.add_projection * before) & (self.used[at] < self.projections)
-        self.used[at] += more
+        used, error = field["used"], field["mse"]
+        able = np.flatnonzero((used < self.projections) & (field["seen"] > self.settings.trusted_pairs * self.inputs))
+        if len(able):
+            last = used[able].astype(np.intp)
+            used[able] += error[last, able] < self.settings.add_projection * error[last - 1, able]
 
-    def _move_metric(
-        self, at: IntArray, w: FloatArray, x: FloatArray, error: FloatArray, s: FloatArray, keep: FloatArray
+    def _learn_metric(
+        self,
+        at: IntArray,
+        field: dict[str, FloatArray],
+        before: dict[str, FloatArray],
+        w: FloatArray,
+        x: FloatArray,
+        error: FloatArray,
+        s: FloatArray,
     ) -> None:
-        """One step down the gradient of J = Σ w e²/(1 − h)² / W + γ/d Σ D², with respect to the Cholesky root of D."""
+        """What a pair says of J = Σ w e²/(1 − h)² / W + γ/d Σ D², and a step down its gradient for ready fields."""
+        total = field["ss"][0]
+        share = np.where(field["ss"] > _TINY, s / np.maximum(field["ss"], _TINY), 0.0)
+        leverage = (s * share).sum(axis=0)
+        room = 1.0 - np.minimum(np.maximum(w * leverage, 0.0), _MOST_LEVERAGE)
+        loo = error / room
+        cost = w * loo * loo
+        weighted = w * loo / room
+        field["cv"] += cost
+        field["h"] += weighted * s
+        field["r2"] += (cost * w / room) * (s * s)
         # In units of full activation, so that a few pairs at a field's fringe do not move it.
-        ready = self.weight[at] > self.settings.trusted_pairs * self.inputs
-        # The mean counts as one more regression, on a constant.
-        s = np.concatenate([np.ones((len(at), 1)), s], axis=1)
-        total = self.weight[at]
-        squares = np.concatenate([total[:, None], self.ss[at]], axis=1)
-        share = np.where(squares > _TINY, s / np.maximum(squares, _TINY), 0.0)
-        leverage = (s * share).sum(axis=1)
-        h = np.clip(w * leverage, 0.0, _MOST_LEVERAGE)
-        loo = error / (1.0 - h)
-        # dJ/dw: the pair's own share and leverage, what the slopes do to all earlier errors and to their leverages.
-        by_weight = (
-            loo**2 * (1.0 + 2.0 * w * leverage / (1.0 - h))
-            - 2.0 * error * (share * self.h[at]).sum(axis=1)
-            - 2.0 * (share**2 * self.r2[at]).sum(axis=1)
-            - self.cv[at] / total
-        ) / total
-        self.cv[at] = keep * self.cv[at] + w * loo**2
-        self.h[at] = keep[:, None] * self.h[at] + (w * loo / (1.0 - h))[:, None] * s
-        self.r2[at] = keep[:, None] * self.r2[at] + (w**2 * loo**2 / (1.0 - h))[:, None] * s**2
-        root, off = self.root[at], x - self.centre[at]
-        # dw/dM = -w M off offᵀ; d(Σ D²)/dM = 4 M D
-        metric = np.swapaxes(root, 1, 2) @ root
-        slope = -(by_weight * w)[:, None, None] * (root @ off[:, :, None]) * off[:, None, :]
-        slope += (self.settings.penalty / self.inputs * w / total)[:, None, None] * 4.0 * (root @ metric)
-        step = self.settings.learning_rate * np.triu(slope)
+        ready = np.flatnonzero(total > self.settings.trusted_pairs * self.inputs)
+        if not len(ready):
+            return
+        # w dJ/dw: the pair's own share and leverage, what the slopes do to all earlier errors and their leverages.
+        by_weight = cost * (1.0 + 2.0 * w * leverage / room) - w * (
+            2.0 * (error * (share * before["h"]).sum(axis=0) + (share * share * before["r2"]).sum(axis=0))
+            + before["cv"] / total
+        )
         # While its leave-one-out error is far above its training error a field knows too little to move.
-        settled = (self.mse[at, self.used[at]] / np.maximum(self.cv[at], _TINY)) ** 4
-        step *= np.minimum(settled, 1.0)[:, None, None]
+        mse = field["mse"][field["used"][ready].astype(np.intp), ready]
+        settled = np.minimum((mse / np.maximum(field["cv"][ready], _TINY)) ** 4, 1.0)
+        self._move(at[ready], x, by_weight[ready] / total[ready], w[ready] / total[ready], settled)
+
+    def _move(self, at: IntArray, x: FloatArray, by_weight: FloatArray, share: FloatArray, settled: FloatArray) -> None:
+        """A step of the Cholesky roots of these fields, cut to what a single pair may change."""
+        place = self._places(at)
+        root, off = self._root[place], x - self._centre[at]
+        # dw/dM = -w M off offᵀ; d(Σ D²)/dM = 4 M D
+        slope = (root @ (-by_weight[:, None] * off)[:, :, None]) * off[:, None, :]
+        metric = root.swapaxes(1, 2) @ root
+        slope += (4.0 * self.settings.penalty / self.inputs * share)[:, None, None] * (root @ metric)
+        step = (self.settings.learning_rate * settled)[:, None, None] * slope * self._upper
         # A single pair never changes a root by more than a share of itself.
         size, limit = np.abs(step).max(axis=(1, 2)), _LARGEST_STEP * np.abs(root).max(axis=(1, 2))
         step *= np.minimum(1.0, limit / np.maximum(size, _TINY))[:, None, None]
-        self.root[at] -= np.where((ready & np.isfinite(size))[:, None, None], step, 0.0)
+        self._root[place] = root - np.where(np.isfinite(size)[:, None, None], step, 0.0)
+
+    def _places(self, at: IntArray) -> IntArray:
+        """Where the roots of these fields are; those that have not moved before get one."""
+        fresh = at[self._place[at] == _NOWHERE]
+        if len(fresh):
+            first = np.sqrt(self.settings.first_metric) * np.eye(self.inputs)
+            self._place[fresh] = len(self._moved) + np.arange(len(fresh))
+            self._moved = np.concatenate([self._moved, fresh])
+            self._root = np.concatenate([self._root, np.broadcast_to(first, (len(fresh), *first.shape))])
+        return self._place[at]
+
+
+def _layout(inputs: int, projections: int) -> dict[str, tuple[int, ...]]:
+    """What a field's row holds. Sums that a pair decays come first; `ss` begins with the sum of the weights."""
+    d, r = inputs, projections
+    sums = {"u": (r, d), "sz": (r, d), "ss": (r + 1,), "sr": (r,), "mse": (r + 1,), "h": (r + 1,), "r2": (r + 1,)}
+    return sums | {"cv": (), "mean_x": (d,)} | dict.fromkeys(_KEPT, ())
 
 
 # Updates of the final model (or one pass, if that is more), and of each one on trial.
