@@ -124,7 +124,7 @@ class ChainParameters:
         self._frames = np.stack(frames)
         self._axes = np.einsum("kij,kj->ki", self._frames[:-1, :3, :3], reference.axes)
         self._points = self._frames[:-1, :3, 3]
-        self._tangents = _tangents(self._axes)
+        self._tangents = tangents(self._axes)
         self._slides = np.flatnonzero(reference.prismatic)
 
     @property
@@ -313,7 +313,7 @@ def _cross_matrices(vectors: FloatArray) -> FloatArray:
     return (vectors @ _CROSS).reshape(*vectors.shape, 3)
 
 
-def _tangents(axes: FloatArray) -> FloatArray:
+def tangents(axes: FloatArray) -> FloatArray:
     """Two unit vectors across each axis and each other, as columns (d, 3, 2)."""
     helper = np.eye(3)[np.abs(axes).argmin(axis=1)]
     first = np.cross(axes, helper)
