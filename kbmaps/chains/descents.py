@@ -45,10 +45,12 @@ class ScrewArms:
         marker's move [m]."""
         count, d = self.axes.shape[:2]
         across = tangents(self.axes.reshape(-1, 3)).reshape(count, d, 3, 2)
-        turns = (across @ steps[:, : 2 * d].reshape(count, d, 2, 1))[..., 0]
-        angles = np.linalg.norm(turns, axis=2, keepdims=True)
-        axes = np.cos(angles) * self.axes + np.sinc(angles / np.pi) * np.cross(turns, self.axes)
-        axes /= np.linalg.norm(axes, axis=2, keepdims=True)
+        tilts = steps[:, : 2 * d].reshape(count, d, 2, 1)
+        angles = np.sqrt(np.einsum("sdti,sdti->sdi", tilts, tilts))
+        # The second tangent is axis × first, so a turn by (α, β) moves the axis along (β, −α).
+        along = (across @ np.stack([tilts[:, :, 1], -tilts[:, :, 0]], axis=2))[..., 0]
+        axes = np.cos(angles) * self.axes + np.sinc(angles / np.pi) * along
+        axes /= np.sqrt(np.einsum("sdi,sdi->sd", axes, axes))[..., None]
         points = self.points.copy()
         points[:, :-1] += (across @ steps[:, 2 * d : 4 * d].reshape(count, d, 2, 1))[..., 0]
         points[:, -1] += steps[:, 4 * d :]
