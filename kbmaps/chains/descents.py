@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -73,9 +72,7 @@ class _Reached:
     squares: FloatArray
 
     def __getitem__(self, chosen: BoolArray | IntArray) -> _Reached:
-        return _Reached(
-            self.turned[:, chosen], self.levers[:, chosen], self.residuals[chosen], self.squares[chosen]
-        )
+        return _Reached(self.turned[:, chosen], self.levers[:, chosen], self.residuals[chosen], self.squares[chosen])
 
 
 class Descents:
