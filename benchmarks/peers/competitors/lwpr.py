@@ -24,8 +24,6 @@ _LARGEST_STEP = 0.1
 _MOST_PROJECTIONS = 4
 _FIRST_ROWS = 64
 _NOWHERE = -1
-# What is one number a field and does not decay.
-_KEPT = ("mean_y", "seen", "used", "forgetting")
 
 
 @dataclass(frozen=True)
@@ -65,7 +63,10 @@ class LWPR:
         self.projections = min(inputs, _MOST_PROJECTIONS)
         self.fields = 0
         self._layout = _layout(inputs, self.projections)
-        self._table = np.empty((_FIRST_ROWS, sum(math.prod(shape) for shape in self._layout.values())))
+        sizes = {name: math.prod(shape) for name, shape in self._layout.items()}
+        self._decayed_first = sum(sizes[name] for name in ("u", "moments", "weight", "mse"))
+        self._decayed = self._decayed_first + sum(sizes[name] for name in ("h", "r2", "cv"))
+        self._table = np.empty((_FIRST_ROWS, sum(sizes.values())))
         self._output, self._centre = np.empty(_FIRST_ROWS, dtype=np.intp), np.empty((_FIRST_ROWS, inputs))
         # Most fields never see enough pairs to change their metric: the first one serves them all. Those that do, the
         # Cholesky roots of their metrics, and where in these a field's is.
@@ -93,16 +94,17 @@ class LWPR:
         return out
 
     def _blended(self, x: FloatArray) -> FloatArray:
-        every = self._named(self._table[: self.fields].T)
+        every, d = self._named(self._table[: self.fields].T), self.inputs
         activation = self._activations(x[:, None])
-        local = every["mean_y"] + np.zeros_like(activation)
-        z = x[:, None, :] - every["mean_x"].T
-        known = every["seen"] > self.settings.trusted_pairs * self.inputs
+        local = every["mean"][d] + np.zeros_like(activation)
+        z = x[:, None, :] - every["mean"][:d].T
+        known = every["seen"] > self.settings.trusted_pairs * d
         for k in range(self.projections):
-            u, square = every["u"][k], np.maximum(every["ss"][k + 1], _TINY)
+            u, moments = every["u"][k], every["moments"][k]
+            sz, sr, ss = moments[:d], moments[d], np.maximum(moments[d + 1], _TINY)
             s = np.einsum("nkd,dk->nk", z, u / np.maximum(np.linalg.norm(u, axis=0), _TINY))
-            local += np.where(known & (k < every["used"]), s * (every["sr"][k] / square), 0.0)
-            z -= s[..., None] * (every["sz"][k] / square).T
+            local += np.where(known & (k < every["used"]), s * (sr / ss), 0.0)
+            z -= s[..., None] * (sz / ss).T
         out = np.zeros((len(x), self.outputs))
         for output in range(self.outputs):
             own = self._output[: self.fields] == output
@@ -130,8 +132,8 @@ class LWPR:
         self.fields += 1
         self._table[at] = 0.0
         fresh = self._named(self._table[at])
-        fresh["mean_x"][...], fresh["mean_y"][...], fresh["used"][...] = x, y, min(2, self.projections)
-        fresh["ss"][0] = _TINY
+        fresh["mean"][:-1], fresh["mean"][-1] = x, y
+        fresh["used"][...], fresh["weight"][...] = min(2, self.projections), _TINY
         fresh["forgetting"][...] = self.settings.forgetting
         self._output[at], self._centre[at], self._place[at] = output, x, _NOWHERE
 
@@ -150,51 +152,48 @@ class LWPR:
         columns = self._table.take(at, axis=0).T.copy()
         field = self._named(columns)
         keep, settings = field["forgetting"].copy(), self.settings
-        sums = columns[: len(columns) - self.inputs - len(_KEPT)]
-        before = {name: field[name].copy() for name in ("h", "r2", "cv")}
-        sums *= keep
+        columns[: self._decayed_first] *= keep
         field["seen"] += 1.0
-        field["ss"][0] += w
-        share = w / field["ss"][0]
-        mean_x, mean_y = field["mean_x"], field["mean_y"]
-        mean_x += share * (x[:, None] - mean_x)
-        mean_y += share * (y - mean_y)
-        projected = np.zeros((self.projections + 1, len(at)))
-        projected[0] = 1.0  # the mean counts as one more regression, on a constant
-        error = self._project(field, w, x[:, None] - mean_x, y - mean_y, projected)
-        self._learn_metric(at, field, before, w, x, error, projected)
+        field["weight"] += w
+        # Inputs, output and, once there is one, the projected input of each field.
+        z = np.empty((self.inputs + 2, len(at)))
+        z[:-2], z[-2] = x[:, None], y
+        field["mean"] += w / field["weight"] * (z[:-1] - field["mean"])
+        z[:-1] -= field["mean"]
+        projected = self._project(field, w, z)
+        step = self._weigh(field, columns, w, z[-2], projected, keep)
+        if step is not None:
+            ready, *sizes = step
+            self._move(at[ready], x, *sizes)
         self._grow(field)
         field["forgetting"][...] = settings.annealing * keep + (1.0 - settings.annealing) * settings.last_forgetting
         self._table[at] = columns.T
 
-    def _project(
-        self, field: dict[str, FloatArray], w: FloatArray, z: FloatArray, rest: FloatArray, projected: FloatArray
-    ) -> FloatArray:
-        """Partial least squares of inputs z (d, k) and outputs rest (k,); fills `projected`, returns what is left."""
-        used, mse = field["used"], field["mse"]
+    def _project(self, field: dict[str, FloatArray], w: FloatArray, z: FloatArray) -> FloatArray:
+        """Partial least squares of inputs and output in z (d + 2, k), which becomes what is left of them.
+
+        Returns what the mean, a regression on a constant, and each projection regress on (r + 1, k).
+        """
+        used = field["used"]
         least, most = int(used.min()), int(used.max())
-        weighted = w * rest
-        mse[0] += weighted * rest
+        projected, rests = np.zeros((self.projections + 1, len(w))), np.empty((self.projections + 1, len(w)))
+        projected[0], rests[0] = 1.0, z[-2]
         for k in range(most):
-            u, ss, sr, sz = field["u"][k], field["ss"][k + 1], field["sr"][k], field["sz"][k]
-            in_use = None if k < least else k < used
-            u += (weighted if in_use is None else np.where(in_use, weighted, 0.0)) * z
-            s = (z * u).sum(axis=0) / np.maximum(np.sqrt((u * u).sum(axis=0)), _TINY)
-            if in_use is not None:
-                s = np.where(in_use, s, 0.0)
-            projected[k + 1] = s
-            ws = w * s
-            ss += ws * s
-            sr += weighted * s
-            sz += ws * z
-            ratio = s / np.maximum(ss, _TINY)
-            rest = rest - ratio * sr
-            weighted = w * rest
-            mse[k + 1] += weighted * rest
-            if k + 1 < most:
-                z = z - ratio * sz
-        mse[most + 1 :] += weighted * rest
-        return rest
+            u, moments = field["u"][k], field["moments"][k]
+            pull = w * z[-2]
+            if k >= least:
+                pull *= k < used
+            u += pull * z[:-2]
+            s = np.vecdot(z[:-2], u, axis=0) / np.maximum(np.sqrt(np.vecdot(u, u, axis=0)), _TINY)
+            if k >= least:
+                s *= k < used
+            projected[k + 1] = z[-1] = s
+            moments += (w * s) * z
+            z[:-1] -= (s / np.maximum(moments[-1], _TINY)) * moments[:-1]
+            rests[k + 1] = z[-2]
+        rests[most + 1 :] = z[-2]
+        field["mse"] += w * rests * rests
+        return projected
 
     def _grow(self, field: dict[str, FloatArray]) -> None:
         """Another projection where the last one paid, with enough pairs to tell."""
@@ -204,40 +203,43 @@ class LWPR:
             last = used[able].astype(np.intp)
             used[able] += error[last, able] < self.settings.add_projection * error[last - 1, able]
 
-    def _learn_metric(
+    def _weigh(
         self,
-        at: IntArray,
         field: dict[str, FloatArray],
-        before: dict[str, FloatArray],
+        columns: FloatArray,
         w: FloatArray,
-        x: FloatArray,
         error: FloatArray,
         s: FloatArray,
-    ) -> None:
-        """What a pair says of J = Σ w e²/(1 − h)² / W + γ/d Σ D², and a step down its gradient for ready fields."""
-        total = field["ss"][0]
-        share = np.where(field["ss"] > _TINY, s / np.maximum(field["ss"], _TINY), 0.0)
-        leverage = (s * share).sum(axis=0)
+        keep: FloatArray,
+    ) -> tuple[IntArray, FloatArray, FloatArray, FloatArray] | None:
+        """What a pair says of J = Σ w e²/(1 − h)² / W + γ/d Σ D².
+
+        Returns which fields are ready to move, and of these w dJ/dw, w / W and how settled they are; None if none is.
+        """
+        total = field["weight"]
+        squares = np.concatenate([total[None], field["moments"][:, -1]])
+        share = np.where(squares > _TINY, s / np.maximum(squares, _TINY), 0.0)
+        leverage = np.vecdot(s, share, axis=0)
         room = 1.0 - np.minimum(np.maximum(w * leverage, 0.0), _MOST_LEVERAGE)
-        loo = error / room
-        cost = w * loo * loo
-        weighted = w * loo / room
-        field["cv"] += cost
-        field["h"] += weighted * s
-        field["r2"] += (cost * w / room) * (s * s)
+        weighted = w * error / room
+        cost = weighted * error / room
         # In units of full activation, so that a few pairs at a field's fringe do not move it.
         ready = np.flatnonzero(total > self.settings.trusted_pairs * self.inputs)
-        if not len(ready):
-            return
-        # w dJ/dw: the pair's own share and leverage, what the slopes do to all earlier errors and their leverages.
-        by_weight = cost * (1.0 + 2.0 * w * leverage / room) - w * (
-            2.0 * (error * (share * before["h"]).sum(axis=0) + (share * share * before["r2"]).sum(axis=0))
-            + before["cv"] / total
-        )
+        by_weight = None
+        if len(ready):
+            # The pair's own share and leverage, what the slopes do to all earlier errors and to their leverages.
+            before = error * np.vecdot(share, field["h"], axis=0) + np.vecdot(share * share, field["r2"], axis=0)
+            by_weight = cost * (1.0 + 2.0 * w * leverage / room) - w * (2.0 * before + field["cv"] / total)
+        columns[self._decayed_first : self._decayed] *= keep
+        field["cv"] += cost
+        field["h"] += (weighted / room) * s
+        field["r2"] += (cost * w / room) * (s * s)
+        if by_weight is None:
+            return None
         # While its leave-one-out error is far above its training error a field knows too little to move.
         mse = field["mse"][field["used"][ready].astype(np.intp), ready]
         settled = np.minimum((mse / np.maximum(field["cv"][ready], _TINY)) ** 4, 1.0)
-        self._move(at[ready], x, by_weight[ready] / total[ready], w[ready] / total[ready], settled)
+        return ready, by_weight[ready] / total[ready], w[ready] / total[ready], settled
 
     def _move(self, at: IntArray, x: FloatArray, by_weight: FloatArray, share: FloatArray, settled: FloatArray) -> None:
         """A step of the Cholesky roots of these fields, cut to what a single pair may change."""
@@ -265,10 +267,15 @@ class LWPR:
 
 
 def _layout(inputs: int, projections: int) -> dict[str, tuple[int, ...]]:
-    """What a field's row holds. Sums that a pair decays come first; `ss` begins with the sum of the weights."""
+    """What a field's row holds: sums that a pair decays first, those that the metric needs as they were, and the rest.
+
+    `moments` are those of a projection with inputs, output and itself.
+    """
     d, r = inputs, projections
-    sums = {"u": (r, d), "sz": (r, d), "ss": (r + 1,), "sr": (r,), "mse": (r + 1,), "h": (r + 1,), "r2": (r + 1,)}
-    return sums | {"cv": (), "mean_x": (d,)} | dict.fromkeys(_KEPT, ())
+    first = {"u": (r, d), "moments": (r, d + 2), "weight": (), "mse": (r + 1,)}
+    return (
+        first | {"h": (r + 1,), "r2": (r + 1,), "cv": ()} | {"mean": (d + 1,), "seen": (), "used": (), "forgetting": ()}
+    )
 
 
 # Updates of the final model (or one pass, if that is more), and of each one on trial.
