@@ -79,7 +79,7 @@ class LWPR:
         activation = self._activations(x)
         closest = np.zeros(self.outputs)
         np.maximum.at(closest, self._output[: self.fields], activation)
-        for output in np.flatnonzero(closest < self.settings.generate):
+        for output in np.flatnonzero(closest < self.settings.generate).tolist():
             self._add(x, float(y[output]), output)
             activation = np.append(activation, 1.0)
         active = np.flatnonzero(activation > _SLIGHT)
@@ -184,7 +184,7 @@ class LWPR:
             if k >= least:
                 pull *= k < used
             u += pull * z[:-2]
-            s = np.vecdot(z[:-2], u, axis=0) / np.maximum(np.sqrt(np.vecdot(u, u, axis=0)), _TINY)
+            s = _dots(z[:-2], u) / np.maximum(np.sqrt(_dots(u, u)), _TINY)
             if k >= least:
                 s *= k < used
             projected[k + 1] = z[-1] = s
@@ -219,7 +219,7 @@ class LWPR:
         total = field["weight"]
         squares = np.concatenate([total[None], field["moments"][:, -1]])
         share = np.where(squares > _TINY, s / np.maximum(squares, _TINY), 0.0)
-        leverage = np.vecdot(s, share, axis=0)
+        leverage = _dots(s, share)
         room = 1.0 - np.minimum(np.maximum(w * leverage, 0.0), _MOST_LEVERAGE)
         weighted = w * error / room
         cost = weighted * error / room
@@ -228,7 +228,7 @@ class LWPR:
         by_weight = None
         if len(ready):
             # The pair's own share and leverage, what the slopes do to all earlier errors and to their leverages.
-            before = error * np.vecdot(share, field["h"], axis=0) + np.vecdot(share * share, field["r2"], axis=0)
+            before = error * _dots(share, field["h"]) + _dots(share * share, field["r2"])
             by_weight = cost * (1.0 + 2.0 * w * leverage / room) - w * (2.0 * before + field["cv"] / total)
         columns[self._decayed_first : self._decayed] *= keep
         field["cv"] += cost
@@ -264,6 +264,11 @@ class LWPR:
             self._moved = np.concatenate([self._moved, fresh])
             self._root = np.concatenate([self._root, np.broadcast_to(first, (len(fresh), *first.shape))])
         return self._place[at]
+
+
+def _dots(first: FloatArray, second: FloatArray) -> FloatArray:
+    """Inner products (k,) of columns (m, k)."""
+    return np.add.reduce(first * second, axis=0)
 
 
 def _layout(inputs: int, projections: int) -> dict[str, tuple[int, ...]]:
