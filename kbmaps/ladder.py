@@ -133,10 +133,11 @@ class Ladder:
             shift_std=_proper(tolerances.points, 0.015),
             marker_std=_proper(tolerances.tool, 0.03),
         )
+        residual = ResidualLearner(nominal, tolerances)
         return cls(
             {
-                "residual": Rung(ResidualLearner(nominal, tolerances)),
-                "rigid": Rung(RigidLearner(nominal, tolerances)),
+                "residual": Rung(residual),
+                "rigid": Rung(residual.rigid.twin()),
                 "train": Rung(train, extrapolates=False),
             }
         )

@@ -70,6 +70,13 @@ class RigidLearner:
         self._sigma = np.empty(0)
         self._fit: RigidFit | None = None
         self._widest = 0.0
+        self._twin: RigidLearner | None = None
+
+    def twin(self) -> RigidLearner:
+        """A learner of the same arm without pairs. While it gets the same pairs, it takes this one's fit over."""
+        twin = RigidLearner(self.nominal, self._tolerances, self._prior if self._told_prior else None)
+        twin._twin = self
+        return twin
 
     @property
     def joints(self) -> int:
@@ -231,12 +238,19 @@ class RigidLearner:
         return with_units(self._q, self._x, self._sigma)
 
     def _fitted(self) -> RigidFit | None:
+        twin = self._twin
+        if self._fit is None and twin is not None and twin._fit is not None and self._same_pairs(twin):
+            self._fit, self._widest = twin._fit, twin._widest
         if self._fit is None and self.pairs:
             fit = fit_chain(self._prior, self._units(), self._start())
             _, variance = fit.belief.predict_with_variance(self._q[fit.inliers])
             self._widest = float(variance.sum(axis=1).max(initial=0.0))
             self._fit = fit
         return self._fit
+
+    def _same_pairs(self, other: RigidLearner) -> bool:
+        pairs = zip((self._q, self._x, self._sigma), (other._q, other._x, other._sigma), strict=True)
+        return all(np.array_equal(own, others, equal_nan=True) for own, others in pairs)
 
     def _start(self) -> FloatArray:
         return self._prior.mean if self._told_prior else self._place.change(self._q, self._x)

@@ -195,7 +195,8 @@ class ResidualLearner:
     def _rigid_model(self, before: ResidualModel) -> ResidualModel:
         report = self._rigid.report()
         noise = report.noise * report.misfit if report.freedom >= _LEAST_FREEDOM else before.noise
-        return ResidualModel.of_belief(self._rigid.belief, before.features.scaling, noise)
+        belief = self._rigid.belief
+        return ResidualModel(before.features, belief.mean, {}, belief.root, noise)
 
 
 def _stored_prior(fields: dict[str, Any]) -> ChainBelief | ResidualModel | None:

@@ -149,6 +149,11 @@ class CoreFamily:
             motions[k, :, : len(directions)] = np.column_stack(directions)
         return cls(train.cores.reshape(chain.joints, CORE_NUMBERS), motions, length)
 
+    @property
+    def sizes(self) -> FloatArray:
+        """What each number of a core is measured by (36,): 1, or for translations `length`."""
+        return np.tile([1.0, 1.0, 1.0, self.length], 9)
+
     def prior(self, ellipse_std: float) -> CorePrior:
         """The prior whose cores have `ellipse_std` of their own in each number, times `length` in translations.
 
@@ -157,8 +162,7 @@ class CoreFamily:
         """
         if not ellipse_std > 0.0:
             raise SettingError(f"ellipse_std must be greater than 0, got {ellipse_std!r}")
-        sizes = ellipse_std * np.tile([1.0, 1.0, 1.0, self.length], 9)
-        covariances = self.motions @ self.motions.swapaxes(1, 2) + np.diag(np.square(sizes))
+        covariances = self.motions @ self.motions.swapaxes(1, 2) + np.diag(np.square(ellipse_std * self.sizes))
         spread: FloatArray = np.linalg.cholesky(covariances).astype(np.float64, copy=False)
         return CorePrior(self.mean, spread)
 

@@ -19,7 +19,7 @@ from kbmaps.maps.stack import BasisStack
 from kbmaps.model import Estimate
 from kbmaps.packed import named, pack, unpack
 from kbmaps.pairs import checked_pairs
-from kbmaps.trains.core_evidence import USUAL_ELLIPSE_STD, core_information, likely_ellipse_std
+from kbmaps.trains.core_evidence import USUAL_ELLIPSE_STD, core_equations, likely_ellipse_std
 from kbmaps.trains.core_prior import CORE_NUMBERS, CoreFamily, CorePrior
 from kbmaps.trains.misfit import misfit_sizes
 from kbmaps.trains.posterior import TensorPosterior
@@ -361,7 +361,7 @@ class TensorLearner:
             return fit
         prior = self._known_prior()
         problem = data.chosen(fit.used).problem(prior, fit.noise)
-        std = likely_ellipse_std(self._family, *core_information(problem, fit.z))
+        std = likely_ellipse_std(self._family, *core_equations(problem, fit.z))
         self._prior = self._family.prior(std)
         if np.array_equal(self._prior.spread, prior.spread):
             return fit
