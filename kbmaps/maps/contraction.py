@@ -112,7 +112,8 @@ class NumpyNet:
 
 def contracted(planes: FloatArray, left: FloatArray, right: FloatArray) -> FloatArray:
     """Outputs (n, outputs) of planes (outputs · left_size, right_size) for many rows' halves (n, ·) of the weights."""
-    by_left = (planes @ right.T).reshape(-1, left.shape[1], len(left))
+    rows, width = left.shape
+    by_left = (planes @ right.T).reshape(len(planes) // width, width, rows)
     return np.einsum("oln,nl->no", by_left, left)
 
 

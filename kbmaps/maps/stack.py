@@ -84,7 +84,7 @@ class BasisStack:
     def _products(self, q: FloatArray) -> FloatArray:
         """The three products (..., 3 d) that the basis functions are mixed from, as `basis.Terms` has them."""
         if q.ndim > 1:
-            return self._products_of_rows(q.reshape(-1, self.joints).T).T.reshape(*q.shape[:-1], -1)
+            return self._products_of_rows(q.reshape(-1, self.joints).T).T.reshape(*q.shape[:-1], 3 * self.joints)
         sines = np.sin(0.5 * q - self._half_phases)
         products = sines.take(_FIRST, axis=-2) * sines.take(_SECOND, axis=-2)
         if self._any_slides:
@@ -96,13 +96,13 @@ class BasisStack:
         """The same (3 d, n) for many rows, transposed, q (d, n): inner loops over rows are long ones."""
         sines = np.sin(0.5 * q - self._half_phases[:, :, None])
         products = np.empty((3, *q.shape))
-        for product, first, second in zip(products, _FIRST, _SECOND, strict=True):
-            np.multiply(sines[first], sines[second], out=product)
+        for place, (first, second) in enumerate(((0, 0), (0, 1), (1, 1))):
+            np.multiply(sines[first], sines[second], out=products[place])
         if self._any_slides:
             share = (q - self._start[:, None]) / self._span[:, None]
             stroke = np.stack([1.0 - share, share, np.zeros_like(share)])
             products = np.where(self._slides[:, None], stroke, products)
-        return products.reshape(3 * self.joints, -1)
+        return products.reshape(3 * self.joints, q.shape[1])
 
     def halves(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Left (left_size,) and right (right_size,) weights for q (d,); for q (n, d) with a leading n."""
@@ -141,7 +141,7 @@ class BasisStack:
         factors = np.ascontiguousarray(weights[:, begin:end].transpose(1, 2, 0))
         product = np.ones((1, count))
         for factor, size in zip(factors[::-1], self.sizes[begin:end][::-1], strict=True):
-            product = (factor[:size, None] * product).reshape(-1, count)
+            product = (factor[:size, None] * product).reshape(len(product) * size, count)
         return product.T
 
 
