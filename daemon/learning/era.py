@@ -158,6 +158,7 @@ class Era:
         q, x = self.memory.all()
         self.members.start_again(prior, q, x)
         self._claims.prior_changed(x[-RECENT:] - prior.predict(q[-RECENT:]))
+        self._choose_map()
         self._replays_due += self._replays_per_pair * min(len(q), RECENT)
 
     def ask(self) -> None:
