@@ -37,7 +37,10 @@ REGION_SAMPLES = 256
 
 
 class Learning:
-    """Learns the forward kinematics of one robot from pairs."""
+    """Learns the forward kinematics of one robot from pairs.
+
+    What is learnt is in its `Eras`. Here it is counted, kept apart for the two threads, and published.
+    """
 
     def __init__(self, nominal: NominalModel, settings: LearnerConfig, solver: Solver) -> None:
         self._nominal, self._settings = nominal, settings
