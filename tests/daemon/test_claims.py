@@ -6,7 +6,7 @@ import pytest
 from guided_arm import JOINTS, nominal_model, path
 
 from daemon.learning.claims import Claims, ClaimsState
-from daemon.learning.members import INSTANT, PRIOR, RIGID
+from daemon.learning.members import INSTANT, PRIOR, RESIDUAL, RIGID
 from interfaces.records import FloatArray
 from kbmaps import ChainBelief, ChainTolerances
 
@@ -99,6 +99,20 @@ def test_residuals_within_the_noise_add_nothing_to_what_is_left_open_of_the_chai
     noise = np.random.default_rng(0).normal(0.0, np.sqrt(NOISE[0]), (50, 3))
     claims.solution_taken(RIGID, noise, sure_belief(), neighbours=True)
     assert sigma(claims, RIGID, walk) < 1e-6
+
+
+@pytest.mark.parametrize("answered", [RIGID, RESIDUAL])
+def test_of_two_solutions_alike_the_one_that_answered_with_the_last_tool_answers_with_this_one(
+    answered: str, walk: FloatArray
+) -> None:
+    claims = Claims(nominal_model().bases, 0.1)
+    claims.change_tool(0.1, answered)
+    far, alike = np.full(3, 0.04), np.full(3, 0.002)
+    for name in (RIGID, RESIDUAL):
+        claims.solution_taken(name, np.zeros((10, 3)), None, neighbours=True)
+    for row in walk[:10]:
+        claims.predicted(row, {PRIOR: far, INSTANT: far, RIGID: alike, RESIDUAL: alike}, NOISE)
+    assert claims.best(PRIOR) == answered
 
 
 def test_claims_are_the_same_after_a_restart(walk: FloatArray) -> None:
