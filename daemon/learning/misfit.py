@@ -10,6 +10,8 @@ from interfaces.records import FloatArray
 
 # What is smaller than so many of its standard errors may be chance.
 CLEARLY = 2.0
+# As in the fits: 3 of 100,000 good pairs are further out. What was left out there says nothing of what is missed.
+OUTLIER_SIGMAS = 4.8
 # Below this number of pairs, what was seen with the last tool counts.
 WARM = 10.0
 
@@ -31,6 +33,7 @@ def misfit(
         scatter: 1-sigma of a coordinate around the solution [m], with the numbers that it has used up allowed for; 0
             where that is not known.
     """
+    errors = _without_outliers(errors, scatter) if scatter > 0.0 else errors
     n = len(errors)
     if neighbours and n > 1:
         variance = (errors[1:] * errors[:-1]).mean(axis=0)
@@ -42,3 +45,9 @@ def misfit(
     seen = np.where(variance > CLEARLY * chance, variance, 0.0)
     missing = max(WARM - n, 0.0)
     return np.sqrt((n * seen + missing * np.square(before)) / max(n, WARM))
+
+
+def _without_outliers(errors: FloatArray, scatter: float) -> FloatArray:
+    """Those that the fit has not left out; all where these would be the fewer: then it is the fit that is off."""
+    near = np.linalg.norm(errors, axis=1) <= OUTLIER_SIGMAS * scatter
+    return errors[near] if near.mean() > 0.5 else errors
