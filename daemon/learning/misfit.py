@@ -40,8 +40,9 @@ def misfit(
         chance = np.square(errors).mean(axis=0) / math.sqrt(n - 1)
     else:
         square = np.square(errors).mean(axis=0)
-        variance = square * max(scatter**2 / max(float(square.mean()), 1e-300), 1.0) - noise_variance
-        chance = noise_variance * math.sqrt(2.0 / n)
+        taken = max(scatter**2 / max(float(square.mean()), 1e-300), 1.0)
+        variance = taken * square - noise_variance
+        chance = noise_variance * math.sqrt(2.0 * taken / n)
     seen = np.where(variance > CLEARLY * chance, variance, 0.0)
     missing = max(WARM - n, 0.0)
     return np.sqrt((n * seen + missing * np.square(before)) / max(n, WARM))
