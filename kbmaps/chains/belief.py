@@ -14,7 +14,7 @@ from kbmaps.chains.chain import RigidChain
 from kbmaps.chains.packed import chain_arrays, chain_from_arrays
 from kbmaps.chains.parameters import WIDE, ChainParameters, ChainTolerances
 from kbmaps.errors import KBMapsError, ModelFormatError, NonFiniteError, SettingError, ShapeError
-from kbmaps.packed import pack, unpack
+from kbmaps.packed import numbers, pack, unpack
 
 _KIND = "belief in a rigid chain, 1"
 _BLOCK = 2048
@@ -28,6 +28,8 @@ class ChainBelief:
         parameters: what they are, and the reference chain that they change.
         mean: (size,) [rad, m].
         root: matrix W (size, k) with the covariance W Wᵀ; a row of zeros holds its parameter.
+        noise: 1-sigma of a coordinate of what was measured around the chain [m], as the pairs showed it; 0 where none
+            did.
 
     Raises:
         ShapeError, NonFiniteError
@@ -36,6 +38,7 @@ class ChainBelief:
     parameters: ChainParameters
     mean: FloatArray
     root: FloatArray
+    noise: float = 0.0
 
     def __post_init__(self) -> None:
         size = self.parameters.size
@@ -101,14 +104,16 @@ class ChainBelief:
 
     def to_bytes(self) -> bytes:
         """The belief and its reference chain, as one self-describing byte string."""
-        return pack(_KIND, {}, chain_arrays(self.parameters.reference) | {"mean": self.mean, "root": self.root})
+        arrays = chain_arrays(self.parameters.reference) | {"mean": self.mean, "root": self.root}
+        return pack(_KIND, {"noise": self.noise}, arrays)
 
     @classmethod
     def from_bytes(cls, data: bytes) -> Self:
         """The belief in `data`. Raises ModelFormatError: it is none, or damaged."""
-        _, arrays = unpack(data, _KIND)
+        fields, arrays = unpack(data, _KIND)
+        noise = numbers(fields).get("noise", 0.0)
         try:
-            return cls(ChainParameters(chain_from_arrays(arrays)), arrays["mean"], arrays["root"])
+            return cls(ChainParameters(chain_from_arrays(arrays)), arrays["mean"], arrays["root"], noise)
         except (KeyError, KBMapsError) as error:
             raise ModelFormatError(f"the bytes do not describe a belief in a chain: {error}") from error
 
@@ -139,7 +144,7 @@ class ChainBelief:
         root = cast(FloatArray, np.linalg.solve(factor, self.root.T)).T
         mean = self.mean - root @ (root.T @ (added * self.mean))
         evidence = float(np.log(wide[free] / narrow[free]).sum() - np.log(np.diag(factor)).sum())
-        return type(self)(self.parameters, mean, root), evidence - 0.5 * float(self.mean @ (added * mean))
+        return type(self)(self.parameters, mean, root, self.noise), evidence - 0.5 * float(self.mean @ (added * mean))
 
     def with_other_tool(self, tolerance: float) -> Self:
         """The same arm with a marker that was moved, by `tolerance` (1-sigma of each component [m]).
@@ -154,7 +159,7 @@ class ChainBelief:
         free, root = squared(np.concatenate([self.root, moved], axis=1))
         full = np.zeros((self.parameters.size, self.parameters.size))
         full[np.ix_(free, free)] = root
-        return type(self)(self.parameters, self.mean, full)
+        return type(self)(self.parameters, self.mean, full, self.noise)
 
 
 def squared(root: FloatArray) -> tuple[IntArray, FloatArray]:

@@ -13,7 +13,6 @@ from kbmaps.arrays import BoolArray, FloatArray, IntArray
 from kbmaps.chains.chain import RigidChain
 from kbmaps.chains.parameters import ChainParameters
 from kbmaps.maps.basis import learning_bases
-from kbmaps.maps.block_choice import PATH_CORRELATION
 from kbmaps.maps.stack import BasisStack
 
 # Errors of a joint's angle [rad], as functions of its own reading or of gravity's torque about it.
@@ -28,6 +27,8 @@ MOST_FEATURES = 500
 _JOINTS_WITH_OWN_LOADS = 8
 # Ranges of a joint narrower than this [rad, m] would blow its functions up.
 _LEAST_RANGE = 1e-3
+# So much of what smooth functions over the pairs' reach are worth is shared by neighbours on a path.
+_PATH_CORRELATION = 0.9
 # A camera may ride on a head with so many joints, behind which stands the link where gravity is constant.
 _MOST_NECK_JOINTS = 3
 
@@ -122,11 +123,12 @@ class ResidualFeatures:
         return tuple(group for group in groups if group in self._still)
 
     def follow_a_path(self, q: FloatArray) -> bool:
-        """Whether configurations (n, d), in their order, are neighbours on a path: as `kbmaps.follow_a_path`."""
+        """Whether configurations (n, d), in their order, are neighbours on a path: in functions
+        that are scaled to their reach."""
         weights = self._stack.joint_weights(q)
         inner, square = np.einsum("nkm,nkm->nk", weights[:-1], weights[1:]), np.square(weights).sum(axis=2)
         shared = (inner / np.sqrt(square[:-1] * square[1:])).prod(axis=1)
-        return bool(len(shared)) and bool(np.median(shared) > PATH_CORRELATION)
+        return bool(len(shared)) and bool(np.median(shared) > _PATH_CORRELATION)
 
     def positions(self, chain: RigidChain, weights: Weights, q: FloatArray) -> FloatArray:
         """Positions (n, 3) [m] at q (n, d)."""

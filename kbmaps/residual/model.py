@@ -98,7 +98,7 @@ class ResidualModel:
     def belief(self) -> ChainBelief:
         """What is believed of the rigid part, whatever the deviations are."""
         parameters = self.features.parameters
-        return ChainBelief(parameters, self.change, self.root[: parameters.size])
+        return ChainBelief(parameters, self.change, self.root[: parameters.size], self.noise)
 
     @property
     def digest(self) -> str:
