@@ -255,7 +255,7 @@ class ResidualFeatures:
     def _offset_functions(self, group: str, p: FloatArray, q: FloatArray) -> FloatArray:
         """ψ (n, m) of a camera or a smooth group."""
         if group in SMOOTH_GROUPS:
-            weights = self._stack.joint_weights(q)[:, :, 1:].reshape(len(q), -1)
+            weights = self._stack.joint_weights(q)[:, :, 1:].reshape(len(q), 2 * self.joints)
             return np.multiply.reduce(weights[:, self._products[group]], axis=2)
         s = (p - self.scaling.centre) / self.scaling.scale
         degree = CAMERA_GROUPS.index(group) + 1

@@ -151,7 +151,7 @@ class ResidualModel:
         return x, variance
 
     def effects(self, q: ArrayLike) -> dict[str, float]:
-        """By how much each group moves the positions at q (n, d), root mean square of the distances [m].
+        """By how much each group moves the positions at q (n, d), root mean square of the distances [m]; 0 of none.
 
         Raises:
             ShapeError, NonFiniteError
@@ -159,7 +159,7 @@ class ResidualModel:
         angles = rows("q", q, self.joints)
         point = self.features.linearised(self.change, self.chain, self.weights, angles, tuple(self.weights))
         moves = {group: point.groups[group] @ weights for group, weights in self.weights.items()}
-        return {group: math.sqrt(float(np.square(move).sum(axis=1).mean())) for group, move in moves.items()}
+        return {group: math.sqrt(float(np.square(move).sum()) / max(len(move), 1)) for group, move in moves.items()}
 
     def with_other_tool(self, tolerance: float) -> Self:
         """The same arm with a marker that was moved, by `tolerance` (1-sigma of each component [m]).
