@@ -37,7 +37,8 @@ class ResidualLearner:
     Deviations come in groups: eccentric encoders, gear gains, joints that yield under load, a distorting camera, and
     smooth functions of one to three joints. The chain's tolerances and each group's variance are the prior; the
     variances are those that make the pairs most probable, and what is predicted is the average over those sets of
-    groups that the pairs speak for. Where they speak for none, this is `RigidLearner` to the last bit.
+    groups that are about as probable as the best. Where the pairs speak for no group, that is `RigidLearner` to a
+    fraction of its sigma; to the last bit where no set with a group comes near, as without noise.
 
     Args:
         nominal: the chain as drawn, or as `find_chain` found it.
@@ -90,8 +91,14 @@ class ResidualLearner:
 
     @property
     def deviations(self) -> dict[str, float]:
-        """By how much each group of deviations that the pairs speak for moves the learnt positions (RMS) [m]."""
-        return self.model.effects(self._q) if self.pairs else {}
+        """By how much each group of deviations that the pairs speak for moves the learnt positions (RMS) [m].
+
+        Groups that the prior has count as spoken for; those that are in the average beside the best set do not.
+        """
+        fit = self._fitted()
+        if fit is None:
+            return {}
+        return {group: effect for group, effect in self.model.effects(self._q).items() if group in fit.groups}
 
     @property
     def inliers(self) -> BoolArray:
@@ -121,8 +128,7 @@ class ResidualLearner:
         Raises:
             ShapeError, NonFiniteError
         """
-        fit = self._fitted()
-        return self._rigid.predict(q) if fit is None and self._prior is None else self.model.predict(q)
+        return self._rigid.predict(q) if self._is_rigid else self.model.predict(q)
 
     def estimate(self, q: ArrayLike) -> Estimate:
         """Positions at q (n, d), their 1-sigma per axis against the truth, and whether data was there.
@@ -132,9 +138,9 @@ class ResidualLearner:
         Raises:
             ShapeError, NonFiniteError
         """
-        fit = self._fitted()
-        if fit is None and self._prior is None:
+        if self._is_rigid:
             return self._rigid.estimate(q)
+        fit = self._fitted()
         x, variance = self.model.predict_with_variance(q)
         if fit is None:
             return Estimate(x, np.sqrt(variance), np.zeros(len(x), dtype=np.bool_))
@@ -170,12 +176,17 @@ class ResidualLearner:
         return learner
 
     @property
+    def _is_rigid(self) -> bool:
+        """Whether the rigid chain is all there is: nothing was found beside it, now or by who made the prior."""
+        return self._fitted() is None and not self.model.weights
+
+    @property
     def _model_before(self) -> ResidualModel:
         """What is known without pairs."""
         return self._prior or ResidualModel.of_belief(self._rigid.belief)
 
     def _fitted(self) -> ResidualFit | None:
-        """The fit; None where the rigid chain is all there is."""
+        """The fit; None without pairs, and where they speak for nothing but the rigid chain."""
         if self._model is None and self.pairs:
             pairs = with_units(self._q, self._x, self._sigma)
             before = self._prior
@@ -184,7 +195,7 @@ class ResidualLearner:
                 scaling = replace(ResidualScaling.of(self._q, self._x), load=load)
                 before = ResidualModel.of_belief(self._rigid.prior, scaling, 0.0 if before is None else before.noise)
             # Noise that nobody told must be seen in residuals that the chain alone leaves, or anything explains them.
-            if pairs.known or before.noise > 0.0 or self._rigid.report().freedom >= _LEAST_FREEDOM:
+            if pairs.known or before.weights or before.noise > 0.0 or self._rigid.report().freedom >= _LEAST_FREEDOM:
                 self._fit = fit_residual(before, pairs, self._rigid.change)
             self._model = self._rigid_model(before) if self._fit is None else self._fit.model
             if self._fit is not None:
