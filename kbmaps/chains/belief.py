@@ -11,10 +11,10 @@ from numpy.typing import ArrayLike
 
 from kbmaps.arrays import FloatArray, IntArray, frozen, rows, rows_or_vector
 from kbmaps.chains.chain import RigidChain
-from kbmaps.chains.packed import chain_arrays, chain_from_arrays
+from kbmaps.chains.packed import CHAIN, chain_arrays, chain_from_arrays
 from kbmaps.chains.parameters import WIDE, ChainParameters, ChainTolerances
-from kbmaps.errors import KBMapsError, ModelFormatError, NonFiniteError, SettingError, ShapeError
-from kbmaps.packed import pack, unpack
+from kbmaps.errors import NonFiniteError, SettingError, ShapeError
+from kbmaps.packed import complete, pack, restoring, unpack
 
 _KIND = "belief in a rigid chain, 1"
 _BLOCK = 2048
@@ -107,10 +107,9 @@ class ChainBelief:
     def from_bytes(cls, data: bytes) -> Self:
         """The belief in `data`. Raises ModelFormatError: it is none, or damaged."""
         _, arrays = unpack(data, _KIND)
-        try:
+        with restoring("a belief in a chain"):
+            complete(arrays, (*CHAIN, "mean", "root"))
             return cls(ChainParameters(chain_from_arrays(arrays)), arrays["mean"], arrays["root"])
-        except (KeyError, KBMapsError) as error:
-            raise ModelFormatError(f"the bytes do not describe a belief in a chain: {error}") from error
 
     def tightened(self, before: ChainTolerances, after: ChainTolerances) -> tuple[Self, float]:
         """The same pairs' belief had it begun with narrower tolerances, and its evidence.

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import asdict, replace
-from typing import Any, Self
+from dataclasses import replace
+from typing import Any, Self, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -13,18 +13,17 @@ from scipy.special import stdtrit  # pyright: ignore[reportMissingTypeStubs, rep
 from kbmaps.arrays import BoolArray, FloatArray
 from kbmaps.chains.belief import ChainBelief
 from kbmaps.chains.chain import RigidChain
-from kbmaps.chains.packed import chain_arrays, chain_from_arrays
+from kbmaps.chains.packed import CHAIN, chain_arrays, chain_from_arrays, describe_tolerances, parse_tolerances
 from kbmaps.chains.parameters import ChainTolerances
 from kbmaps.chains.rigid_learner import RigidLearner
-from kbmaps.errors import KBMapsError, ModelFormatError
 from kbmaps.model import Estimate
-from kbmaps.packed import numbers, pack, unpack
-from kbmaps.pairs import checked_pairs, with_units
+from kbmaps.packed import complete, named, pack, restoring, unpack
+from kbmaps.pairs import checked_pairs, stored_pairs, with_units
 from kbmaps.residual.features import ResidualScaling
 from kbmaps.residual.fit import ResidualFit, fit_residual
 from kbmaps.residual.model import ResidualModel
 
-_KIND = "rigid chain with residual, batch, 1"
+_KIND = "rigid chain with residual, batch, 2"
 # Configurations where the model is surer than this times the least sure pair (in variance) lie where data was.
 _SUPPORT_FACTOR = 2.0
 _LEAST_FREEDOM = 10.0
@@ -155,24 +154,22 @@ class ResidualLearner:
         """The learner with all its pairs; `from_bytes` gives the same predictions to the last bit."""
         arrays = chain_arrays(self._rigid.nominal) | {"q": self._q, "x": self._x, "sigma": self._sigma}
         prior, belief = self._prior, self._belief
-        priors = {"model": prior.to_bytes().hex()} if prior else {"belief": belief.to_bytes().hex()} if belief else {}
-        return pack(_KIND, asdict(self._rigid.tolerances) | priors, arrays)
+        known = {"model": prior.to_bytes().hex()} if prior else belief and {"belief": belief.to_bytes().hex()}
+        return pack(_KIND, {"tolerances": describe_tolerances(self._rigid.tolerances), "prior": known}, arrays)
 
     @classmethod
     def from_bytes(cls, data: bytes) -> Self:
         """The learner in `data`. Raises ModelFormatError: it is none of this kind, or damaged."""
         fields, arrays = unpack(data, _KIND)
-        prior = _stored_prior(fields)
-        settings = numbers(fields)
-        try:
-            learner = cls(chain_from_arrays(arrays), ChainTolerances(**settings), prior)
-            sigma = arrays["sigma"]
+        with restoring("a rigid chain with residual"):
+            named(fields, "the fields", ("tolerances", "prior"))
+            complete(arrays, (*CHAIN, "q", "x", "sigma"))
+            nominal, tolerances = chain_from_arrays(arrays), parse_tolerances(fields["tolerances"])
+            learner = cls(nominal, tolerances, _stored_prior(fields["prior"]))
+            q, x, sigma = stored_pairs(arrays, learner.joints)
             told = ~np.isnan(sigma)
             for start, end in _runs(told):
-                part = slice(start, end)
-                learner.learn(arrays["q"][part], arrays["x"][part], sigma[part] if told[start] else None)
-        except (KeyError, TypeError, IndexError, KBMapsError) as error:
-            raise ModelFormatError(f"the bytes do not describe a rigid chain with residual: {error}") from error
+                learner.learn(q[start:end], x[start:end], sigma[start:end] if told[start] else None)
         return learner
 
     @property
@@ -209,16 +206,13 @@ class ResidualLearner:
         return ResidualModel.of_belief(self._rigid.belief, before.features.scaling, noise)
 
 
-def _stored_prior(fields: dict[str, Any]) -> ChainBelief | ResidualModel | None:
-    """The prior in the fields of stored bytes, taken out of them. Raises ModelFormatError."""
-    kinds = {"model": ResidualModel.from_bytes, "belief": ChainBelief.from_bytes}
-    for name, read in kinds.items():
-        if name in fields:
-            try:
-                return read(bytes.fromhex(fields.pop(name)))
-            except (TypeError, ValueError) as error:
-                raise ModelFormatError(f"the field {name} is not hexadecimal") from error
-    return None
+def _stored_prior(value: Any) -> ChainBelief | ResidualModel | None:
+    """The prior among the fields of stored bytes. Raises ModelFormatError, TypeError, ValueError."""
+    if value is None:
+        return None
+    if isinstance(value, dict) and "belief" in value:
+        return ChainBelief.from_bytes(bytes.fromhex(named(cast(Any, value), "the prior", ("belief",))["belief"]))
+    return ResidualModel.from_bytes(bytes.fromhex(named(value, "the prior", ("model",))["model"]))
 
 
 def _runs(values: BoolArray) -> list[tuple[int, int]]:
