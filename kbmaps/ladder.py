@@ -80,8 +80,9 @@ class Ladder:
     by one, models learn when it is their time.
 
     Args:
-        rungs: the models by name, the most trusted first: what has fewer free numbers says more about places
-            without data.
+        rungs: the models by name, the most trusted first. What errs least where it is not the best one belongs there,
+            for a clear difference takes many pairs to show: a model that falls back by itself, or one that has fewer
+            free numbers.
 
     Raises:
         SettingError: no rung, none that extrapolates, models of different numbers of joints, or one that has learnt.
@@ -116,6 +117,9 @@ class Ladder:
     @classmethod
     def around(cls, nominal: RigidChain, tolerances: ChainTolerances, lower: ArrayLike, upper: ArrayLike) -> Ladder:
         """The usual ladder for a drawn arm: rigid chain with residual, rigid chain, tensor train.
+
+        The residual comes first, for pairs that are spread: where the arm is rigid it errs next to as the chain does,
+        where it is not the chain is far off. On guided paths the chain first serves better away from them.
 
         Args:
             nominal: the chain as drawn.
