@@ -11,12 +11,12 @@ from numpy.typing import ArrayLike
 
 from kbmaps.arrays import FloatArray, IntArray, frozen, rows, rows_or_vector
 from kbmaps.chains.chain import RigidChain
-from kbmaps.chains.packed import chain_arrays, chain_from_arrays
+from kbmaps.chains.packed import CHAIN, chain_arrays, chain_from_arrays
 from kbmaps.chains.parameters import WIDE, ChainParameters, ChainTolerances
-from kbmaps.errors import KBMapsError, ModelFormatError, NonFiniteError, SettingError, ShapeError
-from kbmaps.packed import numbers, pack, unpack
+from kbmaps.errors import NonFiniteError, SettingError, ShapeError
+from kbmaps.packed import complete, number, pack, restoring, unpack
 
-_KIND = "belief in a rigid chain, 1"
+_KIND = "belief in a rigid chain, 2"
 _BLOCK = 2048
 
 
@@ -33,6 +33,7 @@ class ChainBelief:
 
     Raises:
         ShapeError, NonFiniteError
+        SettingError: a noise below 0.
     """
 
     parameters: ChainParameters
@@ -50,6 +51,8 @@ class ChainBelief:
             if not np.isfinite(getattr(self, name)).all():
                 raise NonFiniteError(name)
             object.__setattr__(self, name, frozen(getattr(self, name)))
+        if not 0.0 <= self.noise < np.inf:
+            raise SettingError(f"noise must be finite and not negative, got {self.noise!r}")
 
     @classmethod
     def from_tolerances(cls, parameters: ChainParameters, tolerances: ChainTolerances) -> Self:
@@ -111,11 +114,10 @@ class ChainBelief:
     def from_bytes(cls, data: bytes) -> Self:
         """The belief in `data`. Raises ModelFormatError: it is none, or damaged."""
         fields, arrays = unpack(data, _KIND)
-        noise = numbers(fields).get("noise", 0.0)
-        try:
+        with restoring("a belief in a chain"):
+            complete(arrays, (*CHAIN, "mean", "root"))
+            noise = number(fields["noise"], "the noise")
             return cls(ChainParameters(chain_from_arrays(arrays)), arrays["mean"], arrays["root"], noise)
-        except (KeyError, KBMapsError) as error:
-            raise ModelFormatError(f"the bytes do not describe a belief in a chain: {error}") from error
 
     def tightened(self, before: ChainTolerances, after: ChainTolerances) -> tuple[Self, float]:
         """The same pairs' belief had it begun with narrower tolerances, and its evidence.

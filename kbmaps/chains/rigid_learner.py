@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict
 from typing import Self
 
 import numpy as np
@@ -13,17 +12,17 @@ from scipy.special import stdtrit  # pyright: ignore[reportMissingTypeStubs, rep
 from kbmaps.arrays import BoolArray, FloatArray, frozen, rows, rows_or_vector
 from kbmaps.chains.belief import ChainBelief
 from kbmaps.chains.chain import RigidChain
-from kbmaps.chains.packed import chain_arrays, chain_from_arrays
+from kbmaps.chains.packed import CHAIN, chain_arrays, chain_from_arrays, describe_tolerances, parse_tolerances
 from kbmaps.chains.parameters import ChainParameters, ChainTolerances
 from kbmaps.chains.placed_start import PlacedStart
 from kbmaps.chains.report import ChainReport, chain_report
 from kbmaps.chains.rigid_fit import RigidFit, fit_chain
-from kbmaps.errors import DegenerateDataError, KBMapsError, ModelFormatError
+from kbmaps.errors import DegenerateDataError
 from kbmaps.model import Estimate
-from kbmaps.packed import numbers, pack, unpack
-from kbmaps.pairs import Pairs, checked_pairs, with_units
+from kbmaps.packed import complete, named, pack, restoring, unpack
+from kbmaps.pairs import Pairs, checked_pairs, stored_pairs, with_units
 
-_KIND = "rigid chain, batch, 1"
+_KIND = "rigid chain, batch, 2"
 _ONE_SIGMA = 0.841344746
 # Configurations where the chain is surer than this times the least sure pair (in variance) lie where data was.
 _SUPPORT_FACTOR = 2.0
@@ -214,24 +213,21 @@ class RigidLearner:
         }
         if self._told_prior:
             arrays |= {"prior_mean": self._prior.mean, "prior_root": self._prior.root}
-        return pack(_KIND, asdict(self._tolerances), arrays)
+        return pack(_KIND, {"tolerances": describe_tolerances(self._tolerances)}, arrays)
 
     @classmethod
     def from_bytes(cls, data: bytes) -> Self:
         """The learner in `data`. Raises ModelFormatError: it is none of this kind, or damaged."""
         fields, arrays = unpack(data, _KIND)
-        settings = numbers(fields)
-        try:
+        with restoring("a rigid learner"):
+            tolerances = parse_tolerances(named(fields, "the fields", ("tolerances",))["tolerances"])
+            complete(arrays, (*CHAIN, "q", "x", "sigma"), ("prior_mean", "prior_root"))
             chain = chain_from_arrays(arrays)
             prior = None
             if "prior_mean" in arrays:
                 prior = ChainBelief(ChainParameters(chain), arrays["prior_mean"], arrays["prior_root"])
-            learner = cls(chain, ChainTolerances(**settings), prior)
-            sigma = arrays["sigma"]
-            learner.learn(arrays["q"], arrays["x"], np.where(np.isnan(sigma), 1.0, sigma))
-        except (KeyError, TypeError, KBMapsError) as error:
-            raise ModelFormatError(f"the bytes do not describe a rigid learner: {error}") from error
-        learner._sigma = sigma
+            learner = cls(chain, tolerances, prior)
+            learner._q, learner._x, learner._sigma = stored_pairs(arrays, learner.joints)
         return learner
 
     def _units(self) -> Pairs:

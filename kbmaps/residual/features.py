@@ -9,9 +9,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kbmaps.arrays import BoolArray, FloatArray, IntArray
+from kbmaps.arrays import BoolArray, FloatArray, IntArray, vector
 from kbmaps.chains.chain import RigidChain
 from kbmaps.chains.parameters import ChainParameters
+from kbmaps.errors import SettingError
 from kbmaps.maps.basis import learning_bases
 from kbmaps.maps.stack import BasisStack
 
@@ -59,6 +60,10 @@ class ResidualScaling:
         centre: of the positions (3,) [m].
         scale: their spread [m].
         load: place of the last load in the frame of the last link (3,) [m]; None: the marker itself.
+
+    Raises:
+        ShapeError, NonFiniteError
+        SettingError: a range or the spread is not positive.
     """
 
     middle: FloatArray
@@ -66,6 +71,15 @@ class ResidualScaling:
     centre: FloatArray
     scale: float
     load: FloatArray | None = None
+
+    def __post_init__(self) -> None:
+        vector("half", self.half, len(self.middle))
+        vector("middle", self.middle, len(self.half))
+        vector("centre", self.centre, 3)
+        if self.load is not None:
+            vector("load", self.load, 3)
+        if not ((self.half > 0.0).all() and 0.0 < self.scale < math.inf):
+            raise SettingError("the ranges and the spread of the positions must be finite and greater than 0")
 
     @classmethod
     def of(cls, q: FloatArray, x: FloatArray) -> ResidualScaling:
@@ -257,7 +271,7 @@ class ResidualFeatures:
     def _offset_functions(self, group: str, p: FloatArray, q: FloatArray) -> FloatArray:
         """ψ (n, m) of a camera or a smooth group."""
         if group in SMOOTH_GROUPS:
-            weights = self._stack.joint_weights(q)[:, :, 1:].reshape(len(q), -1)
+            weights = self._stack.joint_weights(q)[:, :, 1:].reshape(len(q), 2 * self.joints)
             return np.multiply.reduce(weights[:, self._products[group]], axis=2)
         s = (p - self.scaling.centre) / self.scaling.scale
         degree = CAMERA_GROUPS.index(group) + 1

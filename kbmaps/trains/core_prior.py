@@ -9,7 +9,7 @@ import numpy as np
 
 from kbmaps.arrays import FloatArray, frozen
 from kbmaps.chains.chain import RigidChain, cross_matrix
-from kbmaps.errors import SettingError, ShapeError
+from kbmaps.errors import NonFiniteError, SettingError, ShapeError
 from kbmaps.maps.basis import JointBasis
 from kbmaps.trains.train import TensorTrain
 
@@ -36,6 +36,9 @@ class CorePrior:
             raise ShapeError("mean", f"(d, {CORE_NUMBERS})", mean.shape)
         if spread.shape != (len(mean), CORE_NUMBERS, CORE_NUMBERS):
             raise ShapeError("spread", f"({len(mean)}, {CORE_NUMBERS}, {CORE_NUMBERS})", spread.shape)
+        for name, array in (("mean", mean), ("spread", spread)):
+            if not np.isfinite(array).all():
+                raise NonFiniteError(name)
         object.__setattr__(self, "mean", mean)
         object.__setattr__(self, "spread", spread)
 
@@ -117,6 +120,9 @@ class CoreFamily:
             raise ShapeError("mean", f"(d, {CORE_NUMBERS})", mean.shape)
         if motions.ndim != 3 or motions.shape[:2] != mean.shape:
             raise ShapeError("motions", f"({len(mean)}, {CORE_NUMBERS}, m)", motions.shape)
+        for name, array in (("mean", mean), ("motions", motions)):
+            if not np.isfinite(array).all():
+                raise NonFiniteError(name)
         object.__setattr__(self, "mean", mean)
         object.__setattr__(self, "motions", motions)
 

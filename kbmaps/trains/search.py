@@ -226,7 +226,7 @@ def _distances(pairs: Pairs, prior: CorePrior, fit: Fit) -> tuple[FloatArray, bo
     lengths = np.linalg.norm(problem.residuals(fit.z), axis=1) / problem.std
     unit = float(np.median(lengths)) / (_MEDIAN_DISTANCE * math.sqrt(max(freedom, _LEAST_FREEDOM)))
     rounding = fit.noise <= 2.0 * pairs.noise_floor
-    return lengths / max(unit, 1e-300), freedom >= _LEAST_FREEDOM and not rounding
+    return lengths / max(unit, pairs.noise_floor / fit.noise), freedom >= _LEAST_FREEDOM and not rounding
 
 
 def _good(pairs: Pairs, prior: CorePrior, fit: Fit) -> BoolArray:
