@@ -146,10 +146,10 @@ class RecursiveRigidLearner:
             part = slice(begin, begin + self._due - self.kept)
             self._filter.learn(angles[part], positions[part], sigmas[part])
             self._window.add(angles[part], positions[part], sigmas[part])
+            self._pairs += len(angles[part])
             begin = part.stop
             if self.kept == self._due:
                 self._refit()
-        self._pairs += len(angles)
 
     def tool_changed(self, tolerance: float) -> None:
         """Tells that the marker was moved, by `tolerance` (1-sigma of each component [m]); the arm stays known.
