@@ -49,6 +49,7 @@ def reproduce(
 
     from daemon.reproduce import EXPERIMENTS, Run
     from daemon.reproduce.plot import plot
+    from daemon.reproduce.progress import shown_on
     from daemon.reproduce.show import show
     from interfaces.errors import ConfigError
 
@@ -70,7 +71,8 @@ def reproduce(
             continue
         begin = time.perf_counter()
         rng = np.random.default_rng([seed, number])
-        experiment = run(Run(rng, seed, real, lambda said, key=key: progress.print(f"{key}: {said}", highlight=False)))
+        with shown_on(progress, key) as say:
+            experiment = run(Run(rng, seed, real, say))
         file = out / f"{key}.png"
         plot(experiment, file)
         took = time.perf_counter() - begin
@@ -79,5 +81,5 @@ def reproduce(
             console.print(f"took  {took:.0f} s", highlight=False)
         done.append({**msgspec.to_builtins(experiment), "plot": str(file), "took_s": round(took, 1)})
     if as_json:
-        told = {"schema": 2, "version": version("bodyschema"), "seed": seed, "real": real, "experiments": done}
+        told = {"schema": 3, "version": version("bodyschema"), "seed": seed, "real": real, "experiments": done}
         sys.stdout.write(msgspec.json.encode(told).decode() + "\n")
