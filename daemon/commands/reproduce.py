@@ -34,6 +34,9 @@ def reproduce(
     daemon's learner and the other models, on the same pairs. In figures 5 and 7 the marker is also measured: stereo
     images are rendered and tracked, encoders read in ticks.
 
+    Time on two idle cores: fig4 half a minute, fig5 and fig7 about a minute and a half each, fig6 one minute, exactness
+    a few seconds. With --no-real fig5 takes half a minute and fig7 one minute.
+
     Needs: no hardware; pybullet and matplotlib (pip install 'bodyschema[sim]').
 
     Next: docs/reproduced.md tells what the paper leaves open, how it was read here, and what --json prints.

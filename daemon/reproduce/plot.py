@@ -38,12 +38,13 @@ def plot(experiment: Experiment, file: Path) -> None:
     FigureCanvasAgg(figure)
     figure.suptitle(experiment.title, fontsize=11)
     for axes, panel in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels, strict=True):
-        _draw(axes, panel, experiment.floor_m)
+        draw(axes, panel, experiment.floor_m)
         axes.set_xlabel(experiment.counted)
     figure.savefig(file, dpi=100, pil_kwargs={"optimize": True})
 
 
-def _draw(axes: Axes, panel: Panel, floor_m: float) -> None:
+def draw(axes: Axes, panel: Panel, floor_m: float) -> None:
+    """One panel; lengths below the floor [m] are drawn on it."""
     axes.set_yscale("log")
     bands, curves = ([curve for curve in panel.curves if curve.thin is thin] for thin in (True, False))
     for curve in bands:
@@ -105,7 +106,7 @@ def _scales(axes: Axes, *, logarithmic_counts: bool) -> None:
     low, high = axes.get_ylim()
     if low > _PLAIN_MM:
         axes.yaxis.set_major_formatter("{x:,g}")
-    if high < 100.0 * low:
+    if high < 300.0 * low:
         axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=20))
     axes.yaxis.set_minor_formatter(NullFormatter())
 
