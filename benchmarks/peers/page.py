@@ -279,8 +279,10 @@ def _mm(metres: float | None) -> str:
     return f"{value:,.0f}" if value >= 100 else f"{value:.3g}" if value >= 0.001 else f"{value:.0e}"
 
 
-def _short(value: float) -> str:
+def _short(value: float | None) -> str:
     """Two digits, without a power of ten."""
+    if value is None:
+        return ""
     return f"{value:,.0f}" if value >= 100 else f"{value:.2g}"
 
 

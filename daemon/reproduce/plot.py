@@ -133,7 +133,9 @@ def _legend(axes: Axes, panel: Panel) -> None:
     if any(curve.thin for curve in panel.curves):
         once["band: 8 of 10 pairs; its line: the median"] = Patch(facecolor="lightgrey", edgecolor="dimgrey")
     for style, meaning in panel.styles.items():
-        once[meaning] = Line2D([], [], color="dimgrey", linestyle=style, lw=1.5)
+        line = Line2D([], [], color="dimgrey", lw=1.5)
+        line.set(linestyle=style)
+        once[meaning] = line
     if panel.as_paper and any(curve.largest for curve in panel.curves):
         once["dotted: the largest error"] = Line2D([], [], color="dimgrey", linestyle=":", lw=1.0)
     look = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.13), "ncols": 2, "fontsize": 8, "frameon": False}
