@@ -18,8 +18,10 @@ def show(console: Console, experiment: Experiment, plot: Path) -> None:
     """The paper's figures beside ours, other models, what was read into the paper, and where the plot is."""
     console.print()
     console.print(_readings(experiment))
+    console.print()
     if experiment.comparison is not None:
         console.print(_comparison(experiment.comparison))
+        console.print()
     for note in experiment.notes:
         console.print(note, style="dim")
     console.print(f"plot  {plot}", highlight=False, soft_wrap=True)
@@ -54,7 +56,7 @@ def _value(reading: Reading) -> str:
         return "not reached"
     if reading.unit == "m":
         return f"{mm(reading.value)} mm"
-    return f"{reading.value:,.0f}" if reading.unit == "samples" else f"{reading.value:.2f} s"
+    return f"{reading.value:,.0f}" if reading.unit == "samples" else f"{reading.value:.2g} s"
 
 
 def _comparison(comparison: Comparison) -> Table:
