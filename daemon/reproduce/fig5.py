@@ -37,7 +37,7 @@ def fig5(run: Run, *, train: int = 1_000, test: int = 500) -> Experiment:
     counts = list(range(300, train + 1, 50))
     run.say(f"a walk of {train + test:,} pairs through the sampler")
     simulated = {
-        "poses uniform within ±80°": _simulated(run.rng, chain, uniform(run.rng, train + test, 5, HALF_DEG), train),
+        "uniform within ±80°": _simulated(run.rng, chain, uniform(run.rng, train + test, 5, HALF_DEG), train),
         "poses of a random walk": _simulated(run.rng, chain, _shuffled_walk(run, train + test), train),
     }
     measured, noise_m = None, None
