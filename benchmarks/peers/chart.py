@@ -9,6 +9,8 @@ from html import escape
 
 WIDTH, HEIGHT = 520, 320
 _LEFT, _RIGHT, _TOP, _BOTTOM = 54, 14, 12, 40
+# Room for names at the lines' ends, and between two of them.
+_FOR_NAMES, _NAME_HEIGHT = 190, 14
 _MANTISSAS = (1, 2, 5)
 _NARROW_DECADES = 1.6
 
@@ -35,7 +37,7 @@ class Line:
 
 @dataclass(frozen=True)
 class Chart:
-    """Lines, a floor that nothing can be expected below, and goals as points."""
+    """Lines, a floor that nothing can be expected below, goals as points, and whose names are at their lines' ends."""
 
     x_label: str
     y_label: str
@@ -43,6 +45,7 @@ class Chart:
     floor: Sequence[tuple[float, float]] = ()
     goals: Sequence[tuple[float, float]] = ()
     laws: Sequence[Line] = field(default_factory=tuple)
+    named: Sequence[str] = ()
 
     def svg(self) -> str:
         axes = _Axes.around(self)
@@ -50,10 +53,13 @@ class Chart:
         if self.floor:
             parts.append(axes.floor(self.floor))
         parts += [axes.law(law) for law in self.laws]
-        parts += [axes.line(line) for line in self.lines]
+        parts += [axes.line(line) for line in reversed(self.lines)]
         parts += [axes.goal(point) for point in self.goals]
+        if self.named:
+            parts.append(axes.names([line for line in self.lines if line.key in self.named]))
+        width = WIDTH + (_FOR_NAMES if self.named else 0)
         label = escape(f"{self.y_label} against {self.x_label}", quote=True)
-        return f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{label}">{"".join(parts)}</svg>'
+        return f'<svg viewBox="0 0 {width} {HEIGHT}" role="img" aria-label="{label}">{"".join(parts)}</svg>'
 
 
 @dataclass(frozen=True)
@@ -110,6 +116,20 @@ class _Axes:
         title = f"<title>{escape(line.title)}</title>"
         return f'<g data-model="{line.key}">{title}<polyline fill="none" {style}{dashes} points="{path}"/>{marks}</g>'
 
+    def names(self, lines: Sequence[Line]) -> str:
+        """Titles beside the last points, moved apart where they would overlap."""
+        ends = sorted(((self.at(*line.points[-1]), line) for line in lines), key=lambda end: end[0][1])
+        heights = apart([y for (_, y), _ in ends])
+        parts = []
+        for ((x, y), line), height in zip(ends, heights, strict=True):
+            left = WIDTH - _RIGHT + 14
+            path = (
+                f'<path class="leader" stroke="{line.style.colour}" d="M{x + 4:.1f} {y:.1f}L{left - 3} {height:.1f}"/>'
+            )
+            text = f'<text class="end" fill="{line.style.colour}" x="{left}" y="{height + 4:.1f}">{escape(line.title)}'
+            parts.append(f'<g data-model="{line.key}">{path}{text}</text></g>')
+        return "".join(parts)
+
     def law(self, line: Line) -> str:
         path = " ".join(f"{x:.1f},{y:.1f}" for x, y in (self.at(*point) for point in line.points))
         style = f'stroke="{line.style.colour}" stroke-dasharray="2 4" stroke-width="1.5"'
@@ -134,6 +154,18 @@ class _Axes:
             for mantissa in (_MANTISSAS if narrow else (1,))
         ]
         return [tick for tick in ticks if self.y[0] <= math.log10(tick) <= self.y[1]]
+
+
+def apart(heights: Sequence[float]) -> list[float]:
+    """Ascending heights, a name's height apart at least and within the chart."""
+    placed: list[float] = []
+    for height in heights:
+        placed.append(max(height, placed[-1] + _NAME_HEIGHT) if placed else height)
+    lowest = float(HEIGHT - _BOTTOM)
+    for place in reversed(range(len(placed))):
+        placed[place] = min(placed[place], lowest)
+        lowest = placed[place] - _NAME_HEIGHT
+    return placed
 
 
 def _number(value: float) -> str:

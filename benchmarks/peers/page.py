@@ -13,22 +13,33 @@ from benchmarks.peers.results import Cell, Results, cell
 from benchmarks.peers.tasks import Task
 
 _OURS = ("#e4572e", "#f0a202", "#2a9d5c", "#1f8fe0", "#8e5bd6", "#d6409f", "#12a5a5", "#b5651d", "#5a7d00", "#c1121f")
-_PEERS = (
-    "#6b7a8f", "#9a7b4f", "#4f8a8b", "#a06a8c", "#7f8c3a", "#5b6fb0", "#b06a5b", "#4d9078", "#8a6fbf", "#a38b00",
-    "#3f88a5", "#97627a", "#708090", "#6c8f5a",
-)  # fmt: skip
-_DASHES = ("6 3", "2 3", "8 3 2 3")
+# Peers are told apart by what is written on their lines: one grey for other learners, ink for calibration.
+_LEARNT, _CALIBRATED = "#929aa5", "var(--ink)"
+_DASHES = ("6 3", "2 3", "8 3 2 3", "12 3")
+# So many of ours, and of each group of peers, have their names at their lines' ends.
+_NAMED = (("ours", 3), ("calibration", 1), ("learnt", 1))
+_GROUPS = {"ours": "Ours", "calibration": "Calibration", "learnt": "Learners"}
 _STYLE = (Path(__file__).parent / "page.css").read_text()
 _SCRIPT = (Path(__file__).parent / "page.js").read_text()
 _GOAL_FACTOR = 1.15
 
 
 def styles(competitors: Sequence[Competitor]) -> dict[str, Style]:
-    """One look for each competitor: ours solid and heavy, peers dashed and light."""
-    ours = [competitor.key for competitor in competitors if competitor.family == "ours"]
-    peers = [competitor.key for competitor in competitors if competitor.family == "peer"]
+    """One look for each competitor: ours solid, heavy and in a colour of their own, peers dashed and light."""
+    ours, calibrated, learnt = (
+        [competitor.key for competitor in competitors if _group(competitor) == group] for group in _GROUPS
+    )
     looks = {key: Style(_OURS[i % len(_OURS)]) for i, key in enumerate(ours)}
-    return looks | {key: Style(_PEERS[i % len(_PEERS)], _DASHES[i % len(_DASHES)], 1.5) for i, key in enumerate(peers)}
+    for colour, keys in ((_CALIBRATED, calibrated), (_LEARNT, learnt)):
+        looks |= {key: Style(colour, _DASHES[i % len(_DASHES)], 1.5) for i, key in enumerate(keys)}
+    return looks
+
+
+def _group(competitor: Competitor) -> str:
+    """Whose line it is, and of which kind."""
+    if competitor.family == "ours":
+        return "ours"
+    return "calibration" if competitor.calibrates else "learnt"
 
 
 def write_page(path: Path, results: Results, tasks: Sequence[Task], competitors: Sequence[Competitor]) -> None:
@@ -74,26 +85,33 @@ def goal(task: Task, results: Results, pairs: int, test: str) -> float | None:
 
 def _head(results: Results) -> str:
     seeds = len({key[3] for key in results.outcomes})
+    spread = (
+        "One seed only: a single arm for each task, so no figure has a spread."
+        if seeds == 1
+        else f"Means over up to {seeds} seeds, each another arm, with their standard errors."
+    )
     return (
         "<header><h1>Learners of forward kinematics, side by side</h1>"
         "<p>Mean distance to the true position on poses that were not learnt [mm], against the number of pairs n. All "
         "are given the same pairs; who needs poses of its own choosing gets as many readings. "
-        f"Means over up to {seeds} seeds with their standard errors. The grey floor is what the posterior of the right "
-        "model with the right prior leaves: no learner can expect to do better. A diamond is a goal: the figure aimed "
-        "at, or 1.15 times the floor where that is higher.</p></header>"
+        f"{spread} The grey floor is what the posterior of the right model with the right prior leaves, an expectation "
+        "over arms and noise: no learner can do better on average, but on the arms of a few seeds one may. A diamond "
+        "is a goal: the figure aimed at, or 1.15 times the floor where that is higher.</p>"
+        "<p>Point at a name or a line to have it alone, press a name to hide it. The names of the best are at their "
+        "lines' ends.</p></header>"
     )
 
 
 def _legend(competitors: Sequence[Competitor], looks: dict[str, Style]) -> str:
     rows = []
-    for family, name in (("ours", "Ours"), ("peer", "Peers")):
+    for group, name in _GROUPS.items():
         items = "".join(
             f'<button type="button" data-toggle="{c.key}" aria-pressed="true">{_swatch(looks[c.key])}'
             f"{escape(c.title)}</button>"
             for c in competitors
-            if c.family == family
+            if _group(c) == group
         )
-        rows.append(f"<div><b>{name}</b>{items}</div>")
+        rows.append(f"<div><b>{name}</b><span>{items}</span></div>")
     return f'<nav class="legend" aria-label="Models; press to hide">{"".join(rows)}</nav>'
 
 
@@ -150,7 +168,7 @@ def _section(task: Task, results: Results, competitors: Sequence[Competitor], lo
 def _panel(
     task: Task,
     test: str,
-    named: bool,
+    captioned: bool,
     results: Results,
     competitors: Sequence[Competitor],
     looks: dict[str, Style],
@@ -166,16 +184,25 @@ def _panel(
             lines.append(Line(competitor.key, competitor.title, looks[competitor.key], points, bars))
     if not lines:
         return ""
+    named = _best(lines, competitors)
     floor = [(float(n), 1e3 * b) for n in counts if (b := results.bound(task.key, n, test)) is not None]
     goals = [(float(n), 1e3 * g) for n in counts if (g := goal(task, results, n, test)) is not None]
-    caption = f"<figcaption>{escape(test)}</figcaption>" if named else ""
-    return f"<figure>{caption}{Chart('pairs n', 'mean error [mm]', lines, floor, goals).svg()}</figure>"
+    caption = f"<figcaption>{escape(test)}</figcaption>" if captioned else ""
+    return f"<figure>{caption}{Chart('pairs n', 'mean error [mm]', lines, floor, goals, named=named).svg()}</figure>"
+
+
+def _best(lines: Sequence[Line], competitors: Sequence[Competitor]) -> list[str]:
+    """Keys of the best few of each group after the most pairs."""
+    last = max(line.points[-1][0] for line in lines)
+    ended = sorted((line for line in lines if line.points[-1][0] == last), key=lambda line: line.points[-1][1])
+    group = {competitor.key: _group(competitor) for competitor in competitors}
+    return [line.key for of, few in _NAMED for line in [one for one in ended if group[one.key] == of][:few]]
 
 
 def _table(
     task: Task,
     test: str,
-    named: bool,
+    captioned: bool,
     results: Results,
     competitors: Sequence[Competitor],
     looks: dict[str, Style],
@@ -189,7 +216,8 @@ def _table(
     rows = []
     bounds = [results.bound(task.key, n, test) for n in counts]
     if any(bound is not None for bound in bounds):
-        rows.append(f'<tr class="floor-row"><td>Floor (bound){"".join(f"<td>{_mm(b)}" for b in bounds)}<td><td></tr>')
+        floor = "".join(f"<td>{_mm(bound)}" for bound in bounds)
+        rows.append(f'<tr class="floor-row"><td>Floor (expected){floor}<td><td></tr>')
     for competitor in competitors:
         row = cells[competitor.key]
         name = f"<td>{_swatch(looks[competitor.key])}{escape(competitor.title)}"
@@ -198,11 +226,11 @@ def _table(
             rows.append(f'<tr class="out">{name}<td class="why" colspan="{len(counts) + 2}">{escape(reason)}</tr>')
             continue
         last = [entry for entry in row if entry.mean is not None]
-        times = f"<td>{_seconds(last[-1].learn_s)}<td>{last[-1].predict_us:.2g}" if last else "<td><td>"
+        times = f"<td>{_seconds(last[-1].learn_s)}<td>{_short(last[-1].predict_us)}" if last else "<td><td>"
         entries = "".join(_entry(entry, best[i]) for i, entry in enumerate(row))
         rows.append(f'<tr class="{competitor.family}">{name}{entries}{times}</tr>')
     heads = "".join(f"<th>n = {n:,}" for n in counts)
-    caption = f"<caption>{escape(test)}</caption>" if named else ""
+    caption = f"<caption>{escape(test)}</caption>" if captioned else ""
     return (
         f'<div class="scroll"><table>{caption}<thead><tr><th>mm ± standard error{heads}<th>learn<th>µs a row</tr>'
         f"</thead><tbody>{''.join(rows)}</tbody></table></div>"
@@ -249,6 +277,13 @@ def _mm(metres: float | None) -> str:
         return ""
     value = 1e3 * metres
     return f"{value:,.0f}" if value >= 100 else f"{value:.3g}" if value >= 0.001 else f"{value:.0e}"
+
+
+def _short(value: float | None) -> str:
+    """Two digits, without a power of ten."""
+    if value is None:
+        return ""
+    return f"{value:,.0f}" if value >= 100 else f"{value:.2g}"
 
 
 def _seconds(seconds: float | None) -> str:

@@ -77,6 +77,7 @@ class Competitor:
         family: "ours" or "peer".
         learn: fits a problem; the second argument is what it had learnt before the tool was changed.
         refuses: why it cannot run on a problem, or None.
+        calibrates: fits the numbers of the drawing all at once, or takes them as they are.
         about: what was implemented, for the page.
     """
 
@@ -86,6 +87,7 @@ class Competitor:
     learn: Learn
     about: str
     refuses: Refusal = lambda _: None
+    calibrates: bool = False
 
 
 @dataclass(frozen=True)

@@ -34,6 +34,9 @@ def reproduce(
     daemon's learner and the other models, on the same pairs. In figures 5 and 7 the marker is also measured: stereo
     images are rendered and tracked, encoders read in ticks.
 
+    Time on two idle cores: fig4 half a minute, fig5 and fig7 about a minute and a half each, fig6 one minute, exactness
+    a few seconds. With --no-real fig5 takes half a minute and fig7 one minute.
+
     Needs: no hardware; pybullet and matplotlib (pip install 'bodyschema[sim]').
 
     Next: docs/reproduced.md tells what the paper leaves open, how it was read here, and what --json prints.
@@ -49,6 +52,7 @@ def reproduce(
 
     from daemon.reproduce import EXPERIMENTS, Run
     from daemon.reproduce.plot import plot
+    from daemon.reproduce.progress import shown_on
     from daemon.reproduce.show import show
     from interfaces.errors import ConfigError
 
@@ -70,7 +74,8 @@ def reproduce(
             continue
         begin = time.perf_counter()
         rng = np.random.default_rng([seed, number])
-        experiment = run(Run(rng, seed, real, lambda said, key=key: progress.print(f"{key}: {said}", highlight=False)))
+        with shown_on(progress, key) as say:
+            experiment = run(Run(rng, seed, real, say))
         file = out / f"{key}.png"
         plot(experiment, file)
         took = time.perf_counter() - begin
@@ -79,5 +84,5 @@ def reproduce(
             console.print(f"took  {took:.0f} s", highlight=False)
         done.append({**msgspec.to_builtins(experiment), "plot": str(file), "took_s": round(took, 1)})
     if as_json:
-        told = {"schema": 2, "version": version("bodyschema"), "seed": seed, "real": real, "experiments": done}
+        told = {"schema": 3, "version": version("bodyschema"), "seed": seed, "real": real, "experiments": done}
         sys.stdout.write(msgspec.json.encode(told).decode() + "\n")

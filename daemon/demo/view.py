@@ -35,10 +35,12 @@ def shown_on(console: Console) -> Iterator[Callable[[Snapshot], None]]:
 
 
 class _Lines:
+    """Lines of less than 80 characters, a few seconds apart, and none that says what the last one said."""
+
     def __init__(self, console: Console) -> None:
         self._console = console
         self._next = 0.0
-        self._phase = ""
+        self._phase = self._said = ""
 
     def __call__(self, snapshot: Snapshot) -> None:
         if snapshot.phase != self._phase:
@@ -49,14 +51,14 @@ class _Lines:
         self._next = time.monotonic() + PLAIN_EVERY_S
         learner, verdict = snapshot.learner, snapshot.verdict
         truth = mm(verdict.error_m) if verdict else "-"
-        rejected = sum(snapshot.sampler.rejected.values())
-        self._console.print(
-            f"{learner.pairs:5d} of {snapshot.target} pairs, {rejected} frames rejected; "
-            f"error before learning each {mm(learner.prequential_m.get(learner.answering))}, "
-            f"claimed {mm(learner.claimed_error_m)}, truth on held-out poses {truth}; "
-            f"{snapshot.asker.answers} answers",
-            soft_wrap=True,
+        said = (
+            f"{learner.pairs:5d} of {snapshot.target} pairs; "
+            f"error: next pair {mm(learner.prequential_m.get(learner.answering))}, "
+            f"claimed {mm(learner.claimed_error_m)}, held out {truth}"
         )
+        if said != self._said:
+            self._said = said
+            self._console.print(said, soft_wrap=True)
 
 
 def _screen(snapshot: Snapshot) -> RenderableType:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from .experiment import Comparison, Curve, Experiment, Panel, Reading, Run
+from .experiment import Column, Comparison, Curve, Experiment, Panel, Reading, Run
 from .registry import EXPERIMENTS
 
-__all__ = ["EXPERIMENTS", "Comparison", "Curve", "Experiment", "Panel", "Reading", "Run"]
+__all__ = ["EXPERIMENTS", "Column", "Comparison", "Curve", "Experiment", "Panel", "Reading", "Run"]

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
 
 from interfaces.records import FloatArray
+
+from .progress import Say
 
 # The mean length of a noise vector with a unit standard deviation per axis: 2 √(2/π).
 MEAN_NOISE = 2.0 * math.sqrt(2.0 / math.pi)
@@ -34,7 +36,7 @@ class Run:
     rng: np.random.Generator
     seed: int
     real: bool
-    say: Callable[[str], None]
+    say: Say
 
 
 @dataclass
@@ -45,7 +47,8 @@ class Curve:
         name: as the legend says it.
         colour: the paper's, where it has this curve.
         style: of the line, as matplotlib calls it.
-        thin: drawn in the background.
+        width: of the line [points].
+        thin: varies from pair to pair; drawn in the background, as a band.
         count: samples or cycles (n,).
         mean: mean errors [m] (n,).
         largest: largest errors [m] (n,); empty where the figure has none.
@@ -54,6 +57,7 @@ class Curve:
     name: str
     colour: str
     style: str = "-"
+    width: float = 2.0
     thin: bool = False
     count: list[int] = field(default_factory=list)
     mean: list[float] = field(default_factory=list)
@@ -91,11 +95,13 @@ class Panel:
         curves: its lines.
         as_paper: drawn as the paper draws it: counts on a linear axis, and the largest errors too, dotted. Otherwise
             counts are on a logarithmic one, from 1 on.
+        styles: what a line's style means, where it means something.
     """
 
     title: str
     curves: Sequence[Curve]
     as_paper: bool = False
+    styles: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -118,17 +124,25 @@ class Reading:
 
 
 @dataclass(frozen=True)
+class Column:
+    """Where a comparison was tested, and after how many pairs."""
+
+    test: str
+    count: int
+
+
+@dataclass(frozen=True)
 class Comparison:
     """Other models on the same pairs.
 
     Attributes:
         title: what the numbers are.
-        columns: after how many pairs, and where it was tested.
+        columns: where it was tested, and after how many pairs.
         rows: mean errors [m], one a column, by model; None where a model says nothing yet.
     """
 
     title: str
-    columns: Sequence[str]
+    columns: Sequence[Column]
     rows: Mapping[str, Sequence[float | None]]
 
 

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
 from .arm import CRUDE, JOINTS, OTHER_SIX, arm, crude_estimate, uniform
-from .experiment import MEAN_NOISE, Comparison, Curve, Experiment, Pairs, Panel, Reading, Run, Tests
+from .experiment import MEAN_NOISE, Column, Comparison, Curve, Experiment, Pairs, Panel, Reading, Run, Tests
 from .least_squares import REGULARISED, blank_map, plain, regularised
 from .models import FROM_NOTHING, SEARCHED, WITH_DRAWING, Knowledge, learn_all
+from .progress import counted
 
 SIGMA_M = 0.010
 HALF_DEG, FAR_DEG = 80.0, 120.0
@@ -21,11 +22,11 @@ def fig4(run: Run, *, samples: int = 13_000, tests: int = 6_000) -> Experiment:
     """Least squares over growing subsets of noisy pairs, tested without noise within ±80° and ±120°."""
     pairs, held = _drawn(run.rng, JOINTS[6], samples, tests)
     counts = [n for n in (800, *range(1_000, 4_000, 200), *range(4_000, 13_001, 1_000)) if n <= samples]
-    run.say(f"exact learning of {counts[-1]:,} samples, solved {len(counts)} times")
-    training, of_tests = _least_squares(pairs, held, counts)
-    run.say("exact learning with another six joints")
+    what = f"exact learning, solved after up to {counts[-1]:,} samples"
+    training, of_tests = _least_squares(pairs, held, counted(run.say, what, counts))
     few = [n for n in counts if n <= 4_000]
-    other = _least_squares(*_drawn(run.rng, OTHER_SIX, few[-1], tests), few)
+    what = "exact learning with another six joints"
+    other = _least_squares(*_drawn(run.rng, OTHER_SIX, few[-1], tests), counted(run.say, what, few))
     compared = [n for n in (30, 100, 300, 1_000, 2_200, 6_000, 13_000) if n <= samples]
     models = _models(run, pairs, held, compared)
     notes = [
@@ -38,12 +39,12 @@ def fig4(run: Run, *, samples: int = 13_000, tests: int = 6_000) -> Experiment:
     drawn = [curve for of_model in models.values() for curve in of_model.values()]
     panels = [
         Panel("as in the paper", [_noise_level(counts), training, *of_tests.values()], as_paper=True),
-        Panel("other models; solid: ±80°, dashed: ±120°", drawn),
+        Panel("other models", drawn, styles={"-": "within ±80°", "--": "within ±120°"}),
     ]
     columns = [(test, n) for test in held for n in compared if n in (30, 100, 300, 2_200, 13_000)]
     table = Comparison(
         "mean error of other models on the same pairs",
-        [f"{test} at {n:,}" for test, n in columns],
+        [Column(test, n) for test, n in columns],
         {
             "least squares": [of_tests[test].at(n) for test, n in columns],
             **{name: [of_model[test].at(n) for test, n in columns] for name, of_model in models.items()},
@@ -75,7 +76,7 @@ def _drawn(rng: np.random.Generator, joints: Sequence[str], samples: int, tests:
     return (q, x), {"test": (near, chain.positions(near)), "extrapolation": (far, chain.positions(far))}
 
 
-def _least_squares(pairs: Pairs, held: Tests, counts: Sequence[int]) -> tuple[Curve, dict[str, Curve]]:
+def _least_squares(pairs: Pairs, held: Tests, counts: Iterable[int]) -> tuple[Curve, dict[str, Curve]]:
     """Training, and the tests, in the paper's colours."""
     training = Curve("training", "tab:green")
     return training, plain(blank_map(pairs[0].shape[1], HALF_DEG), pairs, counts, held, training=training)
@@ -90,13 +91,13 @@ def _noise_level(counts: Sequence[int]) -> Curve:
 
 def _models(run: Run, pairs: Pairs, held: Tests, counts: Sequence[int]) -> dict[str, dict[str, Curve]]:
     half = np.radians(HALF_DEG)
-    run.say(f"{len(WITH_DRAWING)} models from a crude estimate")
     drawing = Knowledge(crude_estimate(run.rng, arm(6)), CRUDE, half)
-    found = learn_all(WITH_DRAWING, drawing, pairs, counts, held)
-    run.say(f"{len(FROM_NOTHING)} models from nothing")
+    found = learn_all(WITH_DRAWING, drawing, pairs, counts, held, say=run.say)
     enough = [n for n in counts if n >= SEARCHED]
-    found |= learn_all(FROM_NOTHING, Knowledge.searched(run.rng, *pairs, half), pairs, enough, held)
-    return found | {REGULARISED: regularised(pairs, counts, held)}
+    run.say("searching a chain in the first pairs")
+    nothing = Knowledge.searched(run.rng, *pairs, half)
+    found |= learn_all(FROM_NOTHING, nothing, pairs, enough, held, say=run.say)
+    return found | {REGULARISED: regularised(pairs, counted(run.say, f"{REGULARISED}, fits", counts), held)}
 
 
 def _readings(training: Curve, of_tests: dict[str, Curve], other_crossing: int | None) -> list[Reading]:

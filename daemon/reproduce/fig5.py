@@ -11,10 +11,11 @@ from interfaces.records import FloatArray
 from kbmaps import RigidChain
 
 from .arm import CRUDE, JOINTS, arm, crude_estimate, uniform
-from .experiment import MEAN_NOISE, Comparison, Curve, Experiment, Pairs, Panel, Reading, Run, Tests
+from .experiment import MEAN_NOISE, Column, Comparison, Curve, Experiment, Pairs, Panel, Reading, Run, Tests
 from .least_squares import REGULARISED, blank_map, plain, regularised
 from .measured import Measured, postures
 from .models import FROM_NOTHING, SEARCHED, WITH_DRAWING, Knowledge, learn_all
+from .progress import counted
 from .walk import walk
 
 SIGMA_M = 0.020
@@ -34,9 +35,9 @@ def fig5(run: Run, *, train: int = 1_000, test: int = 500) -> Experiment:
     """Least squares from nothing, on tracked positions and on simulated ones with noise in the same poses."""
     chain = arm(5)
     counts = list(range(300, train + 1, 50))
-    run.say("exact learning of simulated pairs")
+    run.say(f"a walk of {train + test:,} pairs through the sampler")
     simulated = {
-        "poses uniform within ±80°": _simulated(run.rng, chain, uniform(run.rng, train + test, 5, HALF_DEG), train),
+        "uniform within ±80°": _simulated(run.rng, chain, uniform(run.rng, train + test, 5, HALF_DEG), train),
         "poses of a random walk": _simulated(run.rng, chain, _shuffled_walk(run, train + test), train),
     }
     measured, noise_m = None, None
@@ -46,6 +47,7 @@ def fig5(run: Run, *, train: int = 1_000, test: int = 500) -> Experiment:
         measured = _as_measured(found, train)
         simulated = {"the postures measured": _simulated(run.rng, chain, found.q, train), **simulated}
         noise_m = found.noise_m
+    run.say("exact learning")
     errors = {name: _least_squares(data, counts) for name, data in simulated.items()}
     paper = [_coloured(next(iter(errors.values()))[AS_MEASURED], "simulated, σ = 20 mm", "tab:red")]
     of_measured = None
@@ -105,7 +107,7 @@ def _as_measured(found: Measured, train: int) -> _Data:
 
 
 def _shuffled_walk(run: Run, count: int) -> FloatArray:
-    q = walk(run.rng, count, JOINTS[5])
+    q = walk(run.rng, count, JOINTS[5], say=run.say)
     return q[run.rng.permutation(count)]
 
 
@@ -120,13 +122,14 @@ def _coloured(curve: Curve, name: str, colour: str) -> Curve:
 def _models(run: Run, data: _Data, counts: list[int]) -> dict[str, dict[str, Curve]]:
     half = np.radians(HALF_DEG)
     early = [n for n in (30, 100, 200, *counts) if n <= counts[-1]]
-    run.say(f"{len(WITH_DRAWING) + len(FROM_NOTHING)} other models")
     drawing = Knowledge(crude_estimate(run.rng, arm(5)), CRUDE, half)
-    found = learn_all(WITH_DRAWING, drawing, data.pairs, early, data.tests, styles=("--", "-"))
+    found = learn_all(WITH_DRAWING, drawing, data.pairs, early, data.tests, styles=("--", "-"), say=run.say)
     enough = [n for n in early if n >= SEARCHED]
+    run.say("searching a chain in the first pairs")
     nothing = Knowledge.searched(run.rng, *data.pairs, half)
-    found |= learn_all(FROM_NOTHING, nothing, data.pairs, enough, data.tests, styles=("--", "-"))
-    return found | {REGULARISED: regularised(data.pairs, enough, data.tests, styles=("--", "-"))}
+    found |= learn_all(FROM_NOTHING, nothing, data.pairs, enough, data.tests, styles=("--", "-"), say=run.say)
+    solved = counted(run.say, f"{REGULARISED}, fits", enough)
+    return found | {REGULARISED: regularised(data.pairs, solved, data.tests, styles=("--", "-"))}
 
 
 def _readings(poses: str, curves: dict[str, Curve]) -> list[Reading]:
@@ -150,7 +153,7 @@ def _comparison(
     columns = [(test, n) for test in (TRUE, AS_MEASURED) for n in (30, 100, 300, train) if test is TRUE or n == train]
     return Comparison(
         f"mean error of other models on the same {'measured' if real else 'simulated'} pairs",
-        [f"{test} at {n:,}" for test, n in columns],
+        [Column(test, n) for test, n in columns],
         {
             "least squares": [plain_errors[test].at(n) for test, n in columns],
             **{name: [of_model[test].at(n) for test, n in columns] for name, of_model in models.items()},

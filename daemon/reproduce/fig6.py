@@ -10,7 +10,7 @@ from interfaces.records import FloatArray
 from kbmaps import ChainTolerances, RigidChain
 
 from .arm import JOINTS, arm, beside, longer_tool
-from .experiment import Comparison, Curve, Experiment, Panel, Reading, Run, Tests
+from .experiment import Column, Comparison, Curve, Experiment, Panel, Reading, Run, Tests
 from .models import Knowledge
 from .stream import EARLY, RULE, Stream, background, bernstein_map, in_stages, learn_stream, papers_rule
 from .walk import WALK_SIGMA, walk
@@ -19,7 +19,7 @@ MOVED_M = 0.250
 TEST_POSES = 1_000
 PAPERS_CYCLES = 1_800
 SIGMAS_M = {"without noise": 0.0, "σ = 20 mm": 0.020}
-COLOURS = {"without noise": ("tab:red", "lightcoral", "--"), "σ = 20 mm": ("tab:orange", "navajowhite", "-")}
+COLOURS = {"without noise": ("tab:red", "lightcoral", "--"), "σ = 20 mm": ("tab:orange", "burlywood", "-")}
 NEAR, ANYWHERE = "near the walk", "anywhere"
 _PAPER = "about 50 mm"
 
@@ -29,7 +29,7 @@ def fig6(run: Run, *, online: int = 1_700, cycles: int = 3_000) -> Experiment:
     nominal = arm(7)
     chain = longer_tool(nominal, MOVED_M)
     run.say(f"a walk of {online:,} pairs through the sampler")
-    q = walk(run.rng, online, JOINTS[7])
+    q = walk(run.rng, online, JOINTS[7], say=run.say)
     order, tests = in_stages(run.rng, online, cycles), _tests(run.rng, q, chain)
     known = Knowledge(nominal, ChainTolerances(tool=MOVED_M / np.sqrt(3.0)), np.pi)
     streams = {
@@ -47,12 +47,16 @@ def fig6(run: Run, *, online: int = 1_700, cycles: int = 3_000) -> Experiment:
         for noise in streams
     ]
     readings += _other_readings(run, nominal, chain, streams, online, cycles)
-    behind = background(bernstein_map(nominal), streams["without noise"])
+    behind = background(bernstein_map(nominal), streams["without noise"], run.say)
     panels = [
         Panel(
             "as in the paper, tested near the walk (pale: anywhere)", [*behind, *_papers_curves(found)], as_paper=True
         ),
-        Panel(f"other models, {NEAR}; solid: σ = 20 mm, dashed: without noise", _models_curves(found)),
+        Panel(
+            f"other models, {NEAR}",
+            _models_curves(found),
+            styles={style: noise for noise, (*_, style) in reversed(COLOURS.items())},
+        ),
     ]
     title = "Figure 6: tool moved by 250 mm, 7 joints, 1,700 online, then permuted"
     return Experiment("fig6", title, "cycles", panels, readings, _comparison(found, online), _NOTES)
@@ -78,11 +82,11 @@ def _other_readings(
     run: Run, nominal: RigidChain, chain: RigidChain, streams: dict[str, Stream], online: int, cycles: int
 ) -> list[Reading]:
     """The paper's rule under other readings of its set-up."""
-    run.say(f"{RULE}, other readings of the set-up")
+    run.say("a walk of larger steps")
     noisy = streams["σ = 20 mm"]
     true = chain.positions(noisy.q)
     per_vector = replace(noisy, x=true + (noisy.x - true) / np.sqrt(3.0))
-    q = walk(run.rng, online, JOINTS[7], each_joint=True)
+    q = walk(run.rng, online, JOINTS[7], each_joint=True, say=run.say)
     tests = _tests(run.rng, q, chain)
     each_joint = Stream("", q, chain.positions(q), 0.0, in_stages(run.rng, online, cycles), tests)
     across = nominal.with_tool(MOVED_M * _across(nominal.fixed[-1][:3, 3]))
@@ -97,8 +101,8 @@ def _other_readings(
     }
     readings: list[Reading] = []
     for name, (prior, stream) in variants.items():
-        short = replace(stream, order=stream.order[:PAPERS_CYCLES])
-        for test, curve in papers_rule(prior, short).items():
+        short = replace(stream, name=name, order=stream.order[:PAPERS_CYCLES])
+        for test, curve in papers_rule(prior, short, run.say).items():
             readings.append(Reading(f"after {PAPERS_CYCLES:,} cycles", f"{name}; {test}", _PAPER, curve.mean[-1]))
     return readings
 
@@ -127,9 +131,9 @@ def _models_curves(found: dict[str, dict[str, dict[str, Curve]]]) -> list[Curve]
 
 
 def _comparison(found: dict[str, dict[str, dict[str, Curve]]], online: int) -> Comparison:
-    columns = [(noise, test, n) for noise in found for n in (EARLY, online) for test in (NEAR, ANYWHERE)]
+    columns = [(noise, test, n) for noise in found for test in (NEAR, ANYWHERE) for n in (EARLY, online)]
     return Comparison(
         "mean error of other models on the same pairs",
-        [f"{noise}, {test}, at {n:,}" for noise, test, n in columns],
+        [Column(f"{noise}, {test}", n) for noise, test, n in columns],
         {name: [found[noise][name][test].at(n) for noise, test, n in columns] for name in next(iter(found.values()))},
     )

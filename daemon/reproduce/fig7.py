@@ -11,7 +11,7 @@ from interfaces.records import FloatArray
 from kbmaps import RigidChain
 
 from .arm import CRUDE, JOINTS, arm, beside, crude_estimate
-from .experiment import Comparison, Curve, Experiment, Panel, Reading, Run, Tests
+from .experiment import Column, Comparison, Curve, Experiment, Panel, Reading, Run, Tests
 from .measured import Measured, guided_walk
 from .models import Knowledge
 from .stream import EARLY, RULE, Stream, background, bernstein_map, in_stages, learn_stream, papers_rule
@@ -23,7 +23,7 @@ HELD_OUT, HELD_OUT_TRUE, ONWARD = "held out, as measured", "held out, true", "wh
 MEASURED, SAME_POSES = "measured", "simulated in the measured poses"
 RANDOM, NOISY, EACH_JOINT = "random walk", "random walk, σ = 20 mm", "random walk, 1° to 3° a joint"
 _SIGMA_M = 0.020
-_PAPER = "not stated; both curves alike"
+_PAPER = "both curves alike"
 
 Found = dict[str, dict[str, dict[str, Curve]]]
 
@@ -53,13 +53,12 @@ def fig7(run: Run, *, online: int = 600, cycles: int = 2_200, held_out: int = 40
     learnt: Found = {}
     for name, stream in streams.items():
         if name in (SAME_POSES, EACH_JOINT):
-            run.say(f"{RULE}, {name}: {cycles:,} cycles")
-            learnt[name] = {RULE: papers_rule(bernstein_map(crude), stream)}
+            learnt[name] = {RULE: papers_rule(bernstein_map(crude), stream, run.say)}
         else:
             learnt[name] = learn_stream(stream, crude, known, run.say, tool_changed=False)
     title = "Figure 7: crude estimate, 6 joints, 600 online, then permuted"
     compared = {name: of_model for name, of_model in learnt.items() if len(of_model) > 1}
-    _, apart = background(bernstein_map(crude), next(iter(streams.values())))
+    _, apart = background(bernstein_map(crude), next(iter(streams.values())), run.say)
     panels = [_papers_panel(learnt, apart), _models_panel(compared)]
     readings = _readings(learnt, streams, size)
     return Experiment("fig7", title, "cycles", panels, readings, _comparison(compared, online), _notes(noise))
@@ -84,7 +83,7 @@ def _notes(noise_m: float | None) -> list[str]:
 def _random_walks(run: Run, chain: RigidChain, size: _Size) -> dict[str, Stream]:
     """The paper's simulation: a walk without noise; with noise; and in steps of 1° to 3° of each joint."""
     run.say(f"walks of {size.online:,} pairs through the sampler")
-    q, q_joint = (walk(run.rng, size.online, JOINTS[6], each_joint=each) for each in (False, True))
+    q, q_joint = (walk(run.rng, size.online, JOINTS[6], each_joint=each, say=run.say) for each in (False, True))
     order = in_stages(run.rng, size.online, size.cycles)
     noise = _SIGMA_M * run.rng.normal(size=(size.online, 3))
     tests, tests_joint = (_tests(run.rng, poses, chain) for poses in (q, q_joint))
@@ -163,7 +162,7 @@ def _comparison(compared: Found, online: int) -> Comparison:
     ]
     return Comparison(
         "mean error of other models on the same pairs",
-        [f"{name}, {test}, at {count:,}" for name, test, count in columns],
+        [Column(f"{name}, {test}", count) for name, test, count in columns],
         {
             model: [compared[name][model][test].at(count) for name, test, count in columns]
             for model in next(iter(compared.values()))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
@@ -23,7 +23,7 @@ def blank_map(joints: int, half_range_deg: float) -> KBMap:
 
 
 def plain(
-    prior: KBMap, pairs: Pairs, counts: Sequence[int], tests: Tests, *, training: Curve | None = None
+    prior: KBMap, pairs: Pairs, counts: Iterable[int], tests: Tests, *, training: Curve | None = None
 ) -> dict[str, Curve]:
     """Least squares over the first pairs, for each of the counts: a curve for each test.
 
@@ -46,7 +46,7 @@ def plain(
 
 
 def regularised(
-    pairs: Pairs, counts: Sequence[int], tests: Tests, *, styles: Sequence[str] = ("-", "--")
+    pairs: Pairs, counts: Iterable[int], tests: Tests, *, styles: Sequence[str] = ("-", "--")
 ) -> dict[str, Curve]:
     """The daemon's exact member: the precision of a prior that knows nothing is chosen by the pairs themselves."""
     q, x = pairs

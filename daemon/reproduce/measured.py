@@ -15,7 +15,8 @@ from kbmaps import RigidChain
 
 from .arm import JOINTS
 from .arm import configuration as configured
-from .sampling import Progress, sampled
+from .progress import Say
+from .sampling import sampled
 
 # The tracker may miss the ball in some of the postures.
 _SPARE = 1.05
@@ -43,7 +44,7 @@ class Measured:
         return float(np.linalg.norm(self.x - self.true.positions(self.q), axis=1).mean())
 
 
-def guided_walk(joints: int, count: int, seed: int, say: Progress) -> Measured:
+def guided_walk(joints: int, count: int, seed: int, say: Say) -> Measured:
     """A walk by the virtual hand, in the sampler's steps of 1° to 3°."""
     with tempfile.TemporaryDirectory(prefix="bodyschema_") as folder:
         config = configured(JOINTS[joints], Path(folder), DaemonConfig(), sim_seed=seed)
@@ -52,7 +53,7 @@ def guided_walk(joints: int, count: int, seed: int, say: Progress) -> Measured:
         return Measured(q, x, simulated_truth(config), config.robot.chain)
 
 
-def postures(joints: int, count: int, seed: int, say: Progress) -> Measured:
+def postures(joints: int, count: int, seed: int, say: Say) -> Measured:
     """Postures drawn independently, without a path between them: the sampler's rule on steps is off."""
     with tempfile.TemporaryDirectory(prefix="bodyschema_") as folder:
         config = configured(JOINTS[joints], Path(folder), DaemonConfig(any_step=True), sim_seed=seed)

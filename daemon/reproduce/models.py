@@ -22,6 +22,7 @@ from kbmaps import (
 from kbmaps.model import Model
 
 from .experiment import Curve, Pairs, Tests, distances
+from .progress import Say, counted, quiet
 
 # Pairs from which a chain is searched where nothing is known of the arm.
 SEARCHED = 100
@@ -62,11 +63,15 @@ class Knowledge:
 
 @dataclass(frozen=True)
 class Contender:
-    """A model under the name and in the colour of its curve."""
+    """A model under the name, in the colour and in the width [points] of its curve.
+
+    Models that are often equally good have widths far apart.
+    """
 
     name: str
     colour: str
     make: Callable[[Knowledge], Model]
+    width: float = 2.0
 
 
 def _tensor_train_around(known: Knowledge) -> Model:
@@ -84,13 +89,18 @@ def _tensor_train_around(known: Knowledge) -> Model:
 
 # With a drawing of the arm.
 WITH_DRAWING = (
-    Contender("rigid chain", "tab:blue", lambda known: RigidLearner(known.chain, known.tolerances)),
-    Contender("rigid chain, recursive", "tab:cyan", lambda known: RecursiveRigidLearner(known.chain, known.tolerances)),
+    Contender("rigid chain", "tab:blue", lambda known: RigidLearner(known.chain, known.tolerances), 5.0),
+    Contender(
+        "rigid chain, recursive",
+        "tab:cyan",
+        lambda known: RecursiveRigidLearner(known.chain, known.tolerances),
+        3.2,
+    ),
     Contender("tensor train", "tab:purple", _tensor_train_around),
 )
 # Without one, from `Knowledge.searched`.
 FROM_NOTHING = (
-    Contender("rigid chain, from nothing", "tab:olive", lambda known: RigidLearner(known.chain, known.tolerances)),
+    Contender("rigid chain, from nothing", "tab:olive", lambda known: RigidLearner(known.chain, known.tolerances), 1.4),
     Contender("tensor train, from nothing", "tab:pink", lambda known: TensorLearner(known.bases)),
 )
 
@@ -104,6 +114,7 @@ def learn_all(
     *,
     styles: Sequence[str] = ("-", "--", ":"),
     suffix: str = "",
+    say: Say = quiet,
 ) -> dict[str, dict[str, Curve]]:
     """Each contender's errors after so many of the pairs q (n, d) [rad] and x (n, 3) [m]: curves by model and test.
 
@@ -111,16 +122,17 @@ def learn_all(
         counts: ascending; 0 is what a model says before the first pair.
         styles: of the tests' lines.
         suffix: what the curves' names end with.
+        say: told which contender learns, and how far it is.
     """
     q, x = pairs
     found: dict[str, dict[str, Curve]] = {}
     for contender in contenders:
         model, done = contender.make(known), 0
         curves = {
-            test: Curve(f"{contender.name}{suffix}", contender.colour, style)
+            test: Curve(f"{contender.name}{suffix}", contender.colour, style, contender.width)
             for test, style in zip(tests, styles, strict=False)
         }
-        for count in counts:
+        for count in counted(say, f"{contender.name}, fits", counts):
             if count > done:
                 model.learn(q[done:count], x[done:count])
                 done = count

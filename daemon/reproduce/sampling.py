@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import time
 from dataclasses import replace
 from types import TracebackType
 from typing import Self
@@ -20,17 +20,15 @@ from interfaces.errors import SourceEnded, SourceError
 from interfaces.protocols import MarkerSource
 from interfaces.records import FloatArray, MarkerFix, MarkerMiss
 
-_TELL_EVERY = 200
-
-Progress = Callable[[str], None]
+from .progress import TELL_EVERY_S, Say
 
 
 class _Enough:
     """A marker source that ends as soon as the store has enough pairs."""
 
-    def __init__(self, marker: MarkerSource, stored: PairReader, count: int, say: Progress) -> None:
+    def __init__(self, marker: MarkerSource, stored: PairReader, count: int, say: Say) -> None:
         self._marker, self._stored, self._count, self._say = marker, stored, count, say
-        self._told = 0
+        self._told = time.monotonic()
 
     def __enter__(self) -> Self:
         self._marker.__enter__()
@@ -45,13 +43,13 @@ class _Enough:
         pairs = self._stored.last_seq()
         if pairs >= self._count:
             raise SourceEnded("there are enough pairs")
-        if pairs >= self._told + _TELL_EVERY:
-            self._told = pairs
+        if time.monotonic() - self._told >= TELL_EVERY_S:
+            self._told = time.monotonic()
             self._say(f"{pairs:,} of {self._count:,} pairs sampled")
         return self._marker.read(timeout_s)
 
 
-def sampled(config: Config, sources: Sources, count: int, say: Progress) -> tuple[FloatArray, FloatArray]:
+def sampled(config: Config, sources: Sources, count: int, say: Say) -> tuple[FloatArray, FloatArray]:
     """The first pairs that the sampler accepts: q (count, d) [rad or m] and x (count, 3) [m].
 
     Raises:

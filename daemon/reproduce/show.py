@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
-from .experiment import Comparison, Experiment, Reading
+from .experiment import Column, Comparison, Experiment, Reading
 
 # Lengths below are rounding errors [m].
 ROUNDING_M = 1e-12
@@ -17,8 +18,10 @@ def show(console: Console, experiment: Experiment, plot: Path) -> None:
     """The paper's figures beside ours, other models, what was read into the paper, and where the plot is."""
     console.print()
     console.print(_readings(experiment))
+    console.print()
     if experiment.comparison is not None:
         console.print(_comparison(experiment.comparison))
+        console.print()
     for note in experiment.notes:
         console.print(note, style="dim")
     console.print(f"plot  {plot}", highlight=False, soft_wrap=True)
@@ -35,16 +38,16 @@ def mm(length_m: float | None) -> str:
 
 
 def _readings(experiment: Experiment) -> Table:
-    table = Table(title=experiment.title, title_justify="left")
+    """What was measured, with the paper's figure beside it, heads the ways to read the paper."""
+    table = Table(title=experiment.title, title_justify="left", box=SIMPLE_HEAD, pad_edge=False, show_edge=False)
     table.add_column("")
-    table.add_column("read as")
-    table.add_column("paper")
     table.add_column("its method, here", justify="right")
     said = ""
     for reading in experiment.readings:
-        same = reading.what == said
-        said = reading.what
-        table.add_row("" if same else said, reading.read_as, "" if same else reading.paper, _value(reading))
+        if reading.what != said:
+            said = reading.what
+            table.add_row(said, f"paper: {reading.paper}", style="bold")
+        table.add_row(f"  {reading.read_as}", _value(reading))
     return table
 
 
@@ -53,15 +56,22 @@ def _value(reading: Reading) -> str:
         return "not reached"
     if reading.unit == "m":
         return f"{mm(reading.value)} mm"
-    return f"{reading.value:,.0f}" if reading.unit == "samples" else f"{reading.value:.2f} s"
+    return f"{reading.value:,.0f}" if reading.unit == "samples" else f"{reading.value:.2g} s"
 
 
 def _comparison(comparison: Comparison) -> Table:
-    """Models are columns: their names are short, and the rows say where they were tested."""
-    table = Table(title=f"{comparison.title} [mm]", title_justify="left")
-    table.add_column("")
-    for name in comparison.rows:
-        table.add_column(name, justify="right")
-    for place, where in enumerate(comparison.columns):
-        table.add_row(where, *(mm(errors[place]) for errors in comparison.rows.values()))
+    """A column for each number of pairs; where it was tested heads the models."""
+    counts = sorted({column.count for column in comparison.columns})
+    table = Table(
+        title=f"{comparison.title} [mm]", title_justify="left", box=SIMPLE_HEAD, pad_edge=False, show_edge=False
+    )
+    table.add_column("after so many pairs")
+    for count in counts:
+        table.add_column(f"{count:,}", justify="right", no_wrap=True)
+    for test in dict.fromkeys(column.test for column in comparison.columns):
+        table.add_row(test, style="bold")
+        for name, errors in comparison.rows.items():
+            told = dict(zip(comparison.columns, errors, strict=True))
+            cells = (mm(told[at]) if (at := Column(test, count)) in told else "" for count in counts)
+            table.add_row(f"  {name}", *cells)
     return table

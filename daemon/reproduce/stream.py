@@ -15,6 +15,7 @@ from kbmaps import NLMS, JointBasis, KBMap, RigidChain
 
 from .experiment import Curve, Tests, distances
 from .models import WITH_DRAWING, Knowledge, learn_all, spread_counts
+from .progress import Say, counted
 
 ALPHA = np.radians(60.0)
 EVERY = 10
@@ -60,11 +61,12 @@ def bernstein_map(chain: RigidChain, alpha: float = ALPHA) -> KBMap:
     return chain.to_kbmap(tuple(JointBasis.bernstein(alpha) for _ in range(chain.joints)))
 
 
-def papers_rule(prior: KBMap, stream: Stream) -> dict[str, Curve]:
+def papers_rule(prior: KBMap, stream: Stream, say: Say) -> dict[str, Curve]:
     """The paper's rule (eq. 20) with μ0 = 1 over all cycles: a curve for each test."""
     learner = NLMS(prior, 1.0)
     curves = {test: Curve(RULE, "tab:red") for test in stream.tests}
-    for cycle in range(0, len(stream.order), EVERY):
+    what = f"{RULE}, {stream.name}: cycles, {EVERY} at a time"
+    for cycle in counted(say, what, range(0, len(stream.order), EVERY)):
         _test(learner.map.predict, stream.tests, curves, cycle)
         chosen = stream.order[cycle : cycle + EVERY]
         learner.replay(stream.q[chosen], stream.x[chosen])
@@ -72,12 +74,13 @@ def papers_rule(prior: KBMap, stream: Stream) -> dict[str, Curve]:
     return curves
 
 
-def background(prior: KBMap, stream: Stream) -> tuple[Curve, Curve]:
+def background(prior: KBMap, stream: Stream, say: Say) -> tuple[Curve, Curve]:
     """The error on each pair before the paper's rule learns it, and how far consecutive markers are apart."""
     learner = NLMS(prior, 1.0)
     errors = Curve("each pair before it is learnt", "tab:green", thin=True)
     steps = Curve("distance of consecutive markers", "lightskyblue", thin=True)
-    for cycle, chosen in enumerate(stream.order):
+    for cycle in counted(say, f"{RULE}, {stream.name}: each pair before it is learnt", range(len(stream.order))):
+        chosen = stream.order[cycle]
         q, x = stream.q[chosen], stream.x[chosen]
         errors.add_one(cycle, float(np.linalg.norm(learner.map.predict(q) - x)))
         if cycle:
@@ -86,7 +89,7 @@ def background(prior: KBMap, stream: Stream) -> tuple[Curve, Curve]:
     return errors, steps
 
 
-def daemons_learner(nominal: RigidChain, stream: Stream, *, tool_changed: bool) -> dict[str, Curve]:
+def daemons_learner(nominal: RigidChain, stream: Stream, say: Say, *, tool_changed: bool) -> dict[str, Curve]:
     """The daemon's learner on the same pairs, each once and in their order; it replays by itself."""
     limit = np.full(nominal.joints, np.pi)
     learning = Learning(NominalModel(nominal, -limit, limit), LearnerConfig(), DirectSolver())
@@ -94,7 +97,7 @@ def daemons_learner(nominal: RigidChain, stream: Stream, *, tool_changed: bool) 
         learning.tool_changed()
     curves = {test: Curve(LEARNER, "tab:green") for test in stream.tests}
     cov = frozen_array(max(stream.sigma, _LEAST_SIGMA_M) ** 2 * np.eye(3))
-    for number in range(stream.online):
+    for number in counted(say, f"{LEARNER}, {stream.name}: pairs", range(stream.online)):
         if number % EVERY == 0:
             _test(lambda q: learning.snapshot.predict(q).x, stream.tests, curves, number)
         q, x = frozen_array(stream.q[number]), frozen_array(stream.x[number])
@@ -106,7 +109,7 @@ def daemons_learner(nominal: RigidChain, stream: Stream, *, tool_changed: bool) 
 
 
 def learn_stream(
-    stream: Stream, nominal: RigidChain, known: Knowledge, say: Callable[[str], None], *, tool_changed: bool
+    stream: Stream, nominal: RigidChain, known: Knowledge, say: Say, *, tool_changed: bool
 ) -> dict[str, dict[str, Curve]]:
     """Everybody on one stream: curves by model and test.
 
@@ -115,12 +118,19 @@ def learn_stream(
         known: what the other models begin with.
         tool_changed: whether the daemon's learner is told that the marker was moved.
     """
-    say(f"{RULE}, {stream.name}: {len(stream.order):,} cycles")
-    found = {RULE: papers_rule(bernstein_map(nominal), stream)}
-    say(f"{LEARNER} and {len(WITH_DRAWING)} other models, {stream.name}: {stream.online:,} pairs")
-    found[LEARNER] = daemons_learner(nominal, stream, tool_changed=tool_changed)
+    found = {
+        RULE: papers_rule(bernstein_map(nominal), stream, say),
+        LEARNER: daemons_learner(nominal, stream, say, tool_changed=tool_changed),
+    }
     counts = sorted({0, EARLY, *spread_counts(1, stream.online)})
-    return found | learn_all(WITH_DRAWING, known, (stream.q, stream.x), counts, stream.tests)
+    return found | learn_all(
+        WITH_DRAWING,
+        known,
+        (stream.q, stream.x),
+        counts,
+        stream.tests,
+        say=lambda said: say(f"{stream.name}, {said}"),
+    )
 
 
 def _test(predict: Callable[[FloatArray], FloatArray], tests: Tests, curves: dict[str, Curve], count: int) -> None:

@@ -18,6 +18,7 @@ from interfaces.records import FloatArray, JointReading, MarkerFix, frozen_array
 from kbmaps import RigidChain
 
 from .arm import configuration
+from .progress import Say, quiet
 from .sampling import sampled
 
 # Normally distributed about zero with this standard deviation [rad].
@@ -88,7 +89,9 @@ class _Marker(_Source):
         return MarkerFix(t, frozen_array(self._chain.positions(q)), _COV)
 
 
-def walk(rng: np.random.Generator, count: int, joints: Sequence[str], *, each_joint: bool = False) -> FloatArray:
+def walk(
+    rng: np.random.Generator, count: int, joints: Sequence[str], *, each_joint: bool = False, say: Say = quiet
+) -> FloatArray:
     """A random walk (count, d) [rad] whose poses are normally distributed, in steps of 1° to 3°.
 
     The daemon's sampler decides which of its frames become pairs.
@@ -96,6 +99,7 @@ def walk(rng: np.random.Generator, count: int, joints: Sequence[str], *, each_jo
     Args:
         each_joint: 1° to 3° is what a joint moves on average (the root mean square), not the Euclidean norm over all
             joints.
+        say: told how many pairs there are.
     """
     stretch = float(np.sqrt(len(joints))) if each_joint else 1.0
     rules = DaemonConfig(min_step_deg=stretch * STEP_DEG[0], max_step_deg=stretch * STEP_DEG[1])
@@ -103,4 +107,4 @@ def walk(rng: np.random.Generator, count: int, joints: Sequence[str], *, each_jo
         config = configuration(joints, Path(folder), rules)
         steps = _Walk(rng.spawn(1)[0], len(joints), stretch)
         sources = Sources(_Encoders(steps, joints), _Marker(steps, config.robot.chain), SystemClock())
-        return sampled(config, sources, count, lambda _said: None)[0]
+        return sampled(config, sources, count, say)[0]

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from benchmarks.peers.bound import bounds
+from benchmarks.peers.chart import apart
 from benchmarks.peers.page import write_page
 from benchmarks.peers.problem import Competitor, Fitted, Problem, drawn
 from benchmarks.peers.registry import BY_KEY, COMPETITORS
@@ -136,3 +137,19 @@ def test_a_competitor_has_one_colour_in_all_charts(page):
     colours = re.findall(r'<g data-model="rigid"><title>[^<]*</title><polyline fill="none" stroke="(#\w+)"', page)
     assert len(colours) >= len(simulated_tasks())
     assert len(set(colours)) == 1
+
+
+def test_the_names_of_the_best_stand_at_their_lines_ends(page):
+    section = page.split('<section id="rough6">')[1].split("</section>")[0]
+    assert len(re.findall(r'<text class="end"', section)) == 5
+
+
+def test_a_single_seed_is_not_called_a_mean(page):
+    assert "One seed only" in page
+    assert "Means over" not in page
+
+
+def test_names_at_lines_ends_are_kept_apart_within_the_chart():
+    placed = apart([10.0, 11.0, 279.0, 280.0, 280.0])
+    assert min(np.diff(placed)) >= 14.0
+    assert max(placed) <= 280.0

@@ -15,7 +15,7 @@ from rich.console import Console
 pytest.importorskip("matplotlib")
 
 from daemon.cli import app
-from daemon.reproduce import EXPERIMENTS, Comparison, Curve, Experiment, Panel, Reading, Run
+from daemon.reproduce import EXPERIMENTS, Column, Comparison, Curve, Experiment, Panel, Reading, Run
 from daemon.reproduce.arm import JOINTS, OTHER_SIX, arm, longer_tool
 from daemon.reproduce.exactness import exactness
 from daemon.reproduce.experiment import MEAN_NOISE
@@ -57,7 +57,7 @@ def error(experiment: Experiment, model: str, *words: str) -> float:
     """Of one model, where one column says all of this."""
     table = experiment.comparison
     assert table is not None
-    (place,) = [k for k, column in enumerate(table.columns) if all(word in column for word in words)]
+    (place,) = [k for k, c in enumerate(table.columns) if all(word in f"{c.test} at {c.count}" for word in words)]
     found = table.rows[model][place]
     assert found is not None
     return found
@@ -170,7 +170,7 @@ def test_as_many_noise_free_samples_as_control_points_give_the_arm_back() -> Non
 
 def test_the_terminal_tells_a_quantity_once_and_each_way_to_read_it() -> None:
     readings = [Reading("error", read_as, "50 mm", given) for read_as, given in (("near", 0.0235), ("far", None))]
-    table = Comparison("others", ["at 30"], {"rigid chain": [1e-15], "tensor train": [0.118]})
+    table = Comparison("others", [Column("near", 30)], {"rigid chain": [1e-15], "tensor train": [0.118]})
     console = Console(width=120, record=True, file=io.StringIO())
     show(console, Experiment("x", "X", "cycles", [], readings, table, []), Path("x.png"))
     text = console.export_text()
@@ -198,14 +198,14 @@ def test_the_command_gives_everything_as_json(tmp_path, capsys, monkeypatch) -> 
     (found,) = told["experiments"]
     parsed = msgspec.convert({name: found[name] for name in Experiment.__dataclass_fields__}, Experiment)
     assert parsed.readings
-    assert (told["schema"], told["seed"], told["real"], found["plot"]) == (2, 0, False, str(tmp_path / "fig7.png"))
+    assert (told["schema"], told["seed"], told["real"], found["plot"]) == (3, 0, False, str(tmp_path / "fig7.png"))
 
 
 def test_the_page_documents_every_field_of_the_json(tmp_path, capsys, monkeypatch) -> None:
     monkeypatch.setitem(EXPERIMENTS, "exactness", lambda _run: small("exactness"))
     app(["reproduce", "exactness", "--json", "--out", str(tmp_path)], result_action="return_value")
     told = json.loads(capsys.readouterr().out)
-    kinds = (Experiment, Panel, Curve, Reading, Comparison)
+    kinds = (Experiment, Panel, Curve, Reading, Comparison, Column)
     known = {*told, *told["experiments"][0], *(name for kind in kinds for name in kind.__dataclass_fields__)}
     documented = set(re.findall(r"`(\w+)`", PAGE.read_text(encoding="utf-8").partition("## What --json prints")[2]))
     assert known <= documented

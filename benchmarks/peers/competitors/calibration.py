@@ -128,8 +128,15 @@ COMPETITORS = (
         "scipy.optimize.least_squares (Levenberg-Marquardt) on the identifiable placement errors of all joint frames, "
         "no prior, as FIGAROH does; after a tool change the tool's three numbers only.",
         lambda problem: needs_drawing(problem) or _all_turn(problem),
+        calibrates=True,
     ),
     Competitor(
-        "drawing", "Drawing as it is", "peer", _learn_nothing, "Learns nothing: the nominal chain.", needs_drawing
+        "drawing",
+        "Drawing as it is",
+        "peer",
+        _learn_nothing,
+        "Learns nothing: the nominal chain.",
+        needs_drawing,
+        calibrates=True,
     ),
 )
