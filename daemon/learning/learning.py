@@ -89,6 +89,18 @@ class Learning:
         return self._members is None
 
     @property
+    def at_rest(self) -> bool:
+        """Whether no work is left with the pairs that came: nothing to fit, to solve or to replay.
+
+        For the thread that calls `work`.
+        """
+        with self._lock:
+            count = self._memory.count
+            if self._fitting.due(count):
+                return False
+            return self._members is None or (self._replays_due < 1.0 and self._solving.has_solved(self._task, count))
+
+    @property
     def counters(self) -> Counters:
         """A copy of all that is counted."""
         with self._lock:

@@ -26,8 +26,6 @@ from .report import Figures, ReplayReport
 from .steps import Steps
 
 GLANCE_S = 0.25
-# The learner has settled when nothing of it has changed for so long: it begins idle work after half a second.
-SETTLED_S = 2.0
 STALL_LIMIT_S = 120.0
 BATCH = 2000
 # Live pairs come at the rate of the frames at most, and over some time: background learning is made for that.
@@ -162,7 +160,7 @@ class _Live:
                     file=self._recording.file or "recording",
                     remedy="--any-step relaxes its step and speed rules",
                 )
-            if through and learner.pairs + learner.refused >= sampler.pairs and now - changed > SETTLED_S:
+            if through and learner.pairs + learner.refused >= sampler.pairs and learner.at_rest:
                 return Learnt(sampler, learner, changed - begin)
             if now - changed > self._stall_limit_s:
                 raise BusError(f"no progress for {self._stall_limit_s:.0f} s; --keep DIR keeps the logs that say why")
