@@ -126,6 +126,5 @@ def figures(robot: RobotDescription, known: Known) -> tuple[ChainFigures, tuple[
     belief = no_surer_than_possible(known.belief, prior, robot)
     beliefs = [belief.tightened(wide, replace(wide, axes=axes, points=points)) for axes, points in made]
     kept, shares = probable(np.array([evidence for _, evidence in beliefs]))
-    return ChainFigures(robot, tuple(beliefs[k][0] for k in kept), shares, prior), made[kept[0]] if is_told(
-        [made[k] for k in kept]
-    ) else None
+    told = is_told([made[k] for k in kept])
+    return ChainFigures(robot, tuple(beliefs[k][0] for k in kept), shares, prior), made[kept[0]] if told else None

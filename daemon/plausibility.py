@@ -28,6 +28,8 @@ BEYOND_LIMITS_RAD = 2.0 * math.pi
 MANY = 0.1
 # What a rigid chain leaves of the arm's reach, of a recording of another arm or of columns mixed up.
 FAR_OFF = 0.02
+# ... and what the drawn chain leaves in its best place.
+FAR_OFF_AS_DRAWN = 0.2
 # ... and how many times the noise that was told.
 FAR_OFF_SIGMAS = 5.0
 # Rows that other readings of the columns are judged by, how many readings are fitted, and how much better the named
@@ -96,14 +98,15 @@ def require_units(robot: RobotDescription, recording: Recording) -> None:
         )
 
 
-def is_far_off(robot: RobotDescription, left_m: FloatArray, sigma_m: float | None) -> bool:
+def is_far_off(robot: RobotDescription, left_m: FloatArray, sigma_m: float | None, share: float = FAR_OFF) -> bool:
     """Whether a chain that leaves these distances (n,) [m] to the pairs is not this arm's.
 
     Args:
         sigma_m: 1-sigma of a coordinate that was told [m].
+        share: of the arm's reach that may be left.
     """
     noise = 0.0 if sigma_m is None else FAR_OFF_SIGMAS * sigma_m
-    return float(np.median(left_m)) > max(FAR_OFF * reach_m(robot), noise)
+    return float(np.median(left_m)) > max(share * reach_m(robot), noise)
 
 
 def mixed_up(robot: RobotDescription, recording: Recording) -> str | None:

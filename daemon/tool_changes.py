@@ -11,7 +11,7 @@ log = logging.getLogger(__name__)
 
 
 class ToolChanges:
-    """Notices by the learner's counters that the tool was changed. Whoever calls it sees to it that one does at a time."""
+    """Notices by the learner's counters that the tool was changed. Not to be used by two threads at once."""
 
     def __init__(self, counters: Counters) -> None:
         """From these counters on; what they have counted already is not told."""

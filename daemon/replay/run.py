@@ -15,6 +15,7 @@ from daemon.bus import Bus, client
 from daemon.config import Config
 from daemon.evaluate import ErrorFigures, Split, aligned_chain, coverage
 from daemon.keys import Keys
+from daemon.plausibility import FAR_OFF_AS_DRAWN, OTHER_CAUSES, is_far_off, mixed_up
 from daemon.status import LearnerStatus, SamplerStatus
 from daemon.wire import JointsRequest, PredictReply, decode, encode
 from interfaces.errors import BusError, RecordingError
@@ -129,8 +130,18 @@ def _report(job: Job, before: FloatArray, learnt: Learnt, prediction: PredictRep
         doubted=learner.doubted,
         replayed=learner.replayed,
         outlook=learner.outlook,
+        doubt=_doubt(job, before),
         learning_s=learnt.seconds,
     )
+
+
+def _doubt(job: Job, before: FloatArray) -> str | None:
+    """Why the rows are not this arm's, as its drawing in the best place has them; None where they may be."""
+    robot, held_out = job.config.robot, job.held_out_rows
+    left_m = np.linalg.norm(before - held_out.x, axis=1)
+    if not is_far_off(robot, left_m, job.sigma_m, share=FAR_OFF_AS_DRAWN):
+        return None
+    return f"So far apart is no arm from its drawing. {mixed_up(robot, job.learnt_rows) or OTHER_CAUSES}."
 
 
 class _Live:

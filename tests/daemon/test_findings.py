@@ -10,6 +10,7 @@ from guided_arm import Scene, make_pair, near, new_learning, teach
 from test_calibration import DESK_ARM, figures_of
 
 import daemon.findings
+from daemon.chain_figures import is_told
 from daemon.config import LearnerConfig
 from daemon.findings import EVERY_S, Findings, figures
 from daemon.learning import DirectSolver, Learning, NominalModel
@@ -291,9 +292,9 @@ def test_they_are_at_rest_when_they_are_of_the_present_chain() -> None:
     assert [*rested, findings.at_rest] == [False, True, False]
 
 
-def test_few_pairs_do_not_tell_how_well_the_arm_is_made() -> None:
-    arm = Planted.of(2, 5)
-    assert figures(arm.robot, arm.known())[1] is None
+def test_an_arm_that_may_be_ten_times_better_made_than_seems_is_not_said_to_be_made_so() -> None:
+    assert is_told([(0.003, 0.001), (0.001, 0.0005)])
+    assert not is_told([(0.003, 0.001), (0.0003, 0.0001)])
 
 
 def test_a_failure_to_find_them_does_not_stop_the_learner(monkeypatch, caplog) -> None:
