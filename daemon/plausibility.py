@@ -6,6 +6,7 @@ import itertools
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,13 +69,15 @@ def limits_text(robot: RobotDescription, joint: int) -> str:
     return f"{lower:.4g} to {upper:.4g} rad ({math.degrees(lower):.4g}° to {math.degrees(upper):.4g}°)"
 
 
-def require_units(robot: RobotDescription, recording: Recording) -> None:
+def require_units(robot: RobotDescription, recording: Recording, file: Path) -> None:
     """Refuse angles and positions that no arm has in radians and metres.
+
+    Args:
+        file: what the recording is of.
 
     Raises:
         RecordingError: angles far beyond the limits, or positions farther apart than the arm reaches.
     """
-    file = recording.file or "recording"
     beyond = beyond_limits(robot, recording.q, BEYOND_LIMITS_RAD).mean(axis=0)
     beyond[robot.chain.prismatic] = 0.0
     if beyond.max() > MANY:

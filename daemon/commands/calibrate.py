@@ -85,7 +85,7 @@ def calibrate(
     first = first or 1
     recording = recordings.between(recording, first, last, source)
     sigma_m = None if sigma_mm is None else 1e-3 * sigma_mm
-    require_units(description, recording)
+    require_units(description, recording, source)
     found = Calibration.of(description, recording, sigma_m=sigma_m, zeros_rad=math.radians(zeros_deg))
     report = CalibrationReport.of(found, source.name, first)
     written = None

@@ -68,7 +68,7 @@ def replay(
 
     config = Config.load(robot_file(robot, recording))
     rows = Recording.read(recording, config.robot.joints)
-    require_units(config.robot, rows)
+    require_units(config.robot, rows, recording)
     split = split_blocks(len(rows), held_out)
     any_step |= config.tables.daemon.any_step
     if not any_step:
