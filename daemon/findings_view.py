@@ -73,7 +73,7 @@ def calibration_table(calibration: ChainCalibration, slides: Collection[str] = (
 
 def _workmanship(calibration: ChainCalibration) -> str:
     if calibration.axes_rad is None or calibration.points_m is None:
-        return "these pairs do not tell"
+        return "not told by these pairs"
     return f"about {_DEG * calibration.axes_rad:.2g}° and {1e3 * calibration.points_m:.2g} mm"
 
 
