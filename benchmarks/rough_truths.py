@@ -24,7 +24,6 @@ Truths, all made by what happens to the arm and not by what a learner supposes:
 from __future__ import annotations
 
 import argparse
-import math
 import os
 import time
 from collections.abc import Callable
@@ -36,8 +35,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from benchmarks.humanoid_arm import NECK_JOINTS
+from benchmarks.recording import RECORDED, Recording
 from benchmarks.rough_arm import RoughArm, rough_arm
-from interfaces.robot import RobotDescription
 from kbmaps import (
     ChainTolerances,
     Ladder,
@@ -222,34 +221,21 @@ def run(truth: str, model: str, pairs: int, seed: int, told: bool) -> list[float
     return [*figures, taken]
 
 
-RECORDED = ChainTolerances(
-    axes=np.radians(1.0),
-    points=0.005,
-    zeros=np.radians(1.0),
-    tool=math.inf,
-    base_rotation=math.inf,
-    base_translation=math.inf,
-)
-
-
-def recording_split(folder: Path, pairs: int, seed: int) -> tuple[float, float]:
+def recording_split(known: Recording, pairs: int, seed: int) -> tuple[float, float]:
     """Mean errors [mm] of the rows that were not learnt, of the rigid chain and with residual, for a random split."""
-    robot = RobotDescription.load(folder / "robot.toml")
-    table = np.genfromtxt(folder / "measured.csv", delimiter=",", skip_header=1)
-    q, x = table[:, : robot.chain.joints], table[:, -3:]
-    order = np.random.default_rng(seed).permutation(len(q))
-    learnt, rest = order[:pairs], order[pairs:]
-    learner = ResidualLearner(robot.chain, RECORDED)
-    learner.learn(q[learnt], x[learnt])
+    learnt, rest = known.split(pairs, seed)
+    learner = ResidualLearner(known.chain, RECORDED)
+    learner.learn(known.q[learnt], known.x[learnt])
     alone, whole = (
-        1e3 * float(np.linalg.norm(model.predict(q[rest]) - x[rest], axis=1).mean())
+        1e3 * float(np.linalg.norm(model.predict(known.q[rest]) - known.x[rest], axis=1).mean())
         for model in (learner.rigid, learner)
     )
     return alone, whole
 
 
 def recording(folder: Path, pairs: int, seeds: range) -> None:
-    alone, whole = np.mean([recording_split(folder, pairs, seed) for seed in seeds], axis=0)
+    known = Recording.load(folder)
+    alone, whole = np.mean([recording_split(known, pairs, seed) for seed in seeds], axis=0)
     print(f"{folder.name}: {pairs:5d} pairs  rigid {alone:.4f}  residual {whole:.4f} mm", flush=True)
 
 

@@ -20,6 +20,8 @@ SHORTEST, SHARE, LONGEST = 100, 0.5, 1000
 CLEARLY = 2.0
 # A squared error counts up to so many times the median of the better model: an outlier tells of neither.
 _CAP = 9.0
+# No median is taken for smaller [m²]: where a model is exact, another one that errs still loses.
+_LEAST = 1e-30
 
 
 class Contest:
@@ -106,7 +108,7 @@ def _clearly_worse(errors: FloatArray, others: FloatArray) -> bool:
     errors, others, count = errors[both], others[both], int(both.sum())
     if count < FEWEST:
         return False
-    cap = _CAP * min(float(np.median(errors)), float(np.median(others)))
+    cap = _CAP * max(min(float(np.median(errors)), float(np.median(others))), _LEAST)
     losses = np.minimum(errors, cap) - np.minimum(others, cap)
     mean = float(losses.mean())
     # A few losses are alike by chance: their spread is taken for no smaller than so few can tell.

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import base64
-import binascii
 import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Self, cast
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -25,12 +24,13 @@ from kbmaps.kernel.kernel_learner import KernelLearner
 from kbmaps.kernel.structured_learner import StructuredLearner
 from kbmaps.maps.basis import learning_bases
 from kbmaps.model import Estimate, Model
-from kbmaps.packed import pack, unpack
-from kbmaps.pairs import checked_pairs
+from kbmaps.packed import complete, count, flag, named, number, pack, restoring, unpack
+from kbmaps.pairs import checked_pairs, stored_pairs
 from kbmaps.residual.learner import ResidualLearner
 from kbmaps.trains.learner import TensorLearner
 
-_KIND = "ladder, 1"
+_KIND = "ladder, 2"
+_RUNG = ("name", "class", "growth", "extrapolates", "asked", "failure", "model")
 _STORED: tuple[type[Model], ...] = (
     KernelLearner,
     RecursiveRigidLearner,
@@ -40,8 +40,9 @@ _STORED: tuple[type[Model], ...] = (
     TensorLearner,
     ToolLayer,
 )
-# What a model may raise on pairs that it cannot digest. It is out then, and the others go on.
-_FAILURES = (KBMapsError, ArithmeticError, ValueError, np.linalg.LinAlgError)
+# What a model may raise on pairs that it cannot digest. It is out then, and the others go on. (numpy's LinAlgError is a
+# ValueError; others of these are mistakes in a model's code, which have to be seen.)
+_FAILURES = (KBMapsError, ArithmeticError, np.linalg.LinAlgError)
 
 
 @dataclass(frozen=True)
@@ -71,14 +72,17 @@ class Ladder:
 
     Each pair is predicted by every model before it is learnt. The most trusted model answers that is not clearly
     worse than another on the last pairs (`Contest`). Where it has no data and may not extrapolate, the best of those
-    answers that may. A model that fails, or predicts what is not finite, is left out: it spoils nothing.
+    answers that may. A model that fails, has too few pairs yet, or predicts what is not finite, is left out: it spoils
+    nothing. It learns on when it is due, and is back when its predictions are finite; what it had predicted before does
+    not count then.
 
     When `learn` got many pairs at once, the model that answers has learnt all of them when it returns; with pairs one
     by one, models learn when it is their time.
 
     Args:
-        rungs: the models by name, the most trusted first: what has fewer free numbers says more about places
-            without data.
+        rungs: the models by name, the most trusted first. What errs least where it is not the best one belongs there,
+            for a clear difference takes many pairs to show: a model that falls back by itself, or one that has fewer
+            free numbers.
 
     Raises:
         SettingError: no rung, none that extrapolates, models of different numbers of joints, or one that has learnt.
@@ -98,24 +102,24 @@ class Ladder:
     """
 
     def __init__(self, rungs: Mapping[str, Rung]) -> None:
-        joints = {rung.model.joints for rung in rungs.values()}
-        if len(joints) != 1:
-            raise SettingError(f"a ladder needs models of one number of joints, got {sorted(joints) or 'none'}")
-        if not any(rung.extrapolates for rung in rungs.values()):
-            raise SettingError("a ladder needs a model that may extrapolate")
+        self._rungs = dict(rungs)
+        self._joints = self._checked_joints()
         if any(rung.model.pairs for rung in rungs.values()):
             raise SettingError("the models of a ladder must not have learnt before it")
-        self._rungs = dict(rungs)
-        self._joints = joints.pop()
         self._q, self._x, self._sigma = np.empty((0, self._joints)), np.empty((0, 3)), np.empty(0)
-        self._learnt = dict.fromkeys(self._rungs, 0)
+        self._asked = dict.fromkeys(self._rungs, 0)
         self._failures: dict[str, str] = {}
         self._contest = Contest()
+        for name in self._rungs:
+            self._hear(name, self._q)
         self._answering = self._answers_first()
 
     @classmethod
     def around(cls, nominal: RigidChain, tolerances: ChainTolerances, lower: ArrayLike, upper: ArrayLike) -> Ladder:
         """The usual ladder for a drawn arm: rigid chain with residual, rigid chain, tensor train.
+
+        The residual comes first, for pairs that are spread: where the arm is rigid it errs next to as the chain does,
+        where it is not the chain is far off. On guided paths the chain first serves better away from them.
 
         Args:
             nominal: the chain as drawn.
@@ -133,10 +137,11 @@ class Ladder:
             shift_std=_proper(tolerances.points, 0.015),
             marker_std=_proper(tolerances.tool, 0.03),
         )
+        residual = ResidualLearner(nominal, tolerances)
         return cls(
             {
-                "residual": Rung(ResidualLearner(nominal, tolerances)),
-                "rigid": Rung(RigidLearner(nominal, tolerances)),
+                "residual": Rung(residual),
+                "rigid": Rung(residual.rigid.twin()),
                 "train": Rung(train, extrapolates=False),
             }
         )
@@ -163,7 +168,7 @@ class Ladder:
 
     @property
     def failures(self) -> Mapping[str, str]:
-        """Why models are out, by name."""
+        """Why models have no say at present, by name."""
         return dict(self._failures)
 
     def errors(self) -> dict[str, float]:
@@ -191,7 +196,7 @@ class Ladder:
         while begin < end:
             until = min(end, max(begin + 1, self._next_due()))
             self._judge(slice(begin, until))
-            for name in self._working():
+            for name in self._rungs:
                 if until >= self._due(name):
                     self._teach(name, until)
             begin = until
@@ -204,6 +209,7 @@ class Ladder:
 
         Raises:
             ShapeError, NonFiniteError
+            DegenerateDataError: no model that may extrapolate has pairs enough yet.
         """
         angles = rows_or_vector("q", q, self._joints)
         if self._rungs[self._answering].extrapolates:
@@ -216,6 +222,7 @@ class Ladder:
 
         Raises:
             ShapeError, NonFiniteError
+            DegenerateDataError: no model that may extrapolate has pairs enough yet.
         """
         angles = rows("q", q, self._joints)
         rung = self._rungs[self._answering]
@@ -237,20 +244,16 @@ class Ladder:
                 "class": type(rung.model).__name__,
                 "growth": rung.growth,
                 "extrapolates": rung.extrapolates,
-                "learnt": self._learnt[name],
+                "asked": self._asked[name],
                 "failure": self._failures.get(name),
                 "model": base64.b64encode(rung.model.to_bytes()).decode(),
             }
             for name, rung in self._rungs.items()
         ]
-        fields = {"rungs": entries, "answering": self._answering, "judged": self._contest.pairs}
-        arrays = {
-            "q": self._q,
-            "x": self._x,
-            "sigma": self._sigma,
-        }
-        arrays |= {f"errors of {name}": squares for name, squares in self._contest.errors.items()}
-        return pack(_KIND, fields, arrays)
+        errors = self._contest.errors
+        fields = {"rungs": entries, "answering": self._answering, "judged": self._contest.pairs, "judges": list(errors)}
+        stacked = np.array(list(errors.values())) if errors else np.empty((0, 0))
+        return pack(_KIND, fields, {"q": self._q, "x": self._x, "sigma": self._sigma, "errors": stacked})
 
     @classmethod
     def from_bytes(cls, data: bytes, kinds: Sequence[type[Model]] = ()) -> Self:
@@ -264,36 +267,45 @@ class Ladder:
         """
         fields, arrays = unpack(data, _KIND)
         classes = {kind.__name__: kind for kind in (*_STORED, *kinds)}
-        try:
-            entries = cast(list[dict[str, Any]], fields["rungs"])
-            models = {entry["name"]: _restored(entry, classes) for entry in entries}
+        with restoring("a ladder"):
+            named(fields, "the fields", ("rungs", "answering", "judged", "judges"))
+            complete(arrays, ("q", "x", "sigma", "errors"))
+            entries = [named(entry, "a rung", _RUNG) for entry in fields["rungs"]]
             ladder = cls.__new__(cls)
-            ladder._restore(fields, entries, models, arrays)
-        except (KeyError, TypeError, ValueError, binascii.Error, KBMapsError) as error:
-            raise ModelFormatError(f"the bytes do not describe a ladder: {error}") from error
+            ladder._rungs = {entry["name"]: _restored(entry, classes) for entry in entries}
+            ladder._restore(fields, entries, arrays)
         return ladder
 
     def _restore(
-        self,
-        fields: Mapping[str, Any],
-        entries: Sequence[Mapping[str, Any]],
-        models: Mapping[str, Model],
-        arrays: Mapping[str, FloatArray],
+        self, fields: Mapping[str, Any], entries: Sequence[Mapping[str, Any]], arrays: Mapping[str, FloatArray]
     ) -> None:
-        self._rungs = {
-            entry["name"]: Rung(models[entry["name"]], float(entry["growth"]), bool(entry["extrapolates"]))
-            for entry in entries
-        }
-        self._joints = next(iter(models.values())).joints
-        self._q, self._x, self._sigma = arrays["q"], arrays["x"], arrays["sigma"]
-        self._learnt = {entry["name"]: int(entry["learnt"]) for entry in entries}
-        self._failures = {entry["name"]: entry["failure"] for entry in entries if entry["failure"] is not None}
-        stored = {name: arrays.get(f"errors of {name}") for name in self._rungs}
-        judged = {name: squares for name, squares in stored.items() if squares is not None}
-        self._contest = Contest(judged, int(fields["judged"]))
-        self._answering = str(fields["answering"])
-        if self._answering not in self._rungs:
-            raise ValueError("the model that answers is not on it")
+        self._joints = self._checked_joints()
+        self._q, self._x, self._sigma = stored_pairs(arrays, self._joints)
+        self._asked = {entry["name"]: count(entry["asked"], "asked") for entry in entries}
+        failures = {entry["name"]: entry["failure"] for entry in entries}
+        self._failures = {name: failure for name, failure in failures.items() if failure is not None}
+        judges, errors = fields["judges"], arrays["errors"]
+        if errors.ndim != 2 or not (errors >= 0.0)[~np.isnan(errors)].all() or not set(judges) <= set(self._rungs):
+            raise ModelFormatError("its contest is none of its models'")
+        self._contest = Contest(dict(zip(judges, errors, strict=True)), count(fields["judged"], "judged"))
+        self._answering = fields["answering"]
+        if len(self._rungs) != len(entries) or self._answering not in self._rungs:
+            raise ModelFormatError("two of its models have one name, or the one that answers is not on it")
+        if any(rung.model.pairs > self._asked[name] for name, rung in self._rungs.items()):
+            raise ModelFormatError("a model on it has learnt more pairs than it was asked to")
+        if max(*self._asked.values(), 0) > self.pairs or self._contest.pairs != self.pairs:
+            raise ModelFormatError(f"it has {self.pairs} pairs, and its models had more, or others")
+        if not {type(failure) for failure in failures.values()} <= {str, type(None)}:
+            raise ModelFormatError("it is not said in words why a model is out")
+
+    def _checked_joints(self) -> int:
+        """The models' number of joints. Raises SettingError: they make no ladder."""
+        joints = {rung.model.joints for rung in self._rungs.values()}
+        if len(joints) != 1:
+            raise SettingError(f"a ladder needs models of one number of joints, got {sorted(joints) or 'none'}")
+        if not any(rung.extrapolates for rung in self._rungs.values()):
+            raise SettingError("a ladder needs a model that may extrapolate")
+        return joints.pop()
 
     def _working(self) -> list[str]:
         return [name for name in self._rungs if name not in self._failures]
@@ -303,12 +315,12 @@ class Ladder:
         return next(name for name in (*self._working(), *self._rungs) if self._rungs[name].extrapolates)
 
     def _due(self, name: str) -> float:
-        """How many pairs it takes until a model learns again."""
-        learnt = self._learnt[name]
-        return learnt + max(1.0, self._rungs[name].growth * learnt)
+        """How many pairs it takes until a model learns again, or tries to."""
+        asked = self._asked[name]
+        return asked + max(1.0, self._rungs[name].growth * asked)
 
     def _next_due(self) -> int:
-        return math.ceil(min((self._due(name) for name in self._working()), default=0.0))
+        return math.ceil(min(self._due(name) for name in self._rungs))
 
     def _judge(self, part: slice) -> None:
         """Every model predicts pairs that it has not learnt."""
@@ -317,7 +329,7 @@ class Ladder:
             try:
                 errors = self._x[part] - self._rungs[name].model.predict(self._q[part])
             except _FAILURES as error:
-                self._failures[name] = str(error)
+                self._leave_out(name, str(error))
                 continue
             with np.errstate(over="ignore"):  # an absurd prediction has an infinite error, which counts as none
                 squares[name] = np.square(errors).sum(axis=1)
@@ -325,20 +337,36 @@ class Ladder:
             self._contest.add({name: float(values[k]) for name, values in squares.items()})
 
     def _teach(self, name: str, until: int) -> None:
-        """A model learns all pairs up to one."""
-        part = slice(self._learnt[name], until)
-        model, told = self._rungs[name].model, ~np.isnan(self._sigma[part])
+        """A model learns all pairs up to one, from that on which it says it learnt last."""
+        model = self._rungs[name].model
+        part = slice(model.pairs, until)
+        told = ~np.isnan(self._sigma[part])
+        self._asked[name] = until
         try:
             for run in _runs(told):
                 these = slice(part.start + run.start, part.start + run.stop)
                 model.learn(self._q[these], self._x[these], self._sigma[these] if told[run.start] else None)
-            finite = bool(np.isfinite(model.predict(self._q[part])).all())
         except _FAILURES as error:
-            self._failures[name] = str(error)
+            self._leave_out(name, str(error))
             return
-        self._learnt[name] = until
-        if not finite:
-            self._failures[name] = "it predicted what is not finite"
+        self._hear(name, self._q[part])
+
+    def _hear(self, name: str, q: FloatArray) -> None:
+        """A model that predicts finite positions at q (n, d) has a say, any other has none."""
+        try:
+            finite = bool(np.isfinite(self._rungs[name].model.predict(q)).all())
+        except _FAILURES as error:
+            self._leave_out(name, str(error))
+            return
+        if finite:
+            self._failures.pop(name, None)
+        else:
+            self._leave_out(name, "it predicted what is not finite")
+
+    def _leave_out(self, name: str, reason: str) -> None:
+        """A model has no say until it has learnt on; what it was like before is nothing to compare it by then."""
+        self._failures[name] = reason
+        self._contest.forget(name)
 
     def _choose(self) -> None:
         working = self._working()
@@ -350,16 +378,17 @@ class Ladder:
 
     def _catch_up(self) -> None:
         """Who answers learns what has come; should that break it, the next best does."""
-        while self._working() and self._learnt[self._answering] < self.pairs:
+        while self._working() and self._asked[self._answering] < self.pairs:
             self._teach(self._answering, self.pairs)
             self._choose()
 
 
-def _restored(entry: Mapping[str, Any], classes: Mapping[str, type[Model]]) -> Model:
+def _restored(entry: Mapping[str, Any], classes: Mapping[str, type[Model]]) -> Rung:
     kind = classes.get(str(entry["class"]))
     if kind is None:
         raise ModelFormatError(f"the class {entry['class']} is not known; name it in `kinds`")
-    return kind.from_bytes(base64.b64decode(entry["model"], validate=True))
+    model = kind.from_bytes(base64.b64decode(entry["model"], validate=True))
+    return Rung(model, number(entry["growth"], "growth"), flag(entry["extrapolates"], "extrapolates"))
 
 
 def _runs(values: np.ndarray) -> list[slice]:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from kbmaps.arrays import FloatArray
 from kbmaps.errors import SettingError
+from kbmaps.packed import count, named, number
 
 # What weighs less than this beside a new pair is no part of a sum in float64.
 _NOTHING = 1e-20
@@ -47,3 +49,15 @@ class Memory:
     def weights(self, pairs: int) -> FloatArray:
         """Weights (pairs,) of pairs in the order in which they came: 1 for the last."""
         return self.forgetting ** np.arange(pairs - 1, -1, -1.0)
+
+
+def describe_memory(memory: Memory) -> dict[str, float | None]:
+    """A memory as JSON holds it."""
+    return {"window": memory.window, "forgetting": memory.forgetting}
+
+
+def parse_memory(value: Any) -> Memory:
+    """The memory that `describe_memory` gave. Raises ModelFormatError, SettingError."""
+    described = named(value, "the memory", ("window", "forgetting"))
+    window = None if described["window"] is None else count(described["window"], "the window")
+    return Memory(window, number(described["forgetting"], "forgetting"))

@@ -26,7 +26,10 @@ class Estimate:
 
 
 class Model(Protocol):
-    """A model of a forward kinematics that learns from pairs."""
+    """A model of a forward kinematics that learns from pairs.
+
+    While the pairs so far determine none, `predict` and `estimate` raise DegenerateDataError.
+    """
 
     @property
     def joints(self) -> int:

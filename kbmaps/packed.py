@@ -16,25 +16,28 @@ import hashlib
 import json
 import math
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Generator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Any, cast
 
 import numpy as np
 
 from kbmaps.arrays import FloatArray
-from kbmaps.errors import ModelFormatError
+from kbmaps.errors import KBMapsError, ModelFormatError
 
 MAGIC = b"KBPACK\r\n"
 VERSION = 1
 _PREFIX = struct.Struct("<8sII")
 _CHECKSUM_BYTES = 16
 _MAX_DIMENSIONS = 4
+_LARGEST_COUNT = 2**53
 
 
 def pack(kind: str, fields: Mapping[str, Any], arrays: Mapping[str, FloatArray]) -> bytes:
-    """The byte string for a model of this kind; `fields` holds what JSON can."""
+    """The byte string for a model of this kind; `fields` holds what JSON can: None in place of an infinite number."""
     shapes = {name: list(array.shape) for name, array in arrays.items()}
-    header = json.dumps({"kind": kind, "fields": dict(fields), "arrays": shapes}, separators=(",", ":")).encode()
+    content = {"kind": kind, "fields": dict(fields), "arrays": shapes}
+    header = json.dumps(content, separators=(",", ":"), allow_nan=False).encode()
     payload = b"".join(array.astype("<f8", copy=False).tobytes() for array in arrays.values())
     body = _PREFIX.pack(MAGIC, VERSION, len(header)) + header + payload
     return body + _checksum(body)
@@ -48,7 +51,7 @@ def unpack(data: bytes, kind: str) -> tuple[dict[str, Any], dict[str, FloatArray
     """
     header, payload = _split(memoryview(data))
     try:
-        content: Any = json.loads(header)
+        content: Any = json.loads(header, parse_float=_finite, parse_constant=_finite)
     except (ValueError, RecursionError) as error:
         raise ModelFormatError(f"the header is not JSON: {error}") from error
     parts = named(content, "the header", ("kind", "fields", "arrays"))
@@ -66,12 +69,63 @@ def named(value: Any, what: str, keys: Sequence[str]) -> dict[str, Any]:
     return cast(dict[str, Any], value)
 
 
+@contextmanager
+def restoring(what: str) -> Generator[None]:
+    """Restores `what` from fields and arrays inside: whatever does not fit raises ModelFormatError.
+
+    What comes from outside may be missing, of another type, too large, or no possible setting of a model.
+    """
+    try:
+        yield
+    except ModelFormatError:
+        raise
+    except (ArithmeticError, KeyError, MemoryError, TypeError, ValueError, KBMapsError) as error:
+        raise ModelFormatError(f"the bytes do not describe {what}: {error}") from error
+
+
+def complete(arrays: Mapping[str, FloatArray], always: Sequence[str], *parts: Sequence[str]) -> None:
+    """Raises ModelFormatError unless the arrays are those always there and each part whole or not at all."""
+    expected = set(always)
+    for part in parts:
+        expected |= set(part) if any(name in arrays for name in part) else set()
+    if set(arrays) != expected:
+        raise ModelFormatError(f"the arrays must be {', '.join(sorted(expected))}; got {', '.join(sorted(arrays))}")
+
+
 def numbers(fields: Mapping[str, Any]) -> dict[str, float]:
     """Fields that are all numbers. Raises ModelFormatError."""
-    for name, value in fields.items():
-        if type(value) not in (int, float):
-            raise ModelFormatError(f"the field {name} is not a number")
-    return {name: float(value) for name, value in fields.items()}
+    return {name: number(value, f"the field {name}") for name, value in fields.items()}
+
+
+def number(value: Any, what: str) -> float:
+    """`value` if it is a number. Raises ModelFormatError."""
+    if type(value) not in (int, float):
+        raise ModelFormatError(f"{what} is not a number")
+    return float(value)
+
+
+def count(value: Any, what: str) -> int:
+    """`value` if it is a whole number from 0 on that every reader of JSON can hold. Raises ModelFormatError."""
+    if type(value) is not int or not 0 <= value <= _LARGEST_COUNT:
+        raise ModelFormatError(f"{what} is not a whole number from 0 to {_LARGEST_COUNT}")
+    return value
+
+
+def flag(value: Any, what: str) -> bool:
+    """`value` if it is true or false. Raises ModelFormatError."""
+    if type(value) is not bool:
+        raise ModelFormatError(f"{what} is neither true nor false")
+    return value
+
+
+def unless_infinite(value: float) -> float | None:
+    """A number as JSON can hold it: None where it is infinite."""
+    return None if math.isinf(value) else value
+
+
+def or_infinite(value: Any, what: str) -> float:
+    """The number that `unless_infinite` gave. Raises ModelFormatError."""
+    return math.inf if value is None else number(value, what)
 
 
 def _split(view: memoryview) -> tuple[bytes, memoryview]:
@@ -107,6 +161,13 @@ def _arrays(shapes: dict[str, Any], payload: memoryview) -> dict[str, FloatArray
     if begin != len(payload):
         raise ModelFormatError(f"the header announces {begin} bytes of numbers, there are {len(payload)}")
     return arrays
+
+
+def _finite(text: str) -> float:
+    value = float(text)
+    if not math.isfinite(value):
+        raise ValueError(f"{text} is not a finite number")
+    return value
 
 
 def _shape(entry: Any) -> list[int]:

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kbmaps.arrays import BoolArray, FloatArray, rows_or_vector
-from kbmaps.errors import NonFiniteError, SettingError, ShapeError
+from kbmaps.arrays import BoolArray, FloatArray, rows, rows_or_vector
+from kbmaps.errors import ModelFormatError, NonFiniteError, SettingError, ShapeError
+from kbmaps.packed import restoring
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,6 +47,21 @@ def with_units(q: FloatArray, x: FloatArray, sigma: FloatArray) -> Pairs:
     if not told.any():
         return Pairs(q, x, np.ones(len(q)), False)
     return Pairs(q, x, np.where(told, sigma / np.median(sigma[told]), 1.0), False)
+
+
+def stored_pairs(arrays: Mapping[str, FloatArray], joints: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """q (n, d), x (n, 3) and sigma (n,), NaN where it was not told, of the arrays of a stored model.
+
+    Raises:
+        ModelFormatError: they are missing, or no pairs.
+    """
+    with restoring("pairs"):
+        q, x, sigma = rows("q", arrays["q"], joints), rows("x", arrays["x"], 3), arrays["sigma"]
+        if not sigma.shape == (len(q),) == (len(x),):
+            raise ModelFormatError(f"q, x and sigma are of different pairs: {q.shape}, {x.shape} and {sigma.shape}")
+        if (sigma <= 0.0).any():
+            raise ModelFormatError("a stored sigma is not greater than 0 m")
+    return q, x, sigma
 
 
 def checked_pairs(

@@ -78,13 +78,11 @@ class Row:
     Attributes:
         name: as on the command line.
         what: what is to be reached.
-        waiting: what has to be there before the row can be judged; until then its figures are for information.
     """
 
     name: str
     what: str
     figures: tuple[Figure, ...]
-    waiting: str = ""
 
     @property
     def studies(self) -> tuple[Study, ...]:

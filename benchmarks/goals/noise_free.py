@@ -115,103 +115,118 @@ def _exact_in_time(what: str, key: str, run: Callable[[int], Values], share: flo
     ]
 
 
-def rows() -> list[Row]:
+def _net_row() -> Row:
     net = (Study("full net, noise-free", _full_net),)
+    return Row(
+        "net",
+        "noise-free, 3^d random pairs over ±80°, α in 20…70°, error on ±180°",
+        (
+            Figure(
+                "d = 2…7 turning joints: mean error, worst seed and d",
+                net,
+                worst("turning"),
+                at_most(_EXACT_M, "m"),
+            ),
+            Figure("the same at d = 7: median seed", net, median("d=7"), at_most(_EXACT_M, "m")),
+            Figure("the same at d = 7 from 5 % more pairs: worst seed", net, worst("more"), at_most(_EXACT_M, "m")),
+            Figure(
+                "mixed chains, 3^R·2^P pairs: mean error, median seed", net, median("mixed"), at_most(_EXACT_M, "m")
+            ),
+            Figure("mixed chains, 3^R·2^P pairs: mean error, worst seed", net, worst("mixed"), at_most(_EXACT_M, "m")),
+            Figure("fit at d = 7: CPU time, worst seed", net, worst("s"), at_most(2.0, "s")),
+        ),
+    )
+
+
+def _far_row() -> Row:
     cluster = (Study("full net, from +-20 deg", _cluster, seeds=20),)
+    return Row(
+        "net-20",
+        "noise-free cluster ±20°, twice 3^d pairs, d = 7, full map, error on ±80°",
+        (
+            Figure("mean error, median seed", cluster, median("mean"), at_most(1e-7, "m")),
+            Figure("mean error, worst seed", cluster, worst("mean"), at_most(1e-7, "m")),
+        ),
+    )
+
+
+def _cluster_row() -> Row:
+    return Row(
+        "cluster-5",
+        "noise-free cluster ±5°, d = 7, error on ±80°",
+        (
+            Figure(
+                "rigid chain from nothing, 60 pairs: mean error, worst seed",
+                (Study("rigid, 60 pairs within +-5 deg", partial(_rigid_from_nothing, 60, 5.0)),),
+                worst("m"),
+                at_most(1e-7, "m"),
+            ),
+            Figure(
+                "tensor train from nothing, 150 pairs: share of seeds with a mean error ≤ 1e-7 m",
+                (Study("train, 150 pairs within +-5 deg", partial(_train, Task(7, 150, reach_deg=5.0))),),
+                share_below("m", 1e-7),
+                at_least(95.0, "%"),
+            ),
+        ),
+    )
+
+
+def _train_row() -> Row:
+    return Row(
+        "train",
+        "tensor train from nothing, d = 7, exact",
+        tuple(_exact_in_time("110 pairs", "train, 110 pairs", partial(_train, Task(7, 110)), 95.0, 2.0)),
+    )
+
+
+def _rough_row() -> Row:
     rough = tensor_train.ROUGH
-    return [
-        Row(
-            "net",
-            "noise-free, 3^d random pairs over ±80°, α in 20…70°, error on ±180°",
-            (
-                Figure(
-                    "d = 2…7 turning joints: mean error, worst seed and d",
-                    net,
-                    worst("turning"),
-                    at_most(_EXACT_M, "m"),
+    return Row(
+        "rough-exact",
+        "exact from a rough prior, many joints",
+        tuple(
+            figure
+            for joints, pairs in ((20, 200), (30, 300))
+            for figure in (
+                *_exact_in_time(
+                    f"tensor train, d = {joints}, {pairs} pairs",
+                    f"train, rough prior, d={joints}, {pairs} pairs",
+                    partial(_train, Task(joints, pairs, prior=rough)),
+                    95.0,
+                    5.0,
                 ),
-                Figure("the same at d = 7: median seed", net, median("d=7"), at_most(_EXACT_M, "m")),
-                Figure("the same at d = 7 from 5 % more pairs: worst seed", net, worst("more"), at_most(_EXACT_M, "m")),
-                Figure(
-                    "mixed chains, 3^R·2^P pairs: mean error, median seed", net, median("mixed"), at_most(_EXACT_M, "m")
+                *_exact_in_time(
+                    f"rigid chain, d = {joints}, {pairs} pairs",
+                    f"rigid, rough prior, d={joints}, {pairs} pairs",
+                    partial(_rigid_rough, joints, pairs),
+                    95.0,
+                    5.0,
                 ),
-                Figure(
-                    "mixed chains, 3^R·2^P pairs: mean error, worst seed", net, worst("mixed"), at_most(_EXACT_M, "m")
-                ),
-                Figure("fit at d = 7: CPU time, worst seed", net, worst("s"), at_most(2.0, "s")),
+            )
+        ),
+    )
+
+
+def _rigid_row() -> Row:
+    return Row(
+        "rigid",
+        "rigid chain, d = 7, exact",
+        (
+            Figure(
+                "15 pairs, from the drawing: share of seeds exact",
+                (Study("rigid, 15 pairs from the drawing", partial(_rigid_from_drawing, 15)),),
+                mean("exact"),
+                at_least(95.0, "%"),
+            ),
+            Figure(
+                "60 pairs, from nothing: share of seeds exact",
+                (Study("rigid, 60 pairs from nothing", partial(_rigid_from_nothing, 60, 80.0)),),
+                mean("exact"),
+                at_least(95.0, "%"),
             ),
         ),
-        Row(
-            "net-20",
-            "noise-free cluster ±20°, twice 3^d pairs, d = 7, full map, error on ±80°",
-            (
-                Figure("mean error, median seed", cluster, median("mean"), at_most(1e-7, "m")),
-                Figure("mean error, worst seed", cluster, worst("mean"), at_most(1e-7, "m")),
-            ),
-        ),
-        Row(
-            "cluster-5",
-            "noise-free cluster ±5°, d = 7, error on ±80°",
-            (
-                Figure(
-                    "rigid chain from nothing, 60 pairs: mean error, worst seed",
-                    (Study("rigid, 60 pairs within +-5 deg", partial(_rigid_from_nothing, 60, 5.0)),),
-                    worst("m"),
-                    at_most(1e-7, "m"),
-                ),
-                Figure(
-                    "tensor train from nothing, 150 pairs: share of seeds with a mean error ≤ 1e-7 m",
-                    (Study("train, 150 pairs within +-5 deg", partial(_train, Task(7, 150, reach_deg=5.0))),),
-                    share_below("m", 1e-7),
-                    at_least(95.0, "%"),
-                ),
-            ),
-        ),
-        Row(
-            "train",
-            "tensor train from nothing, d = 7, exact",
-            tuple(_exact_in_time("110 pairs", "train, 110 pairs", partial(_train, Task(7, 110)), 95.0, 2.0)),
-        ),
-        Row(
-            "rough-exact",
-            "exact from a rough prior, many joints",
-            tuple(
-                figure
-                for joints, pairs in ((20, 200), (30, 300))
-                for figure in (
-                    *_exact_in_time(
-                        f"tensor train, d = {joints}, {pairs} pairs",
-                        f"train, rough prior, d={joints}, {pairs} pairs",
-                        partial(_train, Task(joints, pairs, prior=rough)),
-                        95.0,
-                        5.0,
-                    ),
-                    *_exact_in_time(
-                        f"rigid chain, d = {joints}, {pairs} pairs",
-                        f"rigid, rough prior, d={joints}, {pairs} pairs",
-                        partial(_rigid_rough, joints, pairs),
-                        95.0,
-                        5.0,
-                    ),
-                )
-            ),
-        ),
-        Row(
-            "rigid",
-            "rigid chain, d = 7, exact",
-            (
-                Figure(
-                    "15 pairs, from the drawing: share of seeds exact",
-                    (Study("rigid, 15 pairs from the drawing", partial(_rigid_from_drawing, 15)),),
-                    mean("exact"),
-                    at_least(95.0, "%"),
-                ),
-                Figure(
-                    "60 pairs, from nothing: share of seeds exact",
-                    (Study("rigid, 60 pairs from nothing", partial(_rigid_from_nothing, 60, 80.0)),),
-                    mean("exact"),
-                    at_least(95.0, "%"),
-                ),
-            ),
-        ),
-    ]
+    )
+
+
+def rows() -> list[Row]:
+    return [_net_row(), _far_row(), _cluster_row(), _train_row(), _rough_row(), _rigid_row()]

@@ -11,9 +11,10 @@ import numpy as np
 from benchmarks.goals.goal import Figure, Row, at_most
 from benchmarks.goals.study import Estimate, Measured, NotHereError, Study, Values, mean
 from benchmarks.peers.__main__ import DATA_VARIABLE
+from benchmarks.recording import Recording
 from benchmarks.rough_truths import MODELS, recording_split, run
 
-# The model of `MODELS` that the row judges; it waits until there is one.
+# The model of `MODELS` that is judged against the others.
 ANSWER = "ladder"
 _TRUTHS = ("sag1", "sag3", "eccentric", "gain", "affine", "lens")
 # Pairs, and how many seeds.
@@ -33,16 +34,16 @@ def _studies(truth: str, pairs: int) -> dict[str, Study]:
     }
 
 
-def _over_best(models: Sequence[str], judged: str) -> Estimate:
-    """The geometric mean, over the set-ups, of a model's mean error over that of the best single model."""
-    return lambda samples: Measured(float(np.exp(np.mean(np.log(_ratios(models, judged, samples))))))
+def _over_best(models: Sequence[str]) -> Estimate:
+    """The geometric mean, over the set-ups, of the mean error over that of the best single model."""
+    return lambda samples: Measured(float(np.exp(np.mean(np.log(_ratios(models, samples))))))
 
 
-def _most_over_best(models: Sequence[str], judged: str) -> Estimate:
-    return lambda samples: Measured(max(_ratios(models, judged, samples)))
+def _most_over_best(models: Sequence[str]) -> Estimate:
+    return lambda samples: Measured(max(_ratios(models, samples)))
 
 
-def _ratios(models: Sequence[str], judged: str, samples: Sequence[Sequence[Values]]) -> list[float]:
+def _ratios(models: Sequence[str], samples: Sequence[Sequence[Values]]) -> list[float]:
     """The samples are those of all models, set-up by set-up."""
     ratios: list[float] = []
     for first in range(0, len(samples), len(models)):
@@ -50,13 +51,11 @@ def _ratios(models: Sequence[str], judged: str, samples: Sequence[Sequence[Value
             model: float(np.mean([values["error"] for values in seeds]))
             for model, seeds in zip(models, samples[first : first + len(models)], strict=True)
         }
-        ratios.append(errors[judged] / min(error for model, error in errors.items() if model != ANSWER))
+        ratios.append(errors[ANSWER] / min(error for model, error in errors.items() if model != ANSWER))
     return ratios
 
 
 def _ladder_row() -> Row:
-    """Judges the ladder where `MODELS` has it; until then shows what the best single model is."""
-    judged = ANSWER if ANSWER in MODELS else "residual"
     figures: list[Figure] = []
     every: list[Study] = []
     for pairs in _SIZES:
@@ -66,7 +65,7 @@ def _ladder_row() -> Row:
             Figure(
                 f"{pairs:,} pairs: the model that answers over the best single one, the worst truth",
                 tuple(studies),
-                _most_over_best(tuple(MODELS), judged),
+                _most_over_best(tuple(MODELS)),
                 at_most(1.2),
             )
         )
@@ -74,7 +73,7 @@ def _ladder_row() -> Row:
         Figure(
             "the same, geometric mean over truths and sizes",
             tuple(every),
-            _over_best(tuple(MODELS), judged),
+            _over_best(tuple(MODELS)),
             at_most(1.05),
         )
     )
@@ -82,8 +81,7 @@ def _ladder_row() -> Row:
         "non-rigid truths (sag 1°, 3°; eccentric 1°; gain 1 %; camera 2–3 %; radial 2 %), over the best of "
         + ", ".join(model for model in MODELS if model != ANSWER)
     )
-    waiting = "" if ANSWER in MODELS else "one model that chooses among these; the figures are the residual learner's"
-    return Row("ladder", what, tuple(figures), waiting)
+    return Row("ladder", what, tuple(figures))
 
 
 def _split(data: Path | None, pairs: int | None, seed: int) -> Values:
@@ -93,9 +91,8 @@ def _split(data: Path | None, pairs: int | None, seed: int) -> Values:
     folder = data / _RECORDING
     if not folder.is_dir():
         raise NotHereError(f"there is no {folder}")
-    if pairs is None:
-        pairs = 4 * len(np.genfromtxt(folder / "measured.csv", delimiter=",", skip_header=1)) // 5
-    alone, whole = recording_split(folder, pairs, seed)
+    known = Recording.load(folder)
+    alone, whole = recording_split(known, 4 * len(known) // 5 if pairs is None else pairs, seed)
     return {"rigid": alone, "residual": whole}
 
 

@@ -20,17 +20,15 @@ def table(rows: Iterable[Row], results: Mapping[str, Sequence[Values]]) -> str:
 
 def _lines(row: Row, results: Mapping[str, Sequence[Values]]) -> Iterator[str]:
     cells = [judged(figure, results) for figure in row.figures]
-    yield f"| **{row.name}**: {row.what} | | | | | {_standing(row, cells)} |"
+    yield f"| **{row.name}**: {row.what} | | | | | {_standing(cells)} |"
     for cell in cells:
         yield (
             f"| – {cell.figure.what} | {_goal(cell)} | {_shown(cell.measured)} | {_shown(cell.bound)} | "
-            f"{cell.seeds} of {cell.wanted} | {_mark(row, cell)} |"
+            f"{cell.seeds} of {cell.wanted} | {_mark(cell)} |"
         )
 
 
-def _standing(row: Row, cells: Sequence[Cell]) -> str:
-    if row.waiting:
-        return f"waiting for {row.waiting}"
+def _standing(cells: Sequence[Cell]) -> str:
     verdicts = [cell.verdict for cell in cells]
     for verdict in (Verdict.NOT_MET, Verdict.OPEN):
         if verdict in verdicts:
@@ -44,9 +42,7 @@ def _goal(cell: Cell) -> str:
     return text if cell.goal == cell.figure.goal else f"{text} ({cell.figure.goal.text()})"
 
 
-def _mark(row: Row, cell: Cell) -> str:
-    if row.waiting:
-        return ""
+def _mark(cell: Cell) -> str:
     return cell.verdict.value + (" (within 2 s.e.)" if cell.in_doubt else "")
 
 

@@ -22,6 +22,11 @@ class KnownArm:
     chain: ChainBelief
     residual: ResidualModel | None = None
 
+    @classmethod
+    def from_bytes(cls, chain: bytes, residual: bytes | None) -> KnownArm:
+        """Read what `to_bytes` of its parts wrote."""
+        return cls(ChainBelief.from_bytes(chain), None if residual is None else ResidualModel.from_bytes(residual))
+
     def updated(self, chain: ChainBelief | None, residual: ResidualModel | None) -> KnownArm:
         """With what was found since; None: as before."""
         return KnownArm(chain or self.chain, residual or self.residual)

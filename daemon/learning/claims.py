@@ -192,7 +192,8 @@ class Claims:
             self._belief = belief
         noise = self.errors[PRIOR].noise_variance
         before = self._misfits_before.get(name, self._misfits_before.get(RIGID, np.zeros(3)))
-        self._misfits[name] = misfit(errors, noise, before, neighbours=neighbours)
+        scatter = 0.0 if belief is None else belief.noise
+        self._misfits[name] = misfit(errors, noise, before, neighbours=neighbours, scatter=scatter)
 
     def predicted_late(self, name: str, q: FloatArray, errors: FloatArray, *, anew: bool) -> None:
         """A solution that was found only now predicts the last pairs, of which it knows none.

@@ -13,7 +13,8 @@ from .learnt import LearntModel
 
 PRIOR, INSTANT, RIGID, RESIDUAL, EXACT = "prior", "nlms", "rigid", "residual", "exact"
 SOLVED = (RIGID, RESIDUAL, EXACT)
-# Who is believed first when the errors do not tell: what has fewer numbers says more about places without data.
+# Who is believed first when the errors do not tell. Pairs come along guided paths, where errors tell of the path only:
+# what has fewer numbers says more about places beside it. (`Ladder.around` is for spread pairs, and has another order.)
 TRUSTED = (RIGID, RESIDUAL, EXACT, PRIOR, INSTANT)
 
 

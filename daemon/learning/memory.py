@@ -9,6 +9,9 @@ from interfaces.records import FloatArray
 
 IntArray = NDArray[np.intp]
 
+# So many neighbours are looked back at together.
+RUN = 20
+
 
 class PairMemory:
     """The newest `capacity` pairs, in arrays. Pairs are counted from the last `clear`."""
@@ -59,9 +62,15 @@ class PairMemory:
         return q, x
 
     def some(self, end: int, limit: int) -> tuple[FloatArray, FloatArray]:
-        """At most `limit` of the kept pairs before the one numbered `end`, evenly spread: q (n, d), x (n, 3)."""
-        count = min(limit, max(end - self._oldest, 0))
-        return self._numbered(np.linspace(self._oldest, end - 1, count).astype(np.intp))
+        """At most `limit` of the kept pairs before the one numbered `end`, in order: q (n, d), x (n, 3).
+
+        They come in evenly spread runs of `RUN` neighbours, which show what neighbours on a path share.
+        """
+        kept = max(end - self._oldest, 0)
+        if kept <= limit:
+            return self._numbered(np.arange(self._oldest, end))
+        begins = np.linspace(self._oldest, end - RUN, max(limit // RUN, 1)).astype(np.intp)
+        return self._numbered((begins[:, None] + np.arange(min(RUN, limit))).ravel())
 
     def at(self, places: IntArray) -> tuple[FloatArray, FloatArray]:
         """The kept pairs at places 0 (the oldest) ... len − 1: q (n, d), x (n, 3)."""

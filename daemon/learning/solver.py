@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, Protocol
 
 import numpy as np
@@ -233,8 +233,8 @@ def fitted_belief(prior: ChainBelief, q: FloatArray, x: FloatArray) -> ChainBeli
     if shared < SHARED:
         return learner.belief
     again = RigidLearner(prior.parameters.reference, ChainTolerances(), prior)
-    again.learn(q[inliers], x[inliers], learner.report().noise * math.sqrt(shared))
-    return again.belief
+    again.learn(q[inliers], x[inliers], learner.belief.noise * math.sqrt(shared))
+    return replace(again.belief, noise=learner.belief.noise)
 
 
 def fitted_residual(prior: ChainBelief | ResidualModel, q: FloatArray, x: FloatArray) -> ResidualModel | None:

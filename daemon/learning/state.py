@@ -12,6 +12,7 @@ from interfaces.errors import BodyschemaError
 from interfaces.records import FloatArray
 
 from .claims import ClaimsState
+from .members import PRIOR
 
 
 class StateError(BodyschemaError):
@@ -40,16 +41,16 @@ class Counters(msgspec.Struct, kw_only=True):
 
 
 class LearningHeader(msgspec.Struct, kw_only=True):
-    """The part of the state that is not arrays.
+    """The part of the state that is not arrays. What has a default belongs to an era.
 
     Attributes:
         fingerprint: of the nominal model it started from.
-        answering: the model that answers.
         claims: what is known of each model's errors.
-        doubted_in_a_row: length of the present run of doubted pairs.
         kept_of: how many pairs there were since the prior; the newest of them are kept.
         next_fit: pairs at which what is not known, or the tool after a change, is fitted again; None when nothing is.
         first_fit: whether that is the first one.
+        answering: the model that answers.
+        doubted_in_a_row: length of the present run of doubted pairs.
         replays_due: replay steps that are still owed.
         belief: what was believed of the chain before the first of these pairs, as bytes; None before the alignment.
         residual: what was known of the arm beyond that, as bytes; None if nothing was.
@@ -57,17 +58,17 @@ class LearningHeader(msgspec.Struct, kw_only=True):
 
     fingerprint: str
     counters: Counters
-    answering: str
     claims: ClaimsState
     curve: list[CurvePoint]
     curve_stride: int
-    doubted_in_a_row: int
     kept_of: int
     next_fit: int | None
     first_fit: bool
-    replays_due: float
-    belief: bytes | None
-    residual: bytes | None
+    answering: str = PRIOR
+    doubted_in_a_row: int = 0
+    replays_due: float = 0.0
+    belief: bytes | None = None
+    residual: bytes | None = None
 
 
 @dataclass(frozen=True)

@@ -43,7 +43,7 @@ class ReplayReport(msgspec.Struct, frozen=True, kw_only=True):
         prequential_mm: recent mean error on pairs before they were learnt, by model [mm].
         claimed_mm: mean error to the truth that the learner claims where data is [mm], or null.
         in_support_share: share of held-out rows that the learner says lie where data was.
-        within_sigma_share: share of held-out coordinates within the 1-sigma claimed for them and the recording's noise.
+        within_sigma_share: share of held-out coordinates within the 1-sigma claimed and the noise that was stated.
         replayed: replay steps of the instant learner.
         outlook: what the learner expects of further pairs, or null.
         doubt: why no figure is to be trusted, or null: the rows are far from any arm like the drawn one.

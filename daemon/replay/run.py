@@ -63,6 +63,15 @@ class Job:
         return keys if self.sigma_m is None else keys | {"recording_sigma_m": self.sigma_m}
 
     @property
+    def noise_m(self) -> FloatArray | float:
+        """1-sigma of the held-out positions [m] as the recording (n, 3) or the command says; 0 where neither does."""
+        cov = self.held_out_rows.cov
+        if cov is not None:
+            return np.sqrt(np.diagonal(cov, axis1=1, axis2=2))
+        stated = self.config.tables.drivers.recording_sigma_m if self.sigma_m is None else self.sigma_m
+        return stated or 0.0
+
+    @property
     def learnt_rows(self) -> Recording:
         """The rows that are fed."""
         return self.recording.rows(~self.split.held_out)
@@ -106,7 +115,6 @@ def _report(job: Job, before: FloatArray, learnt: Learnt, prediction: PredictRep
     robot, held_out = job.config.robot, job.held_out_rows
     sampler, learner = learnt.sampler, learnt.learner
     x, sigma = np.array(prediction.x), np.array(prediction.sigma)
-    noise = 0.0 if held_out.cov is None else np.sqrt(np.diagonal(held_out.cov, axis1=1, axis2=2))
     claimed = learner.claimed_error_m
     unknown = (("pose_known = false", robot.camera.pose_known), ("marker_known = false", robot.robot.marker_known))
     return ReplayReport(
@@ -126,7 +134,7 @@ def _report(job: Job, before: FloatArray, learnt: Learnt, prediction: PredictRep
         prequential_mm={name: 1e3 * error for name, error in learner.prequential_m.items()},
         claimed_mm=None if claimed is None else 1e3 * claimed,
         in_support_share=float(np.mean(prediction.in_support)),
-        within_sigma_share=coverage(x, held_out.x, sigma, noise),
+        within_sigma_share=coverage(x, held_out.x, sigma, job.noise_m),
         doubted=learner.doubted,
         replayed=learner.replayed,
         outlook=learner.outlook,

@@ -11,12 +11,12 @@ from numpy.typing import ArrayLike
 
 from kbmaps.arrays import FloatArray, IntArray, frozen, rows, rows_or_vector
 from kbmaps.chains.chain import RigidChain
-from kbmaps.chains.packed import chain_arrays, chain_from_arrays
+from kbmaps.chains.packed import CHAIN, chain_arrays, chain_from_arrays
 from kbmaps.chains.parameters import WIDE, ChainParameters, ChainTolerances
-from kbmaps.errors import KBMapsError, ModelFormatError, NonFiniteError, SettingError, ShapeError
-from kbmaps.packed import pack, unpack
+from kbmaps.errors import NonFiniteError, SettingError, ShapeError
+from kbmaps.packed import complete, number, pack, restoring, unpack
 
-_KIND = "belief in a rigid chain, 1"
+_KIND = "belief in a rigid chain, 2"
 _BLOCK = 2048
 
 
@@ -28,14 +28,18 @@ class ChainBelief:
         parameters: what they are, and the reference chain that they change.
         mean: (size,) [rad, m].
         root: matrix W (size, k) with the covariance W Wᵀ; a row of zeros holds its parameter.
+        noise: 1-sigma of a coordinate of what was measured around the chain [m], as the pairs showed it; 0 where none
+            did.
 
     Raises:
         ShapeError, NonFiniteError
+        SettingError: a noise below 0.
     """
 
     parameters: ChainParameters
     mean: FloatArray
     root: FloatArray
+    noise: float = 0.0
 
     def __post_init__(self) -> None:
         size = self.parameters.size
@@ -47,6 +51,8 @@ class ChainBelief:
             if not np.isfinite(getattr(self, name)).all():
                 raise NonFiniteError(name)
             object.__setattr__(self, name, frozen(getattr(self, name)))
+        if not 0.0 <= self.noise < np.inf:
+            raise SettingError(f"noise must be finite and not negative, got {self.noise!r}")
 
     @classmethod
     def from_tolerances(cls, parameters: ChainParameters, tolerances: ChainTolerances) -> Self:
@@ -101,16 +107,17 @@ class ChainBelief:
 
     def to_bytes(self) -> bytes:
         """The belief and its reference chain, as one self-describing byte string."""
-        return pack(_KIND, {}, chain_arrays(self.parameters.reference) | {"mean": self.mean, "root": self.root})
+        arrays = chain_arrays(self.parameters.reference) | {"mean": self.mean, "root": self.root}
+        return pack(_KIND, {"noise": self.noise}, arrays)
 
     @classmethod
     def from_bytes(cls, data: bytes) -> Self:
         """The belief in `data`. Raises ModelFormatError: it is none, or damaged."""
-        _, arrays = unpack(data, _KIND)
-        try:
-            return cls(ChainParameters(chain_from_arrays(arrays)), arrays["mean"], arrays["root"])
-        except (KeyError, KBMapsError) as error:
-            raise ModelFormatError(f"the bytes do not describe a belief in a chain: {error}") from error
+        fields, arrays = unpack(data, _KIND)
+        with restoring("a belief in a chain"):
+            complete(arrays, (*CHAIN, "mean", "root"))
+            noise = number(fields["noise"], "the noise")
+            return cls(ChainParameters(chain_from_arrays(arrays)), arrays["mean"], arrays["root"], noise)
 
     def tightened(self, before: ChainTolerances, after: ChainTolerances) -> tuple[Self, float]:
         """The same pairs' belief had it begun with narrower tolerances, and its evidence.
@@ -139,7 +146,7 @@ class ChainBelief:
         root = cast(FloatArray, np.linalg.solve(factor, self.root.T)).T
         mean = self.mean - root @ (root.T @ (added * self.mean))
         evidence = float(np.log(wide[free] / narrow[free]).sum() - np.log(np.diag(factor)).sum())
-        return type(self)(self.parameters, mean, root), evidence - 0.5 * float(self.mean @ (added * mean))
+        return type(self)(self.parameters, mean, root, self.noise), evidence - 0.5 * float(self.mean @ (added * mean))
 
     def with_other_tool(self, tolerance: float) -> Self:
         """The same arm with a marker that was moved, by `tolerance` (1-sigma of each component [m]).
@@ -154,7 +161,7 @@ class ChainBelief:
         free, root = squared(np.concatenate([self.root, moved], axis=1))
         full = np.zeros((self.parameters.size, self.parameters.size))
         full[np.ix_(free, free)] = root
-        return type(self)(self.parameters, self.mean, full)
+        return type(self)(self.parameters, self.mean, full, self.noise)
 
 
 def squared(root: FloatArray) -> tuple[IntArray, FloatArray]:

@@ -14,6 +14,7 @@ from kbmaps.chains.packed import chain_arrays, chain_from_arrays
 from kbmaps.errors import ModelFormatError
 from kbmaps.maps.kbmap import KBMap
 from kbmaps.maps.packed import describe_bases, parse_bases
+from kbmaps.packed import count
 
 
 class Predictor(Protocol):
@@ -85,7 +86,7 @@ def unpacked(fields: Any, arrays: Mapping[str, FloatArray], given: object | None
     if name == "RigidChain":
         return ChainModel(chain_from_arrays(arrays))
     if name == "Origin":
-        return Origin(int(described["joints"]))
+        return Origin(count(described["joints"], "the number of joints"))
     if given is None or type(given).__name__ != name:
         raise ModelFormatError(
             f"the model behind this one, a {name}, does not travel in its bytes: restore it and pass it in"

@@ -15,6 +15,8 @@ from kbmaps.maps.basis import JointBasis
 from kbmaps.maps.kbmap import KBMap
 
 _RIGID_TOLERANCE = 1e-6
+# (3, 9): row i is the matrix K of `cross_matrix` of the unit vector e_i.
+_CROSS = np.stack([np.cross(unit, np.eye(3)).T.ravel() for unit in np.eye(3)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -227,5 +229,5 @@ def check_rigid(name: str, transform: FloatArray) -> None:
 
 def cross_matrix(vectors: FloatArray) -> FloatArray:
     """The matrices K (..., 3, 3) with K @ y = vectors × y, for vectors (..., 3)."""
-    # Column i of K is vector × e_i, row i of this cross product.
-    return np.cross(vectors[..., None, :], np.eye(3)).swapaxes(-1, -2)
+    # One product, since this is called for every pair that comes.
+    return (vectors @ _CROSS).reshape(*vectors.shape, 3)

@@ -3,11 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import asdict, fields
+from typing import Any
 
 import numpy as np
 
 from kbmaps.arrays import FloatArray
 from kbmaps.chains.chain import RigidChain
+from kbmaps.chains.parameters import ChainTolerances
+from kbmaps.errors import ModelFormatError
+from kbmaps.packed import named, or_infinite, unless_infinite
+
+CHAIN = ("fixed", "axes", "prismatic")
 
 
 def chain_arrays(chain: RigidChain) -> dict[str, FloatArray]:
@@ -16,5 +23,23 @@ def chain_arrays(chain: RigidChain) -> dict[str, FloatArray]:
 
 
 def chain_from_arrays(arrays: Mapping[str, FloatArray]) -> RigidChain:
-    """The chain in unpacked arrays. Raises KeyError (one is missing), ChainError, ShapeError, NonFiniteError."""
+    """The chain in unpacked arrays.
+
+    Raises:
+        KeyError (one is missing), ModelFormatError, ChainError, ShapeError, NonFiniteError.
+    """
+    if not np.isin(arrays["prismatic"], (0.0, 1.0)).all():
+        raise ModelFormatError("it is not said of every joint whether it slides")
     return RigidChain(arrays["fixed"], arrays["axes"], arrays["prismatic"] != 0.0)
+
+
+def describe_tolerances(tolerances: ChainTolerances) -> dict[str, float | None]:
+    """Tolerances as JSON holds them: None where one is infinite."""
+    return {name: unless_infinite(value) for name, value in asdict(tolerances).items()}
+
+
+def parse_tolerances(value: Any) -> ChainTolerances:
+    """The tolerances that `describe_tolerances` gave. Raises ModelFormatError, SettingError."""
+    names = [field.name for field in fields(ChainTolerances)]
+    described = named(value, "the tolerances", names)
+    return ChainTolerances(*(or_infinite(described[name], f"the tolerance {name}") for name in names))

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from kbmaps.arrays import BoolArray, FloatArray, frozen, rows_or_vector, vector
-from kbmaps.chains.chain import RigidChain
+from kbmaps.chains.chain import RigidChain, cross_matrix
 from kbmaps.errors import SettingError
 
 # What an infinite tolerance is taken for [rad, m]: far beyond anything real, and still a proper prior.
@@ -18,14 +18,6 @@ _JOINT_PARAMETERS = 5
 # Below this angle [rad] the quotients of the exponential map are taken from their series.
 SMALL_ANGLE = 1e-3
 _EYE = np.eye(3)
-
-
-def _cross_tensor() -> FloatArray:
-    """(3, 9): a vector times it is the matrix K (3, 3), flattened, with K y = vector × y."""
-    return np.stack([np.cross(unit, _EYE).T.ravel() for unit in _EYE])
-
-
-_CROSS = _cross_tensor()
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,7 +116,7 @@ class ChainParameters:
         self._frames = np.stack(frames)
         self._axes = np.einsum("kij,kj->ki", self._frames[:-1, :3, :3], reference.axes)
         self._points = self._frames[:-1, :3, 3]
-        self._tangents = _tangents(self._axes)
+        self._tangents = tangents(self._axes)
         self._slides = np.flatnonzero(reference.prismatic)
 
     @property
@@ -210,12 +202,12 @@ class ChainParameters:
         axes = before @ geometry.axes[:, None, :, None]
         centres = (before @ geometry.points[:, None, :, None])[..., 0] + placed[:-1, :, :3, 3]
         turning = np.concatenate([across[..., 2:], axes], axis=3)
-        moved = _cross_matrices(centres - x) @ turning
+        moved = cross_matrix(centres - x) @ turning
         for k in self._slides:
-            turned_axis = _cross_matrices(-geometry.axes[k]) @ geometry.tilt_turns[k]
+            turned_axis = cross_matrix(-geometry.axes[k]) @ geometry.tilt_turns[k]
             moved[k, ..., :2] = angles[:, k, None, None] * (before[k] @ turned_axis)
             moved[k, ..., 2] = axes[k, ..., 0]
-        jacobian[:, :, self.base_turn] = _cross_matrices(geometry.base[:3, 3] - x) @ geometry.base_turns
+        jacobian[:, :, self.base_turn] = cross_matrix(geometry.base[:3, 3] - x) @ geometry.base_turns
         jacobian[:, :, self.base_shift] = _EYE
         by_joint = (len(q), 3, len(moved), 2)
         jacobian[:, :, self.tilts].reshape(by_joint)[...] = moved[..., :2].transpose(1, 2, 0, 3)
@@ -251,7 +243,7 @@ class ChainParameters:
         turns = motions[..., :3, :3]
         # Rodrigues: R = a aᵀ + cos q (1 − a aᵀ) + sin q [a]×
         turns[...] = np.cos(values) * (_EYE - along)[:, None]
-        turns += np.sin(values) * _cross_matrices(axes)[:, None]
+        turns += np.sin(values) * cross_matrix(axes)[:, None]
         turns += along[:, None]
         motions[..., :3, 3] = geometry.points[:, None] - (turns @ geometry.points[:, None, :, None])[..., 0]
         for k in self._slides:
@@ -303,22 +295,20 @@ def _exponentials(turns: FloatArray) -> tuple[FloatArray, FloatArray]:
     sine: FloatArray = np.where(small, 1.0 - squares / 6.0, np.sin(safe) / safe)
     cosine: FloatArray = np.where(small, 0.5 - squares / 24.0, (1.0 - np.cos(safe)) / (safe * safe))
     rest: FloatArray = np.where(small, 1.0 / 6.0 - squares / 120.0, (1.0 - np.sin(safe) / safe) / (safe * safe))
-    k = _cross_matrices(turns)
+    k = cross_matrix(turns)
     kk = k @ k
     return _EYE + sine * k + cosine * kk, _EYE + cosine * k + rest * kk
 
 
-def _cross_matrices(vectors: FloatArray) -> FloatArray:
-    """Matrices K (..., 3, 3) with K y = vector × y. One product, since this is called for every pair that comes."""
-    return (vectors @ _CROSS).reshape(*vectors.shape, 3)
-
-
-def _tangents(axes: FloatArray) -> FloatArray:
+def tangents(axes: FloatArray) -> FloatArray:
     """Two unit vectors across each axis and each other, as columns (d, 3, 2)."""
-    helper = np.eye(3)[np.abs(axes).argmin(axis=1)]
-    first = np.cross(axes, helper)
-    first /= np.linalg.norm(first, axis=1, keepdims=True)
-    return frozen(np.stack([first, np.cross(axes, first)], axis=2))
+    cross = cross_matrix(axes)
+    columns = np.empty((len(axes), 3, 2))
+    # The axis × e_i with the axis's smallest component i.
+    first = cross[np.arange(len(axes)), :, np.abs(axes).argmin(axis=1)]
+    columns[..., 0] = first / np.linalg.norm(first, axis=1, keepdims=True)
+    columns[..., 1] = (cross @ columns[..., :1])[..., 0]
+    return frozen(columns)
 
 
 def _reorthonormalised(transforms: FloatArray) -> FloatArray:

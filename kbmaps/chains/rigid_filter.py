@@ -12,7 +12,7 @@ import numpy as np
 from kbmaps.arrays import FloatArray
 from kbmaps.chains.belief import ChainBelief
 from kbmaps.chains.parameters import SMALL_ANGLE, WIDE, ChainParameters, ChainTolerances
-from kbmaps.errors import NonFiniteError, ShapeError
+from kbmaps.errors import NonFiniteError, SettingError, ShapeError
 from kbmaps.maps.kernels import FilterKernel, filter_kernel
 
 # Unit of the marker's place where its tolerance is 0, so that a tool change can loosen it [m].
@@ -55,6 +55,8 @@ class RigidFilter:
         noise_square: the estimated variance [m²] of a coordinate of the pairs that came without their sigma.
         noise_coordinates: how many coordinates that rests on.
     """
+
+    STORED = ("change", "covariance", "noise")
 
     def __init__(self, parameters: ChainParameters, tolerances: ChainTolerances, noise: float) -> None:
         self.parameters = parameters
@@ -104,13 +106,15 @@ class RigidFilter:
         return {"change": self.change, "covariance": self._covariance, "noise": noise}
 
     def restore(self, arrays: Mapping[str, FloatArray]) -> None:
-        """The state that `arrays` gave. Raises KeyError, ShapeError, NonFiniteError."""
+        """The state that `arrays` gave. Raises KeyError, ShapeError, NonFiniteError, SettingError."""
         present = self.arrays()
         for name in present:
             if arrays[name].shape != present[name].shape:
                 raise ShapeError(name, str(present[name].shape), arrays[name].shape)
             if not np.isfinite(arrays[name]).all():
                 raise NonFiniteError(name)
+        if not (arrays["noise"] > 0.0).all():
+            raise SettingError("the noise must be greater than 0 m")
         self.change, self._covariance = np.array(arrays["change"]), np.array(arrays["covariance"])
         self.noise_square, self.noise_coordinates = (float(number) for number in arrays["noise"])
 

@@ -267,7 +267,9 @@ def _summary(fitter: _Fitter, inliers: BoolArray, noise: float, freedom: float) 
     spans = 6.0 * float(np.log(noise * fitter.pairs.unit[inliers]).sum())
     evidence = -0.5 * (square + spans + 3.0 * float(inliers.sum()) * math.log(2.0 * math.pi))
     evidence -= 0.5 * float(np.log1p(np.square(singular)).sum())
-    return RigidFit(ChainBelief(parameters, point.change, spread), noise, freedom, inliers, rank, looseness, evidence)
+    seen = noise * math.sqrt(float(np.square(fitter.pairs.unit).mean())) if freedom > 0.0 else 0.0
+    belief = ChainBelief(parameters, point.change, spread, seen)
+    return RigidFit(belief, noise, freedom, inliers, rank, looseness, evidence)
 
 
 def _undetermined(design: FloatArray) -> tuple[FloatArray, int]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict
 from typing import Self
 
 import numpy as np
@@ -13,17 +12,17 @@ from scipy.special import stdtrit  # pyright: ignore[reportMissingTypeStubs, rep
 from kbmaps.arrays import BoolArray, FloatArray, frozen, rows, rows_or_vector
 from kbmaps.chains.belief import ChainBelief
 from kbmaps.chains.chain import RigidChain
-from kbmaps.chains.packed import chain_arrays, chain_from_arrays
+from kbmaps.chains.packed import CHAIN, chain_arrays, chain_from_arrays, describe_tolerances, parse_tolerances
 from kbmaps.chains.parameters import ChainParameters, ChainTolerances
 from kbmaps.chains.placed_start import PlacedStart
 from kbmaps.chains.report import ChainReport, chain_report
 from kbmaps.chains.rigid_fit import RigidFit, fit_chain
-from kbmaps.errors import DegenerateDataError, KBMapsError, ModelFormatError
+from kbmaps.errors import DegenerateDataError
 from kbmaps.model import Estimate
-from kbmaps.packed import numbers, pack, unpack
-from kbmaps.pairs import Pairs, checked_pairs, with_units
+from kbmaps.packed import complete, named, pack, restoring, unpack
+from kbmaps.pairs import Pairs, checked_pairs, stored_pairs, with_units
 
-_KIND = "rigid chain, batch, 1"
+_KIND = "rigid chain, batch, 2"
 _ONE_SIGMA = 0.841344746
 # Configurations where the chain is surer than this times the least sure pair (in variance) lie where data was.
 _SUPPORT_FACTOR = 2.0
@@ -70,6 +69,13 @@ class RigidLearner:
         self._sigma = np.empty(0)
         self._fit: RigidFit | None = None
         self._widest = 0.0
+        self._twin: RigidLearner | None = None
+
+    def twin(self) -> RigidLearner:
+        """A learner of the same arm without pairs. While it gets the same pairs, it takes this one's fit over."""
+        twin = RigidLearner(self.nominal, self._tolerances, self._prior if self._told_prior else None)
+        twin._twin = self
+        return twin
 
     @property
     def joints(self) -> int:
@@ -207,36 +213,40 @@ class RigidLearner:
         }
         if self._told_prior:
             arrays |= {"prior_mean": self._prior.mean, "prior_root": self._prior.root}
-        return pack(_KIND, asdict(self._tolerances), arrays)
+        return pack(_KIND, {"tolerances": describe_tolerances(self._tolerances)}, arrays)
 
     @classmethod
     def from_bytes(cls, data: bytes) -> Self:
         """The learner in `data`. Raises ModelFormatError: it is none of this kind, or damaged."""
         fields, arrays = unpack(data, _KIND)
-        settings = numbers(fields)
-        try:
+        with restoring("a rigid learner"):
+            tolerances = parse_tolerances(named(fields, "the fields", ("tolerances",))["tolerances"])
+            complete(arrays, (*CHAIN, "q", "x", "sigma"), ("prior_mean", "prior_root"))
             chain = chain_from_arrays(arrays)
             prior = None
             if "prior_mean" in arrays:
                 prior = ChainBelief(ChainParameters(chain), arrays["prior_mean"], arrays["prior_root"])
-            learner = cls(chain, ChainTolerances(**settings), prior)
-            sigma = arrays["sigma"]
-            learner.learn(arrays["q"], arrays["x"], np.where(np.isnan(sigma), 1.0, sigma))
-        except (KeyError, TypeError, KBMapsError) as error:
-            raise ModelFormatError(f"the bytes do not describe a rigid learner: {error}") from error
-        learner._sigma = sigma
+            learner = cls(chain, tolerances, prior)
+            learner._q, learner._x, learner._sigma = stored_pairs(arrays, learner.joints)
         return learner
 
     def _units(self) -> Pairs:
         return with_units(self._q, self._x, self._sigma)
 
     def _fitted(self) -> RigidFit | None:
+        twin = self._twin
+        if self._fit is None and twin is not None and twin._fit is not None and self._same_pairs(twin):
+            self._fit, self._widest = twin._fit, twin._widest
         if self._fit is None and self.pairs:
             fit = fit_chain(self._prior, self._units(), self._start())
             _, variance = fit.belief.predict_with_variance(self._q[fit.inliers])
             self._widest = float(variance.sum(axis=1).max(initial=0.0))
             self._fit = fit
         return self._fit
+
+    def _same_pairs(self, other: RigidLearner) -> bool:
+        pairs = zip((self._q, self._x, self._sigma), (other._q, other._x, other._sigma), strict=True)
+        return all(np.array_equal(own, others, equal_nan=True) for own, others in pairs)
 
     def _start(self) -> FloatArray:
         return self._prior.mean if self._told_prior else self._place.change(self._q, self._x)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict
 from typing import Self
 
 import numpy as np
@@ -12,18 +11,19 @@ from numpy.typing import ArrayLike
 from kbmaps.arrays import FloatArray, frozen, rows, rows_or_vector
 from kbmaps.chains.belief import ChainBelief
 from kbmaps.chains.chain import RigidChain
-from kbmaps.chains.packed import chain_arrays, chain_from_arrays
+from kbmaps.chains.packed import CHAIN, chain_arrays, chain_from_arrays, describe_tolerances, parse_tolerances
 from kbmaps.chains.parameters import ChainParameters, ChainTolerances
 from kbmaps.chains.rigid_filter import LEAST_NOISE_M, NOISE_COORDINATES, NOISE_MEMORY, RigidFilter
 from kbmaps.chains.rigid_fit import RigidFit
 from kbmaps.chains.rigid_learner import RigidLearner
 from kbmaps.chains.rigid_window import RigidWindow
-from kbmaps.errors import KBMapsError, ModelFormatError, SettingError
+from kbmaps.errors import ModelFormatError, SettingError
 from kbmaps.model import Estimate
-from kbmaps.packed import numbers, pack, unpack
+from kbmaps.packed import complete, count, named, pack, restoring, unpack
 from kbmaps.pairs import checked_pairs
 
-_KIND = "rigid chain, recursive, 2"
+_KIND = "rigid chain, recursive, 3"
+_COUNTS = ("pairs", "window", "due")
 # The first refit comes with this pair, the next when the kept pairs have grown by this factor, or the window is full.
 _FIRST, _GROWTH = 8, 1.5
 # A noise found from fewer degrees of freedom is a guess: the next refit comes with the next pair.
@@ -146,10 +146,10 @@ class RecursiveRigidLearner:
             part = slice(begin, begin + self._due - self.kept)
             self._filter.learn(angles[part], positions[part], sigmas[part])
             self._window.add(angles[part], positions[part], sigmas[part])
+            self._pairs += len(angles[part])
             begin = part.stop
             if self.kept == self._due:
                 self._refit()
-        self._pairs += len(angles)
 
     def tool_changed(self, tolerance: float) -> None:
         """Tells that the marker was moved, by `tolerance` (1-sigma of each component [m]); the arm stays known.
@@ -188,22 +188,21 @@ class RecursiveRigidLearner:
         """The learner as it is; `from_bytes` learns on to the last bit as this one would."""
         counts = {"pairs": self._pairs, "window": self._window.size, "due": self._due}
         arrays = chain_arrays(self.nominal) | self._filter.arrays() | self._window.arrays()
-        return pack(_KIND, asdict(self._tolerances) | counts, arrays)
+        return pack(_KIND, {"tolerances": describe_tolerances(self._tolerances), **counts}, arrays)
 
     @classmethod
     def from_bytes(cls, data: bytes) -> Self:
         """The learner in `data`. Raises ModelFormatError: it is none of this kind, or damaged."""
         fields, arrays = unpack(data, _KIND)
-        settings = numbers(fields)
-        try:
-            pairs, window, due = (int(settings.pop(name)) for name in ("pairs", "window", "due"))
-            learner = cls(chain_from_arrays(arrays), ChainTolerances(**settings), window=window)
+        with restoring("a recursive rigid learner"):
+            settings = named(fields, "the fields", ("tolerances", *_COUNTS))
+            pairs, window, due = (count(settings[name], f"the field {name}") for name in _COUNTS)
+            complete(arrays, (*CHAIN, *RigidFilter.STORED, *RigidWindow.STORED), RigidWindow.STORED_BELIEF)
+            learner = cls(chain_from_arrays(arrays), parse_tolerances(settings["tolerances"]), window=window)
             learner._filter.restore(arrays)
             learner._window.restore(arrays)
-        except (KeyError, TypeError, ValueError, KBMapsError) as error:
-            raise ModelFormatError(f"the bytes do not describe a recursive rigid learner: {error}") from error
-        if not learner.kept < due <= window:
-            raise ModelFormatError(f"the next refit is due with {due} pairs, which does not fit a window of {window}")
+            if not learner.kept < due <= window or learner.kept > pairs:
+                raise ModelFormatError(f"{pairs} pairs and a refit at {due} do not fit {learner.kept} kept of {window}")
         learner._pairs, learner._due = pairs, due
         return learner
 

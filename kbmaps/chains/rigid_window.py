@@ -7,13 +7,13 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from kbmaps.arrays import FloatArray
+from kbmaps.arrays import FloatArray, vector
 from kbmaps.chains.belief import ChainBelief
 from kbmaps.chains.parameters import ChainParameters, ChainTolerances
 from kbmaps.chains.placed_start import PlacedStart
 from kbmaps.chains.rigid_fit import NOTHING_KNOWN, NoiseKnowledge, RigidFit, fit_chain, folded
 from kbmaps.errors import ModelFormatError, SettingError
-from kbmaps.pairs import checked_pairs, with_units
+from kbmaps.pairs import stored_pairs, with_units
 
 LEAST_WINDOW = 16
 # With so few pairs, and nothing before them, an earlier fit may be far off: look from the drawing on.
@@ -33,6 +33,9 @@ class RigidWindow:
     Raises:
         SettingError: size below 16.
     """
+
+    STORED = ("q", "x", "sigma", "known")
+    STORED_BELIEF = ("before_mean", "before_root")
 
     def __init__(self, parameters: ChainParameters, tolerances: ChainTolerances, size: int) -> None:
         if size < LEAST_WINDOW:
@@ -104,9 +107,8 @@ class RigidWindow:
         Raises:
             ModelFormatError, KeyError, ValueError, ShapeError, NonFiniteError, SettingError: it is none.
         """
-        sigma = arrays["sigma"]
-        q, x, _ = checked_pairs(arrays["q"], arrays["x"], np.where(np.isnan(sigma), 1.0, sigma), self._joints)
-        coordinates, square, excess = (float(number) for number in arrays["known"])
+        q, x, sigma = stored_pairs(arrays, self._joints)
+        coordinates, square, excess = (float(number) for number in vector("known", arrays["known"], 3))
         if len(q) > self.size or not all(0.0 <= number < math.inf for number in (coordinates, square, excess)):
             raise ModelFormatError("the stored pairs do not fit their window, or their noise is none")
         if "before_mean" in arrays:

@@ -8,19 +8,15 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kbmaps.arrays import BoolArray, FloatArray, IntArray, rows
+from kbmaps.arrays import BoolArray, FloatArray, rows
 from kbmaps.chains.chain import RigidChain
-from kbmaps.chains.parameters import ChainParameters
+from kbmaps.chains.descents import Descents, ScrewArms
 from kbmaps.errors import DegenerateDataError, SettingError, ShapeError
 
-_STEPS = 150
-_FIRST_DAMPING, _LEAST_DAMPING, _LEAST_RAISED_DAMPING, _MOST_DAMPING = 1e-2, 1e-14, 1e-8, 1e6
 # A start whose residual [m] is rounding has found the chain.
 _ROUNDING_M = 1e-9
 # A start that leaves less than this times the noise has found the chain.
 _EXPLAINED = 1.2
-# A step that mends less than this share of the squared residual ends a start, once it has happened a few times.
-_STALLED, _STALLED_STEPS = 1e-4, 8
 
 
 def find_chain(
@@ -87,60 +83,28 @@ def find_chain(
 def _best_of(
     q: FloatArray, x: FloatArray, slides: BoolArray, size: float, rng: np.random.Generator, starts: int, enough: float
 ) -> RigidChain:
-    """The best of at most `starts` descents, the first whose RMS residual is `enough` [m] ends the search."""
-    centre = x.mean(axis=0)
-    best, best_rms = _descend(_random_chain(slides, centre, size, rng), q, x, size)
-    for _ in range(1, starts):
-        if best_rms <= enough:
-            break
-        chain, rms = _descend(_random_chain(slides, centre, size, rng), q, x, size)
-        if rms < best_rms:
-            best, best_rms = chain, rms
+    """The best of at most `starts` descents; the first whose RMS residual is `enough` [m] ends the search."""
+    descents = Descents(q, x, slides, size)
+    best, best_rms = None, math.inf
+    side_by_side = 1
+    while best is None or (starts > 0 and best_rms > enough):
+        # Often the first does. Each that does not makes it likelier that many are needed.
+        count = min(side_by_side, starts)
+        arms, rms = descents.run(_random_arms(count, len(slides), x.mean(axis=0), size, rng), enough)
+        winner = int(rms.argmin())
+        if best is None or rms[winner] < best_rms:
+            best, best_rms = arms.chain(winner, slides), float(rms[winner])
+        starts -= count
+        side_by_side *= 2
     return best
 
 
-def _random_chain(slides: BoolArray, centre: FloatArray, size: float, rng: np.random.Generator) -> RigidChain:
-    """A chain whose axes at zero have any direction and pass where the positions are."""
-    axes = rng.normal(size=(len(slides), 3))
-    axes /= np.linalg.norm(axes, axis=1, keepdims=True)
-    points = np.concatenate([centre + size * rng.normal(size=(len(slides), 3)), centre[None]])
-    fixed = np.tile(np.eye(4), (len(slides) + 1, 1, 1))
-    fixed[:, :3, 3] = np.diff(points, axis=0, prepend=np.zeros((1, 3)))
-    return RigidChain(fixed, axes, slides)
-
-
-def _descend(chain: RigidChain, q: FloatArray, x: FloatArray, size: float) -> tuple[RigidChain, float]:
-    """Levenberg-Marquardt from one chain, each step around the chain it has reached; with the RMS residual [m]."""
-    damping, stalled, square = _FIRST_DAMPING, 0, math.inf
-    for _ in range(_STEPS):
-        parameters = ChainParameters(chain)
-        predicted, jacobian = parameters.linearised(np.zeros(parameters.size), q)
-        residual = x - predicted
-        last, square = square, float(np.square(residual).sum())
-        stalled = stalled + 1 if square > (1.0 - _STALLED) * last else 0
-        if stalled >= _STALLED_STEPS or square <= len(x) * (1e-3 * _ROUNDING_M) ** 2:
-            break
-        free, scales = _free(parameters, size)
-        design = (jacobian[:, :, free] * scales).reshape(residual.size, -1)
-        gram, slope = design.T @ design, design.T @ residual.ravel()
-        held = np.diag(gram) + 1e-3 * size**2
-        change = np.zeros(parameters.size)
-        while damping <= _MOST_DAMPING:
-            change[free] = scales * np.linalg.solve(gram + np.diag(damping * held), slope)
-            if np.square(x - parameters.positions(change, q)).sum() < square:
-                break
-            damping = max(4.0 * damping, _LEAST_RAISED_DAMPING)
-        else:
-            break
-        chain, damping = parameters.chain(change), max(0.2 * damping, _LEAST_DAMPING)
-    return chain, math.sqrt(square / len(x))
-
-
-def _free(parameters: ChainParameters, size: float) -> tuple[IntArray, FloatArray]:
-    """The parameters that positions can show, and a unit for each."""
-    scales = np.zeros(parameters.size)
-    scales[parameters.tilts] = 1.0
-    scales[parameters.shifts] = size * np.repeat(~parameters.reference.prismatic, 2)
-    scales[parameters.tool] = size
-    free = np.flatnonzero(scales)
-    return free, scales[free]
+def _random_arms(count: int, joints: int, centre: FloatArray, size: float, rng: np.random.Generator) -> ScrewArms:
+    """Arms whose axes at zero have any direction and pass where the positions are."""
+    axes, points = np.empty((count, joints, 3)), np.empty((count, joints + 1, 3))
+    for arm in range(count):
+        axes[arm] = rng.normal(size=(joints, 3))
+        points[arm, :-1] = centre + size * rng.normal(size=(joints, 3))
+    axes /= np.linalg.norm(axes, axis=2, keepdims=True)
+    points[:, -1] = centre
+    return ScrewArms(axes, points)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, Protocol, Self, cast, runtime_checkable
 
@@ -13,10 +14,10 @@ from kbmaps.arrays import BoolArray, FloatArray, frozen, rows, rows_or_vector
 from kbmaps.chains.carried import ChainModel, as_model, packable, unpacked
 from kbmaps.chains.chain import RigidChain
 from kbmaps.chains.marker_fit import MarkerKnowledge, MarkerPosterior, Residuals, fit_marker
-from kbmaps.errors import KBMapsError, ModelFormatError, SettingError
+from kbmaps.errors import ModelFormatError, SettingError
 from kbmaps.maps.kbmap import KBMap
 from kbmaps.model import Estimate
-from kbmaps.packed import named, numbers, pack, unpack
+from kbmaps.packed import complete, count, named, numbers, or_infinite, pack, restoring, unless_infinite, unpack
 from kbmaps.pairs import checked_pairs
 
 _KIND = "tool layer, 1"
@@ -28,6 +29,7 @@ _NOISE_COORDINATES = 6.0
 # So many pairs are kept to judge outliers among; older ones live on in sums.
 _RECENT = 128
 _SUPPORT_FACTOR = 1.0
+_RESIDUALS = ("rotations", "residuals", "sigma")
 _SUMS = ("information", "pull", "square", "inner")
 _NUMBERS = ("errors", "count", "noise_count", "noise_square")
 
@@ -206,7 +208,7 @@ class ToolLayer:
         """
         behind, arrays = packable(self._model)
         fields: dict[str, Any] = {
-            "outlier_sigmas": self._outlier_sigmas if math.isfinite(self._outlier_sigmas) else None,
+            "outlier_sigmas": unless_infinite(self._outlier_sigmas),
             "pairs": self._pairs,
             "known": {name: getattr(self._before, name) for name in _NUMBERS},
             "model": behind,
@@ -225,21 +227,18 @@ class ToolLayer:
             ModelFormatError: it is none of this kind, or damaged, or its model is missing.
         """
         fields, arrays = unpack(data, _KIND)
-        try:
-            outlier_sigmas = math.inf if fields["outlier_sigmas"] is None else fields["outlier_sigmas"]
+        with restoring("a tool layer"):
+            named(fields, "the fields", ("outlier_sigmas", "pairs", "known", "model"))
+            outlier_sigmas = or_infinite(fields["outlier_sigmas"], "outlier_sigmas")
             layer = cls(unpacked(fields["model"], arrays, model), outlier_sigmas=outlier_sigmas)
+            complete(arrays, (*_SUMS, *_RESIDUALS, *packable(layer._model)[1]))
             sums = {name: _shaped(arrays[name], getattr(layer._before, name)) for name in _SUMS}
             scalars = numbers(named(fields["known"], "what is known", _NUMBERS))
             layer._before = replace(layer._before, **cast(dict[str, Any], sums | scalars))
-            rotations, errors, sigma = arrays["rotations"], arrays["residuals"], arrays["sigma"]
-            layer._recent = Residuals(
-                _shaped(rotations, np.empty((len(sigma), 3, 3))), _shaped(errors, np.empty((len(sigma), 3))), sigma
-            )
-            layer._pairs = int(fields["pairs"])
-        except ModelFormatError:
-            raise
-        except (KeyError, TypeError, ValueError, KBMapsError) as error:
-            raise ModelFormatError(f"the bytes do not describe a tool layer: {error}") from error
+            layer._recent = _residuals(arrays)
+            layer._pairs = count(fields["pairs"], "the number of pairs")
+            if len(layer._recent) > layer._pairs or min(scalars.values()) < 0.0:
+                raise ModelFormatError("its numbers do not fit each other")
         return layer
 
     def _residuals(self, q: FloatArray, x: FloatArray, sigma: FloatArray) -> Residuals:
@@ -272,6 +271,15 @@ def _checked_spread(spread: float) -> float:
     if not spread > 0.0:
         raise SettingError(f"spread must be greater than 0 m (infinity included), got {spread!r}")
     return min(float(spread), _WIDE)
+
+
+def _residuals(arrays: Mapping[str, FloatArray]) -> Residuals:
+    """What `to_bytes` stored of the recent pairs. Raises ModelFormatError, KeyError."""
+    rotations, errors, sigma = (arrays[name] for name in _RESIDUALS)
+    if sigma.ndim != 1 or (sigma <= 0.0).any():
+        raise ModelFormatError("the sigmas of a stored layer are not positive numbers, one a pair")
+    n = len(sigma)
+    return Residuals(_shaped(rotations, np.empty((n, 3, 3))), _shaped(errors, np.empty((n, 3))), sigma)
 
 
 def _shaped(array: FloatArray, like: FloatArray) -> FloatArray:

@@ -99,21 +99,39 @@ static inline void release_all(Py_buffer *views, int count)
 
 /* ---- small linear algebra -------------------------------------------------------------------------------------- */
 
-/* out (width) = factors (count) @ rows (count, width). Four rows at a time: the compiler keeps `out` in registers. */
+enum { COLUMNS = 16 };
+
+/* out (COLUMNS) = factors (count) @ the first columns of rows (count, width). So few that the compiler keeps the sums in
+ * registers, and two of each, since one sum waits for itself. */
+INLINE void combine_columns(const double *restrict rows, index_t count, index_t width, const double *restrict factors,
+                            double *restrict out)
+{
+    double even[COLUMNS] = {0.0}, odd[COLUMNS] = {0.0};
+    index_t i = 0;
+    for (; i + 2 <= count; i += 2, rows += 2 * width)
+        for (int j = 0; j < COLUMNS; j++)
+            even[j] += factors[i] * rows[j], odd[j] += factors[i + 1] * rows[width + j];
+    if (i < count)
+        for (int j = 0; j < COLUMNS; j++)
+            even[j] += factors[i] * rows[j];
+    for (int j = 0; j < COLUMNS; j++)
+        out[j] = even[j] + odd[j];
+}
+
+/* out (width) = factors (count) @ rows (count, width) */
 INLINE void combine(const double *restrict rows, index_t count, index_t width, const double *restrict factors,
                     double *restrict out)
 {
-    memset(out, 0, (size_t)width * sizeof(double));
-    index_t i = 0;
-    for (; i + 4 <= count; i += 4) {
-        const double *row = rows + i * width;
-        double a = factors[i], b = factors[i + 1], c = factors[i + 2], d = factors[i + 3];
-        for (index_t j = 0; j < width; j++)
-            out[j] += (a * row[j] + b * row[j + width]) + (c * row[j + 2 * width] + d * row[j + 3 * width]);
+    index_t j = 0;
+    for (; j + COLUMNS <= width; j += COLUMNS)
+        combine_columns(rows + j, count, width, factors, out + j);
+    for (; j < width; j++) {
+        double even = 0.0, odd = 0.0;
+        index_t i = 0;
+        for (; i + 2 <= count; i += 2)
+            even += factors[i] * rows[i * width + j], odd += factors[i + 1] * rows[(i + 1) * width + j];
+        out[j] = even + odd + (i < count ? factors[i] * rows[i * width + j] : 0.0);
     }
-    for (; i < count; i++)
-        for (index_t j = 0; j < width; j++)
-            out[j] += factors[i] * rows[i * width + j];
 }
 
 INLINE double dot(const double *a, const double *b, index_t count)

@@ -2,6 +2,10 @@
 #include "common.h"
 
 enum { HALF_PHASES, MIX, SLIDES, PLANES, NET_ARRAYS };
+/* From so many rows on a block of COLUMNS is quicker, even if not full, than row by row. */
+enum { FEWEST_IN_BLOCK = 5 };
+/* Doubles of working memory that are taken from the stack: enough for a row at seven joints. */
+enum { ON_STACK = 1024 };
 
 typedef struct {
     PyObject_HEAD
@@ -20,8 +24,8 @@ static index_t half_size(const Net *net, index_t begin, index_t end)
     return size;
 }
 
-/* Three entries a joint of values (or, for derivative = 1, slopes) of its basis functions. */
-INLINE void joint_weights(const Net *net, const double *q, int derivative, double *weights)
+/* Three entries a joint of values (or, for derivative = 1, slopes) of its basis functions, `lanes` apart. */
+INLINE void joint_weights(const Net *net, const double *q, int derivative, index_t lanes, double *weights)
 {
     index_t d = net->joints;
     for (index_t k = 0; k < d; k++) {
@@ -41,46 +45,82 @@ INLINE void joint_weights(const Net *net, const double *q, int derivative, doubl
             products[0] = u * u, products[1] = u * v, products[2] = v * v;
         }
         for (int j = 0; j < 3; j++)
-            weights[3 * k + j] = products[0] * mix[j] + products[1] * mix[3 + j] + products[2] * mix[6 + j];
+            weights[(3 * k + j) * lanes] = products[0] * mix[j] + products[1] * mix[3 + j] + products[2] * mix[6 + j];
     }
 }
 
-/* Kronecker product of the weights of the joints begin..end; grown in place, from its end. */
-INLINE void kronecker(const Net *net, const double *weights, index_t begin, index_t end, double *out)
+/* Kronecker product of the weights of the joints begin..end, for each lane; grown in place, from the last joint. */
+INLINE void kronecker(const Net *net, const double *restrict weights, index_t begin, index_t end, index_t lanes,
+                      double *restrict out)
 {
     index_t size = 1;
-    out[0] = 1.0;
-    for (index_t k = begin; k < end; k++) {
+    for (index_t n = 0; n < lanes; n++)
+        out[n] = 1.0;
+    for (index_t k = end; k-- > begin;) {
         index_t functions = ARRAY(net, SLIDES)[k] != 0.0 ? 2 : 3;
-        for (index_t i = size; i-- > 0;) {
-            double factor = out[i];
-            for (index_t j = functions; j-- > 0;)
-                out[i * functions + j] = factor * weights[3 * k + j];
-        }
+        const double *factors = weights + 3 * k * lanes;
+        for (index_t j = functions; j-- > 0;) /* what the others are made from comes last */
+            for (index_t i = 0; i < size; i++)
+                for (index_t n = 0; n < lanes; n++)
+                    out[(j * size + i) * lanes + n] = factors[j * lanes + n] * out[i * lanes + n];
         size *= functions;
     }
 }
 
-/* Doubles of working memory that one call of the functions below needs. */
-static size_t net_scratch(const Net *net)
+/* Working memory for one call of the functions below with n rows: `few` where that will do. NULL: there is none. */
+static double *working_memory(const Net *net, index_t n, double few[ON_STACK])
 {
-    return (size_t)(9 * net->joints + 2 * net->left + 2 * net->right + net->outputs * (net->left + net->right));
+    index_t lanes = n < FEWEST_IN_BLOCK ? 1 : COLUMNS, halves = net->left + net->right;
+    index_t doubles = (9 * net->joints + 2 * halves) * lanes + net->outputs * halves;
+    return doubles <= ON_STACK ? few : malloc((size_t)doubles * sizeof(double));
+}
+
+/* The outputs of up to COLUMNS rows at once: row n is column n of all that stands in scratch. */
+INLINE void outputs_of_block(const Net *net, const double *q, index_t n, index_t begin, index_t end, double *scratch,
+                             double *out)
+{
+    double *weights = scratch, *left = weights + 3 * net->joints * COLUMNS, *right = left + net->left * COLUMNS;
+    memset(weights, 0, (size_t)(3 * net->joints * COLUMNS) * sizeof(double));
+    for (index_t i = 0; i < n; i++)
+        joint_weights(net, q + i * net->joints, 0, COLUMNS, weights + i);
+    kronecker(net, weights, 0, net->split, COLUMNS, left);
+    kronecker(net, weights, net->split, net->joints, COLUMNS, right);
+    for (index_t o = begin; o < end; o++) {
+        double sums[COLUMNS] = {0.0}, by_right[COLUMNS];
+        for (index_t l = 0; l < net->left; l++) {
+            const double *row = ARRAY(net, PLANES) + (o * net->left + l) * net->right;
+            combine_columns(right, net->right, COLUMNS, row, by_right);
+            for (int j = 0; j < COLUMNS; j++)
+                sums[j] += left[l * COLUMNS + j] * by_right[j];
+        }
+        for (index_t i = 0; i < n; i++)
+            out[i * (end - begin) + o - begin] = sums[i];
+    }
+}
+
+INLINE void outputs_of_one(const Net *net, const double *q, index_t begin, index_t end, double *scratch, double *out)
+{
+    double *weights = scratch, *left = weights + 3 * net->joints, *right = left + net->left, *sum = right + net->right;
+    joint_weights(net, q, 0, 1, weights);
+    kronecker(net, weights, 0, net->split, 1, left);
+    kronecker(net, weights, net->split, net->joints, 1, right);
+    for (index_t o = begin; o < end; o++) {
+        combine(ARRAY(net, PLANES) + o * net->left * net->right, net->left, net->right, left, sum);
+        *out++ = dot(sum, right, net->right);
+    }
 }
 
 FAST static void outputs_of(const Net *net, const double *q, index_t n, index_t begin, index_t end, double *scratch,
                             double *out)
 {
-    index_t plane = net->left * net->right;
-    double *weights = scratch, *left = weights + 3 * net->joints, *right = left + net->left, *sum = right + net->right;
-    for (index_t i = 0; i < n; i++, q += net->joints) {
-        joint_weights(net, q, 0, weights);
-        kronecker(net, weights, 0, net->split, left);
-        kronecker(net, weights, net->split, net->joints, right);
-        for (index_t o = begin; o < end; o++) {
-            combine(ARRAY(net, PLANES) + o * plane, net->left, net->right, left, sum);
-            *out++ = dot(sum, right, net->right);
-        }
+    index_t d = net->joints, outputs = end - begin, done = 0;
+    while (n - done >= FEWEST_IN_BLOCK) {
+        index_t count = n - done < COLUMNS ? n - done : COLUMNS;
+        outputs_of_block(net, q + done * d, count, begin, end, scratch, out + done * outputs);
+        done += count;
     }
+    for (; done < n; done++)
+        outputs_of_one(net, q + done * d, begin, end, scratch, out + done * outputs);
 }
 
 FAST static void derivatives_of(const Net *net, const double *q, index_t n, index_t begin, index_t end,
@@ -91,10 +131,10 @@ FAST static void derivatives_of(const Net *net, const double *q, index_t n, inde
     double *left = varied + 3 * d, *right = left + net->left, *half = right + net->right;
     double *by_left = half + net->left + net->right, *by_right = by_left + net->outputs * net->left;
     for (index_t i = 0; i < n; i++, q += d, out += count * d) {
-        joint_weights(net, q, 0, weights);
-        joint_weights(net, q, 1, slopes);
-        kronecker(net, weights, 0, net->split, left);
-        kronecker(net, weights, net->split, d, right);
+        joint_weights(net, q, 0, 1, weights);
+        joint_weights(net, q, 1, 1, slopes);
+        kronecker(net, weights, 0, net->split, 1, left);
+        kronecker(net, weights, net->split, d, 1, right);
         for (index_t o = 0; o < count; o++) {
             const double *rows = ARRAY(net, PLANES) + (begin + o) * plane;
             combine(rows, net->left, net->right, left, by_right + o * net->right);
@@ -107,7 +147,7 @@ FAST static void derivatives_of(const Net *net, const double *q, index_t n, inde
             int on_left = k < net->split;
             index_t size = on_left ? net->left : net->right;
             const double *rest = on_left ? by_left : by_right;
-            kronecker(net, varied, on_left ? 0 : net->split, on_left ? net->split : d, half);
+            kronecker(net, varied, on_left ? 0 : net->split, on_left ? net->split : d, 1, half);
             for (index_t o = 0; o < count; o++)
                 out[o * d + k] = dot(rest + o * size, half, size);
         }
@@ -121,9 +161,9 @@ FAST static void learn_from(const Net *net, const double *q, const double *targe
     double *weights = scratch, *left = weights + 3 * net->joints, *right = left + left_size, *sum = right + right_size;
     for (index_t i = 0; i < n; i++) {
         index_t pair = order == NULL ? i : order[i];
-        joint_weights(net, q + pair * net->joints, 0, weights);
-        kronecker(net, weights, 0, net->split, left);
-        kronecker(net, weights, net->split, net->joints, right);
+        joint_weights(net, q + pair * net->joints, 0, 1, weights);
+        kronecker(net, weights, 0, net->split, 1, left);
+        kronecker(net, weights, net->split, net->joints, 1, right);
         double mu = mu0[i] / (dot(left, left, left_size) * dot(right, right, right_size));
         for (index_t o = 0; o < net->outputs; o++) {
             double *rows = ARRAY(net, PLANES) + o * left_size * right_size;
@@ -190,7 +230,7 @@ static PyObject *evaluated(Net *net, PyObject *const *args, index_t count, evalu
                                                  : Py_BuildValue("(nn)", n, outputs));
     PyObject *out = shape == NULL ? NULL : PyObject_CallFunctionObjArgs(net->empty, shape, NULL);
     Py_XDECREF(shape);
-    double *scratch = malloc(net_scratch(net) * sizeof(double));
+    double few[ON_STACK], *scratch = working_memory(net, n, few);
     if (out != NULL && scratch == NULL)
         PyErr_NoMemory();
     if (out == NULL || scratch == NULL || PyObject_GetBuffer(out, &result, PyBUF_WRITABLE) != 0) {
@@ -203,7 +243,8 @@ static PyObject *evaluated(Net *net, PyObject *const *args, index_t count, evalu
             PyEval_RestoreThread(thread);
         PyBuffer_Release(&result);
     }
-    free(scratch);
+    if (scratch != few)
+        free(scratch);
     PyBuffer_Release(&q);
     return out;
 }
@@ -221,14 +262,15 @@ static PyObject *net_derivatives(Net *net, PyObject *const *args, index_t count)
 static PyObject *learned(Net *net, const Py_buffer *q, const Py_buffer *x, const index_t *order, index_t n,
                          const double *mu0)
 {
-    double *scratch = malloc(net_scratch(net) * sizeof(double));
+    double few[ON_STACK], *scratch = working_memory(net, 1, few);
     if (scratch == NULL)
         return PyErr_NoMemory();
     PyThreadState *thread = n > 1 ? PyEval_SaveThread() : NULL;
     learn_from(net, q->buf, x->buf, order, n, mu0, scratch);
     if (thread != NULL)
         PyEval_RestoreThread(thread);
-    free(scratch);
+    if (scratch != few)
+        free(scratch);
     Py_RETURN_NONE;
 }
 

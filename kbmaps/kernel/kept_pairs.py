@@ -13,7 +13,7 @@ from kbmaps.errors import ModelFormatError
 from kbmaps.kernel.kernel_fit import Observations
 from kbmaps.kernel.product_kernel import ProductKernel
 from kbmaps.memory import Memory
-from kbmaps.pairs import checked_pairs, with_units
+from kbmaps.pairs import checked_pairs, stored_pairs, with_units
 
 
 class KeptPairs:
@@ -24,6 +24,8 @@ class KeptPairs:
             the model's positions (n, 3).
         total: how many pairs have come.
     """
+
+    STORED = ("q", "x", "sigma", "behind")
 
     def __init__(self, joints: int, memory: Memory) -> None:
         self._memory = memory
@@ -81,10 +83,10 @@ class KeptPairs:
         """The pairs that `arrays` gave.
 
         Raises:
-            ModelFormatError: they do not fit each other. KeyError, ShapeError, NonFiniteError, SettingError.
+            ModelFormatError: they do not fit each other. KeyError.
         """
-        sigma, behind = arrays["sigma"], arrays["behind"]
-        q, x, _ = self.checked(arrays["q"], arrays["x"], np.where(np.isnan(sigma), 1.0, sigma))
+        q, x, sigma = stored_pairs(arrays, self.q.shape[1])
+        behind = arrays["behind"]
         if behind.shape != x.shape or not np.isfinite(behind).all() or total < len(q):
             raise ModelFormatError("the stored pairs and what was predicted for them do not fit each other")
         self.q, self.x, self.sigma, self.behind, self.total = q, x, sigma, behind, total

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict
 from typing import Any, Self
 
 import numpy as np
@@ -13,17 +12,20 @@ from numpy.typing import ArrayLike
 from kbmaps.arrays import FloatArray, rows
 from kbmaps.chains.carried import Origin, Predictor, as_model, packable, unpacked
 from kbmaps.chains.chain import RigidChain
-from kbmaps.errors import DegenerateDataError, KBMapsError, ModelFormatError, SettingError
+from kbmaps.errors import DegenerateDataError, ModelFormatError, SettingError
+from kbmaps.kernel.kept_pairs import KeptPairs
 from kbmaps.kernel.kernel_fit import Precision
 from kbmaps.kernel.regression import KernelRegression
 from kbmaps.maps.basis import JointBasis
 from kbmaps.maps.packed import describe_bases, parse_bases
 from kbmaps.maps.support import SUPPORT_LIMIT
-from kbmaps.memory import Memory
+from kbmaps.memory import Memory, describe_memory, parse_memory
 from kbmaps.model import Estimate
-from kbmaps.packed import pack, unpack
+from kbmaps.packed import complete, count, named, number, pack, restoring, unpack
 
 _KIND = "kernel learner, 1"
+# Of positions, relative to the largest coordinate.
+_ROUNDING = 1e-11
 
 
 class KernelLearner(KernelRegression):
@@ -124,13 +126,14 @@ class KernelLearner(KernelRegression):
     def to_bytes(self) -> bytes:
         """The learner with the pairs that count; `from_bytes` gives the same predictions to the last bit.
 
-        A prior that is neither a `KBMap` nor a `RigidChain` stays behind.
+        A prior that is neither a `KBMap` nor a `RigidChain` stays behind. That which is given in its place has to
+        predict the same at the pairs, up to rounding; predictions differ as it does.
         """
         behind, arrays = packable(self._prior)
         fields: dict[str, Any] = {
             "bases": describe_bases(self.bases),
             "precision": self._precision,
-            "memory": asdict(self._memory),
+            "memory": describe_memory(self._memory),
             "pairs": self.pairs,
             "prior": behind,
         }
@@ -147,20 +150,15 @@ class KernelLearner(KernelRegression):
             ModelFormatError: it is none of this kind, or damaged, or its prior is missing or predicts otherwise.
         """
         fields, arrays = unpack(data, _KIND)
-        try:
-            learner = cls(
-                parse_bases(fields["bases"]),
-                unpacked(fields["prior"], arrays, prior),
-                precision=fields["precision"],
-                memory=Memory(**fields["memory"]),
-            )
-            learner._pairs.restore(arrays, int(fields["pairs"]))
-        except ModelFormatError:
-            raise
-        except (KeyError, TypeError, ValueError, KBMapsError) as error:
-            raise ModelFormatError(f"the bytes do not describe a kernel learner: {error}") from error
-        if learner.kept and not np.allclose(learner._prior.predict(learner._pairs.q), learner._pairs.behind):
-            raise ModelFormatError("the prior predicts otherwise than the one that the stored learner had")
+        with restoring("a kernel learner"):
+            named(fields, "the fields", ("bases", "precision", "memory", "pairs", "prior"))
+            behind = unpacked(fields["prior"], arrays, prior)
+            precision, memory = _parse_precision(fields["precision"]), parse_memory(fields["memory"])
+            learner = cls(parse_bases(fields["bases"]), behind, precision=precision, memory=memory)
+            complete(arrays, (*KeptPairs.STORED, *packable(behind)[1]))
+            learner._pairs.restore(arrays, count(fields["pairs"], "the number of pairs"))
+            if not _same(learner._prior.predict(learner._pairs.q), learner._pairs.behind):
+                raise ModelFormatError("the prior predicts otherwise than the one that the stored learner had")
         return learner
 
     def _behind(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -168,6 +166,16 @@ class KernelLearner(KernelRegression):
 
     def _features(self) -> FloatArray:
         return _no_features(self.kept)
+
+
+def _same(x: FloatArray, other: FloatArray) -> bool:
+    """Whether positions (n, 3) are the same but for the rounding of other batches."""
+    return bool((np.abs(x - other) <= _ROUNDING * np.abs(other).max(initial=0.0)).all())
+
+
+def _parse_precision(value: Any) -> Precision:
+    """Raises ModelFormatError."""
+    return value if value is None or value == "evidence" else number(value, "the precision")
 
 
 def _no_features(count: int) -> FloatArray:

@@ -4,25 +4,26 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict
 from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from kbmaps.arrays import FloatArray, frozen, rows
-from kbmaps.chains.carried import ChainModel, packable, unpacked
+from kbmaps.chains.carried import ChainModel
 from kbmaps.chains.chain import RigidChain
+from kbmaps.chains.packed import CHAIN, chain_arrays, chain_from_arrays, describe_tolerances, parse_tolerances
 from kbmaps.chains.parameters import WIDE, ChainParameters, ChainTolerances
-from kbmaps.errors import BasisError, KBMapsError, ModelFormatError
+from kbmaps.errors import BasisError
+from kbmaps.kernel.kept_pairs import KeptPairs
 from kbmaps.kernel.regression import KernelRegression
 from kbmaps.maps.basis import JointBasis
 from kbmaps.maps.packed import describe_bases, parse_bases
-from kbmaps.memory import Memory
+from kbmaps.memory import Memory, describe_memory, parse_memory
 from kbmaps.model import Estimate
-from kbmaps.packed import named, numbers, pack, unpack
+from kbmaps.packed import complete, count, named, pack, restoring, unpack
 
-_KIND = "structured learner, 1"
+_KIND = "structured learner, 2"
 # A configuration lies where data was while what is left open is at most the noise of a pair (in variance).
 _LARGEST_LEVERAGE = 1.0
 
@@ -111,30 +112,24 @@ class StructuredLearner(KernelRegression):
 
     def to_bytes(self) -> bytes:
         """The learner with the pairs that count; `from_bytes` gives the same predictions to the last bit."""
-        behind, arrays = packable(self._nominal)
         fields: dict[str, Any] = {
             "bases": describe_bases(self.bases),
-            "tolerances": asdict(self._tolerances),
-            "memory": asdict(self._memory),
+            "tolerances": describe_tolerances(self._tolerances),
+            "memory": describe_memory(self._memory),
             "pairs": self.pairs,
-            "nominal": behind,
         }
-        return pack(_KIND, fields, self._pairs.arrays() | arrays)
+        return pack(_KIND, fields, self._pairs.arrays() | chain_arrays(self.nominal))
 
     @classmethod
     def from_bytes(cls, data: bytes) -> Self:
         """The learner in `data`. Raises ModelFormatError: it is none of this kind, or damaged."""
         fields, arrays = unpack(data, _KIND)
-        try:
-            tolerances = numbers(named(fields["tolerances"], "the tolerances", tuple(asdict(ChainTolerances()))))
-            nominal = unpacked(fields["nominal"], arrays, None)
-            bases, memory = parse_bases(fields["bases"]), Memory(**fields["memory"])
-            learner = cls(nominal.chain, ChainTolerances(**tolerances), bases, memory=memory)
-            learner._pairs.restore(arrays, int(fields["pairs"]))
-        except ModelFormatError:
-            raise
-        except (AttributeError, KeyError, TypeError, ValueError, KBMapsError) as error:
-            raise ModelFormatError(f"the bytes do not describe a structured learner: {error}") from error
+        with restoring("a structured learner"):
+            named(fields, "the fields", ("bases", "tolerances", "memory", "pairs"))
+            complete(arrays, (*CHAIN, *KeptPairs.STORED))
+            bases, memory = parse_bases(fields["bases"]), parse_memory(fields["memory"])
+            learner = cls(chain_from_arrays(arrays), parse_tolerances(fields["tolerances"]), bases, memory=memory)
+            learner._pairs.restore(arrays, count(fields["pairs"], "the number of pairs"))
         return learner
 
     def _behind(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:

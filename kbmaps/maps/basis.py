@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from typing import Literal, NamedTuple, cast
 
 import numpy as np
@@ -105,10 +106,11 @@ def _check_scale(scale: float) -> None:
         raise BasisError(f"scale must be greater than 0, got {scale!r}")
 
 
+@cache
 def _legendre() -> tuple[FloatArray, FloatArray]:
     """Nodes on [−1, 1] and shares (sum 1) that integrate the squares of our functions to rounding."""
     nodes, shares = cast(tuple[FloatArray, FloatArray], np.polynomial.legendre.leggauss(32))
-    return nodes, 0.5 * shares
+    return frozen(nodes), frozen(0.5 * shares)
 
 
 _BUILDERS: Mapping[BasisKind, Callable[..., Terms]] = {

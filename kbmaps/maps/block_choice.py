@@ -26,8 +26,9 @@ BLOCK_PAIRS = 30
 PRECISIONS = 10.0 ** np.arange(-13.0, 3.25, 0.5)
 # What is taken while there are too few pairs to ask.
 FIRST_PRECISION = 1e-3
-# Neighbours of a path are nearly the same configuration: so much of their prior variance is shared.
-PATH_CORRELATION = 0.9
+# Neighbours of a path are nearly the same configuration: so much of their prior variance is shared. In bases over the
+# whole turn that is a step of 8 degrees, along which what bends three times as fast still shares 0.95.
+PATH_CORRELATION = 0.995
 # Relative to the largest eigenvalue of the kernel: what lies below is rounding.
 _SMALLEST_EIGENVALUE = 1e-15
 

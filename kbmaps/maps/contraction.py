@@ -14,7 +14,7 @@ from kbmaps.maps.stack import BasisStack
 Check = Callable[[ArrayLike], FloatArray]
 """Turns what a caller gave into a finite array of the right shape, or raises."""
 
-_BATCH_ROWS = 512
+_BATCH_ROWS = 1024
 _BLOCK = 64
 
 
@@ -45,8 +45,7 @@ class NumpyNet:
         out = np.empty((len(angles), count))
         for rows in _batches(len(angles)):
             left, right = stack.halves(angles[rows])
-            by_left = (right @ planes.T).reshape(len(left), count, stack.left_size)
-            out[rows] = (by_left @ left[:, :, None])[:, :, 0]
+            out[rows] = contracted(planes, left, right)
         return out
 
     def derivatives(self, q: ArrayLike, begin: int, end: int) -> FloatArray:
@@ -85,8 +84,7 @@ class NumpyNet:
         left, right = self._stack.halves(q)
         kernel = (left @ left.T) * (right @ right.T)
         steps = mu0 / np.diag(kernel)
-        by_left = (right @ self._planes.T).reshape(len(q), self._outputs, -1)
-        errors = targets - (by_left @ left[:, :, None])[:, :, 0]
+        errors = targets - contracted(self._planes, left, right)
         np.einsum("ij,j->ij", kernel, steps, out=kernel)
         for j in range(1, len(q)):
             errors[j] -= kernel[j, :j] @ errors[:j]
@@ -110,6 +108,13 @@ class NumpyNet:
             else:
                 columns[..., k] = (by_right @ stack.right(varied)[..., None])[..., 0]
         return columns
+
+
+def contracted(planes: FloatArray, left: FloatArray, right: FloatArray) -> FloatArray:
+    """Outputs (n, outputs) of planes (outputs · left_size, right_size) for many rows' halves (n, ·) of the weights."""
+    rows, width = left.shape
+    by_left = (planes @ right.T).reshape(len(planes) // width, width, rows)
+    return np.einsum("oln,nl->no", by_left, left)
 
 
 def _batches(count: int) -> Iterator[slice]:

@@ -9,6 +9,7 @@ import numpy as np
 
 from kbmaps.arrays import FloatArray
 from kbmaps.maps.basis import JointBasis
+from kbmaps.maps.contraction import contracted
 from kbmaps.maps.factor import RowFactor
 from kbmaps.maps.moments import Moments
 from kbmaps.maps.stack import BasisStack
@@ -78,28 +79,22 @@ class Design:
 
     def errors(self, coefficients: FloatArray) -> FloatArray:
         """Targets − A @ coefficients (m, outputs): (n, outputs)."""
-        planes = coefficients.T.reshape(-1, self._stack.right_size)
-        remaining = self._table[: self._pairs, self._stack.joints : -1].copy()
-        for part, left, right in self._blocks():
-            by_left = (right @ planes.T).reshape(len(left), self.outputs, -1)
-            remaining[part] -= (by_left @ left[:, :, None])[:, :, 0]
-        return remaining
+        return self._table[: self._pairs, self._stack.joints : -1] - self.times(coefficients)
 
     def times(self, coefficients: FloatArray) -> FloatArray:
         """A @ coefficients (m, outputs): (n, outputs)."""
         planes = coefficients.T.reshape(-1, self._stack.right_size)
         product = np.empty((self._pairs, self.outputs))
         for part, left, right in self._blocks():
-            by_left = (right @ planes.T).reshape(len(left), self.outputs, -1)
-            product[part] = (by_left @ left[:, :, None])[:, :, 0]
+            product[part] = contracted(planes, left, right)
         return product
 
     def transposed_times(self, values: FloatArray) -> FloatArray:
         """Aᵀ @ values (n, outputs): (m, outputs)."""
         planes = np.zeros((self.outputs * self._stack.left_size, self._stack.right_size))
         for part, left, right in self._blocks():
-            by_output = values[part][:, :, None] * left[:, None, :]
-            planes += by_output.reshape(len(left), -1).T @ right
+            by_output = values[part].T[:, None, :] * left.T
+            planes += by_output.reshape(-1, len(left)) @ right
         return planes.reshape(self.outputs, -1).T
 
     def gram(self) -> FloatArray:

@@ -7,16 +7,18 @@ from collections.abc import Callable
 
 # Multiplicative step of the search.
 _STEP = math.log(8.0)
+# A vertex nearer than this share of a step is not tried: evidence is level there, and a try costs a factorisation.
+_NEAR = 0.1
 
 
 def most_evident(log_evidence: Callable[[float], float], start: float, low: float, high: float) -> float:
     """The positive scale of the greatest evidence near `start`.
 
     Climbs in steps of a factor until both neighbours are lower, then tries the vertex of the parabola
-    through the three.
+    through the three, unless that is next to the middle one.
 
     Args:
-        log_evidence: of a scale.
+        log_evidence: of a scale. Where the search starts at its end, the best scale is the last one it is asked for.
         start: where to begin; taken into the limits.
         low, high: limits of the scale.
     """
@@ -31,13 +33,16 @@ def most_evident(log_evidence: Callable[[float], float], start: float, low: floa
     middle = min(max(math.log(start), lowest), highest)
     while True:
         below, above = max(middle - _STEP, lowest), min(middle + _STEP, highest)
+        for position in (below, above, middle):
+            evidence(position)
         best = max((middle, below, above), key=evidence)
         if best == middle:
             break
         middle = best
     if below < middle < above:
         vertex = _vertex((below, middle, above), (evidence(below), evidence(middle), evidence(above)))
-        middle = max((middle, vertex), key=evidence)
+        if abs(vertex - middle) > _NEAR * _STEP:
+            middle = max((middle, vertex), key=evidence)
     return math.exp(middle)
 
 

@@ -61,11 +61,15 @@ class ExactSolution:
 
 @dataclass(frozen=True)
 class _Fit:
-    """One λ: the change of the coefficients (m, outputs) before refinement, noise variances of positions and of
-    orientations, and evidence. The multipliers (n, outputs) are what it comes from with fewer pairs than unknowns."""
+    """One λ before refinement, with its evidence and the noise variances of positions and of orientations.
 
-    change: FloatArray
-    multipliers: FloatArray | None
+    The solution is the change of the coefficients (m, outputs); with fewer pairs than unknowns, the multipliers
+    (n, outputs) that it comes from. What it leaves of the errors (n, outputs) is known in the first case.
+    """
+
+    precision: float
+    solution: FloatArray
+    remaining: FloatArray | None
     variances: list[float]
     log_evidence: float
 
@@ -189,10 +193,13 @@ class ExactLearner:
         if prior_precision is None:
             return self._solve_unregularised(errors)
         gram = ShiftedGram(self._design.gram())
+        rhs = self._design.transposed_times(errors) if self._design.overdetermined else errors
         if isinstance(prior_precision, str):
-            prior_precision = self._most_evident(gram, errors)
-            self._last_precision = prior_precision
-        return self._solve_ridge(gram, errors, prior_precision)
+            fit = self._most_evident(gram, errors, rhs)
+            self._last_precision = fit.precision
+        else:
+            fit = self._fit(gram, errors, rhs, prior_precision)
+        return self._refined(gram, errors, fit)
 
     def _solve_unregularised(self, errors: FloatArray) -> ExactSolution:
         change = nearest_solution(self._design, errors)
@@ -201,34 +208,34 @@ class ExactLearner:
         noises = [math.sqrt(float(squares[part].mean()) / freedom) if freedom > 0 else None for part in self._parts]
         return self._solution(change, noises, 0.0, None, squares)
 
-    def _solve_ridge(self, gram: ShiftedGram, errors: FloatArray, precision: float) -> ExactSolution:
-        fit = self._fit(gram, errors, precision)
-        # One step of refinement through the pairs themselves mends the rounding of the Gram matrix.
-        remaining = errors - self._design.times(fit.change)
-        if fit.multipliers is None:
-            rest = self._design.transposed_times(remaining) - precision * fit.change
-            change = fit.change + gram.solve(rest)
+    def _refined(self, gram: ShiftedGram, errors: FloatArray, fit: _Fit) -> ExactSolution:
+        """One step of refinement through the pairs themselves mends the rounding of the Gram matrix."""
+        gram.factorise(fit.precision)
+        design, change = self._design, fit.solution
+        if fit.remaining is not None:
+            rest = design.transposed_times(fit.remaining) - fit.precision * change
+            change = change + gram.solve(rest)
         else:
-            correction = gram.solve(remaining - precision * fit.multipliers)
-            change = self._design.transposed_times(fit.multipliers + correction)
+            remaining = errors - design.times(design.transposed_times(fit.solution))
+            multipliers = fit.solution + gram.solve(remaining - fit.precision * fit.solution)
+            change = design.transposed_times(multipliers)
         squares = self._residual_squares(errors, change)
         noises = [math.sqrt(variance) for variance in fit.variances]
-        return self._solution(change, noises, precision, fit.log_evidence, squares)
+        return self._solution(change, noises, fit.precision, fit.log_evidence, squares)
 
-    def _fit(self, gram: ShiftedGram, errors: FloatArray, precision: float) -> _Fit:
+    def _fit(self, gram: ShiftedGram, errors: FloatArray, rhs: FloatArray, precision: float) -> _Fit:
         """Evidence of λ. The errors of one coordinate are N(0, s² (A Aᵀ / λ + I)).
 
         With fewer pairs than unknowns through A Aᵀ, else through AᵀA, of the same determinant but for powers of λ.
         """
         if not gram.factorise(precision):
             raise SettingError(f"prior_precision = {precision:.3g} is below rounding here; use None or a larger one")
+        solution, remaining = gram.solve(rhs), None
         if self._design.overdetermined:
-            multipliers, change = None, gram.solve(self._design.transposed_times(errors))
-            squares = self._residual_squares(errors, change) + precision * np.square(change).sum(axis=0)
+            remaining = errors - self._design.times(solution)
+            squares = np.square(remaining).sum(axis=0) + precision * np.square(solution).sum(axis=0)
         else:
-            multipliers = gram.solve(errors)
-            change = self._design.transposed_times(multipliers)
-            squares = precision * np.einsum("ko,ko->o", errors, multipliers)
+            squares = precision * np.einsum("ko,ko->o", errors, solution)
         spread = gram.log_determinant - gram.size * math.log(precision)
         variances = [max(float(squares[part].mean()) / self._count, _VARIANCE_FLOOR) for part in self._parts]
         log_evidence = 0.0
@@ -236,7 +243,7 @@ class ExactLearner:
             outputs = part.stop - part.start
             log_evidence -= 0.5 * outputs * self._count * (math.log(2.0 * math.pi * variance) + 1.0)
             log_evidence += 0.5 * outputs * (self._log_weights - spread)
-        return _Fit(change, multipliers, variances, log_evidence)
+        return _Fit(precision, solution, remaining, variances, log_evidence)
 
     @property
     def _count(self) -> float:
@@ -253,13 +260,17 @@ class ExactLearner:
         positions = slice(0, POSITION_OUTPUTS)
         return [positions] if self._outputs == POSITION_OUTPUTS else [positions, slice(POSITION_OUTPUTS, POSE_OUTPUTS)]
 
-    def _most_evident(self, gram: ShiftedGram, errors: FloatArray) -> float:
+    def _most_evident(self, gram: ShiftedGram, errors: FloatArray, rhs: FloatArray) -> _Fit:
         """λ of the greatest evidence: climbs from the last one in steps, then takes the vertex of a parabola."""
         mean = gram.trace / gram.size
         low, high = (limit * mean for limit in _SEARCH_LIMITS)
-        return most_evident(
-            lambda precision: self._fit(gram, errors, precision).log_evidence, self._last_precision, low, high
-        )
+        fits: dict[float, _Fit] = {}
+
+        def log_evidence(precision: float) -> float:
+            fits[precision] = self._fit(gram, errors, rhs, precision)
+            return fits[precision].log_evidence
+
+        return fits[most_evident(log_evidence, self._last_precision, low, high)]
 
     def _residual_squares(self, errors: FloatArray, change: FloatArray) -> FloatArray:
         return np.square(errors - self._design.times(change)).sum(axis=0)

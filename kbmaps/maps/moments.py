@@ -53,29 +53,26 @@ class Moments:
     def gram(self) -> FloatArray:
         """A new Gram matrix (m, m), Fortran-ordered, of which only the upper triangle counts."""
         stack, split = self._stack, self._stack.split
-        right = self._unfolded(self._sums, split, stack.joints)
         left = self._unfolded(np.eye(len(self._sums)), 0, split)
-        size = stack.left_size * stack.right_size
-        gram = np.empty((size, size))
-        blocks = gram.reshape(stack.left_size, stack.right_size, stack.left_size, stack.right_size)
-        by_moment = right.reshape(len(right), -1)
-        for row in range(stack.left_size):
+        right = self._unfolded(self._sums, split, stack.joints)
+        gram = np.empty((stack.left_size, stack.right_size, stack.left_size, stack.right_size))
+        for row, by_moment in enumerate(left):
             # Blocks of the lower triangle in C order: the upper one in Fortran order, since each is symmetric.
-            entries = left[:, row, row:].T @ by_moment
-            blocks[row:, :, row] = entries.reshape(-1, stack.right_size, stack.right_size)
-        return gram.T
+            np.matmul(by_moment[:, : row + 1].T, right, out=gram[row, :, : row + 1])
+        return gram.reshape(self._stack.left_size * self._stack.right_size, -1).T
 
     def _unfolded(self, sums: FloatArray, begin: int, end: int) -> FloatArray:
-        """Moments (rows, those of the joints begin..end) as sums of w_a w_b (rows, a, b)."""
-        rows, joints = len(sums), range(begin, end)
-        unfolded = sums.reshape(rows, *self._sizes[begin:end])
-        for place, k in enumerate(joints, 1):
+        """Moments (rows, those of the joints begin..end) as sums of w_a w_b (a, rows, b)."""
+        rows, sizes = len(sums), self._stack.sizes[begin:end]
+        unfolded = sums
+        for k in reversed(range(begin, end)):
             table = _full_products(self._polynomials[k], self._stack.sizes[k])
-            unfolded = np.moveaxis(np.tensordot(table, unfolded, axes=(1, place)), 0, place)
-        sizes = [self._stack.sizes[k] for k in joints]
+            done = math.prod(size * size for size in self._stack.sizes[k + 1 : end])
+            unfolded = table @ unfolded.reshape(-1, table.shape[1], done)
         paired = unfolded.reshape(rows, *(size for size in sizes for _ in range(2)))
-        order = [0, *range(1, 2 * len(sizes), 2), *range(2, 2 * len(sizes) + 1, 2)]
-        return np.ascontiguousarray(paired.transpose(order)).reshape(rows, math.prod(sizes), math.prod(sizes))
+        joints = range(1, 2 * len(sizes), 2)
+        in_order = paired.transpose(*joints, 0, *(place + 1 for place in joints))
+        return np.ascontiguousarray(in_order).reshape(math.prod(sizes), rows, math.prod(sizes))
 
 
 def _polynomials(basis: JointBasis) -> FloatArray:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from functools import partial
 from typing import Any, Self
 
@@ -10,14 +9,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from kbmaps.arrays import IntArray, rows, vector
-from kbmaps.errors import KBMapsError, ModelFormatError, SettingError, ShapeError
+from kbmaps.errors import ModelFormatError, SettingError, ShapeError
 from kbmaps.maps.kbmap import POSITION_OUTPUTS, KBMap
 from kbmaps.maps.kernels import net_kernel
 from kbmaps.maps.packed import describe_bases, parse_bases
 from kbmaps.maps.stack import BasisStack
 from kbmaps.maps.step_size import DEFAULT_MU0, StepSize
 from kbmaps.maps.targets import pose_targets
-from kbmaps.packed import pack, unpack
+from kbmaps.packed import complete, count, named, number, or_infinite, pack, restoring, unless_infinite, unpack
 
 _KIND = "nlms, 1"
 
@@ -125,7 +124,7 @@ class NLMS:
         fields: dict[str, Any] = {
             "bases": describe_bases(self._bases),
             "mu0": settings.mu0,
-            "decay": settings.decay if math.isfinite(settings.decay) else None,
+            "decay": unless_infinite(settings.decay),
             "floor": settings.floor,
             "pairs": self._pairs,
         }
@@ -135,14 +134,17 @@ class NLMS:
     def from_bytes(cls, data: bytes) -> Self:
         """The learner in `data`. Raises ModelFormatError: it is none of this kind, or damaged."""
         fields, arrays = unpack(data, _KIND)
-        try:
+        with restoring("an NLMS learner"):
+            named(fields, "the fields", ("bases", "mu0", "decay", "floor", "pairs"))
+            complete(arrays, ("planes",))
             bases = parse_bases(fields["bases"])
-            decay = math.inf if fields["decay"] is None else fields["decay"]
-            net = arrays["planes"].reshape(-1, *(basis.size for basis in bases))
-            learner = cls(KBMap(bases, net), StepSize(fields["mu0"], decay, fields["floor"]))
-            learner._pairs = int(fields["pairs"])
-        except (KeyError, TypeError, ValueError, KBMapsError) as error:
-            raise ModelFormatError(f"the bytes do not describe an NLMS learner: {error}") from error
+            steps = StepSize(
+                number(fields["mu0"], "mu0"), or_infinite(fields["decay"], "decay"), number(fields["floor"], "floor")
+            )
+            learner = cls(KBMap(bases, arrays["planes"].reshape(-1, *(basis.size for basis in bases))), steps)
+            if arrays["planes"].shape != learner._planes.shape:
+                raise ModelFormatError("the net is not laid out as its bases are")
+            learner._pairs = count(fields["pairs"], "the number of pairs")
         return learner
 
 

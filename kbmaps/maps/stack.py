@@ -83,14 +83,26 @@ class BasisStack:
 
     def _products(self, q: FloatArray) -> FloatArray:
         """The three products (..., 3 d) that the basis functions are mixed from, as `basis.Terms` has them."""
-        halved = 0.5 * q
-        sines = np.sin((halved if q.ndim == 1 else halved[..., None, :]) - self._half_phases)
+        if q.ndim > 1:
+            return self._products_of_rows(q.reshape(-1, self.joints).T).T.reshape(*q.shape[:-1], 3 * self.joints)
+        sines = np.sin(0.5 * q - self._half_phases)
         products = sines.take(_FIRST, axis=-2) * sines.take(_SECOND, axis=-2)
         if self._any_slides:
             share = (q - self._start) / self._span
-            stroke = np.stack([1.0 - share, share, np.zeros_like(share)], axis=-2)
-            products = np.where(self._slides, stroke, products)
-        return products.reshape(*q.shape[:-1], 3 * self.joints)
+            products = np.where(self._slides, np.stack([1.0 - share, share, np.zeros_like(share)]), products)
+        return products.reshape(-1)
+
+    def _products_of_rows(self, q: FloatArray) -> FloatArray:
+        """The same (3 d, n) for many rows, transposed, q (d, n): inner loops over rows are long ones."""
+        sines = np.sin(0.5 * q - self._half_phases[:, :, None])
+        products = np.empty((3, *q.shape))
+        for place, (first, second) in enumerate(((0, 0), (0, 1), (1, 1))):
+            np.multiply(sines[first], sines[second], out=products[place])
+        if self._any_slides:
+            share = (q - self._start[:, None]) / self._span[:, None]
+            stroke = np.stack([1.0 - share, share, np.zeros_like(share)])
+            products = np.where(self._slides[:, None], stroke, products)
+        return products.reshape(3 * self.joints, q.shape[1])
 
     def halves(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Left (left_size,) and right (right_size,) weights for q (d,); for q (n, d) with a leading n."""
@@ -121,13 +133,16 @@ class BasisStack:
         return (left[:, :, None] * right[:, None, :]).reshape(len(q), -1)
 
     def _kronecker(self, weights: FloatArray, begin: int, end: int) -> FloatArray:
-        """For a batch, joint by joint from the last: less memory than gathering all factors, and long inner loops."""
+        """For a batch, joint by joint from the last: less memory than gathering all factors.
+
+        Made transposed, for long inner loops over the rows, and returned as a transposed view.
+        """
         count = len(weights)
-        product = np.ones((count, 1))
-        for k in range(end - 1, begin - 1, -1):
-            factor = weights[:, k, : self.sizes[k], None]
-            product = (factor * product[:, None, :]).reshape(count, product.shape[1] * self.sizes[k])
-        return product
+        factors = np.ascontiguousarray(weights[:, begin:end].transpose(1, 2, 0))
+        product = np.ones((1, count))
+        for factor, size in zip(factors[::-1], self.sizes[begin:end][::-1], strict=True):
+            product = (factor[:size, None] * product).reshape(len(product) * size, count)
+        return product.T
 
 
 def _factor_index(sizes: tuple[int, ...], first_joint: int) -> IntArray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import cast
 
 import numpy as np
@@ -43,9 +44,7 @@ class ExperimentDesign:
             raise SettingError("the region must hold at least one pose")
         self._noise_square, self._floor_square = posterior.noise**2, posterior.floor**2
         self._region = posterior.roots(poses)
-        # In units of the posterior's own root the present covariance is the identity.
-        self._information = np.eye(self._region.shape[2])
-        self._settle()
+        self.begin_with(self._region[:0])
 
     @property
     def error(self) -> float:
@@ -70,25 +69,28 @@ class ExperimentDesign:
 
     def add(self, roots: FloatArray) -> None:
         """Takes pairs at `roots` (n, 3, p) for measured."""
-        self._information = self._with(roots)
+        self._factor = self._with(roots)
         self._settle()
 
-    def remove(self, roots: FloatArray) -> None:
-        """Takes pairs at `roots` (n, 3, p), which were added before, for not measured."""
-        flat = roots.reshape(-1, roots.shape[2])
-        self._information = self._information - flat.T @ flat / self._noise_square
-        self._settle()
+    def begin_with(self, roots: FloatArray) -> None:
+        """Takes pairs at `roots` (n, 3, p) for measured, and no others."""
+        # In units of the posterior's own root the present covariance is the identity.
+        self._factor = np.eye(self._region.shape[2])
+        self.add(roots)
 
     def error_after(self, roots: FloatArray) -> float:
         """`error` [m] as it would be with pairs at `roots` (n, 3, p) too."""
-        return self._mean_error(_under(_triangle(self._with(roots)), self._region))
+        return self._mean_error(_under(self._with(roots), self._region))
 
     def _with(self, roots: FloatArray) -> FloatArray:
-        flat = roots.reshape(-1, roots.shape[2])
-        return self._information + flat.T @ flat / self._noise_square
+        """L (p, p), lower triangular, with L Lᵀ the information of pairs at `roots` (n, 3, p) too.
+
+        The information itself is not summed: where pairs tell 1e8 times what was known, nothing else would be left.
+        """
+        stacked = np.concatenate([self._factor.T, roots.reshape(-1, roots.shape[2]) / math.sqrt(self._noise_square)])
+        return cast(FloatArray, np.linalg.qr(stacked, mode="r")).T
 
     def _settle(self) -> None:
-        self._factor = _triangle(self._information)
         self._left = self._reduced(self._region)
         variances: FloatArray = np.einsum("tip,tip->t", self._left, self._left) + 3.0 * self._floor_square
         weights = 0.5 / np.sqrt(np.maximum(variances, _TINY_VARIANCE)) / len(variances)
@@ -170,9 +172,8 @@ def next_poses(
         design.add(posterior.roots(chosen[k : k + 1]))
     if exchange is not None and count > 1:
         for k in list(range(count)) * _PLAN_ROUNDS:
-            design.remove(posterior.roots(chosen[k : k + 1]))
+            design.begin_with(posterior.roots(np.delete(chosen, k, axis=0)))
             chosen[k] = exchange.improved(chosen[k])
-            design.add(posterior.roots(chosen[k : k + 1]))
     return chosen
 
 
@@ -217,11 +218,6 @@ def _steps(begin: FloatArray, end: FloatArray, pairs: int, step: float) -> Float
     distance = float(np.linalg.norm(end - begin))
     count = min(int(distance / step), pairs)
     return begin + np.arange(1, count + 1)[:, None] * (step / max(distance, step)) * (end - begin)
-
-
-def _triangle(information: FloatArray) -> FloatArray:
-    """L (p, p), lower triangular, with L Lᵀ the information."""
-    return cast(FloatArray, np.linalg.cholesky(information))
 
 
 def _under(factor: FloatArray, roots: FloatArray) -> FloatArray:

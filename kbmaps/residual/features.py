@@ -9,11 +9,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kbmaps.arrays import BoolArray, FloatArray, IntArray
+from kbmaps.arrays import BoolArray, FloatArray, IntArray, vector
 from kbmaps.chains.chain import RigidChain
 from kbmaps.chains.parameters import ChainParameters
+from kbmaps.errors import SettingError
 from kbmaps.maps.basis import learning_bases
-from kbmaps.maps.block_choice import PATH_CORRELATION
 from kbmaps.maps.stack import BasisStack
 
 # Errors of a joint's angle [rad], as functions of its own reading or of gravity's torque about it.
@@ -28,6 +28,8 @@ MOST_FEATURES = 500
 _JOINTS_WITH_OWN_LOADS = 8
 # Ranges of a joint narrower than this [rad, m] would blow its functions up.
 _LEAST_RANGE = 1e-3
+# So much of what smooth functions over the pairs' reach are worth is shared by neighbours on a path.
+_PATH_CORRELATION = 0.9
 # A camera may ride on a head with so many joints, behind which stands the link where gravity is constant.
 _MOST_NECK_JOINTS = 3
 
@@ -58,6 +60,10 @@ class ResidualScaling:
         centre: of the positions (3,) [m].
         scale: their spread [m].
         load: place of the last load in the frame of the last link (3,) [m]; None: the marker itself.
+
+    Raises:
+        ShapeError, NonFiniteError
+        SettingError: a range or the spread is not positive.
     """
 
     middle: FloatArray
@@ -65,6 +71,15 @@ class ResidualScaling:
     centre: FloatArray
     scale: float
     load: FloatArray | None = None
+
+    def __post_init__(self) -> None:
+        vector("half", self.half, len(self.middle))
+        vector("middle", self.middle, len(self.half))
+        vector("centre", self.centre, 3)
+        if self.load is not None:
+            vector("load", self.load, 3)
+        if not ((self.half > 0.0).all() and 0.0 < self.scale < math.inf):
+            raise SettingError("the ranges and the spread of the positions must be finite and greater than 0")
 
     @classmethod
     def of(cls, q: FloatArray, x: FloatArray) -> ResidualScaling:
@@ -122,11 +137,12 @@ class ResidualFeatures:
         return tuple(group for group in groups if group in self._still)
 
     def follow_a_path(self, q: FloatArray) -> bool:
-        """Whether configurations (n, d), in their order, are neighbours on a path: as `kbmaps.follow_a_path`."""
+        """Whether configurations (n, d), in their order, are neighbours on a path: in functions
+        that are scaled to their reach."""
         weights = self._stack.joint_weights(q)
         inner, square = np.einsum("nkm,nkm->nk", weights[:-1], weights[1:]), np.square(weights).sum(axis=2)
         shared = (inner / np.sqrt(square[:-1] * square[1:])).prod(axis=1)
-        return bool(len(shared)) and bool(np.median(shared) > PATH_CORRELATION)
+        return bool(len(shared)) and bool(np.median(shared) > _PATH_CORRELATION)
 
     def positions(self, chain: RigidChain, weights: Weights, q: FloatArray) -> FloatArray:
         """Positions (n, 3) [m] at q (n, d)."""
@@ -255,7 +271,7 @@ class ResidualFeatures:
     def _offset_functions(self, group: str, p: FloatArray, q: FloatArray) -> FloatArray:
         """ψ (n, m) of a camera or a smooth group."""
         if group in SMOOTH_GROUPS:
-            weights = self._stack.joint_weights(q)[:, :, 1:].reshape(len(q), -1)
+            weights = self._stack.joint_weights(q)[:, :, 1:].reshape(len(q), 2 * self.joints)
             return np.multiply.reduce(weights[:, self._products[group]], axis=2)
         s = (p - self.scaling.centre) / self.scaling.scale
         degree = CAMERA_GROUPS.index(group) + 1

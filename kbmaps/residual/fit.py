@@ -50,6 +50,7 @@ class ResidualFit:
         freedom: residual coordinates minus those that all weights have used up.
         shared: correlation of the errors of neighbours on a path; 0 where pairs are apart.
         inliers: which pairs (n,) are no outliers.
+        groups: that the pairs speak for, or the prior has; the model averages over others too.
     """
 
     model: ResidualModel
@@ -57,6 +58,7 @@ class ResidualFit:
     freedom: float
     shared: float
     inliers: BoolArray
+    groups: tuple[str, ...]
 
 
 class _Fitter:
@@ -121,6 +123,11 @@ class _Fitter:
         average = model.average(() if self._on_path else groups)
         self._take(average.mean, average.groups)
         return average
+
+    @property
+    def chosen(self) -> tuple[str, ...]:
+        """The groups of the prior and of the most probable set."""
+        return tuple(dict.fromkeys((*self._known, *self.variances)))
 
     def _considered(self) -> tuple[str, ...]:
         """All groups with no more features than there are coordinates; the largest only where the one before is in."""
@@ -259,6 +266,7 @@ def fit_residual(prior: ResidualModel, pairs: Pairs, change: FloatArray) -> Resi
         freedom=freedom,
         shared=fitter.shared,
         inliers=fitter.inliers,
+        groups=fitter.chosen,
     )
 
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import asdict, replace
-from typing import Any, Self
+from dataclasses import replace
+from typing import Any, Self, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -13,18 +13,17 @@ from scipy.special import stdtrit  # pyright: ignore[reportMissingTypeStubs, rep
 from kbmaps.arrays import BoolArray, FloatArray
 from kbmaps.chains.belief import ChainBelief
 from kbmaps.chains.chain import RigidChain
-from kbmaps.chains.packed import chain_arrays, chain_from_arrays
+from kbmaps.chains.packed import CHAIN, chain_arrays, chain_from_arrays, describe_tolerances, parse_tolerances
 from kbmaps.chains.parameters import ChainTolerances
 from kbmaps.chains.rigid_learner import RigidLearner
-from kbmaps.errors import KBMapsError, ModelFormatError
 from kbmaps.model import Estimate
-from kbmaps.packed import numbers, pack, unpack
-from kbmaps.pairs import checked_pairs, with_units
+from kbmaps.packed import complete, named, pack, restoring, unpack
+from kbmaps.pairs import checked_pairs, stored_pairs, with_units
 from kbmaps.residual.features import ResidualScaling
 from kbmaps.residual.fit import ResidualFit, fit_residual
 from kbmaps.residual.model import ResidualModel
 
-_KIND = "rigid chain with residual, batch, 1"
+_KIND = "rigid chain with residual, batch, 2"
 # Configurations where the model is surer than this times the least sure pair (in variance) lie where data was.
 _SUPPORT_FACTOR = 2.0
 _LEAST_FREEDOM = 10.0
@@ -37,7 +36,8 @@ class ResidualLearner:
     Deviations come in groups: eccentric encoders, gear gains, joints that yield under load, a distorting camera, and
     smooth functions of one to three joints. The chain's tolerances and each group's variance are the prior; the
     variances are those that make the pairs most probable, and what is predicted is the average over those sets of
-    groups that the pairs speak for. Where they speak for none, this is `RigidLearner` to the last bit.
+    groups that are about as probable as the best. Where the pairs speak for no group, that is `RigidLearner` to a
+    fraction of its sigma; to the last bit where no set with a group comes near, as without noise.
 
     Args:
         nominal: the chain as drawn, or as `find_chain` found it.
@@ -90,8 +90,14 @@ class ResidualLearner:
 
     @property
     def deviations(self) -> dict[str, float]:
-        """By how much each group of deviations that the pairs speak for moves the learnt positions (RMS) [m]."""
-        return self.model.effects(self._q) if self.pairs else {}
+        """By how much each group of deviations that the pairs speak for moves the learnt positions (RMS) [m].
+
+        Groups that the prior has count as spoken for; those that are in the average beside the best set do not.
+        """
+        fit = self._fitted()
+        if fit is None:
+            return {}
+        return {group: effect for group, effect in self.model.effects(self._q).items() if group in fit.groups}
 
     @property
     def inliers(self) -> BoolArray:
@@ -121,8 +127,7 @@ class ResidualLearner:
         Raises:
             ShapeError, NonFiniteError
         """
-        fit = self._fitted()
-        return self._rigid.predict(q) if fit is None and self._prior is None else self.model.predict(q)
+        return self._rigid.predict(q) if self._is_rigid else self.model.predict(q)
 
     def estimate(self, q: ArrayLike) -> Estimate:
         """Positions at q (n, d), their 1-sigma per axis against the truth, and whether data was there.
@@ -132,9 +137,9 @@ class ResidualLearner:
         Raises:
             ShapeError, NonFiniteError
         """
-        fit = self._fitted()
-        if fit is None and self._prior is None:
+        if self._is_rigid:
             return self._rigid.estimate(q)
+        fit = self._fitted()
         x, variance = self.model.predict_with_variance(q)
         if fit is None:
             return Estimate(x, np.sqrt(variance), np.zeros(len(x), dtype=np.bool_))
@@ -149,25 +154,28 @@ class ResidualLearner:
         """The learner with all its pairs; `from_bytes` gives the same predictions to the last bit."""
         arrays = chain_arrays(self._rigid.nominal) | {"q": self._q, "x": self._x, "sigma": self._sigma}
         prior, belief = self._prior, self._belief
-        priors = {"model": prior.to_bytes().hex()} if prior else {"belief": belief.to_bytes().hex()} if belief else {}
-        return pack(_KIND, asdict(self._rigid.tolerances) | priors, arrays)
+        known = {"model": prior.to_bytes().hex()} if prior else belief and {"belief": belief.to_bytes().hex()}
+        return pack(_KIND, {"tolerances": describe_tolerances(self._rigid.tolerances), "prior": known}, arrays)
 
     @classmethod
     def from_bytes(cls, data: bytes) -> Self:
         """The learner in `data`. Raises ModelFormatError: it is none of this kind, or damaged."""
         fields, arrays = unpack(data, _KIND)
-        prior = _stored_prior(fields)
-        settings = numbers(fields)
-        try:
-            learner = cls(chain_from_arrays(arrays), ChainTolerances(**settings), prior)
-            sigma = arrays["sigma"]
+        with restoring("a rigid chain with residual"):
+            named(fields, "the fields", ("tolerances", "prior"))
+            complete(arrays, (*CHAIN, "q", "x", "sigma"))
+            nominal, tolerances = chain_from_arrays(arrays), parse_tolerances(fields["tolerances"])
+            learner = cls(nominal, tolerances, _stored_prior(fields["prior"]))
+            q, x, sigma = stored_pairs(arrays, learner.joints)
             told = ~np.isnan(sigma)
             for start, end in _runs(told):
-                part = slice(start, end)
-                learner.learn(arrays["q"][part], arrays["x"][part], sigma[part] if told[start] else None)
-        except (KeyError, TypeError, IndexError, KBMapsError) as error:
-            raise ModelFormatError(f"the bytes do not describe a rigid chain with residual: {error}") from error
+                learner.learn(q[start:end], x[start:end], sigma[start:end] if told[start] else None)
         return learner
+
+    @property
+    def _is_rigid(self) -> bool:
+        """Whether the rigid chain is all there is: nothing was found beside it, now or by who made the prior."""
+        return self._fitted() is None and not self.model.weights
 
     @property
     def _model_before(self) -> ResidualModel:
@@ -175,7 +183,7 @@ class ResidualLearner:
         return self._prior or ResidualModel.of_belief(self._rigid.belief)
 
     def _fitted(self) -> ResidualFit | None:
-        """The fit; None where the rigid chain is all there is."""
+        """The fit; None without pairs, and where they speak for nothing but the rigid chain."""
         if self._model is None and self.pairs:
             pairs = with_units(self._q, self._x, self._sigma)
             before = self._prior
@@ -184,7 +192,7 @@ class ResidualLearner:
                 scaling = replace(ResidualScaling.of(self._q, self._x), load=load)
                 before = ResidualModel.of_belief(self._rigid.prior, scaling, 0.0 if before is None else before.noise)
             # Noise that nobody told must be seen in residuals that the chain alone leaves, or anything explains them.
-            if pairs.known or before.noise > 0.0 or self._rigid.report().freedom >= _LEAST_FREEDOM:
+            if pairs.known or before.weights or before.noise > 0.0 or self._rigid.report().freedom >= _LEAST_FREEDOM:
                 self._fit = fit_residual(before, pairs, self._rigid.change)
             self._model = self._rigid_model(before) if self._fit is None else self._fit.model
             if self._fit is not None:
@@ -195,19 +203,17 @@ class ResidualLearner:
     def _rigid_model(self, before: ResidualModel) -> ResidualModel:
         report = self._rigid.report()
         noise = report.noise * report.misfit if report.freedom >= _LEAST_FREEDOM else before.noise
-        return ResidualModel.of_belief(self._rigid.belief, before.features.scaling, noise)
+        belief = self._rigid.belief
+        return ResidualModel(before.features, belief.mean, {}, belief.root, noise)
 
 
-def _stored_prior(fields: dict[str, Any]) -> ChainBelief | ResidualModel | None:
-    """The prior in the fields of stored bytes, taken out of them. Raises ModelFormatError."""
-    kinds = {"model": ResidualModel.from_bytes, "belief": ChainBelief.from_bytes}
-    for name, read in kinds.items():
-        if name in fields:
-            try:
-                return read(bytes.fromhex(fields.pop(name)))
-            except (TypeError, ValueError) as error:
-                raise ModelFormatError(f"the field {name} is not hexadecimal") from error
-    return None
+def _stored_prior(value: Any) -> ChainBelief | ResidualModel | None:
+    """The prior among the fields of stored bytes. Raises ModelFormatError, TypeError, ValueError."""
+    if value is None:
+        return None
+    if isinstance(value, dict) and "belief" in value:
+        return ChainBelief.from_bytes(bytes.fromhex(named(cast(Any, value), "the prior", ("belief",))["belief"]))
+    return ResidualModel.from_bytes(bytes.fromhex(named(value, "the prior", ("model",))["model"]))
 
 
 def _runs(values: BoolArray) -> list[tuple[int, int]]:

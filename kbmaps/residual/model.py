@@ -16,13 +16,14 @@ from numpy.typing import ArrayLike
 from kbmaps.arrays import FloatArray, frozen, rows, rows_or_vector
 from kbmaps.chains.belief import ChainBelief
 from kbmaps.chains.chain import RigidChain
-from kbmaps.chains.packed import chain_arrays, chain_from_arrays
+from kbmaps.chains.packed import CHAIN, chain_arrays, chain_from_arrays
 from kbmaps.chains.parameters import ChainParameters
-from kbmaps.errors import KBMapsError, ModelFormatError, NonFiniteError, SettingError, ShapeError
-from kbmaps.packed import numbers, pack, unpack
+from kbmaps.errors import NonFiniteError, SettingError, ShapeError
+from kbmaps.packed import complete, named, numbers, pack, restoring, unpack
 from kbmaps.residual.features import ResidualFeatures, ResidualScaling
 
-_KIND = "rigid chain with residual, fitted, 1"
+_KIND = "rigid chain with residual, fitted, 2"
+_SCALING = ("middle", "half", "centre", "load")
 _GROUP = "group "
 # Lumped loads on linear springs are true to some per cent of the yielding that they explain.
 _LAW_ERROR = 0.03
@@ -48,6 +49,7 @@ class ResidualModel:
 
     Raises:
         ShapeError, NonFiniteError
+        SettingError: the noise is negative or not finite, or there is no such group.
     """
 
     features: ResidualFeatures
@@ -59,6 +61,10 @@ class ResidualModel:
     def __post_init__(self) -> None:
         parameters = self.features.parameters
         object.__setattr__(self, "weights", MappingProxyType({g: frozen(w) for g, w in self.weights.items()}))
+        if strange := set(self.weights) - set(self.features.groups()):
+            raise SettingError(f"this arm has no groups {', '.join(sorted(strange))}")
+        if len(self.features.scaling.middle) != self.joints:
+            raise ShapeError("middle", f"({self.joints},)", self.features.scaling.middle.shape)
         arrays = {"change": (self.change, parameters.size)}
         arrays |= {group: (weights, self.features.size(group)) for group, weights in self.weights.items()}
         for name, (array, size) in arrays.items():
@@ -70,6 +76,8 @@ class ResidualModel:
         for name, array in (("root", self.root), *((name, array) for name, (array, _) in arrays.items())):
             if not np.isfinite(array).all():
                 raise NonFiniteError(name)
+        if not 0.0 <= self.noise < math.inf:
+            raise SettingError(f"noise must be finite and not negative, got {self.noise!r}")
         object.__setattr__(self, "change", frozen(self.change))
         object.__setattr__(self, "root", frozen(self.root))
 
@@ -98,7 +106,7 @@ class ResidualModel:
     def belief(self) -> ChainBelief:
         """What is believed of the rigid part, whatever the deviations are."""
         parameters = self.features.parameters
-        return ChainBelief(parameters, self.change, self.root[: parameters.size])
+        return ChainBelief(parameters, self.change, self.root[: parameters.size], self.noise)
 
     @property
     def digest(self) -> str:
@@ -151,7 +159,7 @@ class ResidualModel:
         return x, variance
 
     def effects(self, q: ArrayLike) -> dict[str, float]:
-        """By how much each group moves the positions at q (n, d), root mean square of the distances [m].
+        """By how much each group moves the positions at q (n, d), root mean square of the distances [m]; 0 of none.
 
         Raises:
             ShapeError, NonFiniteError
@@ -159,7 +167,7 @@ class ResidualModel:
         angles = rows("q", q, self.joints)
         point = self.features.linearised(self.change, self.chain, self.weights, angles, tuple(self.weights))
         moves = {group: point.groups[group] @ weights for group, weights in self.weights.items()}
-        return {group: math.sqrt(float(np.square(move).sum(axis=1).mean())) for group, move in moves.items()}
+        return {group: math.sqrt(float(np.square(move).sum()) / max(len(move), 1)) for group, move in moves.items()}
 
     def with_other_tool(self, tolerance: float) -> Self:
         """The same arm with a marker that was moved, by `tolerance` (1-sigma of each component [m]).
@@ -187,16 +195,15 @@ class ResidualModel:
     def from_bytes(cls, data: bytes) -> Self:
         """The model in `data`. Raises ModelFormatError: it is none of this kind, or damaged."""
         fields, arrays = unpack(data, _KIND)
-        settings = numbers(fields)
-        try:
-            scaling = ResidualScaling(
-                arrays["middle"], arrays["half"], arrays["centre"], settings["scale"], arrays.get("load")
-            )
+        with restoring("a rigid chain with residual"):
+            settings = numbers(named(fields, "the fields", ("scale", "noise")))
+            groups = [name for name in arrays if name.startswith(_GROUP)]
+            complete(arrays, (*CHAIN, *_SCALING, "change", "root", *groups))
+            middle, half, centre, load = (arrays[name] for name in _SCALING)
+            scaling = ResidualScaling(middle, half, centre, settings["scale"], load if len(load) else None)
             features = ResidualFeatures(ChainParameters(chain_from_arrays(arrays)), scaling)
-            weights = {name.removeprefix(_GROUP): w for name, w in arrays.items() if name.startswith(_GROUP)}
+            weights = {name.removeprefix(_GROUP): arrays[name] for name in groups}
             return cls(features, arrays["change"], weights, arrays["root"], settings["noise"])
-        except (KeyError, ValueError, KBMapsError) as error:
-            raise ModelFormatError(f"the bytes do not describe a rigid chain with residual: {error}") from error
 
     def _arrays(self) -> dict[str, FloatArray]:
         scaling = self.features.scaling
@@ -204,9 +211,8 @@ class ResidualModel:
             "middle": scaling.middle,
             "half": scaling.half,
             "centre": scaling.centre,
+            "load": np.empty(0) if scaling.load is None else scaling.load,
             "change": self.change,
             "root": self.root,
         }
-        if scaling.load is not None:
-            arrays["load"] = scaling.load
         return arrays | {_GROUP + group: weights for group, weights in self.weights.items()}

@@ -17,42 +17,71 @@ USUAL_ELLIPSE_STD = 0.003
 _DECADE = math.log(10.0)
 
 
-def core_information(problem: TensorProblem, z: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """H (36 d, 36 d) and h (36 d,) of a problem linearised at z: its log likelihood is -½ (cᵀ H c - 2 hᵀ c) + …"""
+def core_equations(problem: TensorProblem, z: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """J (3 n, 36 d) and y (3 n,) of a problem linearised at z: y = J c + e for cores c (36 d,), with e ~ N(0, I)."""
     prior = problem.prior
     plain = CorePrior(prior.mean, np.tile(np.eye(CORE_NUMBERS), (prior.joints, 1, 1)))
-    maps = problem.maps(z)
-    jacobian = whitened_jacobian(problem.weights, maps, plain) / np.repeat(problem.std, 3)[:, None]
+    jacobian = whitened_jacobian(problem.weights, problem.maps(z), plain) / np.repeat(problem.std, 3)[:, None]
     residuals = (problem.residuals(z) / problem.std[:, None]).ravel()
-    information = jacobian.T @ jacobian
-    return information, jacobian.T @ residuals + information @ prior.cores(z).ravel()
+    return jacobian, residuals + jacobian @ prior.cores(z).ravel()
 
 
-def likely_ellipse_std(family: CoreFamily, information: FloatArray, pull: FloatArray) -> float:
-    """The most probable of `ELLIPSE_STDS`, for what pairs tell of the cores c (36 d,), linearised at a fit to them.
+def likely_ellipse_std(family: CoreFamily, jacobian: FloatArray, positions: FloatArray) -> float:
+    """The most probable of `ELLIPSE_STDS`, for what pairs tell of the cores, linearised at a fit to them.
 
-    With c = m + S z, z ~ N(0, I) and the pairs' log likelihood -½ (cᵀ H c - 2 hᵀ c), z marginalised,
+    With c = m + S z, z ~ N(0, I), y - J m = r and z marginalised,
 
-        2 log p = (h - H m)ᵀ S (I + Sᵀ H S)⁻¹ Sᵀ (h - H m) - log |I + Sᵀ H S| + terms without S.
+        2 log p = - rᵀ (I + J S Sᵀ Jᵀ)⁻¹ r - log |I + J S Sᵀ Jᵀ| + terms without S,
+
+    or, where there are fewer cores' numbers than coordinates,
+
+        2 log p = rᵀ J S (I + Sᵀ Jᵀ J S)⁻¹ Sᵀ Jᵀ r - log |I + Sᵀ Jᵀ J S| + terms without S.
 
     Args:
-        information, pull: H (36 d, 36 d) and h (36 d,).
+        jacobian, positions: J (3 n, 36 d) and y (3 n,) of `core_equations`.
     """
-    slope = pull - information @ family.mean.ravel()
+    residuals = positions - jacobian @ family.mean.ravel()
+    few = len(jacobian) < jacobian.shape[1]
+    evidences = _by_coordinates(family, jacobian, residuals) if few else _by_cores(family, jacobian, residuals)
     scores = [
-        _evidence(family.prior(std), information, slope) - 0.5 * (math.log(std / USUAL_ELLIPSE_STD) / _DECADE) ** 2
-        for std in ELLIPSE_STDS
+        evidence - 0.5 * (math.log(std / USUAL_ELLIPSE_STD) / _DECADE) ** 2
+        for std, evidence in zip(ELLIPSE_STDS, evidences, strict=True)
     ]
     return ELLIPSE_STDS[int(np.argmax(scores))]
 
 
-def _evidence(prior: CorePrior, information: FloatArray, slope: FloatArray) -> float:
-    joints = prior.joints
-    blocks = information.reshape(joints, CORE_NUMBERS, joints, CORE_NUMBERS)
-    whitened = np.einsum("aij,aibk,bkl->ajbl", prior.spread, blocks, prior.spread, optimize=True)
-    matrix = np.asfortranarray(whitened.reshape(information.shape) + np.eye(len(information)))
-    pull = (prior.spread.swapaxes(1, 2) @ slope.reshape(joints, CORE_NUMBERS, 1)).ravel()
-    factor, positive = lapack.cholesky_lower(matrix)
+def _by_coordinates(family: CoreFamily, jacobian: FloatArray, residuals: FloatArray) -> list[float]:
+    """Log evidence of each of `ELLIPSE_STDS`; S Sᵀ is what rigid motions do, and the square of each times the rest."""
+    joints = len(family.mean)
+    blocks = jacobian.reshape(-1, joints, CORE_NUMBERS).swapaxes(0, 1)
+    moved = (blocks @ family.motions).swapaxes(0, 1).reshape(len(jacobian), -1)
+    own = jacobian * np.tile(family.sizes, joints)
+    rigid, rest = np.eye(len(jacobian)) + moved @ moved.T, own @ own.T
+    evidences: list[float] = []
+    for std in ELLIPSE_STDS:
+        square, log_determinant = _inverse_square(rigid + std**2 * rest, residuals)
+        evidences.append(-0.5 * (square + log_determinant))
+    return evidences
+
+
+def _by_cores(family: CoreFamily, jacobian: FloatArray, residuals: FloatArray) -> list[float]:
+    """Log evidence of each of `ELLIPSE_STDS`."""
+    joints, size = len(family.mean), jacobian.shape[1]
+    blocks = (jacobian.T @ jacobian).reshape(joints, CORE_NUMBERS, joints, CORE_NUMBERS)
+    slope = (jacobian.T @ residuals).reshape(joints, CORE_NUMBERS, 1)
+    evidences: list[float] = []
+    for std in ELLIPSE_STDS:
+        spread = family.prior(std).spread
+        whitened = np.einsum("aij,aibk,bkl->ajbl", spread, blocks, spread, optimize=True).reshape(size, size)
+        pull = (spread.swapaxes(1, 2) @ slope).ravel()
+        square, log_determinant = _inverse_square(whitened + np.eye(size), pull)
+        evidences.append(0.5 * (square - log_determinant))
+    return evidences
+
+
+def _inverse_square(matrix: FloatArray, vector: FloatArray) -> tuple[float, float]:
+    """vᵀ M⁻¹ v and log |M|, which is infinite where M is not positive definite up to rounding."""
+    factor, positive = lapack.cholesky_lower(np.asfortranarray(matrix))
     if not positive:
-        return -math.inf
-    return 0.5 * float(pull @ lapack.cholesky_solve(factor, pull)) - float(np.log(np.diag(factor)).sum())
+        return 0.0, math.inf
+    return float(vector @ lapack.cholesky_solve(factor, vector)), 2.0 * float(np.log(np.diag(factor)).sum())

@@ -9,7 +9,7 @@ import numpy as np
 
 from kbmaps.arrays import FloatArray, frozen
 from kbmaps.chains.chain import RigidChain, cross_matrix
-from kbmaps.errors import SettingError, ShapeError
+from kbmaps.errors import NonFiniteError, SettingError, ShapeError
 from kbmaps.maps.basis import JointBasis
 from kbmaps.trains.train import TensorTrain
 
@@ -36,6 +36,9 @@ class CorePrior:
             raise ShapeError("mean", f"(d, {CORE_NUMBERS})", mean.shape)
         if spread.shape != (len(mean), CORE_NUMBERS, CORE_NUMBERS):
             raise ShapeError("spread", f"({len(mean)}, {CORE_NUMBERS}, {CORE_NUMBERS})", spread.shape)
+        for name, array in (("mean", mean), ("spread", spread)):
+            if not np.isfinite(array).all():
+                raise NonFiniteError(name)
         object.__setattr__(self, "mean", mean)
         object.__setattr__(self, "spread", spread)
 
@@ -117,6 +120,9 @@ class CoreFamily:
             raise ShapeError("mean", f"(d, {CORE_NUMBERS})", mean.shape)
         if motions.ndim != 3 or motions.shape[:2] != mean.shape:
             raise ShapeError("motions", f"({len(mean)}, {CORE_NUMBERS}, m)", motions.shape)
+        for name, array in (("mean", mean), ("motions", motions)):
+            if not np.isfinite(array).all():
+                raise NonFiniteError(name)
         object.__setattr__(self, "mean", mean)
         object.__setattr__(self, "motions", motions)
 
@@ -149,6 +155,11 @@ class CoreFamily:
             motions[k, :, : len(directions)] = np.column_stack(directions)
         return cls(train.cores.reshape(chain.joints, CORE_NUMBERS), motions, length)
 
+    @property
+    def sizes(self) -> FloatArray:
+        """What each number of a core is measured by (36,): 1, or for translations `length`."""
+        return np.tile([1.0, 1.0, 1.0, self.length], 9)
+
     def prior(self, ellipse_std: float) -> CorePrior:
         """The prior whose cores have `ellipse_std` of their own in each number, times `length` in translations.
 
@@ -157,8 +168,7 @@ class CoreFamily:
         """
         if not ellipse_std > 0.0:
             raise SettingError(f"ellipse_std must be greater than 0, got {ellipse_std!r}")
-        sizes = ellipse_std * np.tile([1.0, 1.0, 1.0, self.length], 9)
-        covariances = self.motions @ self.motions.swapaxes(1, 2) + np.diag(np.square(sizes))
+        covariances = self.motions @ self.motions.swapaxes(1, 2) + np.diag(np.square(ellipse_std * self.sizes))
         spread: FloatArray = np.linalg.cholesky(covariances).astype(np.float64, copy=False)
         return CorePrior(self.mean, spread)
 

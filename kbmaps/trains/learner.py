@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import fields
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from typing import Any, Self
 
 import numpy as np
@@ -12,22 +12,24 @@ from numpy.typing import ArrayLike
 
 from kbmaps.arrays import BoolArray, FloatArray, rows, rows_or_vector, vector
 from kbmaps.chains.chain import RigidChain
-from kbmaps.errors import DegenerateDataError, KBMapsError, ModelFormatError, SettingError, ShapeError
+from kbmaps.errors import DegenerateDataError, ModelFormatError, SettingError, ShapeError
 from kbmaps.maps.basis import JointBasis
 from kbmaps.maps.packed import describe_bases, parse_bases
 from kbmaps.maps.stack import BasisStack
 from kbmaps.model import Estimate
-from kbmaps.packed import named, pack, unpack
-from kbmaps.pairs import checked_pairs
-from kbmaps.trains.core_evidence import USUAL_ELLIPSE_STD, core_information, likely_ellipse_std
+from kbmaps.packed import complete, count, flag, named, number, pack, restoring, unpack
+from kbmaps.pairs import checked_pairs, stored_pairs
+from kbmaps.trains.core_evidence import USUAL_ELLIPSE_STD, core_equations, likely_ellipse_std
 from kbmaps.trains.core_prior import CORE_NUMBERS, CoreFamily, CorePrior
 from kbmaps.trains.misfit import misfit_sizes
 from kbmaps.trains.posterior import TensorPosterior
 from kbmaps.trains.search import PLAUSIBLE, Fit, Pairs, information, refine, search
-from kbmaps.trains.settings import TensorSettings
+from kbmaps.trains.settings import TensorSettings, parse_settings
 from kbmaps.trains.train import TensorTrain
 
-KIND = "tensor learner"
+KIND = "tensor learner, 2"
+_FIELDS = ("bases", "settings", "pairs", "waiting", "searches", "length")
+_FITTED = ("z", "sure", "used", "information", "absorbed")
 # Relative to the residuals under the prior: the noise that the first fit around a prior starts with.
 _FIRST_NOISE = 0.1
 # A refit that leaves this many times the noise of the fit before has lost its way and is searched anew.
@@ -296,8 +298,9 @@ class TensorLearner:
             arrays |= {"absorbed": self._posterior.absorbed}
         content = {
             "bases": describe_bases(self.bases),
-            "settings": [getattr(self.settings, name) for name in _SETTINGS],
-            "counts": [self._pairs, self._waiting],
+            "settings": asdict(self.settings),
+            "pairs": self._pairs,
+            "waiting": self._waiting,
             "searches": self._searches,
             "length": 0.0 if self._family is None else self._family.length,
         }
@@ -311,39 +314,43 @@ class TensorLearner:
             ModelFormatError: the bytes are damaged, truncated, or something else.
         """
         content, arrays = unpack(data, KIND)
-        named(content, "the fields", ("bases", "settings", "counts", "searches", "length"))
-        try:
+        with restoring("a tensor learner"):
+            named(content, "the fields", _FIELDS)
+            complete(arrays, ("q", "x", "sigma"), ("mean", "spread"), ("family_mean", "motions"), _FITTED)
             return cls._restored(content, arrays)
-        except ModelFormatError:
-            raise
-        except (KBMapsError, KeyError, TypeError, ValueError) as error:
-            raise ModelFormatError(f"the parts of the stored learner do not fit each other: {error}") from error
 
     @classmethod
     def _restored(cls, content: dict[str, Any], arrays: dict[str, FloatArray]) -> Self:
-        values = dict(zip(_SETTINGS, content["settings"], strict=True))
         prior = CorePrior(arrays["mean"], arrays["spread"]) if "mean" in arrays else None
-        learner = cls(parse_bases(content["bases"]), prior, TensorSettings(**values))
-        learner._q = rows("q", arrays["q"], learner.joints)
-        learner._x = rows("x", arrays["x"], 3)
-        learner._sigma = arrays["sigma"]
-        if not len(learner._q) == len(learner._x) == len(learner._sigma) or learner._sigma.ndim != 1:
-            raise ModelFormatError("the stored learner's pairs are of different numbers")
-        learner._pairs, learner._waiting = (int(number) for number in content["counts"])
-        learner._searches = bool(content["searches"])
+        learner = cls(parse_bases(content["bases"]), prior, parse_settings(content["settings"]))
+        learner._q, learner._x, learner._sigma = stored_pairs(arrays, learner.joints)
+        learner._pairs, learner._waiting = count(content["pairs"], "pairs"), count(content["waiting"], "waiting")
+        if not learner._waiting <= learner.kept <= learner._pairs:
+            raise ModelFormatError(f"of {learner._pairs} pairs {learner.kept} are kept and {learner._waiting} wait")
+        learner._searches = flag(content["searches"], "the field searches")
+        if prior is None and not (learner._searches and set(arrays) == {"q", "x", "sigma"}):
+            raise ModelFormatError("a learner that has no prior yet cannot have fitted, and has to search")
         if prior is not None and "z" in arrays:
-            size = CORE_NUMBERS * learner.joints
-            z = vector("z", arrays["z"], size)
-            noise, *misfit = (float(number) for number in vector("sure", arrays["sure"], 4))
-            learner._fit = Fit(z, noise, arrays["used"].astype(np.bool_))
-            learner._train = TensorTrain(learner.bases, prior.cores(z))
-            known = rows("information", arrays["information"], size)
-            learner._posterior = TensorPosterior(learner._train, prior, known, noise=noise)
-            absorbed = rows("absorbed", arrays["absorbed"], sum(misfit_sizes(learner.joints)))
-            learner._posterior.take(np.array(misfit), absorbed)
+            learner._restore_fit(prior, arrays)
         if "motions" in arrays:
-            learner._family = CoreFamily(arrays["family_mean"], arrays["motions"], float(content["length"]))
+            length = number(content["length"], "the field length")
+            learner._family = CoreFamily(arrays["family_mean"], arrays["motions"], length)
+            _of_rows("family_mean", arrays["family_mean"], learner.joints, CORE_NUMBERS)
         return learner
+
+    def _restore_fit(self, prior: CorePrior, arrays: Mapping[str, FloatArray]) -> None:
+        size = CORE_NUMBERS * self.joints
+        z, used = vector("z", arrays["z"], size), arrays["used"]
+        noise, *misfit = (float(value) for value in vector("sure", arrays["sure"], 4))
+        if used.ndim != 1 or not np.isin(used, (0.0, 1.0)).all() or not noise > 0.0:
+            raise ModelFormatError("it is not said which pairs a fit used, or it has no noise")
+        self._fit = Fit(z, noise, used.astype(np.bool_))
+        self._train = TensorTrain(self.bases, prior.cores(z))
+        known = _of_rows("information", arrays["information"], size, size)
+        self._posterior = TensorPosterior(self._train, prior, known, noise=noise)
+        self._posterior.take(
+            np.array(misfit), _of_rows("absorbed", arrays["absorbed"], size, sum(misfit_sizes(self.joints)))
+        )
 
     def _keep(self, count: int) -> None:
         begin = max(len(self._q) - count, 0)
@@ -361,7 +368,7 @@ class TensorLearner:
             return fit
         prior = self._known_prior()
         problem = data.chosen(fit.used).problem(prior, fit.noise)
-        std = likely_ellipse_std(self._family, *core_information(problem, fit.z))
+        std = likely_ellipse_std(self._family, *core_equations(problem, fit.z))
         self._prior = self._family.prior(std)
         if np.array_equal(self._prior.spread, prior.spread):
             return fit
@@ -388,4 +395,8 @@ class TensorLearner:
         return fit
 
 
-_SETTINGS = tuple(field.name for field in fields(TensorSettings))
+def _of_rows(name: str, values: FloatArray, length: int, width: int) -> FloatArray:
+    """Finite `values` of shape (length, width). Raises ShapeError, NonFiniteError."""
+    if len(values) != length:
+        raise ShapeError(name, f"({length}, {width})", values.shape)
+    return rows(name, values, width)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -34,27 +36,50 @@ class TensorPosterior:
     ) -> None:
         self._train, self._prior, self.information = train, prior, information
         self._stack = BasisStack(train.bases)
-        size = CORE_NUMBERS * prior.joints
-        self._root = np.eye(size) if information is None else inverse_roots(information)
         self.noise = noise
         self._sizes = misfit_sizes(prior.joints)
-        self.misfit, self.absorbed = np.zeros(len(self._sizes)), np.zeros((size, sum(self._sizes)))
+        size = CORE_NUMBERS * prior.joints
+        self._left: tuple[FloatArray, FloatArray, FloatArray] | None = None
+        self._misfit, self._absorbed = np.zeros(len(self._sizes)), np.zeros((size, sum(self._sizes)))
 
     def judge(self, q: FloatArray, residuals: FloatArray, std: FloatArray) -> None:
-        """Finds what the train does not follow from what it leaves of its pairs.
+        """Finds what the train does not follow from what it leaves of its pairs; once somebody asks.
 
         Args:
             q: configurations (n, d) of the pairs that the fit used; residuals: (n, 3) [m] there.
             std: of a coordinate of each (n,) [m], as in `information`.
         """
+        self._left = q, residuals, std
+
+    @property
+    def misfit(self) -> FloatArray:
+        """Standard deviations (3,) [rad, m] of errors that no train follows; 0 where the pairs speak for none."""
+        self._judge_what_is_left()
+        return self._misfit
+
+    @property
+    def absorbed(self) -> FloatArray:
+        """How the cores make up for such errors (36 d, 5 d + 18)."""
+        self._judge_what_is_left()
+        return self._absorbed
+
+    def _judge_what_is_left(self) -> None:
+        if self._left is None:
+            return
+        q, residuals, std = self._left
         scale = np.repeat(std, 3)[:, None]
         directions = misfit_directions(self._train, q).reshape(len(scale), -1) / scale
         absorbed = (self._linear_roots(q).reshape(len(scale), -1) / scale).T @ directions
         self.take(likely_misfit(directions, absorbed, residuals.ravel() / scale[:, 0], self._sizes), absorbed)
 
     def take(self, misfit: FloatArray, absorbed: FloatArray) -> None:
-        """Standard deviations (3,) [rad, m] of the errors, and how the cores make up for them (36 d, 5 d + 18)."""
-        self.misfit, self.absorbed = misfit, absorbed
+        """The standard deviations (3,) [rad, m], and how the cores make up for the errors (36 d, 5 d + 18)."""
+        self._misfit, self._absorbed, self._left = misfit, absorbed, None
+
+    @cached_property
+    def _root(self) -> FloatArray:
+        """A root of the cores' covariance (36 d, 36 d)."""
+        return np.eye(CORE_NUMBERS * self.joints) if self.information is None else inverse_roots(self.information)
 
     @property
     def joints(self) -> int:

@@ -219,14 +219,15 @@ def _noise(pairs: Pairs, problem: TensorProblem, z: FloatArray) -> float:
 def _distances(pairs: Pairs, prior: CorePrior, fit: Fit) -> tuple[FloatArray, bool]:
     """Residuals' lengths (n,) in robust standard deviations, and whether these mean anything.
 
-    Where every sigma is given the unit is the larger of it and what the median says.
+    The unit is what the median says; where every sigma is told, no less than that.
     """
     problem = pairs.problem(prior, fit.noise)
     freedom = 1.0 - effective_parameters(problem, fit.z) / (3.0 * len(pairs.x))
     lengths = np.linalg.norm(problem.residuals(fit.z), axis=1) / problem.std
     unit = float(np.median(lengths)) / (_MEDIAN_DISTANCE * math.sqrt(max(freedom, _LEAST_FREEDOM)))
     rounding = fit.noise <= 2.0 * pairs.noise_floor
-    return lengths / max(unit, 1e-300), freedom >= _LEAST_FREEDOM and not rounding
+    least = pairs.noise_floor / fit.noise if pairs.unknown.any() else 1.0
+    return lengths / max(unit, least), freedom >= _LEAST_FREEDOM and not rounding
 
 
 def _good(pairs: Pairs, prior: CorePrior, fit: Fit) -> BoolArray:

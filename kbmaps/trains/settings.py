@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from typing import Any
 
 from kbmaps.errors import SettingError
+from kbmaps.packed import count, flag, named
 
 
 @dataclass(frozen=True)
@@ -36,3 +38,11 @@ class TensorSettings:
                 raise SettingError(f"{name} must be at least 1, got {value}")
         if self.seed < 0:
             raise SettingError(f"seed must be at least 0, got {self.seed}")
+
+
+def parse_settings(value: Any) -> TensorSettings:
+    """The settings that `dataclasses.asdict` gave. Raises ModelFormatError, SettingError."""
+    stored = named(value, "the settings", [field.name for field in fields(TensorSettings)])
+    whole = {name: count(stored[name], f"the setting {name}") for name in ("refit_every", "starts", "seed")}
+    window = None if stored["window"] is None else count(stored["window"], "the setting window")
+    return TensorSettings(window, robust=flag(stored["robust"], "the setting robust"), **whole)

@@ -10,12 +10,12 @@ from numpy.typing import ArrayLike
 
 from kbmaps.arrays import FloatArray, frozen, rows_or_vector
 from kbmaps.chains.chain import RigidChain
-from kbmaps.errors import BasisError, ModelFormatError, NonFiniteError, ShapeError
+from kbmaps.errors import BasisError, NonFiniteError, ShapeError
 from kbmaps.maps.basis import JointBasis
 from kbmaps.maps.kbmap import KBMap
 from kbmaps.maps.packed import describe_bases, parse_bases
 from kbmaps.maps.stack import BasisStack
-from kbmaps.packed import named, pack, unpack
+from kbmaps.packed import complete, named, pack, restoring, unpack
 
 KIND = "tensor train"
 
@@ -161,16 +161,9 @@ class TensorTrain:
             ModelFormatError: the bytes are damaged, truncated, or something else.
         """
         fields, arrays = unpack(data, KIND)
-        bases = parse_bases(named(fields, "the fields", ("bases",))["bases"])
-        return restored(bases, named(arrays, "the arrays", ("cores",))["cores"])
-
-
-def restored(bases: tuple[JointBasis, ...], cores: FloatArray) -> TensorTrain:
-    """A train out of stored parts. Raises ModelFormatError where they do not fit each other."""
-    try:
-        return TensorTrain(bases, cores)
-    except (ShapeError, NonFiniteError, BasisError) as error:
-        raise ModelFormatError(f"the stored cores are no tensor train: {error}") from error
+        with restoring("a tensor train"):
+            complete(arrays, ("cores",))
+            return cls(parse_bases(named(fields, "the fields", ("bases",))["bases"]), arrays["cores"])
 
 
 def apply(maps: FloatArray, points: FloatArray) -> FloatArray:

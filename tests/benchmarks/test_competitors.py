@@ -137,10 +137,11 @@ def test_a_body_schemas_step_goes_down_the_squared_error():
     problem = simple_problem()
     assert problem.drawing is not None
     schema = BodySchema.drawn(problem.drawing)
-    for q, x in zip(problem.q[:20], problem.x[:20], strict=True):
-        before = np.linalg.norm(schema.predict(q[None])[0] - x)
-        schema.step(q, x, 0.1)
-        assert np.linalg.norm(schema.predict(q[None])[0] - x) < before
+    for pair in range(20):
+        q, x = problem.q[pair : pair + 1], problem.x[pair : pair + 1]
+        before = np.linalg.norm(schema.predict(q) - x)
+        schema.learn(problem.q, problem.x, np.array([pair]), np.array([0.1]))
+        assert np.linalg.norm(schema.predict(q) - x) < before
 
 
 def test_lagrange_weights_reproduce_polynomials_of_their_degree():

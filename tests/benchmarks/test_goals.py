@@ -147,23 +147,6 @@ def test_a_row_stands_as_its_worst_figure(errors, standing):
     assert shown.splitlines()[2].endswith(f"| {standing} |")
 
 
-def test_a_row_that_waits_is_not_judged():
-    shown = table([Row("some", "something", (a_figure(),), waiting="the other half")], values(1.0))
-    assert "waiting for the other half" in shown
-    assert Verdict.MET.value not in shown.splitlines()[3]
-
-
-def test_the_row_of_the_ladder_waits_until_the_ladder_is_among_the_models(monkeypatch):
-    def row() -> Row:
-        return next(row for row in registry.rows(None) if row.name == "ladder")
-
-    without = {name: make for name, make in not_rigid.MODELS.items() if name != not_rigid.ANSWER}
-    monkeypatch.setattr(not_rigid, "MODELS", without)
-    assert row().waiting
-    monkeypatch.setattr(not_rigid, "MODELS", without | {not_rigid.ANSWER: without["rigid"]})
-    assert not row().waiting
-
-
 def test_the_ladder_is_held_against_the_best_single_model_of_each_truth(monkeypatch):
     models = {"rigid": None, "residual": None, not_rigid.ANSWER: None}
     monkeypatch.setattr(not_rigid, "MODELS", models)

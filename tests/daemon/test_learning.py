@@ -285,6 +285,14 @@ def test_the_prior_answers_while_there_are_few_pairs() -> None:
     assert learning.snapshot.answering == "prior"
 
 
+def test_pairs_that_all_came_before_the_first_solution_can_show_that_it_shall_answer() -> None:
+    learning = new_learning()
+    teach(learning, Scene.draw(0, 60).pairs, background=False)
+    while learning.work():
+        pass
+    assert learning.snapshot.answering in SOLVED
+
+
 def test_a_solution_answers_in_the_end() -> None:
     learning = new_learning()
     teach(learning, Scene.draw(0, 200).pairs)

@@ -46,3 +46,29 @@ def test_while_pairs_are_few_the_misfit_with_the_last_tool_counts() -> None:
     few = misfit(np.zeros((2, 3)), np.full(3, 1e-6), before, neighbours=True)
     many = misfit(np.zeros((50, 3)), np.full(3, 1e-6), before, neighbours=True)
     np.testing.assert_allclose([few, many], [np.sqrt(0.8) * before, NONE])
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_what_the_solutions_own_numbers_took_from_the_errors_is_given_back(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    rows, numbers = 100, 50
+    basis, _ = np.linalg.qr(rng.normal(size=(rows, numbers)))
+    missed = rng.normal(0.0, 0.003, (rows, 3))
+    errors = missed - basis @ (basis.T @ missed)
+    scatter = float(np.sqrt(np.square(errors).sum() / (3 * (rows - numbers))))
+    found = misfit(errors, np.full(3, 1e-8), NONE, neighbours=False, scatter=scatter)
+    np.testing.assert_allclose(np.sqrt(np.square(found).mean()), 0.003, rtol=0.2)
+
+
+@pytest.mark.parametrize("neighbours", [True, False])
+def test_an_outlier_that_the_fit_left_out_is_no_misfit(neighbours: bool) -> None:
+    errors = np.random.default_rng(0).normal(0.0, 0.002, (100, 3))
+    errors[50] = 0.05
+    found = misfit(errors, np.full(3, 0.002**2), NONE, neighbours=neighbours, scatter=0.002)
+    np.testing.assert_array_equal(found, NONE)
+
+
+def test_a_fit_that_most_pairs_contradict_leaves_none_of_them_out() -> None:
+    errors = np.random.default_rng(0).normal(0.0, 0.003, (100, 3))
+    found = misfit(errors, np.full(3, 1e-8), NONE, neighbours=False, scatter=1e-5)
+    np.testing.assert_allclose(found, 0.003, rtol=0.2)

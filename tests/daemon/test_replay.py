@@ -4,6 +4,7 @@ import json
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import msgspec
@@ -12,9 +13,10 @@ import pytest
 from small_arm import JOINTS, write_small_arm
 
 from daemon.cli import app
-from daemon.config import DaemonConfig
-from daemon.evaluate import EvaluationError
+from daemon.config import Config, DaemonConfig
+from daemon.evaluate import EvaluationError, split_blocks
 from daemon.replay.report import Figures, ReplayReport, as_text
+from daemon.replay.run import Job
 from daemon.replay.steps import Steps, require_path
 from interfaces.errors import ConfigError, RecordingError
 from interfaces.recording import Recording
@@ -82,6 +84,21 @@ def test_single_poses_are_refused_before_anything_starts(tmp_path: Path, robot: 
     with pytest.raises(RecordingError, match="--any-step"):
         replay(tmp_path / "a.csv", "--keep", tmp_path / "kept")
     assert not (tmp_path / "kept").exists()
+
+
+def job(folder: Path, recording: Recording, sigma_m: float | None) -> Job:
+    split = split_blocks(len(recording), 0.3)
+    return Job(Config.load(write_small_arm(folder)), recording, split, None, sigma_m, any_step=True, folder=folder)
+
+
+def test_noise_that_only_the_command_states_counts_in_the_judgement(tmp_path: Path) -> None:
+    assert job(tmp_path, poses(), 3e-5).noise_m == 3e-5
+    assert job(tmp_path, poses(), None).noise_m == 0.0
+
+
+def test_noise_that_the_recording_states_goes_before_that_of_the_command(tmp_path: Path) -> None:
+    recording = replace(poses(), cov=np.tile(4e-6 * np.eye(3), (40, 1, 1)))
+    np.testing.assert_allclose(job(tmp_path, recording, 3e-5).noise_m, np.full((12, 3), 2e-3))
 
 
 def test_a_share_that_leaves_nothing_is_refused(tmp_path: Path, robot: Path) -> None:

@@ -81,6 +81,12 @@ def test_a_restored_learner_answers_with_it_bit_by_bit(arm: SaggingArm, taught: 
     np.testing.assert_allclose(one.sigma, other.sigma, rtol=1e-9)
 
 
+def test_a_restored_learner_publishes_the_same_map(taught: Learning) -> None:
+    restored = new_learning()
+    restored.restore(taught.state())
+    assert restored.snapshot.require_map().digest == taught.snapshot.require_map().digest
+
+
 def test_what_the_arm_yields_stays_known_with_another_tool(arm: SaggingArm, taught: Learning) -> None:
     learning = new_learning()
     learning.restore(taught.state())

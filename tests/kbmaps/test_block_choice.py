@@ -66,6 +66,12 @@ def test_poses_chosen_at_random_are_no_path(seed: int) -> None:
     assert not follow_a_path(prior, np.random.default_rng(seed).uniform(-1.5, 1.5, (100, JOINTS)))
 
 
+@pytest.mark.parametrize("seed", SEEDS)
+def test_a_sweep_in_steps_of_25_degrees_is_no_path(seed: int) -> None:
+    prior = wrong_prior(random_chain(np.random.default_rng(seed), "R" * JOINTS))
+    assert not follow_a_path(prior, 12.5 * path(np.random.default_rng(seed), 100))
+
+
 def test_one_pair_is_no_path() -> None:
     prior = wrong_prior(random_chain(np.random.default_rng(0), "R" * JOINTS))
     assert not follow_a_path(prior, np.zeros((1, JOINTS)))

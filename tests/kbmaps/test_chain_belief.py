@@ -114,3 +114,22 @@ def test_a_belief_that_is_not_finite_is_refused():
     parameters = ChainParameters(rough_arm(np.random.default_rng(11)).nominal)
     with pytest.raises(NonFiniteError, match="root"):
         ChainBelief(parameters, np.zeros(parameters.size), np.full((parameters.size, 1), np.nan))
+
+
+@pytest.mark.parametrize("told", [None, 0.002])
+def test_a_belief_knows_how_far_the_pairs_lay_around_the_chain(told):
+    rng = np.random.default_rng(3)
+    arm = rough_arm(rng)
+    learner = RigidLearner(arm.nominal, ROUGH)
+    learner.learn(*arm.pairs(rng, 200, 0.005), told)
+    assert learner.belief.noise == pytest.approx(0.005, rel=0.1)
+
+
+def test_what_a_belief_knows_of_the_noise_survives_as_bytes_and_another_tool():
+    rng = np.random.default_rng(4)
+    arm = rough_arm(rng)
+    learner = RigidLearner(arm.nominal, ROUGH)
+    learner.learn(*arm.pairs(rng, 50, 0.005))
+    noise = learner.belief.noise
+    assert ChainBelief.from_bytes(learner.belief.to_bytes()).noise == noise
+    assert learner.belief.with_other_tool(0.2).noise == noise

@@ -5,6 +5,7 @@ import pytest
 from planted_chains import random_chain, random_q
 
 from kbmaps import ChainTolerances, DegenerateDataError, RigidLearner, SettingError, ShapeError, find_chain
+from kbmaps.chains.descents import Descents, ScrewArms
 
 
 @pytest.mark.parametrize("kinds", ["RRRRRRR", "RRRRRR", "RRPRR"])
@@ -32,6 +33,23 @@ def test_a_found_chain_is_the_start_of_a_learner_without_a_prior():
     learner.learn(q, x, 0.01)
     test = random_q(rng, "RRRRRR", 300, 80)
     assert np.linalg.norm(learner.predict(test) - chain.positions(test), axis=1).mean() < 0.0045
+
+
+@pytest.mark.parametrize("kinds", ["RRRR", "RPRR"])
+def test_a_descent_ends_in_the_same_place_alone_and_among_others(kinds):
+    rng = np.random.default_rng(3)
+    chain, slides = random_chain(rng, kinds), np.array([kind == "P" for kind in kinds])
+    q = random_q(rng, kinds, 30, 80)
+    x = chain.positions(q) + 0.01 * rng.normal(size=(30, 3))
+    axes = rng.normal(size=(3, 4, 3))
+    starts = ScrewArms(axes / np.linalg.norm(axes, axis=2, keepdims=True), x.mean(axis=0) + rng.normal(size=(3, 5, 3)))
+    descents = Descents(q, x, slides, 0.3)
+    together, rms = descents.run(starts, 0.0)
+    for index in range(3):
+        _, own = descents.run(starts[np.array([index])], 0.0)
+        np.testing.assert_allclose(rms[index], own[0], rtol=1e-6)
+        off = together.chain(index, slides).positions(q) - x
+        np.testing.assert_allclose(rms[index], np.sqrt(np.square(off).sum(axis=1).mean()), rtol=1e-9)
 
 
 def test_the_same_generator_finds_the_same_chain():

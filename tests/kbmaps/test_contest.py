@@ -33,6 +33,10 @@ def test_a_model_that_is_clearly_better_answers_though_it_is_less_trusted():
     assert contest(0.01, 0.001, 50).best(TRUSTED, "none") == "bent"
 
 
+def test_without_noise_an_exact_model_answers():
+    assert contest(0.01, 0.0, 50, noise=0.0).best(TRUSTED, "none") == "bent"
+
+
 def test_a_small_difference_is_seen_below_a_noise_that_both_meet():
     chosen = [contest(0.003, 0.001, 400, noise=0.005, seed=seed).best(TRUSTED, "none") for seed in range(20)]
     assert chosen.count("bent") >= 18

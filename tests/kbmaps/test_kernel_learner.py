@@ -267,6 +267,22 @@ def test_a_prior_that_does_not_travel_is_asked_for():
     np.testing.assert_array_equal(KernelLearner.from_bytes(data, behind).predict(q), learner.predict(q))
 
 
+def test_a_prior_that_is_off_by_a_micrometre_is_another_one():
+    class Placed:
+        joints = 2
+
+        def __init__(self, x):
+            self.x = x
+
+        def predict(self, q):
+            return np.broadcast_to([self.x, 0.0, 0.0], (*np.shape(q)[:-1], 3))
+
+    learner = KernelLearner(bases_for("RR"), Placed(1.0))
+    learner.learn(*noisy_pairs(np.random.default_rng(10), "RR", 6))
+    with pytest.raises(ModelFormatError, match="otherwise"):
+        KernelLearner.from_bytes(learner.to_bytes(), Placed(1.000001))
+
+
 @given(where=st.integers(0, 2000), bit=st.integers(0, 7))
 @settings(max_examples=40, deadline=None)
 def test_damaged_bytes_are_refused(where, bit):

@@ -9,6 +9,7 @@ from planted_chains import bases_for
 from rough_arms import ROUGH, Arm, rough_arm
 
 from kbmaps import (
+    DegenerateDataError,
     Estimate,
     KernelLearner,
     Ladder,
@@ -17,6 +18,7 @@ from kbmaps import (
     RigidLearner,
     Rung,
     SettingError,
+    TensorLearner,
 )
 
 KINDS = "RRR"
@@ -28,14 +30,23 @@ class Scripted:
 
     joints = 3
 
-    def __init__(self, says: Callable[[np.ndarray], np.ndarray], breaks_at: float = math.inf) -> None:
+    def __init__(
+        self,
+        says: Callable[[np.ndarray], np.ndarray],
+        breaks_at: float = math.inf,
+        mends_at: float = math.inf,
+        error: Exception | None = None,
+    ) -> None:
         self.pairs = 0
-        self.says, self.breaks_at = says, breaks_at
+        self.says, self.breaks_at, self.mends_at = says, breaks_at, mends_at
+        self.error = error or FloatingPointError("overflow")
+        self.seen: list[np.ndarray] = []
 
     def learn(self, q, x, sigma=None):
         self.pairs += len(np.atleast_2d(q))
-        if self.pairs >= self.breaks_at:
-            raise FloatingPointError("overflow")
+        self.seen.extend(np.atleast_2d(q))
+        if self.breaks_at <= self.pairs < self.mends_at:
+            raise self.error
 
     def predict(self, q):
         return self.says(np.atleast_2d(q)) if np.ndim(q) == 2 else self.says(np.atleast_2d(q))[0]
@@ -93,6 +104,70 @@ def test_a_model_that_breaks_is_out_and_says_why(arm):
     held = ladder(arm, Scripted(arm.real.positions, breaks_at=20))
     held.learn(*arm.pairs(np.random.default_rng(5), 60, 0.005))
     assert (held.answering, held.failures) == ("rigid", {"other": "overflow"})
+
+
+def test_a_model_that_broke_is_back_when_it_can_digest_the_pairs(arm):
+    other = Scripted(lambda q: bent(arm, q), breaks_at=20, mends_at=40)
+    held = ladder(arm, other)
+    rng = np.random.default_rng(11)
+    q, _ = arm.pairs(rng, 120)
+    x = bent(arm, q) + 0.002 * rng.normal(size=(120, 3))
+    held.learn(q[:30], x[:30])
+    assert held.failures == {"other": "overflow"}
+    held.learn(q[30:], x[30:])
+    assert (held.answering, held.failures) == ("other", {})
+    np.testing.assert_array_equal(other.seen, q)
+
+
+def test_a_model_that_comes_back_with_nonsense_stays_out(arm):
+    other = Scripted(lambda q: np.full((len(q), 3), 0.0 if other.pairs < 20 else math.nan), breaks_at=20, mends_at=21)
+    held = ladder(arm, other)
+    held.learn(*arm.pairs(np.random.default_rng(12), 60, 0.005))
+    assert held.answering == "rigid"
+    assert "not finite" in held.failures["other"]
+
+
+def test_a_model_that_came_back_is_compared_by_what_it_predicts_since(arm):
+    """It was right before, and is wrong ever since."""
+    other = Scripted(lambda q: bent(arm, q) if other.pairs < 60 else np.zeros((len(q), 3)), breaks_at=50, mends_at=60)
+    held = ladder(arm, other)
+    for q in arm.pairs(np.random.default_rng(13), 90)[0]:
+        held.learn(q, bent(arm, q[None])[0])
+    assert held.failures == {}
+    assert held.answering == "rigid"
+    assert held.errors()["other"] > 0.1
+
+
+def test_a_model_without_prior_joins_in_when_it_has_pairs_enough(arm):
+    held = ladder(arm, TensorLearner(bases_for(KINDS)))
+    q, _ = arm.pairs(np.random.default_rng(14), 120)
+    held.learn(q[:10], bent(arm, q[:10]))
+    assert "needs" in held.failures["other"]
+    assert "other" not in held.errors()
+    held.learn(q[10:], bent(arm, q[10:]))
+    assert held.failures == {}
+    assert "other" in held.errors()
+
+
+def test_who_is_not_ready_leaves_the_answer_to_the_next(arm):
+    rigid = RigidLearner(arm.nominal, ROUGH)
+    held = Ladder({"tensor": Rung(TensorLearner(bases_for(KINDS))), "rigid": Rung(rigid)})
+    q, _ = arm.pairs(np.random.default_rng(15), 5)
+    assert held.answering == "rigid"
+    np.testing.assert_array_equal(held.predict(q), rigid.predict(q))
+
+
+def test_a_ladder_of_which_nobody_is_ready_says_so(arm):
+    held = Ladder({"tensor": Rung(TensorLearner(bases_for(KINDS)))})
+    held.learn(*arm.pairs(np.random.default_rng(16), 5))
+    with pytest.raises(DegenerateDataError, match="needs"):
+        held.predict(np.zeros(3))
+
+
+def test_a_mistake_in_a_model_s_code_is_seen(arm):
+    held = ladder(arm, Scripted(arm.real.positions, breaks_at=20, error=ValueError("shapes do not match")))
+    with pytest.raises(ValueError, match="shapes do not match"):
+        held.learn(*arm.pairs(np.random.default_rng(17), 60))
 
 
 def test_where_it_had_no_data_a_model_that_may_not_extrapolate_does_not_answer(arm):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 
 import numpy as np
@@ -14,6 +15,7 @@ from kbmaps import (
     ModelFormatError,
     NonFiniteError,
     ResidualLearner,
+    ResidualModel,
     RigidLearner,
     SettingError,
     ShapeError,
@@ -71,6 +73,49 @@ def test_a_rigid_arm_without_noise_is_learnt_as_a_rigid_chain_to_the_last_bit(ar
     rigid = RigidLearner(arm.nominal, ROUGH)
     rigid.learn(q, x)
     assert np.array_equal(taught(arm, q, x).predict(q), rigid.predict(q))
+
+
+@functools.cache
+def of_rigid_arms() -> list[tuple[ResidualLearner, float]]:
+    """Learners of rigid arms with noise, and how far they are from their rigid chain, over its sigma (RMS)."""
+    learners = []
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        arm = rough_arm(rng, "RRRR")
+        learner = taught(arm, *arm.pairs(rng, 60, SIGMA))
+        q, _ = arm.pairs(rng, 200)
+        moved, sigma = learner.predict(q) - learner.rigid.predict(q), learner.rigid.estimate(q).sigma
+        learners.append((learner, math.sqrt(np.square(moved).mean() / np.square(sigma).mean())))
+    return learners
+
+
+def test_where_noise_speaks_for_no_deviation_the_answer_is_the_rigid_chain_s_to_a_fraction_of_its_sigma():
+    shares = [share for learner, share in of_rigid_arms() if not learner.deviations]
+    assert len(shares) >= 8
+    assert max(shares) < 0.5
+
+
+def test_deviations_are_those_that_the_pairs_speak_for():
+    """Not those that are in the average with a small weight."""
+    averaged = [learner for learner, share in of_rigid_arms() if share > 0.0]
+    assert any(set(learner.model.weights) > set(learner.deviations) for learner in averaged)
+
+
+@pytest.mark.parametrize("told", [None, SIGMA])
+@pytest.mark.parametrize("pairs", [1, 4, 40])
+def test_what_is_known_of_a_rigid_chain_is_claimed_as_the_rigid_learner_does(arm, rng, pairs, told):
+    before = RigidLearner(arm.nominal, ROUGH)
+    before.learn(*arm.pairs(rng, 30), SIGMA)
+    belief = before.belief.with_other_tool(0.1)
+    learner = ResidualLearner(arm.nominal, ROUGH, ResidualModel.of_belief(belief))
+    rigid = RigidLearner(arm.nominal, ROUGH, belief)
+    q, x = arm.pairs(rng, pairs)
+    for one in (learner, rigid):
+        one.learn(q, x, told)
+    mine, theirs = learner.estimate(q), rigid.estimate(q)
+    np.testing.assert_array_equal(mine.x, theirs.x)
+    np.testing.assert_array_equal(mine.sigma, theirs.sigma)
+    np.testing.assert_array_equal(mine.in_support, theirs.in_support)
 
 
 def test_a_rigid_arm_costs_next_to_nothing_over_the_rigid_chain():

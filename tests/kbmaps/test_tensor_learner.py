@@ -395,3 +395,14 @@ def test_a_stored_train_is_no_learner():
     _, learner, _, _ = noisy_fit()
     with pytest.raises(ModelFormatError):
         TensorLearner.from_bytes(learner.train.to_bytes())
+
+
+def test_outliers_beside_pairs_that_the_prior_explains_exactly_are_left_out():
+    rng = np.random.default_rng(12)
+    learner = TensorLearner.around(random_chain(rng, "RRR"), bases_for("RRR"), ellipse_std=1e-3)
+    q = random_q(rng, "RRR", 60, 80.0)
+    x = learner.predict(q)
+    x[:5] += 0.1
+    with np.errstate(over="raise", invalid="raise", divide="raise"):
+        learner.learn(q, x)
+    np.testing.assert_array_equal(np.flatnonzero(learner.outliers), np.arange(5))

@@ -13,11 +13,15 @@ import numpy as np
 
 from benchmarks.peers.problem import Competitor, Fitted, Problem
 from kbmaps import RigidChain
-from kbmaps.arrays import FloatArray
+from kbmaps.arrays import FloatArray, IntArray
+from kbmaps.chains.chain import cross_matrix
 
 _UPDATES = 6000
 _LINK_RATE = 0.5
 _LAST_RATE_SHARE = 0.02
+# The components of a cross product: v × u = v[after] u[after next] − v[after next] u[after].
+_AFTER, _AFTER_NEXT = np.array([1, 2, 0]), np.array([2, 0, 1])
+_CROSS = cross_matrix(np.eye(3)).reshape(3, 9)
 
 
 @dataclass
@@ -58,39 +62,61 @@ class BodySchema:
             x = self.links[k] + np.einsum("nij,nj->ni", rotations(self.axes[k], q[:, k]), x)
         return x
 
-    def step(self, q: FloatArray, x: FloatArray, rate: float) -> None:
-        """One step for a pair q (d,), x (3,)."""
-        turns = rotations(self.axes, q)
-        before = np.empty((len(q) + 1, 3, 3))
-        before[0] = np.eye(3)
-        for k, turn in enumerate(turns):
-            before[k + 1] = before[k] @ turn
-        shares = np.einsum("kij,kj->ki", before, self.links)
-        error = x - shares.sum(axis=0)
+    def learn(self, q: FloatArray, x: FloatArray, order: IntArray, rates: FloatArray) -> None:
+        """One step for each pair of an order, of q (n, d) and x (n, 3), at its rate."""
+        step = _Stepper(self)
+        cosines, sines = np.cos(q)[..., None], np.sin(q)[..., None]
+        for index, rate in zip(order.tolist(), rates.tolist(), strict=True):
+            step(cosines[index], sines[index], x[index], rate)
+
+
+class _Stepper:
+    """Changes a schema in place, pair by pair, in memory that is laid out once."""
+
+    def __init__(self, schema: BodySchema) -> None:
+        self.axes, self.links = schema.axes, schema.links
+        self.scale = 1.0 / schema.length**2
+        joints = len(schema.axes)
+        self.turns = np.empty((joints, 3, 3))
+        # The rotation before each joint and, last, of the marker.
+        self.before = np.empty((joints + 1, 3, 3))
+        self.before[0] = np.eye(3)
+        self.products = [(self.before[k], self.turns[k], self.before[k + 1]) for k in range(joints)]
+
+    def __call__(self, cosine: FloatArray, sine: FloatArray, x: FloatArray, rate: float) -> None:
+        """One step for cosines and sines (d, 1) of a pair's angles and its position x (3,)."""
+        axes, links, before = self.axes, self.links, self.before
+        versine = 1.0 - cosine
+        # Rodrigues: R = a aᵀ (1 − cos q) + sin q [a]× + cos q 1
+        np.multiply((versine * axes)[:, :, None], axes[:, None, :], out=self.turns)
+        flat = self.turns.reshape(-1, 9)
+        flat += (sine * axes) @ _CROSS
+        flat[:, ::4] += cosine
+        for first, turn, product in self.products:
+            np.matmul(first, turn, out=product)
+        shares = (before @ links[:, :, None])[:, :, 0]
+        beyond = np.add.accumulate(shares[::-1])[::-1]
         # In the frame before each joint: the error; in the one after it: what the joint carries.
-        error_here = np.einsum("kij,i->kj", before, error)
-        carried = np.cumsum(shares[::-1], axis=0)[::-1][1:]
-        carried = np.einsum("kij,ki->kj", before[1:], carried)
-        a, u, v = self.axes, error_here[:-1], carried
-        cosine, sine = np.cos(q)[:, None], np.sin(q)[:, None]
-        along = np.einsum("ki,ki->k", a, v)[:, None] * u + np.einsum("ki,ki->k", u, a)[:, None] * v
-        gradient = (1.0 - cosine) * along + sine * np.cross(v, u)
-        gradient -= np.einsum("ki,ki->k", gradient, a)[:, None] * a
+        u = (x - beyond[0]) @ before
+        v = (beyond[1:, None] @ before[1:])[:, 0]
+        u_joints = u[:-1]
+        gradient = (versine * np.vecdot(axes, v)[:, None]) * u_joints
+        gradient += (versine * np.vecdot(axes, u_joints)[:, None]) * v
+        gradient += (sine * v.take(_AFTER, axis=1)) * u_joints.take(_AFTER_NEXT, axis=1)
+        gradient -= (sine * v.take(_AFTER_NEXT, axis=1)) * u_joints.take(_AFTER, axis=1)
+        gradient -= np.vecdot(gradient, axes)[:, None] * axes
         # Normalised, so that a rate of 1 takes about the whole error away whatever the arm's size.
-        mobility = len(self.links) + float(np.square(carried).sum()) / self.length**2
-        self.links += rate / mobility * error_here
-        self.axes += rate / mobility * gradient / self.length**2
-        self.axes /= np.linalg.norm(self.axes, axis=1, keepdims=True)
+        pace = rate / (len(links) + float(np.vdot(v, v)) * self.scale)
+        links += pace * u
+        axes += (pace * self.scale) * gradient
+        axes /= np.sqrt(np.vecdot(axes, axes))[:, None]
 
 
 def rotations(axes: FloatArray, angles: FloatArray) -> FloatArray:
     """Rotations (k, 3, 3) by angles (k,) about unit axes (k, 3), or all about one (3,)."""
-    x, y, z = axes.T
-    zero = np.zeros_like(x)
-    cross = np.moveaxis(np.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]]), (0, 1), (-2, -1))
     outer = axes[..., :, None] * axes[..., None, :]
     cosine, sine = np.cos(angles)[:, None, None], np.sin(angles)[:, None, None]
-    return cosine * np.eye(3) + (1.0 - cosine) * outer + sine * cross
+    return cosine * np.eye(3) + (1.0 - cosine) * outer + sine * cross_matrix(axes)
 
 
 def learn(problem: Problem, earlier: Fitted | None) -> Fitted:
@@ -101,8 +127,7 @@ def learn(problem: Problem, earlier: Fitted | None) -> Fitted:
     passes = -(-_UPDATES // problem.pairs)
     order = np.concatenate([problem.rng.permutation(problem.pairs) for _ in range(passes)])[:_UPDATES]
     rates = _LINK_RATE * np.maximum(1.0 - np.arange(_UPDATES) / _UPDATES, _LAST_RATE_SHARE)
-    for index, rate in zip(order, rates, strict=True):
-        schema.step(problem.q[index], problem.x[index], rate)
+    schema.learn(problem.q, problem.x, order, rates)
     return schema
 
 

@@ -8,6 +8,7 @@ the leave-one-out error. All fields of all outputs are updated at once, as array
 from __future__ import annotations
 
 import copy
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,6 +22,8 @@ _MOST_LEVERAGE = 0.9
 _LARGEST_STEP = 0.1
 # The paper: a few projections do, whatever the number of inputs.
 _MOST_PROJECTIONS = 4
+_FIRST_ROWS = 64
+_NOWHERE = -1
 
 
 @dataclass(frozen=True)
@@ -48,36 +51,39 @@ class Settings:
 
 
 class LWPR:
-    """Inputs (d,), several outputs at once; every output has its own fields."""
+    """Inputs (d,), several outputs at once; every output has its own fields.
+
+    A field's sums are one row of a table: a pair costs one gather and one scatter of the active fields. In between they
+    are columns, so that what is one number a field lies side by side.
+    """
 
     def __init__(self, inputs: int, outputs: int, settings: Settings | None = None) -> None:
         self.settings = Settings() if settings is None else settings
         self.inputs, self.outputs = inputs, outputs
         self.projections = min(inputs, _MOST_PROJECTIONS)
-        d, r = inputs, self.projections
-        self.output = np.empty(0, dtype=np.intp)
-        self.centre, self.root = np.empty((0, d)), np.empty((0, d, d))
-        self.mean_x, self.mean_y = np.empty((0, d)), np.empty(0)
-        self.weight, self.seen, self.used = np.empty(0), np.empty(0), np.empty(0, dtype=np.intp)
-        self.u, self.sz = np.empty((0, r, d)), np.empty((0, r, d))
-        self.ss, self.sr, self.mse = np.empty((0, r)), np.empty((0, r)), np.empty((0, r + 1))
-        self.h, self.r2 = np.empty((0, r + 1)), np.empty((0, r + 1))
-        self.cv, self.forgetting = np.empty(0), np.empty(0)
-
-    @property
-    def fields(self) -> int:
-        return len(self.output)
+        self.fields = 0
+        self._layout = _layout(inputs, self.projections)
+        sizes = {name: math.prod(shape) for name, shape in self._layout.items()}
+        self._decayed_first = sum(sizes[name] for name in ("u", "moments", "weight", "mse"))
+        self._decayed = self._decayed_first + sum(sizes[name] for name in ("h", "r2", "cv"))
+        self._table = np.empty((_FIRST_ROWS, sum(sizes.values())))
+        self._output, self._centre = np.empty(_FIRST_ROWS, dtype=np.intp), np.empty((_FIRST_ROWS, inputs))
+        # Most fields never see enough pairs to change their metric: the first one serves them all. Those that do, the
+        # Cholesky roots of their metrics, and where in these a field's is.
+        self._moved, self._root = np.empty(0, dtype=np.intp), np.empty((0, inputs, inputs))
+        self._place = np.empty(_FIRST_ROWS, dtype=np.intp)
+        self._upper = np.triu(np.ones((inputs, inputs)))
 
     def learn(self, x: FloatArray, y: FloatArray) -> None:
         """One pair: x (d,) and y (outputs,)."""
-        activation = self._activations(x[None])[0]
-        for output in range(self.outputs):
-            own = activation[self.output == output]
-            if own.size == 0 or own.max() < self.settings.generate:
-                self._add(x, y[output], output)
-                activation = np.append(activation, 1.0)
+        activation = self._activations(x)
+        closest = np.zeros(self.outputs)
+        np.maximum.at(closest, self._output[: self.fields], activation)
+        for output in np.flatnonzero(closest < self.settings.generate).tolist():
+            self._add(x, float(y[output]), output)
+            activation = np.append(activation, 1.0)
         active = np.flatnonzero(activation > _SLIGHT)
-        self._update(active, activation[active], x, y[self.output[active]])
+        self._update(active, activation[active], x, y[self._output[active]])
 
     def predict(self, x: FloatArray) -> FloatArray:
         """Outputs (n, outputs) at x (n, d): the fields' local predictions, weighted by activation."""
@@ -88,122 +94,193 @@ class LWPR:
         return out
 
     def _blended(self, x: FloatArray) -> FloatArray:
-        activation = self._activations(x)
-        local = self.mean_y + np.zeros_like(activation)
-        z = x[:, None, :] - self.mean_x
+        every, d = self._named(self._table[: self.fields].T), self.inputs
+        activation = self._activations(x[:, None])
+        local = every["mean"][d] + np.zeros_like(activation)
+        z = x[:, None, :] - every["mean"][:d].T
+        known = every["seen"] > self.settings.trusted_pairs * d
         for k in range(self.projections):
-            in_use = (k < self.used) & (self.seen > self.settings.trusted_pairs * self.inputs)
-            s, beta, p = self._projection(k, z)
-            local += np.where(in_use, s * beta, 0.0)
-            z = z - s[..., None] * p
+            u, moments = every["u"][k], every["moments"][k]
+            sz, sr, ss = moments[:d], moments[d], np.maximum(moments[d + 1], _TINY)
+            s = np.einsum("nkd,dk->nk", z, u / np.maximum(np.linalg.norm(u, axis=0), _TINY))
+            local += np.where(known & (k < every["used"]), s * (sr / ss), 0.0)
+            z -= s[..., None] * (sz / ss).T
         out = np.zeros((len(x), self.outputs))
         for output in range(self.outputs):
-            own = self.output == output
+            own = self._output[: self.fields] == output
             if own.any():
                 weights = activation[:, own] + np.finfo(np.float64).tiny
                 out[:, output] = (weights * local[:, own]).sum(axis=1) / weights.sum(axis=1)
         return out
 
     def _activations(self, x: FloatArray) -> FloatArray:
-        off = np.einsum("kij,nkj->nki", self.root, x[:, None] - self.centre)
-        return np.exp(-0.5 * np.einsum("nki,nki->nk", off, off))
-
-    def _projection(self, k: int, z: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Projected input s, slope and direction to take out, of projection k."""
-        u = self.u[:, k]
-        u = u / np.maximum(np.linalg.norm(u, axis=-1, keepdims=True), _TINY)
-        ss = np.maximum(self.ss[:, k], _TINY)
-        return (z * u).sum(axis=-1), self.sr[:, k] / ss, self.sz[:, k] / ss[:, None]
+        """Activations (..., fields) at x (d,) or (n, 1, d)."""
+        off = x - self._centre[: self.fields]
+        distances = self.settings.first_metric * np.einsum("...i,...i->...", off, off)
+        if len(self._moved):
+            turned = self._root @ off[..., self._moved, :, None]
+            distances[..., self._moved] = np.square(turned[..., 0]).sum(axis=-1)
+        return np.exp(-0.5 * distances)
 
     def _add(self, x: FloatArray, y: float, output: int) -> None:
-        d, r = self.inputs, self.projections
-        root = np.sqrt(self.settings.first_metric) * np.eye(d)
-        fresh: dict[str, object] = {
-            "output": output, "centre": x, "root": root, "mean_x": x, "mean_y": y, "weight": _TINY, "seen": 0.0,
-            "used": min(2, r), "u": np.zeros((r, d)), "sz": np.zeros((r, d)), "ss": np.zeros(r), "sr": np.zeros(r),
-            "mse": np.zeros(r + 1), "h": np.zeros(r + 1), "r2": np.zeros(r + 1), "cv": 0.0,
-            "forgetting": self.settings.forgetting,
-        }  # fmt: skip
-        for name, value in fresh.items():
-            old = getattr(self, name)
-            setattr(self, name, np.concatenate([old, np.asarray(value, dtype=old.dtype)[None]]))
+        if self.fields == len(self._table):
+            self._table, self._output, self._centre, self._place = (
+                np.concatenate([array, np.empty_like(array)])
+                for array in (self._table, self._output, self._centre, self._place)
+            )
+        at = self.fields
+        self.fields += 1
+        self._table[at] = 0.0
+        fresh = self._named(self._table[at])
+        fresh["mean"][:-1], fresh["mean"][-1] = x, y
+        fresh["used"][...], fresh["weight"][...] = min(2, self.projections), _TINY
+        fresh["forgetting"][...] = self.settings.forgetting
+        self._output[at], self._centre[at], self._place[at] = output, x, _NOWHERE
+
+    def _named(self, columns: FloatArray) -> dict[str, FloatArray]:
+        """The same memory (numbers, ...) by name."""
+        named: dict[str, FloatArray] = {}
+        begin = 0
+        for name, shape in self._layout.items():
+            end = begin + math.prod(shape)
+            named[name] = columns[begin:end].reshape(shape + columns.shape[1:])
+            begin = end
+        return named
 
     def _update(self, at: IntArray, w: FloatArray, x: FloatArray, y: FloatArray) -> None:
         """Recursive sums of the local models (table 3 of the paper), then the metric."""
-        keep = self.forgetting[at]
-        self.seen[at] += 1.0
-        weight = keep * self.weight[at] + w
-        self.mean_x[at] += (w / weight)[:, None] * (x - self.mean_x[at])
-        self.mean_y[at] += w / weight * (y - self.mean_y[at])
-        self.weight[at] = weight
-        z, rest = x - self.mean_x[at], y - self.mean_y[at]
-        self.mse[at, 0] = keep * self.mse[at, 0] + w * rest**2
-        projected = np.zeros((len(at), self.projections))
-        residual = rest.copy()
-        for k in range(self.projections):
-            in_use = k < self.used[at]
-            self.u[at, k] = keep[:, None] * self.u[at, k] + np.where(in_use, w * rest, 0.0)[:, None] * z
-            u = self.u[at, k] / np.maximum(np.linalg.norm(self.u[at, k], axis=1, keepdims=True), _TINY)
-            s = np.where(in_use, np.einsum("kd,kd->k", z, u), 0.0)
-            self.ss[at, k] = keep * self.ss[at, k] + w * s * s
-            self.sr[at, k] = keep * self.sr[at, k] + w * s * rest
-            self.sz[at, k] = keep[:, None] * self.sz[at, k] + (w * s)[:, None] * z
-            ss = np.maximum(self.ss[at, k], _TINY)
-            projected[:, k] = s
-            rest = rest - s * self.sr[at, k] / ss
-            z = z - (s / ss)[:, None] * self.sz[at, k]
-            self.mse[at, k + 1] = keep * self.mse[at, k + 1] + w * rest**2
-            residual = np.where(in_use, rest, residual)
-        self._move_metric(at, w, x, residual, projected, keep)
-        self._grow(at)
-        final = self.settings.last_forgetting
-        self.forgetting[at] = self.settings.annealing * keep + (1.0 - self.settings.annealing) * final
+        columns = self._table.take(at, axis=0).T.copy()
+        field = self._named(columns)
+        keep, settings = field["forgetting"].copy(), self.settings
+        columns[: self._decayed_first] *= keep
+        field["seen"] += 1.0
+        field["weight"] += w
+        # Inputs, output and, once there is one, the projected input of each field.
+        z = np.empty((self.inputs + 2, len(at)))
+        z[:-2], z[-2] = x[:, None], y
+        field["mean"] += w / field["weight"] * (z[:-1] - field["mean"])
+        z[:-1] -= field["mean"]
+        projected = self._project(field, w, z)
+        step = self._weigh(field, columns, w, z[-2], projected, keep)
+        if step is not None:
+            ready, *sizes = step
+            self._move(at[ready], x, *sizes)
+        self._grow(field)
+        field["forgetting"][...] = settings.annealing * keep + (1.0 - settings.annealing) * settings.last_forgetting
+        self._table[at] = columns.T
 
-    def _grow(self, at: IntArray) -> None:
+    def _project(self, field: dict[str, FloatArray], w: FloatArray, z: FloatArray) -> FloatArray:
+        """Partial least squares of inputs and output in z (d + 2, k), which becomes what is left of them.
+
+        Returns what the mean, a regression on a constant, and each projection regress on (r + 1, k).
+        """
+        used = field["used"]
+        least, most = int(used.min()), int(used.max())
+        projected, rests = np.zeros((self.projections + 1, len(w))), np.empty((self.projections + 1, len(w)))
+        projected[0], rests[0] = 1.0, z[-2]
+        for k in range(most):
+            u, moments = field["u"][k], field["moments"][k]
+            pull = w * z[-2]
+            if k >= least:
+                pull *= k < used
+            u += pull * z[:-2]
+            s = _dots(z[:-2], u) / np.maximum(np.sqrt(_dots(u, u)), _TINY)
+            if k >= least:
+                s *= k < used
+            projected[k + 1] = z[-1] = s
+            moments += (w * s) * z
+            z[:-1] -= (s / np.maximum(moments[-1], _TINY)) * moments[:-1]
+            rests[k + 1] = z[-2]
+        rests[most + 1 :] = z[-2]
+        field["mse"] += w * rests * rests
+        return projected
+
+    def _grow(self, field: dict[str, FloatArray]) -> None:
         """Another projection where the last one paid, with enough pairs to tell."""
-        rows = np.arange(len(at))
-        last, before = self.mse[at][rows, self.used[at]], self.mse[at][rows, self.used[at] - 1]
-        ready = self.seen[at] > self.settings.trusted_pairs * self.inputs
-        more = ready & (last < self.settings.add_projection * before) & (self.used[at] < self.projections)
-        self.used[at] += more
+        used, error = field["used"], field["mse"]
+        able = np.flatnonzero((used < self.projections) & (field["seen"] > self.settings.trusted_pairs * self.inputs))
+        if len(able):
+            last = used[able].astype(np.intp)
+            used[able] += error[last, able] < self.settings.add_projection * error[last - 1, able]
 
-    def _move_metric(
-        self, at: IntArray, w: FloatArray, x: FloatArray, error: FloatArray, s: FloatArray, keep: FloatArray
-    ) -> None:
-        """One step down the gradient of J = Σ w e²/(1 − h)² / W + γ/d Σ D², with respect to the Cholesky root of D."""
-        # In units of full activation, so that a few pairs at a field's fringe do not move it.
-        ready = self.weight[at] > self.settings.trusted_pairs * self.inputs
-        # The mean counts as one more regression, on a constant.
-        s = np.concatenate([np.ones((len(at), 1)), s], axis=1)
-        total = self.weight[at]
-        squares = np.concatenate([total[:, None], self.ss[at]], axis=1)
+    def _weigh(
+        self,
+        field: dict[str, FloatArray],
+        columns: FloatArray,
+        w: FloatArray,
+        error: FloatArray,
+        s: FloatArray,
+        keep: FloatArray,
+    ) -> tuple[IntArray, FloatArray, FloatArray, FloatArray] | None:
+        """What a pair says of J = Σ w e²/(1 − h)² / W + γ/d Σ D².
+
+        Returns which fields are ready to move, and of these w dJ/dw, w / W and how settled they are; None if none is.
+        """
+        total = field["weight"]
+        squares = np.concatenate([total[None], field["moments"][:, -1]])
         share = np.where(squares > _TINY, s / np.maximum(squares, _TINY), 0.0)
-        leverage = (s * share).sum(axis=1)
-        h = np.clip(w * leverage, 0.0, _MOST_LEVERAGE)
-        loo = error / (1.0 - h)
-        # dJ/dw: the pair's own share and leverage, what the slopes do to all earlier errors and to their leverages.
-        by_weight = (
-            loo**2 * (1.0 + 2.0 * w * leverage / (1.0 - h))
-            - 2.0 * error * (share * self.h[at]).sum(axis=1)
-            - 2.0 * (share**2 * self.r2[at]).sum(axis=1)
-            - self.cv[at] / total
-        ) / total
-        self.cv[at] = keep * self.cv[at] + w * loo**2
-        self.h[at] = keep[:, None] * self.h[at] + (w * loo / (1.0 - h))[:, None] * s
-        self.r2[at] = keep[:, None] * self.r2[at] + (w**2 * loo**2 / (1.0 - h))[:, None] * s**2
-        root, off = self.root[at], x - self.centre[at]
-        # dw/dM = -w M off offᵀ; d(Σ D²)/dM = 4 M D
-        metric = np.swapaxes(root, 1, 2) @ root
-        slope = -(by_weight * w)[:, None, None] * (root @ off[:, :, None]) * off[:, None, :]
-        slope += (self.settings.penalty / self.inputs * w / total)[:, None, None] * 4.0 * (root @ metric)
-        step = self.settings.learning_rate * np.triu(slope)
+        leverage = _dots(s, share)
+        room = 1.0 - np.minimum(np.maximum(w * leverage, 0.0), _MOST_LEVERAGE)
+        weighted = w * error / room
+        cost = weighted * error / room
+        # In units of full activation, so that a few pairs at a field's fringe do not move it.
+        ready = np.flatnonzero(total > self.settings.trusted_pairs * self.inputs)
+        by_weight = None
+        if len(ready):
+            # The pair's own share and leverage, what the slopes do to all earlier errors and to their leverages.
+            before = error * _dots(share, field["h"]) + _dots(share * share, field["r2"])
+            by_weight = cost * (1.0 + 2.0 * w * leverage / room) - w * (2.0 * before + field["cv"] / total)
+        columns[self._decayed_first : self._decayed] *= keep
+        field["cv"] += cost
+        field["h"] += (weighted / room) * s
+        field["r2"] += (cost * w / room) * (s * s)
+        if by_weight is None:
+            return None
         # While its leave-one-out error is far above its training error a field knows too little to move.
-        settled = (self.mse[at, self.used[at]] / np.maximum(self.cv[at], _TINY)) ** 4
-        step *= np.minimum(settled, 1.0)[:, None, None]
+        mse = field["mse"][field["used"][ready].astype(np.intp), ready]
+        settled = np.minimum((mse / np.maximum(field["cv"][ready], _TINY)) ** 4, 1.0)
+        return ready, by_weight[ready] / total[ready], w[ready] / total[ready], settled
+
+    def _move(self, at: IntArray, x: FloatArray, by_weight: FloatArray, share: FloatArray, settled: FloatArray) -> None:
+        """A step of the Cholesky roots of these fields, cut to what a single pair may change."""
+        place = self._places(at)
+        root, off = self._root[place], x - self._centre[at]
+        # dw/dM = -w M off offᵀ; d(Σ D²)/dM = 4 M D
+        slope = (root @ (-by_weight[:, None] * off)[:, :, None]) * off[:, None, :]
+        metric = root.swapaxes(1, 2) @ root
+        slope += (4.0 * self.settings.penalty / self.inputs * share)[:, None, None] * (root @ metric)
+        step = (self.settings.learning_rate * settled)[:, None, None] * slope * self._upper
         # A single pair never changes a root by more than a share of itself.
         size, limit = np.abs(step).max(axis=(1, 2)), _LARGEST_STEP * np.abs(root).max(axis=(1, 2))
         step *= np.minimum(1.0, limit / np.maximum(size, _TINY))[:, None, None]
-        self.root[at] -= np.where((ready & np.isfinite(size))[:, None, None], step, 0.0)
+        self._root[place] = root - np.where(np.isfinite(size)[:, None, None], step, 0.0)
+
+    def _places(self, at: IntArray) -> IntArray:
+        """Where the roots of these fields are; those that have not moved before get one."""
+        fresh = at[self._place[at] == _NOWHERE]
+        if len(fresh):
+            first = np.sqrt(self.settings.first_metric) * np.eye(self.inputs)
+            self._place[fresh] = len(self._moved) + np.arange(len(fresh))
+            self._moved = np.concatenate([self._moved, fresh])
+            self._root = np.concatenate([self._root, np.broadcast_to(first, (len(fresh), *first.shape))])
+        return self._place[at]
+
+
+def _dots(first: FloatArray, second: FloatArray) -> FloatArray:
+    """Inner products (k,) of columns (m, k)."""
+    return np.add.reduce(first * second, axis=0)
+
+
+def _layout(inputs: int, projections: int) -> dict[str, tuple[int, ...]]:
+    """What a field's row holds: sums that a pair decays first, those that the metric needs as they were, and the rest.
+
+    `moments` are those of a projection with inputs, output and itself.
+    """
+    d, r = inputs, projections
+    first = {"u": (r, d), "moments": (r, d + 2), "weight": (), "mse": (r + 1,)}
+    return (
+        first | {"h": (r + 1,), "r2": (r + 1,), "cv": ()} | {"mean": (d + 1,), "seen": (), "used": (), "forgetting": ()}
+    )
 
 
 # Updates of the final model (or one pass, if that is more), and of each one on trial.

@@ -1,0 +1,51 @@
+"""Recordings of real robots: folders with a robot.toml and a measured.csv."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from interfaces.robot import RobotDescription
+from kbmaps import ChainTolerances, RigidChain
+from kbmaps.arrays import FloatArray, IntArray
+
+# How far a robot may be from its maker's drawing; where instrument and reflector are is not known at all.
+RECORDED = ChainTolerances(
+    axes=math.radians(1.0),
+    points=0.005,
+    zeros=math.radians(1.0),
+    tool=math.inf,
+    base_rotation=math.inf,
+    base_translation=math.inf,
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """A measured robot.
+
+    Attributes:
+        chain: as its maker draws it.
+        q, x: what was measured, (n, d) [rad] and (n, 3) [m].
+    """
+
+    chain: RigidChain
+    q: FloatArray
+    x: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.q)
+
+    @classmethod
+    def load(cls, folder: Path) -> Recording:
+        robot = RobotDescription.load(folder / "robot.toml")
+        table = np.genfromtxt(folder / "measured.csv", delimiter=",", skip_header=1)
+        return cls(robot.chain, table[:, : robot.chain.joints], table[:, -3:])
+
+    def split(self, pairs: int, seed: int) -> tuple[IntArray, IntArray]:
+        """Rows to learn, so many, and all others, in a random order."""
+        order = np.random.default_rng(seed).permutation(len(self))
+        return order[:pairs], order[pairs:]

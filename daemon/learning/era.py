@@ -1,0 +1,224 @@
+"""An era: what is learnt with one tool on top of one prior."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+
+from daemon.config import LearnerConfig
+from interfaces.records import FloatArray, Pair
+from kbmaps import KBMap, follow_a_path
+
+from .arm import KnownArm
+from .claims import Claims
+from .doubts import Doubts
+from .gate import DOUBT, limit_m, sound
+from .learnt import LearntModel
+from .members import EXACT, INSTANT, PRIOR, Members
+from .memory import PairMemory, Permutations
+from .solver import Solved, Task
+from .state import LearningHeader
+
+# So many of the learnt pairs say how well a model fits what it knows.
+LOOKED_BACK = 500
+# Pairs from which the errors of a prior that was fitted anew are taken, and that are replayed on top of it.
+RECENT = 200
+REPLAY_STEPS = 64
+# So many of the pairs that came while the solver worked judge its solution.
+JUDGED_LATE = 100
+# With so many new pairs for each that a solution knows, the last solution was another one.
+MANY_NEW = 0.25
+LOOKED_BACK_IN_REPLAY = 4
+# Names of stored nets begin with this.
+NET = "net_"
+
+
+class Era:
+    """Learns side by side the models of one tool, and chooses the one that answers.
+
+    It has no lock of its own. What the eras before it taught comes as `prior`, `arm` and `claims`.
+
+    Args:
+        prior: the map to learn on top of.
+        arm: what is known of the arm before the first pair.
+        claims: what the models are said to be wrong by; followed here while the era lasts.
+        settings: of the learner.
+        task_numbers: numbers for the solver's tasks that no other era has.
+
+    Attributes:
+        members: the models.
+        memory: the pairs with this tool.
+        doubts: those that are doubted.
+        arm: as given, or with the last solutions where these stand for pairs that are no longer kept.
+        answering: the model that answers.
+        task_number: of the solver's present task.
+    """
+
+    def __init__(
+        self, prior: KBMap, arm: KnownArm, claims: Claims, settings: LearnerConfig, task_numbers: Iterator[int]
+    ) -> None:
+        self.members = Members(prior, settings.step_size)
+        self.memory = PairMemory(prior.joints, settings.replay_capacity)
+        self.doubts = Doubts(prior.joints)
+        self.arm = arm
+        self.answering = self._answering_map = PRIOR
+        self._claims, self._replays_per_pair = claims, settings.replays_per_pair
+        self._order = Permutations(settings.seed)
+        self._replays_due = 0.0
+        self._solver_prior: KBMap | None = None
+        self._task_numbers = task_numbers
+        self.task_number = next(task_numbers)
+
+    @property
+    def model(self) -> LearntModel:
+        """The model that answers."""
+        return self.members.models[self.answering]
+
+    @property
+    def map(self) -> KBMap:
+        """The answering model if it is a KB-Map, else the best that is one."""
+        return self.members.maps[self._answering_map]
+
+    @property
+    def task(self) -> Task:
+        """What the solver has to solve."""
+        known = self._solver_prior
+        prior = known or self.members.prior
+        return Task(self.task_number, prior, self.arm.chain, self.arm.residual, prior_stays=known is not None)
+
+    @property
+    def owes_replays(self) -> bool:
+        """Whether there are replay steps to do."""
+        return self._replays_due >= 1.0 and len(self.memory) > 0
+
+    def limit_m(self, pair: Pair) -> float:
+        """How far from its prediction the pair may lie before it is doubted [m]."""
+        variance = np.diag(pair.cov)
+        claimed = float(np.sqrt(self._claims.of(self.answering).variance(pair.q[None]).sum()))
+        recent = max(self._claims.errors[self.answering].rms_m, float(np.sqrt(variance.sum())))
+        return limit_m(recent, claimed)
+
+    def learn(self, pair: Pair) -> bool:
+        """Learn one pair at once; False if it is doubted."""
+        errors, limit = self.members.errors(pair.q, pair.x), self.limit_m(pair)
+        if self.doubts.doubt(pair.q, pair.x, float(np.linalg.norm(errors[self.answering])), limit):
+            self.members.learn(pair.q, errors[INSTANT], limit / DOUBT)  # a step no longer than any other
+            return False
+        delayed = None if self.members.delayed is None else pair.x - self.members.delayed.predict(pair.q)
+        self._claims.predicted(pair.q, errors, np.diag(pair.cov), delayed)
+        self._choose()
+        self.members.learn(pair.q, errors[INSTANT], np.inf)
+        self._keep(pair.q, pair.x)
+        self._replays_due += self._replays_per_pair
+        return True
+
+    def learn_waiting(self, q: FloatArray, x: FloatArray) -> None:
+        """Learn pairs, q (n, d) and x (n, 3), that waited for the prior: each once, in their order."""
+        for row_q, row_x in zip(q, x, strict=True):
+            errors = self.members.errors(row_q, row_x)
+            self._claims.predicted(row_q, errors, np.zeros(3))
+            self.members.learn(row_q, errors[INSTANT], np.inf)
+            self._keep(row_q, row_x)
+        self._choose()
+        self._replays_due += self._replays_per_pair * len(q)
+
+    def begin_with(self, q: FloatArray, x: FloatArray) -> None:
+        """Learn pairs, q (n, d) and x (n, 3), that were doubted until they began this era."""
+        for row_q, row_x in zip(q, x, strict=True):
+            self._keep(row_q, row_x)
+        self.members.replay(q, x)
+
+    def replay(self) -> int:
+        """Some of the steps that are owed; how many they were."""
+        if not self.owes_replays:
+            return 0
+        places = self._order.take(min(REPLAY_STEPS, int(self._replays_due)), len(self.memory))
+        q, x = self.memory.at(places)
+        seen = slice(LOOKED_BACK_IN_REPLAY)
+        self._claims.replayed(x[seen] - self.members.maps[INSTANT].predict(q[seen]))
+        self.members.replay(q, x)
+        self._replays_due -= len(places)
+        return len(places)
+
+    def set_aside(self, prior: KBMap) -> int:
+        """Doubt those of the first pairs that `prior`, a robust fit to them, contradicts; how many they were.
+
+        They are perhaps still those of the old tool.
+        """
+        q, x = self.memory.all()
+        belongs = sound(np.linalg.norm(x - prior.predict(q), axis=1), self._claims.noise_m)
+        if belongs.all():
+            return 0
+        self.memory.clear()
+        for row_q, row_x, belonging in zip(q, x, belongs, strict=True):
+            (self.memory.append if belonging else self.doubts.set_aside)(row_q, row_x)
+        self._order.restart()
+        self._claims.forget_contest()
+        self.task_number = next(self._task_numbers)
+        return int((~belongs).sum())
+
+    def change_prior(self, prior: KBMap) -> None:
+        """Another prior was fitted to the same pairs."""
+        q, x = self.memory.all()
+        self.members.start_again(prior, q, x)
+        self._claims.prior_changed(x[-RECENT:] - prior.predict(q[-RECENT:]))
+        self._choose_map()
+        self._replays_due += self._replays_per_pair * min(len(q), RECENT)
+
+    def ask(self) -> None:
+        """The solver works on all pairs up to here."""
+        self._claims.solution_asked()
+        self.members.ask()
+
+    def take(self, solved: Solved, model: LearntModel, fed: int) -> None:
+        """A solution of this era's task, for one of the models; the solver has `fed` pairs."""
+        self.members.take(solved.name, model)
+        q, x = self.memory.some(fed, LOOKED_BACK)
+        neighbours = follow_a_path(self.members.prior, q)
+        self._claims.solution_taken(solved.name, x - model.predict(q), solved.belief, neighbours=neighbours)
+        self._judge_late(solved.name, model, solved.pairs)
+
+    def solve_from_what_is_known(self) -> None:
+        """Where pairs are no longer kept, the last solutions stand for them in the place of what was before."""
+        if EXACT in self.members.maps and not self.memory.complete:
+            self._solver_prior = self.members.maps[EXACT]
+            self.arm = self.arm.updated(self._claims.belief, self._claims.residual)
+
+    def store(self, header: LearningHeader) -> dict[str, FloatArray]:
+        """Write into `header` what `restore` has to know; the arrays that it needs beside the kept pairs."""
+        header.answering, header.replays_due = self.answering, self._replays_due
+        header.doubted_in_a_row = self.doubts.in_a_row
+        header.belief = self.arm.chain.to_bytes()
+        header.residual = None if self.arm.residual is None else self.arm.residual.to_bytes()
+        q, x = self.doubts.all()
+        return {"doubted_q": q, "doubted_x": x} | {NET + name: kbmap.net for name, kbmap in self.members.maps.items()}
+
+    def restore(self, header: LearningHeader, arrays: Mapping[str, FloatArray]) -> None:
+        """Go on from a state of an era with this prior and arm."""
+        nets = {name.removeprefix(NET): net for name, net in arrays.items() if name.startswith(NET)}
+        self.members.restore(nets, self._claims.residual)
+        self.memory.restore(arrays["q"], arrays["x"], header.kept_of)
+        self.doubts.restore(arrays["doubted_q"], arrays["doubted_x"], header.doubted_in_a_row)
+        self.answering, self._replays_due = header.answering, header.replays_due
+        self._choose_map()
+        self.solve_from_what_is_known()
+
+    def _judge_late(self, name: str, model: LearntModel, pairs: int) -> None:
+        """What came while the solver worked is new to its solution: a pair that it had not learnt judges it fairly."""
+        q, x, _ = self.memory.since(max(pairs, self.memory.count - JUDGED_LATE))
+        if len(q):
+            self._claims.predicted_late(name, q, x - model.predict(q), anew=len(q) >= MANY_NEW * pairs)
+            self._choose()
+
+    def _keep(self, q: FloatArray, x: FloatArray) -> None:
+        self.memory.append(q, x)
+        self._claims.learnt(q)
+
+    def _choose(self) -> None:
+        self.answering = self._claims.best(self.answering)
+        self._choose_map()
+
+    def _choose_map(self) -> None:
+        is_map = self.answering in self.members.maps
+        self._answering_map = self.answering if is_map else self._claims.best_map(PRIOR)

@@ -1,0 +1,78 @@
+"""The map beside a model that is none: whoever wants a file gets the best one."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+from guided_arm import Scene, make_pair, nominal_model
+
+from daemon.config import LearnerConfig
+from daemon.learning import Solved
+from daemon.learning.arm import KnownArm
+from daemon.learning.claims import Claims
+from daemon.learning.era import Era
+from daemon.learning.learnt import LearntModel
+from daemon.learning.members import EXACT, PRIOR, RESIDUAL, RIGID
+from daemon.learning.solver import fitted_residual
+from kbmaps import ChainTolerances, KBMap
+
+NOMINAL = nominal_model()
+BELIEF = NOMINAL.belief(NOMINAL.chain, ChainTolerances(axes=0.05, points=0.015, zeros=0.05, tool=0.03))
+SCENE = Scene.draw(0, 60, sigma_m=1e-4)
+X = np.array([pair.x for pair in SCENE.pairs])
+
+
+def map_off_by(metres: float) -> KBMap:
+    """The arm's map, with the marker so far from where it is."""
+    return SCENE.chain.with_tool([metres, 0.0, 0.0]).to_kbmap(NOMINAL.bases)
+
+
+def beside(era: Era) -> str:
+    """The name of the map that is published."""
+    return next(name for name, kbmap in era.members.maps.items() if kbmap is era.map)
+
+
+def take(era: Era, name: str, model: LearntModel) -> None:
+    """A solution of all pairs up to now."""
+    pairs = era.memory.count
+    era.ask()
+    era.take(Solved(era.task_number, pairs, name, model), model, pairs)
+
+
+def learn(era: Era, part: slice) -> None:
+    for pair in SCENE.pairs[part]:
+        era.learn(pair)
+
+
+@pytest.fixture
+def era() -> Era:
+    """The chain with residual answers; of the maps, that of the rigid chain is the best."""
+    era = Era(NOMINAL.prior(), KnownArm(BELIEF), Claims(NOMINAL.bases, 0.1), LearnerConfig(), itertools.count())
+    learn(era, slice(0, 20))
+    residual = fitted_residual(BELIEF, SCENE.q, X)
+    assert residual is not None
+    take(era, RIGID, map_off_by(0.004))
+    take(era, RESIDUAL, residual)
+    learn(era, slice(20, 40))
+    return era
+
+
+def test_while_a_model_that_is_no_map_answers_the_map_beside_it_is_the_best_one(era: Era) -> None:
+    assert (era.answering, beside(era)) == (RESIDUAL, RIGID)
+
+
+def test_it_becomes_another_one_when_that_predicts_better(era: Era) -> None:
+    take(era, EXACT, map_off_by(0.001))
+    learn(era, slice(40, 60))
+    assert (era.answering, beside(era)) == (RESIDUAL, EXACT)
+
+
+def test_it_is_the_map_just_fitted_when_the_pairs_that_compared_them_are_set_aside(era: Era) -> None:
+    old_tool = make_pair(41, SCENE.q[0], X[0] + 0.2)
+    era.begin_with(old_tool.q[None], old_tool.x[None])
+    fitted = map_off_by(0.0)
+    doubted = era.set_aside(fitted)
+    era.change_prior(fitted)
+    assert (doubted, beside(era)) == (1, PRIOR)

@@ -1,0 +1,28 @@
+from __future__ import annotations
+
+import numpy as np
+
+from daemon.learning.memory import RUN, PairMemory
+
+
+def filled(pairs: int, capacity: int) -> PairMemory:
+    memory = PairMemory(1, capacity)
+    for k in range(pairs):
+        memory.append(np.array([k]), np.zeros(3))
+    return memory
+
+
+def test_those_looked_back_at_are_all_while_they_are_few() -> None:
+    q, _ = filled(80, 1000).some(70, 100)
+    np.testing.assert_array_equal(q[:, 0], np.arange(70))
+
+
+def test_those_looked_back_at_are_runs_of_neighbours_from_first_to_last() -> None:
+    q, _ = filled(5000, 4000).some(4500, 100)
+    runs = q[:, 0].reshape(-1, RUN)
+    assert (runs[0, 0], runs[-1, -1]) == (1000, 4499)
+    np.testing.assert_array_equal(np.diff(runs, axis=1), 1)
+
+
+def test_no_more_are_looked_back_at_than_asked_for() -> None:
+    assert len(filled(500, 500).some(500, RUN // 2)[0]) == RUN // 2

@@ -1,0 +1,64 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from guided_arm import Scene, built_chain, near, nominal_model, path
+
+from daemon.learning import DirectSolver, LearntModel, Task
+from daemon.learning.members import RESIDUAL, RIGID
+from daemon.learning.solver import FOLDED, KEPT, fitted_belief
+from interfaces.records import FloatArray
+from kbmaps import ChainTolerances, RigidChain
+
+NOMINAL = nominal_model()
+BELIEF = NOMINAL.belief(NOMINAL.chain, ChainTolerances(axes=0.05, points=0.015, zeros=0.05, tool=0.03))
+TASK = Task(1, NOMINAL.prior(), BELIEF)
+SIGMA_M = 0.002
+
+
+def test_a_chain_of_the_first_pairs_is_found_before_that_of_all() -> None:
+    scene, solver = Scene.draw(0, 40), DirectSolver()
+    solver.start(TASK)
+    solver.learn(scene.q, scene.chain.positions(scene.q))
+    solutions = solver.solutions()
+    assert [(solved.name, solved.pairs) for solved in (next(solutions), next(solutions))] == [(RIGID, 30), (RIGID, 40)]
+
+
+@pytest.fixture(scope="module")
+def arm() -> RigidChain:
+    return built_chain(np.random.default_rng(0))
+
+
+@pytest.fixture(scope="module")
+def seen_first() -> FloatArray:
+    return path(np.random.default_rng(1), FOLDED)
+
+
+@pytest.fixture(scope="module")
+def after_a_long_rest(arm: RigidChain, seen_first: FloatArray) -> dict[str, LearntModel]:
+    """Solutions of a path whose pairs are no longer kept, and of an arm that hardly moved since."""
+    rng, solver = np.random.default_rng(2), DirectSolver()
+    q = np.vstack([seen_first, seen_first[-1] + rng.normal(0.0, 0.02, (KEPT + 1 - FOLDED, NOMINAL.joints))])
+    solver.start(TASK)
+    solver.learn(q, arm.positions(q) + SIGMA_M * rng.normal(size=(len(q), 3)))
+    return {solved.name: solved.model for solved in solver.solutions() if solved.model is not None}
+
+
+@pytest.mark.parametrize("name", [RIGID, RESIDUAL])
+def test_what_pairs_that_are_no_longer_kept_said_of_the_arm_is_not_forgotten(
+    name: str, arm: RigidChain, seen_first: FloatArray, after_a_long_rest: dict[str, LearntModel]
+) -> None:
+    q = near(np.random.default_rng(3), seen_first)
+    miss = after_a_long_rest[name].predict(q) - arm.positions(q)
+    assert np.linalg.norm(miss, axis=1).mean() < SIGMA_M
+
+
+def test_neighbours_that_share_their_errors_say_less_than_as_many_that_do_not(arm: RigidChain) -> None:
+    rng = np.random.default_rng(4)
+    q = path(rng, 400)
+    own = SIGMA_M * rng.normal(size=(400, 3))
+    shared = np.repeat(own[::20], 20, axis=0)
+    of_own, of_shared = (
+        fitted_belief(BELIEF, q, arm.positions(q) + noise).predict_with_variance(q)[1].mean() for noise in (own, shared)
+    )
+    assert of_shared > 4.0 * of_own

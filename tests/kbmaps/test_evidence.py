@@ -1,0 +1,47 @@
+"""The search for the scale of the greatest evidence."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from kbmaps.maps.evidence import most_evident
+
+LOW, HIGH = 1e-9, 1e9
+
+
+def peaked(at: float, asked: list[float]) -> Callable[[float], float]:
+    """A parabola of the scale's logarithm, which notes what it is asked for."""
+
+    def log_evidence(scale: float) -> float:
+        asked.append(scale)
+        return -((math.log(scale) - math.log(at)) ** 2)
+
+    return log_evidence
+
+
+@given(at=st.floats(1e-6, 1e6), start=st.floats(1e-6, 1e6))
+@settings(max_examples=100, deadline=None)
+def test_a_peak_is_found_to_a_tenth_of_a_step(at, start):
+    found = most_evident(peaked(at, []), start, LOW, HIGH)
+    assert abs(math.log(found / at)) <= 0.1 * math.log(8.0) + 1e-9
+
+
+@pytest.mark.parametrize("off", [1.0, 1.2, 1 / 1.2])
+def test_a_search_from_its_end_asks_three_times_and_for_the_best_last(off):
+    asked: list[float] = []
+    found = most_evident(peaked(0.3, asked), 0.3 * off, LOW, HIGH)
+    assert len(asked) == 3
+    assert asked[-1] == found
+
+
+def test_a_peak_beyond_the_limits_is_sought_at_the_limit():
+    assert most_evident(peaked(1e12, []), 1.0, LOW, HIGH) == pytest.approx(HIGH)
+
+
+def test_level_evidence_keeps_the_start():
+    assert most_evident(lambda _: 0.0, 0.7, LOW, HIGH) == pytest.approx(0.7)
