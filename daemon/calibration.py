@@ -23,13 +23,15 @@ from kbmaps import (
     align,
 )
 
-from .chain_figures import HALF_WIDTH_95, WORKMANSHIP, ChainFigures, probable
+from .chain_figures import HALF_WIDTH_95, WORKMANSHIP, ChainFigures, is_told, probable
 
 IntArray = NDArray[np.intp]
 
 # How many pairs are asked. No arm is quite rigid, and thousands of pairs would take its sag for bad workmanship.
 JUDGED_PAIRS = 300
 SLIDE_ZEROS_M = 0.02
+# A number is shown when it is left so much less uncertain than it was.
+MUCH_SURER = 1.0 / 3.0
 # Of what is said to be known, and of what is not, once it has been fitted: then far more than the fit can be off.
 KNOWN_TURN_RAD, KNOWN_PLACE_M = 0.02, 0.01
 FITTED_TURN_RAD, FITTED_PLACE_M = 0.5, 0.5
@@ -90,6 +92,35 @@ class Calibration:
     def learner(self) -> RigidLearner:
         """The most probable one."""
         return self.learners[0]
+
+    @property
+    def workmanship(self) -> ChainTolerances | None:
+        """How well the arm seems to be made; None where the pairs do not tell."""
+        made = [(learner.tolerances.axes, learner.tolerances.points) for learner in self.learners]
+        return self.learner.tolerances if is_told(made) else None
+
+    @property
+    def noise_m(self) -> float:
+        """1-sigma of a measured coordinate [m], as the pairs scatter around the learnt chain; outliers apart."""
+        report = self.learner.report()
+        if not self.noise_told:
+            return report.noise
+        squares = np.sort(np.square(self.learner.predict(self.recording.q) - self.recording.x).sum(axis=1))
+        return float(np.sqrt(squares[: len(squares) - report.outliers].sum() / max(report.freedom, 1.0)))
+
+    @cached_property
+    def shown(self) -> int:
+        """How many independent numbers of the arm the pairs make much surer than they were: a third of what they were.
+
+        Before, an arm of the worst workmanship was possible.
+        """
+        report, (axes, points) = self.learner.report(), WORKMANSHIP[-1]
+        parameters = ChainParameters(self.placed.chain)
+        before = ChainBelief.from_tolerances(parameters, replace(self.learner.tolerances, axes=axes, points=points))
+        _, jacobian = parameters.linearised(self.learner.change, self.recording.q)
+        rows = (jacobian @ before.root).reshape(-1, before.root.shape[1]) / (report.noise * report.misfit)
+        left = 1.0 / np.sqrt(1.0 + np.square(np.linalg.svd(rows, compute_uv=False)))
+        return int((left < MUCH_SURER).sum())
 
     @cached_property
     def figures(self) -> ChainFigures:

@@ -8,6 +8,7 @@ import msgspec
 import numpy as np
 
 from daemon.calibration import Calibration
+from daemon.plausibility import OTHER_CAUSES, is_far_off, mixed_up
 from daemon.tool_jump import tool_jump
 from interfaces.recording import Recording
 from interfaces.records import FloatArray
@@ -48,17 +49,21 @@ class CalibrationReport(msgspec.Struct, frozen=True, kw_only=True):
         camera_link, camera_xyz_mm, camera_rpy_deg: pose of the measurement frame in this link (URDF convention).
         marker_link, marker_xyz_mm: the marker in this link.
         zeros: of the joints, in the order of q.
-        noise_mm: 1-sigma of a measured coordinate, estimated or (`noise_told`) from the recording.
+        noise_mm: 1-sigma of a measured coordinate, as the pairs scatter around the learnt arm.
+        told_noise_mm: the same as it was told with the pairs (RMS), or null; where told, the intervals rest on it.
         misfit: residuals over what the told noise explains; 1 where it explains them, or was not told.
         drawn_error_mm: mean distance from the pairs to the drawn arm, with what robot.toml calls not known fitted.
         learnt_error_mm: mean distance to the learnt arm, over the same pairs, which it was fitted to.
-        axes_deg, points_mm: how well the arm is made, by the pairs: 1-sigma of an axis' tilt and shift.
-        shown: independent numbers of the arm that the pairs determine, of `showable` that positions can.
+        axes_deg, points_mm: how well the arm is made, by the pairs: 1-sigma of an axis' tilt and shift; null where the
+            pairs do not tell.
+        shown: independent numbers of the arm that the pairs make three times as sure as they were, of `showable` that
+            positions can.
         still: joints that hardly moved.
         first: number of the first row (of a store: pair) that was learnt.
         other_tool_from: number of the row from which on the marker sits elsewhere on the hand, or null: the figures
             are then of neither tool.
         other_tool_mm: how far from there, or null.
+        doubt: why no figure is to be trusted, or null: the pairs are far from any arm like this one.
     """
 
     robot: str
@@ -72,18 +77,19 @@ class CalibrationReport(msgspec.Struct, frozen=True, kw_only=True):
     marker_xyz_mm: list[Figure]
     zeros: list[Zero]
     noise_mm: float
-    noise_told: bool
+    told_noise_mm: float | None
     misfit: float
     drawn_error_mm: float
     learnt_error_mm: float
-    axes_deg: float
-    points_mm: float
+    axes_deg: float | None
+    points_mm: float | None
     shown: int
     showable: int
     still: list[str]
     first: int
     other_tool_from: int | None
     other_tool_mm: float | None
+    doubt: str | None
     schema: int = 1
 
     @classmethod
@@ -96,7 +102,7 @@ class CalibrationReport(msgspec.Struct, frozen=True, kw_only=True):
         """
         jump = tool_jump(calibration.learner, calibration.recording)
         robot, recording, learner = calibration.robot, calibration.recording, calibration.learner
-        report, tolerances, slides = learner.report(), learner.tolerances, robot.chain.prismatic
+        report, made, slides = learner.report(), calibration.workmanship, robot.chain.prismatic
         named = calibration.figures
         values, halves = named.values, named.half_widths
         figures = [
@@ -114,14 +120,14 @@ class CalibrationReport(msgspec.Struct, frozen=True, kw_only=True):
             marker_link=robot.robot.marker_link,
             marker_xyz_mm=figures[6:],
             zeros=_zeros(calibration, values[9:], halves[9:]),
-            noise_mm=1e3 * report.noise,
-            noise_told=calibration.noise_told,
+            noise_mm=1e3 * calibration.noise_m,
+            told_noise_mm=1e3 * report.noise if calibration.noise_told else None,
             misfit=report.misfit,
             drawn_error_mm=1e3 * _mean_error(calibration.placed.chain.positions(recording.q), recording),
             learnt_error_mm=1e3 * _mean_error(learner.predict(recording.q), recording),
-            axes_deg=_DEG * tolerances.axes,
-            points_mm=1e3 * tolerances.points,
-            shown=report.determined,
+            axes_deg=None if made is None else _DEG * made.axes,
+            points_mm=None if made is None else 1e3 * made.points,
+            shown=calibration.shown,
             # Everett and Hsu 1988: four for each joint that turns, two for each that slides, six for the ends of the
             # chain, less the three turns of the marker that its place does not show.
             showable=4 * int((~slides).sum()) + 2 * int(slides.sum()) + 3,
@@ -129,7 +135,20 @@ class CalibrationReport(msgspec.Struct, frozen=True, kw_only=True):
             first=first,
             other_tool_from=None if jump is None else first + jump.row - 1,
             other_tool_mm=None if jump is None else 1e3 * jump.distance_m,
+            doubt=_doubt(calibration) if jump is None else None,
         )
+
+
+def _doubt(calibration: Calibration) -> str | None:
+    """Why the chain is not this arm's; None where it may be."""
+    robot, recording, learner = calibration.robot, calibration.recording, calibration.learner
+    left = np.linalg.norm(learner.predict(recording.q) - recording.x, axis=1)
+    if not is_far_off(robot, left, learner.report().noise if calibration.noise_told else None):
+        return None
+    return (
+        f"The learnt arm misses half of the pairs by over {1e3 * float(np.median(left)):.3g} mm, as none does that "
+        f"is like the drawn one. {mixed_up(robot, recording) or OTHER_CAUSES}."
+    )
 
 
 def _zeros(calibration: Calibration, values: FloatArray, halves: FloatArray) -> list[Zero]:

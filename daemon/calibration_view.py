@@ -10,8 +10,6 @@ from rich.text import Text
 
 from daemon.calibration_report import CalibrationReport, Figure, Zero
 
-# Of the noise; so far off is no calibrated camera, but another unit or another robot [mm].
-FAR_MM = 50.0
 # Told noise that explains the residuals leaves less than this.
 MISFIT = 1.5
 
@@ -35,13 +33,10 @@ def view(report: CalibrationReport) -> Group:
 
 def sentences(report: CalibrationReport) -> list[str]:
     """The report in words."""
-    told = "" if report.noise_told else ", estimated"
     said = [
         f"Mean distance to the pairs: {report.drawn_error_mm:.3f} mm for the drawn arm in its best place, "
-        f"{report.learnt_error_mm:.3f} mm for the learnt one. Noise of a coordinate: {report.noise_mm:.3f} mm{told}. "
-        f"{_outliers(report)}",
-        f"This arm is made to about {report.axes_deg:.2g}° (axes) and {report.points_mm:.2g} mm (their places), as the "
-        "pairs have it.",
+        f"{report.learnt_error_mm:.3f} mm for the learnt one. {_noise(report)} {_outliers(report)}",
+        _workmanship(report),
         f"The pairs show {report.shown} of the {report.showable} numbers that positions can show of such an arm."
         + _advice(report),
     ]
@@ -61,8 +56,8 @@ def sentences(report: CalibrationReport) -> list[str]:
             f"The residuals are {report.misfit:.1f} times what the noise explains: the arm is not quite a rigid chain "
             "(it sags, its encoders are eccentric), or the noise is larger than told. The intervals are wider for it."
         )
-    if report.noise_mm > FAR_MM:
-        said.append("That is very far off. Are positions in metres, angles in radians, and both of this robot?")
+    if report.doubt is not None:
+        said.insert(0, report.doubt)
     return said
 
 
@@ -72,6 +67,22 @@ def two_tools(report: CalibrationReport) -> str:
         f"From number {report.other_tool_from} on the marker sits about {report.other_tool_mm:.0f} mm elsewhere on the "
         "hand: these are pairs of two tools, and no figure is right for both. Calibrate them apart: "
         f"--first {report.other_tool_from}, or --last {(report.other_tool_from or 0) - 1}."
+    )
+
+
+def _noise(report: CalibrationReport) -> str:
+    scatter = f"Noise of a coordinate, as the pairs scatter: {report.noise_mm:.3f} mm"
+    if report.told_noise_mm is None:
+        return f"{scatter}."
+    return f"{scatter}; as was told with them: {report.told_noise_mm:.3f} mm, on which the intervals rest."
+
+
+def _workmanship(report: CalibrationReport) -> str:
+    if report.axes_deg is None or report.points_mm is None:
+        return "These pairs do not tell how well the arm is made; the intervals hold for a good one and for a bad one."
+    return (
+        f"This arm is made to about {report.axes_deg:.2g}° (axes) and {report.points_mm:.2g} mm (their places), as the "
+        "pairs have it."
     )
 
 

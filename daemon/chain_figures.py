@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -23,6 +24,8 @@ IntArray = NDArray[np.intp]
 WORKMANSHIP = ((0.0003, 0.0001), (0.001, 0.0005), (0.003, 0.001), (0.01, 0.003), (0.03, 0.01), (0.06, 0.03))
 # Workmanship that is less probable than this is not considered.
 LEAST_SHARE = 0.01
+# Where what is probable differs by more than this, the pairs do not tell.
+TOLD_WITHIN = 4.0
 HALF_WIDTH_95 = 1.959964
 # A zero that is still as uncertain as it was before is nothing that the pairs show.
 NOT_SHOWN = 0.9
@@ -183,6 +186,12 @@ def probable(evidence: FloatArray) -> tuple[IntArray, FloatArray]:
     shares /= shares.sum()
     kept = np.array([k for k in np.argsort(-shares) if shares[k] > LEAST_SHARE], dtype=np.intp)
     return kept, shares[kept] / shares[kept].sum()
+
+
+def is_told(made: Sequence[tuple[float, float]]) -> bool:
+    """Whether pairs that leave these workmanships (axes [rad], places [m]) probable tell how well the arm is made."""
+    axes = [axes for axes, _ in made]
+    return max(axes) <= TOLD_WITHIN * min(axes)
 
 
 def _spread(belief: ChainBelief, which: IntArray) -> FloatArray:

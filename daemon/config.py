@@ -67,6 +67,10 @@ class DaemonConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     segment_gap_s: Positive = 1.0
 
 
+# A larger radius is one of another unit [m].
+LARGEST_BALL_M = 0.5
+
+
 class LearnerConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The table [learner].
 
@@ -135,6 +139,13 @@ class Config:
             line = line_of(text, ("daemon", "min_step_deg"))
             raise ConfigError("min_step_deg is not below max_step_deg", file=file, line=line)
         _check_endpoints(tables.zenoh, file, text)
+        if tables.vision.radius_m > LARGEST_BALL_M:
+            raise ConfigError(
+                f"vision.radius_m = {tables.vision.radius_m:g}: this looks like millimetres",
+                file=file,
+                line=line_of(text, ("vision", "radius_m")),
+                remedy="Give metres",
+            )
         return cls(file, robot, tables)
 
     def with_state_dir(self, folder: Path) -> Config:

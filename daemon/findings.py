@@ -11,9 +11,10 @@ from interfaces.protocols import Clock
 from interfaces.robot import RobotDescription
 from kbmaps import ChainBelief, KBMapsError
 
-from .chain_figures import WORKMANSHIP, ChainFigures, no_surer_than_possible, probable
+from .chain_figures import WORKMANSHIP, ChainFigures, is_told, no_surer_than_possible, probable
 from .learning import Learning
 from .learning.learning import REGION_RAD
+from .learning.members import SOLVED
 from .learning.outlook import Known, Scatter, foreseen
 from .status import ChainCalibration, JointZero, LearntFigure, Outlook
 
@@ -46,11 +47,24 @@ class Findings:
     @property
     def outlook(self) -> Outlook | None:
         """What further pairs would gain; None while no solution with the present tool answers."""
-        return self._found[1] if self._learning.belief is not None else None
+        answers = self._learning.belief is not None and self._learning.snapshot.answering in SOLVED
+        return self._found[1] if answers else None
+
+    @property
+    def at_rest(self) -> bool:
+        """Whether what was found rests on the chain and the model that there are now."""
+        return self._found_of == self._present
+
+    @property
+    def _present(self) -> tuple[ChainBelief | None, str]:
+        return self._learning.belief, self._learning.snapshot.answering
 
     def renew(self) -> None:
         """Find both again if what they rest on has changed, and it is time to."""
-        begin, present = self._clock.now(), (self._learning.belief, self._learning.snapshot.answering)
+        begin, present = self._clock.now(), self._present
+        if present[0] is None:
+            self._found_of, self._found = present, (None, None)  # what was found was of another tool
+            return
         if present == self._found_of or begin < self._due_at:
             return
         self._found_of, known = present, self._learning.known()
@@ -90,15 +104,17 @@ def calibrated(robot: RobotDescription, known: Known, scatter: Scatter) -> Chain
             name: JointZero(number.learnt, number.half_width) if shown else None
             for name, number, shown in zip(robot.joints, numbers[9:], found.shown, strict=True)
         },
-        axes_rad=workmanship[0],
-        points_m=workmanship[1],
+        axes_rad=None if workmanship is None else workmanship[0],
+        points_m=None if workmanship is None else workmanship[1],
         noise_m=scatter.noise_m,
         outliers=scatter.outliers,
     )
 
 
-def figures(robot: RobotDescription, known: Known) -> tuple[ChainFigures, tuple[float, float]]:
+def figures(robot: RobotDescription, known: Known) -> tuple[ChainFigures, tuple[float, float] | None]:
     """The figures, and how well the arm seems to be made: 1-sigma of an axis' tilt [rad] and its shift [m].
+
+    None where the pairs do not tell.
 
     The learner begins with wide tolerances, which cost it little, but with which a tilted axis could be any zero. How
     well the arm is made, the pairs tell.
@@ -110,4 +126,5 @@ def figures(robot: RobotDescription, known: Known) -> tuple[ChainFigures, tuple[
     belief = no_surer_than_possible(known.belief, prior, robot)
     beliefs = [belief.tightened(wide, replace(wide, axes=axes, points=points)) for axes, points in made]
     kept, shares = probable(np.array([evidence for _, evidence in beliefs]))
-    return ChainFigures(robot, tuple(beliefs[k][0] for k in kept), shares, prior), made[kept[0]]
+    told = is_told([made[k] for k in kept])
+    return ChainFigures(robot, tuple(beliefs[k][0] for k in kept), shares, prior), made[kept[0]] if told else None

@@ -16,28 +16,27 @@ _DEG = math.degrees(1.0)
 
 
 def outlook_lines(outlook: Outlook | None) -> list[str]:
-    """Whether there is enough data, in at most three lines."""
+    """Whether there is enough data, in at most two lines."""
     if outlook is None:
         return ["not known yet"]
     pairs = outlook.further_pairs[-1]
-    like = f"{pairs} more pairs like these: {mm(outlook.like_so_far_m[-1])}"
+    like = f"{pairs} more pairs like these would take {_gain(outlook, outlook.like_so_far_m)} off the error"
     return [
-        f"{'yes' if outlook.enough else 'no'}: {mm(outlook.error_m)} off where the arm was, "
-        f"{mm(outlook.anywhere_m)} in its whole range",
-        like if _other_is_better(outlook) else f"{like}; no other motion gains more",
-        *([f"{pairs} of {outlook.best_motion}: {mm(outlook.best_motion_m[-1])}"] if _other_is_better(outlook) else []),
+        f"{'yes' if outlook.enough else 'no'}: {like}",
+        f"{pairs} of {outlook.best_motion}: {_gain(outlook, outlook.best_motion_m)}"
+        if _other_is_better(outlook)
+        else "no other motion gains more",
     ]
 
 
 def outlook_sentence(outlook: Outlook) -> str:
     """The same in words."""
-    now, after = mm(outlook.error_m), mm(outlook.like_so_far_m[-1])
     best = "no other motion gains more"
     if _other_is_better(outlook):
-        best = f"{outlook.best_motion} gains most: {mm(outlook.best_motion_m[-1])}"
+        best = f"{outlook.best_motion} gains most: {_gain(outlook, outlook.best_motion_m)}"
     return (
-        f"{outlook.further_pairs[-1]} more pairs like these would take the error that the learner expects where the "
-        f"arm was from {now} to {after}; {best}. {'Enough data.' if outlook.enough else 'More data would help.'}"
+        f"{outlook.further_pairs[-1]} more pairs like these would take {_gain(outlook, outlook.like_so_far_m)} off the "
+        f"error where the arm was; {best}. {'Enough data.' if outlook.enough else 'More data would help.'}"
     )
 
 
@@ -63,7 +62,7 @@ def calibration_table(calibration: ChainCalibration, slides: Collection[str] = (
         facts.add_row("zeros to add", zeros)
     if drawn:
         facts.add_row("left as drawn", f"{', '.join(drawn)}: no motion shows {_such_zeros(drawn)}")
-    facts.add_row("arm made to", f"about {_DEG * calibration.axes_rad:.2g}° and {1e3 * calibration.points_m:.2g} mm")
+    facts.add_row("arm made to", _workmanship(calibration))
     facts.add_row("noise", f"{mm(calibration.noise_m)} a coordinate, {_outliers(calibration.outliers)}")
     return Group(
         Text(f"calibration: from robot.toml to what {calibration.pairs} pairs show, ± for 95 %", style="bold"),
@@ -72,12 +71,23 @@ def calibration_table(calibration: ChainCalibration, slides: Collection[str] = (
     )
 
 
+def _workmanship(calibration: ChainCalibration) -> str:
+    if calibration.axes_rad is None or calibration.points_m is None:
+        return "not told by these pairs"
+    return f"about {_DEG * calibration.axes_rad:.2g}° and {1e3 * calibration.points_m:.2g} mm"
+
+
 def _such_zeros(joints: list[str]) -> str:
     return "its zero" if len(joints) == 1 else "their zeros"
 
 
 def _other_is_better(outlook: Outlook) -> bool:
     return outlook.best_motion_m != outlook.like_so_far_m
+
+
+def _gain(outlook: Outlook, after_m: list[float]) -> str:
+    """The share of the error that the most of the further pairs would take off."""
+    return f"{max(1.0 - after_m[-1] / outlook.error_m, 0.0):.0%}" if outlook.error_m else "0%"
 
 
 def _outliers(count: int) -> str:

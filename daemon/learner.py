@@ -27,6 +27,7 @@ from daemon.learning import Learning, NominalModel, StateError
 from daemon.learning.solver import LARGEST_NET
 from daemon.solver_process import SolverLostError, SolverProcess
 from daemon.status import LearnerStatus
+from daemon.tool_changes import ToolChanges
 from daemon.wire import OCTETS, CommandReply, CommandRequest, PairsReply, decode, encode
 from interfaces.protocols import Clock
 from kbmaps import KBMapsError
@@ -63,6 +64,8 @@ class Learner:
         self._checkpointed_pairs = self._learning.counters.pairs
         self._checkpoint_problem: str | None = None
         self._checkpoint_lock = threading.Lock()
+        self._tool_changes = ToolChanges(self._learning.counters)
+        self._rested_with: int | None = None
         self._stop = threading.Event()
         self._failure: Exception | None = None
 
@@ -115,7 +118,9 @@ class Learner:
 
     def status(self) -> LearnerStatus:
         """The learner's state."""
-        counters, snapshot = self._learning.counters, self._learning.snapshot
+        counters = self._learning.counters
+        at_rest = self._rested_with == counters.pairs  # before what is said below: it is final then
+        snapshot = self._learning.snapshot
         now = self._clock.now()
         written = self._checkpointed_at if self._checkpoint_problem is None else None
         return LearnerStatus(
@@ -138,6 +143,8 @@ class Learner:
             refused=counters.refused,
             doubted=counters.doubted,
             changes=counters.changes,
+            last_change=self._tool_changes.last,
+            at_rest=at_rest,
             checkpoint_age_s=None if written is None else now - written,
             uptime_s=now - self._started_at,
             health=list(self._health()),
@@ -224,6 +231,7 @@ class Learner:
         with self._feed.lock:
             foreign = self._feed.foreign_store
             self._learning.reset_to_prior(forget_store=foreign is not None)
+            self._tool_changes.forget(self._learning.counters)
             self._feed.restart()
         self._feed.wake()
         self.checkpoint()
@@ -234,6 +242,7 @@ class Learner:
     def _tool_changed(self) -> str:
         with self._feed.lock:
             self._learning.tool_changed()
+            self._tool_changes.note(self._learning.counters, found=False)
         self.checkpoint()
         return "pairs with the old tool no longer count; what they taught is where learning starts again"
 
@@ -252,6 +261,8 @@ class Learner:
     def _learn_pairs(self) -> None:
         while not self._stop.is_set():
             self._feed.step(IDLE_S)
+            with self._feed.lock:
+                self._tool_changes.note(self._learning.counters, found=True)
 
     def _work_in_background(self) -> None:
         with contextlib.suppress(OSError):  # niceness is a courtesy: without it answers are a little later
@@ -261,9 +272,12 @@ class Learner:
             try:
                 self._findings.renew()
                 worked = self._learning.work()
+                pairs = self._learning.counters.pairs
+                self._rested_with = pairs if self._learning.at_rest and self._findings.at_rest else None
             except SolverLostError as error:
                 log.warning("%s", error)
                 self._learning.restart_solver()
+                self._rested_with = None
                 self._stop.wait(1.0)
                 continue
             if worked:

@@ -21,6 +21,13 @@ def mm(metres: float | None, unit: str = " mm") -> str:
     return f"{value:.{0 if value >= 100 else 1 if value >= 1 else 2 if value >= 0.1 else 3}f}{unit}"
 
 
+def two_digits(value: float) -> str:
+    """A positive number with two significant digits, never in powers of ten."""
+    if value <= 0.0 or not math.isfinite(value):
+        return f"{value:g}"
+    return f"{value:.{max(1 - math.floor(math.log10(value)), 0)}f}"
+
+
 def titled_table(title: str, *, numbers: bool = True) -> Table:
     """An empty table without lines: names on the left and, unless told otherwise, numbers on the right."""
     table = Table(box=None, pad_edge=False, show_header=False, title=Text(title, style="bold"), title_justify="left")

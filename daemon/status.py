@@ -78,7 +78,8 @@ class ChainCalibration(msgspec.Struct, frozen=True, kw_only=True):
         camera_link, camera_xyz, camera_rpy: pose of the measurement frame in this link (URDF convention) [m, rad].
         marker_link, marker_xyz: the marker in this link [m].
         zeros: by joint; null where no motion shows it and it is left as drawn. The other figures are given that.
-        axes_rad, points_m: how well the arm seems to be made: 1-sigma of an axis' tilt and of its shift.
+        axes_rad, points_m: how well the arm seems to be made: 1-sigma of an axis' tilt and of its shift; null
+            where the pairs do not tell.
         noise_m: 1-sigma of a measured coordinate.
         outliers: of the last 500 pairs, those too far from the chain for this noise.
     """
@@ -90,8 +91,8 @@ class ChainCalibration(msgspec.Struct, frozen=True, kw_only=True):
     marker_link: str
     marker_xyz: list[LearntFigure]
     zeros: dict[str, JointZero | None]
-    axes_rad: float
-    points_m: float
+    axes_rad: float | None
+    points_m: float | None
     noise_m: float
     outliers: int
 
@@ -123,6 +124,13 @@ class Outlook(msgspec.Struct, frozen=True, kw_only=True):
     enough: bool
 
 
+class ToolChange(msgspec.Struct, frozen=True):
+    """The last change of the tool: sequence number of the first pair with it, and whether it was found, not told."""
+
+    first_seq: int
+    found: bool
+
+
 class LearnerStatus(msgspec.Struct, frozen=True, kw_only=True):
     """State of the learner.
 
@@ -144,6 +152,8 @@ class LearnerStatus(msgspec.Struct, frozen=True, kw_only=True):
         refused: pairs that could not be taken.
         doubted: pairs that looked like gross outliers and were learnt with care.
         changes: tool changes that were told, or found in the pairs.
+        last_change: the last of them; null where there was none since the process started.
+        at_rest: whether nothing is left to do with the pairs that came: to fit, to solve, to replay or to find out.
         checkpoint_age_s: time since the last checkpoint, or null before any.
         health: sentences about what is wrong; empty when all is well.
     """
@@ -167,6 +177,8 @@ class LearnerStatus(msgspec.Struct, frozen=True, kw_only=True):
     refused: int
     doubted: int
     changes: int
+    last_change: ToolChange | None
+    at_rest: bool
     checkpoint_age_s: float | None
     uptime_s: float
     health: list[str]

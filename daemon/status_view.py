@@ -129,12 +129,25 @@ def _learner(status: LearnerStatus) -> list[RenderableType]:
     facts = _facts()
     facts.add_row("pairs", f"{status.pairs} learnt, {status.replayed} replay steps{doubted}{refused}")
     facts.add_row("next pair", f"missed by: {errors}")
-    facts.add_row("claimed", f"{mm(status.claimed_error_m)} mean error where data is")
-    for name, line in zip(("enough?", "", ""), outlook_lines(status.outlook), strict=False):
+    facts.add_row("claimed", f"{mm(status.claimed_error_m)} mean error where data is{_elsewhere(status)}")
+    if status.changes:
+        facts.add_row("tool", _tool_change(status))
+    for name, line in zip(("enough?", ""), outlook_lines(status.outlook), strict=False):
         facts.add_row(name, line)
     facts.add_row("answering", f"{status.answering}, model {status.model or 'none yet'}")
     facts.add_row("checkpoint", saved)
     return [_head("learner", status), facts, *_health(status.health)]
+
+
+def _elsewhere(status: LearnerStatus) -> str:
+    return "" if status.outlook is None else f", {mm(status.outlook.anywhere_m)} over all joints' ranges"
+
+
+def _tool_change(status: LearnerStatus) -> str:
+    since, change = f"{status.pairs_since_change} pairs since", status.last_change
+    if change is None:
+        return f"changed {status.changes} time{'' if status.changes == 1 else 's'}; {since}"
+    return f"changed at pair {change.first_seq} ({'found' if change.found else 'told'}); {since}"
 
 
 def _facts() -> Table:

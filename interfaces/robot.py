@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -24,8 +26,11 @@ from .urdf import MOVING, UrdfJoint, UrdfTree, chain_between
 
 Vector3 = tuple[float, float, float]
 Positive = Annotated[float, Meta(gt=0)]
+# Beyond these a number is of another unit: degrees, millimetres.
+LARGEST_TURN_RAD, LONGEST_TOOL_M, FARTHEST_CAMERA_M = 2.0 * math.pi, 2.0, 50.0
 # One chunk of a zenoh key: no separators, no wild cards, and not the @ that hides a chunk from wild cards.
-Name = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.-]*$")]
+NAME = r"^[A-Za-z0-9_][A-Za-z0-9_.-]*$"
+Name = Annotated[str, Meta(pattern=NAME)]
 
 
 class RobotSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -122,6 +127,7 @@ class RobotDescription:
                 raise ConfigError(
                     f"the table [{section}] is missing", file=file, remedy="`bodyschema config init` shows one"
                 )
+        _check_name(tables["robot"], text, file)
         robot = convert(tables["robot"], RobotSection, file=file, text=text, prefix=("robot",))
         camera = convert(tables["camera"], CameraSection, file=file, text=text, prefix=("camera",))
         return cls._assemble(robot, camera, text, file)
@@ -144,6 +150,7 @@ class RobotDescription:
             tree.require_link(camera.parent_link)
         with blamed_on("robot", "marker_link"):
             tree.require_link(robot.marker_link)
+        _check_units(robot, camera, text, file)
         with blamed_on("robot", "joints"):
             chain = chain_between(
                 tree,
@@ -176,6 +183,36 @@ class RobotDescription:
     def joints(self) -> tuple[str, ...]:
         """Names of the joints in the order of q."""
         return self.robot.joints
+
+
+def _check_name(table: Any, text: str, file: Path) -> None:
+    """ConfigError with words in the place of a pattern."""
+    name = table.get("name") if isinstance(table, dict) else None
+    if isinstance(name, str) and not re.match(NAME, name):
+        raise ConfigError(
+            f"robot.name: {name!r} is no name for zenoh keys",
+            file=file,
+            line=line_of(text, ("robot", "name")),
+            remedy="Take letters, digits, _ . and -, without spaces, and begin with a letter, a digit or _",
+        )
+
+
+def _check_units(robot: RobotSection, camera: CameraSection, text: str, file: Path) -> None:
+    """ConfigError where a number is one of degrees or millimetres."""
+
+    def refuse(keys: tuple[str, str], value: object, unit: str, remedy: str) -> None:
+        what = f"{'.'.join(keys)} = {value}: this looks like {unit}"
+        raise ConfigError(what, file=file, line=line_of(text, keys), remedy=remedy)
+
+    if max(map(abs, camera.rpy)) > LARGEST_TURN_RAD:
+        refuse(("camera", "rpy"), list(camera.rpy), "degrees", "Give radians: a right angle is 1.5708")
+    for keys, length, largest in (
+        (("robot", "marker_xyz"), robot.marker_xyz, LONGEST_TOOL_M),
+        (("camera", "xyz"), camera.xyz, FARTHEST_CAMERA_M),
+        (("camera", "baseline_m"), (camera.baseline_m or 0.0,), LONGEST_TOOL_M),
+    ):
+        if math.hypot(*length) > largest:
+            refuse(keys, list(length) if len(length) > 1 else length[0], "millimetres", "Give metres")
 
 
 def _calibration(camera: CameraSection) -> StereoCalibration | None:

@@ -46,7 +46,8 @@ def calibrate(
 
     Learns a rigid chain from all pairs, around the nominal one. Outliers are left out. All pairs have to be of one
     tool: from a store those are learnt that the learner beside it counts since the tool was last changed. Where
-    residuals jump as with another tool, this is said, with the row, and nothing is written.
+    residuals jump as with another tool, this is said, with the row, and nothing is written; nor is it where the pairs
+    are far from any arm like the drawn one: columns mixed up, another robot.
 
     The URDF opens in pybullet, Pinocchio and ROS: it has the camera and the marker as links of their own, and takes
     its positions from them to rounding as the learnt chain does. Meshes, masses and limits stay.
@@ -67,6 +68,7 @@ def calibrate(
     from daemon.calibration_report import CalibrationReport
     from daemon.calibration_view import two_tools, view
     from daemon.config import Config
+    from daemon.plausibility import require_units
     from daemon.present_tool import first_pair
     from daemon.wire import encode
     from interfaces.calibrated_files import write_calibrated
@@ -83,12 +85,15 @@ def calibrate(
     first = first or 1
     recording = recordings.between(recording, first, last, source)
     sigma_m = None if sigma_mm is None else 1e-3 * sigma_mm
+    require_units(description, recording, source)
     found = Calibration.of(description, recording, sigma_m=sigma_m, zeros_rad=math.radians(zeros_deg))
     report = CalibrationReport.of(found, source.name, first)
     written = None
     if out is not None:
         if report.other_tool_from is not None:
             raise CalibrationError(f"nothing was written. {two_tools(report)}")
+        if report.doubt is not None:
+            raise CalibrationError(f"nothing was written. {report.doubt}")
         heading = f"Calibrated by bodyschema from {report.pairs} pairs of {source.name}"
         written = write_calibrated(description, found.figures.geometry, out, heading)
     if as_json:
@@ -97,4 +102,9 @@ def calibrate(
     console = Console(highlight=False)
     console.print(view(report))
     if written is not None:
-        console.print(f"\n{written} written. Next: `bodyschema run --robot {written}`", markup=False, soft_wrap=True)
+        console.print(
+            f"\n{written} written. Next: stop what runs with {config.file.name} (the new one has its ports), then "
+            f"`bodyschema run --robot {written}`",
+            markup=False,
+            soft_wrap=True,
+        )

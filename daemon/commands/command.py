@@ -40,8 +40,11 @@ def command(
     from daemon.config import Config
     from daemon.keys import Keys
     from daemon.wire import CommandReply, CommandRequest, decode, encode
+    from interfaces.errors import RequestError
 
     process: Process = to or ("sampler" if name in SAMPLERS else "learner")
+    if process == "sampler" and name not in SAMPLERS:
+        raise RequestError(f"the sampler knows {' and '.join(SAMPLERS)} alone; {name} is the learner's: drop --to")
     config = Config.load(robot)
     with client(getattr(config.tables.zenoh, process)) as bus:
         reply = bus.ask_one(Keys(config.robot.name).command(process), encode(CommandRequest(name)))

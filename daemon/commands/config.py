@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -78,8 +80,12 @@ def check(*, robot: RobotFile = HERE) -> None:
             f"  {joint}: on the way, but not in joints: stands still at {description.robot.held_at.get(joint, 0.0):.4g}"
         )
     known = {True: "known", False: "only roughly known: fitted first"}
-    say(f"  marker on {description.robot.marker_link}, {known[description.robot.marker_known]}")
-    say(f"  camera on {description.camera.parent_link}, {known[description.camera.pose_known]}")
+    section, camera = description.robot, description.camera
+    say(f"  marker on {section.marker_link} at {_numbers(section.marker_xyz)} m, {known[section.marker_known]}")
+    say(
+        f"  camera on {camera.parent_link} at {_numbers(camera.xyz)} m, roll, pitch, yaw "
+        f"{_numbers(map(math.degrees, camera.rpy))}°, {known[camera.pose_known]}"
+    )
     stereo = "described" if description.calibration else "not described: no images can be used, recordings can"
     say(f"  stereo calibration {stereo}")
     say(f"  sampler on {zenoh.sampler}, learner on {zenoh.learner}")
@@ -103,6 +109,10 @@ def show(*, robot: RobotFile = HERE) -> None:
     tables["robot"] = msgspec.to_builtins(checked.robot.robot)
     tables["camera"] = msgspec.to_builtins(checked.robot.camera)
     say(msgspec.json.format(msgspec.json.encode(tables)).decode())
+
+
+def _numbers(values: Iterable[float]) -> str:
+    return ", ".join(f"{round(value, 4) + 0.0:.4g}" for value in values)
 
 
 def _standing_still(description: RobotDescription) -> list[str]:

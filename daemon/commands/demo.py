@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Annotated
 
 from cyclopts import Parameter
+from cyclopts.validators import Number
 
 OUT = Path("bodyschema-demo")
 
@@ -13,9 +14,9 @@ OUT = Path("bodyschema-demo")
 def demo(
     *,
     out: Annotated[Path, Parameter(help="Folder for the recording, the curve and the plot.")] = OUT,
-    pairs: Annotated[int, Parameter(help="Pairs to learn before the tool change.")] = 600,
-    pairs_after: Annotated[int, Parameter(help="Pairs to learn after it.")] = 300,
-    seed: Annotated[int, Parameter(help="Another robot, another path, other noise.")] = 0,
+    pairs: Annotated[int, Parameter(help="Pairs to learn before the tool change.", validator=Number(gte=1))] = 600,
+    pairs_after: Annotated[int, Parameter(help="Pairs to learn after it.", validator=Number(gte=1))] = 300,
+    seed: Annotated[int, Parameter(help="Another robot, another path, other noise.", validator=Number(gte=0))] = 0,
 ) -> None:
     """Watch the whole thing learn, in simulation, in about a minute.
 

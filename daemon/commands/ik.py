@@ -42,12 +42,17 @@ def ik(
 
     Next: the same from a program of yours, from where your arm is: docs/zenoh.md.
     """
+    import math
+
     from daemon.bus import client
     from daemon.config import Config
     from daemon.keys import Keys
     from daemon.wire import IkReply, IkRequest, decode, encode
+    from interfaces.errors import RequestError
 
     config = Config.load(robot)
+    if not all(map(math.isfinite, (x, y, z))):
+        raise RequestError(f"{x:g}, {y:g}, {z:g} is no position: give three finite numbers in metres")
     with client(config.tables.zenoh.learner) as bus:
         payload = bus.ask_one(Keys(config.robot.name).ik, encode(IkRequest((x, y, z), posture=posture)))
     reply = decode(payload, IkReply)
@@ -66,6 +71,8 @@ def _show(reply: IkReply, config: Config, deg: bool) -> None:
     from rich.table import Table
     from rich.text import Text
 
+    from daemon.screen import two_digits
+
     table = Table(box=None, pad_edge=False, header_style="bold", show_header=False)
     for name, value, slides in zip(config.robot.joints, reply.q, config.robot.chain.prismatic, strict=True):
         unit = "m" if slides else "deg" if deg else "rad"
@@ -75,7 +82,7 @@ def _show(reply: IkReply, config: Config, deg: bool) -> None:
     console = Console(highlight=False)
     console.print(table)
     console.print(REASONS[reply.reason].format(mm=1e3 * reply.distance))
-    spread = ", ".join(f"{1e3 * value:.1f}" for value in reply.sigma)
+    spread = ", ".join(two_digits(1e3 * value) for value in reply.sigma)
     where = "where data was" if reply.in_support else "away from all data"
     console.print(
         f"1-sigma of x, y, z there {spread} mm, {where}; model {reply.model}, {reply.pairs} pairs", style="dim"

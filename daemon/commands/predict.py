@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
@@ -12,6 +13,7 @@ from daemon.commands.options import HERE, RobotFile, flag
 if TYPE_CHECKING:
     from daemon.config import Config
     from daemon.wire import JointsRequest, PredictReply
+    from interfaces.records import FloatArray
 
 
 def predict(
@@ -29,6 +31,9 @@ def predict(
 
     Next: the same from a program of yours, over zenoh: docs/zenoh.md.
     """
+    import numpy as np
+    from rich.console import Console
+
     from daemon.bus import client
     from daemon.config import Config
     from daemon.keys import Keys
@@ -42,6 +47,26 @@ def predict(
         sys.stdout.write(payload.decode() + "\n")
         return
     _show(decode(payload, PredictReply))
+    for note in _notes(config, np.array(request.q), deg):
+        Console(highlight=False).print(note, style="yellow", markup=False)
+
+
+def _notes(config: Config, q: FloatArray, deg: bool) -> Iterator[str]:
+    """What is to be said of joint values q (n, d) [rad, m] that the arm cannot have."""
+    import numpy as np
+
+    from daemon.plausibility import beyond_limits, limits_text
+
+    beyond = beyond_limits(config.robot, q)
+    for joint in np.flatnonzero(beyond.any(axis=0)):
+        worst = q[beyond[:, joint], joint][np.abs(q[beyond[:, joint], joint]).argmax()]
+        unit = " m" if config.robot.chain.prismatic[joint] else " rad"
+        forgotten = "" if deg or unit == " m" else ". --deg takes degrees"
+        limits = limits_text(config.robot, int(joint))
+        yield (
+            f"{config.robot.joints[joint]} cannot be at {worst:.4g}{unit}: its limits are {limits}{forgotten}. The "
+            "answer is the model's all the same"
+        )
 
 
 def _request(values: tuple[float, ...], config: Config, deg: bool) -> JointsRequest:
@@ -86,12 +111,14 @@ def _show(reply: PredictReply) -> None:
     from rich.table import Table
     from rich.text import Text
 
+    from daemon.screen import two_digits
+
     table = Table(box=None, pad_edge=False, header_style="bold")
     for name in ("x", "y", "z", "1-sigma of x, y, z"):
         table.add_column(Text(f"{name} [mm]"), justify="right", no_wrap=True)
     table.add_column("", no_wrap=True)
     for x, sigma, inside in zip(reply.x, reply.sigma, reply.in_support, strict=True):
-        spread = ", ".join(f"{1e3 * value:.1f}" for value in sigma)
+        spread = ", ".join(two_digits(1e3 * value) for value in sigma)
         where = "where data was" if inside else "away from all data"
         table.add_row(*(f"{1e3 * value:.1f}" for value in x), spread, where)
     console = Console(highlight=False)

@@ -58,6 +58,7 @@ def replay(
 
     from daemon.config import Config
     from daemon.evaluate import split_blocks
+    from daemon.plausibility import require_units
     from daemon.replay.report import as_text
     from daemon.replay.run import Job
     from daemon.replay.run import replay as run_replay
@@ -67,6 +68,7 @@ def replay(
 
     config = Config.load(robot_file(robot, recording))
     rows = Recording.read(recording, config.robot.joints)
+    require_units(config.robot, rows, recording)
     split = split_blocks(len(rows), held_out)
     any_step |= config.tables.daemon.any_step
     if not any_step:
@@ -78,7 +80,7 @@ def replay(
         job = Job(config, rows, split, speed, sigma_m, any_step, keep or Path(temporary))
         with _progress(Console(stderr=True, highlight=False)) as show:
             report = run_replay(job, show)
-    sys.stdout.write((encode(report).decode() if as_json else as_text(report)) + "\n")
+    sys.stdout.write((encode(report).decode() if as_json else as_text(report, Console().width)) + "\n")
 
 
 @contextmanager

@@ -87,6 +87,11 @@ class Era:
         prior = known or self.members.prior
         return Task(self.task_number, prior, self.arm.chain, self.arm.residual, prior_stays=known is not None)
 
+    @property
+    def owes_replays(self) -> bool:
+        """Whether there are replay steps to do."""
+        return self._replays_due >= 1.0 and len(self.memory) > 0
+
     def limit_m(self, pair: Pair) -> float:
         """How far from its prediction the pair may lie before it is doubted [m]."""
         variance = np.diag(pair.cov)
@@ -126,7 +131,7 @@ class Era:
 
     def replay(self) -> int:
         """Some of the steps that are owed; how many they were."""
-        if self._replays_due < 1.0 or not len(self.memory):
+        if not self.owes_replays:
             return 0
         places = self._order.take(min(REPLAY_STEPS, int(self._replays_due)), len(self.memory))
         q, x = self.memory.at(places)

@@ -73,6 +73,18 @@ class Learning:
         return self._eras.present is None
 
     @property
+    def at_rest(self) -> bool:
+        """Whether no work is left with the pairs that came: nothing to fit, to solve or to replay.
+
+        For the thread that calls `work`.
+        """
+        with self._lock:
+            era, count = self._eras.present, self._eras.memory.count
+            if self._eras.fitting.due(count):
+                return False
+            return era is None or (not era.owes_replays and self._solving.has_solved(era.task_number, count))
+
+    @property
     def counters(self) -> Counters:
         """A copy of all that is counted."""
         with self._lock:

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
+import textwrap
+
 import msgspec
 
 from daemon.evaluate import BLOCKS, ErrorFigures
 from daemon.findings_view import outlook_sentence
 from daemon.screen import mm
 from daemon.status import Outlook
-
-# No arm is described that badly: rather another unit, or another robot [mm].
-FAR_MM = 1000.0
 
 
 class Figures(msgspec.Struct, frozen=True):
@@ -47,6 +46,7 @@ class ReplayReport(msgspec.Struct, frozen=True, kw_only=True):
         within_sigma_share: share of held-out coordinates within the 1-sigma claimed and the noise that was stated.
         replayed: replay steps of the instant learner.
         outlook: what the learner expects of further pairs, or null.
+        doubt: why no figure is to be trusted, or null: the rows are far from any arm like the drawn one.
         learning_s: time from the first pair to the end of learning [s].
     """
 
@@ -70,12 +70,13 @@ class ReplayReport(msgspec.Struct, frozen=True, kw_only=True):
     doubted: int
     replayed: int
     outlook: Outlook | None
+    doubt: str | None
     learning_s: float
     schema: int = 1
 
 
-def as_text(report: ReplayReport) -> str:
-    """The report for a terminal."""
+def as_text(report: ReplayReport, width: int = 80) -> str:
+    """The report for a terminal of so many columns; figures in columns are not wrapped."""
     rejected = ", ".join(f"{count} {reason}" for reason, count in sorted(report.rejected.items())) or "none"
     fitted = f"the nominal model with {' and '.join(report.fitted)} fitted" if report.fitted else "the nominal model"
     lines = [
@@ -94,13 +95,20 @@ def as_text(report: ReplayReport) -> str:
         f"before is {fitted} to the rows that were learnt; after is what the learner answers (model: "
         f"{report.answering}). {_verdict(report)}",
         f"error on new pairs before they were learnt: {_by_model(report.prequential_mm)}",
-        f"the learner claims {mm(_metres(report.claimed_mm))} where data is; its 1-sigma covers "
+        f"the errors above count the noise of the measurements; the learner claims {mm(_metres(report.claimed_mm))} to "
+        "the truth where data is; its 1-sigma and that noise together cover "
         f"{report.within_sigma_share:.0%} of the held-out coordinates (68 % is right); "
         f"{report.in_support_share:.0%} of the held-out rows lie where data was",
         *([] if report.outlook is None else [outlook_sentence(report.outlook)]),
         f"{report.replayed} replay steps, {report.doubted} pairs doubted, {report.learning_s:.1f} s",
     ]
-    return "\n".join(lines)
+    return "\n".join(_wrapped(line, width) for line in lines)
+
+
+def _wrapped(line: str, width: int) -> str:
+    if len(line) <= width or "   " in line:
+        return line
+    return textwrap.fill(line, width, break_long_words=False, break_on_hyphens=False)
 
 
 def _row(figures: Figures) -> str:
@@ -109,8 +117,8 @@ def _row(figures: Figures) -> str:
 
 
 def _verdict(report: ReplayReport) -> str:
-    if report.before.mean_mm > FAR_MM:
-        return "Metres apart: are the positions in metres, the angles in radians, and both of this robot?"
+    if report.doubt is not None:
+        return report.doubt
     ratio = report.after.mean_mm / report.before.mean_mm if report.before.mean_mm else 1.0
     if abs(ratio - 1.0) < 0.01:
         return "Learning left the mean error as it was."

@@ -15,6 +15,7 @@ from daemon.bus import Bus, client
 from daemon.config import Config
 from daemon.evaluate import ErrorFigures, Split, aligned_chain, coverage
 from daemon.keys import Keys
+from daemon.plausibility import FAR_OFF_AS_DRAWN, OTHER_CAUSES, is_far_off, mixed_up
 from daemon.status import LearnerStatus, SamplerStatus
 from daemon.wire import JointsRequest, PredictReply, decode, encode
 from interfaces.errors import BusError, RecordingError
@@ -26,8 +27,6 @@ from .report import Figures, ReplayReport
 from .steps import Steps
 
 GLANCE_S = 0.25
-# The learner has settled when nothing of it has changed for so long: it begins idle work after half a second.
-SETTLED_S = 2.0
 STALL_LIMIT_S = 120.0
 BATCH = 2000
 # Live pairs come at the rate of the frames at most, and over some time: background learning is made for that.
@@ -139,8 +138,18 @@ def _report(job: Job, before: FloatArray, learnt: Learnt, prediction: PredictRep
         doubted=learner.doubted,
         replayed=learner.replayed,
         outlook=learner.outlook,
+        doubt=_doubt(job, before),
         learning_s=learnt.seconds,
     )
+
+
+def _doubt(job: Job, before: FloatArray) -> str | None:
+    """Why the rows are not this arm's, as its drawing in the best place has them; None where they may be."""
+    robot, held_out = job.config.robot, job.held_out_rows
+    left_m = np.linalg.norm(before - held_out.x, axis=1)
+    if not is_far_off(robot, left_m, job.sigma_m, share=FAR_OFF_AS_DRAWN):
+        return None
+    return f"So far apart is no arm from its drawing. {mixed_up(robot, job.learnt_rows) or OTHER_CAUSES}."
 
 
 class _Live:
@@ -170,7 +179,7 @@ class _Live:
                     file=self._recording.file or "recording",
                     remedy="--any-step relaxes its step and speed rules",
                 )
-            if through and learner.pairs + learner.refused >= sampler.pairs and now - changed > SETTLED_S:
+            if through and learner.pairs + learner.refused >= sampler.pairs and learner.at_rest:
                 return Learnt(sampler, learner, changed - begin)
             if now - changed > self._stall_limit_s:
                 raise BusError(f"no progress for {self._stall_limit_s:.0f} s; --keep DIR keeps the logs that say why")

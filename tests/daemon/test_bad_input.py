@@ -325,6 +325,16 @@ def test_the_status_of_a_learner_alone_names_the_command_that_starts_a_sampler(l
     assert f"sampler does not answer on {lonely_learner.tables.zenoh.sampler}. Start it with `bodyschema s" in text
 
 
+def test_a_command_that_the_sampler_does_not_know_is_the_learner_s(lonely_learner) -> None:
+    said = refused("command", "tool_changed", "--to", "sampler", cwd=lonely_learner.file.parent)
+    assert said == "the sampler knows pause and resume alone; tool_changed is the learner's: drop --to"
+
+
+def test_a_target_that_is_no_position_is_refused_in_words(lonely_learner) -> None:
+    said = refused("ik", "nan", "0", "1", cwd=lonely_learner.file.parent)
+    assert said == "nan, 0, 1 is no position: give three finite numbers in metres"
+
+
 def test_recording_without_a_sampler_is_refused(lonely_learner) -> None:
     said = refused("record", "a.csv", cwd=lonely_learner.file.parent)
     assert said.startswith(f"nobody listens on {lonely_learner.tables.zenoh.sampler}. Start")

@@ -18,6 +18,7 @@ from daemon.checkpoint import write_checkpoint
 from daemon.cli import app
 from daemon.config import Config
 from daemon.learning import DirectSolver, Learning, NominalModel
+from daemon.plausibility import mixed_up
 from daemon.recordings import of_robot
 from daemon.session import session_of
 from daemon.store import PairStore
@@ -156,8 +157,37 @@ def test_a_joint_that_hardly_moved_is_named() -> None:
     assert "Hardly moved: elbow_pitch." in said(dataclasses.replace(arm, recording=recording))
 
 
-def test_noise_that_no_camera_has_is_questioned() -> None:
-    assert "Are positions in metres, angles in radians" in said(planted(1), noise_mm=80.0)
+def test_the_scatter_of_the_pairs_is_not_what_their_source_told() -> None:
+    arm = planted(1)
+    told = Recording(arm.robot.joints, arm.recording.q, arm.recording.x, cov=np.tile(0.003**2 * np.eye(3), (100, 1, 1)))
+    report = report_on(dataclasses.replace(arm, recording=told))
+    assert report.noise_mm == pytest.approx(1e3 * SIGMA_M, rel=0.15)
+    assert report.told_noise_mm == pytest.approx(3.0)
+
+
+@pytest.fixture(scope="module")
+def corner() -> CalibrationReport:
+    """Of twelve pairs within a few degrees."""
+    arm = planted(1)
+    q = arm.recording.q[0] + 0.05 * np.random.default_rng(0).normal(size=(12, 4))
+    x = arm.parameters.positions(arm.change, q) + SIGMA_M * np.random.default_rng(1).normal(size=(12, 3))
+    return report_on(dataclasses.replace(arm, recording=Recording(arm.robot.joints, q, x)))
+
+
+def test_few_pairs_of_one_corner_do_not_tell_how_well_the_arm_is_made(corner) -> None:
+    assert (corner.axes_deg, corner.points_mm) == (None, None)
+    assert "These pairs do not tell how well the arm is made" in "\n".join(sentences(corner))
+
+
+def test_few_pairs_of_one_corner_show_few_of_the_numbers(corner) -> None:
+    assert corner.shown < 0.8 * corner.showable
+
+
+def test_pairs_of_all_poses_show_all_numbers_and_how_well_the_arm_is_made() -> None:
+    report = report_on(planted(1))
+    assert report.shown == report.showable
+    assert report.axes_deg is not None
+    assert 0.3 < report.axes_deg / np.degrees(0.003) < 3.4  # one step of the choices
 
 
 def test_residuals_that_the_told_noise_does_not_explain_are_said() -> None:
@@ -189,7 +219,8 @@ def test_the_table_fits_a_terminal_of_80_columns(pairs_file, capsys, monkeypatch
 
 def test_the_written_robot_is_the_learnt_one(pairs_file, tmp_path, capsys) -> None:
     called(pairs_file, "--out", tmp_path / "calibrated")
-    assert "robot.toml written. Next: `bodyschema run --robot" in capsys.readouterr().out.replace("\n", " ")
+    said = capsys.readouterr().out.replace("\n", " ")
+    assert "robot.toml written. Next: stop what runs with robot.toml (the new one has its ports), then" in said
     written = Config.load(tmp_path / "calibrated" / "robot.toml", {}).robot
     robot = RobotDescription.load(DESK_ARM)
     read = Recording.read(pairs_file, robot.joints)
@@ -232,6 +263,56 @@ def test_the_simulation_takes_a_calibrated_robot(tmp_path) -> None:
         scene = physics.scene()
     seen = (np.linalg.inv(scene.T_world_camera) @ np.append(scene.x_world, 1.0))[:3]
     np.testing.assert_allclose(seen, found.learner.predict(scene.angles), rtol=0, atol=1e-6)
+
+
+# --- other units, another order, another robot
+
+
+def written_as(
+    file: Path, *, order: tuple[int, ...] = (0, 1, 2, 3), q_scale: float = 1.0, x_scale: float = 1.0
+) -> None:
+    pairs = planted(1).recording
+    Recording(pairs.joints, q_scale * pairs.q[:, order], x_scale * pairs.x).write_csv(file)
+
+
+def test_positions_in_millimetres_are_refused(pairs_file) -> None:
+    written_as(pairs_file, x_scale=1e3)
+    with pytest.raises(RecordingError, match=r"the arm reaches 0.57 m: these look like millimetres. .* divide by 1000"):
+        called(pairs_file)
+
+
+def test_angles_in_degrees_are_refused(pairs_file) -> None:
+    written_as(pairs_file, q_scale=float(np.degrees(1.0)))
+    with pytest.raises(RecordingError, match=r"limits from .* rad \(.*\): these look like degrees"):
+        called(pairs_file)
+
+
+def test_columns_in_another_order_are_named_and_nothing_is_written(pairs_file, tmp_path) -> None:
+    written_as(pairs_file, order=(1, 0, 2, 3))
+    said_why = r"nothing was written. .*With the columns base_yaw and shoulder_pitch exchanged, the pairs would fit to"
+    with pytest.raises(CalibrationError, match=said_why):
+        called(pairs_file, "--out", tmp_path / "calibrated")
+    assert not (tmp_path / "calibrated").exists()
+
+
+def test_a_joint_that_counts_the_other_way_is_named() -> None:
+    arm = planted(2)
+    q = arm.recording.q * [1.0, -1.0, 1.0, 1.0]
+    assert "With shoulder_pitch counting the other way" in (
+        mixed_up(arm.robot, Recording(arm.robot.joints, q, arm.recording.x)) or ""
+    )
+
+
+def test_columns_that_are_right_are_not_said_to_be_mixed_up() -> None:
+    arm = planted(3)
+    assert mixed_up(arm.robot, arm.recording) is None
+
+
+def test_positions_of_no_arm_are_doubted_without_a_cause() -> None:
+    arm = planted(1)
+    x = 0.2 * np.random.default_rng(0).normal(size=(100, 3))
+    doubt = report_on(dataclasses.replace(arm, recording=Recording(arm.robot.joints, arm.recording.q, x))).doubt
+    assert "Is the recording of another robot" in (doubt or "")
 
 
 # --- pairs of two tools

@@ -9,10 +9,12 @@ import tomllib
 from pathlib import Path
 
 import pytest
+from cyclopts import CycloptsError
 from small_arm import URDF, write_small_arm
 
 from daemon.cli import COMMANDS, app, command_line
 from daemon.config import Config
+from daemon.screen import two_digits
 from interfaces.errors import BusError, ConfigError
 
 LIMIT_S = 60.0
@@ -153,3 +155,15 @@ def test_a_sampler_without_a_driver_says_so_and_leaves_no_store(tmp_path, robot)
     done = run("sampler", "--robot", robot, cwd=tmp_path)
     assert (done.returncode, "no driver is configured" in done.stderr) == (1, True)
     assert not (tmp_path / "state").exists()
+
+
+@pytest.mark.parametrize(
+    ("value", "shown"), [(0.031, "0.031"), (0.5, "0.50"), (1.96, "2.0"), (123.4, "123"), (0.0, "0")]
+)
+def test_a_sigma_is_shown_with_two_digits_however_small(value: float, shown: str) -> None:
+    assert two_digits(value) == shown
+
+
+def test_a_demo_of_no_pairs_is_refused() -> None:
+    with pytest.raises(CycloptsError, match="--pairs"):
+        app(["demo", "--pairs", "-1"], exit_on_error=False, print_error=False)

@@ -99,3 +99,28 @@ def test_a_missing_table_is_named(tmp_path) -> None:
     (tmp_path / "robot.toml").write_text("[camera]\n")
     with pytest.raises(ConfigError, match=r"the table \[robot\] is missing"):
         Config.load(tmp_path / "robot.toml", {})
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "said"),
+    [
+        ("camera.rpy", "[-90, 0, 90]", r"line \d+: camera.rpy = \[-90.0, 0.0, 90.0\]: this looks like degrees"),
+        ("robot.marker_xyz", "[0, 0, 30]", r"line \d+: robot.marker_xyz = \[0.0, 0.0, 30.0\]: this looks like millim"),
+        ("camera.xyz", "[1100, 0, 300]", r"line \d+: camera.xyz = \[1100.0, 0.0, 300.0\]: this looks like millim"),
+        ("vision.radius_m", "20", r"line \d+: vision.radius_m = 20: this looks like millimetres. Give metres"),
+        ("robot.name", '"my arm"', r"line \d+: robot.name: 'my arm' is no name .* Take letters, digits"),
+    ],
+)
+def test_a_number_of_another_unit_is_refused_with_its_line(tmp_path, key: str, value: str, said: str) -> None:
+    file = write_small_arm(tmp_path, "[vision]\n")
+    table, name = key.split(".")
+    text = file.read_text().replace('name = "arm"\n', "") if name == "name" else file.read_text()
+    file.write_text(text.replace(f"[{table}]\n", f"[{table}]\n{name} = {value}\n"))
+    with pytest.raises(ConfigError, match=said):
+        Config.load(file, {})
+
+
+def test_a_camera_that_stands_as_far_as_a_laser_tracker_is_none_in_millimetres(tmp_path) -> None:
+    file = write_small_arm(tmp_path)
+    file.write_text(file.read_text().replace("[camera]\n", "[camera]\nxyz = [8.0, -6.0, 1.5]\n"))
+    assert Config.load(file, {}).robot.camera.xyz == (8.0, -6.0, 1.5)

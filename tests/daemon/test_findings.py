@@ -10,6 +10,7 @@ from guided_arm import Scene, make_pair, near, new_learning, teach
 from test_calibration import DESK_ARM, figures_of
 
 import daemon.findings
+from daemon.chain_figures import is_told
 from daemon.config import LearnerConfig
 from daemon.findings import EVERY_S, Findings, figures
 from daemon.learning import DirectSolver, Learning, NominalModel
@@ -135,7 +136,9 @@ def test_zeros_that_no_motion_shows_are_null_and_the_others_are_not() -> None:
 
 def test_the_arm_is_found_to_be_better_made_than_the_learner_s_tolerances() -> None:
     arm = Planted.of(2, 60)
-    _, (axes, points) = figures(arm.robot, arm.known())
+    _, made = figures(arm.robot, arm.known())
+    assert made is not None
+    axes, points = made
     assert axes < 0.02
     assert points < 0.005
 
@@ -266,6 +269,32 @@ def test_with_another_tool_nothing_is_told_before_its_first_solution() -> None:
     findings.renew()
     arm.learning.tool_changed()
     assert (findings.calibration, findings.outlook) == (None, None)
+
+
+def test_what_was_found_with_another_tool_is_not_told_with_this_one_s_first_solution() -> None:
+    arm = Planted.of(1, 40)
+    findings = findings_of(arm)
+    findings.renew()
+    arm.learning.tool_changed()
+    findings.renew()
+    arm.teach(np.random.default_rng(8), 12)
+    assert arm.learning.belief is not None
+    assert (findings.calibration, findings.outlook) == (None, None)  # it is not time to find them yet
+
+
+def test_they_are_at_rest_when_they_are_of_the_present_chain() -> None:
+    arm = Planted.of(1, 40)
+    findings = findings_of(arm)
+    rested = [findings.at_rest]
+    findings.renew()
+    rested.append(findings.at_rest)
+    arm.teach(np.random.default_rng(8), 30)
+    assert [*rested, findings.at_rest] == [False, True, False]
+
+
+def test_an_arm_that_may_be_ten_times_better_made_than_seems_is_not_said_to_be_made_so() -> None:
+    assert is_told([(0.003, 0.001), (0.001, 0.0005)])
+    assert not is_told([(0.003, 0.001), (0.0003, 0.0001)])
 
 
 def test_a_failure_to_find_them_does_not_stop_the_learner(monkeypatch, caplog) -> None:

@@ -252,6 +252,24 @@ def test_a_told_tool_change_keeps_what_was_learnt_and_drops_the_pairs() -> None:
     assert (len(state.arrays["q"]), state.header.counters.since_change, state.header.counters.pairs) == (0, 0, 100)
 
 
+def test_a_learner_is_at_rest_when_all_pairs_are_solved_and_replayed_and_not_before() -> None:
+    learning = new_learning()
+    teach(learning, Scene.draw(0, 40).pairs)
+    rested = []
+    learning.solve_soon()
+    while not learning.at_rest:
+        rested.append(learning.work())
+    assert rested
+    assert all(rested)
+    assert not learning.work()
+
+
+def test_a_learner_that_waits_for_its_first_alignment_is_at_rest() -> None:
+    learning = new_learning(nominal_model(pose_known=False))
+    teach(learning, Scene.draw(0, 3).pairs)
+    assert learning.at_rest
+
+
 def test_reset_to_prior_answers_as_before_any_pair() -> None:
     scene = Scene.draw(0, 100)
     learning, fresh = new_learning(), new_learning()

@@ -7,6 +7,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 from small_arm import JOINTS, write_small_arm
@@ -14,6 +15,7 @@ from small_arm import JOINTS, write_small_arm
 from daemon.cli import app
 from daemon.config import Config, DaemonConfig
 from daemon.evaluate import EvaluationError, split_blocks
+from daemon.replay.report import Figures, ReplayReport, as_text
 from daemon.replay.run import Job
 from daemon.replay.steps import Steps, require_path
 from interfaces.errors import ConfigError, RecordingError
@@ -43,7 +45,7 @@ def guided(robot: Path, rows: int = 160) -> Recording:
 
 def poses(rows: int = 40) -> Recording:
     rng = np.random.default_rng(3)
-    return Recording(JOINTS, rng.uniform(-1.5, 1.5, size=(rows, 2)), rng.normal(size=(rows, 3)))
+    return Recording(JOINTS, rng.uniform(-1.5, 1.5, size=(rows, 2)), 0.1 * rng.normal(size=(rows, 3)))
 
 
 def replay(*arguments: object) -> None:
@@ -127,6 +129,59 @@ def test_an_unreadable_recording_ends_with_exit_code_1_and_one_line(tmp_path: Pa
         f"bodyschema: {source}, line 3, column y: the field is empty. Write it like -0.5 or 1e-3, without quotes\n"
     )
     assert sorted(tmp_path.iterdir()) == before
+
+
+def test_positions_in_millimetres_are_refused_before_anything_starts(tmp_path: Path, robot: Path) -> None:
+    recording = guided(robot)
+    Recording(recording.joints, recording.q, 1e3 * recording.x).write_csv(tmp_path / "a.csv")
+    with pytest.raises(RecordingError, match="these look like millimetres"):
+        replay(tmp_path / "a.csv", "--keep", tmp_path / "kept")
+    assert not (tmp_path / "kept").exists()
+
+
+def report(**changed: object) -> ReplayReport:
+    figures = Figures(1.0, 1.0, 1.0, 1.0, 1.0)
+    told = ReplayReport(
+        recording="a.csv",
+        robot="arm",
+        rows=160,
+        held_out=48,
+        held_out_blocks=3,
+        accepted=112,
+        rejected={},
+        any_step=False,
+        steps="",
+        fitted=["pose_known = false", "marker_known = false"],
+        before=figures,
+        after=figures,
+        answering="rigid",
+        prequential_mm={"prior": 37.4, "nlms": 1.7, "rigid": 0.4, "residual": 0.4, "exact": 2.0},
+        claimed_mm=0.09,
+        in_support_share=0.9,
+        within_sigma_share=0.88,
+        doubted=0,
+        replayed=1000,
+        outlook=None,
+        doubt=None,
+        learning_s=3.0,
+    )
+    return msgspec.structs.replace(told, **changed)
+
+
+def test_the_report_is_wrapped_to_the_terminal() -> None:
+    assert max(map(len, as_text(report(), 80).splitlines())) <= 80
+    assert max(map(len, as_text(report(), 200).splitlines())) > 80
+
+
+def test_the_report_says_that_the_errors_have_the_measurements_noise() -> None:
+    said = " ".join(as_text(report()).split())
+    assert (
+        "the learner claims 0.090 mm to the truth where data is; its 1-sigma and that noise together cover 88%" in said
+    )
+
+
+def test_a_doubt_about_the_recording_takes_the_place_of_the_verdict() -> None:
+    assert "So far apart." in as_text(report(doubt="So far apart."))
 
 
 def test_a_guided_recording_is_learnt_by_the_two_processes(tmp_path: Path, robot: Path) -> None:

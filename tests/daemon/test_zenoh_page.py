@@ -21,6 +21,7 @@ from small_arm import write_small_arm
 
 from daemon import history, simulation, status, wire
 from daemon.bus import Bus, client
+from daemon.cli import app
 from daemon.config import Config
 from daemon.keys import Keys
 from daemon.learning import curve, incoming
@@ -139,6 +140,23 @@ def test_the_command_predict_prints_the_same(learner: Config) -> None:
     done = subprocess.run(command, capture_output=True, text=True, timeout=LIMIT_S, check=True)
     assert done.stdout.splitlines()[0].split("]")[:3] == ["x [mm", "  y [mm", "  z [mm"]
     assert done.stdout.splitlines()[1].split()[:3] == ["300.0", "0.0", "0.0"]
+
+
+def predicted(learner: Config, capsys, *arguments: str) -> str:
+    command = ["predict", "--robot", str(learner.file), *arguments]
+    app(command, exit_on_error=False, result_action="return_value")
+    return " ".join(capsys.readouterr().out.split())
+
+
+def test_joint_values_that_the_arm_cannot_have_are_named_with_their_limits_and_deg(learner: Config, capsys) -> None:
+    said = predicted(learner, capsys, "--", "-60", "0")
+    assert "waist cannot be at -60 rad: its limits are -3 to 3 rad (-171.9° to 171.9°). --deg takes degrees." in said
+    assert "cannot be" not in predicted(learner, capsys, "--deg", "--", "-60", "0")
+
+
+def test_degrees_beyond_the_limits_are_named_without_the_option_that_was_given(learner: Config, capsys) -> None:
+    said = predicted(learner, capsys, "--deg", "--", "0", "900")
+    assert "shoulder cannot be at 15.71 rad: its limits are -2 to 2 rad (-114.6° to 114.6°). The answer" in said
 
 
 def ask_ik(learner: Config, request: IkRequest) -> IkReply:
