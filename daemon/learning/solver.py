@@ -43,7 +43,7 @@ FITTED = 2000
 # The chain with residual takes longest, up to a second: it is solved anew when the pairs have grown by this factor.
 RESIDUAL_GROWTH = 1.15
 # With so many times the pairs of the last solution, this share of them is solved for first, if it is so many.
-MANY_NEW, FIRST_SHARE, FEWEST_FIRST = 1.5, 0.75, 5
+FIRST_GROWTH, FIRST_SHARE, FEWEST_FIRST = 1.5, 0.75, 5
 # From so many neighbours on that count as one, their errors are no chance.
 SHARED = 1.5
 
@@ -155,7 +155,7 @@ class DirectSolver:
     def solutions(self) -> Iterator[Solved]:
         """Each model's solution as it is found, the rigid chain first: it is the quickest."""
         task = self._started
-        if self._pairs >= MANY_NEW * self._solved_at:
+        if self._pairs >= FIRST_GROWTH * self._solved_at:
             yield from self._solved_of_some(task)
         self._solved_at = self._pairs
         belief = fitted_belief(self._before, self._q, self._x)
