@@ -197,16 +197,6 @@ def test_a_learner_restored_amid_a_tool_change_fits_the_tool_all_the_same() -> N
     assert Scene(changed, q, []).error_m(restored) < 0.025
 
 
-def test_a_restored_learner_answers_as_the_one_that_was_saved() -> None:
-    scene = Scene.draw(0, 100)
-    learning, restored = new_learning(), new_learning()
-    teach(learning, scene.pairs)
-    restored.restore(learning.state())
-    before, after = learning.snapshot.predict(scene.q), restored.snapshot.predict(scene.q)
-    np.testing.assert_array_equal(before.x, after.x)
-    np.testing.assert_allclose(before.sigma, after.sigma, rtol=0.1)
-
-
 @pytest.mark.parametrize("end", ["restart", "lost solver"])
 def test_what_was_learnt_from_pairs_that_are_no_longer_kept_is_not_forgotten(end: str) -> None:
     scene = Scene.draw(0, 600)
