@@ -66,6 +66,7 @@ def replay(
     from interfaces.recording import Recording
 
     config = Config.load(robot_file(robot, recording))
+    config.require_learnable()
     rows = Recording.read(recording, config.robot.joints)
     split = split_blocks(len(rows), held_out)
     any_step |= config.tables.daemon.any_step

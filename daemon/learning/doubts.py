@@ -9,7 +9,7 @@ from .memory import PairMemory
 
 
 class Doubts:
-    """Counts the doubted pairs in a row, and keeps the newest of them: with as many as make a change, another era begins.
+    """Counts the doubted pairs in a row, and keeps the newest of them: they may be the first of another era.
 
     Doubted pairs that stand alone are outliers. Nothing is learnt from them later, so they are not kept.
     """

@@ -93,7 +93,7 @@ class NominalModel:
         return np.where(self.chain.prismatic, angle * (self.upper - self.lower) / np.pi, angle)
 
     def fingerprint(self, tolerances: ChainTolerances) -> str:
-        """Tells this nominal model with its tolerances from any other; a learner's state only fits those it came from."""
+        """Tells this nominal model with these tolerances from any other; a state only fits those it came from."""
         said = f"{self.pose_known} {self.marker_known} {tolerances} {self.prior().digest}"
         return hashlib.blake2b(said.encode(), digest_size=8).hexdigest()
 

@@ -52,7 +52,7 @@ class LearningHeader(msgspec.Struct, kw_only=True):
         answering: the model that answers.
         doubted_in_a_row: length of the present run of doubted pairs.
         replays_due: replay steps that are still owed.
-        replay_position: where in their order: epochs begun, pairs of the present one, and how many of them were replayed.
+        replay_position: how far they are: epochs begun, pairs of the present one, and how many of these were replayed.
         belief: what was believed of the chain before the first of these pairs, as bytes; None before the alignment.
         residual: what was known of the arm beyond that, as bytes; None if nothing was.
     """
@@ -77,7 +77,8 @@ class LearningHeader(msgspec.Struct, kw_only=True):
 class LearningState:
     """A learner's state.
 
-    `arrays` are the nets by model, the kept pairs, those doubted in a row, those of the claims, and what a tool is fitted to.
+    `arrays` are the nets by model, the kept pairs, those doubted in a row, what the claims need, and what a tool is
+    fitted to.
     """
 
     header: LearningHeader

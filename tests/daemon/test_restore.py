@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from guided_arm import Scene, make_pair, measured, new_learning, nominal_model, path, teach
+from guided_arm import Scene, make_pair, measured, new_learning, nominal_model, teach
 
 from daemon.config import LearnerConfig
 from daemon.learning import DirectSolver, Learning, Solved, StateError
