@@ -297,21 +297,21 @@ def test_the_same_pairs_and_seed_give_the_same_model() -> None:
     assert one.snapshot.digest == two.snapshot.digest
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(
     seed=st.integers(0, 2**32 - 1),
-    wild=st.dictionaries(st.integers(0, 39), st.floats(-900.0, 900.0), max_size=12),
-    told=st.integers(0, 40),
+    wild=st.dictionaries(st.integers(0, 23), st.floats(-900.0, 900.0), max_size=12),
+    told=st.integers(0, 24),
 )
 def test_predictions_are_finite_whatever_is_measured(seed: int, wild: dict[int, float], told: int) -> None:
     rng = np.random.default_rng(seed)
     learning = new_learning()
-    pairs = measured(built_chain(rng), path(rng, 40), rng)
+    pairs = measured(built_chain(rng), path(rng, 24), rng)
     for number, pair in enumerate(pairs):
         if number == told:
             learning.tool_changed()
         shifted = np.clip(pair.x + wild.get(number, 0.0), -1000.0, 1000.0)
-        teach(learning, [make_pair(pair.seq, pair.q, shifted)])
+        teach(learning, [make_pair(pair.seq, pair.q, shifted)], background=number % 6 == 5)
     prediction = learning.snapshot.predict(rng.uniform(-np.pi, np.pi, (50, JOINTS)))
     assert np.isfinite(prediction.x).all()
     assert np.isfinite(prediction.sigma).all()
