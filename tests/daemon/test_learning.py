@@ -1,11 +1,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 import pytest
 from guided_arm import (
     JOINTS,
+    NOW_AND_THEN,
     Scene,
     built_chain,
     make_pair,
@@ -94,9 +96,10 @@ class Taught:
     learning: Learning
 
     @classmethod
+    @cache
     def draw(cls, seed: int) -> Taught:
         scene, learning = Scene.draw(seed, 2 * HALF), new_learning()
-        teach(learning, scene.pairs[:HALF])
+        teach(learning, scene.pairs[:HALF], every=NOW_AND_THEN)
         return cls(scene, learning)
 
     @property
@@ -117,27 +120,25 @@ class Taught:
         return copy
 
 
-@pytest.fixture(scope="module")
-def taught() -> list[Taught]:
-    return [Taught.draw(seed) for seed in MANY_SEEDS]
-
-
 @pytest.mark.parametrize("seed", SEEDS)
-def test_three_hundred_pairs_take_most_of_the_nominal_error_away(taught: list[Taught], seed: int) -> None:
-    scene, learning = taught[seed].scene, taught[seed].copy()
+def test_three_hundred_pairs_take_most_of_the_nominal_error_away(seed: int) -> None:
+    scene, learning = Taught.draw(seed).scene, Taught.draw(seed).copy()
     nominal_error = scene.error_m(new_learning())
     teach(learning, scene.pairs[HALF:])
     assert scene.error_m(learning) < 0.2 * nominal_error
 
 
-def test_the_claimed_error_is_the_true_one_on_average(taught: list[Taught]) -> None:
-    ratios = [(case.learning.claimed_error_m() or 0.0) / case.half.error_m(case.learning) for case in taught]
+def test_the_claimed_error_is_the_true_one_on_average() -> None:
+    ratios = [
+        (case.learning.claimed_error_m() or 0.0) / case.half.error_m(case.learning)
+        for case in map(Taught.draw, MANY_SEEDS)
+    ]
     assert 0.8 < np.mean(ratios) < 1.5
 
 
-def test_the_claimed_sigma_covers_two_thirds_of_the_coordinates_on_average(taught: list[Taught]) -> None:
+def test_the_claimed_sigma_covers_two_thirds_of_the_coordinates_on_average() -> None:
     covered = []
-    for seed, case in enumerate(taught):
+    for seed, case in enumerate(map(Taught.draw, MANY_SEEDS)):
         q = near(np.random.default_rng(seed), case.half.q)
         prediction = case.learning.snapshot.predict(q)
         covered.append((np.abs(prediction.x - case.scene.chain.positions(q)) <= prediction.sigma).mean())
@@ -161,8 +162,9 @@ def test_where_data_was_is_in_support_and_far_away_is_not() -> None:
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_one_gross_outlier_does_not_spoil_the_map(taught: list[Taught], seed: int) -> None:
-    scene, learning, without = taught[seed].first(HALF + 50), taught[seed].copy(), taught[seed].copy()
+def test_one_gross_outlier_does_not_spoil_the_map(seed: int) -> None:
+    taught = Taught.draw(seed)
+    scene, learning, without = taught.first(HALF + 50), taught.copy(), taught.copy()
     outlier, *after = scene.pairs[HALF:]
     teach(learning, [make_pair(outlier.seq, outlier.q, outlier.x + np.array([1.0, 0.0, 0.0])), *after])
     teach(without, after)
@@ -179,8 +181,8 @@ def test_a_gross_outlier_is_counted_as_doubted_and_as_learnt() -> None:
 
 @pytest.mark.parametrize("told", [True, False], ids=["told", "not told"])
 @pytest.mark.parametrize("seed", SEEDS)
-def test_a_tool_change_is_followed_within_tens_of_pairs(taught: list[Taught], seed: int, told: bool) -> None:
-    scene, learning = taught[seed].half, taught[seed].copy()
+def test_a_tool_change_is_followed_within_tens_of_pairs(seed: int, told: bool) -> None:
+    scene, learning = Taught.draw(seed).half, Taught.draw(seed).copy()
     rng = np.random.default_rng(seed)
     changed = scene.chain.with_tool([0.0, 0.15, 0.2])
     if told:
@@ -192,10 +194,8 @@ def test_a_tool_change_is_followed_within_tens_of_pairs(taught: list[Taught], se
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_a_pair_of_the_old_tool_after_a_told_change_is_doubted_and_spoils_nothing(
-    taught: list[Taught], seed: int
-) -> None:
-    scene, learning = taught[seed].scene, taught[seed].copy()
+def test_a_pair_of_the_old_tool_after_a_told_change_is_doubted_and_spoils_nothing(seed: int) -> None:
+    scene, learning = Taught.draw(seed).scene, Taught.draw(seed).copy()
     rng = np.random.default_rng(seed)
     doubted = learning.counters.doubted
     old = scene.pairs[HALF]
@@ -207,8 +207,8 @@ def test_a_pair_of_the_old_tool_after_a_told_change_is_doubted_and_spoils_nothin
     assert Scene(changed, q, []).error_m(learning) < 0.025
 
 
-def test_a_learner_restored_amid_a_tool_change_fits_the_tool_all_the_same(taught: list[Taught]) -> None:
-    scene, learning, restored = taught[0].half, taught[0].copy(), new_learning()
+def test_a_learner_restored_amid_a_tool_change_fits_the_tool_all_the_same() -> None:
+    scene, learning, restored = Taught.draw(0).half, Taught.draw(0).copy(), new_learning()
     rng = np.random.default_rng(0)
     learning.tool_changed()
     changed = scene.chain.with_tool([0.0, 0.15, 0.2])
@@ -225,7 +225,7 @@ def test_what_was_learnt_from_pairs_that_are_no_longer_kept_is_not_forgotten(end
     scene = Scene.draw(0, 600)
     settings = LearnerConfig(replay_capacity=150)
     learning = new_learning(settings=settings)
-    teach(learning, scene.pairs)
+    teach(learning, scene.pairs, every=NOW_AND_THEN)
     early = Scene(scene.chain, scene.q[:300], [])
     before, sigma = early.error_m(learning), learning.snapshot.predict(early.q).sigma.mean()
     if end == "restart":
@@ -244,16 +244,16 @@ def test_what_was_learnt_from_pairs_that_are_no_longer_kept_is_not_forgotten(end
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_an_untold_tool_change_is_found_once(taught: list[Taught], seed: int) -> None:
-    scene, learning = taught[seed].half, taught[seed].copy()
+def test_an_untold_tool_change_is_found_once(seed: int) -> None:
+    scene, learning = Taught.draw(seed).half, Taught.draw(seed).copy()
     rng = np.random.default_rng(seed)
     q = scene.q[-1] + path(rng, 100)
     teach(learning, measured(scene.chain.with_tool([0.0, 0.15, 0.2]), q, rng, first=HALF + 1))
     assert learning.counters.changes == 1
 
 
-def test_a_told_tool_change_keeps_what_was_learnt_and_drops_the_pairs(taught: list[Taught]) -> None:
-    scene, learning = taught[0].half, taught[0].copy()
+def test_a_told_tool_change_keeps_what_was_learnt_and_drops_the_pairs() -> None:
+    scene, learning = Taught.draw(0).half, Taught.draw(0).copy()
     before = learning.snapshot.predict(scene.q).x
     learning.tool_changed()
     state = learning.state()
@@ -261,8 +261,8 @@ def test_a_told_tool_change_keeps_what_was_learnt_and_drops_the_pairs(taught: li
     assert (len(state.arrays["q"]), state.header.counters.since_change, state.header.counters.pairs) == (0, 0, HALF)
 
 
-def test_reset_to_prior_answers_as_before_any_pair(taught: list[Taught]) -> None:
-    scene, learning, fresh = taught[0].half, taught[0].copy(), new_learning()
+def test_reset_to_prior_answers_as_before_any_pair() -> None:
+    scene, learning, fresh = Taught.draw(0).half, Taught.draw(0).copy(), new_learning()
     learning.reset_to_prior()
     np.testing.assert_array_equal(learning.snapshot.predict(scene.q).x, fresh.snapshot.predict(scene.q).x)
     assert learning.counters.last_seq == HALF
@@ -282,8 +282,8 @@ def test_pairs_that_all_came_before_the_first_solution_can_show_that_it_shall_an
     assert learning.snapshot.answering in SOLVED
 
 
-def test_a_solution_answers_in_the_end(taught: list[Taught]) -> None:
-    assert taught[0].learning.snapshot.answering in SOLVED
+def test_a_solution_answers_in_the_end() -> None:
+    assert Taught.draw(0).learning.snapshot.answering in SOLVED
 
 
 def test_a_snapshot_does_not_change_when_learning_goes_on() -> None:

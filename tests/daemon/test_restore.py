@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import msgspec
 import numpy as np
 import pytest
-from guided_arm import Scene, make_pair, measured, new_learning, nominal_model, teach
+from guided_arm import NOW_AND_THEN, Scene, make_pair, measured, new_learning, nominal_model, teach
 
 from daemon.config import LearnerConfig
 from daemon.learning import DirectSolver, Learning, Solved, StateError
@@ -40,7 +41,7 @@ class Saved:
         for number, pair in enumerate(pairs):
             if number == tool_changed_at:
                 self.learning.tool_changed()
-            teach(self.learning, [pair], background=number % 10 == 9)
+            teach(self.learning, [pair], background=number % NOW_AND_THEN == 0)
         self.learning.solve_soon()
         while self.learning.work():
             pass
@@ -118,7 +119,7 @@ def test_a_restored_order_goes_on_where_it_was(taken: int) -> None:
 def test_a_state_that_was_learnt_with_another_tolerance_is_not_gone_on_from(tolerance: str) -> None:
     learning = new_learning()
     teach(learning, Scene.draw(0, 3).pairs)
-    other = new_learning(settings=LearnerConfig(**{tolerance: 0.5}))
+    other = new_learning(settings=msgspec.structs.replace(LearnerConfig(), **{tolerance: 0.5}))
     with pytest.raises(StateError, match="to other tolerances"):
         other.restore(learning.state())
 
