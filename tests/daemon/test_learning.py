@@ -237,6 +237,7 @@ def test_what_was_learnt_from_pairs_that_are_no_longer_kept_is_not_forgotten(end
     teach(
         learning,
         measured(scene.chain, scene.q[-1] + path(np.random.default_rng(1), 60), np.random.default_rng(1), first=601),
+        every=NOW_AND_THEN,
     )
     assert early.error_m(learning) < 1.5 * before
     assert learning.snapshot.predict(early.q).sigma.mean() < 3.0 * sigma
