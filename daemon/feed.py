@@ -56,11 +56,6 @@ class PairFeed:
         """Whether pairs are left to history for now."""
         return self._paused
 
-    @property
-    def caught_up(self) -> bool:
-        """Whether every stored pair that is known of has been learnt."""
-        return not (self._behind or self._missed) and self._waiting.empty()
-
     def offer(self, payload: bytes) -> None:
         """A published pair."""
         try:

@@ -70,6 +70,7 @@ def check(*, robot: RobotFile = HERE) -> None:
     from interfaces.urdf import REVOLUTE
 
     checked = Config.load(robot)
+    checked.require_learnable()
     description, zenoh = checked.robot, checked.tables.zenoh
     say(f"{robot} is in order: robot {description.name}, {len(description.joints)} joints")
     for name, lower, upper in zip(description.joints, description.lower, description.upper, strict=True):

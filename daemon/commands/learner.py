@@ -35,6 +35,7 @@ def learner(
 
     logs.set_up(verbose=verbose)
     config = Config.load(robot)
+    config.require_learnable()
     if state_dir is not None:
         config = config.with_state_dir(state_dir)
     ending = Ending()

@@ -67,6 +67,7 @@ def replay(
     from interfaces.recording import Recording
 
     config = Config.load(robot_file(robot, recording))
+    config.require_learnable()
     rows = Recording.read(recording, config.robot.joints)
     require_units(config.robot, rows, recording)
     split = split_blocks(len(rows), held_out)

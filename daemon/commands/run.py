@@ -32,6 +32,7 @@ def run(
 
     logs.set_up(verbose=verbose)
     config = Config.load(robot)
+    config.require_learnable()
     check_sources(config, sim=sim)
     options = ["--robot", str(robot), *(["--state-dir", str(state_dir)] if state_dir else [])]
     options += ["--verbose"] if verbose else []

@@ -1,4 +1,4 @@
-"""The pairs that are doubted, and whether they are the beginning of something new."""
+"""The pairs that are doubted in a row, and whether they are the beginning of something new."""
 
 from __future__ import annotations
 
@@ -7,14 +7,15 @@ from interfaces.records import FloatArray
 from .gate import CHANGE, FEWEST_FOR_CHANGE, Gate
 from .memory import PairMemory
 
-KEPT = 64
-
 
 class Doubts:
-    """Keeps the newest doubted pairs and counts those in a row."""
+    """Counts the doubted pairs in a row, and keeps the newest of them: they may be the first of another era.
+
+    Doubted pairs that stand alone are outliers. Nothing is learnt from them later, so they are not kept.
+    """
 
     def __init__(self, joints: int) -> None:
-        self._memory = PairMemory(joints, KEPT)
+        self._memory = PairMemory(joints, CHANGE)
         self._gate = Gate()
 
     @property
@@ -33,32 +34,19 @@ class Doubts:
         return self.in_a_row >= FEWEST_FOR_CHANGE
 
     def doubt(self, q: FloatArray, x: FloatArray, distance_m: float, limit_m: float) -> bool:
-        """Whether to doubt the pair at q (d,), x (3,) that lies `distance_m` from its prediction; if so it is kept."""
+        """Whether to doubt the pair at q (d,), x (3,) that lies `distance_m` from its prediction."""
         doubted = self._gate.doubts(distance_m, limit_m)
         if doubted:
-            self.set_aside(q, x)
+            self._memory.append(q, x)
+        else:
+            self._memory.clear()
         return doubted
-
-    def set_aside(self, q: FloatArray, x: FloatArray) -> None:
-        """Keep a pair that was doubted for another reason."""
-        self._memory.append(q, x)
 
     def run(self) -> tuple[FloatArray, FloatArray]:
         """The newest doubted pairs in a row, as many as make a change: q (n, d), x (n, 3)."""
-        q, x, _ = self._memory.since(self._memory.count - min(self.in_a_row, CHANGE))
-        return q, x
-
-    def all(self) -> tuple[FloatArray, FloatArray]:
-        """All kept ones: q (n, d), x (n, 3)."""
         return self._memory.all()
 
-    def clear(self) -> None:
-        """Forget them."""
-        self._memory.clear()
-        self._gate = Gate()
-
     def restore(self, q: FloatArray, x: FloatArray, in_a_row: int) -> None:
-        """Go on from these."""
-        for row_q, row_x in zip(q, x, strict=True):
-            self._memory.append(row_q, row_x)
+        """Go on from the run q (n, d), x (n, 3), of which `in_a_row` were counted."""
+        self._memory.restore(q, x, in_a_row)
         self._gate = Gate(in_a_row)

@@ -15,7 +15,7 @@ from .claims import Claims
 from .doubts import Doubts
 from .gate import DOUBT, limit_m, sound
 from .learnt import LearntModel
-from .members import EXACT, INSTANT, PRIOR, Members
+from .members import EXACT, INSTANT, PRIOR, RESIDUAL, Members
 from .memory import PairMemory, Permutations
 from .solver import Solved, Task
 from .state import LearningHeader
@@ -27,8 +27,8 @@ RECENT = 200
 REPLAY_STEPS = 64
 # So many of the pairs that came while the solver worked judge its solution.
 JUDGED_LATE = 100
-# With so many new pairs for each that a solution knows, the last solution was another one.
-MANY_NEW = 0.25
+# With so many new pairs for each that a solution knows, the last solution was another one: it is judged by these alone.
+JUDGED_ANEW = 0.25
 LOOKED_BACK_IN_REPLAY = 4
 # Names of stored nets begin with this.
 NET = "net_"
@@ -73,12 +73,12 @@ class Era:
     @property
     def model(self) -> LearntModel:
         """The model that answers."""
-        return self.members.models[self.answering]
+        return self.members.model(self.answering)
 
     @property
     def map(self) -> KBMap:
         """The answering model if it is a KB-Map, else the best that is one."""
-        return self.members.maps[self._answering_map]
+        return self.members.map(self._answering_map)
 
     @property
     def task(self) -> Task:
@@ -136,13 +136,13 @@ class Era:
         places = self._order.take(min(REPLAY_STEPS, int(self._replays_due)), len(self.memory))
         q, x = self.memory.at(places)
         seen = slice(LOOKED_BACK_IN_REPLAY)
-        self._claims.replayed(x[seen] - self.members.maps[INSTANT].predict(q[seen]))
+        self._claims.replayed(x[seen] - self.members.predict(INSTANT, q[seen]))
         self.members.replay(q, x)
         self._replays_due -= len(places)
         return len(places)
 
     def set_aside(self, prior: KBMap) -> int:
-        """Doubt those of the first pairs that `prior`, a robust fit to them, contradicts; how many they were.
+        """Leave out those of the first pairs that `prior`, a robust fit to them, contradicts; how many they were.
 
         They are perhaps still those of the old tool.
         """
@@ -151,8 +151,8 @@ class Era:
         if belongs.all():
             return 0
         self.memory.clear()
-        for row_q, row_x, belonging in zip(q, x, belongs, strict=True):
-            (self.memory.append if belonging else self.doubts.set_aside)(row_q, row_x)
+        for row_q, row_x in zip(q[belongs], x[belongs], strict=True):
+            self.memory.append(row_q, row_x)
         self._order.restart()
         self._claims.forget_contest()
         self.task_number = next(self._task_numbers)
@@ -181,8 +181,8 @@ class Era:
 
     def solve_from_what_is_known(self) -> None:
         """Where pairs are no longer kept, the last solutions stand for them in the place of what was before."""
-        if EXACT in self.members.maps and not self.memory.complete:
-            self._solver_prior = self.members.maps[EXACT]
+        if EXACT in self.members.names and not self.memory.complete:
+            self._solver_prior = self.members.map(EXACT)
             self.arm = self.arm.updated(self._claims.belief, self._claims.residual)
 
     def store(self, header: LearningHeader) -> dict[str, FloatArray]:
@@ -191,8 +191,9 @@ class Era:
         header.doubted_in_a_row = self.doubts.in_a_row
         header.belief = self.arm.chain.to_bytes()
         header.residual = None if self.arm.residual is None else self.arm.residual.to_bytes()
-        q, x = self.doubts.all()
-        return {"doubted_q": q, "doubted_x": x} | {NET + name: kbmap.net for name, kbmap in self.members.maps.items()}
+        header.replay_position = self._order.position
+        q, x = self.doubts.run()
+        return {"doubted_q": q, "doubted_x": x} | {NET + name: net for name, net in self.members.nets().items()}
 
     def restore(self, header: LearningHeader, arrays: Mapping[str, FloatArray]) -> None:
         """Go on from a state of an era with this prior and arm."""
@@ -201,6 +202,7 @@ class Era:
         self.memory.restore(arrays["q"], arrays["x"], header.kept_of)
         self.doubts.restore(arrays["doubted_q"], arrays["doubted_x"], header.doubted_in_a_row)
         self.answering, self._replays_due = header.answering, header.replays_due
+        self._order.restore(header.replay_position)
         self._choose_map()
         self.solve_from_what_is_known()
 
@@ -208,7 +210,7 @@ class Era:
         """What came while the solver worked is new to its solution: a pair that it had not learnt judges it fairly."""
         q, x, _ = self.memory.since(max(pairs, self.memory.count - JUDGED_LATE))
         if len(q):
-            self._claims.predicted_late(name, q, x - model.predict(q), anew=len(q) >= MANY_NEW * pairs)
+            self._claims.predicted_late(name, q, x - model.predict(q), anew=len(q) >= JUDGED_ANEW * pairs)
             self._choose()
 
     def _keep(self, q: FloatArray, x: FloatArray) -> None:
@@ -220,5 +222,4 @@ class Era:
         self._choose_map()
 
     def _choose_map(self) -> None:
-        is_map = self.answering in self.members.maps
-        self._answering_map = self.answering if is_map else self._claims.best_map(PRIOR)
+        self._answering_map = self._claims.best_map(PRIOR) if self.answering == RESIDUAL else self.answering

@@ -43,6 +43,7 @@ class Eras:
 
     def __init__(self, nominal: NominalModel, settings: LearnerConfig, task_numbers: Iterator[int]) -> None:
         self._nominal, self._settings, self._task_numbers = nominal, settings, task_numbers
+        self._fingerprint = nominal.fingerprint(chain_tolerances(settings))
         self.claims = Claims(nominal.bases, EXPECTED_M)
         self.fitting = Fitting(nominal)
         self.waiting = PairMemory(nominal.joints, settings.replay_capacity)
@@ -63,12 +64,14 @@ class Eras:
         """As they were when `state` was taken.
 
         Raises:
-            StateError: it belongs to another nominal model.
+            StateError: it belongs to another nominal model, or to other tolerances.
         """
         header, arrays = state.header, state.arrays
-        if header.fingerprint != nominal.fingerprint:
-            raise StateError("it belongs to another nominal model: robot.toml or the URDF has changed since")
         eras = cls(nominal, settings, task_numbers)
+        if header.fingerprint != eras._fingerprint:
+            raise StateError(
+                "it belongs to another nominal model or to other tolerances: robot.toml or the URDF has changed since"
+            )
         eras.fitting.restore(header.next_fit, header.first_fit, arrays)
         eras.claims.restore(header.claims, arrays, arrays["q"])
         if header.belief is None:
@@ -83,7 +86,7 @@ class Eras:
         """Everything that `restored` needs, with what is counted beside it."""
         q, x = self.memory.all()
         header = LearningHeader(
-            fingerprint=self._nominal.fingerprint,
+            fingerprint=self._fingerprint,
             counters=copy.copy(counters),
             claims=copy.deepcopy(self.claims.state()),
             curve=curve.points,

@@ -212,7 +212,7 @@ class Learning:
         """Go on from a state; the solver gets the kept pairs again in the background.
 
         Raises:
-            StateError: it belongs to another nominal model.
+            StateError: it belongs to another nominal model, or to other tolerances.
         """
         eras, header = Eras.restored(state, self._nominal, self._settings, self._task_numbers), state.header
         with self._lock:

@@ -12,6 +12,8 @@ from kbmaps import NLMS, KBMap, NonFiniteError
 from .learnt import LearntModel
 
 PRIOR, INSTANT, RIGID, RESIDUAL, EXACT = "prior", "nlms", "rigid", "residual", "exact"
+# The instant learner's map as it was when the present solutions were asked for, among the stored nets.
+_DELAYED = "delayed"
 SOLVED = (RIGID, RESIDUAL, EXACT)
 # Who is believed first when the errors do not tell. Pairs come along guided paths, where errors tell of the path only:
 # what has fewer numbers says more about places beside it. (`Ladder.around` is for spread pairs, and has another order.)
@@ -27,9 +29,10 @@ class Members:
 
     def __init__(self, prior: KBMap, step_size: float) -> None:
         self._step_size = step_size
-        self._maps = {PRIOR: prior, INSTANT: prior}
+        self._fixed = {PRIOR: prior}
         self._residual: LearntModel | None = None
         self._instant = NLMS(prior, step_size)
+        self._instant_map: KBMap | None = prior
         self._asked: KBMap | None = None
         self._delayed: KBMap | None = None
 
@@ -39,43 +42,65 @@ class Members:
         return self._delayed
 
     @property
-    def maps(self) -> Mapping[str, KBMap]:
-        """Those of the present models that are KB-Maps; none of them is touched by later learning."""
-        return self._maps
+    def names(self) -> tuple[str, ...]:
+        """Those of the present models."""
+        return (*self._fixed, INSTANT) if self._residual is None else (*self._fixed, INSTANT, RESIDUAL)
 
     @property
-    def models(self) -> Mapping[str, LearntModel]:
-        """The present models."""
-        return self._maps if self._residual is None else {**self._maps, RESIDUAL: self._residual}
+    def maps(self) -> Mapping[str, KBMap]:
+        """Those of the present models that are KB-Maps; none of them is touched by later learning."""
+        return {name: self.map(name) for name in self.names if name != RESIDUAL}
 
     @property
     def prior(self) -> KBMap:
         """Where learning started."""
-        return self._maps[PRIOR]
+        return self._fixed[PRIOR]
+
+    def model(self, name: str) -> LearntModel:
+        """One of the present models, untouched by later learning."""
+        return self._residual if name == RESIDUAL and self._residual is not None else self.map(name)
+
+    def map(self, name: str) -> KBMap:
+        """One of those that are KB-Maps. The instant learner's is copied when somebody wants it, not with each pair."""
+        if name != INSTANT:
+            return self._fixed[name]
+        if self._instant_map is None:
+            try:
+                self._instant_map = self._instant.map
+            except NonFiniteError:  # overflow on absurd numbers: begin again rather than answer NaN
+                return self._begun_again()
+        return self._instant_map
+
+    def predict(self, name: str, q: FloatArray) -> FloatArray:
+        """What one of the models predicts at q (d,) or (n, d) [rad]: (3,) or (n, 3) [m]."""
+        if name != INSTANT or self._instant_map is not None:
+            return self.model(name).predict(q)
+        predicted = self._instant.predict(q)
+        return predicted if np.isfinite(predicted).all() else self._begun_again().predict(q)
 
     def errors(self, q: FloatArray, x: FloatArray) -> dict[str, FloatArray]:
         """Measured minus predicted position (3,) [m] by model, for one pair."""
-        return {name: x - model.predict(q) for name, model in self.models.items()}
+        return {name: x - self.predict(name, q) for name in self.names}
 
     def learn(self, q: FloatArray, error: FloatArray, limit_m: float) -> None:
         """One step of the instant learner for the pair at q (d,), where its error (3,) [m] counts up to `limit_m`."""
         counted = error * min(1.0, limit_m / max(float(np.linalg.norm(error)), 1e-300))
-        self._instant.learn(q, self._maps[INSTANT].predict(q) + counted)
-        self._renew()
+        self._instant.learn(q, self.predict(INSTANT, q) + counted)
+        self._instant_map = None
 
     def replay(self, q: FloatArray, x: FloatArray) -> None:
         """Steps of the instant learner for q (n, d), x (n, 3), in their order."""
         self._instant.replay(q, x)
-        self._renew()
+        self._instant_map = None
 
     def ask(self) -> None:
         """The solver works on all pairs up to here."""
-        self._asked = self._maps[INSTANT]
+        self._asked = self.map(INSTANT)
 
     def take(self, name: str, solution: LearntModel) -> None:
         """The solver's solution for one of the models of what it was asked."""
         if isinstance(solution, KBMap):
-            self._maps[name] = solution
+            self._fixed[name] = solution
         else:
             self._residual = solution
         self._delayed = self._asked
@@ -85,21 +110,23 @@ class Members:
 
         The solutions stay: they fit the pairs.
         """
-        self._maps[PRIOR] = prior
-        self._instant = NLMS(prior, self._step_size)
+        self._fixed[PRIOR] = prior
+        self._begun_again()
         self.replay(q, x)
 
-    def restore(self, nets: Mapping[str, FloatArray], residual: LearntModel | None) -> None:
-        """The KB-Maps that `nets` names, and the chain with residual."""
-        self._residual = residual
-        self._maps |= {name: KBMap(self.prior.bases, net) for name, net in nets.items()}
-        self._instant = NLMS(self._maps[INSTANT], self._step_size)
-        if any(name in self.models for name in SOLVED):
-            self._delayed = self._maps[INSTANT]
+    def nets(self) -> dict[str, FloatArray]:
+        """What `restore` needs beside the chain with residual."""
+        nets = {name: kbmap.net for name, kbmap in self.maps.items()}
+        return nets if self._delayed is None else nets | {_DELAYED: self._delayed.net}
 
-    def _renew(self) -> None:
-        try:
-            self._maps[INSTANT] = self._instant.map
-        except NonFiniteError:  # overflow on absurd numbers: begin again rather than answer NaN
-            self._instant = NLMS(self.prior, self._step_size)
-            self._maps[INSTANT] = self.prior
+    def restore(self, nets: Mapping[str, FloatArray], residual: LearntModel | None) -> None:
+        """Go on from `nets` and the chain with residual."""
+        maps = {name: KBMap(self.prior.bases, net) for name, net in nets.items()}
+        self._residual, self._delayed, self._instant_map = residual, maps.pop(_DELAYED, None), maps.pop(INSTANT)
+        self._fixed |= maps
+        self._instant = NLMS(self._instant_map, self._step_size)
+
+    def _begun_again(self) -> KBMap:
+        """The map of an instant learner that begins at the prior again."""
+        self._instant, self._instant_map = NLMS(self.prior, self._step_size), self.prior
+        return self._instant_map

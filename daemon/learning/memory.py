@@ -90,17 +90,32 @@ class Permutations:
 
     def __init__(self, seed: int) -> None:
         self._seed = seed
-        self._epoch = 0
+        self._epoch = self._places = self._taken = 0
         self._order: IntArray = np.empty(0, dtype=np.intp)
+
+    @property
+    def position(self) -> tuple[int, int, int]:
+        """What `restore` needs: epochs begun, the places of the present one, and how many of them were taken."""
+        return self._epoch, self._places, self._taken
 
     def take(self, count: int, places: int) -> IntArray:
         """Up to `count` of the places 0 ... places − 1; fewer at the end of an epoch."""
-        if not len(self._order):
-            self._order = np.random.default_rng([self._seed, self._epoch]).permutation(places)
-            self._epoch += 1
-        taken, self._order = self._order[:count], self._order[count:]
+        if self._taken == self._places:
+            self._begin(self._epoch + 1, places)
+        taken = self._order[self._taken : self._taken + count]
+        self._taken += len(taken)
         return taken
 
     def restart(self) -> None:
         """Drop what is left of the epoch: the places have changed their meaning."""
-        self._order = np.empty(0, dtype=np.intp)
+        self._taken = self._places
+
+    def restore(self, position: tuple[int, int, int]) -> None:
+        """Go on from there."""
+        epoch, places, taken = position
+        self._begin(epoch, places)
+        self._taken = taken
+
+    def _begin(self, epoch: int, places: int) -> None:
+        self._epoch, self._places, self._taken = epoch, places, 0
+        self._order = np.random.default_rng([self._seed, epoch]).permutation(places)

@@ -92,11 +92,10 @@ class NominalModel:
         """`angle` [rad] for each joint that turns, and as much of its stroke [m] for each that slides (d,)."""
         return np.where(self.chain.prismatic, angle * (self.upper - self.lower) / np.pi, angle)
 
-    @property
-    def fingerprint(self) -> str:
-        """Tells this nominal model from any other; a learner's state only fits the one it came from."""
-        known = f"{self.pose_known} {self.marker_known} ".encode()
-        return hashlib.blake2b(known + self.prior().digest.encode(), digest_size=8).hexdigest()
+    def fingerprint(self, tolerances: ChainTolerances) -> str:
+        """Tells this nominal model with these tolerances from any other; a state only fits those it came from."""
+        said = f"{self.pose_known} {self.marker_known} {tolerances} {self.prior().digest}"
+        return hashlib.blake2b(said.encode(), digest_size=8).hexdigest()
 
     def prior(self) -> KBMap:
         """The chain as a map in the learning bases."""

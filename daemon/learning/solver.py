@@ -16,6 +16,7 @@ from kbmaps import (
     ChainTolerances,
     ExactLearner,
     KBMap,
+    Memory,
     NonFiniteError,
     ResidualLearner,
     ResidualModel,
@@ -33,6 +34,9 @@ log = logging.getLogger(__name__)
 
 # Memory and time grow with the square and the cube of the control points: 3^7 take 77 MB and 0.2 s.
 LARGEST_NET = 2187
+# So many of the newest pairs bend the exact map: with more, time and memory would grow without end, and what older ones
+# say of the arm as a chain is kept. Measured where a chain misses 10 mm (docs/learner.md).
+WINDOW = 20_000
 # The prior's precision is looked for anew when the pairs have grown by this factor.
 RETUNE = 1.25
 # So many of the newest pairs are kept for what needs the pairs themselves; what the older ones say of the chain is
@@ -43,7 +47,7 @@ FITTED = 2000
 # The chain with residual takes longest, up to a second: it is solved anew when the pairs have grown by this factor.
 RESIDUAL_GROWTH = 1.15
 # With so many times the pairs of the last solution, this share of them is solved for first, if it is so many.
-MANY_NEW, FIRST_SHARE, FEWEST_FIRST = 1.5, 0.75, 5
+FIRST_GROWTH, FIRST_SHARE, FEWEST_FIRST = 1.5, 0.75, 5
 # From so many neighbours on that count as one, their errors are no chance.
 SHARED = 1.5
 
@@ -128,7 +132,8 @@ class DirectSolver:
         """Forget all pairs and begin a new task."""
         self._solved_at = 0
         self._task, self._folded, self._folded_residual = task, task.belief, task.residual or task.belief
-        self._exact = ExactLearner(task.prior) if task.prior.size <= LARGEST_NET else None
+        within = Memory(window=WINDOW)
+        self._exact = ExactLearner(task.prior, memory=within) if task.prior.size <= LARGEST_NET else None
         self._precision, self._tuned_at, self._residual_at, self._pairs, self._solved = None, 0, 0, 0, []
         self._q, self._x = np.empty((0, task.prior.joints)), np.empty((0, 3))
 
@@ -155,7 +160,7 @@ class DirectSolver:
     def solutions(self) -> Iterator[Solved]:
         """Each model's solution as it is found, the rigid chain first: it is the quickest."""
         task = self._started
-        if self._pairs >= MANY_NEW * self._solved_at:
+        if self._pairs >= FIRST_GROWTH * self._solved_at:
             yield from self._solved_of_some(task)
         self._solved_at = self._pairs
         belief = fitted_belief(self._before, self._q, self._x)

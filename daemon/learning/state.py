@@ -44,7 +44,7 @@ class LearningHeader(msgspec.Struct, kw_only=True):
     """The part of the state that is not arrays. What has a default belongs to an era.
 
     Attributes:
-        fingerprint: of the nominal model it started from.
+        fingerprint: of the nominal model and the tolerances it started from.
         claims: what is known of each model's errors.
         kept_of: how many pairs there were since the prior; the newest of them are kept.
         next_fit: pairs at which what is not known, or the tool after a change, is fitted again; None when nothing is.
@@ -52,6 +52,7 @@ class LearningHeader(msgspec.Struct, kw_only=True):
         answering: the model that answers.
         doubted_in_a_row: length of the present run of doubted pairs.
         replays_due: replay steps that are still owed.
+        replay_position: how far they are: epochs begun, pairs of the present one, and how many of these were replayed.
         belief: what was believed of the chain before the first of these pairs, as bytes; None before the alignment.
         residual: what was known of the arm beyond that, as bytes; None if nothing was.
     """
@@ -67,6 +68,7 @@ class LearningHeader(msgspec.Struct, kw_only=True):
     answering: str = PRIOR
     doubted_in_a_row: int = 0
     replays_due: float = 0.0
+    replay_position: tuple[int, int, int] = (0, 0, 0)
     belief: bytes | None = None
     residual: bytes | None = None
 
@@ -75,7 +77,8 @@ class LearningHeader(msgspec.Struct, kw_only=True):
 class LearningState:
     """A learner's state.
 
-    `arrays` are the nets by model, kept and doubted pairs, those of the claims, and what a tool is fitted to.
+    `arrays` are the nets by model, the kept pairs, those doubted in a row, what the claims need, and what a tool is
+    fitted to.
     """
 
     header: LearningHeader

@@ -8,7 +8,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kbmaps.arrays import IntArray, rows, vector
+from kbmaps.arrays import FloatArray, IntArray, rows, rows_or_vector, vector
 from kbmaps.errors import ModelFormatError, SettingError, ShapeError
 from kbmaps.maps.kbmap import POSITION_OUTPUTS, KBMap
 from kbmaps.maps.kernels import net_kernel
@@ -55,6 +55,8 @@ class NLMS:
         check_q = partial(vector, "q", width=self._stack.joints)
         check_x = partial(vector, "x", width=self._outputs)
         self._kernel = net_kernel(self._stack, self._planes, check_q, check_x)
+        check_rows = partial(rows_or_vector, "q", width=self._stack.joints)
+        self._reader = net_kernel(self._stack, self._planes, check_rows, check_x)
 
     @property
     def step_size(self) -> StepSize:
@@ -75,6 +77,14 @@ class NLMS:
         """What has been learnt so far: a snapshot that later learning does not touch."""
         sizes = [basis.size for basis in self._bases]
         return KBMap(self._bases, self._planes.reshape(self._outputs, *sizes))
+
+    def predict(self, q: ArrayLike) -> FloatArray:
+        """Marker position (3,) [m] for joint angles q (d,) [rad], or (n, 3) for (n, d), as `map` would, without a copy.
+
+        Raises:
+            ShapeError, NonFiniteError
+        """
+        return self._reader.outputs(q, 0, POSITION_OUTPUTS)
 
     def learn(self, q: ArrayLike, x: ArrayLike, rotation: ArrayLike | None = None) -> None:
         """One step for marker position x (3,) [m] at joint angles q (d,) [rad].

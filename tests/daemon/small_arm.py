@@ -26,3 +26,22 @@ def write_small_arm(folder: Path, tables: str = "") -> Path:
     file = folder / "robot.toml"
     file.write_text(ROBOT + tables)
     return file
+
+
+def write_long_arm(folder: Path, joints: int) -> Path:
+    """Write robot.toml and URDF of an arm with so many joints that turn into `folder`; the path of robot.toml."""
+    links = "".join(f'<link name="link_{k}"/>' for k in range(joints + 1))
+    turning = "".join(
+        f'<joint name="joint_{k}" type="revolute"><parent link="link_{k}"/><child link="link_{k + 1}"/>'
+        f'<origin xyz="0.1 0 0.02"/><axis xyz="{k % 2} 0 {1 - k % 2}"/>'
+        '<limit lower="-3" upper="3" effort="1" velocity="1"/></joint>'
+        for k in range(joints)
+    )
+    (folder / "long.urdf").write_text(f'<robot name="long">{links}{turning}</robot>')
+    names = [f"joint_{k}" for k in range(joints)]
+    file = folder / "robot.toml"
+    file.write_text(
+        f'[robot]\nname = "long"\nurdf = "long.urdf"\njoints = {names}\nmarker_link = "link_{joints}"\n'
+        '[camera]\nparent_link = "link_0"\n'
+    )
+    return file

@@ -17,7 +17,7 @@ from queue import Queue
 from unittest import mock
 
 import pytest
-from small_arm import ROBOT, URDF, write_small_arm
+from small_arm import ROBOT, URDF, write_long_arm, write_small_arm
 
 from daemon.bus import Bus, client
 from daemon.cli import main
@@ -124,6 +124,21 @@ def test_nothing_starts_with_a_wrong_description(robot, command, right, wrong, l
     message = refused(command, *(["walk.csv"] if command == "replay" else []), cwd=robot.parent)
     assert message.startswith("leg.urdf: " if line is None else f"robot.toml, line {line}: ")
     assert said in message
+
+
+@pytest.mark.parametrize("command", ["config check", "learner", "run", "replay walk.csv"])
+def test_more_joints_than_can_be_learnt_are_refused_with_the_limit_and_what_learns_them(tmp_path, command) -> None:
+    write_long_arm(tmp_path, joints=13)
+    message = refused(*command.split(), cwd=tmp_path)
+    assert message.startswith("robot.toml, line 4: 13 joints are too many for the learner: their map has 1,594,323")
+    assert "Name at most 12 in joints" in message
+    assert "kbmaps.RigidLearner or kbmaps.TensorLearner" in message
+
+
+def test_twelve_joints_are_in_order(tmp_path) -> None:
+    write_long_arm(tmp_path, joints=12)
+    done = run_here("config", "check", cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
 
 
 def test_a_folder_for_robot_toml_is_refused(robot) -> None:

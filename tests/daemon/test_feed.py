@@ -30,6 +30,10 @@ class HandClock:
         return ""
 
 
+# A step takes one offer; so many more are there for those that only wake the feed, and to catch up.
+SPARE_STEPS = 5
+
+
 class Store:
     """The sampler's history: answers a page at a time, or not at all."""
 
@@ -56,17 +60,19 @@ class Fed:
         self.clock = HandClock()
         self.history = Store(PAIRS[:stored])
         self.feed = PairFeed(self.learning, self.history, self.clock)
+        self._offered = 0
 
     def publish(self, *pairs: Pair) -> None:
+        self._offered += len(pairs)
         for pair in pairs:
             self.feed.offer(payload(pair))
 
     def settle(self) -> None:
         """Take all that has been offered, and what is behind."""
-        self.feed.step(0.0)
-        while not self.feed.caught_up:
+        for _ in range(self._offered + SPARE_STEPS):
             self.clock.time += RETRY_S
             self.feed.step(0.0)
+        self._offered = 0
 
     @property
     def learnt(self) -> tuple[int, int]:

@@ -8,13 +8,13 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from daemon.config import DaemonConfig, LearnerConfig
+from daemon.config import LARGEST_MAP, DaemonConfig, LearnerConfig
 from daemon.learning.gate import CHANGE, DOUBT, FEWEST_FOR_CHANGE
 from daemon.learning.learning import REGION_RAD
 from daemon.learning.members import TRUSTED
 from daemon.learning.nominal import PAIRS_TO_REFIT
 from daemon.learning.snapshot import IN_SUPPORT
-from daemon.learning.solver import KEPT, LARGEST_NET
+from daemon.learning.solver import KEPT, LARGEST_NET, WINDOW
 from kbmaps.contest import CLEARLY, SHORTEST
 
 PAGE = (Path(__file__).parents[2] / "docs" / "learner.md").read_text(encoding="utf-8")
@@ -42,6 +42,8 @@ def test_the_page_s_numbers_are_the_code_s() -> None:
     assert f"and {words[CHANGE]} are none in any case" in text
     assert f"after {words[PAIRS_TO_REFIT]} pairs (a change that was found: at once) the tool's three numbers" in text
     assert f"at {LARGEST_NET:,} control points" in text
+    assert f"up to {LARGEST_MAP:,} control points" in text
+    assert f"the newest {WINDOW:,} pairs" in text
     assert f"within {words[round(57.29578 * REGION_RAD)]} degrees a joint" in text
     assert ("less than a quarter of the prior's variance" in text) == (IN_SUPPORT == 0.25)
     assert f"the last {words[SHORTEST]} pairs" in text

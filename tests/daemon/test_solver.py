@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from guided_arm import Scene, built_chain, near, nominal_model, path
 
+import daemon.learning.solver as solver_module
 from daemon.learning import DirectSolver, LearntModel, Task
-from daemon.learning.members import RESIDUAL, RIGID
+from daemon.learning.members import EXACT, RESIDUAL, RIGID
 from daemon.learning.solver import FOLDED, KEPT, fitted_belief
 from interfaces.records import FloatArray
 from kbmaps import ChainTolerances, RigidChain
@@ -51,6 +52,19 @@ def test_what_pairs_that_are_no_longer_kept_said_of_the_arm_is_not_forgotten(
     q = near(np.random.default_rng(3), seen_first)
     miss = after_a_long_rest[name].predict(q) - arm.positions(q)
     assert np.linalg.norm(miss, axis=1).mean() < SIGMA_M
+
+
+def test_pairs_beyond_the_window_no_longer_bend_the_exact_map(arm: RigidChain, monkeypatch) -> None:
+    window, older = 200, 300
+    monkeypatch.setattr(solver_module, "WINDOW", window)
+    q, solver = path(np.random.default_rng(5), older + window), DirectSolver()
+    x = arm.positions(q)
+    x[:older] += 0.1
+    solver.start(Task(1, arm.to_kbmap(NOMINAL.bases), BELIEF, prior_stays=True))
+    solver.learn(q, x)
+    exact = next(solved.model for solved in solver.solutions() if solved.name == EXACT)
+    assert exact is not None
+    np.testing.assert_allclose(exact.predict(q), arm.positions(q), atol=1e-6)
 
 
 def test_neighbours_that_share_their_errors_say_less_than_as_many_that_do_not(arm: RigidChain) -> None:

@@ -80,6 +80,17 @@ def test_replaying_noise_free_pairs_approaches_the_chain():
     assert prediction_errors(learner.map, test, chain.positions(test)).mean() < 1e-4
 
 
+def test_it_predicts_what_its_map_predicts():
+    rng = np.random.default_rng(6)
+    kbmap = random_map(rng, bases_for("RPR"))
+    learner = NLMS(kbmap)
+    q, x = rng.uniform(-0.5, 0.5, (20, 3)), rng.normal(size=(20, 3))
+    learner.learn(q[0], x[0])
+    learner.replay(q, x)
+    np.testing.assert_array_equal(learner.predict(q), learner.map.predict(q))
+    np.testing.assert_array_equal(learner.predict(q[0]), learner.map.predict(q[0]))
+
+
 def test_a_snapshot_does_not_follow_later_learning():
     rng = np.random.default_rng(1)
     kbmap = random_map(rng, bases_for("RR"))

@@ -1,0 +1,71 @@
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+from guided_arm import Scene, nominal_model
+
+from daemon.config import LearnerConfig
+from daemon.learning.arm import KnownArm
+from daemon.learning.claims import Claims
+from daemon.learning.doubts import Doubts
+from daemon.learning.era import Era
+from daemon.learning.gate import CHANGE
+from kbmaps import ChainTolerances
+
+NEAR, LIMIT, FAR = 0.001, 0.01, 0.1
+
+
+def meet(doubts: Doubts, number: int, distance_m: float) -> None:
+    """A pair that is known by its number."""
+    doubts.doubt(np.full(1, float(number)), np.full(3, float(number)), distance_m, LIMIT)
+
+
+def run(doubts: Doubts) -> list[float]:
+    q, x = doubts.run()
+    np.testing.assert_array_equal(x, np.repeat(q, 3, axis=1))
+    return q[:, 0].tolist()
+
+
+def test_a_run_is_of_the_pairs_that_were_doubted_in_a_row() -> None:
+    doubts = Doubts(1)
+    for number, distance in enumerate([FAR, FAR, NEAR, FAR, FAR, FAR]):
+        meet(doubts, number, distance)
+    assert (doubts.in_a_row, run(doubts)) == (3, [3.0, 4.0, 5.0])
+
+
+def test_a_pair_that_is_believed_ends_the_run() -> None:
+    doubts = Doubts(1)
+    for number, distance in enumerate([FAR, FAR, NEAR]):
+        meet(doubts, number, distance)
+    assert (doubts.in_a_row, run(doubts)) == (0, [])
+
+
+def test_a_restored_run_goes_on() -> None:
+    doubts, again = Doubts(1), Doubts(1)
+    for number in range(2):
+        meet(doubts, number, FAR)
+    again.restore(*doubts.run(), doubts.in_a_row)
+    meet(again, 2, FAR)
+    assert (again.in_a_row, run(again)) == (3, [0.0, 1.0, 2.0])
+
+
+def test_a_run_has_no_more_pairs_than_make_a_change() -> None:
+    doubts = Doubts(1)
+    for number in range(CHANGE + 2):
+        meet(doubts, number, FAR)
+    assert run(doubts) == [float(number) for number in range(2, CHANGE + 2)]
+
+
+def test_first_pairs_that_the_fitted_tool_contradicts_are_no_part_of_a_run() -> None:
+    nominal, scene = nominal_model(), Scene.draw(0, 8)
+    belief = nominal.belief(nominal.chain, ChainTolerances(tool=0.03))
+    era = Era(nominal.prior(), KnownArm(belief), Claims(nominal.bases, 0.1), LearnerConfig(), itertools.count())
+    x = np.array([pair.x for pair in scene.pairs])
+    x[0] += 0.2  # with the old tool
+    era.begin_with(scene.q[:6], x[:6])
+    era.doubts.doubt(scene.q[6], x[6], FAR, LIMIT)
+    era.set_aside(scene.chain.to_kbmap(nominal.bases))
+    era.doubts.doubt(scene.q[7], x[7], FAR, LIMIT)
+    np.testing.assert_array_equal(era.doubts.run()[0], scene.q[6:])
+    np.testing.assert_array_equal(era.memory.all()[0], scene.q[1:6])

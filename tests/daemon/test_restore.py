@@ -1,0 +1,131 @@
+"""A learner that goes on from a state learns and answers as the one that was saved."""
+
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+import pytest
+from guided_arm import NOW_AND_THEN, Scene, make_pair, measured, new_learning, nominal_model, teach
+
+from daemon.config import LearnerConfig
+from daemon.learning import DirectSolver, Learning, Solved, StateError
+from daemon.learning.memory import Permutations
+from daemon.learning.snapshot import Prediction
+from interfaces.records import FloatArray, Pair
+
+TAUGHT, LATER = 100, 40
+
+
+class OnlyUntilSaved(DirectSolver):
+    """Answers no more when the learner has been saved."""
+
+    saved = False
+
+    def poll(self) -> Solved | None:
+        return None if self.saved else super().poll()
+
+
+def same(a: Prediction, b: Prediction) -> None:
+    np.testing.assert_array_equal(a.x, b.x)
+    np.testing.assert_array_equal(a.sigma, b.sigma)
+    np.testing.assert_array_equal(a.in_support, b.in_support)
+
+
+class Saved:
+    """A learner that was taught and saved, and one that goes on from there; neither has solutions any more."""
+
+    def __init__(self, pairs: list[Pair], *, tool_changed_at: int | None = None, unknown: bool = False) -> None:
+        solver, known = OnlyUntilSaved(), not unknown
+        nominal = nominal_model(pose_known=known, marker_known=known)
+        self.learning = Learning(nominal, LearnerConfig(), solver)
+        for number, pair in enumerate(pairs):
+            if number == tool_changed_at:
+                self.learning.tool_changed()
+            teach(self.learning, [pair], background=number % NOW_AND_THEN == 0)
+        self.learning.solve_soon()
+        while self.learning.work():
+            pass
+        solver.saved = True
+        again = OnlyUntilSaved()
+        again.saved = True
+        self.restored = Learning(nominal, LearnerConfig(), again)
+        self.restored.restore(self.learning.state())
+
+    def assert_same(self, q: FloatArray) -> None:
+        same(self.learning.snapshot.predict(q), self.restored.snapshot.predict(q))
+
+
+def scene_with(case: str) -> tuple[Saved, list[Pair], FloatArray]:
+    """A saved learner, further pairs, and poses to compare at."""
+    rng, scene = np.random.default_rng(1), Scene.draw(0, TAUGHT + LATER)
+    q = np.vstack([scene.q, rng.uniform(-np.pi, np.pi, (50, scene.q.shape[1]))])
+    pairs = scene.pairs
+    if case == "other tool":
+        moved = scene.chain.with_tool([0.0, 0.15, 0.2])
+        pairs = pairs[:60] + measured(moved, scene.q[60:], rng, first=61)
+    if case == "amid doubts":
+        wild = pairs[TAUGHT - 1]
+        pairs[TAUGHT - 1] = make_pair(wild.seq, wild.q, wild.x + 1.0)
+    saved = Saved(
+        pairs[:TAUGHT], tool_changed_at=60 if case == "other tool" else None, unknown=case == "frame to be found"
+    )
+    return saved, pairs[TAUGHT:], q
+
+
+CASES = ["as drawn", "frame to be found", "other tool", "amid doubts"]
+
+
+@pytest.fixture(scope="module", params=CASES)
+def case(request: pytest.FixtureRequest) -> tuple[Saved, list[Pair], FloatArray]:
+    """Taught once for both claims; the first compares before the second goes on."""
+    return scene_with(request.param)
+
+
+def test_a_restored_learner_answers_as_the_one_that_was_saved(case: tuple[Saved, list[Pair], FloatArray]) -> None:
+    saved, _, q = case
+    saved.assert_same(q)
+
+
+def test_a_restored_learner_answers_the_same_after_each_further_pair(
+    case: tuple[Saved, list[Pair], FloatArray],
+) -> None:
+    saved, further, q = case
+    for pair in further:
+        teach(saved.learning, [pair], background=False)
+        teach(saved.restored, [pair], background=False)
+        saved.assert_same(q)
+
+
+def test_a_restored_learner_replays_the_same_pairs() -> None:
+    saved, further, _ = scene_with("as drawn")
+    states = []
+    for learning in (saved.learning, saved.restored):
+        teach(learning, further)
+        states.append(learning.state().arrays["net_nlms"])
+    np.testing.assert_array_equal(*states)
+
+
+@pytest.mark.parametrize("taken", [0, 3, 10, 13])
+def test_a_restored_order_goes_on_where_it_was(taken: int) -> None:
+    order, again = Permutations(seed=3), Permutations(seed=3)
+    while taken > 0:
+        taken -= len(order.take(taken, 10))
+    again.restore(order.position)
+    for _ in range(5):
+        np.testing.assert_array_equal(order.take(4, 12), again.take(4, 12))
+
+
+@pytest.mark.parametrize("tolerance", ["angle_tolerance_deg", "length_tolerance_m", "place_tolerance_m"])
+def test_a_state_that_was_learnt_with_another_tolerance_is_not_gone_on_from(tolerance: str) -> None:
+    learning = new_learning()
+    teach(learning, Scene.draw(0, 3).pairs)
+    other = new_learning(settings=msgspec.structs.replace(LearnerConfig(), **{tolerance: 0.5}))
+    with pytest.raises(StateError, match="to other tolerances"):
+        other.restore(learning.state())
+
+
+def test_a_state_that_was_learnt_with_another_step_size_is_gone_on_from() -> None:
+    learning, other = new_learning(), new_learning(settings=LearnerConfig(step_size=0.2))
+    teach(learning, Scene.draw(0, 3).pairs)
+    other.restore(learning.state())
+    assert other.counters.pairs == 3
