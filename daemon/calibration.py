@@ -23,7 +23,8 @@ from kbmaps import (
     align,
 )
 
-from .chain_figures import HALF_WIDTH_95, WORKMANSHIP, ChainFigures, is_told, probable
+from .chain_figures import HALF_WIDTH_95, ChainFigures, is_told, probable
+from .learning.workmanship import WORKMANSHIP
 
 IntArray = NDArray[np.intp]
 

@@ -19,9 +19,6 @@ from kbmaps import ChainBelief, ChainParameters
 BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.intp]
 
-# How well arms are made: tilt of an axis [rad] and its shift [m], 1-sigma, from a milled arm to a kit. Which of them
-# an arm is, its pairs tell.
-WORKMANSHIP = ((0.0003, 0.0001), (0.001, 0.0005), (0.003, 0.001), (0.01, 0.003), (0.03, 0.01), (0.06, 0.03))
 # Workmanship that is less probable than this is not considered.
 LEAST_SHARE = 0.01
 # Where what is probable differs by more than this, the pairs do not tell.

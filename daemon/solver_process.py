@@ -25,7 +25,7 @@ from daemon.learning import DirectSolver, Solved, Task
 from daemon.learning.members import RESIDUAL
 from interfaces.errors import BodyschemaError
 from interfaces.records import FloatArray
-from kbmaps import ChainBelief, KBMap, ResidualModel
+from kbmaps import ChainBelief, ChainTolerances, KBMap, ResidualModel
 
 NICENESS = 5
 LONGEST_REST_S = 5.0
@@ -45,6 +45,7 @@ class StartTask(msgspec.Struct, frozen=True, tag="start"):
     belief: bytes
     residual: bytes | None
     prior_stays: bool
+    tolerances: ChainTolerances | None
 
 
 class Learn(msgspec.Struct, frozen=True, tag="learn"):
@@ -71,6 +72,7 @@ class Solution(msgspec.Struct, frozen=True):
     model: bytes | None
     belief: bytes | None
     last: bool
+    wide: bytes | None
 
 
 _orders = msgspec.msgpack.Decoder(StartTask | Learn | Solve)
@@ -109,8 +111,16 @@ class SolverProcess:
             self._child = subprocess.Popen(
                 command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment, process_group=0
             )
-        residual = None if task.residual is None else task.residual.to_bytes()
-        self._send(StartTask(task.number, task.prior.to_bytes(), task.belief.to_bytes(), residual, task.prior_stays))
+        self._send(
+            StartTask(
+                number=task.number,
+                prior=task.prior.to_bytes(),
+                belief=task.belief.to_bytes(),
+                residual=None if task.residual is None else task.residual.to_bytes(),
+                prior_stays=task.prior_stays,
+                tolerances=task.tolerances,
+            )
+        )
 
     def learn(self, q: FloatArray, x: FloatArray) -> None:
         """More pairs, q (n, d) [rad] and x (n, 3) [m]."""
@@ -176,9 +186,14 @@ def _unpacked(solution: Solution) -> Solved:
     if solution.model is not None and solution.name == RESIDUAL:
         model = belief = ResidualModel.from_bytes(solution.model)
     elif solution.model is not None:
-        model = KBMap.from_bytes(solution.model)
-        belief = None if solution.belief is None else ChainBelief.from_bytes(solution.belief)
-    return Solved(solution.task, solution.pairs, solution.name, model, belief, solution.last)
+        model, belief = KBMap.from_bytes(solution.model), _belief(solution.belief)
+    return Solved(
+        solution.task, solution.pairs, solution.name, model, belief, solution.last, wide=_belief(solution.wide)
+    )
+
+
+def _belief(data: bytes | None) -> ChainBelief | None:
+    return None if data is None else ChainBelief.from_bytes(data)
 
 
 def serve(orders: IO[bytes], solutions: IO[bytes]) -> None:
@@ -188,7 +203,7 @@ def serve(orders: IO[bytes], solutions: IO[bytes]) -> None:
         if isinstance(order, StartTask):
             prior, belief = KBMap.from_bytes(order.prior), ChainBelief.from_bytes(order.belief)
             residual = None if order.residual is None else ResidualModel.from_bytes(order.residual)
-            solver.start(Task(order.number, prior, belief, residual, order.prior_stays))
+            solver.start(Task(order.number, prior, belief, residual, order.prior_stays, order.tolerances))
             rested_at = 0.0  # a new task begins with few pairs, and somebody waits for it
         elif isinstance(order, Learn):
             solver.learn(
@@ -206,7 +221,8 @@ def _solve(solver: DirectSolver, solutions: IO[bytes]) -> float:
     for solved in solver.solutions():
         learnt = None if solved.model is None else solved.model.to_bytes()
         belief = solved.belief.to_bytes() if isinstance(solved.belief, ChainBelief) else None
-        _write(solutions, Solution(solved.task, solved.pairs, solved.name, learnt, belief, solved.last))
+        wide = None if solved.wide is None else solved.wide.to_bytes()
+        _write(solutions, Solution(solved.task, solved.pairs, solved.name, learnt, belief, solved.last, wide))
     return time.monotonic() - begin
 
 

@@ -29,6 +29,7 @@ from kbmaps import (
 
 from .learnt import LearntModel
 from .members import EXACT, RESIDUAL, RIGID
+from .workmanship import likely_tolerances
 
 log = logging.getLogger(__name__)
 
@@ -63,6 +64,8 @@ class Task:
         residual: what is known of the arm beyond that; None: nothing.
         prior_stays: whether the exact map holds to `prior`, and not to the rigid chain: it stands for pairs that are
             no longer kept.
+        tolerances: those that `belief` began with, where the pairs may say that the arm is made better; None: it may
+            not be.
     """
 
     number: int
@@ -70,6 +73,7 @@ class Task:
     belief: ChainBelief
     residual: ResidualModel | None = None
     prior_stays: bool = False
+    tolerances: ChainTolerances | None = None
 
 
 @dataclass(frozen=True)
@@ -83,6 +87,8 @@ class Solved:
         model: None when these pairs have no solution.
         belief: what is believed of the arm now; None where that is as before.
         last: whether this is all that one `solve` gives.
+        wide: of a rigid chain, what would be believed of it were it not for how well it seems to be made; what other
+            pairs are added to.
     """
 
     task: int
@@ -91,6 +97,7 @@ class Solved:
     model: LearntModel | None = None
     belief: ChainBelief | ResidualModel | None = None
     last: bool = True
+    wide: ChainBelief | None = None
 
 
 class Solver(Protocol):
@@ -163,26 +170,29 @@ class DirectSolver:
         if self._pairs >= FIRST_GROWTH * self._solved_at:
             yield from self._solved_of_some(task)
         self._solved_at = self._pairs
-        belief = fitted_belief(self._before, self._q, self._x)
-        rigid = belief.chain.to_kbmap(task.prior.bases)
+        wide = fitted_belief(self._before, self._q, self._x)
+        made = None if task.tolerances is None else likely_tolerances(wide, task.tolerances)
         residual_due = self._pairs >= RESIDUAL_GROWTH * self._residual_at
-        yield Solved(task.number, self._pairs, RIGID, rigid, belief, last=self._exact is None and not residual_due)
+        rigid = _solved_chain(task, self._pairs, wide, made)
+        yield replace(rigid, last=self._exact is None and not residual_due)
         if self._exact is not None:
-            if not task.prior_stays:
-                self._exact.rebase(rigid)
+            if not task.prior_stays and isinstance(rigid.model, KBMap):
+                self._exact.rebase(rigid.model)
             yield self._solve_exact(task, self._exact, last=not residual_due)
         if residual_due:
             self._residual_at = self._pairs
-            residual = fitted_residual(self._residual_before, self._q, self._x)
+            before = self._residual_before
+            before = _as_made(before, task, made) if isinstance(before, ChainBelief) else before
+            residual = fitted_residual(before, self._q, self._x)
             yield Solved(task.number, self._pairs, RESIDUAL if residual else "", residual, residual)
 
     def _solved_of_some(self, task: Task) -> Iterator[Solved]:
         """The chain of the first pairs only: the others can judge it, even if none come after them."""
         some = int(len(self._q) * FIRST_SHARE)
         if some >= FEWEST_FIRST:
-            belief = fitted_belief(self._before, self._q[:some], self._x[:some])
-            rigid = belief.chain.to_kbmap(task.prior.bases)
-            yield Solved(task.number, self._pairs - len(self._q) + some, RIGID, rigid, belief, last=False)
+            wide = fitted_belief(self._before, self._q[:some], self._x[:some])
+            made = None if task.tolerances is None else likely_tolerances(wide, task.tolerances)
+            yield replace(_solved_chain(task, self._pairs - len(self._q) + some, wide, made), last=False)
 
     def _solve_exact(self, task: Task, learner: ExactLearner, *, last: bool) -> Solved:
         """Least squares around the rigid chain.
@@ -223,6 +233,16 @@ class DirectSolver:
         if self._folded_residual is None:
             raise RuntimeError("start a task first")
         return self._folded_residual
+
+
+def _solved_chain(task: Task, pairs: int, wide: ChainBelief, made: ChainTolerances | None) -> Solved:
+    belief = _as_made(wide, task, made)
+    return Solved(task.number, pairs, RIGID, belief.chain.to_kbmap(task.prior.bases), belief, wide=wide)
+
+
+def _as_made(belief: ChainBelief, task: Task, made: ChainTolerances | None) -> ChainBelief:
+    """What is believed of a chain that is made so well."""
+    return belief if task.tolerances is None or made is None else belief.tightened(task.tolerances, made)[0]
 
 
 def fitted_belief(prior: ChainBelief, q: FloatArray, x: FloatArray) -> ChainBelief:
