@@ -20,13 +20,14 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from benchmarks.rough_arm import rough_arm
 from daemon.config import LearnerConfig
 from daemon.learning import DirectSolver, Learning, NominalModel
 from daemon.learning.nominal import chain_tolerances
 from interfaces.records import Pair, frozen_array
-from kbmaps import RigidChain, align
+from kbmaps import RigidChain
 from kbmaps.arrays import FloatArray
 
 JOINTS = (4, 6, 7)
@@ -59,7 +60,6 @@ class Outcome:
         error: mean distance to the truth [m].
         claimed: mean length of sigma [m].
         one, two: shares of coordinates within one and 1.96 sigma.
-        drawn: the error of the drawing, its unknown frame fitted to the same pairs [m]; NaN after a tool change.
     """
 
     stage: str
@@ -89,20 +89,13 @@ def elsewhere(built: RigidChain, frame: str, rng: np.random.Generator) -> RigidC
         built = built.with_tool(MARKER_M * rng.normal(size=3))
     if not pose_known:
         pose = np.eye(4)
-        turn = POSE_RAD * rng.normal(size=3)
-        pose[:3, :3] = rotation(turn)
+        pose[:3, :3] = Rotation.from_rotvec(POSE_RAD * rng.normal(size=3)).as_matrix()
         pose[:3, 3] = POSE_M * rng.normal(size=3)
         built = built.transformed(pose)
     return built
 
 
-def rotation(turn: FloatArray) -> FloatArray:
-    from scipy.spatial.transform import Rotation
-
-    return Rotation.from_rotvec(turn).as_matrix()
-
-
-def outcomes(case: Case) -> Iterator[Outcome]:
+def outcomes(case: Case, pairs: int) -> Iterator[Outcome]:
     """Teach one arm, all background work done after each pair, and look at its stages."""
     rng = np.random.default_rng(case.seed)
     settings = LearnerConfig()
@@ -110,7 +103,7 @@ def outcomes(case: Case) -> Iterator[Outcome]:
     built = elsewhere(arm.parameters.chain(case.drawing * arm.change), case.frame, rng)
     limit = np.full(case.joints, LIMIT)
     learning = Learning(NominalModel(arm.drawing, -limit, limit, *FRAMES[case.frame]), settings, DirectSolver())
-    stages = KNOWN_STAGES if case.frame == "known" else STAGES
+    stages = [stage for stage in (KNOWN_STAGES if case.frame == "known" else STAGES) if stage <= pairs]
     q = guided(case.joints, stages[-1] + TOOL_STAGES[-1], rng)
     if 0 in stages:
         yield from looked(learning, built, q[:1], "0", rng)
@@ -183,6 +176,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=9, help="of each frame and number of joints")
     parser.add_argument("--first", type=int, default=0, help="the first seed")
+    parser.add_argument("--pairs", type=int, default=STAGES[-1], help="go no further before the tool is changed")
     parser.add_argument("--only", default="", help="a part of the frame's name")
     parser.add_argument("--joints", type=int, nargs="+", default=list(JOINTS))
     parser.add_argument("--by", choices=("all", "joints", "noise_m", "drawing"), default="all")
@@ -190,7 +184,7 @@ def main() -> None:
     found: dict[str, dict[tuple[str, str, str], list[Outcome]]] = defaultdict(lambda: defaultdict(list))
     for case in cases(arguments.seeds, arguments.first, arguments.only, tuple(arguments.joints)):
         group = "all" if arguments.by == "all" else f"{arguments.by} {getattr(case, arguments.by)}"
-        for outcome in outcomes(case):
+        for outcome in outcomes(case, arguments.pairs):
             found[group][case.frame, outcome.stage, outcome.where].append(outcome)
     for group, cells in found.items():
         print(f"{group}: errors and claims [mm], coordinates within so many sigma [%], who answered how often")

@@ -3,7 +3,7 @@
 Layout, all little-endian:
 
     magic     8 bytes   b"BSCKPT\\r\\n"
-    version   uint32    2
+    version   uint32    3
     length    uint32    bytes of the header
     header    MessagePack: `_Header`
     arrays    float64, in the header's order
@@ -29,7 +29,7 @@ from interfaces.errors import BodyschemaError
 from interfaces.records import FloatArray
 
 MAGIC = b"BSCKPT\r\n"
-VERSION = 2
+VERSION = 3
 _PREFIX = struct.Struct("<8sII")
 _CHECKSUM_BYTES = 16
 

@@ -17,7 +17,7 @@ from .misfit import misfit
 from .scores import ErrorMemory
 from .unknowns import ChainLayer, DepartureLayer, GrowingSupport, Layer
 
-_CONTEST = "squares_"
+_SUPPORT, _CONTEST = "support_q", "squares_"
 
 
 @dataclass(frozen=True)
@@ -246,6 +246,7 @@ class Claims:
             chain = self._residual if name == RESIDUAL and self._residual is not None else belief
             return Claim(self._misfits.get(name, none), (ChainLayer(chain), self._rest(name)), memory.surprise)
         if name == PRIOR:
+            # The prior is a chain as well, or was learnt with the last tool; it misses what such a chain does.
             inside = self._misfits.get(RIGID, self._misfits_before.get(RIGID, none))
             departure = DepartureLayer(model, belief)
         else:
@@ -272,12 +273,12 @@ class Claims:
         )
 
     def arrays(self) -> dict[str, FloatArray]:
-        """Squared errors (k,) [m²] by model."""
-        return {_CONTEST + name: values.copy() for name, values in self._contest.errors.items()}
+        """The configurations (n, d) [rad] that stand for all data, and squared errors (k,) [m²] by model."""
+        return {_SUPPORT: self._support.configurations} | {_CONTEST + name: values.copy() for name, values in self._contest.errors.items()}
 
-    def restore(self, state: ClaimsState, arrays: Mapping[str, FloatArray], q: FloatArray) -> None:
-        """Go on from a state and its `arrays`; q (n, d) [rad] are the pairs with the present tool."""
-        for row in q:
+    def restore(self, state: ClaimsState, arrays: Mapping[str, FloatArray]) -> None:
+        """Go on from a state and its `arrays`."""
+        for row in arrays[_SUPPORT]:
             self._support.add(row)
         self.errors, self._residuals = dict(state.errors), state.residuals
         squares = {name.removeprefix(_CONTEST): v for name, v in arrays.items() if name.startswith(_CONTEST)}

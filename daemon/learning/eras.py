@@ -70,7 +70,7 @@ class Eras:
             raise StateError("it belongs to another nominal model: robot.toml or the URDF has changed since")
         eras = cls(nominal, settings, task_numbers)
         eras.fitting.restore(header.next_fit, header.first_fit, arrays)
-        eras.claims.restore(header.claims, arrays, arrays["q"])
+        eras.claims.restore(header.claims, arrays)
         if header.belief is None:
             eras.waiting.restore(arrays["q"], arrays["x"], header.kept_of)
         else:

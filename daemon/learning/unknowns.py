@@ -82,6 +82,11 @@ class GrowingSupport:
         """What later pairs do not touch; None before any."""
         return self._view
 
+    @property
+    def configurations(self) -> FloatArray:
+        """The configurations (n, d) [rad] that stand for all data."""
+        return self._growing.configurations
+
     def add(self, q: FloatArray) -> None:
         """A pair has been learnt at q (d,) [rad]."""
         if self._growing.add(q):
