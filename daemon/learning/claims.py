@@ -200,9 +200,7 @@ class Claims:
         scatter = 0.0 if belief is None else belief.noise
         self._misfits[name] = misfit(errors, noise, before, neighbours=neighbours, scatter=scatter)
 
-    def predicted_late(
-        self, name: str, model: LearntModel, q: FloatArray, errors: FloatArray, *, anew: bool
-    ) -> None:
+    def predicted_late(self, name: str, model: LearntModel, q: FloatArray, errors: FloatArray, *, anew: bool) -> None:
         """A solution that was found only now predicts the last pairs, of which it knows none.
 
         Args:
@@ -274,7 +272,9 @@ class Claims:
 
     def arrays(self) -> dict[str, FloatArray]:
         """The configurations (n, d) [rad] that stand for all data, and squared errors (k,) [m²] by model."""
-        return {_SUPPORT: self._support.configurations} | {_CONTEST + name: values.copy() for name, values in self._contest.errors.items()}
+        return {_SUPPORT: self._support.configurations} | {
+            _CONTEST + name: values.copy() for name, values in self._contest.errors.items()
+        }
 
     def restore(self, state: ClaimsState, arrays: Mapping[str, FloatArray]) -> None:
         """Go on from a state and its `arrays`."""

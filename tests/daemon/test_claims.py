@@ -157,7 +157,9 @@ def test_claims_are_the_same_after_a_restart(walk: FloatArray) -> None:
     again.restore(state, claims.arrays())
     anywhere = np.vstack([walk, FAR])
     for name in (PRIOR, INSTANT):
-        np.testing.assert_allclose(again.of(name, MODEL).variance(anywhere), claims.of(name, MODEL).variance(anywhere), rtol=1e-9)
+        np.testing.assert_allclose(
+            again.of(name, MODEL).variance(anywhere), claims.of(name, MODEL).variance(anywhere), rtol=1e-9
+        )
 
 
 @pytest.mark.parametrize("seed", range(3))
