@@ -84,6 +84,10 @@ class Contest:
         """A model is another one from now on."""
         self._errors.pop(name, None)
 
+    def compares(self, name: str) -> bool:
+        """Whether a model has predicted enough of the last pairs to be compared."""
+        return name in self._errors and _count(self._errors[name]) >= FEWEST
+
     def best(self, trusted: Sequence[str], present: str) -> str:
         """The model that shall answer: the most trusted one that is not clearly worse than any other.
 

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 from kbmaps import ChainBelief, ResidualModel
 
-# How far another tool may hold the marker from where the last one did, 1-sigma of each coordinate [m].
+# How far another tool may hold the marker from where the last one did, and a marker whose place is not known from where
+# it is drawn, 1-sigma of each coordinate [m].
 OTHER_TOOL_M = 0.25
 
 

@@ -14,14 +14,9 @@ from kbmaps import ChainBelief, Contest, JointBasis, ResidualModel, SupportSet
 from .members import INSTANT, PRIOR, RESIDUAL, RIGID, SOLVED, TRUSTED
 from .misfit import misfit
 from .scores import ErrorMemory
-from .unknowns import ChainLayer, Layer, Unknowns
+from .unknowns import ChainLayer, DepartureLayer, GrowingSupport, Layer, Predict
 
-# The data leave shapes open that the prior's own error shows little of. Measured on guided paths of simulated arms:
-# the errors a few degrees beside the path are mostly 0.6 to 1.7 times what the prior's error lets expect.
-OPEN_SHARE = 1.1
-# The prior stays: its error is remembered for a thousand pairs.
-PRIOR_DISCOUNT = 0.999
-_ARM, _CONTEST = "arm_q", "squares_"
+_SUPPORT, _CONTEST = "support_q", "squares_"
 
 
 @dataclass(frozen=True)
@@ -35,7 +30,7 @@ class Claim:
     """
 
     inside: FloatArray
-    layers: tuple[Layer | ChainLayer, ...] = ()
+    layers: tuple[Layer | ChainLayer | DepartureLayer, ...] = ()
     surprise: float = 1.0
 
     def variance(self, q: FloatArray) -> FloatArray:
@@ -53,10 +48,8 @@ class ClaimsState(msgspec.Struct, kw_only=True):
         trusted: the models, the most trusted first.
         residuals: errors of the instant learner on pairs that it has learnt already; None before any.
         misfits: what each solution misses at pairs that it knows, 1-sigma per axis [m].
-        prior_errors: those of the prior, over longer.
-        arm_sigma: 1-sigma of the prior before the tool was changed [m].
         misfits_before: what each missed with the last tool, 1-sigma per axis [m].
-        belief: what is believed of the chain, as bytes; None before the first solution.
+        belief: what the pairs let believe of the chain, as bytes; None before that was asked.
         residual: the chain with residual, as bytes; None before its first solution.
     """
 
@@ -66,8 +59,6 @@ class ClaimsState(msgspec.Struct, kw_only=True):
     residuals: ErrorMemory | None
     misfits: dict[str, tuple[float, float, float]]
     misfits_before: dict[str, tuple[float, float, float]]
-    prior_errors: ErrorMemory
-    arm_sigma: float | None
     belief: bytes | None
     residual: bytes | None
 
@@ -81,7 +72,7 @@ class Claims:
     """
 
     def __init__(self, bases: Sequence[JointBasis], expected_m: float) -> None:
-        self._unknowns = Unknowns(bases)
+        self._bases = bases
         self._misfits_before: dict[str, FloatArray] = {}
         self._trusted = TRUSTED
         self._begin(expected_m)
@@ -92,9 +83,10 @@ class Claims:
         self._contest = Contest()
         self._residuals: ErrorMemory | None = None
         self._misfits: dict[str, FloatArray] = {}
-        self._prior_errors = ErrorMemory(expected_m, discount=PRIOR_DISCOUNT)
+        self._support = GrowingSupport(self._bases)
         self._asked: SupportSet | None = None
         self._solved: dict[str, SupportSet | None] = {}
+        self._expected: ChainBelief | None = None
         self._belief: ChainBelief | None = None
         self._residual: ResidualModel | None = None
 
@@ -109,7 +101,7 @@ class Claims:
     @property
     def support(self) -> SupportSet | None:
         """Where data with the present tool was; None before any."""
-        return self._unknowns.support
+        return self._support.view
 
     @property
     def noise_m(self) -> float:
@@ -118,7 +110,7 @@ class Claims:
 
     @property
     def belief(self) -> ChainBelief | None:
-        """What the pairs with the present tool let believe of the chain; None before the first solution."""
+        """What the pairs with the present tool let believe of the chain; None before that was asked."""
         return self._belief
 
     @property
@@ -127,19 +119,31 @@ class Claims:
         return self._residual
 
     def change_tool(self, expected_m: float, answered: str = PRIOR) -> None:
-        """Another tool: a new prior with other errors, and what was not known of the arm is not known now.
+        """Another tool: nothing is known of the models' errors; what is believed of the arm, `expect` says anew.
 
         The solved model that answered with the last tool is trusted first with this one: the arm is the same.
         """
         if answered in SOLVED:
             self._trusted = (answered, *(name for name in TRUSTED if name != answered))
-        self._unknowns.change_tool(self._prior_sigma)
         self._misfits_before |= self._misfits
         self._begin(expected_m)
+
+    def expect(self, belief: ChainBelief) -> None:
+        """What is believed of the chain before the first pair with the present tool."""
+        self._expected = belief
+
+    def fitted(self, belief: ChainBelief) -> None:
+        """What the first pairs let believe of the chain, before any solution."""
+        self._belief = belief
+
+    def untried(self, name: str) -> bool:
+        """Whether there is a solution for this model that has predicted too few pairs to be compared."""
+        return name in self._misfits and not self._contest.compares(name)
 
     def predicted(
         self,
         q: FloatArray,
+        x: FloatArray,
         errors: Mapping[str, FloatArray],
         variance: FloatArray,
         delayed: FloatArray | None = None,
@@ -147,22 +151,22 @@ class Claims:
         """One pair that was predicted before it is learnt.
 
         Args:
-            q: where (d,) [rad].
+            q, x: where (d,) [rad], and what was measured (3,) [m].
             errors: measured minus predicted (3,) [m] by model.
             variance: the measurement's (3,) [m²].
             delayed: the error (3,) [m] of the instant learner as old as the solutions. On a path a few pairs are far,
                 so the models are compared at the same age.
         """
         for name, error in errors.items():
-            claimed = self.of(name).variance(q[None])[0] + variance
+            predicted = (x - error)[None]
+            claimed = self.of(name, lambda _, predicted=predicted: predicted).variance(q[None])[0] + variance
             self.errors[name].add(error, variance, float(np.square(error).sum() / claimed.sum()))
-        self._prior_errors.add(errors[PRIOR], variance)
         compared = dict(errors) if delayed is None else {**errors, INSTANT: delayed}
         self._contest.add({name: float(np.square(error).sum()) for name, error in compared.items()})
 
     def learnt(self, q: FloatArray) -> None:
         """A pair has been learnt at q (d,) [rad]."""
-        self._unknowns.add(q)
+        self._support.add(q)
 
     def replayed(self, errors: FloatArray) -> None:
         """Errors (n, 3) [m] of the instant learner at pairs that it has learnt before."""
@@ -172,7 +176,7 @@ class Claims:
 
     def solution_asked(self) -> None:
         """The solver works on all pairs up to here."""
-        self._asked = self._unknowns.support
+        self._asked = self._support.view
 
     def solution_taken(
         self, name: str, errors: FloatArray, belief: ChainBelief | ResidualModel | None, *, neighbours: bool
@@ -195,10 +199,11 @@ class Claims:
         scatter = 0.0 if belief is None else belief.noise
         self._misfits[name] = misfit(errors, noise, before, neighbours=neighbours, scatter=scatter)
 
-    def predicted_late(self, name: str, q: FloatArray, errors: FloatArray, *, anew: bool) -> None:
+    def predicted_late(self, name: str, predict: Predict, q: FloatArray, errors: FloatArray, *, anew: bool) -> None:
         """A solution that was found only now predicts the last pairs, of which it knows none.
 
         Args:
+            predict: its positions (n, 3) [m] at q (n, d) [rad].
             anew: whether it knows so much more than the last one that what that predicted says nothing of it.
             q: where (n, d) [rad], in their order.
             errors: measured minus predicted (n, 3) [m].
@@ -208,7 +213,7 @@ class Claims:
             self.errors[name] = ErrorMemory(self._expected_m)
         self._contest.add_late(name, np.square(errors).sum(axis=1), fresher=(INSTANT,))
         noise = self.errors[PRIOR].noise_variance
-        claimed = self.of(name).variance(q) + noise
+        claimed = self.of(name, predict).variance(q) + noise
         for error, variance in zip(errors, claimed, strict=True):
             self.errors[name].add(error, noise, float(np.square(error).sum() / variance.sum()))
 
@@ -220,25 +225,37 @@ class Claims:
         """Another prior for the same pairs; its errors (n, 3) [m] at them."""
         noise = self.errors[PRIOR].noise_variance
         self.errors[PRIOR] = ErrorMemory(self._expected_m)
-        self._prior_errors = ErrorMemory(self._expected_m, discount=PRIOR_DISCOUNT)
         self._contest.forget(PRIOR)
         for error in errors:
             self.errors[PRIOR].add(error, noise)
-            self._prior_errors.add(error, noise)
 
-    def of(self, name: str) -> Claim:
-        """What is claimed for one model."""
+    def of(self, name: str, predict: Predict | None = None) -> Claim:
+        """What is claimed for one model.
+
+        Args:
+            predict: its positions (n, 3) [m] at q (n, d) [rad]; None where there is no model yet.
+        """
         memory = self.errors.get(name, ErrorMemory(self._expected_m))
-        if name == PRIOR:
+        belief = self._belief or self._expected
+        if belief is None or predict is None:
             return Claim(memory.sigma)
-        chain = self._residual if name == RESIDUAL else self._belief
-        if name in self._misfits and chain is not None:
-            # Where no data was, the arm may differ from the chain by as much again as it was seen to.
-            rest = float(np.sqrt(np.square(self._misfits[RESIDUAL if name == RESIDUAL else RIGID]).mean()))
-            layers = ChainLayer(chain), Layer(self._solved.get(name), rest)
-            return Claim(self._misfits[name], layers, memory.surprise)
-        inside = memory if self._residuals is None else self._residuals
-        return Claim(inside.sigma, self._unknowns.layers(self._prior_sigma), memory.surprise)
+        none = np.zeros(3)
+        if name in SOLVED:
+            chain = self._residual if name == RESIDUAL and self._residual is not None else belief
+            return Claim(self._misfits.get(name, none), (ChainLayer(chain), self._rest(name)), memory.surprise)
+        if name == PRIOR:
+            # The prior is a chain as well, or was learnt with the last tool; it misses what such a chain does.
+            inside = self._misfits.get(RIGID, self._misfits_before.get(RIGID, none))
+            departure = DepartureLayer(predict, belief)
+        else:
+            inside = (memory if self._residuals is None else self._residuals).sigma
+            departure = DepartureLayer(predict, belief, self.support)
+        return Claim(inside, (ChainLayer(belief), departure, self._rest(RIGID)), memory.surprise)
+
+    def _rest(self, name: str) -> Layer:
+        """Where no data was, the arm may differ from the chain by as much again as it was seen to."""
+        missed = self._misfits.get(RESIDUAL if name == RESIDUAL else RIGID, np.zeros(3))
+        return Layer(self._solved.get(name), float(np.sqrt(np.square(missed).mean())))
 
     def state(self) -> ClaimsState:
         """Everything needed to go on from here that is not in `arrays`."""
@@ -249,39 +266,30 @@ class Claims:
             residuals=self._residuals,
             misfits={name: _triple(missed) for name, missed in self._misfits.items()},
             misfits_before={name: _triple(missed) for name, missed in self._misfits_before.items()},
-            prior_errors=self._prior_errors,
-            arm_sigma=self._unknowns.arm_sigma,
             belief=None if self._belief is None else self._belief.to_bytes(),
             residual=None if self._residual is None else self._residual.to_bytes(),
         )
 
     def arrays(self) -> dict[str, FloatArray]:
         """The configurations (n, d) [rad] that stand for all data, and squared errors (k,) [m²] by model."""
-        squares = {_CONTEST + name: values.copy() for name, values in self._contest.errors.items()}
-        return {_ARM: self._unknowns.arm_configurations} | squares
+        return {_SUPPORT: self._support.configurations} | {
+            _CONTEST + name: values.copy() for name, values in self._contest.errors.items()
+        }
 
-    def restore(self, state: ClaimsState, arrays: Mapping[str, FloatArray], q: FloatArray) -> None:
-        """Go on from a state and its `arrays`; q (n, d) [rad] are the pairs with the present tool."""
-        for row in arrays[_ARM]:
-            self._unknowns.add(row)
-        if state.arm_sigma is not None:
-            self._unknowns.change_tool(state.arm_sigma)
-        for row in q:
-            self._unknowns.add(row)
+    def restore(self, state: ClaimsState, arrays: Mapping[str, FloatArray]) -> None:
+        """Go on from a state and its `arrays`."""
+        for row in arrays[_SUPPORT]:
+            self._support.add(row)
         self.errors, self._residuals = dict(state.errors), state.residuals
         squares = {name.removeprefix(_CONTEST): v for name, v in arrays.items() if name.startswith(_CONTEST)}
-        self._contest, self._prior_errors = Contest(squares, state.judged), state.prior_errors
+        self._contest = Contest(squares, state.judged)
         self._misfits = {name: np.array(missed) for name, missed in state.misfits.items()}
         self._trusted = state.trusted
         self._misfits_before = {name: np.array(missed) for name, missed in state.misfits_before.items()}
         self._belief = None if state.belief is None else ChainBelief.from_bytes(state.belief)
         self._residual = None if state.residual is None else ResidualModel.from_bytes(state.residual)
-        self._asked = self._unknowns.support
+        self._asked = self._support.view
         self._solved = dict.fromkeys(self._misfits, self._asked)
-
-    @property
-    def _prior_sigma(self) -> float:
-        return OPEN_SHARE * float(np.sqrt(np.square(self._prior_errors.sigma).mean()))
 
 
 def _triple(values: FloatArray) -> tuple[float, float, float]:

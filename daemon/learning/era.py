@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from functools import partial
 
 import numpy as np
 
 from daemon.config import LearnerConfig
 from interfaces.records import FloatArray, Pair
-from kbmaps import KBMap, follow_a_path
+from kbmaps import ChainBelief, KBMap, follow_a_path
 
 from .arm import KnownArm
 from .claims import Claims
 from .doubts import Doubts
 from .gate import DOUBT, limit_m, sound
 from .learnt import LearntModel
-from .members import EXACT, INSTANT, PRIOR, RESIDUAL, Members
+from .members import EXACT, INSTANT, PRIOR, RESIDUAL, RIGID, Members
 from .memory import PairMemory, Permutations
 from .solver import Solved, Task
 from .state import LearningHeader
@@ -30,6 +31,8 @@ JUDGED_LATE = 100
 # With so many new pairs for each that a solution knows, the last solution was another one: it is judged by these alone.
 JUDGED_ANEW = 0.25
 LOOKED_BACK_IN_REPLAY = 4
+# Of so many pairs, the chain is believed before it has predicted any. Of fewer, one that is wrong would not show.
+FEWEST_TO_BELIEVE = 3
 # Names of stored nets begin with this.
 NET = "net_"
 
@@ -64,6 +67,7 @@ class Era:
         self.arm = arm
         self.answering = self._answering_map = PRIOR
         self._claims, self._replays_per_pair = claims, settings.replays_per_pair
+        claims.expect(arm.chain)
         self._order = Permutations(settings.seed)
         self._replays_due = 0.0
         self._solver_prior: KBMap | None = None
@@ -95,7 +99,13 @@ class Era:
     def limit_m(self, pair: Pair) -> float:
         """How far from its prediction the pair may lie before it is doubted [m]."""
         variance = np.diag(pair.cov)
-        claimed = float(np.sqrt(self._claims.of(self.answering).variance(pair.q[None]).sum()))
+        claimed = float(
+            np.sqrt(
+                self._claims.of(self.answering, partial(self.members.predict, self.answering))
+                .variance(pair.q[None])
+                .sum()
+            )
+        )
         recent = max(self._claims.errors[self.answering].rms_m, float(np.sqrt(variance.sum())))
         return limit_m(recent, claimed)
 
@@ -106,18 +116,24 @@ class Era:
             self.members.learn(pair.q, errors[INSTANT], limit / DOUBT)  # a step no longer than any other
             return False
         delayed = None if self.members.delayed is None else pair.x - self.members.delayed.predict(pair.q)
-        self._claims.predicted(pair.q, errors, np.diag(pair.cov), delayed)
+        self._claims.predicted(pair.q, pair.x, errors, np.diag(pair.cov), delayed)
         self._choose()
         self.members.learn(pair.q, errors[INSTANT], np.inf)
         self._keep(pair.q, pair.x)
         self._replays_due += self._replays_per_pair
         return True
 
-    def learn_waiting(self, q: FloatArray, x: FloatArray) -> None:
-        """Learn pairs, q (n, d) and x (n, 3), that waited for the prior: each once, in their order."""
+    def learn_waiting(self, q: FloatArray, x: FloatArray, belief: ChainBelief) -> None:
+        """Learn pairs, q (n, d) and x (n, 3), that waited for the prior: each once, in their order.
+
+        Args:
+            belief: what they let believe of the chain.
+        """
+        self._claims.fitted(belief)
+        variance = np.full(3, belief.noise**2)
         for row_q, row_x in zip(q, x, strict=True):
             errors = self.members.errors(row_q, row_x)
-            self._claims.predicted(row_q, errors, np.zeros(3))
+            self._claims.predicted(row_q, row_x, errors, variance)
             self.members.learn(row_q, errors[INSTANT], np.inf)
             self._keep(row_q, row_x)
         self._choose()
@@ -178,6 +194,7 @@ class Era:
         neighbours = follow_a_path(self.members.prior, q)
         self._claims.solution_taken(solved.name, x - model.predict(q), solved.belief, neighbours=neighbours)
         self._judge_late(solved.name, model, solved.pairs)
+        self._choose()
 
     def solve_from_what_is_known(self) -> None:
         """Where pairs are no longer kept, the last solutions stand for them in the place of what was before."""
@@ -210,8 +227,9 @@ class Era:
         """What came while the solver worked is new to its solution: a pair that it had not learnt judges it fairly."""
         q, x, _ = self.memory.since(max(pairs, self.memory.count - JUDGED_LATE))
         if len(q):
-            self._claims.predicted_late(name, q, x - model.predict(q), anew=len(q) >= JUDGED_ANEW * pairs)
-            self._choose()
+            self._claims.predicted_late(
+                name, model.predict, q, x - model.predict(q), anew=len(q) >= JUDGED_ANEW * pairs
+            )
 
     def _keep(self, q: FloatArray, x: FloatArray) -> None:
         self.memory.append(q, x)
@@ -219,6 +237,8 @@ class Era:
 
     def _choose(self) -> None:
         self.answering = self._claims.best(self.answering)
+        if self.answering == PRIOR and self.memory.count >= FEWEST_TO_BELIEVE and self._claims.untried(RIGID):
+            self.answering = RIGID  # the same, after some pairs
         self._choose_map()
 
     def _choose_map(self) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 
 from daemon.config import LearnerConfig
 from interfaces.records import Pair
-from kbmaps import KBMap, RigidChain
+from kbmaps import ChainBelief, KBMap, RigidChain
 
 from .arm import KnownArm
 from .claims import Claims
@@ -45,7 +45,7 @@ class Eras:
         self._nominal, self._settings, self._task_numbers = nominal, settings, task_numbers
         self._fingerprint = nominal.fingerprint(chain_tolerances(settings))
         self.claims = Claims(nominal.bases, EXPECTED_M)
-        self.fitting = Fitting(nominal)
+        self.fitting = Fitting(nominal, chain_tolerances(settings))
         self.waiting = PairMemory(nominal.joints, settings.replay_capacity)
         self.present: Era | None = None
 
@@ -73,7 +73,7 @@ class Eras:
                 "it belongs to another nominal model or to other tolerances: robot.toml or the URDF has changed since"
             )
         eras.fitting.restore(header.next_fit, header.first_fit, arrays)
-        eras.claims.restore(header.claims, arrays, arrays["q"])
+        eras.claims.restore(header.claims, arrays)
         if header.belief is None:
             eras.waiting.restore(arrays["q"], arrays["x"], header.kept_of)
         else:
@@ -127,18 +127,18 @@ class Eras:
         if fit is None:
             return 0
         if self.present is None:
-            return self._begin_first(fit)
+            return 0 if fit.belief is None else self._begin_first(fit, fit.belief)
         doubted = self.present.set_aside(fit.prior) if is_first else 0
         self.present.change_prior(fit.prior)
         return doubted
 
-    def _begin_first(self, fit: Fit) -> int:
+    def _begin_first(self, fit: Fit, belief: ChainBelief) -> int:
         """The frame is known: the pairs that waited for it are learnt now, but for those that the fit contradicts."""
         q, x = self.waiting.all()
         belongs = sound(np.linalg.norm(x - fit.prior.predict(q), axis=1), self.claims.noise_m)
         self.waiting.clear()
         self.present = self._era(fit.prior, self._drawn(fit.chain))
-        self.present.learn_waiting(q[belongs], x[belongs])
+        self.present.learn_waiting(q[belongs], x[belongs], belief)
         return int((~belongs).sum())
 
     def _next(self, era: Era, expected_m: float, first_fit: int = PAIRS_TO_REFIT) -> Era:

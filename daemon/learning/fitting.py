@@ -6,9 +6,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from interfaces.records import FloatArray
-from kbmaps import DegenerateDataError, KBMap, RigidChain
+from kbmaps import ChainBelief, ChainTolerances, DegenerateDataError, KBMap, RigidChain
 
 from .nominal import PAIRS_TO_REFIT, NominalModel
+from .solver import fitted_belief
 
 
 @dataclass(frozen=True)
@@ -17,18 +18,20 @@ class Fit:
 
     Attributes:
         prior: the map to learn on top of.
-        chain: the nominal chain in its frame.
+        chain: the nominal chain, placed; after a tool change what says how the hand is turned.
+        belief: what the pairs let believe of the chain; None after a tool change, where only the tool is fitted.
     """
 
     prior: KBMap
     chain: RigidChain
+    belief: ChainBelief | None = None
 
 
 class Fitting:
     """Tells when a fit is due, at first after few pairs and then whenever they have doubled, and makes it."""
 
-    def __init__(self, nominal: NominalModel) -> None:
-        self._nominal = nominal
+    def __init__(self, nominal: NominalModel, tolerances: ChainTolerances) -> None:
+        self._nominal, self._tolerances = nominal, tolerances
         self._chain = nominal.chain
         self._before: KBMap | None = None
         self._due_at = None if nominal.frame_known else nominal.pairs_to_align
@@ -46,7 +49,7 @@ class Fitting:
 
     @property
     def chain(self) -> RigidChain:
-        """The nominal chain in its frame; after a tool change what says how the hand is turned."""
+        """The nominal chain, placed; after a tool change what says how the hand is turned."""
         return self._chain
 
     def due(self, pairs: int) -> bool:
@@ -62,14 +65,19 @@ class Fitting:
         self._before, self._chain, self._due_at, self._is_first = before, hand, first_at, True
 
     def fit(self, q: FloatArray, x: FloatArray) -> Fit | None:
-        """The prior that fits pairs q (n, d) [rad] and x (n, 3) [m] best; None when they do not determine it."""
+        """The prior that fits pairs q (n, d) [rad] and x (n, 3) [m] best; None when they do not determine it.
+
+        Where the frame is not known, that is the most probable chain. A frame alone, fitted to a drawing that is wrong,
+        takes what is wrong of the arm near the first pairs for its own, and is far off everywhere else.
+        """
         try:
             if self._before is not None:
                 return Fit(self._nominal.with_other_tool(self._before, self._chain, q, x), self._chain)
-            aligned = self._nominal.aligned(q, x)
+            placed = self._nominal.placed(q, x)
         except DegenerateDataError:
             return None
-        return Fit(aligned.to_kbmap(self._nominal.bases), aligned)
+        belief = fitted_belief(self._nominal.belief(placed, self._tolerances), q, x)
+        return Fit(belief.chain.to_kbmap(self._nominal.bases), placed, belief)
 
     def done(self, pairs: int, fit: Fit | None) -> None:
         """That many pairs were fitted."""

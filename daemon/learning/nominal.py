@@ -24,6 +24,8 @@ from kbmaps import (
     with_refitted_marker,
 )
 
+from .arm import OTHER_TOOL_M
+
 # Pairs after a tool change with which the tool is first fitted; with as many more as there were, it is again.
 PAIRS_TO_REFIT = 5
 # A narrower stroke would make the basis needlessly stiff, and equal limits impossible.
@@ -105,24 +107,24 @@ class NominalModel:
         """What is believed of the real chain before any pair.
 
         Args:
-            chain: the nominal chain, in the frame that was found where none is known.
+            chain: the nominal chain, placed where none is known.
             tolerances: of a chain whose frame and marker are known.
         """
         if not self.pose_known:
             tolerances = replace(tolerances, base_rotation=math.inf, base_translation=math.inf)
         if not self.marker_known:
-            tolerances = replace(tolerances, tool=math.inf)
+            # A marker is on the hand. First pairs along a short path would be fitted as well by one metres away.
+            tolerances = replace(tolerances, tool=OTHER_TOOL_M)
         return ChainBelief.from_tolerances(ChainParameters(chain), tolerances)
 
-    def aligned(self, q: FloatArray, x: FloatArray) -> RigidChain:
-        """The chain with what is not known fitted to pairs, q (n, d) [rad] and x (n, 3) [m].
+    def placed(self, q: FloatArray, x: FloatArray) -> RigidChain:
+        """The chain with an unknown pose fitted to pairs, q (n, d) [rad] and x (n, 3) [m]; its marker is as drawn.
 
         Raises:
             DegenerateDataError: the pairs do not determine it.
         """
         chosen = _spread(len(q))
-        fit = align(self.chain, q[chosen], x[chosen], pose_known=self.pose_known, marker_known=self.marker_known)
-        return fit.chain
+        return align(self.chain, q[chosen], x[chosen], pose_known=self.pose_known, marker_known=True).chain
 
     def with_other_tool(self, kbmap: KBMap, chain: RigidChain, q: FloatArray, x: FloatArray) -> KBMap:
         """A learnt map with its marker moved to where pairs since the tool change, q (n, d) and x (n, 3), see it.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,10 +11,12 @@ import numpy as np
 from interfaces.records import FloatArray
 from kbmaps import ChainBelief, JointBasis, ResidualModel, SupportSet
 
+Predict = Callable[[FloatArray], FloatArray]
+
 
 @dataclass(frozen=True)
 class Layer:
-    """One thing that is unknown where no data was: the arm's own shape, or what a changed tool did to it.
+    """What is unknown where no data was.
 
     Attributes:
         support: where data was; None before any.
@@ -40,64 +42,52 @@ class ChainLayer:
         return self.belief.predict_with_variance(q)[1]
 
 
+@dataclass(frozen=True, eq=False)
+class DepartureLayer:
+    """How far a model is from the most probable chain: of the two, the chain is the one that the claim is known of.
+
+    Attributes:
+        predict: positions (n, 3) [m] that the model predicts at q (n, d) [rad].
+        belief: what is believed of the chain.
+        support: where the model itself was shown data; None: nowhere.
+    """
+
+    predict: Predict
+    belief: ChainBelief
+    support: SupportSet | None = None
+
+    def variance(self, q: FloatArray) -> FloatArray:
+        """Squared difference of each coordinate at q (n, d) [rad], shape (n, 3) [m²]."""
+        return unexplained(self.support, q)[:, None] * np.square(self.predict(q) - self.belief.predict(q))
+
+
 def unexplained(support: SupportSet | None, q: FloatArray) -> FloatArray:
     """Share of the prior's variance that is left open at q (n, d) [rad], shape (n,), 0 to 1."""
     return np.ones(len(q)) if support is None else np.asarray(support.unexplained(q))
 
 
-class Unknowns:
-    """Follows where pairs have shown the arm with any tool, and with the present one.
+class GrowingSupport:
+    """Where data was. Queries read it while it grows, so they get a copy; it grows ever more rarely.
 
-    A tool that is fitted anew brings the prior close to the recent pairs, and its error there says nothing about other
-    places: what was never seen of the arm with an earlier tool is still unknown. So its shape is a layer of its own.
+    Args:
+        bases: what is learnt in.
     """
 
     def __init__(self, bases: Sequence[JointBasis]) -> None:
-        self._bases = bases
-        self._arm = _GrowingSupport(bases)
-        self._tool = self._arm
-        self._arm_sigma: float | None = None
+        self._growing = SupportSet(bases)
+        self._view: SupportSet | None = None
 
     @property
-    def arm_configurations(self) -> FloatArray:
-        """The configurations (n, d) [rad] that stand for all data, with any tool."""
-        return self._arm.growing.configurations
+    def view(self) -> SupportSet | None:
+        """What later pairs do not touch; None before any."""
+        return self._view
 
     @property
-    def arm_sigma(self) -> float | None:
-        """1-sigma of the prior before the tool was changed [m]; None if it never was."""
-        return self._arm_sigma
-
-    @property
-    def support(self) -> SupportSet | None:
-        """Where data with the present tool was; None before any."""
-        return self._tool.view
+    def configurations(self) -> FloatArray:
+        """The configurations (n, d) [rad] that stand for all data."""
+        return self._growing.configurations
 
     def add(self, q: FloatArray) -> None:
         """A pair has been learnt at q (d,) [rad]."""
-        self._arm.add(q)
-        if self._tool is not self._arm:
-            self._tool.add(q)
-
-    def change_tool(self, sigma: float) -> None:
-        """From now on another tool; `sigma` is how wrong the prior was [m]."""
-        self._arm_sigma = max(self._arm_sigma or 0.0, sigma)
-        self._tool = _GrowingSupport(self._bases)
-
-    def layers(self, sigma: float) -> tuple[Layer, ...]:
-        """What is left open; `sigma` is how wrong the present prior is [m]."""
-        if self._arm_sigma is None:
-            return (Layer(self._arm.view, sigma),)
-        return Layer(self._tool.view, sigma), Layer(self._arm.view, self._arm_sigma)
-
-
-class _GrowingSupport:
-    """Queries read a support set while it grows, so they get a copy; it grows ever more rarely."""
-
-    def __init__(self, bases: Sequence[JointBasis]) -> None:
-        self.growing = SupportSet(bases)
-        self.view: SupportSet | None = None
-
-    def add(self, q: FloatArray) -> None:
-        if self.growing.add(q):
-            self.view = copy.deepcopy(self.growing)
+        if self._growing.add(q):
+            self._view = copy.deepcopy(self._growing)

@@ -289,7 +289,7 @@ def test_reset_to_prior_answers_as_before_any_pair() -> None:
 
 def test_the_prior_answers_while_there_are_few_pairs() -> None:
     learning = new_learning()
-    teach(learning, Scene.draw(0, 3).pairs)
+    teach(learning, Scene.draw(0, 2).pairs)
     assert learning.snapshot.answering == "prior"
 
 
