@@ -136,6 +136,4 @@ def _tolerances(robot: RobotDescription, zeros_rad: float) -> list[ChainToleranc
 def _claimed(learner: RigidLearner) -> ChainBelief:
     """What the learner believes, as much less surely as its intervals are wider where the noise was estimated."""
     belief = learner.belief
-    own = HALF_WIDTH_95 * np.sqrt(np.square(belief.root[belief.parameters.zeros]).sum(axis=1))
-    wider = float((learner.report().zeros.half_width / own).max())
-    return replace(belief, root=wider * belief.root)
+    return replace(belief, root=learner.report().widening * belief.root)
