@@ -23,7 +23,7 @@ from kbmaps import (
     align,
 )
 
-from .chain_figures import HALF_WIDTH_95, WORKMANSHIP, ChainFigures, probable
+from .chain_figures import WORKMANSHIP, ChainFigures, probable
 
 IntArray = NDArray[np.intp]
 
