@@ -122,10 +122,10 @@ def test_the_intervals_cover_what_was_planted_after_a_tool_change_too() -> None:
 
 
 def test_freeing_what_nothing_shows_leaves_every_position_where_it_is() -> None:
-    arm = Planted.of(4, 80)
+    arm = Planted.of(4, 40)
     arm.change[arm.parameters.tool] += OTHER_TOOL
     arm.learning.tool_changed()
-    arm.teach(np.random.default_rng(8), 40)
+    arm.teach(np.random.default_rng(8), 20)
     known = arm.known()
     prior = known.nominal.belief(known.belief.parameters.reference, known.tolerances)
     freed = no_surer_than_possible(known.belief, prior, arm.robot)
