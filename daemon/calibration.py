@@ -23,7 +23,7 @@ from kbmaps import (
     align,
 )
 
-from .chain_figures import HALF_WIDTH_95, ChainFigures, is_told, probable
+from .chain_figures import ChainFigures, is_told, probable
 from .learning.workmanship import WORKMANSHIP
 
 IntArray = NDArray[np.intp]
@@ -168,6 +168,4 @@ def _tolerances(robot: RobotDescription, zeros_rad: float) -> list[ChainToleranc
 def _claimed(learner: RigidLearner) -> ChainBelief:
     """What the learner believes, as much less surely as its intervals are wider where the noise was estimated."""
     belief = learner.belief
-    own = HALF_WIDTH_95 * np.sqrt(np.square(belief.root[belief.parameters.zeros]).sum(axis=1))
-    wider = float((learner.report().zeros.half_width / own).max())
-    return replace(belief, root=wider * belief.root)
+    return replace(belief, root=learner.report().widening * belief.root)

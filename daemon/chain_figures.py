@@ -30,6 +30,8 @@ NOT_SHOWN = 0.9
 _STEP = 1e-6
 # Poses that stand for all, and the noise of exact pairs [m].
 _POSES, _EXACT_M = 100, 1e-6
+# From one linearisation to the next the error along a curve is squared.
+_RELINEARISED = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,11 +145,25 @@ class ChainFigures:
 
 def after_exact_pairs(prior: ChainBelief, change: FloatArray, robot: RobotDescription) -> ChainBelief:
     """The prior with what exact pairs of all poses would leave open, linearised at a change (size,)."""
-    poses = np.random.default_rng(0).uniform(robot.lower, robot.upper, (_POSES, len(robot.joints)))
-    _, jacobian = prior.parameters.linearised(change, poses)
+    _, jacobian = prior.parameters.linearised(change, _poses(robot))
     rows = (jacobian @ prior.root).reshape(-1, prior.root.shape[1]) / _EXACT_M
     _, singular, vt = np.linalg.svd(rows, full_matrices=False)
     return replace(prior, root=prior.root @ (vt.T / np.sqrt(1.0 + np.square(singular))))
+
+
+def most_probable_alike(prior: ChainBelief, change: FloatArray, robot: RobotDescription) -> FloatArray:
+    """Of all changes (size,) that make the same positions as `change`, the one that is most probable beforehand.
+
+    They lie along a curve, so the way there takes several linearisations.
+    """
+    poses = _poses(robot)
+    same, found = prior.parameters.positions(change, poses), change
+    for _ in range(_RELINEARISED):
+        x, jacobian = prior.parameters.linearised(found, poses)
+        u, singular, vt = np.linalg.svd((jacobian @ prior.root).reshape(3 * _POSES, -1) / _EXACT_M, full_matrices=False)
+        target = (same - x + jacobian @ (found - prior.mean)).ravel() / _EXACT_M
+        found = prior.mean + prior.root @ (vt.T @ (singular / (1.0 + np.square(singular)) * (u.T @ target)))
+    return found
 
 
 def no_surer_than_possible(belief: ChainBelief, prior: ChainBelief, robot: RobotDescription) -> ChainBelief:
@@ -156,21 +172,24 @@ def no_surer_than_possible(belief: ChainBelief, prior: ChainBelief, robot: Robot
     What one chain does as well as another lies along a curve, and its tangents differ from place to place. Pairs
     that were linearised at one place therefore seem to tell something about the tangents at another (Huang, Mourikis
     and Roumeliotis 2010, on the consistency of the extended Kalman filter). In no direction may a belief be surer
-    than exact pairs would make it.
+    than exact pairs would make it. Along what pairs cannot show, its mean goes to where the prior is most probable.
     """
-    best = after_exact_pairs(prior, belief.mean, robot)
+    change = most_probable_alike(prior, belief.mean, robot)
+    best = after_exact_pairs(prior, change, robot)
     free = np.flatnonzero(prior.root.any(axis=1))
     std = _spread(prior, free)
     own, least = (scaled @ scaled.T for scaled in (each.root[free] / std[:, None] for each in (belief, best)))
-    mean = belief.mean[free] / std
-    mean = (mean - least @ mean) * std  # along what exact pairs leave open, to where the prior is most probable
     factor = np.linalg.cholesky(own + least)
     half = np.linalg.solve(factor, np.linalg.solve(factor, least).T)
     shares, vectors = np.linalg.eigh((half + half.T) / 2.0)
-    root, change = np.zeros((len(belief.mean), len(free))), belief.mean.copy()
+    root = np.zeros((len(belief.mean), len(free)))
     root[free] = std[:, None] * (factor @ vectors) * np.sqrt(np.maximum(shares, 1.0 - shares))
-    change[free] = mean
     return replace(belief, mean=change, root=root)
+
+
+def _poses(robot: RobotDescription) -> FloatArray:
+    """Configurations (m, d) that stand for all."""
+    return np.random.default_rng(0).uniform(robot.lower, robot.upper, (_POSES, len(robot.joints)))
 
 
 def probable(evidence: FloatArray) -> tuple[IntArray, FloatArray]:

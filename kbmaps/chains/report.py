@@ -17,7 +17,7 @@ _LOOSE = 0.01
 
 @dataclass(frozen=True, eq=False)
 class Interval:
-    """Values (k,) with the half width (k,) of their 95 % intervals."""
+    """The most probable values (k,) with the half width (k,) of their 95 % intervals."""
 
     value: FloatArray
     half_width: FloatArray
@@ -41,6 +41,7 @@ class ChainReport:
         base_translation: its translation (3) [m].
         tool_shift: move of the tool centre point (3) in the nominal marker frame [m].
         zeros: what has to be added to each joint's reading (d) [rad, m].
+        widening: by what the intervals are wider since the noise was estimated from few pairs (Student's); 1 if told.
         noise: 1-sigma of a measured coordinate [m], estimated or told (their RMS).
         misfit: residual over what the noise explains; about 1 for a rigid chain, 1 where the noise was not told.
         freedom: residual coordinates minus those that the parameters have used up; few make `noise` uncertain.
@@ -55,6 +56,7 @@ class ChainReport:
     base_translation: Interval
     tool_shift: Interval
     zeros: Interval
+    widening: float
     noise: float
     misfit: float
     freedom: float
@@ -66,19 +68,20 @@ class ChainReport:
 def chain_report(
     parameters: ChainParameters,
     change: FloatArray,
-    std: FloatArray,
+    deviation: FloatArray,
     loose: FloatArray,
     *,
+    widening: float,
     noise: float,
     misfit: float,
     freedom: float,
     outliers: int,
     determined: int,
 ) -> ChainReport:
-    """The report on a change (size,) with its standard deviations; `loose` as in `RigidFit`."""
+    """The report on a change (size,) with the RMS deviations of the truth from it (size,); `loose` as in `RigidFit`."""
 
     def interval(part: slice) -> Interval:
-        return Interval(frozen(change[part]), frozen(_HALF_WIDTH_95 * std[part]))
+        return Interval(frozen(change[part]), frozen(_HALF_WIDTH_95 * deviation[part]))
 
     names = parameters.names()
     return ChainReport(
@@ -87,6 +90,7 @@ def chain_report(
         base_translation=interval(parameters.base_shift),
         tool_shift=interval(parameters.tool),
         zeros=interval(parameters.zeros),
+        widening=widening,
         noise=noise,
         misfit=misfit,
         freedom=freedom,

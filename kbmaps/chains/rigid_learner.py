@@ -17,6 +17,7 @@ from kbmaps.chains.parameters import ChainParameters, ChainTolerances
 from kbmaps.chains.placed_start import PlacedStart
 from kbmaps.chains.report import ChainReport, chain_report
 from kbmaps.chains.rigid_fit import RigidFit, fit_chain
+from kbmaps.chains.valley import deviations
 from kbmaps.errors import DegenerateDataError
 from kbmaps.model import Estimate
 from kbmaps.packed import complete, named, pack, restoring, unpack
@@ -26,6 +27,8 @@ _KIND = "rigid chain, batch, 2"
 _ONE_SIGMA = 0.841344746
 # Configurations where the chain is surer than this times the least sure pair (in variance) lie where data was.
 _SUPPORT_FACTOR = 2.0
+# So many pairs, evenly spread, stand for all where the bend of their valley is looked for.
+_FOLLOWED = 100
 
 
 class RigidLearner:
@@ -190,13 +193,14 @@ class RigidLearner:
         if fit is None:
             raise DegenerateDataError("there is nothing to report before the first pair was learnt")
         pairs = self._units()
-        std = np.sqrt(np.square(fit.belief.root).sum(axis=1)) * (1.0 if pairs.known else student(fit.freedom))
+        widening = 1.0 if pairs.known else student(fit.freedom)
         unit = math.sqrt(float(np.square(pairs.unit).mean()))
         return chain_report(
             self._parameters,
             fit.belief.mean,
-            std,
+            widening * self._deviations(fit, pairs),
             fit.loose,
+            widening=widening,
             noise=unit if pairs.known else unit * fit.noise,
             misfit=fit.noise if pairs.known else 1.0,
             freedom=fit.freedom,
@@ -243,6 +247,12 @@ class RigidLearner:
             self._widest = float(variance.sum(axis=1).max(initial=0.0))
             self._fit = fit
         return self._fit
+
+    def _deviations(self, fit: RigidFit, pairs: Pairs) -> FloatArray:
+        good = np.flatnonzero(fit.inliers)
+        some = good[np.unique(np.linspace(0, len(good) - 1, _FOLLOWED).round().astype(np.intp))]
+        sigma = fit.noise * pairs.unit[some] * math.sqrt(len(some) / max(len(good), 1))
+        return deviations(fit.belief, pairs.q[some], sigma)
 
     def _same_pairs(self, other: RigidLearner) -> bool:
         pairs = zip((self._q, self._x, self._sigma), (other._q, other._x, other._sigma), strict=True)

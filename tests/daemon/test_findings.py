@@ -10,7 +10,7 @@ from guided_arm import Scene, make_pair, near, new_learning, teach
 from test_calibration import DESK_ARM, figures_of
 
 import daemon.findings
-from daemon.chain_figures import is_told
+from daemon.chain_figures import is_told, no_surer_than_possible
 from daemon.config import LearnerConfig
 from daemon.findings import EVERY_S, Findings, figures
 from daemon.learning import DirectSolver, Learning, NominalModel
@@ -119,6 +119,18 @@ def covered_after_another_tool(seed: int) -> list[bool]:
 
 def test_the_intervals_cover_what_was_planted_after_a_tool_change_too() -> None:
     assert np.mean([inside for seed in range(3) for inside in covered_after_another_tool(seed)]) > 0.8
+
+
+def test_freeing_what_nothing_shows_leaves_every_position_where_it_is() -> None:
+    arm = Planted.of(4, 40)
+    arm.change[arm.parameters.tool] += OTHER_TOOL
+    arm.learning.tool_changed()
+    arm.teach(np.random.default_rng(8), 20)
+    known = arm.known()
+    prior = known.nominal.belief(known.belief.parameters.reference, known.tolerances)
+    freed = no_surer_than_possible(known.belief, prior, arm.robot)
+    q = np.random.default_rng(9).uniform(arm.robot.lower, arm.robot.upper, (50, 4))
+    np.testing.assert_allclose(freed.predict(q), known.belief.predict(q), rtol=0, atol=0.02 * SIGMA_M)
 
 
 @pytest.mark.soak

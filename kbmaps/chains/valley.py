@@ -1,0 +1,58 @@
+"""How far the parameters of a chain may be off where what fits the pairs equally well lies along a curve."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from kbmaps.arrays import FloatArray
+from kbmaps.chains.belief import ChainBelief, squared
+
+# Of a direction that is open the pairs have left at least this share of the prior's variance.
+_OPEN = 0.5
+# No step along a direction changes a parameter by more than this [rad, m]: beyond, two orders say nothing.
+_LONGEST_STEP = 0.1
+
+
+def deviations(belief: ChainBelief, q: FloatArray, sigma: FloatArray) -> FloatArray:
+    """Root mean square deviation (size,) [rad, m] of each parameter's true value from the mean, to second order.
+
+    What the pairs do not tell apart lies along a curved valley, not along its tangent: another zero of the last joint,
+    made up for by the marker, takes the marker round the joint's axis. With y standard normal along the open
+    directions W_o, the closed ones W_c follow, so that the pairs stay as well explained (our derivation):
+
+        θ = m + W_o y + W_c (z + ½ Σ B_kl y_k y_l)    B_kl = −(J W_c)⁺ ∂²x(W_o e_k, W_o e_l)
+
+    Half the square form has the mean tr B / 2 and the variance tr B² / 2.
+
+    Args:
+        belief: after the pairs.
+        q: the configurations (n, d) of the pairs, or of some that stand for them.
+        sigma: 1-sigma (n,) of a coordinate there [m].
+    """
+    opened, closed, follow = _sides(belief, q, sigma)
+    bend = np.empty((len(belief.mean), opened.shape[1], opened.shape[1]))
+    for k, direction in enumerate(opened.T):
+        step = _LONGEST_STEP / max(float(np.abs(direction).max()), _LONGEST_STEP)
+        _, ahead = belief.parameters.linearised(belief.mean + step * direction, q)
+        _, behind = belief.parameters.linearised(belief.mean - step * direction, q)
+        second = ((ahead - behind) @ opened) / (2.0 * step * sigma[:, None, None])
+        bend[:, k] = -closed @ (follow @ second.reshape(-1, opened.shape[1]))
+    mean = 0.5 * np.einsum("ikk->i", bend)
+    variance = np.square(belief.root).sum(axis=1) + 0.5 * np.square(bend).sum(axis=(1, 2))
+    return np.sqrt(variance + np.square(mean))
+
+
+def _sides(belief: ChainBelief, q: FloatArray, sigma: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """A root of the belief in two parts, open (size, k) and closed (size, c), and (J W_c)⁺ (c, 3 n) of the latter.
+
+    In units of the posterior the square of J W is what the pairs have taken of the prior's variance.
+    """
+    free, triangle = squared(belief.root)
+    root = np.zeros((len(belief.mean), len(free)))
+    root[free] = triangle
+    _, jacobian = belief.parameters.linearised(belief.mean, q)
+    rows = (jacobian[:, :, free] @ triangle / sigma[:, None, None]).reshape(-1, len(free))
+    taken, vectors = np.linalg.eigh(rows.T @ rows)
+    opened, closed = vectors[:, taken <= 1.0 - _OPEN], vectors[:, taken > 1.0 - _OPEN]
+    follow = (rows @ closed / taken[taken > 1.0 - _OPEN]).T
+    return root @ opened, root @ closed, follow
