@@ -11,9 +11,10 @@ import numpy as np
 
 from kbmaps.arrays import FloatArray
 from kbmaps.chains.belief import ChainBelief
-from kbmaps.chains.parameters import SMALL_ANGLE, WIDE, ChainParameters, ChainTolerances
+from kbmaps.chains.parameters import WIDE, ChainParameters, ChainTolerances
 from kbmaps.errors import NonFiniteError, SettingError, ShapeError
 from kbmaps.maps.kernels import FilterKernel, filter_kernel
+from kbmaps.rotations import SMALL_ANGLE
 
 # Unit of the marker's place where its tolerance is 0, so that a tool change can loosen it [m].
 _TOOL_UNIT = 0.1

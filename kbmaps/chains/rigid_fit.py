@@ -12,16 +12,13 @@ from scipy.special import chdtrc  # pyright: ignore[reportMissingTypeStubs, repo
 from kbmaps.arrays import BoolArray, FloatArray
 from kbmaps.chains.belief import ChainBelief, squared
 from kbmaps.pairs import Pairs
+from kbmaps.robust import MEDIAN_NORM, ROUNDING_M
 
-# Noise that is estimated is never below this [m]: there rounding begins.
-_ROUNDING_M = 1e-9
 # A pair this many sigma from where the others predict it is an outlier: of good ones 4 in 100,000 are as far out
 # (chi, three dimensions).
 _OUTLIER_SIGMAS = 4.8
 # A residual's variance is never taken for less than this share of the noise: below, the pair explains itself.
 _LEAST_SHARE = 1e-4
-# A residual norm of noise σ per axis has the median 1.538 σ in three dimensions.
-_MEDIAN_NORM = 1.538
 _SCALES_PER_SIGMA = 3.0
 # Told noise explains a sum of squared residuals that is not less probable than this (χ²).
 _MISFIT_CHANCE = 1e-3
@@ -119,7 +116,7 @@ class _Fitter:
         self.prior, self.pairs = prior, pairs
         self.free, self.root = squared(prior.root)
         self.point = self._at(cast(FloatArray, np.linalg.solve(self.root, (start - prior.mean)[self.free])))
-        self.least_noise = 1.0 if pairs.known else _ROUNDING_M / float(pairs.unit.min())
+        self.least_noise = 1.0 if pairs.known else ROUNDING_M / float(pairs.unit.min())
         self._damping = _FIRST_DAMPING
         # Residual coordinates that the parameters use up.
         self.used = float(min(len(self.free), 3 * len(pairs)))
@@ -131,7 +128,7 @@ class _Fitter:
         """
         norms = self.point.norms
         rank = min(int(0.5 * (len(norms) + self.used / 3.0)), len(norms) - 1)
-        return max(float(np.partition(norms, rank)[rank]) / _MEDIAN_NORM, self.least_noise)
+        return max(float(np.partition(norms, rank)[rank]) / MEDIAN_NORM, self.least_noise)
 
     def improve(self, weights: FloatArray, noise: float) -> float:
         """A Levenberg-Marquardt step; returns its length in units of what is left open (0: none was found)."""
