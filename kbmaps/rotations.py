@@ -73,9 +73,10 @@ def rotation_vector(rotation: FloatArray) -> FloatArray:
 
 
 def exponentials(turns: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Rotations exp([φ]×) (n, 3, 3) of rotation vectors (n, 3), and their left Jacobians.
+    """Rotations exp([φ]×) (n, 3, 3) of rotation vectors (n, 3) [rad], and their left Jacobians (n, 3, 3).
 
-    Rodrigues' formula, and exp([φ + δ]×) = exp([J δ]×) exp([φ]×) to first order, with the left Jacobian J (Chirikjian 2012, section 10.8).
+    Rodrigues' formula, and exp([φ + δ]×) = exp([J δ]×) exp([φ]×) to first order, with the left Jacobian J
+    (Chirikjian 2012, section 10.8).
     """
     angles: FloatArray = np.sqrt(np.einsum("ki,ki->k", turns, turns))[:, None, None]
     safe: FloatArray = np.maximum(angles, SMALL_ANGLE)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kbmaps.arrays import FloatArray, frozen, rows_or_vector, vector
+from kbmaps.arrays import BoolArray, FloatArray, frozen, rows_or_vector, vector
 from kbmaps.chains.chain import RigidChain
 from kbmaps.errors import SettingError
 from kbmaps.rotations import cross_matrix, exponentials
@@ -123,6 +123,19 @@ class ChainParameters:
         """What `linearised` computes with: axes and points of the reference at q = 0 (d, 3), the tangents (d, 3, 2),
         1 where prismatic (d,), and the marker's frame (4, 4)."""
         return self._axes, self._points, self._tangents, self.reference.prismatic.astype(np.float64), self._frames[-1]
+
+    @property
+    def turning(self) -> BoolArray:
+        """Which parameters (size,) are angles, and so bend the marker's way; the others are lengths."""
+        turning = np.zeros(self.size, dtype=np.bool_)
+        turning[self.base_turn] = turning[self.tilts] = True
+        turning[self.zeros] = ~self.reference.prismatic
+        return turning
+
+    @property
+    def reach(self) -> float:
+        """How far the marker usually is from what turns it [m]: half the length of all links."""
+        return max(float(np.linalg.norm(self.reference.fixed[1:, :3, 3], axis=1).sum()) / 2.0, 1e-3)
 
     def standard_deviations(self, tolerances: ChainTolerances) -> FloatArray:
         """Standard deviation (size,) of each parameter; 0 where it is held."""

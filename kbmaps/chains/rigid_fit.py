@@ -58,7 +58,6 @@ class RigidFit:
         freedom: residual coordinates minus those that the parameters have used up.
         inliers: which pairs (n,) are no outliers.
         rank: how many independent directions of the parameters the data determine.
-        loose: how far (size,) each free parameter takes part in directions that the data do not show, in 0..1.
         log_evidence: log marginal likelihood of the inliers (Laplace's approximation).
     """
 
@@ -67,7 +66,6 @@ class RigidFit:
     freedom: float
     inliers: BoolArray
     rank: int
-    loose: FloatArray
     log_evidence: float
 
 
@@ -255,26 +253,21 @@ def _summary(fitter: _Fitter, inliers: BoolArray, noise: float, freedom: float) 
     factor = point.reduced(inliers / (fitter.pairs.unit * noise))
     _, singular, vt = np.linalg.svd(factor[:, :-1])
     singular = np.concatenate([singular, np.zeros(len(vt) - len(singular))])
-    loose, rank = _undetermined(cast(FloatArray, np.linalg.solve(root.T, factor[:, :-1].T)).T)
+    rank = _rank(cast(FloatArray, np.linalg.solve(root.T, factor[:, :-1].T)).T)
     spread = np.zeros((size, size))
     spread[np.ix_(free, free)] = root @ (vt.T / np.sqrt(1.0 + np.square(singular)))
-    looseness = np.zeros(size)
-    looseness[free] = loose
     square = float(np.square(point.norms[inliers]).sum()) / noise**2 + float(point.offset @ point.offset)
     spans = 6.0 * float(np.log(noise * fitter.pairs.unit[inliers]).sum())
     evidence = -0.5 * (square + spans + 3.0 * float(inliers.sum()) * math.log(2.0 * math.pi))
     evidence -= 0.5 * float(np.log1p(np.square(singular)).sum())
     seen = noise * math.sqrt(float(np.square(fitter.pairs.unit).mean())) if freedom > 0.0 else 0.0
     belief = ChainBelief(parameters, point.change, spread, seen)
-    return RigidFit(belief, noise, freedom, inliers, rank, looseness, evidence)
+    return RigidFit(belief, noise, freedom, inliers, rank, evidence)
 
 
-def _undetermined(design: FloatArray) -> tuple[FloatArray, int]:
-    """How far each parameter lies in directions that no row shows, and how many directions the rows do show."""
+def _rank(design: FloatArray) -> int:
+    """How many directions of the parameters the rows show."""
     lengths = np.linalg.norm(design, axis=0)
     seen = lengths > 1e-12 * max(float(lengths.max(initial=0.0)), 1e-300)
-    _, singular, vt = np.linalg.svd(design[:, seen] / lengths[seen])
-    rank = int((singular > 1e-8 * singular.max(initial=0.0)).sum())
-    loose = np.ones(design.shape[1])
-    loose[seen] = np.linalg.norm(vt[rank:], axis=0)
-    return loose, rank
+    singular = np.linalg.svd(design[:, seen] / lengths[seen], compute_uv=False)
+    return int((singular > 1e-8 * singular.max(initial=0.0)).sum())

@@ -24,6 +24,9 @@ from kbmaps.robust import claimed_sigma, student
 
 _KIND = "rigid chain, batch, 2"
 
+# A parameter whose standard deviation the pairs left above this share of the one before was not shown by them.
+_HARDLY_NARROWER = 0.5
+
 
 class RigidLearner:
     """Fits a rigid chain to all pairs, around a nominal one whose tolerances are the prior.
@@ -205,13 +208,19 @@ class RigidLearner:
             self._parameters,
             fit.belief.mean,
             std,
-            fit.loose,
+            self._hidden(fit, unit * fit.noise),
             noise=unit if pairs.known else unit * fit.noise,
             misfit=fit.noise if pairs.known else 1.0,
             freedom=fit.freedom,
             outliers=int((~fit.inliers).sum()),
             determined=fit.rank,
         )
+
+    def _hidden(self, fit: RigidFit, noise: float) -> BoolArray:
+        """Which parameters (size,) matter and were not shown; noise of a coordinate [m]."""
+        before, after = (np.sqrt(np.square(belief.root).sum(axis=1)) for belief in (self._prior, fit.belief))
+        lever = np.where(self._parameters.turning, self._parameters.reach, 1.0)
+        return (after > _HARDLY_NARROWER * before) & (before * lever > noise)
 
     def to_bytes(self) -> bytes:
         """The learner with all its pairs; `from_bytes` gives the same predictions to the last bit."""

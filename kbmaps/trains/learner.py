@@ -204,8 +204,8 @@ class TensorLearner:
         """Tells that the marker was moved: keeps what is known of all other cores, and forgets the pairs.
 
         The train so far becomes the prior's mean. Each core's covariance is the one it has while the others rest,
-        which pins the frames between them. The last core is as free as a marker moved by `tolerance` makes it: along the
-        axes of its frame where a nominal chain gave them, and any way where nothing did.
+        which pins the frames between them. The last core is as free as a marker moved so far makes it: along the axes
+        of its frame where a nominal chain gave them, and any way where nothing did.
 
         Args:
             tolerance: 1-sigma of each component of the move [m].

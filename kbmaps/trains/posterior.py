@@ -123,7 +123,11 @@ class TensorPosterior:
         return variance
 
     def with_other_tool(self, tolerance: float) -> CorePrior:
-        """The cores' own posteriors, each while the others rest; the last as free as a marker moved by `tolerance` [m]."""
+        """The cores' own posteriors, each while the others rest; the last as free as a moved marker makes it.
+
+        Args:
+            tolerance: 1-sigma of each component of the move [m].
+        """
         cores, spread = self._train.cores.reshape(self.joints, CORE_NUMBERS), self._prior.spread
         if self.information is not None:
             blocks = range(0, CORE_NUMBERS * self.joints, CORE_NUMBERS)

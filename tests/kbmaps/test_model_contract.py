@@ -20,6 +20,7 @@ from kbmaps import (
     Model,
     ModelFormatError,
     NonFiniteError,
+    NotNumbersError,
     RecursiveRigidLearner,
     ResidualLearner,
     RigidLearner,
@@ -235,6 +236,9 @@ def test_damaged_bytes_are_refused(taught, spoil):
 @pytest.mark.parametrize(
     ("error", "q", "x", "sigma"),
     [
+        (NotNumbersError, "a", np.zeros(3), None),
+        (NotNumbersError, [[0.0, 0.0, 0.0], [0.0]], np.zeros((2, 3)), None),
+        (NotNumbersError, np.zeros(3), np.zeros(3), "a"),
         (ShapeError, np.zeros(4), np.zeros(3), None),
         (ShapeError, np.zeros((2, 3)), np.zeros((3, 3)), None),
         (ShapeError, np.zeros((2, 3)), np.zeros((2, 3)), np.ones(3)),
@@ -248,6 +252,11 @@ def test_refused_pairs_change_nothing(taught, error, q, x, sigma):
     with pytest.raises(error):
         taught.learn(q, x, sigma)
     assert taught.to_bytes() == before
+
+
+def test_what_is_no_bytes_is_refused(model):
+    with pytest.raises(ModelFormatError, match="bytes, as to_bytes gives them"):
+        type(model).from_bytes("x")
 
 
 def test_wrong_configurations_are_refused(taught):
