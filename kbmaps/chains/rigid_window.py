@@ -7,7 +7,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from kbmaps.arrays import FloatArray, rows, vector
+from kbmaps.arrays import FloatArray, vector
 from kbmaps.chains.belief import ChainBelief
 from kbmaps.chains.parameters import ChainParameters, ChainTolerances
 from kbmaps.chains.placed_start import PlacedStart
@@ -110,7 +110,7 @@ class RigidWindow:
         """For `kbmaps.packed`."""
         q, x, sigma = self._pairs()
         known = np.array([self.noise.coordinates, self.noise.square, self.excess])
-        arrays = {"q": q, "x": x, "sigma": sigma, "known": known, "farthest": self.farthest}
+        arrays = {"q": q, "x": x, "sigma": sigma, "known": known, "farthest": self._stored_farthest()}
         return arrays | ({"before_mean": self.belief.mean, "before_root": self.belief.root} if self._begun else {})
 
     def restore(self, arrays: Mapping[str, FloatArray]) -> None:
@@ -121,14 +121,24 @@ class RigidWindow:
         """
         q, x, sigma = stored_pairs(arrays, self._joints)
         coordinates, square, excess = (float(number) for number in vector("known", arrays["known"], 3))
-        farthest = rows("farthest", arrays["farthest"], self._joints)
+        farthest = self._farthest(arrays["farthest"])
         known = all(0.0 <= number < math.inf for number in (coordinates, square, excess))
-        if len(q) > self.size or len(farthest) > 1 or not known:
+        if len(q) > self.size or not known:
             raise ModelFormatError("the stored pairs do not fit their window, or their noise is none")
         if "before_mean" in arrays:
             self.begin_with(ChainBelief(self.belief.parameters, arrays["before_mean"], arrays["before_root"]))
         self.noise, self.excess, self.farthest = NoiseKnowledge(coordinates, square), excess, farthest
         self.add(q, x, sigma)
+
+    def _stored_farthest(self) -> FloatArray:
+        """`farthest` as a vector (d,); NaN for none."""
+        return self.farthest[0] if len(self.farthest) else np.full(self._joints, np.nan)
+
+    def _farthest(self, stored: FloatArray) -> FloatArray:
+        """What `_stored_farthest` gave. Raises ShapeError, NonFiniteError."""
+        if stored.shape == (self._joints,) and np.isnan(stored).all():
+            return np.empty((0, self._joints))
+        return vector("farthest", stored, self._joints)[None]
 
     def _pairs(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         rows = self._rows[: self._count]

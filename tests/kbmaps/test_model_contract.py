@@ -160,6 +160,19 @@ def test_far_from_a_small_zone_nothing_is_in_support(model, arm):
     assert model.estimate(q[far]).in_support.mean() < 0.05
 
 
+def test_learners_of_the_same_chain_agree_on_where_data_was():
+    rng = np.random.default_rng(10)
+    arm = rough_arm(rng)
+    q, x = arm.pairs(rng, 100, 0.002, reach_deg=30.0)
+    elsewhere = arm.pairs(rng, 1000)[0]
+    shares = []
+    for learner in (RigidLearner, RecursiveRigidLearner, ResidualLearner):
+        model: Model = learner(arm.nominal, ROUGH)
+        model.learn(q, x)
+        shares.append(model.estimate(elsewhere).in_support.mean())
+    assert 0.02 < min(shares) <= max(shares) < min(shares) + 0.03 < 0.2
+
+
 def test_an_estimate_is_of_what_is_predicted_and_says_how_sure_it_is(taught, q):
     estimate = taught.estimate(q)
     np.testing.assert_allclose(estimate.x, taught.predict(q), rtol=0, atol=1e-12)
