@@ -123,7 +123,7 @@ def _tell_recursive(model: Model) -> None:
 
 def _tell_tensor(model: Model) -> None:
     if isinstance(model, TensorLearner):
-        model.move_marker(NEW_TOOL_M)
+        model.tool_changed(NEW_TOOL_M)
 
 
 MODELS: dict[str, Entry] = {

@@ -36,7 +36,7 @@ from kbmaps import (
     learning_bases,
 )
 from kbmaps.arrays import FloatArray
-from kbmaps.chains.carried import ChainModel, Predictor
+from kbmaps.chains.carried import Predictor
 
 SIGMA = 0.01
 TEST_ROWS = 400
@@ -169,7 +169,7 @@ def large(seeds: int) -> None:
             arm = random_arm(joints, rng)
             q, test = arm.angles(500, 80, rng), arm.angles(TEST_ROWS, 80, rng)
             x, true = arm.measured(q, SIGMA, rng), arm.positions(test)
-            row = [error_mm(ChainModel(arm.drawing), true, test)]
+            row = [error_mm(arm.drawing, true, test)]
             for model in (
                 KernelLearner(bases(joints), arm.drawing),
                 StructuredLearner(arm.drawing, ROUGH, bases(joints)),

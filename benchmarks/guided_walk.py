@@ -35,7 +35,7 @@ from kbmaps import (
     SupportSet,
     learning_bases,
     prediction_errors,
-    with_refitted_marker,
+    with_refitted_tool,
 )
 from kbmaps.arrays import FloatArray
 
@@ -147,9 +147,9 @@ def score_walk(walk: Walk, bases: tuple[JointBasis, ...], scores: Scores, seed: 
     for name, learn in learners.items():
         scores.add(f"after: {name}", learn(before, walk.q_after, walk.x_after), walk.changed, tests)
     for pairs in (1, 10, PAIRS_AFTER):
-        refitted = with_refitted_marker(before, walk.nominal, walk.q_after[:pairs], walk.x_after[:pairs], SIGMA_M)
+        refitted = with_refitted_tool(before, walk.nominal, walk.q_after[:pairs], walk.x_after[:pairs], SIGMA_M)
         scores.add(f"after: marker refitted to {pairs} pairs", refitted, walk.changed, tests)
-    refitted = with_refitted_marker(before, walk.nominal, walk.q_after[:10], walk.x_after[:10], SIGMA_M)
+    refitted = with_refitted_tool(before, walk.nominal, walk.q_after[:10], walk.x_after[:10], SIGMA_M)
     both = exact(refitted, walk.q_after, walk.x_after)
     scores.add("after: marker refitted to 10 pairs, then exact", both, walk.changed, tests)
     for pairs in (1, 10, 30, PAIRS_AFTER):

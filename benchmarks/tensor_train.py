@@ -209,7 +209,7 @@ def stream(seeds: int) -> None:
         for i, angles in enumerate(q):
             if i == 600:
                 chain = chain.with_tool([0.0, 0.2, 0.0])
-                learner.move_marker(0.2)
+                learner.tool_changed(0.2)
             start = time.perf_counter()
             learner.learn(angles, chain.positions(angles) + 0.005 * rng.normal(size=3))
             times.append(time.perf_counter() - start)

@@ -1,55 +1,59 @@
-"""Thirty noisy pairs calibrate an arm: camera, tool and joint zeros with 95 % intervals.
+"""Thirty noisy pairs calibrate an arm, and what one does with that: report, next pose, reach, keep, write a URDF.
 
-A rigid chain has few parameters, so few pairs are enough. The drawing is the prior: tolerances say how far the real
-arm may be from it. What no motion can show (the first zero is a turn of the camera) rests on them, and is named.
+The drawing is the prior: tolerances say how far the real arm may be from it. What no motion can show (the first zero is
+a turn of the camera) rests on them, and is named.
 """
 
 from __future__ import annotations
 
+import tempfile
+from pathlib import Path
+
 import numpy as np
 
-from kbmaps import ChainParameters, ChainReport, ChainTolerances, RigidChain, RigidLearner
+from interfaces.calibrated import CalibratedGeometry
+from interfaces.calibrated_files import write_calibrated
+from interfaces.robot import RobotDescription
+from kbmaps import ChainParameters, ChainPosterior, ChainTolerances, InverseKinematics, RigidLearner, next_pose
 
 SIGMA = 0.001  # of the camera, each coordinate [m]
-REACH = np.radians(90)
+ROBOT = Path(__file__).parent / "desk_arm" / "robot.toml"  # any RigidChain will do where no URDF is wanted
 
 
-def drawn_arm() -> RigidChain:
-    fixed = np.tile(np.eye(4), (7, 1, 1))
-    fixed[1:, :3, 3] = [[0, 0, 0.3], [0.3, 0, 0], [0.25, 0, 0], [0.1, 0.05, 0], [0, 0, 0.1], [0.03, 0, 0.1]]
-    axes = np.array([[0, 0, 1.0], [0, 1.0, 0], [0, 1.0, 0], [1.0, 0, 0], [0, 1.0, 0], [1.0, 0, 0]])
-    return RigidChain(fixed, axes, np.zeros(6, dtype=bool))
-
-
-def main() -> tuple[ChainReport, np.ndarray, float]:
+def main(folder: Path) -> dict[str, object]:
     rng = np.random.default_rng(0)
-    drawing = drawn_arm()
+    robot = RobotDescription.load(ROBOT)
     # Well-made parts, joints whose zeros were set by eye, a camera and a tool placed by hand.
     tolerances = ChainTolerances(
         axes=0.001, points=0.0005, zeros=0.05, tool=0.03, base_rotation=0.05, base_translation=0.05
     )
-    parameters = ChainParameters(drawing)
-    change = parameters.standard_deviations(tolerances) * rng.normal(size=parameters.size)
+    parameters = ChainParameters(robot.chain)
+    real = parameters.chain(parameters.standard_deviations(tolerances) * rng.normal(size=parameters.size))
+    poses = rng.uniform(robot.lower, robot.upper, (500, 4))
 
-    q = rng.uniform(-REACH, REACH, (30, 6))
-    learner = RigidLearner(drawing, tolerances)
-    learner.learn(q, parameters.positions(change, q) + SIGMA * rng.normal(size=(30, 3)))
-    report = learner.report()
+    learner = RigidLearner(robot.chain, tolerances)
+    learner.learn(poses[:30], real.positions(poses[:30]) + SIGMA * rng.normal(size=(30, 3)))
+    print(report := learner.report())
 
-    true_zeros = np.degrees(change[parameters.zeros])
-    print("joint zeros [deg]      learnt             true")
-    for k, true in enumerate(true_zeros):
-        learnt, half = np.degrees([report.zeros.value[k], report.zeros.half_width[k]])
-        print(f"  joint {k + 1}        {learnt:7.3f} ± {half:5.3f}   {true:8.3f}")
-    print("tool moved by [mm]", np.round(1e3 * report.tool_shift.value, 1), "±", end=" ")
-    print(np.round(1e3 * report.tool_shift.half_width, 1), "true", np.round(1e3 * change[parameters.tool], 1))
-    print(f"noise {1e3 * report.noise:.2f} mm (true {1e3 * SIGMA:.2f}), {report.outliers} outliers")
+    there = learner.estimate(poses[30])
+    print("1-sigma of another pose [mm]", (1e3 * there.sigma).round(2), "near the pairs" if there.in_support else "far")
+    q_next = next_pose(ChainPosterior.of(learner), region=poses, candidates=poses)
+    print("the pair that would teach most is at [deg]", np.degrees(q_next).round())
 
-    poses = rng.uniform(-REACH, REACH, (500, 6))
-    off = np.linalg.norm(learner.predict(poses) - parameters.positions(change, poses), axis=1)
-    print(f"mean error on other poses {1e3 * off.mean():.2f} mm")
-    return report, true_zeros, float(off.mean())
+    x = real.positions(poses[31])
+    reached = InverseKinematics(learner, robot.lower, robot.upper).solve(x, start=poses[30])
+    miss = np.linalg.norm(real.positions(reached.q) - x)
+    print(f"inverse kinematics: {reached.reason}, the real arm comes within {1e3 * miss:.1f} mm")
+
+    (folder / "arm.kbpack").write_bytes(learner.to_bytes())
+    again = RigidLearner.from_bytes((folder / "arm.kbpack").read_bytes())
+
+    moved = {"T_measured_nominal": report.T_measured_nominal, "zeros": report.zeros.value}
+    geometry = CalibratedGeometry.of(robot, again.chain, **moved)
+    written = write_calibrated(robot, geometry, folder / "calibrated", "calibrated from 30 pairs")
+    return {"real": real, "report": report, "learner": learner, "again": again, "miss": miss, "written": written}
 
 
 if __name__ == "__main__":
-    main()
+    with tempfile.TemporaryDirectory() as folder:
+        main(Path(folder))

@@ -9,7 +9,7 @@ from kbmaps.chains.align import Alignment, align
 from kbmaps.chains.belief import ChainBelief
 from kbmaps.chains.chain import RigidChain
 from kbmaps.chains.parameters import ChainParameters, ChainTolerances
-from kbmaps.chains.refitted_marker import with_refitted_marker
+from kbmaps.chains.refitted_tool import with_refitted_tool
 from kbmaps.chains.report import ChainReport, Interval
 from kbmaps.chains.rigid_learner import RigidLearner
 from kbmaps.chains.rigid_recursive import RecursiveRigidLearner
@@ -22,14 +22,15 @@ from kbmaps.errors import (
     DegenerateDataError,
     KBMapsError,
     ModelFormatError,
+    NetSizeError,
     NonFiniteError,
+    NotNumbersError,
     RotationError,
     SettingError,
     ShapeError,
     SingularAlphaError,
 )
 from kbmaps.inverse.kinematics import InverseKinematics, InverseSolution
-from kbmaps.inverse.reach import PoseModel, PositionModel
 from kbmaps.inverse.resolved_rates import resolved_rates
 from kbmaps.kernel.kernel_learner import KernelLearner
 from kbmaps.kernel.structured_learner import StructuredLearner
@@ -43,7 +44,7 @@ from kbmaps.maps.nlms import NLMS
 from kbmaps.maps.step_size import StepSize
 from kbmaps.maps.support import SUPPORT_LIMIT, SupportSet
 from kbmaps.memory import Memory
-from kbmaps.model import Estimate, Model
+from kbmaps.model import Estimate, Model, PoseModel, PositionModel
 from kbmaps.planning.design import ExperimentDesign, next_pose, next_poses, next_stretch
 from kbmaps.planning.expected_gain import ExpectedError, Forecast, candidate_motions, expected_gain
 from kbmaps.planning.lack_of_fit import systematic_error
@@ -89,7 +90,9 @@ __all__ = [
     "Memory",
     "Model",
     "ModelFormatError",
+    "NetSizeError",
     "NonFiniteError",
+    "NotNumbersError",
     "PoseModel",
     "PositionModel",
     "Posterior",
@@ -127,5 +130,5 @@ __all__ = [
     "resolved_rates",
     "shared_by",
     "systematic_error",
-    "with_refitted_marker",
+    "with_refitted_tool",
 ]

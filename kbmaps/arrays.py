@@ -8,11 +8,23 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from kbmaps.errors import NonFiniteError, ShapeError
+from kbmaps.errors import NonFiniteError, NotNumbersError, ShapeError
 
 FloatArray: TypeAlias = NDArray[np.float64]
 BoolArray: TypeAlias = NDArray[np.bool_]
 IntArray: TypeAlias = NDArray[np.intp]
+
+
+def numbers(name: str, values: ArrayLike) -> FloatArray:
+    """`values` as a float64 array of any shape.
+
+    Raises:
+        NotNumbersError: they are words, or rows of different lengths.
+    """
+    try:
+        return np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise NotNumbersError(name, values) from error
 
 
 def frozen(values: ArrayLike) -> FloatArray:
@@ -26,9 +38,9 @@ def vector(name: str, values: ArrayLike, width: int) -> FloatArray:
     """`values` as a finite float64 vector (width,).
 
     Raises:
-        ShapeError, NonFiniteError
+        ShapeError, NonFiniteError, NotNumbersError
     """
-    array = np.asarray(values, dtype=np.float64)
+    array = numbers(name, values)
     if array.shape != (width,):
         raise ShapeError(name, f"({width},)", array.shape)
     # A sum over a list is several times cheaper than np.isfinite on so few numbers.
@@ -41,9 +53,9 @@ def rows(name: str, values: ArrayLike, width: int) -> FloatArray:
     """`values` as finite float64 rows (n, width).
 
     Raises:
-        ShapeError, NonFiniteError
+        ShapeError, NonFiniteError, NotNumbersError
     """
-    array = np.asarray(values, dtype=np.float64)
+    array = numbers(name, values)
     if array.ndim != 2 or array.shape[1] != width:
         raise ShapeError(name, f"(n, {width})", array.shape)
     if not np.isfinite(array).all():
@@ -55,13 +67,27 @@ def rows_or_vector(name: str, values: ArrayLike, width: int) -> FloatArray:
     """`values` as a finite vector (width,) or finite rows (n, width); the result keeps which of the two it was.
 
     Raises:
-        ShapeError, NonFiniteError
+        ShapeError, NonFiniteError, NotNumbersError
     """
-    array = np.asarray(values, dtype=np.float64)
+    array = numbers(name, values)
     if array.ndim == 1:
         return vector(name, array, width)
     if array.ndim != 2 or array.shape[1] != width:
         raise ShapeError(name, f"({width},) or (n, {width})", array.shape)
     if not np.isfinite(array).all():
+        raise NonFiniteError(name)
+    return array
+
+
+def limits(name: str, values: ArrayLike, width: int) -> FloatArray:
+    """`values` as a float64 vector (width,) of which some may be infinite.
+
+    Raises:
+        ShapeError, NonFiniteError (NaN), NotNumbersError
+    """
+    array = numbers(name, values)
+    if array.shape != (width,):
+        raise ShapeError(name, f"({width},)", array.shape)
+    if np.isnan(array).any():
         raise NonFiniteError(name)
     return array

@@ -2,9 +2,11 @@
 
 KBMapsError
 ├── ShapeError            an array has the wrong shape
+├── NotNumbersError       what should be an array of numbers is none
 ├── NonFiniteError        a number is NaN or infinite
 ├── BasisError            a basis cannot be built from these parameters
-│   └── SingularAlphaError    alpha is too near to 90 degrees
+│   ├── SingularAlphaError    alpha is too near to 90 degrees
+│   └── NetSizeError          a control net would be too large
 ├── ChainError            transforms or axes do not describe a rigid chain
 ├── RotationError         matrices or quaternions do not describe rotations
 ├── SettingError          a learner's setting is outside its range
@@ -13,6 +15,9 @@ KBMapsError
 """
 
 from __future__ import annotations
+
+# Control points, 3^13: 38 MB for positions, 153 MB with orientations.
+LARGEST_NET = 3**13
 
 
 class KBMapsError(Exception):
@@ -24,6 +29,17 @@ class ShapeError(KBMapsError):
 
     def __init__(self, name: str, expected: str, got: tuple[int, ...]) -> None:
         super().__init__(f"{name} must have shape {expected}, got {got}")
+
+
+class NotNumbersError(KBMapsError):
+    """What should be an array of numbers is none."""
+
+    def __init__(self, name: str, got: object) -> None:
+        shown = repr(got)
+        super().__init__(
+            f"{name} must be an array of numbers, got {shown if len(shown) <= 60 else type(got).__name__}; "
+            "rows must be of one length"
+        )
 
 
 class NonFiniteError(KBMapsError):
@@ -44,6 +60,19 @@ class SingularAlphaError(BasisError):
         super().__init__(
             f"alpha = {alpha_deg:.6g} deg is refused: from 80 to 100 deg the middle weight cos(alpha) vanishes and "
             "control points grow without bound; choose e.g. 60 deg, or an orthonormal basis for wide ranges"
+        )
+
+
+class NetSizeError(BasisError):
+    """A control net would not fit into memory, or hardly."""
+
+    def __init__(self, points: int, outputs: int) -> None:
+        gibibytes = 8.0 * outputs * points / 2**30
+        super().__init__(
+            f"a map of these joints has {points:,} control points, {gibibytes:.3g} GiB; at most {LARGEST_NET:,} are "
+            "made. "
+            "Work with the chain or the learner itself: it predicts, has a jacobian, and InverseKinematics takes it; "
+            "learn with RigidLearner, ResidualLearner or TensorLearner, which need no net"
         )
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -12,7 +11,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kbmaps.arrays import FloatArray, rows, rows_or_vector
+from kbmaps.arrays import FloatArray, rows_or_vector
 from kbmaps.chains.chain import RigidChain
 from kbmaps.chains.parameters import ChainTolerances
 from kbmaps.chains.rigid_learner import RigidLearner
@@ -25,7 +24,7 @@ from kbmaps.kernel.structured_learner import StructuredLearner
 from kbmaps.maps.basis import learning_bases
 from kbmaps.model import Estimate, Model
 from kbmaps.packed import complete, count, flag, named, number, pack, restoring, unpack
-from kbmaps.pairs import checked_pairs, stored_pairs
+from kbmaps.pairs import checked_pairs, runs, stored_pairs
 from kbmaps.residual.learner import ResidualLearner
 from kbmaps.trains.learner import TensorLearner
 
@@ -214,27 +213,43 @@ class Ladder:
         angles = rows_or_vector("q", q, self._joints)
         if self._rungs[self._answering].extrapolates:
             return self._rungs[self._answering].model.predict(angles)
-        x = self.estimate(np.atleast_2d(angles)).x
-        return x[0] if angles.ndim == 1 else x
+        return self.estimate(angles).x
 
-    def estimate(self, q: ArrayLike) -> Estimate:
-        """Positions at q (n, d), their 1-sigma per axis against the truth, and whether data was there.
+    def jacobian(self, q: ArrayLike) -> FloatArray:
+        """Derivative (3, d) of the position [m/rad, or m/m], or (n, 3, d) for q (n, d), of who answers there.
 
         Raises:
             ShapeError, NonFiniteError
             DegenerateDataError: no model that may extrapolate has pairs enough yet.
         """
-        angles = rows("q", q, self._joints)
+        angles = rows_or_vector("q", q, self._joints)
         rung = self._rungs[self._answering]
-        inside = rung.model.estimate(angles)
+        if rung.extrapolates:
+            return rung.model.jacobian(angles)
+        batch = np.atleast_2d(angles)
+        columns = rung.model.jacobian(batch)
+        outside = ~rung.model.estimate(batch).in_support
+        if outside.any():
+            columns[outside] = self._fallback().jacobian(batch[outside])
+        return columns[0] if angles.ndim == 1 else columns
+
+    def estimate(self, q: ArrayLike) -> Estimate:
+        """Positions at q (n, d), or (d,), their 1-sigma per axis against the truth, and whether data was there.
+
+        Raises:
+            ShapeError, NonFiniteError
+            DegenerateDataError: no model that may extrapolate has pairs enough yet.
+        """
+        angles = rows_or_vector("q", q, self._joints)
+        batch, rung = np.atleast_2d(angles), self._rungs[self._answering]
+        inside = rung.model.estimate(batch)
         outside = ~inside.in_support
         if rung.extrapolates or not outside.any():
-            return inside
-        safe = self._rungs[self._best([name for name in self._working() if self._rungs[name].extrapolates])]
-        fallback = safe.model.estimate(angles[outside])
+            return inside.like(angles)
+        fallback = self._fallback().estimate(batch[outside])
         x, sigma = inside.x.copy(), inside.sigma.copy()
         x[outside], sigma[outside] = fallback.x, fallback.sigma
-        return Estimate(x, sigma, inside.in_support)
+        return Estimate(x, sigma, inside.in_support).like(angles)
 
     def to_bytes(self) -> bytes:
         """The ladder with all its models and pairs; `from_bytes` gives the same predictions to the last bit."""
@@ -343,7 +358,7 @@ class Ladder:
         told = ~np.isnan(self._sigma[part])
         self._asked[name] = until
         try:
-            for run in _runs(told):
+            for run in runs(told):
                 these = slice(part.start + run.start, part.start + run.stop)
                 model.learn(self._q[these], self._x[these], self._sigma[these] if told[run.start] else None)
         except _FAILURES as error:
@@ -376,6 +391,10 @@ class Ladder:
         present = self._answering if self._answering in names else None
         return self._contest.best(names, present or (names[0] if names else self._answers_first()))
 
+    def _fallback(self) -> Model:
+        """Who answers where the model that answers has no data and may not extrapolate."""
+        return self._rungs[self._best([name for name in self._working() if self._rungs[name].extrapolates])].model
+
     def _catch_up(self) -> None:
         """Who answers learns what has come; should that break it, the next best does."""
         while self._working() and self._asked[self._answering] < self.pairs:
@@ -389,12 +408,6 @@ def _restored(entry: Mapping[str, Any], classes: Mapping[str, type[Model]]) -> R
         raise ModelFormatError(f"the class {entry['class']} is not known; name it in `kinds`")
     model = kind.from_bytes(base64.b64decode(entry["model"], validate=True))
     return Rung(model, number(entry["growth"], "growth"), flag(entry["extrapolates"], "extrapolates"))
-
-
-def _runs(values: np.ndarray) -> list[slice]:
-    """Each run of equal values."""
-    ends = [0, *(np.flatnonzero(values[1:] != values[:-1]) + 1).tolist(), len(values)]
-    return [slice(start, end) for start, end in itertools.pairwise(ends)] if len(values) else []
 
 
 def _proper(tolerance: float, default: float) -> float:

@@ -49,6 +49,10 @@ def unpack(data: bytes, kind: str) -> tuple[dict[str, Any], dict[str, FloatArray
     Raises:
         ModelFormatError: the bytes are damaged, truncated, of another kind, or something else.
     """
+    if not isinstance(data, bytes | bytearray | memoryview):  # pyright: ignore[reportUnnecessaryIsInstance]
+        raise ModelFormatError(
+            f"a stored model is bytes, as to_bytes gives them and Path.read_bytes reads them; got {type(data).__name__}"
+        )
     header, payload = _split(memoryview(data))
     try:
         content: Any = json.loads(header, parse_float=_finite, parse_constant=_finite)

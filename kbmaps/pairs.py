@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -9,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kbmaps.arrays import BoolArray, FloatArray, rows, rows_or_vector
+from kbmaps.arrays import BoolArray, FloatArray, numbers, rows, rows_or_vector
 from kbmaps.errors import ModelFormatError, NonFiniteError, SettingError, ShapeError
 from kbmaps.packed import restoring
 
@@ -80,7 +81,7 @@ def checked_pairs(
         return angles, positions, np.full(len(angles), np.nan)
     if isinstance(sigma, float) and 0.0 < sigma < math.inf:
         return angles, positions, np.full(len(angles), sigma)
-    sigmas = np.asarray(sigma, dtype=np.float64)
+    sigmas = numbers("sigma", sigma)
     if sigmas.shape not in ((), (len(angles),)):
         raise ShapeError("sigma", f"() or ({len(angles)},)", sigmas.shape)
     if not np.isfinite(sigmas).all():
@@ -88,3 +89,9 @@ def checked_pairs(
     if sigmas.size and sigmas.min() <= 0.0:
         raise SettingError("every sigma must be greater than 0 m; pass None where the noise is not known")
     return angles, positions, np.broadcast_to(sigmas, (len(angles),))
+
+
+def runs(told: BoolArray) -> list[slice]:
+    """Each run of pairs whose sigma was told, or was not (n,), as they can be learnt in one go."""
+    ends = [0, *(np.flatnonzero(told[1:] != told[:-1]) + 1).tolist(), len(told)]
+    return [slice(start, end) for start, end in itertools.pairwise(ends)] if len(told) else []

@@ -8,11 +8,16 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation  # pyright: ignore[reportMissingTypeStubs]
 
-from kbmaps.arrays import FloatArray
+from kbmaps.arrays import BoolArray, FloatArray, numbers
 from kbmaps.errors import NonFiniteError, RotationError, ShapeError
 
 # What a measured rotation may be off by: quaternions and matrices are often written with six digits.
 _TOLERANCE = 1e-4
+# Below this angle [rad] the quotients of the exponential map are taken from their series.
+SMALL_ANGLE = 1e-3
+_EYE = np.eye(3)
+# (3, 9): row i is the matrix K of `cross_matrix` of the unit vector e_i.
+_CROSS = np.stack([np.cross(unit, _EYE).T.ravel() for unit in _EYE])
 
 
 def nearest_rotation(matrices: ArrayLike) -> FloatArray:
@@ -31,7 +36,7 @@ def nearest_rotation(matrices: ArrayLike) -> FloatArray:
                [0., 1., 0.],
                [0., 0., 1.]])
     """
-    checked = np.asarray(matrices, dtype=np.float64)
+    checked = numbers("matrices", matrices)
     if checked.shape[-2:] != (3, 3):
         raise ShapeError("matrices", "(..., 3, 3)", checked.shape)
     if not np.isfinite(checked).all():
@@ -67,6 +72,30 @@ def rotation_vector(rotation: FloatArray) -> FloatArray:
     return np.asarray(Rotation.from_matrix(rotation).as_rotvec(), dtype=np.float64)
 
 
+def exponentials(turns: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Rotations exp([φ]×) (n, 3, 3) of rotation vectors (n, 3) [rad], and their left Jacobians (n, 3, 3).
+
+    Rodrigues' formula, and exp([φ + δ]×) = exp([J δ]×) exp([φ]×) to first order, with the left Jacobian J
+    (Chirikjian 2012, section 10.8).
+    """
+    angles: FloatArray = np.sqrt(np.einsum("ki,ki->k", turns, turns))[:, None, None]
+    safe: FloatArray = np.maximum(angles, SMALL_ANGLE)
+    small: BoolArray = angles < SMALL_ANGLE
+    squares = angles * angles
+    sine: FloatArray = np.where(small, 1.0 - squares / 6.0, np.sin(safe) / safe)
+    cosine: FloatArray = np.where(small, 0.5 - squares / 24.0, (1.0 - np.cos(safe)) / (safe * safe))
+    rest: FloatArray = np.where(small, 1.0 / 6.0 - squares / 120.0, (1.0 - np.sin(safe) / safe) / (safe * safe))
+    k = cross_matrix(turns)
+    kk = k @ k
+    return _EYE + sine * k + cosine * kk, _EYE + cosine * k + rest * kk
+
+
+def cross_matrix(vectors: FloatArray) -> FloatArray:
+    """The matrices K (..., 3, 3) with K @ y = vectors × y, for vectors (..., 3)."""
+    # One product, since this is called for every pair that comes.
+    return (vectors @ _CROSS).reshape(*vectors.shape, 3)
+
+
 def rotation_matrices(name: str, values: ArrayLike) -> FloatArray:
     """Measured orientations as proper rotation matrices (3, 3) or (n, 3, 3).
 
@@ -77,7 +106,7 @@ def rotation_matrices(name: str, values: ArrayLike) -> FloatArray:
     Raises:
         ShapeError, NonFiniteError, RotationError: neither matrices nor quaternions of rotations.
     """
-    given = np.asarray(values, dtype=np.float64)
+    given = numbers(name, values)
     is_quaternion = given.ndim in (1, 2) and given.shape[-1:] == (4,)
     if not is_quaternion and not (given.ndim in (2, 3) and given.shape[-2:] == (3, 3)):
         raise ShapeError(name, "(3, 3) or (n, 3, 3), or (4,) or (n, 4) for quaternions", given.shape)

@@ -21,7 +21,7 @@ from kbmaps import (
     RigidChain,
     align,
     learning_bases,
-    with_refitted_marker,
+    with_refitted_tool,
 )
 
 from .arm import OTHER_TOOL_M
@@ -136,7 +136,7 @@ class NominalModel:
             DegenerateDataError: there are no pairs.
         """
         chosen = _spread(len(q))
-        return with_refitted_marker(kbmap, chain, q[chosen], x[chosen])
+        return with_refitted_tool(kbmap, chain, q[chosen], x[chosen])
 
 
 def chain_tolerances(settings: LearnerConfig) -> ChainTolerances:

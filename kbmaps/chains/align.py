@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from kbmaps.arrays import BoolArray, FloatArray, frozen, rows
-from kbmaps.chains.chain import RigidChain, cross_matrix
+from kbmaps.chains.chain import RigidChain
 from kbmaps.errors import DegenerateDataError, SettingError, ShapeError
+from kbmaps.robust import MEDIAN_NORM, ROUNDING_M
+from kbmaps.rotations import cross_matrix, exponentials
 
-# A residual norm of noise σ per axis has the median 1.538 σ in three dimensions.
-_MEDIAN_NORM = 1.538
 # Pairs beyond this many σ are outliers. Far out, since the errors of an uncalibrated arm have long tails themselves
 # and must not be rejected.
 _OUTLIER_SIGMAS = 15.0
@@ -23,8 +23,6 @@ _START_PAIRS = 300
 _STEP_TOLERANCE = 1e-12
 # Singular values below this share of the largest are directions that the data do not determine.
 _RANK_TOLERANCE = 1e-7
-# No residual below a nanometre makes an outlier: on noise-free data that is rounding.
-_ROUNDING_M = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +75,7 @@ class _Fit:
         """
         free_pairs = 2 * self.fit_pose + self.fit_marker
         rank = min(len(self.x) // 2 + free_pairs, len(self.x) - 1)
-        return max(float(np.partition(self.norms(), rank)[rank]) / _MEDIAN_NORM, least)
+        return max(float(np.partition(self.norms(), rank)[rank]) / MEDIAN_NORM, least)
 
     def place(self, weights: FloatArray) -> None:
         """The best pose for the present marker."""
@@ -97,7 +95,7 @@ class _Fit:
         target = (self.errors() * root).ravel()
         step = cast(FloatArray, np.linalg.lstsq(design, target, rcond=_RANK_TOLERANCE)[0])
         if self.fit_pose:
-            self.rotation = _exp(step[:3]) @ self.rotation
+            self.rotation = exponentials(step[:3][None])[0][0] @ self.rotation
             self.translation = self.translation + step[3:6]
         if self.fit_marker:
             self.shift = self.shift + step[-3:]
@@ -191,7 +189,7 @@ def _start_shift(fit: _Fit, sigma: float) -> FloatArray:
         _fit_robustly(trial, sigma)
         spread = trial.spread(0.0)
         # A better start must be clearly better, so that rounding does not choose among equals.
-        if spread < 0.9 * best_spread - _ROUNDING_M:
+        if spread < 0.9 * best_spread - ROUNDING_M:
             best, best_spread = trial.shift, spread
     return best
 
@@ -217,7 +215,7 @@ def _fit_robustly(fit: _Fit, sigma: float) -> BoolArray:
             break
     inliers = np.ones(len(fit.x), dtype=np.bool_)
     for _ in range(_ROUNDS):
-        chosen = norms <= max(_OUTLIER_SIGMAS * fit.spread(sigma), _ROUNDING_M)
+        chosen = norms <= max(_OUTLIER_SIGMAS * fit.spread(sigma), ROUNDING_M)
         step = fit.improve(chosen.astype(np.float64))
         norms = fit.norms()
         settled = bool((chosen == inliers).all()) and step < _STEP_TOLERANCE
@@ -251,12 +249,3 @@ def _check_spread(points: FloatArray, what: str) -> None:
         raise DegenerateDataError(
             f"{what} lie on one line or in one place, so no pose can be fitted to them; record pairs that spread out"
         )
-
-
-def _exp(rotation_vector: FloatArray) -> FloatArray:
-    """Rotation matrix (3, 3) of a rotation vector (3,) [rad] (Rodrigues)."""
-    angle = float(np.linalg.norm(rotation_vector))
-    k = cross_matrix(rotation_vector)
-    sinc = float(np.sinc(angle / np.pi))
-    half_sinc = float(np.sinc(0.5 * angle / np.pi))
-    return np.eye(3) + sinc * k + 0.5 * half_sinc**2 * (k @ k)

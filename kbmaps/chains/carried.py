@@ -25,26 +25,6 @@ class Predictor(Protocol):
         ...
 
 
-class ChainModel:
-    """A rigid chain under the names that models have: positions and orientations of its marker frame."""
-
-    def __init__(self, chain: RigidChain) -> None:
-        self.chain = chain
-
-    @property
-    def joints(self) -> int:
-        """Number of joints d."""
-        return self.chain.joints
-
-    def predict(self, q: ArrayLike) -> FloatArray:
-        """Positions (n, 3) [m] at q (n, d), or (3,) at q (d,)."""
-        return self.chain.positions(q)
-
-    def orientation(self, q: ArrayLike) -> FloatArray:
-        """Rotations (n, 3, 3), or (3, 3) at q (d,)."""
-        return self.chain.poses(q)[..., :3, :3]
-
-
 class Origin:
     """Predicts the origin of the measurement frame everywhere: the prior of who knows nothing."""
 
@@ -59,13 +39,13 @@ class Origin:
 def packable(model: object) -> tuple[dict[str, Any], dict[str, FloatArray]]:
     """Fields and arrays for `kbmaps.packed` from which `unpacked` makes the model again.
 
-    Of a model that is no `KBMap`, `ChainModel` or `Origin`, its type's name only.
+    Of a model that is no `KBMap`, `RigidChain` or `Origin`, its type's name only.
     """
     if isinstance(model, KBMap):
         bases = describe_bases(model.bases)
         return {"type": "KBMap", "bases": bases, "outputs": len(model.net)}, {"net": model.net.reshape(-1)}
-    if isinstance(model, ChainModel):
-        return {"type": "RigidChain"}, chain_arrays(model.chain)
+    if isinstance(model, RigidChain):
+        return {"type": "RigidChain"}, chain_arrays(model)
     if isinstance(model, Origin):
         return {"type": "Origin", "joints": model.joints}, {}
     return {"type": type(model).__name__}, {}
@@ -84,7 +64,7 @@ def unpacked(fields: Any, arrays: Mapping[str, FloatArray], given: object | None
         bases = parse_bases(described["bases"])
         return KBMap(bases, arrays["net"].reshape(described["outputs"], *(basis.size for basis in bases)))
     if name == "RigidChain":
-        return ChainModel(chain_from_arrays(arrays))
+        return chain_from_arrays(arrays)
     if name == "Origin":
         return Origin(count(described["joints"], "the number of joints"))
     if given is None or type(given).__name__ != name:
@@ -92,8 +72,3 @@ def unpacked(fields: Any, arrays: Mapping[str, FloatArray], given: object | None
             f"the model behind this one, a {name}, does not travel in its bytes: restore it and pass it in"
         )
     return given
-
-
-def as_model(model: RigidChain | object) -> Any:
-    """A rigid chain as a `ChainModel`, anything else as it is."""
-    return ChainModel(model) if isinstance(model, RigidChain) else model

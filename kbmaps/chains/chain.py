@@ -9,14 +9,13 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kbmaps.arrays import BoolArray, FloatArray, frozen, rows_or_vector, vector
-from kbmaps.errors import BasisError, ChainError, NonFiniteError, ShapeError
-from kbmaps.maps.basis import JointBasis
-from kbmaps.maps.kbmap import KBMap
+from kbmaps.arrays import BoolArray, FloatArray, frozen, numbers, rows_or_vector, vector
+from kbmaps.errors import ChainError, NonFiniteError, ShapeError
+from kbmaps.maps.basis import JointBasis, check_bases, check_net_size
+from kbmaps.maps.kbmap import POSE_OUTPUTS, POSITION_OUTPUTS, KBMap
+from kbmaps.rotations import cross_matrix, nearest_rotation
 
 _RIGID_TOLERANCE = 1e-6
-# (3, 9): row i is the matrix K of `cross_matrix` of the unit vector e_i.
-_CROSS = np.stack([np.cross(unit, np.eye(3)).T.ravel() for unit in np.eye(3)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,6 +93,22 @@ class RigidChain:
         """
         return self.poses(q)[..., :3, 3]
 
+    def predict(self, q: ArrayLike) -> FloatArray:
+        """`positions`, by the name that models have for it."""
+        return self.positions(q)
+
+    def orientation(self, q: ArrayLike, *, orthonormal: bool = False) -> FloatArray:
+        """Rotation (3, 3) of the marker frame in the measurement frame for q (d,), or (n, 3, 3) for (n, d).
+
+        Args:
+            orthonormal: mends what rounding has left of the fixed transforms' errors, at most 1e-6 each.
+
+        Raises:
+            ShapeError, NonFiniteError
+        """
+        rotations = self.poses(q)[..., :3, :3]
+        return nearest_rotation(rotations) if orthonormal else rotations
+
     def frames(self, q: ArrayLike) -> FloatArray:
         """Poses in the measurement frame of joints 1..d before they move and of the marker: (d+1, 4, 4) for q (d,).
 
@@ -120,6 +135,21 @@ class RigidChain:
             columns[..., k] = axis if self.prismatic[k] else np.cross(axis, lever)
         return columns
 
+    def angular_jacobian(self, q: ArrayLike) -> FloatArray:
+        """Angular velocity (3, d) of the marker frame [rad/rad, or rad/m], or (n, 3, d) for q (n, d).
+
+        In the measurement frame: dR/dq_k = [column k]× R.
+
+        Raises:
+            ShapeError, NonFiniteError
+        """
+        checked = rows_or_vector("q", q, self.joints)
+        columns = np.zeros((*checked.shape[:-1], 3, self.joints))
+        for k, frame in enumerate(self._frames(checked)[:-1]):
+            if not self.prismatic[k]:
+                columns[..., k] = frame[..., :3, :3] @ self.axes[k]
+        return columns
+
     def to_kbmap(self, bases: Sequence[JointBasis], *, orientation: bool = False) -> KBMap:
         """The chain as a KB-Map, exact up to rounding, without any sampling.
 
@@ -131,8 +161,10 @@ class RigidChain:
             orientation: also the nine planes of the rotation matrix.
 
         Raises:
-            BasisError: another number of bases, or a revolute basis for a prismatic joint.
+            BasisError: another number of bases, or a revolute basis for a prismatic joint; NetSizeError: more than
+                3^13 control points.
         """
+        check_net_size(bases, POSE_OUTPUTS if orientation else POSITION_OUTPUTS)
         net = self._net(bases, 3)
         return KBMap(tuple(bases), np.concatenate([net, self.orientation_maps(bases)]) if orientation else net)
 
@@ -142,8 +174,10 @@ class RigidChain:
         A tool moved by δ [m] in the marker frame is G + E1 δ1 + E2 δ2 + E3 δ3 exactly.
 
         Raises:
-            BasisError: another number of bases, or a revolute basis for a prismatic joint.
+            BasisError: another number of bases, or a revolute basis for a prismatic joint; NetSizeError: more than
+                3^13 control points.
         """
+        check_net_size(bases, POSE_OUTPUTS - POSITION_OUTPUTS)
         return np.concatenate([self._net(bases, column) for column in range(3)])
 
     def with_tool(self, marker_shift: ArrayLike) -> RigidChain:
@@ -162,7 +196,7 @@ class RigidChain:
         Raises:
             ShapeError, ChainError: not a rigid transform.
         """
-        transform = np.asarray(T_new_old, dtype=np.float64)
+        transform = numbers("T_new_old", T_new_old)
         check_rigid("T_new_old", transform)
         fixed = self.fixed.copy()
         fixed[0] = transform @ fixed[0]
@@ -202,14 +236,10 @@ class RigidChain:
 
     def _net(self, bases: Sequence[JointBasis], column: int) -> FloatArray:
         """Coefficients (3, m1, ..., md) of the upper part of one column of T(q)."""
-        if len(bases) != self.joints:
-            raise BasisError(f"need {self.joints} bases, one a joint; got {len(bases)}")
+        check_bases(bases, self.prismatic.tolist())
         tensor: FloatArray = self.fixed[-1][:, column]
         for k in range(self.joints - 1, -1, -1):
             basis = bases[k]
-            if basis.is_prismatic != bool(self.prismatic[k]):
-                wanted = "prismatic" if self.prismatic[k] else "revolute"
-                raise BasisError(f"joint {k} is {wanted} but its basis is {basis.kind}")
             # monomials = weights @ inv(matrix), so Σ_i monomial_i A_i = Σ_j weight_j Σ_i inv(matrix)_ji A_i
             terms = self._joint_terms(k)[: basis.size]
             by_weight = np.einsum("ji,irc->rjc", np.linalg.inv(basis.matrix), self.fixed[k] @ terms)
@@ -225,9 +255,3 @@ def check_rigid(name: str, transform: FloatArray) -> None:
     off = np.abs(rotation @ rotation.T - np.eye(3)).max()
     if not (off <= _RIGID_TOLERANCE and np.linalg.det(rotation) > 0.0 and (transform[3] == (0, 0, 0, 1)).all()):
         raise ChainError(f"{name} is not a rigid transform: a proper rotation, a translation and the row 0 0 0 1")
-
-
-def cross_matrix(vectors: FloatArray) -> FloatArray:
-    """The matrices K (..., 3, 3) with K @ y = vectors × y, for vectors (..., 3)."""
-    # One product, since this is called for every pair that comes.
-    return (vectors @ _CROSS).reshape(*vectors.shape, 3)

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from kbmaps.arrays import BoolArray, FloatArray, IntArray
-from kbmaps.chains.chain import RigidChain, cross_matrix
+from kbmaps.chains.chain import RigidChain
 from kbmaps.chains.parameters import tangents
+from kbmaps.rotations import cross_matrix
 
 _STEPS = 150
 _FIRST_DAMPING, _LEAST_DAMPING, _LEAST_RAISED_DAMPING, _MOST_DAMPING = 1e-2, 1e-14, 1e-8, 1e6

@@ -10,12 +10,9 @@ import numpy as np
 
 from kbmaps.arrays import BoolArray, FloatArray
 from kbmaps.maps.noise_evidence import LinearEvidence
+from kbmaps.robust import MEDIAN_NORM, ROUNDING_M
 
-# A residual norm of noise σ per axis has the median 1.538 σ in three dimensions.
-_MEDIAN_NORM = 1.538
 _ROUNDS = 20
-# No residual below a nanometre makes an outlier: on noise-free data that is rounding.
-_ROUNDING_M = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,7 +163,7 @@ def _near(pairs: Residuals, shift: FloatArray, outlier_sigmas: float) -> BoolArr
     """Which pairs (n,) lie within so many robust standard deviations, and no fewer than their sigma says."""
     norms = pairs.norms(shift)
     told = ~np.isnan(pairs.sigma)
-    limits = np.full(len(norms), _ROUNDING_M)
+    limits = np.full(len(norms), ROUNDING_M)
     if told.any():
         sigma = pairs.sigma[told]
         limits[told] += outlier_sigmas * sigma * max(_spread(norms[told] / sigma), 1.0)
@@ -182,4 +179,4 @@ def _spread(norms: FloatArray) -> float:
     least median of squares): else a few pairs would look perfect and the others be outliers.
     """
     rank = min(len(norms) // 2 + 1, len(norms) - 1)
-    return float(np.partition(norms, rank)[rank]) / _MEDIAN_NORM
+    return float(np.partition(norms, rank)[rank]) / MEDIAN_NORM

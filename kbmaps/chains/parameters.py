@@ -8,15 +8,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from kbmaps.arrays import BoolArray, FloatArray, frozen, rows_or_vector, vector
-from kbmaps.chains.chain import RigidChain, cross_matrix
+from kbmaps.chains.chain import RigidChain
 from kbmaps.errors import SettingError
+from kbmaps.rotations import cross_matrix, exponentials
 
 # What an infinite tolerance is taken for [rad, m]: far beyond anything real, and still a proper prior.
 WIDE = 10.0
 _FIXED_PARAMETERS = 9
 _JOINT_PARAMETERS = 5
-# Below this angle [rad] the quotients of the exponential map are taken from their series.
-SMALL_ANGLE = 1e-3
 _EYE = np.eye(3)
 
 
@@ -125,6 +124,19 @@ class ChainParameters:
         1 where prismatic (d,), and the marker's frame (4, 4)."""
         return self._axes, self._points, self._tangents, self.reference.prismatic.astype(np.float64), self._frames[-1]
 
+    @property
+    def turning(self) -> BoolArray:
+        """Which parameters (size,) are angles, and so bend the marker's way; the others are lengths."""
+        turning = np.zeros(self.size, dtype=np.bool_)
+        turning[self.base_turn] = turning[self.tilts] = True
+        turning[self.zeros] = ~self.reference.prismatic
+        return turning
+
+    @property
+    def reach(self) -> float:
+        """How far the marker usually is from what turns it [m]: half the length of all links."""
+        return max(float(np.linalg.norm(self.reference.fixed[1:, :3, 3], axis=1).sum()) / 2.0, 1e-3)
+
     def standard_deviations(self, tolerances: ChainTolerances) -> FloatArray:
         """Standard deviation (size,) of each parameter; 0 where it is held."""
         prismatic = self.reference.prismatic
@@ -150,7 +162,7 @@ class ChainParameters:
     def base_pose(self, change: FloatArray) -> FloatArray:
         """T_measured_nominal (4, 4) of a change (size,)."""
         pose = np.eye(4)
-        pose[:3, :3] = _exponentials(change[None, self.base_turn])[0][0]
+        pose[:3, :3] = exponentials(change[None, self.base_turn])[0][0]
         pose[:3, 3] = change[self.base_shift]
         return pose
 
@@ -183,6 +195,18 @@ class ChainParameters:
         placed = self._placed(geometry, np.atleast_2d(angles) + geometry.zeros)
         x = placed[-1, :, :3, :3] @ geometry.tip + placed[-1, :, :3, 3]
         return x[0] if angles.ndim == 1 else x
+
+    def jacobian(self, change: ArrayLike, q: ArrayLike) -> FloatArray:
+        """Derivative of the positions by the joints [m/rad, or m/m] (3, d) at q (d,), or (n, 3, d) at (n, d).
+
+        Raises:
+            ShapeError, NonFiniteError
+        """
+        angles = rows_or_vector("q", q, self.reference.joints)
+        # A zero is added to its joint's reading, so that the derivatives by both are the same.
+        _, jacobian = self.linearised(vector("change", change, self.size), np.atleast_2d(angles))
+        columns = jacobian[:, :, self.zeros]
+        return columns[0] if angles.ndim == 1 else columns
 
     def linearised(self, change: FloatArray, q: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Positions (n, 3) and their derivatives (n, 3, size) by the change, at q (n, d); the inputs are trusted.
@@ -219,7 +243,7 @@ class ChainParameters:
     def _geometry(self, change: FloatArray) -> _Geometry:
         d = self.reference.joints
         tilts = (self._tangents @ change[self.tilts].reshape(d, 2, 1))[..., 0]
-        rotations, derivatives = _exponentials(np.concatenate([change[None, self.base_turn], tilts]))
+        rotations, derivatives = exponentials(np.concatenate([change[None, self.base_turn], tilts]))
         base = np.eye(4)
         base[:3, :3], base[:3, 3] = rotations[0], change[self.base_shift]
         return _Geometry(
@@ -259,45 +283,6 @@ class ChainParameters:
         for k, motion in enumerate(motions):
             np.matmul(placed[k], motion, out=placed[k + 1])
         return placed
-
-
-def rotation_vector(rotation: FloatArray) -> FloatArray:
-    """The rotation vector (3,) [rad] of a rotation matrix (3, 3), of an angle up to π."""
-    # The quaternion's largest component is found first, so that none is divided by a small one (Shepperd 1978).
-    r = rotation
-    trace = float(np.trace(r))
-    squares = np.array([trace, r[0, 0], r[1, 1], r[2, 2]])
-    largest = int(squares.argmax())
-    if largest == 0:
-        quaternion = np.array([1.0 + trace, r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]])
-    else:
-        i = largest - 1
-        j, k = (i + 1) % 3, (i + 2) % 3
-        quaternion = np.empty(4)
-        quaternion[0] = r[k, j] - r[j, k]
-        quaternion[1 + i] = 1.0 + 2.0 * r[i, i] - trace
-        quaternion[1 + j], quaternion[1 + k] = r[j, i] + r[i, j], r[k, i] + r[i, k]
-    quaternion *= np.copysign(1.0 / np.linalg.norm(quaternion), quaternion[0])
-    sine = float(np.linalg.norm(quaternion[1:]))
-    angle = 2.0 * float(np.arctan2(sine, quaternion[0]))
-    return quaternion[1:] * (angle / sine if sine > 0.0 else 2.0)
-
-
-def _exponentials(turns: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Rotations exp([φ]×) (n, 3, 3) of rotation vectors (n, 3), and their left Jacobians.
-
-    exp([φ + δ]×) = exp([J δ]×) exp([φ]×) to first order, with the left Jacobian J (Chirikjian 2012, section 10.8).
-    """
-    angles: FloatArray = np.sqrt(np.einsum("ki,ki->k", turns, turns))[:, None, None]
-    safe: FloatArray = np.maximum(angles, SMALL_ANGLE)
-    small: BoolArray = angles < SMALL_ANGLE
-    squares = angles * angles
-    sine: FloatArray = np.where(small, 1.0 - squares / 6.0, np.sin(safe) / safe)
-    cosine: FloatArray = np.where(small, 0.5 - squares / 24.0, (1.0 - np.cos(safe)) / (safe * safe))
-    rest: FloatArray = np.where(small, 1.0 / 6.0 - squares / 120.0, (1.0 - np.sin(safe) / safe) / (safe * safe))
-    k = cross_matrix(turns)
-    kk = k @ k
-    return _EYE + sine * k + cosine * kk, _EYE + cosine * k + rest * kk
 
 
 def tangents(axes: FloatArray) -> FloatArray:

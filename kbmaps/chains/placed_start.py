@@ -8,8 +8,9 @@ import numpy as np
 
 from kbmaps.arrays import FloatArray
 from kbmaps.chains.align import align
-from kbmaps.chains.parameters import ChainParameters, ChainTolerances, rotation_vector
+from kbmaps.chains.parameters import ChainParameters, ChainTolerances
 from kbmaps.errors import DegenerateDataError
+from kbmaps.rotations import rotation_vector
 
 # So many pairs, evenly spread, show where an arm stands.
 _PLACED = 64

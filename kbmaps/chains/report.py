@@ -6,13 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kbmaps.arrays import FloatArray, frozen
+from kbmaps.arrays import BoolArray, FloatArray, frozen
 from kbmaps.chains.parameters import ChainParameters
+from kbmaps.chains.report_text import report_text
 
 # Of the standard deviation; Gaussian.
 _HALF_WIDTH_95 = 1.959964
-# A parameter that takes part in undetermined directions by more than this share is named.
-_LOOSE = 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,8 +46,10 @@ class ChainReport:
         freedom: residual coordinates minus those that the parameters have used up; few make `noise` uncertain.
         outliers: how many pairs were left out.
         determined: how many independent directions of the free parameters the pairs show.
-        undetermined: names of the free parameters that the pairs do not fix on their own. They can make up for each
-            other or were never moved; their values rest on the tolerances.
+        undetermined: names of the free parameters that these pairs did not show, though they matter: more than half of
+            what was left open before is still (1-sigma), and it was more than the noise at the arm's reach. They make
+            up for each other or were never moved; their values rest on the tolerances.
+        prismatic: which joints slide (d,).
     """
 
     T_measured_nominal: FloatArray
@@ -63,13 +64,17 @@ class ChainReport:
     outliers: int
     determined: int
     undetermined: tuple[str, ...]
+    prismatic: tuple[bool, ...]
+
+    def __str__(self) -> str:
+        return report_text(self)
 
 
 def chain_report(
     parameters: ChainParameters,
     change: FloatArray,
     deviation: FloatArray,
-    loose: FloatArray,
+    hidden: BoolArray,
     *,
     widening: float,
     noise: float,
@@ -78,7 +83,10 @@ def chain_report(
     outliers: int,
     determined: int,
 ) -> ChainReport:
-    """The report on a change (size,) with the RMS deviations of the truth from it (size,); `loose` as in `RigidFit`."""
+    """The report on a change (size,) with the RMS deviations of the truth from it (size,).
+
+    What is `hidden` (size,) is undetermined.
+    """
 
     def interval(part: slice) -> Interval:
         return Interval(frozen(change[part]), frozen(_HALF_WIDTH_95 * deviation[part]))
@@ -96,5 +104,6 @@ def chain_report(
         freedom=freedom,
         outliers=outliers,
         determined=determined,
-        undetermined=tuple(names[k] for k in np.flatnonzero(loose > _LOOSE)),
+        undetermined=tuple(names[k] for k in np.flatnonzero(hidden)),
+        prismatic=tuple(parameters.reference.prismatic.tolist()),
     )

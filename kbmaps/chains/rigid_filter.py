@@ -11,9 +11,10 @@ import numpy as np
 
 from kbmaps.arrays import FloatArray
 from kbmaps.chains.belief import ChainBelief
-from kbmaps.chains.parameters import SMALL_ANGLE, WIDE, ChainParameters, ChainTolerances
+from kbmaps.chains.parameters import WIDE, ChainParameters, ChainTolerances
 from kbmaps.errors import NonFiniteError, SettingError, ShapeError
 from kbmaps.maps.kernels import FilterKernel, filter_kernel
+from kbmaps.rotations import SMALL_ANGLE
 
 # Unit of the marker's place where its tolerance is 0, so that a tool change can loosen it [m].
 _TOOL_UNIT = 0.1
@@ -65,8 +66,8 @@ class RigidFilter:
         tool[parameters.tool] = True
         self._active = (std > 0.0) | tool
         self._scales = np.where((std == 0.0) & tool, _TOOL_UNIT, std)[self._active]
-        self._bends = self._turning()[self._active]
-        self._reach = max(float(np.linalg.norm(parameters.reference.fixed[1:, :3, 3], axis=1).sum()) / 2.0, 1e-3)
+        self._bends = parameters.turning.astype(np.float64)[self._active]
+        self._reach = parameters.reach
         self._kernel = self._filter_kernel()
         self.change = np.zeros(parameters.size)
         self._covariance: FloatArray = np.diag(np.square(std[self._active] / self._scales))
@@ -122,7 +123,9 @@ class RigidFilter:
         scales = np.zeros(self.parameters.size)
         scales[self._active] = self._scales
         constants = [_ITERATIONS, _SMALL_BEND, _GATE, NOISE_MEMORY, LEAST_NOISE_M**2, SMALL_ANGLE, self._reach]
-        return filter_kernel(*self.parameters.tables, scales, self._turning(), np.array(constants))
+        return filter_kernel(
+            *self.parameters.tables, scales, self.parameters.turning.astype(np.float64), np.array(constants)
+        )
 
     def _learn_compiled(self, kernel: FilterKernel, q: FloatArray, x: FloatArray, sigma: FloatArray) -> None:
         """What `_learn_one` does with each pair."""
@@ -137,13 +140,6 @@ class RigidFilter:
         )
         if taken < len(q):
             raise np.linalg.LinAlgError("Singular matrix")
-
-    def _turning(self) -> FloatArray:
-        """1 for the parameters (size,) that are angles and so bend the marker's way, 0 for lengths."""
-        bends = np.zeros(self.parameters.size)
-        bends[self.parameters.base_turn] = bends[self.parameters.tilts] = 1.0
-        bends[self.parameters.zeros] = ~self.parameters.reference.prismatic
-        return bends
 
     def _linearised(self, change: FloatArray, q: FloatArray) -> tuple[FloatArray, FloatArray]:
         x, jacobian = self.parameters.linearised(change, q)

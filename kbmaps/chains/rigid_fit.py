@@ -12,16 +12,13 @@ from scipy.special import chdtrc  # pyright: ignore[reportMissingTypeStubs, repo
 from kbmaps.arrays import BoolArray, FloatArray
 from kbmaps.chains.belief import ChainBelief, squared
 from kbmaps.pairs import Pairs
+from kbmaps.robust import MEDIAN_NORM, ROUNDING_M
 
-# Noise that is estimated is never below this [m]: there rounding begins.
-_ROUNDING_M = 1e-9
 # A pair this many sigma from where the others predict it is an outlier: of good ones 4 in 100,000 are as far out
 # (chi, three dimensions).
 _OUTLIER_SIGMAS = 4.8
 # A residual's variance is never taken for less than this share of the noise: below, the pair explains itself.
 _LEAST_SHARE = 1e-4
-# A residual norm of noise σ per axis has the median 1.538 σ in three dimensions.
-_MEDIAN_NORM = 1.538
 _SCALES_PER_SIGMA = 3.0
 # Told noise explains a sum of squared residuals that is not less probable than this (χ²).
 _MISFIT_CHANCE = 1e-3
@@ -61,7 +58,6 @@ class RigidFit:
         freedom: residual coordinates minus those that the parameters have used up.
         inliers: which pairs (n,) are no outliers.
         rank: how many independent directions of the parameters the data determine.
-        loose: how far (size,) each free parameter takes part in directions that the data do not show, in 0..1.
         log_evidence: log marginal likelihood of the inliers (Laplace's approximation).
     """
 
@@ -70,7 +66,6 @@ class RigidFit:
     freedom: float
     inliers: BoolArray
     rank: int
-    loose: FloatArray
     log_evidence: float
 
 
@@ -119,7 +114,7 @@ class _Fitter:
         self.prior, self.pairs = prior, pairs
         self.free, self.root = squared(prior.root)
         self.point = self._at(cast(FloatArray, np.linalg.solve(self.root, (start - prior.mean)[self.free])))
-        self.least_noise = 1.0 if pairs.known else _ROUNDING_M / float(pairs.unit.min())
+        self.least_noise = 1.0 if pairs.known else ROUNDING_M / float(pairs.unit.min())
         self._damping = _FIRST_DAMPING
         # Residual coordinates that the parameters use up.
         self.used = float(min(len(self.free), 3 * len(pairs)))
@@ -131,7 +126,7 @@ class _Fitter:
         """
         norms = self.point.norms
         rank = min(int(0.5 * (len(norms) + self.used / 3.0)), len(norms) - 1)
-        return max(float(np.partition(norms, rank)[rank]) / _MEDIAN_NORM, self.least_noise)
+        return max(float(np.partition(norms, rank)[rank]) / MEDIAN_NORM, self.least_noise)
 
     def improve(self, weights: FloatArray, noise: float) -> float:
         """A Levenberg-Marquardt step; returns its length in units of what is left open (0: none was found)."""
@@ -258,26 +253,21 @@ def _summary(fitter: _Fitter, inliers: BoolArray, noise: float, freedom: float) 
     factor = point.reduced(inliers / (fitter.pairs.unit * noise))
     _, singular, vt = np.linalg.svd(factor[:, :-1])
     singular = np.concatenate([singular, np.zeros(len(vt) - len(singular))])
-    loose, rank = _undetermined(cast(FloatArray, np.linalg.solve(root.T, factor[:, :-1].T)).T)
+    rank = _rank(cast(FloatArray, np.linalg.solve(root.T, factor[:, :-1].T)).T)
     spread = np.zeros((size, size))
     spread[np.ix_(free, free)] = root @ (vt.T / np.sqrt(1.0 + np.square(singular)))
-    looseness = np.zeros(size)
-    looseness[free] = loose
     square = float(np.square(point.norms[inliers]).sum()) / noise**2 + float(point.offset @ point.offset)
     spans = 6.0 * float(np.log(noise * fitter.pairs.unit[inliers]).sum())
     evidence = -0.5 * (square + spans + 3.0 * float(inliers.sum()) * math.log(2.0 * math.pi))
     evidence -= 0.5 * float(np.log1p(np.square(singular)).sum())
     seen = noise * math.sqrt(float(np.square(fitter.pairs.unit).mean())) if freedom > 0.0 else 0.0
     belief = ChainBelief(parameters, point.change, spread, seen)
-    return RigidFit(belief, noise, freedom, inliers, rank, looseness, evidence)
+    return RigidFit(belief, noise, freedom, inliers, rank, evidence)
 
 
-def _undetermined(design: FloatArray) -> tuple[FloatArray, int]:
-    """How far each parameter lies in directions that no row shows, and how many directions the rows do show."""
+def _rank(design: FloatArray) -> int:
+    """How many directions of the parameters the rows show."""
     lengths = np.linalg.norm(design, axis=0)
     seen = lengths > 1e-12 * max(float(lengths.max(initial=0.0)), 1e-300)
-    _, singular, vt = np.linalg.svd(design[:, seen] / lengths[seen])
-    rank = int((singular > 1e-8 * singular.max(initial=0.0)).sum())
-    loose = np.ones(design.shape[1])
-    loose[seen] = np.linalg.norm(vt[rank:], axis=0)
-    return loose, rank
+    singular = np.linalg.svd(design[:, seen] / lengths[seen], compute_uv=False)
+    return int((singular > 1e-8 * singular.max(initial=0.0)).sum())

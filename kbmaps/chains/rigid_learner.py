@@ -7,9 +7,8 @@ from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.special import stdtrit  # pyright: ignore[reportMissingTypeStubs, reportUnknownVariableType]
 
-from kbmaps.arrays import BoolArray, FloatArray, frozen, rows, rows_or_vector
+from kbmaps.arrays import BoolArray, FloatArray, frozen, rows_or_vector
 from kbmaps.chains.belief import ChainBelief
 from kbmaps.chains.chain import RigidChain
 from kbmaps.chains.packed import CHAIN, chain_arrays, chain_from_arrays, describe_tolerances, parse_tolerances
@@ -19,16 +18,16 @@ from kbmaps.chains.report import ChainReport, chain_report
 from kbmaps.chains.rigid_fit import RigidFit, fit_chain
 from kbmaps.chains.valley import deviations
 from kbmaps.errors import DegenerateDataError
-from kbmaps.model import Estimate
+from kbmaps.model import Estimate, near_data, widest
 from kbmaps.packed import complete, named, pack, restoring, unpack
 from kbmaps.pairs import Pairs, checked_pairs, stored_pairs, with_units
+from kbmaps.robust import claimed_sigma, student
 
 _KIND = "rigid chain, batch, 2"
-_ONE_SIGMA = 0.841344746
-# Configurations where the chain is surer than this times the least sure pair (in variance) lie where data was.
-_SUPPORT_FACTOR = 2.0
 # So many pairs, evenly spread, stand for all where the bend of their valley is looked for.
 _FOLLOWED = 100
+# A parameter whose standard deviation the pairs left above this share of the one before was not shown by them.
+_HARDLY_NARROWER = 0.5
 
 
 class RigidLearner:
@@ -133,6 +132,14 @@ class RigidLearner:
         return np.zeros(0, dtype=np.bool_) if fit is None else fit.inliers.copy()
 
     @property
+    def least_sure(self) -> FloatArray:
+        """The configuration (1, d) of the pair that the chain is least sure of, outliers left out; (0, d) without."""
+        fit = self._fitted()
+        q = self._q if fit is None else self._q[fit.inliers]
+        _, variance = self.belief.predict_with_variance(q)
+        return q[np.argsort(-variance.sum(axis=1))[:1]]
+
+    @property
     def log_evidence(self) -> float:
         """Log marginal likelihood of the inliers (Laplace's approximation); 0 without pairs."""
         fit = self._fitted()
@@ -163,25 +170,29 @@ class RigidLearner:
         angles = rows_or_vector("q", q, self.joints)
         return self._parameters.positions(self.belief.mean, angles)
 
+    def jacobian(self, q: ArrayLike) -> FloatArray:
+        """Derivative (3, d) of the position [m/rad, or m/m], or (n, 3, d) for q (n, d); exact.
+
+        Raises:
+            ShapeError, NonFiniteError
+        """
+        return self._parameters.jacobian(self.belief.mean, q)
+
     def estimate(self, q: ArrayLike) -> Estimate:
-        """Positions at q (n, d), their 1-sigma per axis against the truth, and whether data was there.
+        """Positions at q (n, d), or (d,), their 1-sigma per axis against the truth, and whether data was there.
 
         Where the told noise does not explain the residuals, what is left over adds to sigma everywhere.
 
         Raises:
             ShapeError, NonFiniteError
         """
-        angles = rows("q", q, self.joints)
+        angles = rows_or_vector("q", q, self.joints)
         fit = self._fitted()
-        x, variance = self.belief.predict_with_variance(angles)
+        x, variance = self.belief.predict_with_variance(np.atleast_2d(angles))
         if fit is None:
-            return Estimate(x, np.sqrt(variance), np.zeros(len(angles), dtype=np.bool_))
-        inside = variance.sum(axis=1) <= _SUPPORT_FACTOR * self._widest
-        pairs = self._units()
-        if pairs.known:
-            variance = variance + (fit.noise**2 - 1.0) * float(np.square(pairs.unit).mean())
-            return Estimate(x, np.sqrt(variance), inside)
-        return Estimate(x, np.sqrt(variance) * student(fit.freedom), inside)
+            return Estimate(x, np.sqrt(variance), np.zeros(len(x), dtype=np.bool_)).like(angles)
+        sigma = claimed_sigma(variance, self._units(), fit.noise, fit.freedom)
+        return Estimate(x, sigma, near_data(variance, self._widest)).like(angles)
 
     def report(self) -> ChainReport:
         """Hand-eye, tool centre point and joint zeros with 95 % intervals.
@@ -199,7 +210,7 @@ class RigidLearner:
             self._parameters,
             fit.belief.mean,
             widening * self._deviations(fit, pairs),
-            fit.loose,
+            self._hidden(fit, unit * fit.noise),
             widening=widening,
             noise=unit if pairs.known else unit * fit.noise,
             misfit=fit.noise if pairs.known else 1.0,
@@ -207,6 +218,12 @@ class RigidLearner:
             outliers=int((~fit.inliers).sum()),
             determined=fit.rank,
         )
+
+    def _hidden(self, fit: RigidFit, noise: float) -> BoolArray:
+        """Which parameters (size,) matter and were not shown; noise of a coordinate [m]."""
+        before, after = (np.sqrt(np.square(belief.root).sum(axis=1)) for belief in (self._prior, fit.belief))
+        lever = np.where(self._parameters.turning, self._parameters.reach, 1.0)
+        return (after > _HARDLY_NARROWER * before) & (before * lever > noise)
 
     def to_bytes(self) -> bytes:
         """The learner with all its pairs; `from_bytes` gives the same predictions to the last bit."""
@@ -244,7 +261,7 @@ class RigidLearner:
         if self._fit is None and self.pairs:
             fit = fit_chain(self._prior, self._units(), self._start())
             _, variance = fit.belief.predict_with_variance(self._q[fit.inliers])
-            self._widest = float(variance.sum(axis=1).max(initial=0.0))
+            self._widest = widest(variance)
             self._fit = fit
         return self._fit
 
@@ -260,8 +277,3 @@ class RigidLearner:
 
     def _start(self) -> FloatArray:
         return self._prior.mean if self._told_prior else self._place.change(self._q, self._x)
-
-
-def student(freedom: float) -> float:
-    """What a sigma with an estimated noise must be multiplied by to cover as a Gaussian one does."""
-    return float(stdtrit(max(freedom, 1.0), _ONE_SIGMA))

@@ -8,7 +8,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kbmaps.arrays import FloatArray, frozen, rows, rows_or_vector
+from kbmaps.arrays import FloatArray, frozen, rows_or_vector
 from kbmaps.chains.belief import ChainBelief
 from kbmaps.chains.chain import RigidChain
 from kbmaps.chains.packed import CHAIN, chain_arrays, chain_from_arrays, describe_tolerances, parse_tolerances
@@ -18,18 +18,16 @@ from kbmaps.chains.rigid_fit import RigidFit
 from kbmaps.chains.rigid_learner import RigidLearner
 from kbmaps.chains.rigid_window import RigidWindow
 from kbmaps.errors import ModelFormatError, SettingError
-from kbmaps.model import Estimate
+from kbmaps.model import Estimate, near_data, widest
 from kbmaps.packed import complete, count, named, pack, restoring, unpack
 from kbmaps.pairs import checked_pairs
 
-_KIND = "rigid chain, recursive, 3"
+_KIND = "rigid chain, recursive, 4"
 _COUNTS = ("pairs", "window", "due")
 # The first refit comes with this pair, the next when the kept pairs have grown by this factor, or the window is full.
 _FIRST, _GROWTH = 8, 1.5
 # A noise found from fewer degrees of freedom is a guess: the next refit comes with the next pair.
 _SURE_FREEDOM = 12.0
-# A pair is near data where the chain's own uncertainty is at most this many times the noise (in variance).
-_SUPPORT_FACTOR = 1.0
 
 
 class RecursiveRigidLearner:
@@ -75,6 +73,7 @@ class RecursiveRigidLearner:
         self._window = RigidWindow(self._parameters, tolerances, window)
         self._due = _FIRST
         self._pairs = 0
+        self._widest: float | None = None
 
     @classmethod
     def continuing(cls, batch: RigidLearner, *, window: int = 1000) -> Self:
@@ -88,6 +87,7 @@ class RecursiveRigidLearner:
         learner._go_on_from(batch.belief)
         learner._filter.noise_coordinates = float(np.clip(report.freedom, NOISE_COORDINATES, NOISE_MEMORY))
         learner._pairs = batch.pairs
+        learner._window.farthest = batch.least_sure
         return learner
 
     @property
@@ -150,6 +150,7 @@ class RecursiveRigidLearner:
             begin = part.stop
             if self.kept == self._due:
                 self._refit()
+        self._widest = None
 
     def tool_changed(self, tolerance: float) -> None:
         """Tells that the marker was moved, by `tolerance` (1-sigma of each component [m]); the arm stays known.
@@ -172,17 +173,29 @@ class RecursiveRigidLearner:
         """
         return self._parameters.positions(self._filter.change, rows_or_vector("q", q, self.joints))
 
-    def estimate(self, q: ArrayLike) -> Estimate:
-        """Positions at q (n, d), their 1-sigma per axis against the truth, and whether data was there.
-
-        Where the told noise does not explain the residuals of a refit, what is left over adds to sigma everywhere.
+    def jacobian(self, q: ArrayLike) -> FloatArray:
+        """Derivative (3, d) of the position [m/rad, or m/m], or (n, 3, d) for q (n, d); exact.
 
         Raises:
             ShapeError, NonFiniteError
         """
-        x, variance = self._filter.with_variance(rows("q", q, self.joints))
-        inside = (variance.mean(axis=1) <= _SUPPORT_FACTOR * self._filter.noise_square) & (self._pairs > 0)
-        return Estimate(x, np.sqrt(variance + self._window.excess), inside)
+        return self._parameters.jacobian(self._filter.change, q)
+
+    def estimate(self, q: ArrayLike) -> Estimate:
+        """Positions at q (n, d), or (d,), their 1-sigma per axis against the truth, and whether data was there.
+
+        Where the told noise does not explain the residuals of a refit, what is left over adds to sigma everywhere. The
+        pairs that support goes by are those that are kept, and of those before them the one that was least sure;
+        they are gone through once after each `learn` (5 ms at 1,000 kept pairs of 7 joints).
+
+        Raises:
+            ShapeError, NonFiniteError
+        """
+        angles = rows_or_vector("q", q, self.joints)
+        x, variance = self._filter.with_variance(np.atleast_2d(angles))
+        if self._widest is None:
+            self._widest = widest(self._filter.with_variance(self._window.configurations)[1])
+        return Estimate(x, np.sqrt(variance + self._window.excess), near_data(variance, self._widest)).like(angles)
 
     def to_bytes(self) -> bytes:
         """The learner as it is; `from_bytes` learns on to the last bit as this one would."""
@@ -229,4 +242,5 @@ class RecursiveRigidLearner:
     def _go_on_from(self, belief: ChainBelief) -> None:
         self._filter.go_on_from(belief)
         self._window.begin_with(belief)
+        self._widest = None
         self._due = _FIRST

@@ -28,13 +28,15 @@ class RigidWindow:
     Attributes:
         belief: of the chain before the pairs that are kept.
         noise: what is known of the noise before them, of pairs that come without their sigma.
+        farthest: of the pairs that were folded, the configuration (1, d) that the chain was least sure of; (0, d)
+            without any.
         excess: variance [m²] of a coordinate that the chain did not explain at the last fit, the noise being told.
 
     Raises:
         SettingError: size below 16.
     """
 
-    STORED = ("q", "x", "sigma", "known")
+    STORED = ("q", "x", "sigma", "known", "farthest")
     STORED_BELIEF = ("before_mean", "before_root")
 
     def __init__(self, parameters: ChainParameters, tolerances: ChainTolerances, size: int) -> None:
@@ -45,6 +47,7 @@ class RigidWindow:
         self.noise = NOTHING_KNOWN
         self.excess = 0.0
         self._begun = False
+        self.farthest = np.empty((0, parameters.reference.joints))
         self._place = PlacedStart(parameters, tolerances)
         self._joints, self._count = parameters.reference.joints, 0
         # q, x and sigma side by side.
@@ -52,6 +55,11 @@ class RigidWindow:
 
     def __len__(self) -> int:
         return self._count
+
+    @property
+    def configurations(self) -> FloatArray:
+        """Those (n, d) of the pairs that are kept, and the farthest of those that were folded."""
+        return np.concatenate([self._rows[: self._count, : self._joints], self.farthest])
 
     @property
     def finds_noise(self) -> bool:
@@ -82,6 +90,9 @@ class RigidWindow:
         # The units are those of the fit, hence of all pairs.
         pairs = with_units(q, x, sigma)
         good = fit.inliers & (np.arange(self._count) < count)
+        candidates = np.concatenate([q[good], self.farthest])
+        _, variance = fit.belief.predict_with_variance(candidates)
+        self.farthest = candidates[np.argsort(-variance.sum(axis=1))[:1]]
         self.belief = folded(self.belief, pairs.chosen(good), fit.belief.mean, fit.noise)
         if not pairs.known:
             told = self.noise.coordinates + fit.freedom * count / self._count
@@ -93,12 +104,13 @@ class RigidWindow:
     def begin_with(self, belief: ChainBelief) -> None:
         """Lets go of all pairs; `belief` is what is believed of the chain from now on."""
         self.belief, self._begun, self._count = belief, True, 0
+        self.farthest = self.farthest[:0]
 
     def arrays(self) -> dict[str, FloatArray]:
         """For `kbmaps.packed`."""
         q, x, sigma = self._pairs()
         known = np.array([self.noise.coordinates, self.noise.square, self.excess])
-        arrays = {"q": q, "x": x, "sigma": sigma, "known": known}
+        arrays = {"q": q, "x": x, "sigma": sigma, "known": known, "farthest": self._stored_farthest()}
         return arrays | ({"before_mean": self.belief.mean, "before_root": self.belief.root} if self._begun else {})
 
     def restore(self, arrays: Mapping[str, FloatArray]) -> None:
@@ -109,12 +121,24 @@ class RigidWindow:
         """
         q, x, sigma = stored_pairs(arrays, self._joints)
         coordinates, square, excess = (float(number) for number in vector("known", arrays["known"], 3))
-        if len(q) > self.size or not all(0.0 <= number < math.inf for number in (coordinates, square, excess)):
+        farthest = self._farthest(arrays["farthest"])
+        known = all(0.0 <= number < math.inf for number in (coordinates, square, excess))
+        if len(q) > self.size or not known:
             raise ModelFormatError("the stored pairs do not fit their window, or their noise is none")
         if "before_mean" in arrays:
             self.begin_with(ChainBelief(self.belief.parameters, arrays["before_mean"], arrays["before_root"]))
-        self.noise, self.excess = NoiseKnowledge(coordinates, square), excess
+        self.noise, self.excess, self.farthest = NoiseKnowledge(coordinates, square), excess, farthest
         self.add(q, x, sigma)
+
+    def _stored_farthest(self) -> FloatArray:
+        """`farthest` as a vector (d,); NaN for none."""
+        return self.farthest[0] if len(self.farthest) else np.full(self._joints, np.nan)
+
+    def _farthest(self, stored: FloatArray) -> FloatArray:
+        """What `_stored_farthest` gave. Raises ShapeError, NonFiniteError."""
+        if stored.shape == (self._joints,) and np.isnan(stored).all():
+            return np.empty((0, self._joints))
+        return vector("farthest", stored, self._joints)[None]
 
     def _pairs(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         rows = self._rows[: self._count]

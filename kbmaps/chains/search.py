@@ -12,9 +12,8 @@ from kbmaps.arrays import BoolArray, FloatArray, rows
 from kbmaps.chains.chain import RigidChain
 from kbmaps.chains.descents import Descents, ScrewArms
 from kbmaps.errors import DegenerateDataError, SettingError, ShapeError
+from kbmaps.robust import ROUNDING_M
 
-# A start whose residual [m] is rounding has found the chain.
-_ROUNDING_M = 1e-9
 # A start that leaves less than this times the noise has found the chain.
 _EXPLAINED = 1.2
 
@@ -57,6 +56,8 @@ def find_chain(
         >>> found.positions([0.0, -np.pi / 2]).round(6) + 0.0
         array([0.3, 0. , 0.2])
     """
+    if not isinstance(rng, np.random.Generator):  # pyright: ignore[reportUnnecessaryIsInstance]
+        raise SettingError(f"rng must be a generator, as numpy.random.default_rng(0) makes one; got {rng!r}")
     width = np.shape(q)[-1] if np.ndim(q) == 2 else 0
     angles, positions = rows("q", q, max(width, 1)), rows("x", x, 3)
     slides = np.zeros(angles.shape[1], dtype=np.bool_) if prismatic is None else np.array(prismatic, dtype=np.bool_)
@@ -74,9 +75,9 @@ def find_chain(
             f"{len(angles)} pairs cannot determine the {unknowns} unknowns of this chain; record {-(-unknowns // 3)}"
         )
     size = float(np.linalg.norm(positions - positions.mean(axis=0), axis=1).mean())
-    if not size > _ROUNDING_M:
+    if not size > ROUNDING_M:
         raise DegenerateDataError("all positions lie in one place; record pairs that spread out")
-    enough = max(_ROUNDING_M, _EXPLAINED * (sigma or 0.0) * math.sqrt(max(3.0 - unknowns / len(angles), 0.0)))
+    enough = max(ROUNDING_M, _EXPLAINED * (sigma or 0.0) * math.sqrt(max(3.0 - unknowns / len(angles), 0.0)))
     return _best_of(angles, positions, slides, size, rng, starts, enough)
 
 

@@ -10,13 +10,13 @@ from typing import Any, Protocol, Self, cast, runtime_checkable
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kbmaps.arrays import BoolArray, FloatArray, frozen, rows, rows_or_vector
-from kbmaps.chains.carried import ChainModel, as_model, packable, unpacked
+from kbmaps.arrays import BoolArray, FloatArray, frozen, rows_or_vector
+from kbmaps.chains.carried import packable, unpacked
 from kbmaps.chains.chain import RigidChain
 from kbmaps.chains.marker_fit import MarkerKnowledge, MarkerPosterior, Residuals, fit_marker
 from kbmaps.errors import ModelFormatError, SettingError
 from kbmaps.maps.kbmap import KBMap
-from kbmaps.model import Estimate
+from kbmaps.model import Estimate, PoseModel
 from kbmaps.packed import complete, count, named, numbers, or_infinite, pack, restoring, unless_infinite, unpack
 from kbmaps.pairs import checked_pairs
 
@@ -28,27 +28,9 @@ _WIDE = 1e6
 _NOISE_COORDINATES = 6.0
 # So many pairs are kept to judge outliers among; older ones live on in sums.
 _RECENT = 128
-_SUPPORT_FACTOR = 1.0
 _RESIDUALS = ("rotations", "residuals", "sigma")
 _SUMS = ("information", "pull", "square", "inner")
 _NUMBERS = ("errors", "count", "noise_count", "noise_square")
-
-
-class OrientedModel(Protocol):
-    """A map to positions and orientations."""
-
-    @property
-    def joints(self) -> int:
-        """Number of joints d."""
-        ...
-
-    def predict(self, q: ArrayLike) -> FloatArray:
-        """Positions (n, 3) [m] at q (n, d), or (3,) at q (d,)."""
-        ...
-
-    def orientation(self, q: ArrayLike) -> FloatArray:
-        """Orientations (n, 3, 3), or (3, 3) at q (d,)."""
-        ...
 
 
 @runtime_checkable
@@ -80,7 +62,7 @@ class ToolLayer:
 
     def __init__(
         self,
-        model: RigidChain | OrientedModel,
+        model: PoseModel,
         *,
         spread: float = 1.0,
         noise: float = 0.01,
@@ -90,12 +72,13 @@ class ToolLayer:
             raise SettingError(f"noise must be finite and greater than 0 m, got {noise!r}")
         if not outlier_sigmas > 0.0:
             raise SettingError(f"outlier_sigmas must be greater than 0, got {outlier_sigmas!r}")
-        self._model: OrientedModel = as_model(model)
+        self._model: PoseModel = model
         self._outlier_sigmas = float(outlier_sigmas)
-        covariance = np.eye(3) * _checked_spread(spread) ** 2
+        covariance = np.eye(3) * _checked_spread("spread", spread) ** 2
         self._before = MarkerKnowledge.before(np.zeros(3), covariance, noise, _NOISE_COORDINATES)
         self._recent = self._residuals(np.empty((0, self.joints)), np.empty((0, 3)), np.empty(0))
         self._pairs = 0
+        self._moved: KBMap | RigidChain | None = None
         self._fit: tuple[MarkerKnowledge, MarkerPosterior, BoolArray] | None = None
 
     @property
@@ -144,13 +127,13 @@ class ToolLayer:
         if len(self._recent) >= 2 * _RECENT:
             self._sum_up()
 
-    def tool_changed(self, spread: float) -> None:
-        """Tells that the marker was moved, by `spread` (1-sigma of each component [m]); the noise stays known.
+    def tool_changed(self, tolerance: float) -> None:
+        """Tells that the marker was moved, by `tolerance` (1-sigma of each component [m]); the noise stays known.
 
         Raises:
-            SettingError: the spread is not positive.
+            SettingError: the tolerance is not positive.
         """
-        moved = np.eye(3) * _checked_spread(spread) ** 2
+        moved = np.eye(3) * _checked_spread("tolerance", tolerance) ** 2
         known, posterior, _ = self._fitted()
         coordinates = known.noise_count + 3.0 * known.count
         self._before = MarkerKnowledge.before(
@@ -167,27 +150,50 @@ class ToolLayer:
         angles = rows_or_vector("q", q, self.joints)
         return self._model.predict(angles) + self._model.orientation(angles) @ self._posterior().shift
 
-    def orientation(self, q: ArrayLike) -> FloatArray:
-        """The model's orientations (n, 3, 3), or (3, 3) at q (d,): a tool does not turn the marker's frame."""
-        return self._model.orientation(q)
+    def jacobian(self, q: ArrayLike) -> FloatArray:
+        """Derivative (3, d) of the position [m/rad, or m/m], or (n, 3, d) for q (n, d).
 
-    def estimate(self, q: ArrayLike) -> Estimate:
-        """Positions at q (n, d), their 1-sigma per axis against the truth, and whether data was there.
-
-        What the model itself claims adds to what is open about δ, and where it is in no support, this is not either.
-        Of a model without claims, the noise tells how well it fits.
+        Exact on a `KBMap` or a `RigidChain`, and on any model whose orientations are rotations.
 
         Raises:
             ShapeError, NonFiniteError
         """
-        angles = rows("q", q, self.joints)
-        posterior, rotations = self._posterior(), self._model.orientation(angles)
+        if isinstance(self._model, KBMap | RigidChain):
+            _, posterior, _ = self._fitted()
+            if self._moved is None:
+                self._moved = self._model.with_tool(posterior.shift)
+            return self._moved.jacobian(q)
+        lever = self._model.orientation(q) @ self._posterior().shift
+        turning = self._model.angular_jacobian(q).swapaxes(-1, -2)
+        return self._model.jacobian(q) + np.cross(turning, lever[..., None, :]).swapaxes(-1, -2)
+
+    def orientation(self, q: ArrayLike, *, orthonormal: bool = False) -> FloatArray:
+        """The model's orientations (n, 3, 3), or (3, 3) at q (d,): a tool does not turn the marker's frame."""
+        return self._model.orientation(q, orthonormal=orthonormal)
+
+    def angular_jacobian(self, q: ArrayLike) -> FloatArray:
+        """The model's angular velocities (n, 3, d), or (3, d) at q (d,), of the orthonormal orientation."""
+        return self._model.angular_jacobian(q)
+
+    def estimate(self, q: ArrayLike) -> Estimate:
+        """Positions at q (n, d), or (d,), their 1-sigma per axis against the truth, and whether data was there.
+
+        What the model itself claims adds to what is open about δ. Every pair shows all of δ, which then is as sure at
+        one configuration as at any other: once there is a pair of the present tool, support is that of the model
+        itself, or everywhere where it claims none.
+
+        Raises:
+            ShapeError, NonFiniteError
+        """
+        angles = rows_or_vector("q", q, self.joints)
+        batch = np.atleast_2d(angles)
+        posterior, rotations = self._posterior(), self._model.orientation(batch)
         variance = np.einsum("nij,jk,nik->ni", rotations, posterior.covariance, rotations)
-        inside = (variance.mean(axis=1) <= _SUPPORT_FACTOR * self._noise_square()) & (self._pairs > 0)
+        inside = np.full(len(batch), len(self._recent) > 0 or self._before.count > 0.0)
         if isinstance(self._model, _Estimating):
-            behind = self._model.estimate(angles)
+            behind = self._model.estimate(batch)
             variance, inside = variance + np.square(behind.sigma), inside & behind.in_support
-        return Estimate(self.predict(angles), np.sqrt(variance), inside)
+        return Estimate(self.predict(batch), np.sqrt(variance), inside).like(angles)
 
     def baked(self) -> KBMap | RigidChain:
         """The model with the marker moved for good, exactly: of a KB-Map G + E1 δ1 + E2 δ2 + E3 δ3.
@@ -195,10 +201,8 @@ class ToolLayer:
         Raises:
             SettingError: the model is neither a `KBMap` nor a `RigidChain`.
         """
-        if isinstance(self._model, KBMap):
+        if isinstance(self._model, KBMap | RigidChain):
             return self._model.with_tool(self.shift)
-        if isinstance(self._model, ChainModel):
-            return self._model.chain.with_tool(self.shift)
         raise SettingError(f"a {type(self._model).__name__} cannot take in a tool; only a KBMap or a RigidChain can")
 
     def to_bytes(self) -> bytes:
@@ -217,7 +221,7 @@ class ToolLayer:
         return pack(_KIND, fields, {name: getattr(self._before, name) for name in _SUMS} | recent | arrays)
 
     @classmethod
-    def from_bytes(cls, data: bytes, model: OrientedModel | None = None) -> Self:
+    def from_bytes(cls, data: bytes, model: PoseModel | None = None) -> Self:
         """The layer in `data`.
 
         Args:
@@ -253,23 +257,17 @@ class ToolLayer:
 
     def _fitted(self) -> tuple[MarkerKnowledge, MarkerPosterior, BoolArray]:
         if self._fit is None:
+            self._moved = None
             self._fit = fit_marker(self._before, self._recent, self._outlier_sigmas)
         return self._fit
 
     def _posterior(self) -> MarkerPosterior:
         return self._fitted()[1]
 
-    def _noise_square(self) -> float:
-        """Variance of a measured coordinate [m²]: as estimated, or as told where all that was recent was told."""
-        told = self._recent.sigma[~np.isnan(self._recent.sigma)]
-        if len(told) and len(told) == len(self._recent):
-            return float(np.square(told).mean())
-        return self.noise**2
 
-
-def _checked_spread(spread: float) -> float:
+def _checked_spread(name: str, spread: float) -> float:
     if not spread > 0.0:
-        raise SettingError(f"spread must be greater than 0 m (infinity included), got {spread!r}")
+        raise SettingError(f"{name} must be greater than 0 m (infinity included), got {spread!r}")
     return min(float(spread), _WIDE)
 
 

@@ -10,10 +10,11 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kbmaps.arrays import FloatArray, IntArray, frozen, vector
-from kbmaps.errors import NonFiniteError, SettingError, ShapeError
+from kbmaps.arrays import FloatArray, IntArray, frozen, limits, vector
+from kbmaps.errors import SettingError, ShapeError
 from kbmaps.inverse.descent import Descent, JointRange, descend, settle
-from kbmaps.inverse.reach import PoseGoal, PoseModel, PositionGoal, PositionModel
+from kbmaps.inverse.reach import PoseGoal, PositionGoal
+from kbmaps.model import PoseModel, PositionModel
 from kbmaps.rotations import rotation_matrices
 
 Reason = Literal["reached", "out_of_reach", "steps_ran_out"]
@@ -62,7 +63,9 @@ class InverseKinematics:
     10 ms at d = 7).
 
     Args:
-        model: positions and their derivative; for poses also the orientation (`PoseModel`).
+        model: positions and their derivative, as every map, chain and learner of this package has them; for poses also
+            the orientation (`PoseModel`): a `RigidChain` (that of a learner is `learner.chain`), a `KBMap` that has it,
+            or a `ToolLayer` on one of these.
         lower, upper: joint limits (d,) [rad, m]. A joint without a limit (infinite) may go anywhere; its samples are
             taken from one turn.
         seed: of the samples.
@@ -72,7 +75,9 @@ class InverseKinematics:
         tolerance, angle_tolerance: distance [m] and angle [rad] that count as reached.
 
     Raises:
-        ShapeError, SettingError (limits the wrong way round, or a setting that is not positive)
+        ShapeError, NonFiniteError
+        SettingError: no such model, limits the wrong way round, or a setting that is not positive.
+        DegenerateDataError: the model has learnt too few pairs to predict.
 
     Example:
         >>> import numpy as np
@@ -103,10 +108,13 @@ class InverseKinematics:
     ) -> None:
         if min(samples, 1 if starts is None else starts, max_steps) < 1 or not min(tolerance, angle_tolerance) > 0.0:
             raise SettingError("samples, starts, max_steps and both tolerances must be greater than 0")
+        _check_model(model)
         self._model = model
-        low, high = _limits("lower", lower, model.joints), _limits("upper", upper, model.joints)
+        low, high = (
+            frozen(limits(name, values, model.joints)) for name, values in (("lower", lower), ("upper", upper))
+        )
         if not (low <= high).all():
-            raise SettingError(f"joint {int((low > high).argmax())}'s lower limit is above its upper one")
+            raise SettingError(f"joint {int((low > high).argmax()) + 1}'s lower limit is above its upper one")
         begin, end = _one_turn(low, high)
         half = 0.5 * (end - begin)
         self._joints = JointRange(low, high, np.where(half > 0.0, half, 1.0))
@@ -233,19 +241,19 @@ class InverseKinematics:
         )
 
 
+def _check_model(model: object) -> None:
+    """Raises SettingError: it lacks what a `PositionModel` has."""
+    if missing := [name for name in ("joints", "predict", "jacobian") if not hasattr(model, name)]:
+        raise SettingError(
+            f"inverse kinematics needs a model with joints, predict and jacobian; a {type(model).__name__} has no "
+            f"{', '.join(missing)}. Give a chain, a map or a learner of kbmaps, or a class of your own that has them"
+        )
+
+
 def _pose_features(x: FloatArray, rotations: FloatArray, lever: float) -> FloatArray:
     """Points (..., 12) whose distances are those of poses: for small angles metres, and radians times lever."""
     turned = rotations.reshape(*x.shape[:-1], 9) * (lever / np.sqrt(2.0))
     return np.concatenate([x, turned], axis=-1)
-
-
-def _limits(name: str, values: ArrayLike, joints: int) -> FloatArray:
-    limits = np.array(values, dtype=np.float64)
-    if limits.shape != (joints,):
-        raise ShapeError(name, f"({joints},)", limits.shape)
-    if np.isnan(limits).any():
-        raise NonFiniteError(name)
-    return limits
 
 
 def _one_turn(low: FloatArray, high: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -3,43 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from kbmaps.arrays import FloatArray
+from kbmaps.model import PoseModel, PositionModel
 from kbmaps.rotations import rotation_vector
-
-
-class PositionModel(Protocol):
-    """A map from joint values to positions, with its derivative."""
-
-    @property
-    def joints(self) -> int:
-        """Number of joints d."""
-        ...
-
-    def predict(self, q: ArrayLike) -> FloatArray:
-        """Positions (n, 3) [m] at q (n, d) [rad, m], or (3,) at q (d,)."""
-        ...
-
-    def jacobian(self, q: ArrayLike) -> FloatArray:
-        """Their derivative (n, 3, d), or (3, d) at q (d,)."""
-        ...
-
-
-@runtime_checkable
-class PoseModel(PositionModel, Protocol):
-    """A map that has the orientation too."""
-
-    def orientation(self, q: ArrayLike, *, orthonormal: bool = False) -> FloatArray:
-        """Orientations (n, 3, 3), or (3, 3) at q (d,); with `orthonormal`, proper rotations."""
-        ...
-
-    def angular_jacobian(self, q: ArrayLike) -> FloatArray:
-        """Angular velocities (n, 3, d), or (3, d), of the orthonormal orientation, in the measurement frame."""
-        ...
 
 
 class Goal(Protocol):

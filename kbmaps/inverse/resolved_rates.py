@@ -7,7 +7,7 @@ from typing import cast
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kbmaps.arrays import BoolArray, FloatArray, vector
+from kbmaps.arrays import BoolArray, FloatArray, limits, numbers, vector
 from kbmaps.errors import NonFiniteError, SettingError, ShapeError
 
 _ROUNDING = 1e-24
@@ -47,7 +47,7 @@ def resolved_rates(
         >>> resolved_rates([[0.0, 0.5]], [0.1], damping=1e-6).round(6)
         array([0. , 0.2])
     """
-    J = np.asarray(jacobian, dtype=np.float64)
+    J = numbers("jacobian", jacobian)
     if J.ndim != 2:
         raise ShapeError("jacobian", "(m, d)", J.shape)
     if not np.isfinite(J).all():
@@ -55,8 +55,8 @@ def resolved_rates(
     m, d = J.shape
     if not damping > 0.0:
         raise SettingError(f"damping must be greater than 0 (rates have no bound without), got {damping!r}")
-    lows = np.full(d, -np.inf) if low is None else _limits("low", low, d)
-    highs = np.full(d, np.inf) if high is None else _limits("high", high, d)
+    lows = np.full(d, -np.inf) if low is None else limits("low", low, d)
+    highs = np.full(d, np.inf) if high is None else limits("high", high, d)
     if not (lows <= highs).all():
         raise SettingError("low must not be above high for any joint")
     wanted = np.zeros(d) if preferred is None else vector("preferred", preferred, d)
@@ -125,12 +125,3 @@ def _unbounded_step(
     gram = scaled @ scaled.T
     np.einsum("ii->i", gram)[:] += damping_square
     return base + scale * (scaled.T @ cast(FloatArray, np.linalg.solve(gram, wanted - jacobian @ base)))
-
-
-def _limits(name: str, values: ArrayLike, joints: int) -> FloatArray:
-    limits = np.asarray(values, dtype=np.float64)
-    if limits.shape != (joints,):
-        raise ShapeError(name, f"({joints},)", limits.shape)
-    if np.isnan(limits).any():
-        raise NonFiniteError(name)
-    return limits

@@ -9,8 +9,8 @@ import numpy as np
 
 from kbmaps.arrays import FloatArray
 from kbmaps.chains.carried import Predictor
-from kbmaps.maps.basis import JointBasis
-from kbmaps.maps.kbmap import KBMap
+from kbmaps.maps.basis import JointBasis, check_net_size
+from kbmaps.maps.kbmap import POSITION_OUTPUTS, KBMap
 
 _THIRD_OF_A_TURN = 2.0 * math.pi / 3.0
 
@@ -21,8 +21,9 @@ def sampled_map(model: Predictor, bases: Sequence[JointBasis]) -> KBMap:
     If the model is a KB-Map in another form, as a rigid chain is or a kernel learner around one, they agree everywhere.
 
     Raises:
-        BasisError, and what the model raises for joint values that are not its own.
+        NetSizeError: more than 3^13. BasisError, and what the model raises for joint values that are not its own.
     """
+    check_net_size(bases, POSITION_OUTPUTS)
     nodes = [_nodes(basis) for basis in bases]
     grid = np.stack(np.meshgrid(*nodes, indexing="ij"), axis=-1).reshape(-1, len(nodes))
     net = model.predict(grid).T.reshape(3, *(len(values) for values in nodes))

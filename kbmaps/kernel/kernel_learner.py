@@ -9,9 +9,8 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kbmaps.arrays import FloatArray, rows
-from kbmaps.chains.carried import Origin, Predictor, as_model, packable, unpacked
-from kbmaps.chains.chain import RigidChain
+from kbmaps.arrays import FloatArray, rows_or_vector
+from kbmaps.chains.carried import Origin, Predictor, packable, unpacked
 from kbmaps.errors import DegenerateDataError, ModelFormatError, SettingError
 from kbmaps.kernel.kept_pairs import KeptPairs
 from kbmaps.kernel.kernel_fit import Precision
@@ -50,7 +49,7 @@ class KernelLearner(KernelRegression):
     def __init__(
         self,
         bases: Sequence[JointBasis],
-        prior: RigidChain | Predictor | None = None,
+        prior: Predictor | None = None,
         *,
         precision: Precision = "evidence",
         memory: Memory | None = None,
@@ -61,7 +60,7 @@ class KernelLearner(KernelRegression):
         elif precision not in (None, "evidence"):
             raise SettingError(f'precision must be None, "evidence" or a number, got {precision!r}')
         super().__init__(bases, precision, memory)
-        self._prior: Predictor = Origin(self.joints) if prior is None else as_model(prior)
+        self._prior: Predictor = Origin(self.joints) if prior is None else prior
 
     @property
     def prior_precision(self) -> float:
@@ -98,30 +97,33 @@ class KernelLearner(KernelRegression):
         self._pairs.add(angles, positions, sigmas, self._prior)
         self._fit = None
 
-    def rebase(self, prior: RigidChain | Predictor) -> None:
+    def rebase(self, prior: Predictor) -> None:
         """Another prior for the same pairs, or the same one after it has changed."""
-        model: Predictor = as_model(prior)
-        self._pairs.replace_model(model)
-        self._prior, self._fit = model, None
+        self._pairs.replace_model(prior)
+        self._prior, self._fit = prior, None
 
     def estimate(self, q: ArrayLike) -> Estimate:
-        """Positions at q (n, d), their 1-sigma per axis against the truth, and whether data was there.
+        """Positions at q (n, d), or (d,), their 1-sigma per axis against the truth, and whether data was there.
 
-        A configuration is in support while the pairs leave at most `SUPPORT_LIMIT` of its prior variance open. Before
-        the first pair sigma is infinite: how good the prior is, only pairs can tell.
+        Support has a law of its own here: a configuration has it while the pairs leave at most `SUPPORT_LIMIT` of its
+        prior variance open. With fewer pairs than control points each pair takes up directions of its own and is known
+        to its noise alone, exact ones to rounding, so that by the law of `Estimate` next to nothing but the pairs
+        themselves would have it. Where λ is so large that even at the pairs more is left open, these have none either.
+        Before the first pair sigma is infinite: how good the prior is, only pairs can tell.
 
         Raises:
             ShapeError, NonFiniteError
         """
-        angles = rows("q", q, self.joints)
+        angles = rows_or_vector("q", q, self.joints)
+        batch = np.atleast_2d(angles)
+        n = len(batch)
         if not self.kept:
-            return Estimate(
-                self._prior.predict(angles), np.full((len(angles), 3), np.inf), np.zeros(len(angles), dtype=np.bool_)
-            )
-        weights = self._kernel.joint_weights(angles)
-        fit, features = self._fitted(), _no_features(len(angles))
-        sigma = np.sqrt(fit.variance(weights, features))
-        return Estimate(self.predict(angles), sigma, fit.unexplained(weights) <= SUPPORT_LIMIT)
+            unknown = Estimate(self._prior.predict(batch), np.full((n, 3), np.inf), np.zeros(n, dtype=np.bool_))
+            return unknown.like(angles)
+        weights = self._kernel.joint_weights(batch)
+        fit = self._fitted()
+        sigma = np.sqrt(fit.variance(weights, _no_features(n)))
+        return Estimate(self.predict(batch), sigma, fit.unexplained(weights) <= SUPPORT_LIMIT).like(angles)
 
     def to_bytes(self) -> bytes:
         """The learner with the pairs that count; `from_bytes` gives the same predictions to the last bit.

@@ -89,7 +89,11 @@ class KernelRegression(ABC):
         return slopes(self, q, self.bases)
 
     def to_kbmap(self) -> KBMap:
-        """The learnt map with its 3^d control points, exact where the model behind is a KB-Map or a rigid chain."""
+        """The learnt map with its 3^d control points, exact where the model behind is a KB-Map or a rigid chain.
+
+        Raises:
+            NetSizeError: more than 3^13.
+        """
         return sampled_map(self, self.bases)
 
     @abstractmethod

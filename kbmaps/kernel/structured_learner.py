@@ -9,23 +9,20 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kbmaps.arrays import FloatArray, frozen, rows
-from kbmaps.chains.carried import ChainModel
+from kbmaps.arrays import FloatArray, frozen, rows_or_vector
 from kbmaps.chains.chain import RigidChain
 from kbmaps.chains.packed import CHAIN, chain_arrays, chain_from_arrays, describe_tolerances, parse_tolerances
 from kbmaps.chains.parameters import WIDE, ChainParameters, ChainTolerances
-from kbmaps.errors import BasisError
 from kbmaps.kernel.kept_pairs import KeptPairs
+from kbmaps.kernel.kernel_fit import KernelFit
 from kbmaps.kernel.regression import KernelRegression
-from kbmaps.maps.basis import JointBasis
+from kbmaps.maps.basis import JointBasis, check_bases
 from kbmaps.maps.packed import describe_bases, parse_bases
 from kbmaps.memory import Memory, describe_memory, parse_memory
-from kbmaps.model import Estimate
+from kbmaps.model import Estimate, near_data, widest
 from kbmaps.packed import complete, count, named, pack, restoring, unpack
 
 _KIND = "structured learner, 2"
-# A configuration lies where data was while what is left open is at most the noise of a pair (in variance).
-_LARGEST_LEVERAGE = 1.0
 
 
 class StructuredLearner(KernelRegression):
@@ -44,7 +41,7 @@ class StructuredLearner(KernelRegression):
         memory: which of the old pairs count.
 
     Raises:
-        BasisError: another number of bases than joints.
+        BasisError: another number of bases than joints, or of other kinds.
     """
 
     def __init__(
@@ -55,11 +52,11 @@ class StructuredLearner(KernelRegression):
         *,
         memory: Memory | None = None,
     ) -> None:
-        if len(bases) != nominal.joints:
-            raise BasisError(f"need {nominal.joints} bases, one a joint; got {len(bases)}")
+        check_bases(bases, nominal.prismatic.tolist())
         super().__init__(bases, "evidence", memory)
-        self._nominal = ChainModel(nominal)
+        self._nominal = nominal
         self._tolerances = tolerances
+        self._widest: tuple[KernelFit, float] | None = None
         self._parameters = ChainParameters(nominal)
         std = np.minimum(self._parameters.standard_deviations(tolerances), WIDE)
         self._free = np.flatnonzero(std)
@@ -68,7 +65,7 @@ class StructuredLearner(KernelRegression):
     @property
     def nominal(self) -> RigidChain:
         """The chain that learning started from."""
-        return self._nominal.chain
+        return self._nominal
 
     @property
     def change(self) -> FloatArray:
@@ -96,19 +93,23 @@ class StructuredLearner(KernelRegression):
         self._fit = None
 
     def estimate(self, q: ArrayLike) -> Estimate:
-        """Positions at q (n, d), their 1-sigma per axis against the truth, and whether data was there.
+        """Positions at q (n, d), or (d,), their 1-sigma per axis against the truth, and whether data was there.
 
         Raises:
             ShapeError, NonFiniteError
         """
-        angles = rows("q", q, self.joints)
-        x, features = self._behind(angles)
+        angles = rows_or_vector("q", q, self.joints)
+        batch = np.atleast_2d(angles)
+        x, features = self._behind(batch)
         if not self.kept:
-            return Estimate(x, np.sqrt(np.square(features).sum(axis=2)), np.zeros(len(x), dtype=np.bool_))
-        fit, weights = self._fitted(), self._kernel.joint_weights(angles)
+            unknown = Estimate(x, np.sqrt(np.square(features).sum(axis=2)), np.zeros(len(x), dtype=np.bool_))
+            return unknown.like(angles)
+        fit, weights = self._fitted(), self._kernel.joint_weights(batch)
         variance = fit.variance(weights, features)
-        inside = variance.mean(axis=1) <= _LARGEST_LEVERAGE * self.noise**2
-        return Estimate(x + fit.mean(weights, features), np.sqrt(variance), inside)
+        if self._widest is None or self._widest[0] is not fit:
+            self._widest = fit, widest(fit.variance(self._kernel.joint_weights(self._pairs.q), self._features()))
+        inside = near_data(variance, self._widest[1])
+        return Estimate(x + fit.mean(weights, features), np.sqrt(variance), inside).like(angles)
 
     def to_bytes(self) -> bytes:
         """The learner with the pairs that count; `from_bytes` gives the same predictions to the last bit."""

@@ -19,8 +19,8 @@ from typing import Literal, NamedTuple, cast
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kbmaps.arrays import FloatArray, frozen
-from kbmaps.errors import BasisError, SingularAlphaError
+from kbmaps.arrays import FloatArray, frozen, numbers
+from kbmaps.errors import LARGEST_NET, BasisError, NetSizeError, SingularAlphaError
 
 BasisKind = Literal["bernstein", "trigonometric", "orthonormal", "prismatic", "prismatic_orthonormal"]
 
@@ -273,8 +273,8 @@ def learning_bases(
         >>> turning.kind, sliding.size
         ('orthonormal', 2)
     """
-    lows = [float(v) for v in np.atleast_1d(np.asarray(low, dtype=np.float64))]
-    highs = [float(v) for v in np.atleast_1d(np.asarray(high, dtype=np.float64))]
+    lows = [float(v) for v in np.atleast_1d(numbers("low", low))]
+    highs = [float(v) for v in np.atleast_1d(numbers("high", high))]
     kinds = [False] * len(lows) if prismatic is None else [bool(p) for p in prismatic]
     if not len(lows) == len(highs) == len(kinds):
         raise BasisError(f"need one range a joint: {len(lows)} low, {len(highs)} high, {len(kinds)} joint kinds")
@@ -282,3 +282,27 @@ def learning_bases(
         JointBasis.prismatic_orthonormal(a, b, scale) if slides else JointBasis.orthonormal(a, b, scale)
         for a, b, slides in zip(lows, highs, kinds, strict=True)
     )
+
+
+def check_bases(bases: Sequence[JointBasis], prismatic: Sequence[bool]) -> None:
+    """Checks bases for joints of these kinds.
+
+    Raises:
+        BasisError: another number of bases, or one of the wrong kind.
+    """
+    if len(bases) != len(prismatic):
+        raise BasisError(f"need {len(prismatic)} bases, one a joint; got {len(bases)}")
+    for k, (basis, slides) in enumerate(zip(bases, prismatic, strict=True)):
+        if basis.is_prismatic != bool(slides):
+            wanted = "prismatic" if slides else "revolute"
+            raise BasisError(
+                f"joint {k + 1} of {len(bases)} is {wanted} but its basis is {basis.kind}; "
+                "make the bases with learning_bases(low, high, prismatic=chain.prismatic)"
+            )
+
+
+def check_net_size(bases: Sequence[JointBasis], outputs: int) -> None:
+    """Raises NetSizeError unless a net in these bases is of a sane size."""
+    points = math.prod(basis.size for basis in bases)
+    if points > LARGEST_NET:
+        raise NetSizeError(points, outputs)

@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kbmaps.arrays import FloatArray, rows_or_vector
+from kbmaps.arrays import FloatArray, numbers, rows_or_vector
 from kbmaps.errors import BasisError, NonFiniteError, SettingError, ShapeError
 from kbmaps.maps.basis import JointBasis
 from kbmaps.maps.design import Design
@@ -298,7 +298,7 @@ class ExactLearner:
 def _checked_weights(weight: ArrayLike | None, pairs: int) -> FloatArray:
     if weight is None:
         return np.ones(pairs)
-    weights = np.asarray(weight, dtype=np.float64)
+    weights = numbers("weight", weight)
     if weights.shape not in ((), (pairs,)):
         raise ShapeError("weight", f"() or ({pairs},)", weights.shape)
     if not np.isfinite(weights).all():

@@ -12,7 +12,7 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kbmaps.arrays import FloatArray, frozen, rows, rows_or_vector, vector
+from kbmaps.arrays import FloatArray, frozen, numbers, rows, rows_or_vector, vector
 from kbmaps.errors import BasisError, NonFiniteError, ShapeError
 from kbmaps.maps import serial
 from kbmaps.maps.basis import JointBasis
@@ -209,9 +209,9 @@ class KBMap:
         for k, basis in enumerate(bases):
             if basis.to_bernstein() != basis:
                 raise BasisError(
-                    f"joint {k} has a {basis.kind} basis; control points need a Bernstein or prismatic one"
+                    f"joint {k + 1} has a {basis.kind} basis; control points need a Bernstein or prismatic one"
                 )
-        given = np.asarray(points, dtype=np.float64)
+        given = numbers("points", points)
         if given.ndim == 0 or given.shape[-1] != POSITION_OUTPUTS:
             raise ShapeError("points", f"(m1, ..., md, {POSITION_OUTPUTS})", given.shape)
         return cls(tuple(bases), np.moveaxis(given, -1, 0))
@@ -256,7 +256,7 @@ def _as_columns(axes: FloatArray) -> FloatArray:
 
 
 def _one_a_joint(name: str, values: ArrayLike, joints: int) -> list[float]:
-    given = np.asarray(values, dtype=np.float64)
+    given = numbers(name, values)
     if given.shape not in ((), (joints,)):
         raise ShapeError(name, f"() or ({joints},)", given.shape)
     if not np.isfinite(given).all():

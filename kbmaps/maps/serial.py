@@ -52,6 +52,8 @@ def decode(data: bytes) -> tuple[tuple[JointBasis, ...], FloatArray, dict[str, s
     Raises:
         ModelFormatError: the bytes are damaged, truncated, or something else.
     """
+    if not isinstance(data, bytes | bytearray | memoryview):  # pyright: ignore[reportUnnecessaryIsInstance]
+        raise ModelFormatError(f"a stored map is bytes, as to_bytes gives them; got {type(data).__name__}")
     view = memoryview(data)
     header, payload = _split(view)
     bases, outputs, metadata = _parse_header(header)

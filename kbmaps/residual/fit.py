@@ -18,11 +18,10 @@ from kbmaps.residual.correlation import innovations, most_probable
 from kbmaps.residual.evidence import Average, GroupedModel, Moments
 from kbmaps.residual.features import SMOOTH_GROUPS
 from kbmaps.residual.model import ResidualModel
+from kbmaps.robust import MEDIAN_NORM, ROUNDING_M
 
-# Noise that is estimated is never below this [m]: there rounding begins.
-_ROUNDING_M = 1e-9
-# Of the chi distribution in three dimensions: 3 of 100,000 good pairs are further out; its median.
-_OUTLIER_SIGMAS, _MEDIAN_NORM = 4.8, 1.538
+# Of the chi distribution in three dimensions: 3 of 100,000 good pairs are further out.
+_OUTLIER_SIGMAS = 4.8
 _ROUNDS, _SELECTIONS = 6, 2
 # Few enough rows for a processor's cache.
 _ROWS_AT_ONCE = 150
@@ -74,7 +73,7 @@ class _Fitter:
         self._known = tuple(prior.weights)
         self._free, self._root = squared(prior.root)
         self._unit = math.sqrt(float(np.square(pairs.unit).mean()))
-        self._least_noise = 1.0 if pairs.known else _ROUNDING_M / float(pairs.unit.min())
+        self._least_noise = 1.0 if pairs.known else ROUNDING_M / float(pairs.unit.min())
         self._on_path = self._features.follow_a_path(pairs.q)
         self._present = np.concatenate([change, *prior.weights.values()])
         self._fresh: dict[str, FloatArray] = {}
@@ -146,7 +145,7 @@ class _Fitter:
     def _judge_pairs(self, residuals: FloatArray) -> None:
         """The middle residual tells what is typical, the noise of the last round what is meant to be."""
         norms = np.linalg.norm(residuals, axis=1)
-        typical = max(float(np.median(norms)) / _MEDIAN_NORM, self._least_noise)
+        typical = max(float(np.median(norms)) / MEDIAN_NORM, self._least_noise)
         bound = typical if math.isinf(self.noise) else max(typical, self.noise)
         self.inliers = norms <= _OUTLIER_SIGMAS * bound
         if math.isinf(self.noise):

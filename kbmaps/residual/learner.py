@@ -2,32 +2,28 @@
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import replace
 from typing import Any, Self, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.special import stdtrit  # pyright: ignore[reportMissingTypeStubs, reportUnknownVariableType]
 
-from kbmaps.arrays import BoolArray, FloatArray
+from kbmaps.arrays import BoolArray, FloatArray, rows_or_vector
 from kbmaps.chains.belief import ChainBelief
 from kbmaps.chains.chain import RigidChain
 from kbmaps.chains.packed import CHAIN, chain_arrays, chain_from_arrays, describe_tolerances, parse_tolerances
 from kbmaps.chains.parameters import ChainTolerances
 from kbmaps.chains.rigid_learner import RigidLearner
-from kbmaps.model import Estimate
+from kbmaps.model import Estimate, near_data, widest
 from kbmaps.packed import complete, named, pack, restoring, unpack
-from kbmaps.pairs import checked_pairs, stored_pairs, with_units
+from kbmaps.pairs import checked_pairs, runs, stored_pairs, with_units
 from kbmaps.residual.features import ResidualScaling
 from kbmaps.residual.fit import ResidualFit, fit_residual
 from kbmaps.residual.model import ResidualModel
+from kbmaps.robust import claimed_sigma
 
 _KIND = "rigid chain with residual, batch, 2"
-# Configurations where the model is surer than this times the least sure pair (in variance) lie where data was.
-_SUPPORT_FACTOR = 2.0
 _LEAST_FREEDOM = 10.0
-_ONE_SIGMA = 0.841344746
 
 
 class ResidualLearner:
@@ -129,8 +125,16 @@ class ResidualLearner:
         """
         return self._rigid.predict(q) if self._is_rigid else self.model.predict(q)
 
+    def jacobian(self, q: ArrayLike) -> FloatArray:
+        """Derivative (3, d) of the position [m/rad, or m/m], or (n, 3, d) for q (n, d), to about 1e-12.
+
+        Raises:
+            ShapeError, NonFiniteError
+        """
+        return self._rigid.jacobian(q) if self._is_rigid else self.model.jacobian(q)
+
     def estimate(self, q: ArrayLike) -> Estimate:
-        """Positions at q (n, d), their 1-sigma per axis against the truth, and whether data was there.
+        """Positions at q (n, d), or (d,), their 1-sigma per axis against the truth, and whether data was there.
 
         Where the told noise does not explain the residuals, what is left over adds to sigma everywhere.
 
@@ -139,16 +143,12 @@ class ResidualLearner:
         """
         if self._is_rigid:
             return self._rigid.estimate(q)
-        fit = self._fitted()
-        x, variance = self.model.predict_with_variance(q)
+        angles, fit = rows_or_vector("q", q, self.joints), self._fitted()
+        x, variance = self.model.predict_with_variance(np.atleast_2d(angles))
         if fit is None:
-            return Estimate(x, np.sqrt(variance), np.zeros(len(x), dtype=np.bool_))
-        inside = variance.sum(axis=1) <= _SUPPORT_FACTOR * self._widest
-        pairs = with_units(self._q, self._x, self._sigma)
-        if pairs.known:
-            variance = variance + (fit.noise**2 - 1.0) * float(np.square(pairs.unit).mean())
-            return Estimate(x, np.sqrt(variance), inside)
-        return Estimate(x, np.sqrt(variance) * float(stdtrit(max(fit.freedom, 1.0), _ONE_SIGMA)), inside)
+            return Estimate(x, np.sqrt(variance), np.zeros(len(x), dtype=np.bool_)).like(angles)
+        sigma = claimed_sigma(variance, with_units(self._q, self._x, self._sigma), fit.noise, fit.freedom)
+        return Estimate(x, sigma, near_data(variance, self._widest)).like(angles)
 
     def to_bytes(self) -> bytes:
         """The learner with all its pairs; `from_bytes` gives the same predictions to the last bit."""
@@ -168,8 +168,8 @@ class ResidualLearner:
             learner = cls(nominal, tolerances, _stored_prior(fields["prior"]))
             q, x, sigma = stored_pairs(arrays, learner.joints)
             told = ~np.isnan(sigma)
-            for start, end in _runs(told):
-                learner.learn(q[start:end], x[start:end], sigma[start:end] if told[start] else None)
+            for run in runs(told):
+                learner.learn(q[run], x[run], sigma[run] if told[run.start] else None)
         return learner
 
     @property
@@ -197,7 +197,7 @@ class ResidualLearner:
             self._model = self._rigid_model(before) if self._fit is None else self._fit.model
             if self._fit is not None:
                 _, variance = self._model.predict_with_variance(self._q[self._fit.inliers])
-                self._widest = float(variance.sum(axis=1).max(initial=0.0))
+                self._widest = widest(variance)
         return self._fit
 
     def _rigid_model(self, before: ResidualModel) -> ResidualModel:
@@ -214,9 +214,3 @@ def _stored_prior(value: Any) -> ChainBelief | ResidualModel | None:
     if isinstance(value, dict) and "belief" in value:
         return ChainBelief.from_bytes(bytes.fromhex(named(cast(Any, value), "the prior", ("belief",))["belief"]))
     return ResidualModel.from_bytes(bytes.fromhex(named(value, "the prior", ("model",))["model"]))
-
-
-def _runs(values: BoolArray) -> list[tuple[int, int]]:
-    """Begin and end of each run of equal values."""
-    ends = [0, *(np.flatnonzero(values[1:] != values[:-1]) + 1).tolist(), len(values)]
-    return list(itertools.pairwise(ends)) if len(values) else []

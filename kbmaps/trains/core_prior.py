@@ -8,9 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from kbmaps.arrays import FloatArray, frozen
-from kbmaps.chains.chain import RigidChain, cross_matrix
+from kbmaps.chains.chain import RigidChain
 from kbmaps.errors import NonFiniteError, SettingError, ShapeError
 from kbmaps.maps.basis import JointBasis
+from kbmaps.rotations import cross_matrix
 from kbmaps.trains.train import TensorTrain
 
 CORE_NUMBERS = 36

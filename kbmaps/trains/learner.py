@@ -16,7 +16,7 @@ from kbmaps.errors import DegenerateDataError, ModelFormatError, SettingError, S
 from kbmaps.maps.basis import JointBasis
 from kbmaps.maps.packed import describe_bases, parse_bases
 from kbmaps.maps.stack import BasisStack
-from kbmaps.model import Estimate
+from kbmaps.model import Estimate, near_data
 from kbmaps.packed import complete, count, flag, named, number, pack, restoring, unpack
 from kbmaps.pairs import checked_pairs, stored_pairs
 from kbmaps.trains.core_evidence import USUAL_ELLIPSE_STD, core_equations, likely_ellipse_std
@@ -27,7 +27,7 @@ from kbmaps.trains.search import PLAUSIBLE, Fit, Pairs, information, refine, sea
 from kbmaps.trains.settings import TensorSettings, parse_settings
 from kbmaps.trains.train import TensorTrain
 
-KIND = "tensor learner, 2"
+KIND = "tensor learner, 3"
 _FIELDS = ("bases", "settings", "pairs", "waiting", "searches", "length")
 _FITTED = ("z", "sure", "used", "information", "absorbed")
 # Relative to the residuals under the prior: the noise that the first fit around a prior starts with.
@@ -200,23 +200,23 @@ class TensorLearner:
             raise SettingError(f"keep must be at least 0, got {keep}")
         self._keep(keep)
 
-    def move_marker(self, std: float) -> None:
-        """The marker has been moved: keeps what is known of all other cores, and forgets the pairs.
+    def tool_changed(self, tolerance: float) -> None:
+        """Tells that the marker was moved: keeps what is known of all other cores, and forgets the pairs.
 
         The train so far becomes the prior's mean. Each core's covariance is the one it has while the others rest,
-        which pins the frames between them. The last core is as free as a marker moved by `std` makes it: along the
-        axes of its frame where a nominal chain gave them, and any way where nothing did.
+        which pins the frames between them. The last core is as free as a marker moved so far makes it: along the axes
+        of its frame where a nominal chain gave them, and any way where nothing did.
 
         Args:
-            std: standard deviation of each component of the move [m].
+            tolerance: 1-sigma of each component of the move [m].
 
         Raises:
-            SettingError: std is not positive.
+            SettingError: the tolerance is not positive.
             DegenerateDataError: there is neither a prior nor enough pairs.
         """
-        if not std > 0.0:
-            raise SettingError(f"std must be greater than 0, got {std!r}")
-        prior = self.posterior.with_moved_marker(std)
+        if not (tolerance > 0.0 and math.isfinite(tolerance)):
+            raise SettingError(f"tolerance must be finite and greater than 0 m, got {tolerance!r}")
+        prior = self.posterior.with_other_tool(tolerance)
         self._keep(0)
         self.rebase(prior)
 
@@ -266,22 +266,30 @@ class TensorLearner:
         """
         return self.train.predict(q)
 
-    def estimate(self, q: ArrayLike) -> Estimate:
-        """Positions at q (n, d) with the standard deviation that Gauss and Newton's posterior leaves them.
-
-        Where residuals show joints or an instrument that err as no train does, what that leaves open adds to it
-        (`kbmaps.trains.misfit`).
-
-        A configuration is in support while its prediction is no less certain than one measurement (leverage ≤ 1).
+    def jacobian(self, q: ArrayLike) -> FloatArray:
+        """Derivative (3, d) of the position [m/rad, or m/m], or (n, 3, d) for q (n, d); exact.
 
         Raises:
             ShapeError, NonFiniteError
             DegenerateDataError: there is neither a prior nor enough pairs.
         """
-        angles, posterior = np.atleast_2d(rows_or_vector("q", q, self.joints)), self.posterior
-        variance = posterior.variance(angles)
-        inside = variance.mean(axis=1) <= posterior.noise**2
-        return Estimate(self.predict(angles), np.sqrt(variance), inside)
+        return self.train.jacobian(q)
+
+    def estimate(self, q: ArrayLike) -> Estimate:
+        """Positions at q (n, d), or (d,), with the standard deviation that Gauss and Newton's posterior leaves them.
+
+        Where residuals show joints or an instrument that err as no train does, what that leaves open adds to it
+        (`kbmaps.trains.misfit`).
+
+        Raises:
+            ShapeError, NonFiniteError
+            DegenerateDataError: there is neither a prior nor enough pairs.
+        """
+        angles = rows_or_vector("q", q, self.joints)
+        batch = np.atleast_2d(angles)
+        variance = self.posterior.variance(batch)
+        inside = near_data(variance, self.posterior.widest)
+        return Estimate(self.predict(batch), np.sqrt(variance), inside).like(angles)
 
     def to_bytes(self) -> bytes:
         """The train, its prior, the kept pairs and the settings as one self-describing byte string."""
@@ -293,7 +301,7 @@ class TensorLearner:
         known = None if self._posterior is None else self._posterior.information
         if self._fit is not None and self._posterior is not None and known is not None:
             used = self._fit.used.astype(np.float64)
-            sure = np.array([self._fit.noise, *self._posterior.misfit])
+            sure = np.array([self._fit.noise, self._posterior.widest, *self._posterior.misfit])
             arrays |= {"z": self._fit.z, "sure": sure, "used": used, "information": known}
             arrays |= {"absorbed": self._posterior.absorbed}
         content = {
@@ -341,16 +349,15 @@ class TensorLearner:
     def _restore_fit(self, prior: CorePrior, arrays: Mapping[str, FloatArray]) -> None:
         size = CORE_NUMBERS * self.joints
         z, used = vector("z", arrays["z"], size), arrays["used"]
-        noise, *misfit = (float(value) for value in vector("sure", arrays["sure"], 4))
+        noise, least_sure, *misfit = (float(value) for value in vector("sure", arrays["sure"], 5))
         if used.ndim != 1 or not np.isin(used, (0.0, 1.0)).all() or not noise > 0.0:
             raise ModelFormatError("it is not said which pairs a fit used, or it has no noise")
         self._fit = Fit(z, noise, used.astype(np.bool_))
         self._train = TensorTrain(self.bases, prior.cores(z))
         known = _of_rows("information", arrays["information"], size, size)
         self._posterior = TensorPosterior(self._train, prior, known, noise=noise)
-        self._posterior.take(
-            np.array(misfit), _of_rows("absorbed", arrays["absorbed"], size, sum(misfit_sizes(self.joints)))
-        )
+        absorbed = _of_rows("absorbed", arrays["absorbed"], size, sum(misfit_sizes(self.joints)))
+        self._posterior.restore(np.array(misfit), absorbed, least_sure)
 
     def _keep(self, count: int) -> None:
         begin = max(len(self._q) - count, 0)

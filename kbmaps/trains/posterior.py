@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 
 from kbmaps.arrays import FloatArray, rows
 from kbmaps.maps.stack import BasisStack
+from kbmaps.model import widest
 from kbmaps.trains.core_prior import CORE_NUMBERS, CorePrior
 from kbmaps.trains.fit import whitened_jacobian
 from kbmaps.trains.misfit import likely_misfit, misfit_directions, misfit_sizes
@@ -40,6 +41,8 @@ class TensorPosterior:
         self._sizes = misfit_sizes(prior.joints)
         size = CORE_NUMBERS * prior.joints
         self._left: tuple[FloatArray, FloatArray, FloatArray] | None = None
+        self._learnt: FloatArray | None = None
+        self._widest = widest(np.empty((0, 3)))
         self._misfit, self._absorbed = np.zeros(len(self._sizes)), np.zeros((size, sum(self._sizes)))
 
     def judge(self, q: FloatArray, residuals: FloatArray, std: FloatArray) -> None:
@@ -49,7 +52,7 @@ class TensorPosterior:
             q: configurations (n, d) of the pairs that the fit used; residuals: (n, 3) [m] there.
             std: of a coordinate of each (n,) [m], as in `information`.
         """
-        self._left = q, residuals, std
+        self._left, self._learnt = (q, residuals, std), q
 
     @property
     def misfit(self) -> FloatArray:
@@ -63,6 +66,13 @@ class TensorPosterior:
         self._judge_what_is_left()
         return self._absorbed
 
+    @property
+    def widest(self) -> float:
+        """The greatest variance of a position among the pairs that the fit used [m²] (`kbmaps.model.widest`)."""
+        if self._learnt is not None:
+            self._widest, self._learnt = widest(self.variance(self._learnt)), None
+        return self._widest
+
     def _judge_what_is_left(self) -> None:
         if self._left is None:
             return
@@ -75,6 +85,11 @@ class TensorPosterior:
     def take(self, misfit: FloatArray, absorbed: FloatArray) -> None:
         """The standard deviations (3,) [rad, m], and how the cores make up for the errors (36 d, 5 d + 18)."""
         self._misfit, self._absorbed, self._left = misfit, absorbed, None
+
+    def restore(self, misfit: FloatArray, absorbed: FloatArray, widest: float) -> None:
+        """What `misfit`, `absorbed` and `widest` were of a posterior that was stored."""
+        self.take(misfit, absorbed)
+        self._widest = widest
 
     @cached_property
     def _root(self) -> FloatArray:
@@ -107,15 +122,19 @@ class TensorPosterior:
             variance[part] = np.square(self.roots(q[part])).sum(axis=2)
         return variance
 
-    def with_moved_marker(self, std: float) -> CorePrior:
-        """The cores' own posteriors, each while the others rest; the last as free as a marker moved by `std` [m]."""
+    def with_other_tool(self, tolerance: float) -> CorePrior:
+        """The cores' own posteriors, each while the others rest; the last as free as a moved marker makes it.
+
+        Args:
+            tolerance: 1-sigma of each component of the move [m].
+        """
         cores, spread = self._train.cores.reshape(self.joints, CORE_NUMBERS), self._prior.spread
         if self.information is not None:
             blocks = range(0, CORE_NUMBERS * self.joints, CORE_NUMBERS)
             told = np.stack([self.information[k : k + CORE_NUMBERS, k : k + CORE_NUMBERS] for k in blocks])
             spread = spread @ inverse_roots(told)
         spread = spread.copy()
-        moves = _marker_moves(cores[-1].reshape(3, 3, 4), std)
+        moves = _marker_moves(cores[-1].reshape(3, 3, 4), tolerance)
         values, vectors = np.linalg.eigh(spread[-1] @ spread[-1].T + moves @ moves.T)
         spread[-1] = vectors * np.sqrt(np.maximum(values, 0.0))
         return CorePrior(cores, spread)

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation  # pyright: ignore[reportMissingTyp
 from kbmaps.arrays import BoolArray, FloatArray
 from kbmaps.chains.chain import RigidChain
 from kbmaps.maps.basis import JointBasis
+from kbmaps.robust import MEDIAN_NORM
 from kbmaps.trains.core_prior import CorePrior
 from kbmaps.trains.fit import LevenbergMarquardt, TensorProblem, alternate
 from kbmaps.trains.train import TensorTrain
@@ -28,8 +29,6 @@ _ROUNDS = 40
 _SAME_NOISE = 0.02
 # Starts that failed leave a tenth or more of the spread, and may agree on it by chance.
 PLAUSIBLE = 0.1
-# The median of |r| for r ~ N(0, I) in three dimensions.
-_MEDIAN_DISTANCE = 1.538
 # Farther than this many robust standard deviations a pair is wrong: 1.5e-5 of good pairs are.
 _OUTLIER_DISTANCE = 5.0
 _WEIGHT_SCALE = 4.0
@@ -224,7 +223,7 @@ def _distances(pairs: Pairs, prior: CorePrior, fit: Fit) -> tuple[FloatArray, bo
     problem = pairs.problem(prior, fit.noise)
     freedom = 1.0 - effective_parameters(problem, fit.z) / (3.0 * len(pairs.x))
     lengths = np.linalg.norm(problem.residuals(fit.z), axis=1) / problem.std
-    unit = float(np.median(lengths)) / (_MEDIAN_DISTANCE * math.sqrt(max(freedom, _LEAST_FREEDOM)))
+    unit = float(np.median(lengths)) / (MEDIAN_NORM * math.sqrt(max(freedom, _LEAST_FREEDOM)))
     rounding = fit.noise <= 2.0 * pairs.noise_floor
     least = pairs.noise_floor / fit.noise if pairs.unknown.any() else 1.0
     return lengths / max(unit, least), freedom >= _LEAST_FREEDOM and not rounding

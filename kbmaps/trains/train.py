@@ -11,8 +11,8 @@ from numpy.typing import ArrayLike
 from kbmaps.arrays import FloatArray, frozen, rows_or_vector
 from kbmaps.chains.chain import RigidChain
 from kbmaps.errors import BasisError, NonFiniteError, ShapeError
-from kbmaps.maps.basis import JointBasis
-from kbmaps.maps.kbmap import KBMap
+from kbmaps.maps.basis import JointBasis, check_bases, check_net_size
+from kbmaps.maps.kbmap import POSITION_OUTPUTS, KBMap
 from kbmaps.maps.packed import describe_bases, parse_bases
 from kbmaps.maps.stack import BasisStack
 from kbmaps.packed import complete, named, pack, restoring, unpack
@@ -62,7 +62,7 @@ class TensorTrain:
             raise NonFiniteError("cores")
         for k, basis in enumerate(bases):
             if cores[k, basis.size :].any():
-                raise BasisError(f"joint {k} is prismatic: the third slice of its core must be 0")
+                raise BasisError(f"joint {k + 1} is prismatic: the third slice of its core must be 0")
         object.__setattr__(self, "bases", bases)
         object.__setattr__(self, "cores", cores)
         object.__setattr__(self, "_stack", BasisStack(bases))
@@ -74,13 +74,9 @@ class TensorTrain:
         Raises:
             BasisError: another number of bases, or a revolute basis for a prismatic joint.
         """
-        if len(bases) != chain.joints:
-            raise BasisError(f"need {chain.joints} bases, one a joint; got {len(bases)}")
+        check_bases(bases, chain.prismatic.tolist())
         cores = np.zeros((chain.joints, 3, 3, 4))
         for k, basis in enumerate(bases):
-            if basis.is_prismatic != bool(chain.prismatic[k]):
-                wanted = "prismatic" if chain.prismatic[k] else "revolute"
-                raise BasisError(f"joint {k} is {wanted} but its basis is {basis.kind}")
             last = chain.fixed[k + 1] if k == chain.joints - 1 else np.eye(4)
             link = RigidChain(np.stack([chain.fixed[k], last]), chain.axes[k : k + 1], chain.prismatic[k : k + 1])
             # monomials = weights @ inv(matrix), so Σ_i monomial_i A_i = Σ_j weight_j Σ_i inv(matrix)_ji A_i
@@ -134,7 +130,12 @@ class TensorTrain:
         return TensorTrain(tuple(bases), cores)
 
     def to_kbmap(self) -> KBMap:
-        """The same map with its full control net: 3^d control points, so for few joints only."""
+        """The same map with its full control net: 3^d control points, so for few joints only.
+
+        Raises:
+            NetSizeError: more than 3^13.
+        """
+        check_net_size(self.bases, POSITION_OUTPUTS)
         tensor: FloatArray = np.array([0.0, 0.0, 0.0, 1.0])
         for k in range(self.joints - 1, -1, -1):
             size = self.bases[k].size

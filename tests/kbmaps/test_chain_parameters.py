@@ -8,7 +8,7 @@ from planted_chains import random_chain, random_q
 from scipy.spatial.transform import Rotation
 
 from kbmaps import ChainParameters, ChainTolerances, SettingError
-from kbmaps.chains.parameters import rotation_vector
+from kbmaps.rotations import rotation_vector
 
 seeds = st.integers(0, 2**32 - 1)
 kinds = st.text("RP", min_size=1, max_size=6)

@@ -77,3 +77,8 @@ def test_positions_in_one_place_are_refused():
 def test_impossible_settings_are_refused(settings, error):
     with pytest.raises(error):
         find_chain(np.zeros((30, 3)), np.ones((30, 3)), rng=np.random.default_rng(0), **settings)
+
+
+def test_a_seed_in_place_of_a_generator_is_refused_with_what_to_write():
+    with pytest.raises(SettingError, match="default_rng"):
+        find_chain(np.zeros((20, 2)), np.zeros((20, 3)), rng=0)

@@ -71,7 +71,7 @@ def test_an_alpha_near_90_degrees_is_refused():
 
 
 def test_coefficients_of_another_basis_are_not_taken_for_control_points():
-    with pytest.raises(BasisError, match="joint 0"):
+    with pytest.raises(BasisError, match="joint 1"):
         KBMap.from_control_points(bases_for("R"), np.ones((3, 3)))
     with pytest.raises(ShapeError):
         KBMap.from_control_points([JointBasis.bernstein(1.0)], np.ones((3, 2)))

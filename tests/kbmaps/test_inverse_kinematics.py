@@ -10,7 +10,18 @@ from planted_chains import bases_for, half_ranges, random_chain, random_map, ran
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
-from kbmaps import InverseKinematics, KBMap, RigidChain, SettingError, ShapeError, learning_bases
+from kbmaps import (
+    ChainTolerances,
+    InverseKinematics,
+    KBMap,
+    Model,
+    RigidChain,
+    RigidLearner,
+    SettingError,
+    ShapeError,
+    TensorLearner,
+    learning_bases,
+)
 
 seeds = st.integers(0, 2**32 - 1)
 RANGE_DEG = 100.0
@@ -247,3 +258,49 @@ def test_targets_of_the_wrong_shape_are_refused():
             solver.solve(*arguments)
     with pytest.raises(ShapeError):
         InverseKinematics(planar_map(0.3, 0.2), [-1, -1, -1], [1, 1, 1])
+
+
+def humanoid() -> RigidChain:
+    """Twenty joints, links of 60 mm, axes in turn about z, y and x."""
+    fixed = np.tile(np.eye(4), (21, 1, 1))
+    fixed[1:, :3, 3] = [0.05, 0.02, 0.03]
+    return RigidChain(fixed, np.eye(3)[[2 - k % 3 for k in range(20)]], np.zeros(20, dtype=bool))
+
+
+@pytest.mark.parametrize("kind", ["rigid", "train"])
+def test_learnt_arms_of_twenty_joints_reach_within_what_they_are_sure_of(kind):
+    rng = np.random.default_rng(0)
+    drawing, reach = humanoid(), np.full(20, np.radians(40.0))
+    real = drawing.with_tool([0.02, -0.01, 0.03])
+    learner: Model = RigidLearner(drawing, ChainTolerances(tool=0.03))
+    if kind == "train":
+        learner = TensorLearner.around(drawing, learning_bases(-reach, reach))
+    q = rng.uniform(-reach, reach, (60, 20))
+    learner.learn(q, real.positions(q) + 1e-3 * rng.normal(size=(60, 3)), 1e-3)
+    solver = InverseKinematics(learner, -reach, reach)
+    for target in real.positions(rng.uniform(-reach, reach, (3, 20))):
+        solution = solver.solve(target)
+        assert solution.converged
+        off = np.abs(real.positions(solution.q) - target)
+        assert (off < 5.0 * learner.estimate(solution.q).sigma + 1e-6).all()
+
+
+def test_a_chain_reaches_a_pose():
+    rng = np.random.default_rng(1)
+    chain = random_chain(rng, "RRRPRRR")
+    half = half_ranges("RRRPRRR", RANGE_DEG)
+    truth = random_q(rng, "RRRPRRR", 1, RANGE_DEG)[0]
+    solution = InverseKinematics(chain, -half, half).solve(chain.predict(truth), chain.orientation(truth))
+    assert solution.converged
+    np.testing.assert_allclose(chain.poses(solution.q), chain.poses(truth), rtol=0, atol=1e-6)
+
+
+def test_what_is_no_model_is_refused_with_what_it_lacks():
+    class Guess:
+        joints = 2
+        predict = staticmethod(np.zeros)
+
+    with pytest.raises(SettingError, match="a Guess has no jacobian"):
+        InverseKinematics(Guess(), [-1, -1], [1, 1])
+    with pytest.raises(SettingError, match="a str has no joints, predict, jacobian"):
+        InverseKinematics("arm", [-1, -1], [1, 1])

@@ -13,12 +13,14 @@ from rough_arms import ROUGH, Arm, rough_arm
 
 from kbmaps import (
     DegenerateDataError,
+    InverseKinematics,
     KernelLearner,
     Ladder,
     Memory,
     Model,
     ModelFormatError,
     NonFiniteError,
+    NotNumbersError,
     RecursiveRigidLearner,
     ResidualLearner,
     RigidLearner,
@@ -50,6 +52,9 @@ MODELS: dict[str, Callable[[Arm], Model]] = {
     "tensor": lambda arm: TensorLearner.around(arm.nominal, bases_for(KINDS)),
     "tensor, from nothing": lambda arm: TensorLearner(bases_for(KINDS)),
 }
+# Those that say what is in support by the law of `Estimate`, and of these those of which not all is shown by any pair.
+LAWFUL = [name for name in MODELS if not name.startswith("kernel")]
+LOCAL = [name for name in LAWFUL if not name.startswith("tool layer")]
 # Those whose state takes more pairs than a lesson of 12 to be there whole.
 LONG = {
     "recursive rigid, with a folded window": 40,
@@ -113,6 +118,59 @@ def test_a_row_of_a_batch_is_what_is_predicted_for_it_alone(taught, q):
     assert batch.shape == (7, 3)
     for k in range(7):
         np.testing.assert_allclose(taught.predict(q[k]), batch[k], rtol=0, atol=1e-12)
+
+
+def test_the_jacobian_is_the_derivative_of_what_is_predicted(taught, q):
+    step = 1e-4
+    jacobian = taught.jacobian(q)
+    assert jacobian.shape == (7, 3, 3)
+    for k, move in enumerate(step * np.eye(3)):
+        x = [taught.predict(q + way * move) for way in (-2, -1, 1, 2)]
+        slope = (x[0] - 8.0 * x[1] + 8.0 * x[2] - x[3]) / (12.0 * step)
+        np.testing.assert_allclose(jacobian[:, :, k], slope, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(taught.jacobian(q[2]), jacobian[2], rtol=0, atol=1e-12)
+
+
+def test_inverse_kinematics_solves_on_it(taught, q):
+    solution = InverseKinematics(taught, -np.abs(q).max(axis=0), np.abs(q).max(axis=0)).solve(taught.predict(q[0]))
+    assert solution.converged
+
+
+def test_the_estimate_for_one_configuration_is_its_row_of_a_batch(taught, q):
+    one, batch = taught.estimate(q[2]), taught.estimate(q)
+    assert (one.x.shape, one.sigma.shape, one.in_support.shape) == ((3,), (3,), ())
+    np.testing.assert_allclose(one.x, batch.x[2], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(one.sigma, batch.sigma[2], rtol=1e-6, atol=1e-12)
+    assert one.in_support == batch.in_support[2]
+
+
+@pytest.mark.parametrize("name", LAWFUL)
+def test_all_learnt_pairs_are_in_support(model, arm):
+    q, x = arm.pairs(np.random.default_rng(8), 60, 0.001)
+    model.learn(q, x)
+    assert model.estimate(q).in_support.all()
+
+
+@pytest.mark.parametrize("name", LOCAL)
+def test_far_from_a_small_zone_nothing_is_in_support(model, arm):
+    rng = np.random.default_rng(9)
+    model.learn(*arm.pairs(rng, 60, 0.001, reach_deg=10.0))
+    q = arm.pairs(rng, 500)[0]
+    far = np.abs(q)[:, [0, 2]].max(axis=1) > np.radians(50.0)
+    assert model.estimate(q[far]).in_support.mean() < 0.05
+
+
+def test_learners_of_the_same_chain_agree_on_where_data_was():
+    rng = np.random.default_rng(10)
+    arm = rough_arm(rng)
+    q, x = arm.pairs(rng, 100, 0.002, reach_deg=30.0)
+    elsewhere = arm.pairs(rng, 1000)[0]
+    shares = []
+    for learner in (RigidLearner, RecursiveRigidLearner, ResidualLearner):
+        model: Model = learner(arm.nominal, ROUGH)
+        model.learn(q, x)
+        shares.append(model.estimate(elsewhere).in_support.mean())
+    assert 0.02 < min(shares) <= max(shares) < min(shares) + 0.03 < 0.2
 
 
 def test_an_estimate_is_of_what_is_predicted_and_says_how_sure_it_is(taught, q):
@@ -191,6 +249,9 @@ def test_damaged_bytes_are_refused(taught, spoil):
 @pytest.mark.parametrize(
     ("error", "q", "x", "sigma"),
     [
+        (NotNumbersError, "a", np.zeros(3), None),
+        (NotNumbersError, [[0.0, 0.0, 0.0], [0.0]], np.zeros((2, 3)), None),
+        (NotNumbersError, np.zeros(3), np.zeros(3), "a"),
         (ShapeError, np.zeros(4), np.zeros(3), None),
         (ShapeError, np.zeros((2, 3)), np.zeros((3, 3)), None),
         (ShapeError, np.zeros((2, 3)), np.zeros((2, 3)), np.ones(3)),
@@ -204,6 +265,11 @@ def test_refused_pairs_change_nothing(taught, error, q, x, sigma):
     with pytest.raises(error):
         taught.learn(q, x, sigma)
     assert taught.to_bytes() == before
+
+
+def test_what_is_no_bytes_is_refused(model):
+    with pytest.raises(ModelFormatError, match="bytes, as to_bytes gives them"):
+        type(model).from_bytes("x")
 
 
 def test_wrong_configurations_are_refused(taught):

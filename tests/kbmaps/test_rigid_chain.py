@@ -7,7 +7,17 @@ from hypothesis import strategies as st
 from planted_chains import bases_for, random_chain, random_q
 from scipy.spatial.transform import Rotation
 
-from kbmaps import BasisError, ChainError, JointBasis, NonFiniteError, RigidChain, ShapeError
+from kbmaps import (
+    BasisError,
+    ChainError,
+    JointBasis,
+    KernelLearner,
+    NetSizeError,
+    NonFiniteError,
+    RigidChain,
+    ShapeError,
+    TensorTrain,
+)
 
 kinds = st.text("RP", min_size=1, max_size=6)
 seeds = st.integers(0, 2**32 - 1)
@@ -122,5 +132,27 @@ def test_a_chain_with_nan_is_refused():
 
 
 def test_a_revolute_basis_for_a_prismatic_joint_is_refused():
-    with pytest.raises(BasisError, match="joint 1 is prismatic"):
+    with pytest.raises(BasisError, match=r"joint 2 of 2 is prismatic .* learning_bases\(low, high, prismatic="):
         random_chain(np.random.default_rng(1), "RP").to_kbmap([JointBasis.trigonometric()] * 2)
+
+
+@pytest.mark.parametrize("orientation", [False, True])
+def test_a_map_of_twenty_joints_is_refused_with_its_size_and_a_way_out(orientation):
+    bases, chain = bases_for("R" * 20), random_chain(np.random.default_rng(0), "R" * 20)
+    with pytest.raises(NetSizeError, match=r"3,486,784,401 control points, (77\.9|312) GiB.*InverseKinematics"):
+        chain.to_kbmap(bases, orientation=orientation)
+    with pytest.raises(NetSizeError):
+        TensorTrain.from_chain(chain, bases).to_kbmap()
+    with pytest.raises(NetSizeError):
+        KernelLearner(bases, chain).to_kbmap()
+
+
+@given(seed=seeds, joint_kinds=kinds)
+@settings(max_examples=15, deadline=None)
+def test_the_angular_jacobian_is_how_the_marker_frame_turns(seed, joint_kinds):
+    rng = np.random.default_rng(seed)
+    chain, step = random_chain(rng, joint_kinds), 1e-6
+    q = random_q(rng, joint_kinds, 1, 180)[0]
+    for k, move in enumerate(step * np.eye(len(joint_kinds))):
+        turn = Rotation.from_matrix(chain.orientation(q + move) @ chain.orientation(q - move).T).as_rotvec()
+        np.testing.assert_allclose(chain.angular_jacobian(q)[:, k], turn / (2.0 * step), rtol=0, atol=1e-7)

@@ -411,3 +411,17 @@ def test_a_twin_fits_nothing_that_has_been_fitted(monkeypatch):
     first.predict(q)
     monkeypatch.setattr(rigid_learner, "fit_chain", None)
     np.testing.assert_array_equal(twin.predict(q), first.predict(q))
+
+
+def test_a_printed_report_is_a_table_in_millimetres_and_degrees():
+    rng = np.random.default_rng(5)
+    arm = rough_arm(rng, "RPR", ChainTolerances(axes=0.01, zeros=0.05, slide_zeros=0.02, tool=0.05))
+    learner = RigidLearner(arm.nominal, ChainTolerances(axes=0.01, zeros=0.05, slide_zeros=0.02, tool=0.05))
+    learner.learn(*arm.pairs(rng, 60, 0.001))
+    report = learner.report()
+    lines = str(report).splitlines()
+    zero, half = (np.degrees(values[0]) for values in (report.zeros.value, report.zeros.half_width))
+    assert f"joint 1 zero  {zero:>10.3f} ± {half:.3f} deg" in lines
+    slide, half = (1e3 * values[1] for values in (report.zeros.value, report.zeros.half_width))
+    assert f"joint 2 zero  {slide:>10.3f} ± {half:.3f} mm" in lines
+    assert "array" not in str(report)

@@ -259,7 +259,7 @@ def changed_tool(settings_: TensorSettings | None = None):
 
 def test_ten_pairs_show_a_moved_marker_once_it_is_told():
     learner, changed, q, x = changed_tool()
-    learner.move_marker(0.2)
+    learner.tool_changed(0.2)
     learner.learn(q[:10], x[:10])
     assert largest_error(learner, changed, "RRRR") < 0.01
 
@@ -284,7 +284,7 @@ def test_forgotten_pairs_no_longer_count():
 def test_a_marker_moved_by_no_spread_is_refused(std):
     _, prior, _, _ = case("RR", 1, 0)
     with pytest.raises(SettingError):
-        TensorLearner.around(prior, bases_for("RR")).move_marker(std)
+        TensorLearner.around(prior, bases_for("RR")).tool_changed(std)
 
 
 def test_a_window_keeps_no_more_than_its_pairs():

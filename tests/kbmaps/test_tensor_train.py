@@ -135,12 +135,12 @@ def test_a_stored_map_of_another_kind_is_refused():
 
 
 def test_a_third_slice_for_a_prismatic_joint_is_refused():
-    with pytest.raises(BasisError, match="joint 1 is prismatic"):
+    with pytest.raises(BasisError, match="joint 2 is prismatic"):
         TensorTrain(bases_for("RP"), np.ones((2, 3, 3, 4)))
 
 
 def test_a_revolute_basis_for_a_prismatic_joint_is_refused():
-    with pytest.raises(BasisError, match="joint 0 is prismatic"):
+    with pytest.raises(BasisError, match="joint 1 of 1 is prismatic"):
         TensorTrain.from_chain(random_chain(np.random.default_rng(0), "P"), bases_for("R"))
 
 

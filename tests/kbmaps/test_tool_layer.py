@@ -214,10 +214,8 @@ def test_what_the_arm_itself_is_unsure_of_is_claimed_too():
         """The learner's claims with its chain's orientations."""
 
         joints = 4
-        predict, estimate = batch.predict, batch.estimate
-
-        def orientation(self, q: np.ndarray) -> np.ndarray:
-            return batch.chain.poses(q)[..., :3, :3]
+        predict, jacobian, estimate = batch.predict, batch.jacobian, batch.estimate
+        orientation, angular_jacobian = batch.chain.orientation, batch.chain.angular_jacobian
 
     layer = ToolLayer(Oriented())
     q = random_q(rng, "RRRR", 200, 15)
@@ -226,6 +224,7 @@ def test_what_the_arm_itself_is_unsure_of_is_claimed_too():
     claim, behind = layer.estimate(far), batch.estimate(far)
     assert (claim.sigma > behind.sigma).all()
     assert not claim.in_support[~behind.in_support].any()
+    np.testing.assert_allclose(layer.jacobian(q), batch.chain.with_tool(layer.shift).jacobian(q), rtol=0, atol=1e-12)
 
 
 def test_without_pairs_the_arm_is_predicted_and_nothing_supported():
@@ -288,6 +287,6 @@ def test_misuse_is_refused_and_changes_nothing():
         layer.learn([0.0, math.nan], np.zeros(3))
     with pytest.raises(SettingError):
         layer.learn(np.zeros(2), np.zeros(3), -1.0)
-    with pytest.raises(SettingError, match="spread"):
+    with pytest.raises(SettingError, match="tolerance"):
         layer.tool_changed(0.0)
     assert layer.to_bytes() == before

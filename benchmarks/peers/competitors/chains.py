@@ -58,7 +58,7 @@ def learn_recursive(problem: Problem, earlier: Fitted | None) -> Fitted:
 def learn_train(problem: Problem, earlier: Fitted | None) -> Fitted:
     if isinstance(earlier, TensorLearner):
         learner = copy.deepcopy(earlier)
-        learner.move_marker((problem.tool_move or 0.0) / _PER_AXIS)
+        learner.tool_changed((problem.tool_move or 0.0) / _PER_AXIS)
     else:
         bases = learning_bases(problem.low, problem.high)
         if problem.drawing is None or problem.tolerances is None:

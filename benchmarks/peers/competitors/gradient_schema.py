@@ -14,7 +14,7 @@ import numpy as np
 from benchmarks.peers.problem import Competitor, Fitted, Problem
 from kbmaps import RigidChain
 from kbmaps.arrays import FloatArray, IntArray
-from kbmaps.chains.chain import cross_matrix
+from kbmaps.rotations import cross_matrix
 
 _UPDATES = 6000
 _LINK_RATE = 0.5

@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 
 from benchmarks.peers.problem import Competitor, Fitted, Problem, at_most
-from kbmaps import NLMS, ExactLearner, KBMap, RigidChain, learning_bases, with_refitted_marker
+from kbmaps import NLMS, ExactLearner, KBMap, RigidChain, learning_bases, with_refitted_tool
 from kbmaps.arrays import FloatArray
 
 _REPLAYS = 4
@@ -44,7 +44,7 @@ def _start(problem: Problem, earlier: Fitted | None) -> KBMap:
         return start_map(problem)
     if earlier.chain is None:
         return earlier.kbmap
-    return with_refitted_marker(earlier.kbmap, earlier.chain, problem.q, problem.x, problem.sigma)
+    return with_refitted_tool(earlier.kbmap, earlier.chain, problem.q, problem.x, problem.sigma)
 
 
 def learn_nlms(problem: Problem, earlier: Fitted | None) -> Fitted:

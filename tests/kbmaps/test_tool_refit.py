@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from planted_chains import bases_for, random_chain, random_map, random_q
 
-from kbmaps import DegenerateDataError, ExactLearner, prediction_errors, with_refitted_marker
+from kbmaps import DegenerateDataError, ExactLearner, prediction_errors, with_refitted_tool
 
 
 @pytest.mark.parametrize("kinds", ["RRRR", "RPRR"])
@@ -13,7 +13,7 @@ def test_one_pair_gives_an_exactly_known_arm_its_new_tool(kinds):
     chain = random_chain(rng, kinds)
     changed = chain.with_tool([0.1, -0.2, 0.05])
     q, test = random_q(rng, kinds, 1, 80), random_q(rng, kinds, 100, 80)
-    refitted = with_refitted_marker(chain.to_kbmap(bases_for(kinds)), chain, q, changed.positions(q))
+    refitted = with_refitted_tool(chain.to_kbmap(bases_for(kinds)), chain, q, changed.positions(q))
     assert prediction_errors(refitted, test, changed.positions(test)).max() < 1e-10
 
 
@@ -27,7 +27,7 @@ def test_what_was_learnt_before_the_change_is_kept():
     learner = ExactLearner(nominal.to_kbmap(bases_for("RRRR")))
     learner.learn(q, true.positions(q))
     changed = true.with_tool([0.25, 0.0, 0.0])
-    refitted = with_refitted_marker(learner.solve().map, nominal, q[:20], changed.positions(q[:20]))
+    refitted = with_refitted_tool(learner.solve().map, nominal, q[:20], changed.positions(q[:20]))
     # Links were moved but not turned, so the nominal orientations are right and the refit is exact.
     assert prediction_errors(refitted, q, changed.positions(q)).max() < 1e-8
 
@@ -35,6 +35,6 @@ def test_what_was_learnt_before_the_change_is_kept():
 def test_without_pairs_nothing_can_be_refitted():
     chain = random_chain(np.random.default_rng(3), "RR")
     with pytest.raises(DegenerateDataError):
-        with_refitted_marker(
+        with_refitted_tool(
             random_map(np.random.default_rng(1), bases_for("RR")), chain, np.empty((0, 2)), np.empty((0, 3))
         )

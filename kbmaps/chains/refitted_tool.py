@@ -17,7 +17,7 @@ from kbmaps.maps.kbmap import POSITION_OUTPUTS, KBMap
 _OUTLIER_SIGMAS = 15.0
 
 
-def with_refitted_marker(
+def with_refitted_tool(
     kbmap: KBMap, chain: RigidChain, q: ArrayLike, x: ArrayLike, sigma: float | None = None
 ) -> KBMap:
     """The map after its marker was moved to another place on the last link, or the tool was changed.

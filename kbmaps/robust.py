@@ -1,0 +1,35 @@
+"""What residuals are judged by: when they are rounding, how large is usual, and what few of them prove."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.special import stdtrit  # pyright: ignore[reportMissingTypeStubs, reportUnknownVariableType]
+
+from kbmaps.arrays import FloatArray
+from kbmaps.pairs import Pairs
+
+# The norm of a residual with noise σ per axis has the median 1.538 σ in three dimensions (√ of χ²₃'s median).
+MEDIAN_NORM = 1.538
+# No residual below a nanometre says anything: on noise-free data that is rounding.
+ROUNDING_M = 1e-9
+_ONE_SIGMA = 0.841344746
+
+
+def student(freedom: float) -> float:
+    """What a sigma with an estimated noise must be multiplied by to cover as a Gaussian one does."""
+    return float(stdtrit(max(freedom, 1.0), _ONE_SIGMA))
+
+
+def claimed_sigma(variance: FloatArray, pairs: Pairs, noise: float, freedom: float) -> FloatArray:
+    """1-sigma against the truth [m] of positions with this posterior variance [m²], after a fit to the pairs.
+
+    Where the noise was told and does not explain the residuals, what is left over is added; where it was estimated
+    from few residuals, it may be larger than it seems.
+
+    Args:
+        noise: that of the fit, in the pairs' units.
+        freedom: residual coordinates minus those that the parameters have used up.
+    """
+    if pairs.known:
+        return np.sqrt(variance + (noise**2 - 1.0) * float(np.square(pairs.unit).mean()))
+    return np.sqrt(variance) * student(freedom)
