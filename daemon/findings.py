@@ -117,14 +117,14 @@ def figures(robot: RobotDescription, known: Known) -> tuple[ChainFigures, tuple[
 
     None where the pairs do not tell.
 
-    The learner begins with wide tolerances, which cost it little, but with which a tilted axis could be any zero. How
-    well the arm is made, the pairs tell.
+    With the tolerances that the learner begins with a tilted axis could be any zero. How well the arm is made, the
+    pairs tell, but seldom beyond doubt: figures that have names are those of all the probable workmanships.
     """
     wide = known.tolerances
     made = [(wide.axes, wide.points)]
     made += [(axes, points) for axes, points in WORKMANSHIP if axes < wide.axes and points < wide.points]
-    prior = known.nominal.belief(known.belief.parameters.reference, wide)
-    belief = no_surer_than_possible(known.belief, prior, robot)
+    prior = known.nominal.belief(known.wide.parameters.reference, wide)
+    belief = no_surer_than_possible(known.wide, prior, robot)
     beliefs = [belief.tightened(wide, replace(wide, axes=axes, points=points)) for axes, points in made]
     kept, shares = probable(np.array([evidence for _, evidence in beliefs]))
     told = is_told([made[k] for k in kept])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from kbmaps import ChainBelief, ResidualModel
+from kbmaps import ChainBelief, ChainTolerances, ResidualModel
 
 # How far another tool may hold the marker from where the last one did, and a marker whose place is not known from where
 # it is drawn, 1-sigma of each coordinate [m].
@@ -17,22 +17,25 @@ class KnownArm:
 
     Attributes:
         chain: as a rigid chain.
+        tolerances: those that this began with.
         residual: as a chain and what it errs by; None: nothing is known of that.
     """
 
     chain: ChainBelief
+    tolerances: ChainTolerances
     residual: ResidualModel | None = None
 
     @classmethod
-    def from_bytes(cls, chain: bytes, residual: bytes | None) -> KnownArm:
+    def from_bytes(cls, chain: bytes, tolerances: ChainTolerances, residual: bytes | None) -> KnownArm:
         """Read what `to_bytes` of its parts wrote."""
-        return cls(ChainBelief.from_bytes(chain), None if residual is None else ResidualModel.from_bytes(residual))
+        known = None if residual is None else ResidualModel.from_bytes(residual)
+        return cls(ChainBelief.from_bytes(chain), tolerances, known)
 
     def updated(self, chain: ChainBelief | None, residual: ResidualModel | None) -> KnownArm:
         """With what was found since; None: as before."""
-        return KnownArm(chain or self.chain, residual or self.residual)
+        return KnownArm(chain or self.chain, self.tolerances, residual or self.residual)
 
     def with_other_tool(self) -> KnownArm:
         """The same arm with a marker that is elsewhere on the hand."""
         residual = None if self.residual is None else self.residual.with_other_tool(OTHER_TOOL_M)
-        return KnownArm(self.chain.with_other_tool(OTHER_TOOL_M), residual)
+        return KnownArm(self.chain.with_other_tool(OTHER_TOOL_M), self.tolerances, residual)

@@ -50,6 +50,7 @@ class ClaimsState(msgspec.Struct, kw_only=True):
         misfits: what each solution misses at pairs that it knows, 1-sigma per axis [m].
         misfits_before: what each missed with the last tool, 1-sigma per axis [m].
         belief: what the pairs let believe of the chain, as bytes; None before that was asked.
+        wide: the same, were it not for how well the arm seems to be made.
         residual: the chain with residual, as bytes; None before its first solution.
     """
 
@@ -60,6 +61,7 @@ class ClaimsState(msgspec.Struct, kw_only=True):
     misfits: dict[str, tuple[float, float, float]]
     misfits_before: dict[str, tuple[float, float, float]]
     belief: bytes | None
+    wide: bytes | None
     residual: bytes | None
 
 
@@ -88,6 +90,7 @@ class Claims:
         self._solved: dict[str, SupportSet | None] = {}
         self._expected: ChainBelief | None = None
         self._belief: ChainBelief | None = None
+        self._wide: ChainBelief | None = None
         self._residual: ResidualModel | None = None
 
     def best(self, present: str) -> str:
@@ -114,6 +117,11 @@ class Claims:
         return self._belief
 
     @property
+    def wide(self) -> ChainBelief | None:
+        """The same, were it not for how well the arm seems to be made: what pairs with another tool are added to."""
+        return self._wide
+
+    @property
     def residual(self) -> ResidualModel | None:
         """What the pairs with the present tool let believe of the arm as no rigid chain; None before that is solved."""
         return self._residual
@@ -134,7 +142,7 @@ class Claims:
 
     def fitted(self, belief: ChainBelief) -> None:
         """What the first pairs let believe of the chain, before any solution."""
-        self._belief = belief
+        self._belief = self._wide = belief
 
     def untried(self, name: str) -> bool:
         """Whether there is a solution for this model that has predicted too few pairs to be compared."""
@@ -179,13 +187,20 @@ class Claims:
         self._asked = self._support.view
 
     def solution_taken(
-        self, name: str, errors: FloatArray, belief: ChainBelief | ResidualModel | None, *, neighbours: bool
+        self,
+        name: str,
+        errors: FloatArray,
+        belief: ChainBelief | ResidualModel | None,
+        wide: ChainBelief | None = None,
+        *,
+        neighbours: bool,
     ) -> None:
         """A solution answers for this model from now on.
 
         Args:
             errors: its errors (n, 3) [m] at pairs that it knows, in their order.
             belief: what is believed of the arm now; None: as before.
+            wide: of a chain, the same, were it not for how well it seems to be made.
             neighbours: whether these pairs follow a path.
         """
         self.errors.setdefault(name, ErrorMemory(self._expected_m))
@@ -193,7 +208,7 @@ class Claims:
         if isinstance(belief, ResidualModel):
             self._residual = belief
         elif belief is not None:
-            self._belief = belief
+            self._belief, self._wide = belief, wide or belief
         noise = self.errors[PRIOR].noise_variance
         before = self._misfits_before.get(name, self._misfits_before.get(RIGID, np.zeros(3)))
         scatter = 0.0 if belief is None else belief.noise
@@ -267,6 +282,7 @@ class Claims:
             misfits={name: _triple(missed) for name, missed in self._misfits.items()},
             misfits_before={name: _triple(missed) for name, missed in self._misfits_before.items()},
             belief=None if self._belief is None else self._belief.to_bytes(),
+            wide=None if self._wide is None else self._wide.to_bytes(),
             residual=None if self._residual is None else self._residual.to_bytes(),
         )
 
@@ -287,6 +303,7 @@ class Claims:
         self._trusted = state.trusted
         self._misfits_before = {name: np.array(missed) for name, missed in state.misfits_before.items()}
         self._belief = None if state.belief is None else ChainBelief.from_bytes(state.belief)
+        self._wide = None if state.wide is None else ChainBelief.from_bytes(state.wide)
         self._residual = None if state.residual is None else ResidualModel.from_bytes(state.residual)
         self._asked = self._support.view
         self._solved = dict.fromkeys(self._misfits, self._asked)

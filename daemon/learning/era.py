@@ -89,7 +89,14 @@ class Era:
         """What the solver has to solve."""
         known = self._solver_prior
         prior = known or self.members.prior
-        return Task(self.task_number, prior, self.arm.chain, self.arm.residual, prior_stays=known is not None)
+        return Task(
+            self.task_number,
+            prior,
+            self.arm.chain,
+            self.arm.residual,
+            prior_stays=known is not None,
+            tolerances=self.arm.tolerances,
+        )
 
     @property
     def owes_replays(self) -> bool:
@@ -192,7 +199,8 @@ class Era:
         self.members.take(solved.name, model)
         q, x = self.memory.some(fed, LOOKED_BACK)
         neighbours = follow_a_path(self.members.prior, q)
-        self._claims.solution_taken(solved.name, x - model.predict(q), solved.belief, neighbours=neighbours)
+        errors = x - model.predict(q)
+        self._claims.solution_taken(solved.name, errors, solved.belief, solved.wide, neighbours=neighbours)
         self._judge_late(solved.name, model, solved.pairs)
         self._choose()
 
@@ -200,7 +208,7 @@ class Era:
         """Where pairs are no longer kept, the last solutions stand for them in the place of what was before."""
         if EXACT in self.members.names and not self.memory.complete:
             self._solver_prior = self.members.map(EXACT)
-            self.arm = self.arm.updated(self._claims.belief, self._claims.residual)
+            self.arm = self.arm.updated(self._claims.wide, self._claims.residual)
 
     def store(self, header: LearningHeader) -> dict[str, FloatArray]:
         """Write into `header` what `restore` has to know; the arrays that it needs beside the kept pairs."""

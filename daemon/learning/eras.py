@@ -9,7 +9,7 @@ import numpy as np
 
 from daemon.config import LearnerConfig
 from interfaces.records import Pair
-from kbmaps import ChainBelief, KBMap, RigidChain
+from kbmaps import ChainBelief, ChainTolerances, KBMap, RigidChain
 
 from .arm import KnownArm
 from .claims import Claims
@@ -77,7 +77,7 @@ class Eras:
         if header.belief is None:
             eras.waiting.restore(arrays["q"], arrays["x"], header.kept_of)
         else:
-            arm = KnownArm.from_bytes(header.belief, header.residual)
+            arm = KnownArm.from_bytes(header.belief, eras._tolerances, header.residual)
             eras.present = eras._era(KBMap(nominal.bases, arrays[NET + PRIOR]), arm)
             eras.present.restore(header, arrays)
         return eras
@@ -143,7 +143,7 @@ class Eras:
 
     def _next(self, era: Era, expected_m: float, first_fit: int = PAIRS_TO_REFIT) -> Era:
         """That of another tool, which begins where `era` ends."""
-        prior, arm = era.map, era.arm.updated(self.claims.belief, self.claims.residual)
+        prior, arm = era.map, era.arm.updated(self.claims.wide, self.claims.residual)
         self.fitting.change_tool(prior, self._hand, first_fit)
         self.claims.change_tool(expected_m, era.answering)
         return self._era(prior, arm.with_other_tool())
@@ -168,4 +168,8 @@ class Eras:
         return Era(prior, arm, self.claims, self._settings, self._task_numbers)
 
     def _drawn(self, chain: RigidChain) -> KnownArm:
-        return KnownArm(self._nominal.belief(chain, chain_tolerances(self._settings)))
+        return KnownArm(self._nominal.belief(chain, chain_tolerances(self._settings)), self._tolerances)
+
+    @property
+    def _tolerances(self) -> ChainTolerances:
+        return self._nominal.tolerances(chain_tolerances(self._settings))

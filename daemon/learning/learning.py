@@ -130,6 +130,7 @@ class Learning:
             return Known(
                 nominal=self._nominal,
                 belief=claims.belief,
+                wide=claims.wide or claims.belief,
                 tolerances=chain_tolerances(self._settings),
                 claim=claims.of(era.answering, era.model.predict),
                 solved=era.answering in SOLVED,

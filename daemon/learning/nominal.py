@@ -110,12 +110,16 @@ class NominalModel:
             chain: the nominal chain, placed where none is known.
             tolerances: of a chain whose frame and marker are known.
         """
+        return ChainBelief.from_tolerances(ChainParameters(chain), self.tolerances(tolerances))
+
+    def tolerances(self, known: ChainTolerances) -> ChainTolerances:
+        """Those of the nominal chain, where `known` are those of one whose frame and marker are known."""
         if not self.pose_known:
-            tolerances = replace(tolerances, base_rotation=math.inf, base_translation=math.inf)
+            known = replace(known, base_rotation=math.inf, base_translation=math.inf)
         if not self.marker_known:
             # A marker is on the hand. First pairs along a short path would be fitted as well by one metres away.
-            tolerances = replace(tolerances, tool=OTHER_TOOL_M)
-        return ChainBelief.from_tolerances(ChainParameters(chain), tolerances)
+            known = replace(known, tool=OTHER_TOOL_M)
+        return known
 
     def placed(self, q: FloatArray, x: FloatArray) -> RigidChain:
         """The chain with an unknown pose fitted to pairs, q (n, d) [rad] and x (n, 3) [m]; its marker is as drawn.

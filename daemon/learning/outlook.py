@@ -38,6 +38,7 @@ class Known:
     Attributes:
         nominal: where learning started.
         belief: what the pairs with the present tool let believe of the chain.
+        wide: the same, were it not for how well it seems to be made.
         tolerances: how far from the nominal chain it was believed to be at first.
         claim: of the model that answers.
         solved: whether that is a solution, of whose error the belief tells.
@@ -48,6 +49,7 @@ class Known:
 
     nominal: NominalModel
     belief: ChainBelief
+    wide: ChainBelief
     tolerances: ChainTolerances
     claim: Claim
     solved: bool

@@ -59,8 +59,9 @@ def test_a_run_has_no_more_pairs_than_make_a_change() -> None:
 
 def test_first_pairs_that_the_fitted_tool_contradicts_are_no_part_of_a_run() -> None:
     nominal, scene = nominal_model(), Scene.draw(0, 8)
-    belief = nominal.belief(nominal.chain, ChainTolerances(tool=0.03))
-    era = Era(nominal.prior(), KnownArm(belief), Claims(nominal.bases, 0.1), LearnerConfig(), itertools.count())
+    tolerances = ChainTolerances(tool=0.03)
+    arm = KnownArm(nominal.belief(nominal.chain, tolerances), tolerances)
+    era = Era(nominal.prior(), arm, Claims(nominal.bases, 0.1), LearnerConfig(), itertools.count())
     x = np.array([pair.x for pair in scene.pairs])
     x[0] += 0.2  # with the old tool
     era.begin_with(scene.q[:6], x[:6])

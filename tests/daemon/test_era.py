@@ -19,7 +19,8 @@ from daemon.learning.solver import fitted_residual
 from kbmaps import ChainTolerances, KBMap
 
 NOMINAL = nominal_model()
-BELIEF = NOMINAL.belief(NOMINAL.chain, ChainTolerances(axes=0.05, points=0.015, zeros=0.05, tool=0.03))
+TOLERANCES = ChainTolerances(axes=0.05, points=0.015, zeros=0.05, tool=0.03)
+BELIEF = NOMINAL.belief(NOMINAL.chain, TOLERANCES)
 SCENE = Scene.draw(0, 60, sigma_m=1e-4)
 X = np.array([pair.x for pair in SCENE.pairs])
 
@@ -49,7 +50,8 @@ def learn(era: Era, part: slice) -> None:
 @pytest.fixture
 def era() -> Era:
     """The chain with residual answers; of the maps, that of the rigid chain is the best."""
-    era = Era(NOMINAL.prior(), KnownArm(BELIEF), Claims(NOMINAL.bases, 0.1), LearnerConfig(), itertools.count())
+    arm = KnownArm(BELIEF, TOLERANCES)
+    era = Era(NOMINAL.prior(), arm, Claims(NOMINAL.bases, 0.1), LearnerConfig(), itertools.count())
     learn(era, slice(0, 20))
     residual = fitted_residual(BELIEF, SCENE.q, X)
     assert residual is not None
