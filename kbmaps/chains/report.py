@@ -30,6 +30,21 @@ class Interval:
         return self.value + self.half_width
 
 
+@dataclass(frozen=True)
+class Scatter:
+    """How pairs lie around a chain.
+
+    Attributes:
+        noise: 1-sigma of a measured coordinate [m], estimated or told (their RMS).
+        misfit: residual over what the noise explains; about 1 for a rigid chain, 1 where the noise was not told.
+        freedom: residual coordinates minus those that the parameters have used up; few make `noise` uncertain.
+    """
+
+    noise: float
+    misfit: float
+    freedom: float
+
+
 @dataclass(frozen=True, eq=False)
 class ChainReport:
     """The learnt chain relative to the nominal one, in the numbers that have names.
@@ -76,10 +91,8 @@ def chain_report(
     deviation: FloatArray,
     hidden: BoolArray,
     *,
+    scatter: Scatter,
     widening: float,
-    noise: float,
-    misfit: float,
-    freedom: float,
     outliers: int,
     determined: int,
 ) -> ChainReport:
@@ -99,9 +112,9 @@ def chain_report(
         tool_shift=interval(parameters.tool),
         zeros=interval(parameters.zeros),
         widening=widening,
-        noise=noise,
-        misfit=misfit,
-        freedom=freedom,
+        noise=scatter.noise,
+        misfit=scatter.misfit,
+        freedom=scatter.freedom,
         outliers=outliers,
         determined=determined,
         undetermined=tuple(names[k] for k in np.flatnonzero(hidden)),

@@ -14,7 +14,7 @@ from kbmaps.chains.chain import RigidChain
 from kbmaps.chains.packed import CHAIN, chain_arrays, chain_from_arrays, describe_tolerances, parse_tolerances
 from kbmaps.chains.parameters import ChainParameters, ChainTolerances
 from kbmaps.chains.placed_start import PlacedStart
-from kbmaps.chains.report import ChainReport, chain_report
+from kbmaps.chains.report import ChainReport, Scatter, chain_report
 from kbmaps.chains.rigid_fit import RigidFit, fit_chain
 from kbmaps.chains.valley import deviations
 from kbmaps.errors import DegenerateDataError
@@ -24,7 +24,7 @@ from kbmaps.pairs import Pairs, checked_pairs, stored_pairs, with_units
 from kbmaps.robust import claimed_sigma, student
 
 _KIND = "rigid chain, batch, 2"
-# So many pairs, evenly spread, stand for all where the bend of their valley is looked for.
+# About so many pairs, evenly spread, stand for all where the bend of their valley is looked for.
 _FOLLOWED = 100
 # A parameter whose standard deviation the pairs left above this share of the one before was not shown by them.
 _HARDLY_NARROWER = 0.5
@@ -132,6 +132,14 @@ class RigidLearner:
         return np.zeros(0, dtype=np.bool_) if fit is None else fit.inliers.copy()
 
     @property
+    def scatter(self) -> Scatter:
+        """How the pairs lie around the chain. Raises DegenerateDataError: no pair has been learnt."""
+        fit = self._fitted()
+        if fit is None:
+            raise DegenerateDataError("nothing lies around the chain before the first pair was learnt")
+        return self._scatter(fit)
+
+    @property
     def least_sure(self) -> FloatArray:
         """The configuration (1, d) of the pair that the chain is least sure of, outliers left out; (0, d) without."""
         fit = self._fitted()
@@ -203,21 +211,24 @@ class RigidLearner:
         fit = self._fitted()
         if fit is None:
             raise DegenerateDataError("there is nothing to report before the first pair was learnt")
-        pairs = self._units()
+        pairs, scatter = self._units(), self._scatter(fit)
         widening = 1.0 if pairs.known else student(fit.freedom)
-        unit = math.sqrt(float(np.square(pairs.unit).mean()))
         return chain_report(
             self._parameters,
             fit.belief.mean,
             widening * self._deviations(fit, pairs),
-            self._hidden(fit, unit * fit.noise),
+            self._hidden(fit, scatter.noise * scatter.misfit),
+            scatter=scatter,
             widening=widening,
-            noise=unit if pairs.known else unit * fit.noise,
-            misfit=fit.noise if pairs.known else 1.0,
-            freedom=fit.freedom,
             outliers=int((~fit.inliers).sum()),
             determined=fit.rank,
         )
+
+    def _scatter(self, fit: RigidFit) -> Scatter:
+        pairs = self._units()
+        unit = math.sqrt(float(np.square(pairs.unit).mean()))
+        noise, misfit = (unit, fit.noise) if pairs.known else (unit * fit.noise, 1.0)
+        return Scatter(noise, misfit, fit.freedom)
 
     def _hidden(self, fit: RigidFit, noise: float) -> BoolArray:
         """Which parameters (size,) matter and were not shown; noise of a coordinate [m]."""
@@ -267,7 +278,7 @@ class RigidLearner:
 
     def _deviations(self, fit: RigidFit, pairs: Pairs) -> FloatArray:
         good = np.flatnonzero(fit.inliers)
-        some = good[np.unique(np.linspace(0, len(good) - 1, _FOLLOWED).round().astype(np.intp))]
+        some = good[:: max(len(good) // _FOLLOWED, 1)]
         sigma = fit.noise * pairs.unit[some] * math.sqrt(len(some) / max(len(good), 1))
         return deviations(fit.belief, pairs.q[some], sigma)
 

@@ -82,10 +82,10 @@ class RecursiveRigidLearner:
         Raises:
             DegenerateDataError: the batch has learnt no pair. SettingError: window below 16.
         """
-        report = batch.report()
-        learner = cls(batch.nominal, batch.tolerances, noise=max(report.noise, LEAST_NOISE_M), window=window)
+        scatter = batch.scatter
+        learner = cls(batch.nominal, batch.tolerances, noise=max(scatter.noise, LEAST_NOISE_M), window=window)
         learner._go_on_from(batch.belief)
-        learner._filter.noise_coordinates = float(np.clip(report.freedom, NOISE_COORDINATES, NOISE_MEMORY))
+        learner._filter.noise_coordinates = float(np.clip(scatter.freedom, NOISE_COORDINATES, NOISE_MEMORY))
         learner._pairs = batch.pairs
         learner._window.farthest = batch.least_sure
         return learner

@@ -84,9 +84,9 @@ class ChainPosterior:
         """
         floor = 0.0
         if isinstance(learner, RigidLearner) and learner.pairs:
-            report = learner.report()
-            told = report.noise if noise is None else noise
-            floor = report.noise * math.sqrt(max(report.misfit**2 - 1.0, 0.0))
+            scatter = learner.scatter
+            told = scatter.noise if noise is None else noise
+            floor = scatter.noise * math.sqrt(max(scatter.misfit**2 - 1.0, 0.0))
             found = math.hypot(told, floor)
         elif noise is not None:
             found = noise

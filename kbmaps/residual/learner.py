@@ -192,7 +192,7 @@ class ResidualLearner:
                 scaling = replace(ResidualScaling.of(self._q, self._x), load=load)
                 before = ResidualModel.of_belief(self._rigid.prior, scaling, 0.0 if before is None else before.noise)
             # Noise that nobody told must be seen in residuals that the chain alone leaves, or anything explains them.
-            if pairs.known or before.weights or before.noise > 0.0 or self._rigid.report().freedom >= _LEAST_FREEDOM:
+            if pairs.known or before.weights or before.noise > 0.0 or self._rigid.scatter.freedom >= _LEAST_FREEDOM:
                 self._fit = fit_residual(before, pairs, self._rigid.change)
             self._model = self._rigid_model(before) if self._fit is None else self._fit.model
             if self._fit is not None:
@@ -201,8 +201,8 @@ class ResidualLearner:
         return self._fit
 
     def _rigid_model(self, before: ResidualModel) -> ResidualModel:
-        report = self._rigid.report()
-        noise = report.noise * report.misfit if report.freedom >= _LEAST_FREEDOM else before.noise
+        scatter = self._rigid.scatter
+        noise = scatter.noise * scatter.misfit if scatter.freedom >= _LEAST_FREEDOM else before.noise
         belief = self._rigid.belief
         return ResidualModel(before.features, belief.mean, {}, belief.root, noise)
 
