@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, Protocol
 
@@ -29,7 +29,7 @@ from kbmaps import (
 
 from .learnt import LearntModel
 from .members import EXACT, RESIDUAL, RIGID
-from .workmanship import likely_tolerances
+from .workmanship import Made, best_made, workmanship
 
 log = logging.getLogger(__name__)
 
@@ -171,7 +171,7 @@ class DirectSolver:
             yield from self._solved_of_some(task)
         self._solved_at = self._pairs
         wide = fitted_belief(self._before, self._q, self._x)
-        made = None if task.tolerances is None else likely_tolerances(wide, task.tolerances)
+        made = _ways_made(wide, task)
         residual_due = self._pairs >= RESIDUAL_GROWTH * self._residual_at
         rigid = _solved_chain(task, self._pairs, wide, made)
         yield replace(rigid, last=self._exact is None and not residual_due)
@@ -191,8 +191,8 @@ class DirectSolver:
         some = int(len(self._q) * FIRST_SHARE)
         if some >= FEWEST_FIRST:
             wide = fitted_belief(self._before, self._q[:some], self._x[:some])
-            made = None if task.tolerances is None else likely_tolerances(wide, task.tolerances)
-            yield replace(_solved_chain(task, self._pairs - len(self._q) + some, wide, made), last=False)
+            pairs = self._pairs - len(self._q) + some
+            yield replace(_solved_chain(task, pairs, wide, _ways_made(wide, task)), last=False)
 
     def _solve_exact(self, task: Task, learner: ExactLearner, *, last: bool) -> Solved:
         """Least squares around the rigid chain.
@@ -235,14 +235,18 @@ class DirectSolver:
         return self._folded_residual
 
 
-def _solved_chain(task: Task, pairs: int, wide: ChainBelief, made: ChainTolerances | None) -> Solved:
+def _ways_made(wide: ChainBelief, task: Task) -> list[Made]:
+    return [] if task.tolerances is None else workmanship(wide, task.tolerances)
+
+
+def _solved_chain(task: Task, pairs: int, wide: ChainBelief, made: Sequence[Made]) -> Solved:
     belief = _as_made(wide, task, made)
     return Solved(task.number, pairs, RIGID, belief.chain.to_kbmap(task.prior.bases), belief, wide=wide)
 
 
-def _as_made(belief: ChainBelief, task: Task, made: ChainTolerances | None) -> ChainBelief:
-    """What is believed of a chain that is made so well."""
-    return belief if task.tolerances is None or made is None else belief.tightened(task.tolerances, made)[0]
+def _as_made(belief: ChainBelief, task: Task, made: Sequence[Made]) -> ChainBelief:
+    """What is believed of a chain that may be made in these ways; as it is where nobody knows any."""
+    return belief if task.tolerances is None or not made else best_made(belief, task.tolerances, made)
 
 
 def fitted_belief(prior: ChainBelief, q: FloatArray, x: FloatArray) -> ChainBelief:
@@ -258,7 +262,7 @@ def fitted_belief(prior: ChainBelief, q: FloatArray, x: FloatArray) -> ChainBeli
     if shared < SHARED:
         return learner.belief
     again = RigidLearner(prior.parameters.reference, ChainTolerances(), prior)
-    again.learn(q[inliers], x[inliers], learner.belief.noise * math.sqrt(shared))
+    again.learn(q[inliers], x[inliers], learner.scatter.noise * math.sqrt(shared))
     return replace(again.belief, noise=learner.belief.noise)
 
 

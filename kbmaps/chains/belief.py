@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Self, cast
 
@@ -147,6 +148,21 @@ class ChainBelief:
         mean = self.mean - root @ (root.T @ (added * self.mean))
         evidence = float(np.log(wide[free] / narrow[free]).sum() - np.log(np.diag(factor)).sum())
         return type(self)(self.parameters, mean, root, self.noise), evidence - 0.5 * float(self.mean @ (added * mean))
+
+    def among(self, beliefs: Sequence[ChainBelief], shares: ArrayLike) -> Self:
+        """This chain, as far as it may be any of several others: the mixture's second moment about this mean.
+
+        Args:
+            beliefs: in the same parameters; this one among them.
+            shares: how probable each is (m,); they add up to 1.
+        """
+        weights = np.sqrt(np.asarray(shares, dtype=np.float64))
+        apart = np.array([belief.mean - self.mean for belief in beliefs]).T * weights
+        roots = [weight * belief.root for weight, belief in zip(weights, beliefs, strict=True)]
+        free, triangle = squared(np.concatenate([*roots, apart], axis=1))
+        root = np.zeros((len(self.mean), len(free)))
+        root[free] = triangle
+        return type(self)(self.parameters, self.mean, root, self.noise)
 
     def with_other_tool(self, tolerance: float) -> Self:
         """The same arm with a marker that was moved, by `tolerance` (1-sigma of each component [m]).

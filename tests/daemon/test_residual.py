@@ -28,7 +28,7 @@ class SaggingArm:
 
     def positions(self, q: FloatArray, marker: RigidChain | None = None) -> FloatArray:
         torques = np.einsum("nij,i->nj", self.chain.jacobian(q), DOWN)
-        return (marker or self.chain).positions(q + 0.3 * torques)
+        return (marker or self.chain).positions(q + 0.5 * torques)
 
     def pairs(self, part: slice, marker: RigidChain | None = None) -> list[Pair]:
         x = self.positions(self.q[part], marker)

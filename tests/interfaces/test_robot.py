@@ -84,7 +84,7 @@ def test_a_joint_that_is_not_learnt_stands_where_held_at_says(tmp_path) -> None:
         ('marker_link = "tip"', 'held_at = {neck = 1}\nmarker_link = "tip"', 5, "there is no joint 'neck'"),
         ('marker_link = "tip"', "", 1, "robot: object missing required field `marker_link`"),
         ('marker_link = "tip"', 'marker_lnk = "tip"', 5, "unknown key 'marker_lnk' in [robot]. Did you mean 'marker_l"),
-        ('name = "arm"', 'name = "my arm"', 2, "robot.name: expected `str` matching regex"),
+        ('name = "arm"', 'name = "my arm"', 2, "robot.name: 'my arm' is no name for zenoh keys"),
         ("[camera]", "[camera]\nfocal_px = 700", 6, "the stereo camera is described in part: principal_point_px"),
     ],
 )

@@ -133,3 +133,17 @@ def test_what_a_belief_knows_of_the_noise_survives_as_bytes_and_another_tool():
     noise = learner.belief.noise
     assert ChainBelief.from_bytes(learner.belief.to_bytes()).noise == noise
     assert learner.belief.with_other_tool(0.2).noise == noise
+
+
+def test_a_chain_that_may_be_another_is_as_unsure_as_both_and_as_far_apart_as_they_are():
+    parameters = ChainParameters(rough_arm(np.random.default_rng(21), "RRR").nominal)
+    rng = np.random.default_rng(22)
+    near, far = (
+        ChainBelief(parameters, mean, 0.01 * rng.normal(size=(parameters.size, 5)))
+        for mean in 0.01 * rng.normal(size=(2, parameters.size))
+    )
+    found = near.among([near, far], [0.75, 0.25])
+    apart = far.mean - near.mean
+    expected = 0.75 * near.covariance + 0.25 * (far.covariance + np.outer(apart, apart))
+    np.testing.assert_allclose(found.covariance, expected, atol=1e-12)
+    np.testing.assert_array_equal(found.mean, near.mean)
