@@ -1,7 +1,8 @@
 """The solver in a process of its own.
 
 One solve takes tenths of a second inside LAPACK, which holds the interpreter's lock: in a thread it would keep
-answers waiting that long. The child works at low priority, at most half of the time on a processor, and ends with its parent.
+answers waiting that long. The child works at low priority, on a processor at most half of the time, and ends with
+its parent.
 
 Both directions carry frames: four bytes of length, then a MessagePack message.
 """
