@@ -23,8 +23,8 @@ from kbmaps import (
     align,
 )
 
-from .chain_figures import ChainFigures, is_told, probable
-from .learning.workmanship import WORKMANSHIP
+from .chain_figures import ChainFigures, is_told
+from .learning.workmanship import WORKMANSHIP, probable
 
 IntArray = NDArray[np.intp]
 

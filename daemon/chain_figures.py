@@ -19,8 +19,6 @@ from kbmaps import ChainBelief, ChainParameters
 BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.intp]
 
-# Workmanship that is less probable than this is not considered.
-LEAST_SHARE = 0.01
 # Where what is probable differs by more than this, the pairs do not tell.
 TOLD_WITHIN = 4.0
 HALF_WIDTH_95 = 1.959964
@@ -190,18 +188,6 @@ def no_surer_than_possible(belief: ChainBelief, prior: ChainBelief, robot: Robot
 def _poses(robot: RobotDescription) -> FloatArray:
     """Configurations (m, d) that stand for all."""
     return np.random.default_rng(0).uniform(robot.lower, robot.upper, (_POSES, len(robot.joints)))
-
-
-def probable(evidence: FloatArray) -> tuple[IntArray, FloatArray]:
-    """Which of several explanations are probable at all, the most probable first, and their shares.
-
-    Args:
-        evidence: log marginal likelihood of each (m,) (MacKay 1992, "Bayesian interpolation").
-    """
-    shares = np.exp(evidence - evidence.max())
-    shares /= shares.sum()
-    kept = np.array([k for k in np.argsort(-shares) if shares[k] > LEAST_SHARE], dtype=np.intp)
-    return kept, shares[kept] / shares[kept].sum()
 
 
 def is_told(made: Sequence[tuple[float, float]]) -> bool:

@@ -11,12 +11,12 @@ from interfaces.protocols import Clock
 from interfaces.robot import RobotDescription
 from kbmaps import ChainBelief, KBMapsError
 
-from .chain_figures import ChainFigures, is_told, no_surer_than_possible, probable
+from .chain_figures import ChainFigures, is_told, no_surer_than_possible
 from .learning import Learning
 from .learning.learning import REGION_RAD
 from .learning.members import SOLVED
 from .learning.outlook import Known, Scatter, foreseen
-from .learning.workmanship import WORKMANSHIP
+from .learning.workmanship import WORKMANSHIP, probable
 from .status import ChainCalibration, JointZero, LearntFigure, Outlook
 
 log = logging.getLogger(__name__)

@@ -7,7 +7,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
+from interfaces.records import FloatArray
 from kbmaps import ChainBelief, ChainTolerances
 
 # Tilt of an axis [rad] and its shift [m], 1-sigma, from a milled arm to a kit.
@@ -46,11 +48,21 @@ def workmanship(belief: ChainBelief, tolerances: ChainTolerances) -> list[Made]:
         The probable ways, the best workmanship last.
     """
     candidates = [tolerances, *(each for made in reversed(WORKMANSHIP) for each in _narrower(tolerances, *made))]
-    evidence = np.array([belief.tightened(tolerances, each)[1] for each in candidates])
+    kept, shares = probable(np.array([belief.tightened(tolerances, each)[1] for each in candidates]))
+    made = {int(k): Made(candidates[k], float(share)) for k, share in zip(kept, shares, strict=True)}
+    return [made[k] for k in sorted(made)]
+
+
+def probable(evidence: FloatArray) -> tuple[NDArray[np.intp], FloatArray]:
+    """Which of several explanations are probable at all, the most probable first, and their shares.
+
+    Args:
+        evidence: log marginal likelihood of each (m,) (MacKay 1992, "Bayesian interpolation").
+    """
     shares = np.exp(evidence - evidence.max())
     shares /= shares.sum()
-    kept = np.flatnonzero(shares > LEAST_SHARE)
-    return [Made(candidates[k], float(shares[k] / shares[kept].sum())) for k in kept]
+    kept = np.array([k for k in np.argsort(-shares) if shares[k] > LEAST_SHARE], dtype=np.intp)
+    return kept, shares[kept] / shares[kept].sum()
 
 
 def best_made(belief: ChainBelief, tolerances: ChainTolerances, made: Sequence[Made]) -> ChainBelief:
