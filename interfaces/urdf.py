@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import io
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -46,13 +46,31 @@ class UrdfJoint:
 
 
 @dataclass(frozen=True, slots=True)
+class PointMass:
+    """What gravity takes hold of in a link.
+
+    Attributes:
+        mass_kg: the link's mass [kg].
+        centre: its centre of mass in the link's frame [m], shape (3,).
+    """
+
+    mass_kg: float
+    centre: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
 class UrdfTree:
-    """The joints of one URDF file by name; every link but the root has exactly one joint above it."""
+    """The joints of one URDF file by name; every link but the root has exactly one joint above it.
+
+    Attributes:
+        masses: of the links that state one, by link.
+    """
 
     file: Path
     name: str
     links: tuple[str, ...]
     joints: dict[str, UrdfJoint]
+    masses: dict[str, PointMass] = field(default_factory=dict)
 
     @classmethod
     def load(cls, file: Path) -> UrdfTree:
@@ -65,7 +83,8 @@ class UrdfTree:
         joints = {joint.name: _joint(joint, file) for joint in robot.joints}
         if len(joints) != len(robot.joints):
             raise RobotError("two joints have the same name", file=file, remedy="Rename one of them")
-        tree = cls(file, str(robot.name), tuple(link.name for link in robot.links), joints)
+        masses = {link.name: _point_mass(link, file) for link in robot.links if link.inertial is not None}
+        tree = cls(file, str(robot.name), tuple(link.name for link in robot.links), joints, masses)
         tree._check()
         return tree
 
@@ -242,6 +261,16 @@ def _joint(joint: Any, file: Path) -> UrdfJoint:
         lower=lower,
         upper=upper,
     )
+
+
+def _point_mass(link: Any, file: Path) -> PointMass:
+    mass = 0.0 if link.inertial.mass is None else float(link.inertial.mass)
+    origin = np.eye(4) if link.inertial.origin is None else np.asarray(link.inertial.origin, dtype=np.float64)
+    if not (np.isfinite(mass) and np.isfinite(origin).all() and mass >= 0.0):
+        raise RobotError(
+            f"link {link.name!r} has a mass of {mass:g} kg, or a centre of mass that is not finite", file=file
+        )
+    return PointMass(mass, frozen_array(origin[:3, 3]))
 
 
 def _limits(joint: Any) -> tuple[float, float]:

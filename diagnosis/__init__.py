@@ -1,0 +1,1 @@
+"""From measured data and the robot's simulation to causes with names."""

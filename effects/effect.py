@@ -1,0 +1,135 @@
+"""One effect at its place with its numbers, as it stands in `extended.toml`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Self
+
+import numpy as np
+
+from interfaces.errors import RobotError
+from interfaces.records import FloatArray, frozen_array
+from interfaces.robot import RobotDescription
+from interfaces.suggest import did_you_mean
+
+from .kinds import KINDS, Kind
+from .parameter import Parameter
+
+# A play, a spring or a rate that is negative is none.
+_POSITIVE = frozenset({"cycles_per_turn", "cycles_per_m", "time_constant_s"})
+
+
+@dataclass(frozen=True, eq=False)
+class Effect:
+    """An effect of a robot.
+
+    Attributes:
+        kind: its row of the table.
+        where, source: the joint it sits at, and the one that causes it; None where there is none.
+        values: its numbers (p,), in the order of `parameters`.
+        prismatic: whether the joint slides.
+    """
+
+    kind: Kind
+    where: str | None
+    source: str | None
+    values: FloatArray
+    prismatic: bool = False
+
+    @classmethod
+    def at(
+        cls,
+        robot: RobotDescription,
+        name: str,
+        where: str | None = None,
+        source: str | None = None,
+        values: Mapping[str, float] | Sequence[float] | FloatArray | None = None,
+    ) -> Self:
+        """The effect called `name`; without `values` it does nothing yet.
+
+        Raises:
+            RobotError: there is no such effect, joint or number, or the effect cannot sit there.
+        """
+        if name not in KINDS:
+            raise RobotError(f"there is no effect {name!r}", remedy=did_you_mean(name, KINDS))
+        kind = KINDS[name]
+        for joint, wanted, what in ((where, kind.at_joint, "where"), (source, kind.takes_source, "source")):
+            if wanted and joint is None:
+                raise RobotError(f"{name} needs a joint: {what} is missing", remedy=f"Name one of {_list(robot)}")
+            if not wanted and joint is not None:
+                raise RobotError(f"{name} has no {what}", remedy=f"Take {what} = {joint!r} out")
+            if joint is not None and joint not in robot.joints:
+                raise RobotError(
+                    f"{what} = {joint!r}: no joint of this robot", remedy=did_you_mean(joint, robot.joints)
+                )
+        if source is not None and source == where:
+            raise RobotError(f"{name}: where and source are the same joint", remedy="Name another joint as source")
+        prismatic = where is not None and bool(robot.chain.prismatic[robot.joints.index(where)])
+        if prismatic and kind.turns_only:
+            raise RobotError(f"{name} cannot sit at {where!r}, which slides", remedy="Name a joint that turns")
+        if kind.needs_stereo and robot.calibration is None:
+            raise RobotError(f"{name} needs a stereo camera", remedy="Add focal_px and its fellows to [camera]")
+        return cls(kind, where, source, _values(kind.parameters(prismatic), values, name), prismatic)
+
+    @property
+    def name(self) -> str:
+        """The name of its row of the table."""
+        return self.kind.name
+
+    @property
+    def key(self) -> tuple[str, str | None, str | None]:
+        """What it is, whatever its numbers: name, where, source."""
+        return self.kind.name, self.where, self.source
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """What its values are."""
+        return self.kind.parameters(self.prismatic)
+
+    @property
+    def amounts(self) -> list[int]:
+        """The places of the values that say how much."""
+        return [k for k, parameter in enumerate(self.parameters) if parameter.is_amount]
+
+    def with_values(self, values: FloatArray) -> Effect:
+        """The same effect with other numbers (p,)."""
+        return Effect(self.kind, self.where, self.source, frozen_array(values), self.prismatic)
+
+    def value(self, name: str) -> float:
+        """The number called `name`; KeyError when it has none."""
+        for parameter, value in zip(self.parameters, self.values, strict=True):
+            if parameter.name == name:
+                return float(value)
+        raise KeyError(name)
+
+    def table(self) -> dict[str, Any]:
+        """The effect as a table of `extended.toml`."""
+        head = {"effect": self.name, "where": self.where, "source": self.source}
+        numbers = {p.name: float(value) for p, value in zip(self.parameters, self.values, strict=True)}
+        return {key: value for key, value in head.items() if value is not None} | numbers
+
+
+def _values(
+    parameters: tuple[Parameter, ...], given: Mapping[str, float] | Sequence[float] | FloatArray | None, name: str
+) -> FloatArray:
+    start = [p.usual if p.nominal is None else p.nominal for p in parameters]
+    if given is None:
+        return frozen_array(start)
+    if isinstance(given, Mapping):
+        names = [p.name for p in parameters]
+        for key in given:
+            if key not in names:
+                raise RobotError(f"{name} has no number {key!r}", remedy=did_you_mean(key, names))
+        given = [given.get(p.name, at_rest) for p, at_rest in zip(parameters, start, strict=True)]
+    values = np.asarray(given, dtype=np.float64)
+    if values.shape != (len(parameters),):
+        raise RobotError(f"{name} has {len(parameters)} numbers, not {values.size}")
+    for parameter, value in zip(parameters, values, strict=True):
+        if not np.isfinite(value) or (parameter.name in _POSITIVE and value <= 0.0):
+            raise RobotError(f"{name}: {parameter.name} = {value:g} cannot be")
+    return frozen_array(values)
+
+
+def _list(robot: RobotDescription) -> str:
+    return ", ".join(robot.joints)

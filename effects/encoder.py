@@ -1,0 +1,196 @@
+"""First stage: from a reading to the joint's angle. Each effect here gives the true angle minus the reading."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from interfaces.records import FloatArray
+
+from .motion import Motion
+from .parameter import Parameter
+
+# Of the numerical derivative of a play by its width [rad, m].
+_WIDTH_STEP = 1e-6
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Where an effect sits: a joint and, for a coupling, the joint that causes it, by their places in q."""
+
+    joint: int
+    prismatic: bool
+    source: int | None = None
+
+
+class EncoderEffect(ABC):
+    """An error of one joint's reading.
+
+    Attributes:
+        name: as in `diagnosis.json`.
+        takes_source: whether another joint causes it.
+        remembers: whether it depends on the order of the readings.
+        turns_only: whether only a joint that turns can have it.
+    """
+
+    name: ClassVar[str]
+    takes_source: ClassVar[bool] = False
+    remembers: ClassVar[bool] = False
+    turns_only: ClassVar[bool] = False
+
+    @abstractmethod
+    def parameters(self, prismatic: bool) -> tuple[Parameter, ...]:
+        """Its numbers at a joint that turns, or slides."""
+
+    @abstractmethod
+    def columns(self, motion: Motion, place: Place, values: FloatArray) -> FloatArray:
+        """Derivative (n, p) of the true angle by `values` (p,); zeros for those that are no amounts."""
+
+    def correction(self, motion: Motion, place: Place, values: FloatArray) -> FloatArray:
+        """True angle minus reading (n,) [rad, m]."""
+        return self.columns(motion, place, values) @ values
+
+
+class JointOffset(EncoderEffect):
+    """The zero is elsewhere: true angle = reading + offset."""
+
+    name = "joint_offset"
+
+    def parameters(self, prismatic: bool) -> tuple[Parameter, ...]:
+        return (Parameter("offset_m", 0.005) if prismatic else Parameter("offset_rad", 0.05),)
+
+    def columns(self, motion: Motion, place: Place, values: FloatArray) -> FloatArray:
+        return np.ones((len(motion), 1))
+
+
+class JointScale(EncoderEffect):
+    """Wrong gear ratio or counts per turn: true angle = reading · (1 + scale_error)."""
+
+    name = "joint_scale"
+
+    def parameters(self, prismatic: bool) -> tuple[Parameter, ...]:
+        return (Parameter("scale_error", 0.01),)
+
+    def columns(self, motion: Motion, place: Place, values: FloatArray) -> FloatArray:
+        return motion.q[:, [place.joint]]
+
+
+class JointEccentricity(EncoderEffect):
+    """The magnet of the encoder sits off the axis: an error with the period of a turn, to first order."""
+
+    name = "joint_eccentricity"
+    turns_only = True
+
+    def parameters(self, prismatic: bool) -> tuple[Parameter, ...]:
+        return (Parameter("sine_rad", 0.02), Parameter("cosine_rad", 0.02))
+
+    def columns(self, motion: Motion, place: Place, values: FloatArray) -> FloatArray:
+        q = motion.q[:, place.joint]
+        return np.stack([np.sin(q), np.cos(q)], axis=1)
+
+
+class JointRipple(EncoderEffect):
+    """Gear teeth, strain wave, pole pairs: an error whose period is a fraction of a turn (of a slide: a length)."""
+
+    name = "joint_ripple"
+
+    def parameters(self, prismatic: bool) -> tuple[Parameter, ...]:
+        if prismatic:
+            return (Parameter("sine_m", 0.001), Parameter("cosine_m", 0.001), Parameter("cycles_per_m", 100.0, None))
+        return (Parameter("sine_rad", 0.01), Parameter("cosine_rad", 0.01), Parameter("cycles_per_turn", 8.0, None))
+
+    def columns(self, motion: Motion, place: Place, values: FloatArray) -> FloatArray:
+        phase = motion.q[:, place.joint] * values[2] * (2.0 * np.pi if place.prismatic else 1.0)
+        return np.stack([np.sin(phase), np.cos(phase), np.zeros_like(phase)], axis=1)
+
+
+class JointCoupling(EncoderEffect):
+    """One joint moves with another: true angle = reading + ratio · (reading of the other)."""
+
+    name = "joint_coupling"
+    takes_source = True
+
+    def parameters(self, prismatic: bool) -> tuple[Parameter, ...]:
+        return (Parameter("ratio", 0.02),)
+
+    def columns(self, motion: Motion, place: Place, values: FloatArray) -> FloatArray:
+        return motion.q[:, [place.source]]
+
+
+class EncoderJump(EncoderEffect):
+    """The zero changes at a moment: true angle = reading + jump from then on."""
+
+    name = "encoder_jump"
+    remembers = True
+
+    def parameters(self, prismatic: bool) -> tuple[Parameter, ...]:
+        return (
+            Parameter("jump_m", 0.005) if prismatic else Parameter("jump_rad", 0.03),
+            Parameter("t0", 0.0, None),
+        )
+
+    def columns(self, motion: Motion, place: Place, values: FloatArray) -> FloatArray:
+        after = motion.clock >= values[1]
+        return np.stack([after.astype(np.float64), np.zeros(len(motion))], axis=1)
+
+
+class Backlash(EncoderEffect):
+    """Play between encoder and joint: the joint rests until the reading has crossed the width of the play."""
+
+    name = "backlash"
+    remembers = True
+
+    def parameters(self, prismatic: bool) -> tuple[Parameter, ...]:
+        return (Parameter("width_m", 0.002) if prismatic else Parameter("width_rad", 0.01),)
+
+    def columns(self, motion: Motion, place: Place, values: FloatArray) -> FloatArray:
+        wider = self.correction(motion, place, values + _WIDTH_STEP)
+        return ((wider - self.correction(motion, place, values)) / _WIDTH_STEP)[:, None]
+
+    def correction(self, motion: Motion, place: Place, values: FloatArray) -> FloatArray:
+        q = motion.q[:, place.joint]
+        return played(q, motion.runs, abs(float(values[0]))) * np.sign(values[0])
+
+
+class Settling(EncoderEffect):
+    """Read before the joint has come to rest: true angle = reading - fraction · last move."""
+
+    name = "settling"
+    remembers = True
+
+    def parameters(self, prismatic: bool) -> tuple[Parameter, ...]:
+        return (Parameter("fraction", 0.05),)
+
+    def columns(self, motion: Motion, place: Place, values: FloatArray) -> FloatArray:
+        return -motion.moves[:, [place.joint]]
+
+
+def played(q: FloatArray, runs: list[tuple[int, int]], width: float) -> FloatArray:
+    """Output minus input (n,) of a play of `width` that is driven by q (n,); each run begins where q leads first."""
+    half = 0.5 * width
+    lag = np.zeros_like(q)
+    for first, end in runs:
+        moves = np.diff(q[first:end])
+        leading = moves[np.flatnonzero(moves)[:1]]
+        output = float(q[first]) - (half * float(np.sign(leading[0])) if len(leading) else 0.0)
+        outputs = []
+        for reading in q[first:end].tolist():
+            output = min(max(output, reading - half), reading + half)
+            outputs.append(output)
+        lag[first:end] = outputs - q[first:end]
+    return lag
+
+
+ENCODER_EFFECTS: tuple[EncoderEffect, ...] = (
+    JointOffset(),
+    JointScale(),
+    JointEccentricity(),
+    JointRipple(),
+    JointCoupling(),
+    EncoderJump(),
+    Backlash(),
+    Settling(),
+)

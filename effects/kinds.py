@@ -1,0 +1,96 @@
+"""The table of effects: every way in which reality may differ from the simulation, each once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from .encoder import ENCODER_EFFECTS, EncoderEffect
+from .parameter import Parameter
+
+Stage = Literal["encoder", "structure", "tool", "camera", "time"]
+
+
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """One row of the table.
+
+    Attributes:
+        name: as in `diagnosis.json`.
+        stage: where in the simulation it acts.
+        at_joint: whether it sits at a joint.
+        turning, sliding: its numbers at a joint that turns, or slides; the same where it sits at none.
+        encoder: what it does to a reading, for those of the first stage.
+        begins: whether it begins at a moment, its parameter `t0`.
+        needs_times: whether it needs times, not only an order.
+        needs_stereo: whether it needs the stereo calibration.
+    """
+
+    name: str
+    stage: Stage
+    at_joint: bool
+    turning: tuple[Parameter, ...]
+    sliding: tuple[Parameter, ...]
+    encoder: EncoderEffect | None = None
+    begins: bool = False
+    needs_times: bool = False
+    needs_stereo: bool = False
+
+    def parameters(self, prismatic: bool) -> tuple[Parameter, ...]:
+        """Its numbers at a joint that turns, or slides."""
+        return self.sliding if prismatic else self.turning
+
+    @property
+    def takes_source(self) -> bool:
+        """Whether another joint causes it."""
+        return self.encoder is not None and self.encoder.takes_source
+
+    @property
+    def turns_only(self) -> bool:
+        """Whether only a joint that turns can have it."""
+        return self.encoder is not None and self.encoder.turns_only
+
+
+T0 = Parameter("t0", 0.0, None)
+_SHIFT = tuple(Parameter(f"{axis}_m", 0.01) for axis in "xyz")
+_TURN = tuple(Parameter(f"r{axis}_rad", 0.02) for axis in "xyz")
+_LINK = (*(Parameter(f"{axis}_m", 0.005) for axis in "xyz"), *_TURN)
+
+
+def _free(
+    name: str, stage: Stage, *parameters: Parameter, needs_times: bool = False, needs_stereo: bool = False
+) -> Kind:
+    begins = T0 in parameters
+    return Kind(name, stage, False, parameters, parameters, None, begins, needs_times, needs_stereo)
+
+
+def _of_encoder(effect: EncoderEffect) -> Kind:
+    turning = effect.parameters(False)
+    return Kind(
+        effect.name, "encoder", True, turning, effect.parameters(True), effect, any(p.name == "t0" for p in turning)
+    )
+
+
+KINDS: dict[str, Kind] = {
+    kind.name: kind
+    for kind in (
+        *(_of_encoder(effect) for effect in ENCODER_EFFECTS),
+        Kind(
+            "joint_compliance",
+            "structure",
+            True,
+            (Parameter("compliance_rad_per_Nm", 0.001),),
+            (Parameter("compliance_m_per_N", 1e-5),),
+        ),
+        Kind("link_geometry", "structure", True, _LINK, _LINK),
+        _free("tool_offset", "tool", *_SHIFT),
+        _free("tool_slip", "tool", *_SHIFT, T0),
+        _free("camera_pose", "camera", *_SHIFT, *_TURN),
+        _free("camera_moved", "camera", *_SHIFT, *_TURN, T0),
+        _free("camera_scale", "camera", Parameter("scale_error", 0.01)),
+        _free("camera_focal", "camera", Parameter("focal_error", 0.01), needs_stereo=True),
+        _free("lens_distortion", "camera", Parameter("k1", 0.05), needs_stereo=True),
+        _free("camera_latency", "time", Parameter("latency_s", 0.02), needs_times=True),
+        _free("thermal_drift", "time", *_SHIFT, Parameter("time_constant_s", 600.0, None), needs_times=True),
+    )
+}

@@ -1,0 +1,25 @@
+"""What an effect is described by: numbers with a name, a unit and a usual size."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class Parameter:
+    """One number of an effect.
+
+    Attributes:
+        name: with its unit, as in `extended.toml` and `diagnosis.json`.
+        usual: the size that it has where the effect is there [the parameter's unit]: what a search begins with.
+        nominal: its value where it does nothing; None for a number that only says when or how (a moment, a period).
+    """
+
+    name: str
+    usual: float
+    nominal: float | None = 0.0
+
+    @property
+    def is_amount(self) -> bool:
+        """Whether it says how much: the measured position depends on it smoothly, and at `nominal` nothing happens."""
+        return self.nominal is not None

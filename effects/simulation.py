@@ -1,0 +1,329 @@
+"""The simulation as a pipeline: encoder, structure, tool, camera, time; the nominal one with effects added.
+
+x_measured = drift(t) + optics(camera(tool(structure(encoder(q(t - latency))))))
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from interfaces.records import FloatArray
+from interfaces.robot import RobotDescription
+from interfaces.urdf import inverse
+from kbmaps import RigidChain
+from kbmaps.rotations import exponentials
+
+from .effect import Effect
+from .encoder import Place
+from .gravity import GravityLoad
+from .motion import Motion
+from .optics import Optics
+
+# A spring's deflection changes its own load: each round brings the next order.
+_SPRING_ROUNDS = 3
+# Of the numerical derivatives by the optics' numbers and by a point.
+_STEP = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class Simulation:
+    """A robot with effects: what its cameras would report.
+
+    Attributes:
+        robot: the robot as described.
+        effects: what is added to it.
+    """
+
+    robot: RobotDescription
+    effects: tuple[Effect, ...] = ()
+
+    @cached_property
+    def gravity(self) -> GravityLoad:
+        """Gravity's torques about the joints."""
+        return GravityLoad(self.robot)
+
+    def with_effects(self, effects: Sequence[Effect]) -> Simulation:
+        """The same robot with these effects in the place of its own."""
+        changed = Simulation(self.robot, tuple(effects))
+        changed.__dict__["gravity"] = self.gravity
+        return changed
+
+    def positions(self, motion: Motion) -> FloatArray:
+        """What would be measured (n, 3) [m] in the measurement frame."""
+        return self.run(motion).measured
+
+    def run(self, motion: Motion) -> Simulated:
+        """The pipeline, with all that is on the way."""
+        readings = motion.earlier(sum(e.value("latency_s") for e in self._of("camera_latency")))
+        q = readings.q.copy()
+        for effect in self.effects:
+            if effect.kind.encoder is not None:
+                place = self.place(effect)
+                q[:, place.joint] += effect.kind.encoder.correction(readings, place, effect.values)
+        q += self._given_way(q)
+        chain = self._chain()
+        frames = chain.frames(q)
+        marker = frames[:, -1]
+        x_true = marker[:, :3, 3] + np.einsum("nij,nj->ni", marker[:, :3, :3], self._tool(motion))
+        x_placed = x_true
+        for effect in self._of("camera_pose"):
+            x_placed = _from(effect.values, x_placed)
+        x_camera = x_placed
+        for effect in self._of("camera_moved"):
+            x_camera = np.where(after(motion, effect)[:, None], _from(effect.values, x_camera), x_camera)
+        measured = self.optics.reported(x_camera, self.robot.calibration) + self._drift(motion)
+        return Simulated(self, motion, readings, q, chain, frames, x_true, x_placed, x_camera, measured)
+
+    def place(self, effect: Effect) -> Place:
+        """Where an effect of the first stage sits."""
+        assert effect.where is not None
+        source = None if effect.source is None else self.robot.joints.index(effect.source)
+        return Place(self.robot.joints.index(effect.where), effect.prismatic, source)
+
+    @cached_property
+    def optics(self) -> Optics:
+        """The cameras' errors."""
+        return Optics(
+            sum(e.value("scale_error") for e in self._of("camera_scale")),
+            sum(e.value("focal_error") for e in self._of("camera_focal")),
+            sum(e.value("k1") for e in self._of("lens_distortion")),
+        )
+
+    def _of(self, name: str) -> list[Effect]:
+        return [effect for effect in self.effects if effect.name == name]
+
+    def _given_way(self, q: FloatArray) -> FloatArray:
+        """How far the joints give under the arm's weight (n, d) [rad, m]."""
+        springs = np.zeros(q.shape[1])
+        for effect in self._of("joint_compliance"):
+            springs[self.place(effect).joint] += effect.values[0]
+        given = np.zeros_like(q)
+        if springs.any():
+            for _ in range(_SPRING_ROUNDS):
+                given = springs * self.gravity.torques(q + given)
+        return given
+
+    def _chain(self) -> RigidChain:
+        """The chain with its links as they are."""
+        chain = self.robot.chain
+        fixed = chain.fixed.copy()
+        for effect in self._of("link_geometry"):
+            k = self.place(effect).joint
+            moved = transforms(effect.values[None])[0]
+            if self.upward[k]:
+                fixed[k + 1] = inverse(moved) @ fixed[k + 1]
+            else:
+                fixed[k] = fixed[k] @ moved
+        return RigidChain(fixed, chain.axes, chain.prismatic)
+
+    @cached_property
+    def upward(self) -> list[bool]:
+        """Which joints are walked from child to parent on the way from camera to marker (d,)."""
+        way = self.robot.tree.path(self.robot.camera.parent_link, self.robot.robot.marker_link)
+        return [upward for joint, upward in way if joint.name in self.robot.joints]
+
+    def _tool(self, motion: Motion) -> FloatArray:
+        """How far the marker is from its place (n, 3) [m], in its link."""
+        shift = np.zeros((len(motion), 3))
+        for effect in self._of("tool_offset"):
+            shift += effect.values
+        for effect in self._of("tool_slip"):
+            shift[after(motion, effect)] += effect.values[:3]
+        return shift
+
+    def _drift(self, motion: Motion) -> FloatArray | float:
+        """How far what is measured has drifted (n, 3) [m]."""
+        return sum((settled(motion, e.values[3])[:, None] * e.values[:3] for e in self._of("thermal_drift")), 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Simulated:
+    """One run of the pipeline, and how its outcome changes with each effect's numbers.
+
+    Attributes:
+        readings: what the encoders read at the time of the images.
+        q: true joint angles (n, d) [rad, m].
+        frames: of the joints and the marker (n, d + 1, 4, 4) in the nominal camera's frame.
+        x_true, x_placed, x_camera: the marker (n, 3) [m] as the nominal camera sees it, the camera where it was set up,
+            and the camera where it is.
+        measured: what would be measured (n, 3) [m].
+    """
+
+    simulation: Simulation
+    motion: Motion
+    readings: Motion
+    q: FloatArray
+    chain: RigidChain
+    frames: FloatArray
+    x_true: FloatArray
+    x_placed: FloatArray
+    x_camera: FloatArray
+    measured: FloatArray
+
+    @cached_property
+    def by_joint(self) -> FloatArray:
+        """Derivative (n, 3, d) of what is measured by the true joint angles [m/rad, m/m]."""
+        chain, frames = self.chain, self.frames
+        axes = np.einsum("nkij,kj->nki", frames[:, :-1, :3, :3], chain.axes)
+        levers = self.x_true[:, None] - frames[:, :-1, :3, 3]
+        moved = np.where(chain.prismatic[:, None], axes, np.cross(axes, levers))
+        return self._seen(np.swapaxes(moved, 1, 2))
+
+    @cached_property
+    def torques(self) -> FloatArray:
+        """Gravity's torques (n, d) [N·m, N]."""
+        return self.simulation.gravity.torques(self.q)
+
+    def columns(self, effect: Effect) -> FloatArray:
+        """Derivative (n, 3, p) of what is measured by the effect's values, at its values; zeros for no amounts."""
+        simulation = self.simulation
+        if effect.kind.encoder is not None:
+            place = simulation.place(effect)
+            by_value = effect.kind.encoder.columns(self.readings, place, effect.values)
+            return self.by_joint[:, :, [place.joint]] * by_value[:, None, :]
+        return self._BY_NAME[effect.name](self, effect)
+
+    def _compliance(self, effect: Effect) -> FloatArray:
+        k = self.simulation.place(effect).joint
+        return self.by_joint[:, :, [k]] * self.torques[:, None, [k]]
+
+    def _link(self, effect: Effect) -> FloatArray:
+        simulation = self.simulation
+        k = simulation.place(effect).joint
+        turn, by_turn = _rotation(effect.values)
+        if simulation.upward[k]:
+            # The frame after the joint's own motion, in which the link above it begins.
+            frame = self.frames[:, k + 1] @ inverse(self.chain.fixed[k + 1])
+            axes = -frame[:, :3, :3] @ turn.T
+        else:
+            frame = self.frames[:, k]
+            axes = frame[:, :3, :3] @ turn.T
+        lever = self.x_true - frame[:, :3, 3]
+        return self._seen(_moved_and_turned(axes, axes @ by_turn, lever))
+
+    def _tool(self, effect: Effect) -> FloatArray:
+        return self._seen(self.frames[:, -1, :3, :3])
+
+    def _tool_slip(self, effect: Effect) -> FloatArray:
+        return _with_moment(self._tool(effect) * self._after(effect))
+
+    def _camera(self, effect: Effect) -> FloatArray:
+        return self._optical(self._since_moved(_of_camera(effect, self.x_placed)))
+
+    def _camera_moved(self, effect: Effect) -> FloatArray:
+        return _with_moment(self._optical(_of_camera(effect, self.x_camera)) * self._after(effect))
+
+    def _optics(self, effect: Effect) -> FloatArray:
+        optics, calibration = self.simulation.optics, self.simulation.robot.calibration
+        numbers = {"scale_error": optics.scale_error, "focal_error": optics.focal_error, "k1": optics.k1}
+        name = effect.parameters[0].name
+        more, less = (Optics(**(numbers | {name: numbers[name] + step})) for step in (_STEP, -_STEP))
+        change = more.reported(self.x_camera, calibration) - less.reported(self.x_camera, calibration)
+        return (change / (2.0 * _STEP))[:, :, None]
+
+    def _latency(self, effect: Effect) -> FloatArray:
+        return -np.einsum("nij,nj->ni", self.by_joint, self.motion.rates)[:, :, None]
+
+    def _drift(self, effect: Effect) -> FloatArray:
+        return _with_moment(settled(self.motion, effect.values[3])[:, None, None] * np.eye(3))
+
+    def _after(self, effect: Effect) -> FloatArray:
+        return after(self.motion, effect)[:, None, None].astype(np.float64)
+
+    def _seen(self, moved: FloatArray) -> FloatArray:
+        """What is measured of moves (n, 3, p) [m] of the point that the nominal camera sees."""
+        for effect in self.simulation.effects:
+            if effect.name == "camera_pose":
+                moved = _rotation(effect.values)[0].T @ moved
+        return self._optical(self._since_moved(moved))
+
+    def _since_moved(self, moved: FloatArray) -> FloatArray:
+        """Moves (n, 3, p) in the frame of the camera where it is, of moves in its frame where it was set up."""
+        for effect in self.simulation.effects:
+            if effect.name == "camera_moved":
+                moved = np.where(self._after(effect) > 0.0, _rotation(effect.values)[0].T @ moved, moved)
+        return moved
+
+    def _optical(self, moved: FloatArray) -> FloatArray:
+        """What is measured of moves (n, 3, p) of the point in the camera's frame [m]."""
+        optics = self.simulation.optics
+        if not optics.inside:
+            return moved * (1.0 + optics.scale_error)
+        return np.einsum("nij,njp->nip", self._by_point, moved)
+
+    @cached_property
+    def _by_point(self) -> FloatArray:
+        """Derivative (n, 3, 3) of what the optics report by the point."""
+        optics, calibration = self.simulation.optics, self.simulation.robot.calibration
+        changes = [
+            optics.reported(self.x_camera + step, calibration) - optics.reported(self.x_camera - step, calibration)
+            for step in _STEP * np.eye(3)
+        ]
+        return np.stack(changes, axis=2) / (2.0 * _STEP)
+
+    _BY_NAME: ClassVar[dict[str, Callable[[Simulated, Effect], FloatArray]]] = {
+        "joint_compliance": _compliance,
+        "link_geometry": _link,
+        "tool_offset": _tool,
+        "tool_slip": _tool_slip,
+        "camera_pose": _camera,
+        "camera_moved": _camera_moved,
+        "camera_scale": _optics,
+        "camera_focal": _optics,
+        "lens_distortion": _optics,
+        "camera_latency": _latency,
+        "thermal_drift": _drift,
+    }
+
+
+def transforms(values: FloatArray) -> FloatArray:
+    """Transforms (n, 4, 4) of shifts [m] and rotation vectors [rad] (n, 6)."""
+    T = np.tile(np.eye(4), (len(values), 1, 1))
+    T[:, :3, :3] = exponentials(values[:, 3:6])[0]
+    T[:, :3, 3] = values[:, :3]
+    return T
+
+
+def settled(motion: Motion, time_constant_s: float) -> FloatArray:
+    """How much of a drift has come (n,), from 0 at the first row towards 1."""
+    return -np.expm1(-(motion.clock - motion.clock[0]) / time_constant_s)
+
+
+def after(motion: Motion, effect: Effect) -> NDArray[np.bool_]:
+    """Which rows (n,) come after the moment at which an effect begins."""
+    return motion.clock >= effect.values[-1]
+
+
+def _rotation(values: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """The rotation (3, 3) of a pose's values (6, ...), and by how much it turns for a change of its numbers (3, 3)."""
+    turns, jacobians = exponentials(values[None, 3:6])
+    return turns[0], jacobians[0]
+
+
+def _from(values: FloatArray, x: FloatArray) -> FloatArray:
+    """Points (n, 3) in the frame of a camera that has the pose `values` (6, ...) in theirs."""
+    return (x - values[:3]) @ _rotation(values)[0]
+
+
+def _of_camera(effect: Effect, x: FloatArray) -> FloatArray:
+    """Moves (n, 3, 6) of points x (n, 3) in the frame of a camera, by the numbers of its pose."""
+    turn, by_turn = _rotation(effect.values)
+    axes = np.broadcast_to(-turn.T, (len(x), 3, 3))
+    return _moved_and_turned(axes, axes @ by_turn, x)
+
+
+def _moved_and_turned(shifts: FloatArray, axes: FloatArray, lever: FloatArray) -> FloatArray:
+    """Moves (n, 3, 6): shifts (n, 3, 3), and turns about the columns of axes (n, 3, 3), of what is at lever (n, 3)."""
+    turned = np.cross(np.swapaxes(axes, 1, 2), lever[:, None, :])
+    return np.concatenate([shifts, np.swapaxes(turned, 1, 2)], axis=2)
+
+
+def _with_moment(columns: FloatArray) -> FloatArray:
+    """Derivatives (n, 3, p) with zeros for the number that says when."""
+    return np.concatenate([columns, np.zeros_like(columns[:, :, :1])], axis=2)
