@@ -91,9 +91,14 @@ class Fit:
         return np.sqrt(self.noise.weights)[:, None]
 
     @cached_property
+    def run_columns(self) -> FloatArray:
+        """Derivatives (n, 3, p) of what is measured by all amounts [m]."""
+        return _amount_columns(self.run, self.simulation.effects)
+
+    @cached_property
     def columns(self) -> FloatArray:
-        """Derivatives (n, 3, p) of the residuals' prediction by all amounts, whitened, weighted."""
-        return self.weighted(_amount_columns(self.run, self.simulation.effects))
+        """`run_columns`, whitened and weighted."""
+        return self.weighted(self.run_columns)
 
     def weighted(self, columns: FloatArray) -> FloatArray:
         """Columns (n, 3, p) [m] whitened and weighted."""
@@ -119,7 +124,7 @@ class Fit:
         """Of all amounts (p, p), nuisances first."""
         n, _, p = self.columns.shape
         flat = self.columns.reshape(3 * n, p)
-        information = flat.T @ flat / self.noise.sigma**2 + np.diag(_prior_precision(self.simulation, self.nuisances))
+        information = flat.T @ flat / self.noise.sigma**2 + np.diag(prior_precision(self.simulation, self.nuisances))
         return np.linalg.pinv(information, rcond=1e-14, hermitian=True)
 
     def with_causes(self, causes: Sequence[Effect]) -> Fit:
@@ -163,7 +168,7 @@ def _at(observations: Observations, simulation: Simulation, nuisances: int, star
 def _step(fit: Fit) -> FloatArray:
     n, _, p = fit.columns.shape
     flat = fit.columns.reshape(3 * n, p)
-    precision = _prior_precision(fit.simulation, fit.nuisances) * fit.noise.sigma**2
+    precision = prior_precision(fit.simulation, fit.nuisances) * fit.noise.sigma**2
     values = np.concatenate([effect.values[effect.amounts] for effect in fit.simulation.effects])
     normal = flat.T @ flat + np.diag(precision)
     gradient = flat.T @ fit.left.ravel() - precision * values
@@ -182,7 +187,7 @@ def _moved(simulation: Simulation, step: FloatArray) -> Simulation:
     return simulation.with_effects(effects)
 
 
-def _prior_precision(simulation: Simulation, nuisances: int) -> FloatArray:
+def prior_precision(simulation: Simulation, nuisances: int) -> FloatArray:
     """Of all amounts (p,): what is not known beforehand may be anything."""
     parts = []
     for k, effect in enumerate(simulation.effects):

@@ -23,6 +23,8 @@ _WIDTHS = np.geomspace(2e-4, 0.15, 14)
 _TIME_CONSTANTS = np.array([0.03, 0.1, 0.3, 1.0, 3.0])
 # Rows that have to lie on either side of a moment.
 _BESIDE = 8
+# Twice the fall of the log-likelihood at the ends of a 95 % interval.
+_AT_95 = 3.841
 # A column of which so little is left beside what is fitted tells nothing.
 _TOLD_APART = 1e-7
 
@@ -36,12 +38,14 @@ class Candidate:
         gain: twice the rise of the log-likelihood.
         dof: how many amounts of it the data tell.
         trials: among how many moments or periods it was chosen.
+        interval: where else the moment or period may be, at 95 %; None for an effect that has none.
     """
 
     effect: Effect
     gain: float
     dof: int
     trials: int = 1
+    interval: tuple[float, float] | None = None
 
 
 class Scan:
@@ -62,7 +66,7 @@ class Scan:
         found = []
         for effect in hypotheses:
             candidate = self.candidate(effect)
-            if candidate is not None and candidate.dof > 0 and np.isfinite(candidate.gain):
+            if candidate is not None and candidate.effect.is_possible and np.isfinite(candidate.gain):
                 found.append(candidate)
         return found
 
@@ -91,42 +95,54 @@ class Scan:
                 place = self._fit.simulation.place(effect)
                 assert effect.kind.encoder is not None
                 bent = effect.kind.encoder.correction(self._fit.run.readings, place, values) / values[0]
-                columns = self._port(place.joint)[:, :, None] * bent[:, None, None]
+                columns = self._ports[place.joint][:, :, None] * bent[:, None, None]
             else:
                 columns = self._fit.weighted(self._fit.run.columns(shaped)[:, :, effect.amounts])
             gain, amounts, dof = self._explained(columns, shaped)
             if scaled:
                 # The width that the shape was made with, and the one that it would take.
                 off = abs(np.log(max(amounts[0], 1e-12) / values[0]))
-                gain, amounts = (gain if off < np.log(3.0) else gain * 0.5), np.abs(amounts)
+                gain = gain if off < np.log(3.0) else 0.5 * gain
             if dof and (best is None or gain > best.gain):
                 best = Candidate(_with_amounts(shaped, amounts), gain, dof, len(shapes))
         return best
 
     def _ripple(self, effect: Effect) -> Candidate | None:
-        """Over all whole numbers of cycles a turn; of a slide, over periods down to twice its usual step."""
+        """Over all whole numbers of cycles a turn, then beside the best; of a slide, over those its path can tell."""
+        place = self._fit.simulation.place(effect)
+        span = max(float(np.ptp(self._fit.run.readings.q[:, place.joint])), 1e-6)
+        first, step = (2.0, 1.0) if not place.prismatic else (1.0 / span, 1.0 / span)
+        coarse = first + step * np.arange(_MOST_CYCLES - 1)
+        gains, _, _ = self._rippled(effect, coarse)
+        # A peak is as wide as what turns the phase by one over the range.
+        width = 1.0 / span if place.prismatic else 2.0 * np.pi / span
+        fine = coarse[int(np.argmax(gains))] + 0.5 * max(width, step) * np.linspace(-1.0, 1.0, 61)
+        fine = fine[fine > 0.5 * first]
+        gains, amounts, dofs = self._rippled(effect, fine)
+        best = int(np.argmax(gains))
+        if not dofs[best]:
+            return None
+        values = np.array([*amounts[best], fine[best]])
+        interval = _interval(fine, gains)
+        return Candidate(effect.with_values(values), float(gains[best]), int(dofs[best]), 2 * len(coarse), interval)
+
+    def _rippled(self, effect: Effect, cycles: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """`_solved` for each number of cycles (m,)."""
         place = self._fit.simulation.place(effect)
         q = self._fit.run.readings.q[:, place.joint]
-        if place.prismatic:
-            span = max(float(np.ptp(q)), 1e-6)
-            cycles = np.arange(1, _MOST_CYCLES + 1) / span
-            phases = 2.0 * np.pi * q[:, None] * cycles
-        else:
-            cycles = np.arange(2.0, _MOST_CYCLES + 1)
-            phases = q[:, None] * cycles
-        port = self._port(place.joint)
+        phases = q[:, None] * cycles * (2.0 * np.pi if place.prismatic else 1.0)
+        port = self._ports[place.joint]
         onto = np.einsum("nir,ni->nr", self._basis, port)
         square, with_left = np.square(port).sum(axis=1), (port * self._left).sum(axis=1)
-        pair = np.stack([np.sin(phases), np.cos(phases)], axis=2)  # (n, m, 2)
-        inner = np.einsum("nma,n,nmb->mab", pair, square, pair, optimize=True)
-        removed = np.einsum("nma,nr->mar", pair, onto, optimize=True)
+        sine, cosine = np.sin(phases), np.cos(phases)
+        inner = np.empty((len(cycles), 2, 2))
+        inner[:, 0, 0], inner[:, 1, 1] = square @ np.square(sine), square @ np.square(cosine)
+        inner[:, 0, 1] = inner[:, 1, 0] = square @ (sine * cosine)
         raw = np.einsum("maa->ma", inner).copy()
+        removed = np.stack([sine.T @ onto, cosine.T @ onto], axis=1)
         inner -= removed @ np.swapaxes(removed, 1, 2)
-        gradient = np.einsum("nma,n->ma", pair, with_left)
-        gains, amounts, dofs = self._solved(inner, gradient, raw, effect)
-        best = int(np.argmax(gains))
-        values = np.array([*amounts[best], cycles[best]])
-        return Candidate(effect.with_values(values), float(gains[best]), int(dofs[best]), len(cycles))
+        gradient = np.stack([with_left @ sine, with_left @ cosine], axis=1)
+        return self._solved(inner, gradient, raw, effect)
 
     def _moment(self, effect: Effect) -> Candidate | None:
         """Over all moments between two rows."""
@@ -149,10 +165,13 @@ class Scan:
         gradient = since(np.einsum("nia,ni->na", columns, self._left))
         gains, amounts, dofs = self._solved(inner, gradient, raw, effect)
         best = int(np.argmax(gains))
+        if not dofs[best]:
+            return None
         row = best + _BESIDE
         moment = 0.5 * (clock[row - 1] + clock[row])
         values = np.append(amounts[best], moment)
-        return Candidate(effect.with_values(values), float(gains[best]), int(dofs[best]), len(gains))
+        interval = _interval(0.5 * (clock[_BESIDE - 1 : n - _BESIDE - 1] + clock[_BESIDE : n - _BESIDE]), gains)
+        return Candidate(effect.with_values(values), float(gains[best]), int(dofs[best]), len(gains), interval)
 
     def _explained(self, columns: FloatArray, effect: Effect) -> tuple[float, FloatArray, int]:
         inner = np.einsum("nia,nib->ab", columns, columns)
@@ -181,13 +200,16 @@ class Scan:
         gains = -3.0 * self._rows * np.log1p(-explained / self._rss)
         return np.where(dofs > 0, gains, 0.0), amounts, dofs
 
-    def _port(self, joint: int) -> FloatArray:
-        """How the weighted residuals' prediction moves with one joint (n, 3)."""
-        return self._ports[joint]
-
     @cached_property
     def _ports(self) -> FloatArray:
+        """How the weighted prediction moves with each joint (d, n, 3)."""
         return np.moveaxis(self._fit.weighted(self._fit.run.by_joint), 2, 0)
+
+
+def _interval(shapes: FloatArray, gains: FloatArray) -> tuple[float, float]:
+    """The first and the last of the shapes (m,) that are not less probable than 95 % of the best allow."""
+    near = np.flatnonzero(gains > gains.max() - _AT_95)
+    return float(shapes[near[0]]), float(shapes[near[-1]])
 
 
 def _with_amounts(effect: Effect, amounts: FloatArray) -> Effect:

@@ -63,7 +63,7 @@ class Search:
         for candidate in self.shortlist(fit, others):
             tried = self.refined(fit.with_causes([*fit.causes, candidate.effect]), candidate.effect.key)
             worth = nats(2.0 * (tried.log_likelihood - fit.log_likelihood), candidate.dof) - self.doubt(candidate)
-            if worth > most:
+            if worth > most and tried.causes[-1].is_possible:
                 best, most = tried, worth
         if best is not None:
             self._tell(f"found {describe(best.causes[-1])}")
@@ -122,7 +122,7 @@ class Search:
                     continue
                 tried = self.refined(fit.with_causes([*others, candidate.effect]), candidate.effect.key)
                 worth = nats(2.0 * (tried.log_likelihood - fit.log_likelihood), candidate.dof - dof)
-                if worth > 1.0:
+                if worth > 1.0 and tried.causes[-1].is_possible:
                     self._tell(f"exchanged {describe(cause)} for {describe(candidate.effect)}")
                     return tried, True
         return fit, False

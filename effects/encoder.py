@@ -144,7 +144,11 @@ class Backlash(EncoderEffect):
     remembers = True
 
     def parameters(self, prismatic: bool) -> tuple[Parameter, ...]:
-        return (Parameter("width_m", 0.002) if prismatic else Parameter("width_rad", 0.01),)
+        return (
+            Parameter("width_m", 0.002, never_negative=True)
+            if prismatic
+            else Parameter("width_rad", 0.01, never_negative=True),
+        )
 
     def columns(self, motion: Motion, place: Place, values: FloatArray) -> FloatArray:
         wider = self.correction(motion, place, values + _WIDTH_STEP)
@@ -162,7 +166,7 @@ class Settling(EncoderEffect):
     remembers = True
 
     def parameters(self, prismatic: bool) -> tuple[Parameter, ...]:
-        return (Parameter("fraction", 0.05),)
+        return (Parameter("fraction", 0.05, never_negative=True),)
 
     def columns(self, motion: Motion, place: Place, values: FloatArray) -> FloatArray:
         return -motion.moves[:, [place.joint]]
