@@ -129,7 +129,7 @@ def _masses(joints: tuple[Joint, ...], kilograms: list[float], rng: np.random.Ge
     masses = {}
     for joint, kg in zip(joints, kilograms, strict=True):
         centre = 0.5 * ends.get(joint.child, np.array([0.0, 0.0, 0.06])) + rng.uniform(-0.03, 0.03, 3)
-        masses[joint.child] = Mass(kg * rng.uniform(0.9, 1.1), vector(centre))
+        masses[joint.child] = Mass(float(kg * rng.uniform(0.9, 1.1)), vector(centre))
     return masses
 
 
@@ -140,7 +140,7 @@ def _standing_camera(rng: np.random.Generator, eye: Vector, target: Vector) -> t
     eyes = Eyes(
         focal_px=round(rng.uniform(680.0, 900.0), 1),
         baseline_m=round(rng.uniform(0.25, 0.5), 3),
-        pixel_sigma=round(rng.uniform(0.1, 0.5), 2),
+        pixel_sigma=round(float(np.exp(rng.uniform(*np.log([0.1, 0.5])))), 2),
         principal_point_px=(round(rng.uniform(625, 655), 1), round(rng.uniform(470, 490), 1)),
     )
     return vector(at), rpy, eyes
@@ -263,7 +263,7 @@ def drawn(rng: np.random.Generator) -> Arm:
         xyz = vector(np.array([length, 0.0, 0.0]) + rng.uniform(-0.05, 0.05, 3))
         rows.append((f"j{index}", "revolute", xyz, vector(rng.uniform(-0.3, 0.3, 3)), letter, -80.0, 80.0))
     kilograms = list(rng.uniform(0.7, 1.3, 6) * np.array([8.0, 6.0, 4.0, 2.5, 1.5, 0.7]))
-    return _beside(rng, "drawn", _chain(BASE, *rows), kilograms, (2.3, 0.9, 1.3), (0.2, 0.0, 0.4))
+    return _beside(rng, "drawn", _chain(BASE, *rows), kilograms, (2.0, 0.8, 1.2), (0.2, 0.0, 0.4))
 
 
 ARMS: dict[str, Callable[[np.random.Generator], Arm]] = {

@@ -111,6 +111,8 @@ def bullet() -> Iterator[Bullet]:
     client = pybullet.connect(pybullet.DIRECT)
     try:
         pybullet.setGravity(0.0, 0.0, -GRAVITY, physicsClientId=client)
+        # Otherwise an arm written over the file of another would come out as that other one.
+        pybullet.setPhysicsEngineParameter(enableFileCaching=0, physicsClientId=client)
         with tempfile.TemporaryDirectory() as folder:
             yield Bullet(client, Path(folder))
     finally:

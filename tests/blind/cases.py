@@ -19,7 +19,7 @@ from .kinds import KINDS, SHIFT, SIX
 from .motion import SEGMENT_RAD, Motion, Style, move
 from .outliers import false_fixes
 from .sizing import NoEffect, Sizer, drawn
-from .world import Sight, World
+from .world import Sight, World, time_constant
 
 MARGIN_PX = 60.0
 SPARE = 0.02  # pairs recorded beyond those asked for: a hidden camera may lose some at the border
@@ -209,14 +209,13 @@ def _one(
 
 def _finished(hidden: Hidden, site: Site, sizer: Sizer) -> Hidden:
     """Lost ticks are whole ones; a lag is told with the rest that it was given."""
-    p, rest = hidden.parameters, site.motion.rest_s
+    p = hidden.parameters
     if hidden.effect == "encoder_jump":
         name, tick = f"jump_{site.unit}", site.arm.quantum(str(site.where))
         lost = np.sign(p[name]) * max(1.0, np.rint(abs(p[name]) / tick))
         return sizer.sized(replace(hidden, parameters={**p, name: float(lost * tick)}))
-    if hidden.effect == "settling" and rest is not None:
-        told = {**p, "rest_s": rest, "left": float(np.exp(-rest / p["tau_s"]))}
-        return replace(hidden, parameters=told)
+    if hidden.effect == "settling":
+        return replace(hidden, parameters={"tau_s": time_constant(p), **p})
     return hidden
 
 

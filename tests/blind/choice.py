@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .arms import ARMS, Arm
+from .arms import ARMS, FLOOR, Arm
 from .hidden import Kind
 from .kinds import KINDS
 from .motion import Style
@@ -104,9 +104,17 @@ def placed(wish: Wish, arm: Arm, taken: Sequence[tuple[str, str | None]], rng: n
     for name in (wish.where, wish.source):
         if name is not None and name not in arm.read:
             raise ValueError(f"{arm.name} reads no joint {name!r}; it reads {', '.join(arm.read)}")
-    possible = bending_joints(arm) if wish.effect == "link_bend" else arm.read
-    free = [name for name in possible if (wish.effect, name) not in taken]
+    free = [name for name in _possible(wish.effect, arm) if (wish.effect, name) not in taken]
     where = wish.where or str(rng.choice(free))
     if kind.at == "joint":
         return Wish(wish.effect, where)
     return Wish(wish.effect, where, wish.source or str(rng.choice([name for name in arm.read if name != where])))
+
+
+def _possible(effect: str, arm: Arm) -> tuple[str, ...]:
+    """Joints where the effect is what it is called."""
+    if effect == "link_bend":
+        return bending_joints(arm)
+    if effect == "growing_link" and arm.camera_link == FLOOR:
+        return arm.read[1:]  # before the first joint growth is a drift of the whole frame
+    return arm.read

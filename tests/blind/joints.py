@@ -6,6 +6,7 @@ The *shaft* is the joint's position as its motor drives it. The encoder reads th
 from __future__ import annotations
 
 import numpy as np
+from scipy.optimize import brentq
 
 from .arrays import FloatArray
 
@@ -47,6 +48,22 @@ def lagging(t: FloatArray, shaft: FloatArray, tau_s: float) -> FloatArray:
         error = keep * error + push
         behind[index] = error
     return shaft + behind
+
+
+def left_of_move(tau_s: float, move_s: float, rest_s: float) -> float:
+    """Part of a smooth move of `move_s` that a lagging output still lacks `rest_s` after its end."""
+    h = np.linspace(0.0, 1.0, 65)
+    t = np.append(h * move_s, move_s + rest_s)
+    return float(1.0 - lagging(t, np.append(h * h * (3.0 - 2.0 * h), 1.0), tau_s)[-1])
+
+
+def lag_that_leaves(left: float, move_s: float, rest_s: float) -> float:
+    """Time constant [s] of a lag that leaves this part of a move."""
+
+    def excess(log_tau: float) -> float:
+        return left_of_move(float(np.exp(log_tau)), move_s, rest_s) - left
+
+    return float(np.exp(brentq(excess, np.log(0.02 * rest_s), np.log(100.0 * (move_s + rest_s)), xtol=1e-10)))
 
 
 def wandering(t: FloatArray, normals: FloatArray, interval_s: float) -> FloatArray:

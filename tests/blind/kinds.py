@@ -44,12 +44,10 @@ def _play(site: Site, rng: np.random.Generator) -> Parameters:
 
 
 def _settling(site: Site, rng: np.random.Generator) -> Parameters:
-    return {"tau_s": 0.3 * rest_of(site)}
-
-
-def rest_of(site: Site) -> float:
-    """Time between move and reading; a tenth of a second, about that between pairs, where the walk never rests."""
-    return 0.1 if site.motion.rest_s is None else site.motion.rest_s
+    move, rest = site.motion.move_s, site.motion.rest_s
+    if move is None or rest is None:
+        return {"tau_s": START}
+    return {"left": START, "move_s": move, "rest_s": rest}
 
 
 def _compliance(site: Site, rng: np.random.Generator) -> Parameters:
@@ -140,11 +138,11 @@ KINDS: dict[str, Kind] = {
     ),
     "settling": Kind(
         "joint",
-        ("tau_s",),
+        ("left", "tau_s"),
         _settling,
-        2.0,
-        "time constant with which the output follows the reading; read rest_s after the move, left is the part of the "
-        "move that is still to come then",
+        0.9,
+        "left is the part of the last move that the output still lacks when it is read: rest_s after the end of a move "
+        "that took move_s; tau_s is the time constant with which it follows; a walk without rests has tau_s alone",
     ),
     "joint_compliance": Kind(
         "joint",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -31,7 +31,8 @@ class Motion:
         shaft: positions at those instants, after the gears and free of any error [rad or m], shape (f, d).
         stamps: when pairs are read [s], shape (n,).
         segment: number of the run of pairs each belongs to, shape (n,).
-        rest_s: time between the end of a move and the reading; None in a walk that never rests.
+        move_s, rest_s: how long every move lasts, and the time between its end and the reading; None in a walk that
+            never rests.
     """
 
     style: Style
@@ -39,12 +40,13 @@ class Motion:
     shaft: FloatArray
     stamps: FloatArray
     segment: IntArray
+    move_s: float | None
     rest_s: float | None
 
     def thinned(self, count: int) -> Motion:
         """The same path, read at only `count` of the stamps, evenly chosen."""
         chosen = np.unique(np.linspace(0, len(self.stamps) - 1, count).astype(int))
-        return Motion(self.style, self.t, self.shaft, self.stamps[chosen], self.segment[chosen], self.rest_s)
+        return replace(self, stamps=self.stamps[chosen], segment=self.segment[chosen])
 
     def at(self, values: FloatArray, t: FloatArray) -> FloatArray:
         """What the columns of `values`, given along the whole path, are at the times `t`, shape (len(t), d)."""
@@ -99,8 +101,8 @@ class _Walk:
         segment = np.array(self._segment)
         t, q, read = self._timed(style, np.array(self._q), segment >= 0, np.array(self._jump))
         fine = _refined(t)
-        rest = READ_AFTER_S if style == "stepped" else None
-        return Motion(style, fine, PchipInterpolator(t, q)(fine), read, segment[segment >= 0], rest)
+        quick = (STEP_S, READ_AFTER_S) if style == "stepped" else (None, None)
+        return Motion(style, fine, PchipInterpolator(t, q)(fine), read, segment[segment >= 0], *quick)
 
     def _region(self, pairs: int) -> int:
         """Walk until `pairs` pairs were seen."""
@@ -173,18 +175,16 @@ class _Walk:
 
 
 def _held(rng: np.random.Generator, ranges: FloatArray, pairs: int, visible: Visible) -> Motion:
-    """Static poses far apart: a move of all joints together, a rest, a reading."""
+    """Static poses far apart: a move of all joints together that always lasts as long, a rest, a reading, a wait."""
     postures = _Postures(rng, ranges, visible)
     q = np.array([postures.draw() for _ in range(pairs)])
-    far = np.linalg.norm(np.diff(q, axis=0, prepend=q[:1]), axis=1)
-    rest = float(rng.uniform(0.3, 0.9))
-    lasts = 0.3 + far / rng.uniform(0.8, 1.6, pairs)
-    stamps = np.cumsum(lasts + rest)
-    begin, end = np.append(0.0, stamps[:-1]), stamps - rest
+    lasts, rest = float(rng.uniform(0.7, 1.6)), float(rng.uniform(0.3, 0.9))
+    stamps = np.cumsum(rng.uniform(0.1, 1.0, pairs) + lasts + rest)
+    begin, end = stamps - rest - lasts, stamps - rest
     t, order = _sorted_unique(np.concatenate([begin, end, stamps]))
     knots = np.concatenate([np.vstack([q[:1], q[:-1]]), q, q])[order]
     fine = _refined(t)
-    return Motion("held", fine, PchipInterpolator(t, knots)(fine), stamps, np.arange(pairs), rest)
+    return Motion("held", fine, PchipInterpolator(t, knots)(fine), stamps, np.arange(pairs), lasts, rest)
 
 
 def _slow_noise(rng: np.random.Generator, count: int, sigma: float) -> FloatArray:

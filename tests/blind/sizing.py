@@ -13,7 +13,7 @@ from .world import World, residuals, whitened
 
 PAIRS_LOOKED_AT = 150
 CLOSE_ENOUGH = 0.03
-MOST_ROUNDS = 6
+MOST_ROUNDS = 10
 
 
 class NoEffect(ValueError):

@@ -11,8 +11,8 @@ from .arms import Arm
 from .arrays import FloatArray
 from .bullet import Bullet
 from .eyes import covariance, triangulate
-from .hidden import Hidden
-from .joints import biased_poles, lagging, off_centre_ring, play, wandering
+from .hidden import Hidden, Parameters
+from .joints import biased_poles, lag_that_leaves, lagging, off_centre_ring, play, wandering
 from .motion import Motion
 from .outside import WANDER_CORNERS
 from .structure import pose, shift, true_structure
@@ -123,7 +123,7 @@ class World:
             output[:, index] = play(output[:, index], next(iter(h.parameters.values())))
         for h in self._named("settling"):
             index = self.arm.read.index(str(h.where))
-            output[:, index] = lagging(motion.t, output[:, index], h.parameters["tau_s"])
+            output[:, index] = lagging(motion.t, output[:, index], time_constant(h.parameters))
         return self._coupled(output)
 
     def _coupled(self, output: FloatArray) -> FloatArray:
@@ -141,6 +141,11 @@ class World:
 
     def _of(self, joint: str | None, q: FloatArray) -> FloatArray:
         return q[:, self.arm.read.index(str(joint))]
+
+
+def time_constant(p: Parameters) -> float:
+    """Of a joint that settles [s]."""
+    return p["tau_s"] if "tau_s" in p else lag_that_leaves(p["left"], p["move_s"], p["rest_s"])
 
 
 def residuals(nominal: World, sight: Sight) -> FloatArray:
