@@ -21,7 +21,9 @@ def aligned(observations: Observations, simulation: Simulation) -> Fit:
     nuisances = free_effects(robot)
     if not robot.camera.pose_known:
         predicted = simulation.positions(observations.motion)
-        nuisances = [e.with_values(placed(predicted, observations.x)) if e.name == "camera_pose" else e for e in nuisances]
+        nuisances = [
+            e.with_values(placed(predicted, observations.x)) if e.name == "camera_pose" else e for e in nuisances
+        ]
     own = [effect for effect in simulation.effects]
     return fitted(observations, simulation.with_effects([*nuisances, *own]), len(nuisances) + len(own))
 

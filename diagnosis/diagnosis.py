@@ -16,6 +16,7 @@ from .alignment import aligned
 from .fit import Fit, fitted
 from .held_out import Added, Blocks, HeldOut, added, gain_percent, is_marker, without_cause
 from .hypotheses import Hypotheses
+from .instrument import instrument_factor
 from .leftover import Leftover, leftover
 from .observations import Observations
 from .rivals import Standing, standings
@@ -25,6 +26,8 @@ from .search import Search
 Told = Callable[[str], None]
 # Fewer fixes than this that are not the marker are no finding.
 _FEWEST_OUTLIERS = 3
+# Of the instrument's noise, another size than that is taken up (in logarithms).
+_SAME_NOISE = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,12 +115,17 @@ def diagnose(
         only, without: names of effects to test, all by default, and not to test.
         tell: is told what happens, in a few words.
     """
-    observations = Observations.of(recording, simulation.robot)
+    observations = Observations.of(recording, simulation)
     start = aligned(observations, simulation)
     hypotheses = Hypotheses.of(simulation, observations, only=only, without=without)
     tell(f"{len(hypotheses.effects)} hypotheses")
     search = Search(hypotheses.effects, tell)
     extended = search.run(start)
+    factor = instrument_factor(extended)
+    if abs(np.log(factor)) > _SAME_NOISE:
+        observations = observations.with_factor(factor)
+        start = aligned(observations, simulation)
+        extended = search.run(start.with_causes(extended.causes))
     tell("asking what else it could be")
     return Diagnosis(
         hypotheses=hypotheses,

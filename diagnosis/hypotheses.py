@@ -75,9 +75,13 @@ class _Limits:
                 "robot.toml has no stereo calibration: a wrong focal length and lens distortion cannot be tested."
             )
         if robot.robot.hold == "torque_free":
-            self.sentences.append("The arm was guided torque-free: the hand bore its weight, so no joint gave under it.")
+            self.sentences.append(
+                "The arm was guided torque-free: the hand bore its weight, so no joint gave under it."
+            )
         elif not simulation.gravity.known:
-            self.sentences.append("The URDF states no masses: joints that give under the arm's weight cannot be tested.")
+            self.sentences.append(
+                "The URDF states no masses: joints that give under the arm's weight cannot be tested."
+            )
 
     def excludes(self, kind: Kind) -> bool:
         """Whether no effect of this kind can be tested, or all of it is free anyway."""

@@ -97,9 +97,7 @@ def _beside(fit: Fit, columns: FloatArray) -> tuple[FloatArray, int]:
     return left[:, told], int(told.sum())
 
 
-def _selected(
-    fit: Fit, groups: list[tuple[tuple[int, ...], FloatArray]]
-) -> tuple[list[tuple[int, ...]], FloatArray]:
+def _selected(fit: Fit, groups: list[tuple[tuple[int, ...], FloatArray]]) -> tuple[list[tuple[int, ...]], FloatArray]:
     """The groups that explain most, added one by one while each brings its share; and what they predict (n, 3) [m]."""
     target = fit.left.ravel()
     chosen: list[tuple[int, ...]] = []

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from effects import Motion
+from effects import Motion, Simulation
 from interfaces.camera import StereoCalibration
 from interfaces.recording import Recording
 from interfaces.records import FloatArray
-from interfaces.robot import RobotDescription
 
 IntArray = NDArray[np.intp]
 
@@ -22,6 +21,8 @@ _UNIT_M = 1e-3
 _OUTLIER_SPREAD = 2.0
 # A measured variance is never taken to be smaller than this share of the median one.
 _SMALLEST_VARIANCE = 1e-4
+# Readings nearer than this are one; so many different ones it takes to see a step, so far they may be off it.
+_SAME_READING, _FEWEST_GAPS, _OFF_A_MULTIPLE = 1e-9, 20, 0.02
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,23 +32,39 @@ class Observations:
     Attributes:
         motion: what the encoders read.
         x: measured positions (n, 3) [m].
-        whitening: (n, 3, 3): W (x - truth) has equal and independent noise in all coordinates, but for one factor.
+        stated: covariance (n, 3, 3) [m²] of the instrument, right but for one factor.
+        rounding: covariance (n, 3, 3) [m²] that comes from readings in whole ticks.
+        stated_factor: by how much the instrument's standard deviations are larger than stated.
     """
 
     motion: Motion
     x: FloatArray
-    whitening: FloatArray
+    stated: FloatArray
+    rounding: FloatArray
+    stated_factor: float = 1.0
 
     @classmethod
-    def of(cls, recording: Recording, robot: RobotDescription) -> Observations:
-        """The positions of a recording; the shape of their noise is its own, else the stereo camera's, else round."""
+    def of(cls, recording: Recording, simulation: Simulation) -> Observations:
+        """The positions of a recording; the instrument's noise is its own, else the stereo camera's, else round."""
+        calibration = simulation.robot.calibration
         if recording.cov is not None:
-            covariances = recording.cov
-        elif robot.calibration is not None:
-            covariances = stereo_covariances(recording.x, robot.calibration)
+            stated = _bounded(recording.cov)
+        elif calibration is not None:
+            stated = _bounded(stereo_covariances(recording.x, calibration))
         else:
-            covariances = np.broadcast_to(_UNIT_M**2 * np.eye(3), (len(recording), 3, 3))
-        return cls(Motion.of(recording), recording.x, _whitening(covariances))
+            stated = np.broadcast_to(_UNIT_M**2 * np.eye(3), (len(recording), 3, 3))
+        motion = Motion.of(recording)
+        moved = simulation.run(motion).by_joint * (ticks(recording.q) / np.sqrt(12.0))
+        return cls(motion, recording.x, stated, moved @ np.swapaxes(moved, 1, 2))
+
+    @cached_property
+    def whitening(self) -> FloatArray:
+        """(n, 3, 3): W (x - truth) has equal and independent noise in all coordinates, but for one factor."""
+        return np.linalg.inv(np.linalg.cholesky(self.stated_factor**2 * self.stated + self.rounding))
+
+    def with_factor(self, stated_factor: float) -> Observations:
+        """The same with another size of the instrument's noise beside that of the rounding."""
+        return replace(self, stated_factor=stated_factor)
 
     def __len__(self) -> int:
         return len(self.x)
@@ -67,11 +84,19 @@ class Observations:
         volume = 4.0 / 3.0 * np.pi * max(float(spread), _UNIT_M) ** 3
         return -np.log(volume) - np.linalg.slogdet(self.whitening)[1]
 
-    def select(self, rows: NDArray[np.bool_]) -> Observations:
-        """Some of the rows (n,)."""
-        motion = self.motion
-        t = None if motion.t is None else motion.t[rows]
-        return Observations(Motion(motion.q[rows], t, motion.segment[rows]), self.x[rows], self.whitening[rows])
+
+def ticks(q: FloatArray) -> FloatArray:
+    """The step (d,) [rad, m] in which each joint is read; 0 where its readings (n, d) are no multiples of any."""
+    steps = np.zeros(q.shape[1])
+    for k, column in enumerate(q.T):
+        gaps = np.diff(np.unique(column))
+        gaps = gaps[gaps > _SAME_READING]
+        if len(gaps) < _FEWEST_GAPS:
+            continue
+        multiples = gaps / gaps.min()
+        if np.abs(multiples - np.round(multiples)).max() < _OFF_A_MULTIPLE:
+            steps[k] = gaps.min()
+    return steps
 
 
 def stereo_covariances(x: FloatArray, calibration: StereoCalibration) -> FloatArray:
@@ -91,8 +116,7 @@ def stereo_covariances(x: FloatArray, calibration: StereoCalibration) -> FloatAr
     return calibration.pixel_sigma**2 * np.asarray(covariance)
 
 
-def _whitening(covariances: FloatArray) -> FloatArray:
+def _bounded(covariances: FloatArray) -> FloatArray:
+    """With a floor under each variance, so that no row counts for all."""
     floor = _SMALLEST_VARIANCE * float(np.median(np.trace(covariances, axis1=1, axis2=2))) / 3.0
-    if not floor > 0.0:
-        floor = _UNIT_M**2
-    return np.linalg.inv(np.linalg.cholesky(covariances + floor * np.eye(3)))
+    return covariances + (floor if floor > 0.0 else _UNIT_M**2) * np.eye(3)

@@ -87,7 +87,9 @@ def _standing(fit: Fit, cause: Effect, hypotheses: Sequence[Effect], search: Sea
             continue
         rival = search.refined(without.with_causes([*without.causes, candidate.effect]), candidate.effect.key)
         behind = nats(2.0 * (rival.log_likelihood - fit.log_likelihood), candidate.dof - itself.dof)
-        tried.append((rival, candidate.effect.key, behind - np.log(max(candidate.trials / max(itself.trials, 1), 1e-3))))
+        tried.append(
+            (rival, candidate.effect.key, behind - np.log(max(candidate.trials / max(itself.trials, 1), 1e-3)))
+        )
     odds = np.exp(np.clip([0.0, -worth, *(behind for _, _, behind in tried)], -500.0, 50.0))
     shares = odds / odds.sum()
     rivals = [

@@ -16,6 +16,9 @@ NAMED = 3.0
 # Candidates within this share of the best gain are refitted in full, so many at most.
 _NEAR, _MOST = 0.4, 6
 _MOST_CAUSES = 12
+# So many sets of causes are looked at, and none twice.
+_MOST_SETS = 60
+Key = tuple[str, str | None, str | None]
 # What a number costs at least [nats].
 _CHEAPEST = 1.5
 
@@ -48,10 +51,15 @@ class Search:
     def run(self, start: Fit) -> Fit:
         """The causes on top of what `start` has fitted."""
         fit = start
+        self._seen: set[frozenset[Key]] = set()
         for _ in range(_MOST_CAUSES):
             better = self._added(fit)
             if better is None:
                 break
+            causes = frozenset(effect.key for effect in better.causes)
+            if causes in self._seen:
+                break
+            self._seen.add(causes)
             fit = self._reviewed(better)
         return fit
 
@@ -71,7 +79,7 @@ class Search:
 
     def doubt(self, candidate: Candidate) -> float:
         """What having looked for it in so many places costs [nats]."""
-        return float(self._doubt + np.log(max(candidate.trials / 10.0, 1.0)))
+        return float(self._doubt + np.log(candidate.trials))
 
     def shortlist(self, fit: Fit, hypotheses: Sequence[Effect]) -> list[Candidate]:
         """The candidates that may be the best when all is refitted, the most probable first."""
@@ -96,13 +104,12 @@ class Search:
 
     def _reviewed(self, fit: Fit) -> Fit:
         """Without what has become redundant, and with better ones in the place of others."""
-        if len(fit.causes) < 2:
-            return fit
-        changed = True
-        for _ in range(4):
-            if not changed:
-                break
+        changed = len(fit.causes) > 1
+        while changed and len(self._seen) < _MOST_SETS:
             fit, changed = self._second_thoughts(fit)
+            causes = frozenset(effect.key for effect in fit.causes)
+            changed = changed and causes not in self._seen
+            self._seen.add(causes)
         return fit
 
     def _second_thoughts(self, fit: Fit) -> tuple[Fit, bool]:

@@ -37,8 +37,10 @@ def finding(name: str, where: str | None, source: str | None, numbers: dict[str,
         case "joint_eccentricity":
             return f"the encoder of {at} sits off its axis: ±{numbers['amplitude_rad'] * _DEG:.2g}° once a turn"
         case "joint_ripple":
-            amplitude = f"{numbers['amplitude_rad'] * _DEG:.2g}°" if "amplitude_rad" in numbers else (
-                f"{1e3 * numbers['amplitude_m']:.2g} mm"
+            amplitude = (
+                f"{numbers['amplitude_rad'] * _DEG:.2g}°"
+                if "amplitude_rad" in numbers
+                else (f"{1e3 * numbers['amplitude_m']:.2g} mm")
             )
             often = (
                 f"{numbers['cycles_per_turn']:.3g} times a turn"
@@ -105,7 +107,9 @@ def sentence(verdict: Verdict, causes: Sequence[Cause], rms: Errors, gain: Gain)
 
 def evidence(cause: Effect, standing: Standing) -> str:
     """Why a cause was named, in one sentence."""
-    text = f"Without it the fit is worse by Δχ² = {standing.gain:.0f} for {standing.dof} number{'s' * (standing.dof > 1)}"
+    text = (
+        f"Without it the fit is worse by Δχ² = {standing.gain:.0f} for {standing.dof} number{'s' * (standing.dof > 1)}"
+    )
     if not standing.rivals:
         return f"{text}; nothing else comes near."
     rival = standing.rivals[0]

@@ -134,7 +134,11 @@ KINDS: dict[str, Kind] = {
         "joint", ("jump_rad", "jump_m"), _jump, 0.2, "reading minus true position from t0 on, whole ticks; 0 before"
     ),
     "backlash": Kind(
-        "joint", ("play_rad", "play_m"), _play, 0.1, "whole width of the play: the output lies within ±half of the reading"
+        "joint",
+        ("play_rad", "play_m"),
+        _play,
+        0.1,
+        "whole width of the play: the output lies within ±half of the reading",
     ),
     "settling": Kind(
         "joint",
@@ -162,13 +166,23 @@ KINDS: dict[str, Kind] = {
     "tool_offset": Kind("robot", SHIFT, _tool, 0.15, "true minus described marker, in the marker's link"),
     "tool_slip": Kind("robot", (*SHIFT,), _slip, 0.1, "marker after t0 minus before, in the marker's link"),
     "camera_pose": Kind(
-        "robot", SIX, _pose, 0.2, "the true left optical frame in the described one: shift, and turn as a rotation vector"
+        "robot",
+        SIX,
+        _pose,
+        0.2,
+        "the true left optical frame in the described one: shift, and turn as a rotation vector",
     ),
     "camera_moved": Kind(
-        "robot", SIX, _moved, 0.15, "the left optical frame after t0 in that before: shift, and turn as a rotation vector"
+        "robot",
+        SIX,
+        _moved,
+        0.15,
+        "the left optical frame after t0 in that before: shift, and turn as a rotation vector",
     ),
     "camera_scale": Kind("robot", ("scale",), _scale, 0.1, "the true baseline is (1 + scale) times the described one"),
-    "camera_focal": Kind("robot", ("scale",), _scale, 0.1, "the true focal length is (1 + scale) times the described one"),
+    "camera_focal": Kind(
+        "robot", ("scale",), _scale, 0.1, "the true focal length is (1 + scale) times the described one"
+    ),
     "lens_distortion": Kind(
         "robot", ("k1", "k2"), _lens, 0.2, "Brown: the true image point is (1 + k1 r² + k2 r⁴) times the ideal one"
     ),
