@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import cast
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from kbmaps.arrays import FloatArray
 from kbmaps.chains.belief import ChainBelief
@@ -88,6 +89,21 @@ class RigidFilter:
             return
         for k in range(len(q)):
             self._learn_one(q[k : k + 1], x[k], float(sigma[k]))
+
+    def learn_plain(self, q: ArrayLike, x: ArrayLike, sigma: ArrayLike | None, row: FloatArray) -> bool:
+        """Learns one pair and writes q, x and sigma to `row` (d + 4), if the kernel can take them as they are.
+
+        False, and nothing has changed, where there is no kernel, or anything has to be converted or complained of.
+        """
+        if self._kernel is None:
+            return False
+        noise = self._kernel.learn_one(
+            self.change, self._covariance, row, q, x, sigma, self.noise_square, self.noise_coordinates
+        )
+        if noise is None:
+            return False
+        self.noise_square, self.noise_coordinates = noise
+        return True
 
     def go_on_from(self, belief: ChainBelief) -> None:
         """Takes what is believed of the same chain for what the pairs so far say."""

@@ -140,6 +140,13 @@ class RecursiveRigidLearner:
         Raises:
             ShapeError, NonFiniteError, SettingError (a sigma that is not positive): nothing has changed.
         """
+        self._widest = None
+        if self._filter.learn_plain(q, x, sigma, self._window.next_row):
+            self._window.next_row_filled()
+            self._pairs += 1
+            if len(self._window) == self._due:
+                self._refit()
+            return
         angles, positions, sigmas = checked_pairs(q, x, sigma, self.joints)
         begin = 0
         while begin < len(angles):
@@ -150,7 +157,6 @@ class RecursiveRigidLearner:
             begin = part.stop
             if self.kept == self._due:
                 self._refit()
-        self._widest = None
 
     def tool_changed(self, tolerance: float) -> None:
         """Tells that the marker was moved, by `tolerance` (1-sigma of each component [m]); the arm stays known.

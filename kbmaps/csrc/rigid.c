@@ -294,6 +294,79 @@ static PyObject *filter_learn(Filter *self, PyObject *const *args, index_t count
     return PyErr_Occurred() ? NULL : Py_BuildValue("(ndd)", done, noise_square, coordinates);
 }
 
+/* A vector (width,) of float64 in C order whose sum is finite, as kbmaps.arrays.vector wants it; 0 for anything else. */
+INLINE int plain_vector(PyObject *object, index_t width, Py_buffer *view)
+{
+    if (!plain(object, view))
+        return 0;
+    double sum = 0.0;
+    if (view->ndim == 1 && view->shape[0] == width)
+        for (index_t i = 0; i < width; i++)
+            sum += ((const double *)view->buf)[i];
+    else
+        sum = NAN;
+    if (isfinite(sum))
+        return 1;
+    PyBuffer_Release(view);
+    return 0;
+}
+
+/* What a sigma stands for: NaN for None, a positive finite float as it is, 0 for anything else. */
+INLINE double plain_sigma(PyObject *sigma)
+{
+    if (sigma == Py_None)
+        return NAN;
+    double value = PyFloat_Check(sigma) ? PyFloat_AsDouble(sigma) : 0.0;
+    return value > 0.0 && isfinite(value) ? value : 0.0;
+}
+
+/* learn_one(change, covariance, row, q, x, sigma, noise_square, coordinates) -> (noise_square, coordinates)
+ *
+ * Writes the pair to row (d + 4). None, and nothing has changed, where it is not float64 as it should be, or the
+ * innovation's covariance singular: the way over kbmaps.pairs.checked_pairs and learn converts it, or says what is wrong. */
+static PyObject *filter_learn_one(Filter *self, PyObject *const *args, index_t count)
+{
+    Py_buffer views[3], q, x;
+    index_t p = self->active, d = self->joints, elements[3] = {self->size, p * p, d + 4};
+    if (count != 8)
+        return PyErr_Format(PyExc_TypeError, "eight arguments are needed");
+    double sigma = plain_sigma(args[5]), noise_square = PyFloat_AsDouble(args[6]), coordinates = PyFloat_AsDouble(args[7]);
+    if (PyErr_Occurred())
+        return NULL;
+    if (sigma == 0.0 || !plain_vector(args[3], d, &q))
+        Py_RETURN_NONE;
+    if (!plain_vector(args[4], 3, &x)) {
+        PyBuffer_Release(&q);
+        Py_RETURN_NONE;
+    }
+    int learnt = 0;
+    if (take_all(args, views, elements, 3)) {
+        double *memory = malloc(work_size(self) * sizeof(double)), *row = views[2].buf;
+        if (memory == NULL) {
+            PyErr_NoMemory();
+        } else if (views[0].readonly || views[1].readonly || views[2].readonly) {
+            PyErr_SetString(PyExc_TypeError, "the state and the row must be writable");
+        } else {
+            Work work = divided(self, memory);
+            learnt = learn_pair(self, views[0].buf, views[1].buf, q.buf, x.buf, sigma, &noise_square, &coordinates, &work);
+            if (learnt) {
+                memcpy(row, q.buf, (size_t)d * sizeof(double));
+                memcpy(row + d, x.buf, 3 * sizeof(double));
+                row[d + 3] = sigma;
+            }
+        }
+        free(memory);
+        release_all(views, 3);
+    }
+    PyBuffer_Release(&q);
+    PyBuffer_Release(&x);
+    if (PyErr_Occurred())
+        return NULL;
+    if (!learnt)
+        Py_RETURN_NONE;
+    return Py_BuildValue("(dd)", noise_square, coordinates);
+}
+
 static int find_active(Filter *self)
 {
     self->places = malloc((size_t)self->size * sizeof(index_t));
@@ -346,6 +419,7 @@ static void filter_dealloc(Filter *self)
 
 static PyMethodDef filter_methods[] = {
     {"learn", (PyCFunction)(void (*)(void))filter_learn, METH_FASTCALL, NULL},
+    {"learn_one", (PyCFunction)(void (*)(void))filter_learn_one, METH_FASTCALL, NULL},
     {NULL, NULL, 0, NULL},
 };
 
