@@ -22,7 +22,7 @@ from kbmaps.model import Estimate, near_data, widest
 from kbmaps.packed import complete, count, named, pack, restoring, unpack
 from kbmaps.pairs import checked_pairs
 
-_KIND = "rigid chain, recursive, 4"
+_KIND = "rigid chain, recursive, 5"
 _COUNTS = ("pairs", "window", "due")
 # The first refit comes with this pair, the next when the kept pairs have grown by this factor, or the window is full.
 _FIRST, _GROWTH = 8, 1.5
@@ -84,7 +84,7 @@ class RecursiveRigidLearner:
         """
         scatter = batch.scatter
         learner = cls(batch.nominal, batch.tolerances, noise=max(scatter.noise, LEAST_NOISE_M), window=window)
-        learner._go_on_from(batch.belief)
+        learner._go_on_from(batch.belief, fitted=True)
         learner._filter.noise_coordinates = float(np.clip(scatter.freedom, NOISE_COORDINATES, NOISE_MEMORY))
         learner._pairs = batch.pairs
         learner._window.farthest = batch.least_sure
@@ -169,7 +169,7 @@ class RecursiveRigidLearner:
         if self.kept >= _FIRST:
             self._window.fold(self._set_right(), self.kept)
         belief = ChainBelief.from_covariance(self._parameters, self._filter.change, self._filter.covariance)
-        self._go_on_from(belief.with_other_tool(tolerance))
+        self._go_on_from(belief.with_other_tool(tolerance), fitted=False)
 
     def predict(self, q: ArrayLike) -> FloatArray:
         """Positions (n, 3) [m] at q (n, d), or (3,) at q (d,).
@@ -238,15 +238,15 @@ class RecursiveRigidLearner:
     def _set_right(self) -> RigidFit:
         """Sets the filter where a fit to the kept pairs is."""
         fit = self._window.fitted(self._filter.change)
-        self._filter.go_on_from(fit.belief)
+        self._filter.go_on_from(fit.belief, fitted=True)
         if self._window.finds_noise:
             self._filter.noise_square = max(fit.noise, LEAST_NOISE_M) ** 2
             coordinates = fit.freedom + self._window.noise.coordinates
             self._filter.noise_coordinates = float(np.clip(coordinates, NOISE_COORDINATES, NOISE_MEMORY))
         return fit
 
-    def _go_on_from(self, belief: ChainBelief) -> None:
-        self._filter.go_on_from(belief)
+    def _go_on_from(self, belief: ChainBelief, *, fitted: bool) -> None:
+        self._filter.go_on_from(belief, fitted=fitted)
         self._window.begin_with(belief)
         self._widest = None
         self._due = _FIRST

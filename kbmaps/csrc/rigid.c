@@ -88,27 +88,50 @@ INLINE void set_column(const Filter *self, index_t parameter, const double *effe
         jacobian[i * self->active + place] = effect[i] * self->scales[place];
 }
 
+/* The frame (rotation, shift) before the first joint; the derivative (3, 3) of its turn. */
+INLINE void begin_frame(const Filter *self, const double *change, double *rotation, double *shift, double *jacobian)
+{
+    exponential(change, CONSTANT(self, SMALL_ANGLE), rotation, jacobian);
+    memcpy(shift, change + 3, 3 * sizeof(double));
+}
+
+/* Position x (3) of the marker in the frame (rotation, shift) after the last joint. */
+INLINE void put_marker(const Filter *self, const double *change, const double *rotation, const double *shift, double *x)
+{
+    const double *tool = change + 6 + 5 * self->joints;
+    double tip[3];
+    for (int i = 0; i < 3; i++) {
+        const double *row = GIVEN(self, TIP_FRAME) + 4 * i;
+        tip[i] = row[3] + row[0] * tool[0] + row[1] * tool[1] + row[2] * tool[2];
+    }
+    times(rotation, tip, x);
+    for (int i = 0; i < 3; i++)
+        x[i] += shift[i];
+}
+
+/* Position (3) at q. */
+INLINE void locate(const Filter *self, const double *change, const double *q, double *x)
+{
+    double rotation[9], shift[3], jacobian[9], numbers[JOINT_NUMBERS];
+    begin_frame(self, change, rotation, shift, jacobian);
+    for (index_t k = 0; k < self->joints; k++)
+        pass_joint(self, k, change, q[k], rotation, shift, numbers);
+    put_marker(self, change, rotation, shift, x);
+}
+
 /* Position (3) at q and its derivatives (3, active) by the change. `numbers` is working memory. */
 INLINE void linearise(const Filter *self, const double *change, const double *q, double *numbers, double *x,
                       double *jacobian)
 {
     index_t d = self->joints, tool = 6 + 5 * d;
-    double base[9], base_jacobian[9], rotation[9], shift[3], tip[3], effect[3], column[3], lever[3];
+    double base_jacobian[9], rotation[9], shift[3], effect[3], column[3], lever[3];
     const double *frame = GIVEN(self, TIP_FRAME), *kept;
-    exponential(change, CONSTANT(self, SMALL_ANGLE), base, base_jacobian);
-    memcpy(rotation, base, sizeof base);
-    memcpy(shift, change + 3, sizeof shift);
+    begin_frame(self, change, rotation, shift, base_jacobian);
     for (index_t k = 0; k < d; k++)
         pass_joint(self, k, change, q[k], rotation, shift, numbers + JOINT_NUMBERS * k);
-    for (int i = 0; i < 3; i++) {
-        const double *row = frame + 4 * i;
-        tip[i] = row[3] + row[0] * change[tool] + row[1] * change[tool + 1] + row[2] * change[tool + 2];
-    }
-    times(rotation, tip, x);
-    for (int i = 0; i < 3; i++) {
-        x[i] += shift[i];
+    put_marker(self, change, rotation, shift, x);
+    for (int i = 0; i < 3; i++)
         lever[i] = change[3 + i] - x[i];
-    }
     for (int j = 0; j < 3; j++) {
         double unit[3] = {j == 0, j == 1, j == 2};
         column_of(base_jacobian, 3, j, column);
@@ -138,6 +161,7 @@ INLINE void linearise(const Filter *self, const double *change, const double *q,
 
 typedef struct {
     double *numbers, *jacobian, *gains, *step, *present, *row, *change;
+    const double *origin; /* where to linearise (size), or NULL: at `change` */
 } Work;
 
 static size_t work_size(const Filter *self)
@@ -145,7 +169,7 @@ static size_t work_size(const Filter *self)
     return (size_t)(JOINT_NUMBERS * self->joints + 9 * self->active + self->size);
 }
 
-static Work divided(const Filter *self, double *memory)
+static Work divided(const Filter *self, double *memory, const double *origin)
 {
     Work work;
     index_t p = self->active;
@@ -156,6 +180,7 @@ static Work divided(const Filter *self, double *memory)
     work.present = work.step + p;
     work.row = work.present + p;
     work.change = work.row + p;
+    work.origin = origin;
     return work;
 }
 
@@ -183,13 +208,15 @@ INLINE double curvature(const Filter *self, const double *covariance, const Work
     return 0.25 * share * share;
 }
 
-/* RigidFilter._update, linearised at work.change, to which work.present led; 0 if it is singular. */
+/* RigidFilter._update at work.change, to which work.present led; 0 if it is singular. */
 INLINE int make_update(const Filter *self, const double *covariance, const double *q, const double *x,
                        double noise_square, double weight, const Work *work, Update *update)
 {
     index_t p = self->active;
     double position[3], innovation[3], weighted[3], matrix[9], moved = 0.0, turn = 0.0;
-    linearise(self, work->change, q, work->numbers, position, work->jacobian);
+    linearise(self, work->origin == NULL ? work->change : work->origin, q, work->numbers, position, work->jacobian);
+    if (work->origin != NULL)
+        locate(self, work->change, q, position);
     update->variance = noise_square + curvature(self, covariance, work);
     for (int c = 0; c < 3; c++) {
         combine(covariance, p, p, work->jacobian + c * p, work->gains + c * p);
@@ -261,16 +288,27 @@ FAST static int learn_pair(const Filter *self, double *change, double *covarianc
     return 1;
 }
 
-/* learn(change, covariance, q, x, sigma, noise_square, coordinates) -> (pairs learnt, noise_square, coordinates) */
+/* The view of where to linearise, empty for None; 0 and an exception where it is neither. */
+INLINE int take_origin(const Filter *self, PyObject *object, Py_buffer *view)
+{
+    memset(view, 0, sizeof *view);
+    return object == Py_None || take_all(&object, view, &self->size, 1);
+}
+
+/* learn(change, covariance, q, x, sigma, origin, noise_square, coordinates) -> (pairs learnt, noise_square, coordinates) */
 static PyObject *filter_learn(Filter *self, PyObject *const *args, index_t count)
 {
-    Py_buffer views[5];
+    Py_buffer views[6];
     index_t p = self->active, elements[5] = {self->size, p * p, -1, -1, -1};
-    if (count != 7)
-        return PyErr_Format(PyExc_TypeError, "seven arguments are needed");
-    double noise_square = PyFloat_AsDouble(args[5]), coordinates = PyFloat_AsDouble(args[6]);
-    if (PyErr_Occurred() || !take_all(args, views, elements, 5))
+    if (count != 8)
+        return PyErr_Format(PyExc_TypeError, "eight arguments are needed");
+    double noise_square = PyFloat_AsDouble(args[6]), coordinates = PyFloat_AsDouble(args[7]);
+    if (PyErr_Occurred() || !take_origin(self, args[5], &views[5]))
         return NULL;
+    if (!take_all(args, views, elements, 5)) {
+        release_all(views + 5, 1);
+        return NULL;
+    }
     index_t n = views[4].len / (index_t)sizeof(double), done = 0;
     double *memory = malloc(work_size(self) * sizeof(double));
     int sound = views[2].len == self->joints * views[4].len && views[3].len == 3 * views[4].len &&
@@ -280,7 +318,7 @@ static PyObject *filter_learn(Filter *self, PyObject *const *args, index_t count
     } else if (!sound) {
         PyErr_SetString(PyExc_TypeError, "q, x and sigma must be of one length, and the state writable");
     } else {
-        Work work = divided(self, memory);
+        Work work = divided(self, memory, views[5].buf);
         const double *q = views[2].buf, *x = views[3].buf, *sigma = views[4].buf;
         PyThreadState *thread = n > 1 ? PyEval_SaveThread() : NULL;
         while (done < n && learn_pair(self, views[0].buf, views[1].buf, q + done * self->joints, x + 3 * done,
@@ -290,7 +328,7 @@ static PyObject *filter_learn(Filter *self, PyObject *const *args, index_t count
             PyEval_RestoreThread(thread);
     }
     free(memory);
-    release_all(views, 5);
+    release_all(views, 6);
     return PyErr_Occurred() ? NULL : Py_BuildValue("(ndd)", done, noise_square, coordinates);
 }
 
@@ -307,7 +345,7 @@ INLINE int plain_vector(PyObject *object, index_t width, Py_buffer *view)
         sum = NAN;
     if (isfinite(sum))
         return 1;
-    PyBuffer_Release(view);
+    PyBuffer_Release(view); /* which sets its obj to NULL */
     return 0;
 }
 
@@ -320,46 +358,42 @@ INLINE double plain_sigma(PyObject *sigma)
     return value > 0.0 && isfinite(value) ? value : 0.0;
 }
 
-/* learn_one(change, covariance, row, q, x, sigma, noise_square, coordinates) -> (noise_square, coordinates)
+/* learn_one(change, covariance, row, q, x, sigma, origin, noise_square, coordinates) -> (noise_square, coordinates)
  *
  * Writes the pair to row (d + 4). None, and nothing has changed, where it is not float64 as it should be, or the
  * innovation's covariance singular: the way over kbmaps.pairs.checked_pairs and learn converts it, or says what is wrong. */
 static PyObject *filter_learn_one(Filter *self, PyObject *const *args, index_t count)
 {
-    Py_buffer views[3], q, x;
-    index_t p = self->active, d = self->joints, elements[3] = {self->size, p * p, d + 4};
-    if (count != 8)
-        return PyErr_Format(PyExc_TypeError, "eight arguments are needed");
-    double sigma = plain_sigma(args[5]), noise_square = PyFloat_AsDouble(args[6]), coordinates = PyFloat_AsDouble(args[7]);
+    enum { CHANGE, COVARIANCE, ROW, ORIGIN, Q, X, VIEWS };
+    Py_buffer views[VIEWS];
+    index_t p = self->active, d = self->joints, elements[ORIGIN] = {self->size, p * p, d + 4};
+    if (count != 9)
+        return PyErr_Format(PyExc_TypeError, "nine arguments are needed");
+    double sigma = plain_sigma(args[5]), noise_square = PyFloat_AsDouble(args[7]), coordinates = PyFloat_AsDouble(args[8]);
     if (PyErr_Occurred())
         return NULL;
-    if (sigma == 0.0 || !plain_vector(args[3], d, &q))
-        Py_RETURN_NONE;
-    if (!plain_vector(args[4], 3, &x)) {
-        PyBuffer_Release(&q);
-        Py_RETURN_NONE;
-    }
-    int learnt = 0;
-    if (take_all(args, views, elements, 3)) {
-        double *memory = malloc(work_size(self) * sizeof(double)), *row = views[2].buf;
+    memset(views, 0, sizeof views);
+    int usable = sigma != 0.0 && plain_vector(args[3], d, &views[Q]) && plain_vector(args[4], 3, &views[X]), learnt = 0;
+    if (usable && take_origin(self, args[6], &views[ORIGIN]) && take_all(args, views, elements, ORIGIN)) {
+        double *memory = malloc(work_size(self) * sizeof(double)), *row = views[ROW].buf;
+        const double *q = views[Q].buf, *x = views[X].buf;
         if (memory == NULL) {
             PyErr_NoMemory();
-        } else if (views[0].readonly || views[1].readonly || views[2].readonly) {
+        } else if (views[CHANGE].readonly || views[COVARIANCE].readonly || views[ROW].readonly) {
             PyErr_SetString(PyExc_TypeError, "the state and the row must be writable");
         } else {
-            Work work = divided(self, memory);
-            learnt = learn_pair(self, views[0].buf, views[1].buf, q.buf, x.buf, sigma, &noise_square, &coordinates, &work);
-            if (learnt) {
-                memcpy(row, q.buf, (size_t)d * sizeof(double));
-                memcpy(row + d, x.buf, 3 * sizeof(double));
-                row[d + 3] = sigma;
-            }
+            Work work = divided(self, memory, views[ORIGIN].buf);
+            learnt = learn_pair(self, views[CHANGE].buf, views[COVARIANCE].buf, q, x, sigma, &noise_square, &coordinates,
+                                &work);
+        }
+        if (learnt) {
+            memcpy(row, q, (size_t)d * sizeof(double));
+            memcpy(row + d, x, 3 * sizeof(double));
+            row[d + 3] = sigma;
         }
         free(memory);
-        release_all(views, 3);
     }
-    PyBuffer_Release(&q);
-    PyBuffer_Release(&x);
+    release_all(views, VIEWS);
     if (PyErr_Occurred())
         return NULL;
     if (!learnt)
