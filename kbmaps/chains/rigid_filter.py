@@ -49,8 +49,8 @@ class _Update:
 class RigidFilter:
     """Takes one pair after the other into a chain's change and its covariance, at a constant cost.
 
-    Each pair is linearised once: where the last fit left the chain, or, before any, where it is when the pair comes. The
-    curvature left out is taken for noise, so that early pairs do not make it too sure.
+    Each pair is linearised once: where the last fit left the chain, or, before any, where it is when the pair comes.
+    The curvature left out is taken for noise, so that early pairs do not make it too sure.
 
     Attributes:
         change: the parameters (size,) as in `ChainParameters`.

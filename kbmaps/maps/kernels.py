@@ -37,8 +37,8 @@ class NetKernel(Protocol):
 class FilterKernel(Protocol):
     """Takes pairs into the state of a `RigidFilter`; returns how many, its noise² and what that rests on.
 
-    `learn_one` checks its pair and writes it to a row (d + 4). It returns None, and nothing has changed, for one that is
-    not yet float64 of the right shape, or is wrong.
+    `learn_one` checks its pair and writes it to a row (d + 4). It returns None, and nothing has changed, for one that
+    is not yet float64 of the right shape, or is wrong.
     """
 
     def learn(
