@@ -177,7 +177,7 @@ class Play:
         self._output: float | None = None
 
     def begin(self, reading: float, leading: float) -> None:
-        """The input stands at `reading` and leads by the half width, in the direction of `leading`; 0: it is centred."""
+        """The input stands at `reading` and leads by half the width, in the direction of `leading`; 0: centred."""
         self._output = reading - self._half * float(np.sign(leading))
 
     def follow(self, reading: float) -> float:

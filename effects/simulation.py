@@ -71,25 +71,29 @@ class Simulation:
 
     def run(self, motion: Motion) -> Simulated:
         """The pipeline, with all that is on the way."""
-        readings = motion.earlier(sum(e.value("latency_s") for e in self._of("camera_latency")))
-        q = readings.q.copy()
-        for effect in self.effects:
-            if effect.kind.encoder is not None:
-                place = self.place(effect)
-                q[:, place.joint] += effect.kind.encoder.correction(readings, place, effect.values)
+        readings = motion.earlier(self.latency_s)
+        q = self.unloaded(readings)
         q += self.given_way(q)
         chain = self._chain()
         frames = chain.frames(q)
         marker = frames[:, -1]
         x_true = marker[:, :3, 3] + np.einsum("nij,nj->ni", marker[:, :3, :3], self.tool_shift(motion))
-        x_placed = x_true
-        for effect in self._of("camera_pose"):
-            x_placed = _from(effect.values, x_placed)
+        x_placed = (x_true - self.camera_pose[:3, 3]) @ self.camera_pose[:3, :3]
         x_camera = x_placed
-        for effect in self._of("camera_moved"):
-            x_camera = np.where(after(motion, effect)[:, None], _from(effect.values, x_camera), x_camera)
+        if self._of("camera_moved"):
+            T_placed_camera = self.camera_moves(motion)
+            x_camera = np.einsum("nji,nj->ni", T_placed_camera[:, :3, :3], x_placed - T_placed_camera[:, :3, 3])
         measured = self.optics.reported(x_camera, self.robot.calibration) + self.added(motion)
         return Simulated(self, motion, readings, q, chain, frames, x_true, x_placed, x_camera, measured)
+
+    def unloaded(self, readings: Motion) -> FloatArray:
+        """True joint angles (n, d) [rad, m] where no weight bends the joints."""
+        q = readings.q.copy()
+        for effect in self.effects:
+            if effect.kind.encoder is not None:
+                place = self.place(effect)
+                q[:, place.joint] += effect.kind.encoder.correction(readings, place, effect.values)
+        return q
 
     def place(self, effect: Effect) -> Place:
         """Where an effect of the first stage sits."""
@@ -105,6 +109,11 @@ class Simulation:
             sum(e.value("focal_error") for e in self._of("camera_focal")),
             sum(e.value("k1") for e in self._of("lens_distortion")),
         )
+
+    @property
+    def latency_s(self) -> float:
+        """How late the images' time stamps are [s]."""
+        return sum(e.value("latency_s") for e in self._of("camera_latency"))
 
     def _of(self, name: str) -> list[Effect]:
         return [effect for effect in self.effects if effect.name == name]
@@ -139,9 +148,7 @@ class Simulation:
     @cached_property
     def link_moves(self) -> list[tuple[int, FloatArray]]:
         """By how much joints' frames are moved: the place in q, and the pose (4, 4) in the frame of the drawing."""
-        return [
-            (self.place(effect).joint, transforms(effect.values[None])[0]) for effect in self._of("link_geometry")
-        ]
+        return [(self.place(effect).joint, transforms(effect.values[None])[0]) for effect in self._of("link_geometry")]
 
     @cached_property
     def upward(self) -> list[bool]:
@@ -157,6 +164,21 @@ class Simulation:
         for effect in self._of("tool_slip"):
             shift[after(motion, effect)] += effect.values[:3]
         return shift
+
+    @property
+    def camera_pose(self) -> FloatArray:
+        """Where the camera was set up (4, 4), in the frame that the description gives it."""
+        T = np.eye(4)
+        for effect in self._of("camera_pose"):
+            T = T @ transforms(effect.values[None])[0]
+        return T
+
+    def camera_moves(self, motion: Motion) -> FloatArray:
+        """Where the camera is (n, 4, 4) in its frame where it was set up."""
+        T = np.tile(np.eye(4), (len(motion), 1, 1))
+        for effect in self._of("camera_moved"):
+            T[after(motion, effect)] @= transforms(effect.values[None, :6])[0]
+        return T
 
     def added(self, motion: Motion) -> FloatArray:
         """What is added to what the cameras report (n, 3) [m]: drift and residual."""
@@ -330,11 +352,6 @@ def _rotation(values: FloatArray) -> tuple[FloatArray, FloatArray]:
     """The rotation (3, 3) of a pose's values (6, ...), and by how much it turns for a change of its numbers (3, 3)."""
     turns, jacobians = exponentials(values[None, 3:6])
     return turns[0], jacobians[0]
-
-
-def _from(values: FloatArray, x: FloatArray) -> FloatArray:
-    """Points (n, 3) in the frame of a camera that has the pose `values` (6, ...) in theirs."""
-    return (x - values[:3]) @ _rotation(values)[0]
 
 
 def _of_camera(effect: Effect, x: FloatArray) -> FloatArray:
