@@ -10,6 +10,7 @@ from effects import KINDS, Effect, Motion, Simulation
 from interfaces.robot import RobotDescription
 from interfaces.toml_file import read_toml
 from sim_backend import EncoderConfig, SimConfig, model_file
+from sim_backend.joints import JointPaths
 from sim_backend.physics import Physics
 from sim_backend.posed import PosedWorld
 from sim_backend.truth import TrueRobot
@@ -44,9 +45,23 @@ EFFECTS = [
     ("camera_scale", None, None, {"scale_error": 0.02}),
     ("camera_focal", None, None, {"focal_error": 0.015}),
     ("lens_distortion", None, None, {"k1": 0.08}),
-    ("camera_latency", None, None, {"latency_s": 0.0}),
+    ("camera_latency", None, None, {"latency_s": 0.0125}),
     ("thermal_drift", None, None, SHIFT | {"time_constant_s": 0.5}),
 ]  # fmt: skip
+
+
+# Those without a memory of their own go through the same lines of the guided world.
+TOGETHER = (
+    {"joint_scale", "joint_eccentricity", "joint_ripple", "joint_coupling"},
+    {"tool_offset", "camera_pose", "camera_scale", "camera_focal", "lens_distortion"},
+)
+
+
+def groups() -> list[list]:
+    """The effects as the guided world tries them: in two groups, and each other one alone."""
+    grouped = [[case for case in EFFECTS if case[0] in names] for names in TOGETHER]
+    alone = [case for case in EFFECTS if not any(case[0] in names for names in TOGETHER)]
+    return grouped + [[case] for case in alone if case[0] != "camera_latency"]  # whose formula is of smooth paths
 
 
 def named(case) -> str:
@@ -92,20 +107,58 @@ def test_every_effect_of_the_table_is_tried() -> None:
     assert {case[0] for case in EFFECTS} == set(KINDS)
 
 
-@pytest.mark.parametrize("case", EFFECTS, ids=named)
-def test_the_guided_world_shows_what_the_simulation_says(case) -> None:
-    simulation = extended(case)
+@pytest.mark.parametrize("cases", groups(), ids=lambda cases: "-".join(map(named, cases)))
+def test_the_guided_world_shows_what_the_simulation_says(cases) -> None:
+    simulation = extended(*cases)
     motion, x = guided(simulation)
     at = slice(FRAME_STEPS, None, FRAME_STEPS)
-    if case[0] == "settling":  # of the move since the last frame, which the first frame does not know
+    if cases[0][0] == "settling":  # of the move since the last frame, which the first frame does not know
         expected, seen = simulation.positions(frames(motion))[1:], x[at][1:]
     else:
         expected, seen = simulation.positions(motion)[at], x[at]
     assert np.abs(seen - expected).max() < CLOSE_M
 
 
-@pytest.mark.parametrize("case", EFFECTS, ids=named)
-def test_the_posed_world_shows_what_the_simulation_says(case) -> None:
+def test_a_late_frame_shows_the_joints_of_the_past() -> None:
+    simulation, steps = extended(("camera_latency", None, None, {"latency_s": 3 / 240})), 3
+    motion, x = guided(simulation)
+    past = simulation.robot.chain.positions(motion.q[FRAME_STEPS - steps :: FRAME_STEPS])
+    assert np.abs(x[FRAME_STEPS::FRAME_STEPS] - past[: len(x[FRAME_STEPS::FRAME_STEPS])]).max() < CLOSE_M
+
+
+@pytest.mark.parametrize("latency_s", [0.0125, 0.031, -0.031])
+def test_on_a_smooth_path_a_late_stamp_is_what_the_simulation_says(latency_s: float) -> None:
+    simulation = extended(("camera_latency", None, None, {"latency_s": latency_s}))
+    truth = TrueRobot.draw(simulation.robot, CONFIG, simulation)
+    paths = JointPaths(truth, 240, 30, begins=0.0)
+    t = np.arange(120) / 240
+    speeds, bends = np.random.default_rng(5).uniform(-1, 1, (2, len(simulation.robot.joints), 1))
+    drives = (speeds * t + bends * t**2).T
+    read, seen = [], []
+    for angles, now in zip(drives, t, strict=True):
+        paths.record(angles, float(now))
+        read.append(paths.read)
+        seen.append(paths.seen)
+    motion = Motion(np.array(read), t, np.zeros(len(t), dtype=np.int64))
+    well_inside = slice(20, -2)
+    said = motion.earlier(simulation.latency_s).q
+    assert np.abs(np.array(seen) - said)[well_inside].max() < 1e-9
+
+
+class NoRenderer:
+    """In the renderer's place: nothing is painted."""
+
+    def __init__(self, *arguments) -> None: ...
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *error) -> None: ...
+
+
+@pytest.mark.parametrize("case", [case for case in EFFECTS if case[0] != "camera_latency"], ids=named)
+def test_the_posed_world_shows_what_the_simulation_says(case, monkeypatch) -> None:
+    monkeypatch.setattr("sim_backend.posed.RenderProcess", NoRenderer)
     simulation = extended(case)
     robot = simulation.robot
     rng = np.random.default_rng(3)
