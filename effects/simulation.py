@@ -29,6 +29,8 @@ from .optics import Optics
 _SPRING_ROUNDS = 3
 # Of the numerical derivatives by the optics' numbers and by a point.
 _STEP = 1e-6
+# ... and by a latency [s].
+_STEP_S = 1e-5
 
 
 class Residual(Protocol):
@@ -276,7 +278,10 @@ class Simulated:
         return (change / (2.0 * _STEP))[:, :, None]
 
     def _latency(self, effect: Effect) -> FloatArray:
-        return -np.einsum("nij,nj->ni", self.by_joint, self.motion.rates)[:, :, None]
+        # Through the encoders' own errors: they too are those of the moment before.
+        latency = self.simulation.latency_s
+        later, sooner = (self.simulation.unloaded(self.motion.earlier(latency + s)) for s in (_STEP_S, -_STEP_S))
+        return np.einsum("nij,nj->ni", self.by_joint, (later - sooner) / (2.0 * _STEP_S))[:, :, None]
 
     def _drift(self, effect: Effect) -> FloatArray:
         return _with_moment(settled(self.motion, effect.values[3])[:, None, None] * np.eye(3))
