@@ -15,7 +15,7 @@ from interfaces.recording import Recording, joints_in
 from interfaces.toml_file import read_toml
 
 ROWS = 50
-EFFECT = '[[effects]]\neffect = "joint_offset"\nwhere = "shoulder"\noffset_rad = 0.05\n'
+EFFECT = '[[effects]]\neffect = "joint_offset"\nwhere = "waist"\noffset_rad = 0.05\n'
 LATE = '[[effects]]\neffect = "camera_latency"\nlatency_s = 0.02\n'
 STEREO = "focal_px = 700.0\nprincipal_point_px = [640.0, 480.0]\nbaseline_m = 0.2\nimage_size_px = [1280, 960]\n"
 
@@ -28,7 +28,7 @@ def measured(file: Path, *, times: bool = True, sigma_m: float | None = None, ro
     """A recording of the small arm, written to `file`."""
     rng = np.random.default_rng(1)
     q = rng.uniform(-1, 1, (ROWS, 2))[:rows]
-    x = np.column_stack([np.cos(q[:, 0]), np.sin(q[:, 0]), 2.0 + q[:, 1]])
+    x = np.column_stack([np.cos(q[:, 0]), np.sin(q[:, 0]), q[:, 1]]) * 0.2
     recording = Recording(
         joints=JOINTS,
         q=q,
@@ -58,7 +58,7 @@ def test_the_simulation_measures_at_the_recording_s_joint_angles(tmp_path, times
     assert (out.t is None) is not times
     np.testing.assert_array_equal(out.segment, like.segment)
     robot = Config.load(tmp_path / "robot.toml").robot
-    np.testing.assert_allclose(out.x, robot.chain.positions(like.q + [0.0, 0.05]), atol=1e-12)
+    np.testing.assert_allclose(out.x, robot.chain.positions(like.q + np.array([0.05, 0.0])), atol=1e-12)
 
 
 def test_parquet_has_the_same_numbers(tmp_path) -> None:
@@ -117,7 +117,7 @@ def test_a_file_that_is_there_is_kept(tmp_path) -> None:
 
 def test_config_check_names_the_effects(tmp_path, capsys) -> None:
     called("config", "check", "--robot", write_small_arm(tmp_path, EFFECT))
-    assert "effect joint_offset at shoulder: offset_rad = 0.05" in capsys.readouterr().out
+    assert "effect joint_offset at waist: offset_rad = 0.05" in capsys.readouterr().out
 
 
 def test_a_wrong_effect_is_refused_wherever_the_file_is_read(tmp_path) -> None:
@@ -135,7 +135,7 @@ def test_a_calibrated_robot_has_no_effects_since_it_was_learnt_without_them(tmp_
     from interfaces.calibrated_files import write_calibrated
 
     robot = load_simulation(write_small_arm(tmp_path, EFFECT)).robot
-    geometry = CalibratedGeometry.of(robot, robot.chain)
+    geometry = CalibratedGeometry.of(robot, robot.chain, T_measured_nominal=np.eye(4), zeros=np.zeros(2))
     file = write_calibrated(robot, geometry, tmp_path / "calibrated", "Calibrated by a test")
     assert "effects" not in read_toml(file)[0]
 
