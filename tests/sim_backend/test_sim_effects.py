@@ -7,13 +7,18 @@ import pytest
 from test_sim_truth import NO_ERRORS
 
 from effects import KINDS, Effect, Motion, Simulation
+from interfaces.records import MarkerFix
 from interfaces.robot import RobotDescription
 from interfaces.toml_file import read_toml
 from sim_backend import EncoderConfig, SimConfig, model_file
 from sim_backend.joints import JointPaths
 from sim_backend.physics import Physics
 from sim_backend.posed import PosedWorld
+from sim_backend.postures import visible_postures
 from sim_backend.truth import TrueRobot
+from vision.config import VisionConfig
+from vision.tracked_camera import TrackedCamera
+from vision.tracker import StereoTracker
 
 CLOSE_M = 1e-6
 FRAME_STEPS = 8
@@ -50,6 +55,8 @@ EFFECTS = [
 ]  # fmt: skip
 
 
+# What happens to images on their way to the tracker.
+SEEN = (("camera_scale", "camera_focal", "lens_distortion"), ("camera_moved", "thermal_drift"))
 # Those without a memory of their own go through the same lines of the guided world.
 TOGETHER = (
     {"joint_scale", "joint_eccentricity", "joint_ripple", "joint_coupling"},
@@ -170,3 +177,26 @@ def test_the_posed_world_shows_what_the_simulation_says(case, monkeypatch) -> No
     ahead = simulation.run(motion).x_camera[:, 2] > 0.1
     assert ahead.any()
     assert np.abs(x - simulation.positions(motion))[ahead].max() < CLOSE_M
+
+
+def doubled(case):
+    name, where, source, values = case
+    return name, where, source, {key: value if key == "time_constant_s" else 2.0 * value for key, value in values.items()}
+
+
+@pytest.mark.parametrize("names", SEEN, ids="-".join)
+def test_the_tracker_measures_what_the_world_says_that_it_shows(names) -> None:
+    simulation = extended(*(doubled(case) for case in EFFECTS if case[0] in names))
+    plain = SimConfig(seed=4, errors=NO_ERRORS)
+    postures = visible_postures(simulation.robot, plain, 8)
+    with PosedWorld(simulation.robot, plain, postures, simulation) as world:
+        tracked = TrackedCamera(world.camera, StereoTracker(world.camera.calibration, VisionConfig()))
+        shown = np.array([world.scene(number).x_seen for number in range(len(postures))])
+        with tracked:
+            fixes = [tracked.read(20.0) for _ in postures]
+    seen = [k for k, fix in enumerate(fixes) if isinstance(fix, MarkerFix)]
+    misses = np.array([fixes[k].x for k in seen]) - shown[seen]
+    effects = shown[seen] - simulation.robot.chain.positions(postures[seen])
+    assert len(seen) >= 4
+    # A tenth of a pixel is two millimetres of depth at this distance.
+    assert np.linalg.norm(misses, axis=1).mean() < 0.1 * np.linalg.norm(effects, axis=1).mean()
