@@ -118,6 +118,7 @@ class JointCoupling(EncoderEffect):
         return (Parameter("ratio", 0.02),)
 
     def columns(self, motion: Motion, place: Place, values: FloatArray) -> FloatArray:
+        assert place.source is not None
         return motion.q[:, [place.source]]
 
 
@@ -180,19 +181,33 @@ class Settling(EncoderEffect):
         return np.stack([-missing, np.zeros_like(missing)], axis=1)
 
 
+class Play:
+    """A play of a width [rad, m], driven reading by reading: its output follows when the input has crossed it."""
+
+    def __init__(self, width: float) -> None:
+        self._half = 0.5 * width
+        self._output: float | None = None
+
+    def begin(self, reading: float, leading: float) -> None:
+        """The input stands at `reading` and leads by half the width, in the direction of `leading`; 0: centred."""
+        self._output = reading - self._half * float(np.sign(leading))
+
+    def follow(self, reading: float) -> float:
+        """The output for the next reading."""
+        output = reading if self._output is None else self._output
+        self._output = min(max(output, reading - self._half), reading + self._half)
+        return self._output
+
+
 def played(q: FloatArray, runs: list[tuple[int, int]], width: float) -> FloatArray:
     """Output minus input (n,) of a play of `width` that is driven by q (n,); each run begins where q leads first."""
-    half = 0.5 * width
     lag = np.zeros_like(q)
     for first, end in runs:
         moves = np.diff(q[first:end])
         leading = moves[np.flatnonzero(moves)[:1]]
-        output = float(q[first]) - (half * float(np.sign(leading[0])) if len(leading) else 0.0)
-        outputs = []
-        for reading in q[first:end].tolist():
-            output = min(max(output, reading - half), reading + half)
-            outputs.append(output)
-        lag[first:end] = outputs - q[first:end]
+        play = Play(width)
+        play.begin(float(q[first]), float(leading[0]) if len(leading) else 0.0)
+        lag[first:end] = [play.follow(reading) for reading in q[first:end].tolist()] - q[first:end]
     return lag
 
 

@@ -35,11 +35,19 @@ class Optics:
         if not self.inside:
             return x * (1.0 + self.scale_error)
         assert calibration is not None
+        left, right = self.rays(x, calibration)
+        depth = calibration.baseline_m / (left[:, 0] - right[:, 0])
+        return np.stack([left[:, 0] * depth, 0.5 * (left[:, 1] + right[:, 1]) * depth, depth], axis=1)
+
+    def rays(self, x: FloatArray, calibration: StereoCalibration) -> tuple[FloatArray, FloatArray]:
+        """Where the left and the right eye see points (n, 3) [m]: (n, 2) each, as the nominal calibration reads it.
+
+        A ray (a, b) is that along (a, b, 1) in the eye's own optical frame.
+        """
         true_baseline = calibration.baseline_m / (1.0 + self.scale_error)
         left = self._seen(x[:, 0] / x[:, 2], x[:, 1] / x[:, 2])
         right = self._seen((x[:, 0] - true_baseline) / x[:, 2], x[:, 1] / x[:, 2])
-        depth = calibration.baseline_m / (left[:, 0] - right[:, 0])
-        return np.stack([left[:, 0] * depth, 0.5 * (left[:, 1] + right[:, 1]) * depth, depth], axis=1)
+        return left, right
 
     def _seen(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """Nominal rays (n, 2) of what the true camera sees along the rays (x, y, 1)."""
