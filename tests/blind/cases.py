@@ -22,7 +22,7 @@ from .sizing import NoEffect, Sizer, drawn
 from .world import Sight, World, time_constant
 
 MARGIN_PX = 60.0
-SPARE = 0.02  # pairs recorded beyond those asked for: a hidden camera may lose some at the border
+SPARE = 0.05  # pairs recorded beyond those asked for: a hidden camera may lose some at the border
 RANDOM_SIZES = (0.2, 15.0)
 TRIES = 12
 Size = float | str | Sequence[float]
@@ -113,7 +113,8 @@ def hide(
     """
     streams = [np.random.default_rng(child) for child in np.random.SeedSequence(seed).spawn(6)]
     choosing, building, moving, freshly, noising, rough = streams
-    wished = wishes(effects, hold, choosing)
+    nuisances = _rough(rough, marker_known=marker_known, pose_known=pose_known)
+    wished = wishes(effects, hold, [nuisance.effect for nuisance in nuisances], choosing)
     described = chosen_arm(arm, wished, building)
     hold, style = chosen_motion(hold, wished, choosing)
     if outliers > 0.0 and "outliers" not in [wish.effect for wish in wished]:
@@ -124,7 +125,6 @@ def hide(
         visible = _visibility(nominal)
         motion = move(moving, style, described.ranges, pairs + spare, visible)
         truth = _hidden(wished, size, outliers, Sizer(client, nominal, motion), motion, described, choosing)
-        nuisances = _rough(rough, marker_known=marker_known, pose_known=pose_known)
         world = World(client, described, [*truth, *nuisances])
         fraction = sum(hidden.parameters["fraction"] for hidden in truth if hidden.effect == "outliers")
         measured = _taken(world, motion, pairs, fraction, noising)

@@ -140,7 +140,7 @@ KINDS: dict[str, Kind] = {
         "joint",
         ("left", "tau_s"),
         _settling,
-        0.9,
+        0.5,
         "left is the part of the last move that the output still lacks when it is read: rest_s after the end of a move "
         "that took move_s; tau_s is the time constant with which it follows; a walk without rests has tau_s alone",
     ),

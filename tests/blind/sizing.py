@@ -13,7 +13,8 @@ from .world import World, residuals, whitened
 
 PAIRS_LOOKED_AT = 150
 CLOSE_ENOUGH = 0.03
-MOST_ROUNDS = 10
+MOST_ROUNDS = 12
+SMALLEST = 1e-6
 
 
 class NoEffect(ValueError):
@@ -33,15 +34,19 @@ class Sizer:
         Raises:
             NoEffect: no amplitude shows.
         """
+        tried: list[tuple[float, float]] = []  # logarithms of amplitude and of what it came to, over the size wanted
+        amplitude, best = 1.0, hidden
         for _ in range(MOST_ROUNDS):
-            hidden = self.sized(hidden)
-            if not hidden.size > 1e-6:
+            parameters, stopped = kind.scaled(hidden.parameters, amplitude)
+            best = self.sized(replace(hidden, parameters=parameters))
+            if not best.size > SMALLEST:
                 raise NoEffect(f"{hidden.effect} at {hidden.where} does not show")
-            parameters, stopped = kind.scaled(hidden.parameters, size / hidden.size)
-            if abs(size / hidden.size - 1.0) < CLOSE_ENOUGH or (stopped and parameters == hidden.parameters):
+            off = float(np.log(best.size / size))
+            if abs(off) < CLOSE_ENOUGH or (stopped and off < 0.0):
                 break
-            hidden = replace(hidden, parameters=parameters)
-        return self.sized(hidden)
+            tried.append((float(np.log(amplitude)), off))
+            amplitude = float(np.exp(_next(tried)))
+        return best
 
     def sized(self, hidden: Hidden) -> Hidden:
         """The effect with its size filled in."""
@@ -78,6 +83,16 @@ class Sizer:
         finally:
             world.close()
         return shares
+
+
+def _next(tried: list[tuple[float, float]]) -> float:
+    """Logarithm of the amplitude to try next: between the nearest from below and above, else in proportion."""
+    below = max((point for point in tried if point[1] < 0.0), default=None)
+    above = min((point for point in tried if point[1] > 0.0), default=None)
+    if below is None or above is None:
+        return tried[-1][0] - tried[-1][1]
+    part = np.clip(below[1] / (below[1] - above[1]), 0.15, 0.85)
+    return below[0] + float(part) * (above[0] - below[0])
 
 
 def drawn(kind: Kind, effect: str, site: Site, rng: np.random.Generator) -> Hidden:
