@@ -178,7 +178,7 @@ def _beside(
 
 
 def _ticks(read: tuple[str, ...], rng: np.random.Generator) -> dict[str, int]:
-    return {name: int(rng.choice([4096, 8192, 16384, 65536])) for name in read}
+    return {name: int(rng.choice([4096, 8192, 16384, 65536], p=[0.1, 0.2, 0.3, 0.4])) for name in read}
 
 
 def industrial(rng: np.random.Generator) -> Arm:
@@ -253,7 +253,9 @@ def head(rng: np.random.Generator) -> Arm:
         camera_link="head_tilt_link",
         camera_xyz=vector(np.array([0.06, 0.04, 0.05]) + rng.uniform(-0.01, 0.01, 3)),
         camera_rpy=vector(np.array(straight) + rng.uniform(-0.05, 0.05, 3)),
-        eyes=Eyes(round(rng.uniform(520.0, 640.0), 1), round(rng.uniform(0.07, 0.12), 3), round(rng.uniform(0.1, 0.4), 2)),
+        eyes=Eyes(
+            round(rng.uniform(520.0, 640.0), 1), round(rng.uniform(0.07, 0.12), 3), round(rng.uniform(0.1, 0.4), 2)
+        ),
         marker_link=arm[-1].child,
         marker_xyz=vector(np.array([0.06, 0.02, -0.05]) + rng.uniform(-0.01, 0.01, 3)),
     )

@@ -14,12 +14,12 @@ from .bullet import bullet
 from .choice import Wish, chosen_arm, chosen_motion, placed, wishes
 from .eyes import covariance, in_view, triangulate
 from .files import write_recording, write_robot
-from .hidden import Hidden, Site, direction
+from .hidden import Hidden, Parameters, Site, direction
 from .kinds import KINDS, SHIFT, SIX
-from .motion import SEGMENT_RAD, Motion, Style, move
+from .motion import SEGMENT_RAD, Motion, Style, move, narrowed
 from .outliers import false_fixes
 from .sizing import NoEffect, Sizer, drawn
-from .world import Sight, World, time_constant
+from .world import Sight, World, noise, time_constant
 
 MARGIN_PX = 60.0
 SPARE = 0.05  # pairs recorded beyond those asked for: a hidden camera may lose some at the border
@@ -38,7 +38,8 @@ class Taken:
         q: encoder readings, quantised [rad or m], shape (n, d).
         x: measured marker positions [m], shape (n, 3).
         x_noise_free: what the described cameras would report without pixel noise and without false fixes, shape (n, 3).
-        covariance: of x for the pixel noise [m²], shape (n, 3, 3).
+        covariance: of x for the pixel noise [m²], which the recording may tell, shape (n, 3, 3).
+        noise: that and what rounding to ticks adds to a residual at the readings [m²], shape (n, 3, 3).
         outlier: which fixes are not the marker, shape (n,).
     """
 
@@ -48,6 +49,7 @@ class Taken:
     x: FloatArray
     x_noise_free: FloatArray
     covariance: FloatArray
+    noise: FloatArray
     outlier: BoolArray
 
 
@@ -62,7 +64,7 @@ class HiddenCase:
         nuisances: what is wrong but not a finding, since robot.toml calls it not known.
         measured, fresh: the recording, and another one of the same arm on another way. Moments (t0) count from the
             start of either.
-        sigma_m: RMS length of the noise of a measured position.
+        sigma_m: RMS length of the noise of a residual, that of ticks included.
     """
 
     folder: Path
@@ -93,6 +95,8 @@ def hide(
     size: Size = "random",
     outliers: float = 0.0,
     hold: str | None = None,
+    reach: float = 1.0,
+    still: Sequence[str] = (),
     marker_known: bool = True,
     pose_known: bool = True,
 ) -> HiddenCase:
@@ -106,6 +110,8 @@ def hide(
         size: of each effect in units of the noise, one for all or one for each; "random" draws 0.2..15 each.
         outliers: fraction of false fixes, beside any effect.
         hold: torque_free, zero_force or held; any in which the effects show when None.
+        reach: part of each joint's range that both recordings go through, around a posture that is drawn.
+        still: joints that never move.
         marker_known, pose_known: False writes a rough marker or camera pose into robot.toml and says so there.
 
     Raises:
@@ -123,14 +129,15 @@ def hide(
         nominal = World(client, described, [])
         spare = int(np.ceil(SPARE * pairs)) + 2
         visible = _visibility(nominal)
-        motion = move(moving, style, described.ranges, pairs + spare, visible)
+        ranges = narrowed(moving, described.ranges, visible, reach, [described.read.index(name) for name in still])
+        motion = move(moving, style, ranges, pairs + spare, visible)
         truth = _hidden(wished, size, outliers, Sizer(client, nominal, motion), motion, described, choosing)
         world = World(client, described, [*truth, *nuisances])
         fraction = sum(hidden.parameters["fraction"] for hidden in truth if hidden.effect == "outliers")
-        measured = _taken(world, motion, pairs, fraction, noising)
+        measured = _taken(nominal, world, motion, pairs, fraction, noising)
         again = fresh_pairs or pairs
-        other = move(freshly, style, described.ranges, again + spare, visible)
-        fresh = _taken(world, other, again, fraction, noising)
+        other = move(freshly, style, ranges, again + spare, visible)
+        fresh = _taken(nominal, world, other, again, fraction, noising)
     write_robot(folder, described, hold, marker_known=marker_known, pose_known=pose_known)
     tells_noise = bool(choosing.random() < 0.6)
     for name, taken in (("measured", measured), ("fresh", fresh)):
@@ -143,7 +150,7 @@ def hide(
             taken.x,
             taken.covariance if tells_noise else None,
         )
-    sigma_m = float(np.sqrt(np.mean(np.trace(measured.covariance, axis1=1, axis2=2))))
+    sigma_m = float(np.sqrt(np.mean(np.trace(measured.noise, axis1=1, axis2=2))))
     return HiddenCase(folder, seed, described, hold, style, truth, nuisances, measured, fresh, sigma_m)
 
 
@@ -223,16 +230,18 @@ def _rough(rng: np.random.Generator, *, marker_known: bool, pose_known: bool) ->
     """What is wrong with a marker and a camera pose that are only roughly known."""
     nuisances = []
     if not marker_known:
-        p = dict(zip(SHIFT, (0.015 * direction(rng)).tolist(), strict=True))
-        nuisances.append(Hidden("tool_offset", None, None, p, KINDS["tool_offset"].sign))
+        shift: Parameters = dict(zip(SHIFT, (0.015 * direction(rng)).tolist(), strict=True))
+        nuisances.append(Hidden("tool_offset", None, None, shift, KINDS["tool_offset"].sign))
     if not pose_known:
         six = np.concatenate([0.03 * direction(rng), 0.04 * direction(rng)])
-        p = dict(zip(SIX, six.tolist(), strict=True))
-        nuisances.append(Hidden("camera_pose", None, None, p, KINDS["camera_pose"].sign))
+        pose: Parameters = dict(zip(SIX, six.tolist(), strict=True))
+        nuisances.append(Hidden("camera_pose", None, None, pose, KINDS["camera_pose"].sign))
     return tuple(nuisances)
 
 
-def _taken(world: World, motion: Motion, pairs: int, fraction: float, rng: np.random.Generator) -> Taken:
+def _taken(
+    nominal: World, world: World, motion: Motion, pairs: int, fraction: float, rng: np.random.Generator
+) -> Taken:
     """The first `pairs` pairs that the true cameras see, with noise, ticks and false fixes."""
     arm, sight = world.arm, world.measure(motion)
     width, height = arm.eyes.image_size_px
@@ -252,5 +261,6 @@ def _taken(world: World, motion: Motion, pairs: int, fraction: float, rng: np.ra
         x=triangulate(arm.eyes, pixels),
         x_noise_free=sight.x,
         covariance=covariance(arm.eyes, pixels),
+        noise=noise(nominal, q, sight.pixels),
         outlier=outlier,
     )

@@ -18,7 +18,9 @@ def main() -> None:
     """The command."""
     parser = argparse.ArgumentParser(prog="python -m tests.blind.hide", description="Hide effects in a recording.")
     parser.add_argument("--seed", type=int, required=True)
-    parser.add_argument("--effect", action="append", help="effect, effect@joint or effect@joint:source; may be repeated")
+    parser.add_argument(
+        "--effect", action="append", help="effect, effect@joint or effect@joint:source; may be repeated"
+    )
     parser.add_argument("--count", type=int, default=1, help="how many to draw where no --effect is given")
     parser.add_argument("--out", type=Path, required=True, help="folder that is written")
     parser.add_argument("--arm", choices=list(ARMS))

@@ -124,8 +124,8 @@ KINDS: dict[str, Kind] = {
         ("bias_sine", "bias_cosine"),
         _ripple,
         0.3,
-        "reading = atan2(sin Nq + bias_sine, cos Nq + bias_cosine) / N of the true angle q with N = poles a turn, so "
-        "reading minus true is about (bias_sine cos Nq − bias_cosine sin Nq) / N; a sliding joint turns once per turn_m",
+        "reading = atan2(sin Nq + bias_sine, cos Nq + bias_cosine) / N of the true angle q with N = poles a turn: "
+        "reading minus true is about (bias_sine cos Nq − bias_cosine sin Nq) / N; a slide turns once per turn_m",
     ),
     "joint_coupling": Kind(
         "pair", ("ratio",), _coupling, 0.2, "true position minus reading, per position of the source joint"
@@ -134,7 +134,11 @@ KINDS: dict[str, Kind] = {
         "joint", ("jump_rad", "jump_m"), _jump, 0.2, "reading minus true position from t0 on, whole ticks; 0 before"
     ),
     "backlash": Kind(
-        "joint", ("play_rad", "play_m"), _play, 0.1, "whole width of the play: the output lies within ±half of the reading"
+        "joint",
+        ("play_rad", "play_m"),
+        _play,
+        0.1,
+        "whole width of the play: the output lies within ±half of the reading",
     ),
     "settling": Kind(
         "joint",
@@ -162,13 +166,23 @@ KINDS: dict[str, Kind] = {
     "tool_offset": Kind("robot", SHIFT, _tool, 0.15, "true minus described marker, in the marker's link"),
     "tool_slip": Kind("robot", (*SHIFT,), _slip, 0.1, "marker after t0 minus before, in the marker's link"),
     "camera_pose": Kind(
-        "robot", SIX, _pose, 0.2, "the true left optical frame in the described one: shift, and turn as a rotation vector"
+        "robot",
+        SIX,
+        _pose,
+        0.2,
+        "the true left optical frame in the described one: shift, and turn as a rotation vector",
     ),
     "camera_moved": Kind(
-        "robot", SIX, _moved, 0.15, "the left optical frame after t0 in that before: shift, and turn as a rotation vector"
+        "robot",
+        SIX,
+        _moved,
+        0.15,
+        "the left optical frame after t0 in that before: shift, and turn as a rotation vector",
     ),
     "camera_scale": Kind("robot", ("scale",), _scale, 0.1, "the true baseline is (1 + scale) times the described one"),
-    "camera_focal": Kind("robot", ("scale",), _scale, 0.1, "the true focal length is (1 + scale) times the described one"),
+    "camera_focal": Kind(
+        "robot", ("scale",), _scale, 0.1, "the true focal length is (1 + scale) times the described one"
+    ),
     "lens_distortion": Kind(
         "robot", ("k1", "k2"), _lens, 0.2, "Brown: the true image point is (1 + k1 r² + k2 r⁴) times the ideal one"
     ),
@@ -180,7 +194,7 @@ KINDS: dict[str, Kind] = {
         SHIFT,
         _drift,
         0.1,
-        "measured minus true position at the end of the drift, in the measurement frame; before that times 1 − exp(−t/tau)",
+        "measured minus true position at the drift's end, in the measurement frame; before that times 1 − exp(−t/tau)",
     ),
     "outliers": Kind("robot", (), _outliers, 1.0, "fraction of the fixes that are not the marker"),
 }

@@ -15,9 +15,7 @@ INSIDE_PX = 5.0
 TRIES = 60
 
 
-def false_fixes(
-    world: World, sight: Sight, fraction: float, rng: np.random.Generator
-) -> tuple[FloatArray, BoolArray]:
+def false_fixes(world: World, sight: Sight, fraction: float, rng: np.random.Generator) -> tuple[FloatArray, BoolArray]:
     """Pixel centres with a `fraction` of them somewhere else, and which ones those are."""
     count = len(sight.x)
     outlier = _runs(count, round(fraction * count), rng)

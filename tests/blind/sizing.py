@@ -9,7 +9,7 @@ import numpy as np
 from .bullet import Bullet
 from .hidden import Hidden, Kind, Site
 from .motion import Motion
-from .world import World, residuals, whitened
+from .world import World, noise, residuals, whitened
 
 PAIRS_LOOKED_AT = 150
 CLOSE_ENOUGH = 0.03
@@ -27,6 +27,8 @@ class Sizer:
     def __init__(self, bullet: Bullet, nominal: World, motion: Motion) -> None:
         self._bullet, self._nominal = bullet, nominal
         self._motion = motion.thinned(PAIRS_LOOKED_AT)
+        plain = nominal.measure(self._motion)
+        self._noise = noise(nominal, plain.readings, plain.pixels)
 
     def scaled(self, hidden: Hidden, kind: Kind, size: float) -> Hidden:
         """The effect with parameters scaled so that the whitened RMS of its residual is about `size`.
@@ -56,9 +58,9 @@ class Sizer:
         finally:
             world.close()
         off = residuals(self._nominal, sight)
-        noise = whitened(self._nominal.arm, sight, off)
+        in_noise = whitened(self._noise, off)
         return replace(
-            hidden, size=float(np.sqrt(np.mean(noise**2))), rms_m=float(np.sqrt(np.mean(np.sum(off**2, axis=1))))
+            hidden, size=float(np.sqrt(np.mean(in_noise**2))), rms_m=float(np.sqrt(np.mean(np.sum(off**2, axis=1))))
         )
 
     def shows_on(self, hidden: Hidden, rng: np.random.Generator) -> dict[str, float]:
