@@ -18,8 +18,9 @@ from .hidden import Hidden, Parameters, Site, direction
 from .kinds import KINDS, SHIFT, SIX
 from .motion import SEGMENT_RAD, Motion, Style, move, narrowed
 from .outliers import false_fixes
+from .rendered import PIXEL_SIGMA, tracked
 from .sizing import NoEffect, Sizer, drawn
-from .world import Sight, World, noise, time_constant
+from .world import World, noise, time_constant
 
 MARGIN_PX = 60.0
 SPARE = 0.05  # pairs recorded beyond those asked for: a hidden camera may lose some at the border
@@ -99,6 +100,7 @@ def hide(
     still: Sequence[str] = (),
     marker_known: bool = True,
     pose_known: bool = True,
+    rendered: bool = False,
 ) -> HiddenCase:
     """Write a case into `folder`; everything is drawn from `seed`.
 
@@ -113,6 +115,8 @@ def hide(
         reach: part of each joint's range that both recordings go through, around a posture that is drawn.
         still: joints that never move.
         marker_known, pose_known: False writes a rough marker or camera pose into robot.toml and says so there.
+        rendered: paint every image and look for the marker in it with the tracker (some tenths of a second a pair);
+            a pair whose marker is not found is left out.
 
     Raises:
         ValueError: an effect cannot sit there, or does not show in this motion.
@@ -122,6 +126,8 @@ def hide(
     nuisances = _rough(rough, marker_known=marker_known, pose_known=pose_known)
     wished = wishes(effects, hold, [nuisance.effect for nuisance in nuisances], choosing)
     described = chosen_arm(arm, wished, building)
+    if rendered:
+        described = replace(described, eyes=replace(described.eyes, pixel_sigma=PIXEL_SIGMA))
     hold, style = chosen_motion(hold, wished, choosing)
     if outliers > 0.0 and "outliers" not in [wish.effect for wish in wished]:
         wished.append(Wish("outliers"))
@@ -134,10 +140,10 @@ def hide(
         truth = _hidden(wished, size, outliers, Sizer(client, nominal, motion), motion, described, choosing)
         world = World(client, described, [*truth, *nuisances])
         fraction = sum(hidden.parameters["fraction"] for hidden in truth if hidden.effect == "outliers")
-        measured = _taken(nominal, world, motion, pairs, fraction, noising)
+        measured = _taken(nominal, world, motion, pairs, fraction, noising, rendered=rendered)
         again = fresh_pairs or pairs
         other = move(freshly, style, ranges, again + spare, visible)
-        fresh = _taken(nominal, world, other, again, fraction, noising)
+        fresh = _taken(nominal, world, other, again, fraction, noising, rendered=rendered)
     write_robot(folder, described, hold, marker_known=marker_known, pose_known=pose_known)
     tells_noise = bool(choosing.random() < 0.6)
     for name, taken in (("measured", measured), ("fresh", fresh)):
@@ -240,27 +246,46 @@ def _rough(rng: np.random.Generator, *, marker_known: bool, pose_known: bool) ->
 
 
 def _taken(
-    nominal: World, world: World, motion: Motion, pairs: int, fraction: float, rng: np.random.Generator
+    nominal: World,
+    world: World,
+    motion: Motion,
+    pairs: int,
+    fraction: float,
+    rng: np.random.Generator,
+    *,
+    rendered: bool,
 ) -> Taken:
     """The first `pairs` pairs that the true cameras see, with noise, ticks and false fixes."""
     arm, sight = world.arm, world.measure(motion)
     width, height = arm.eyes.image_size_px
     inside = (sight.pixels > 0.0).all(axis=1) & (sight.pixels < [width, height, width, height]).all(axis=1)
     kept = np.flatnonzero(inside)[:pairs]
-    t, sight = motion.stamps[kept], Sight(sight.readings[kept], sight.pixels[kept], sight.x[kept])
+    sight = sight.of(kept)
+    points, outlier = false_fixes(world, sight, fraction, rng)
+    if rendered:
+        found, x, told = tracked(world.eyes, points, rng)
+    else:
+        found, x, told = _fixed(world, points, rng)
+    kept, sight, outlier, x, told = kept[found], sight.of(np.flatnonzero(found)), outlier[found], x[found], told[found]
     ticks = np.array([arm.quantum(name) for name in arm.read])
     q = np.rint(sight.readings / ticks) * ticks
-    pixels, outlier = false_fixes(world, sight, fraction, rng)
-    pixels = pixels + rng.normal(0.0, arm.eyes.pixel_sigma, pixels.shape)
     step = np.linalg.norm(np.diff(q, axis=0), axis=1)
     torn = (np.diff(motion.segment[kept]) > 0) | (step > SEGMENT_RAD[1])
     return Taken(
-        t=t,
+        t=motion.stamps[kept],
         segment=np.append(0, np.cumsum(torn)),
         q=q,
-        x=triangulate(arm.eyes, pixels),
+        x=x,
         x_noise_free=sight.x,
-        covariance=covariance(arm.eyes, pixels),
+        covariance=told,
         noise=noise(nominal, q, sight.pixels),
         outlier=outlier,
     )
+
+
+def _fixed(world: World, points: FloatArray, rng: np.random.Generator) -> tuple[BoolArray, FloatArray, FloatArray]:
+    """Fixes from noisy pixel centres: all are found; positions and covariances."""
+    eyes = world.arm.eyes
+    pixels = world.eyes.project(points)
+    pixels = pixels + rng.normal(0.0, eyes.pixel_sigma, pixels.shape)
+    return np.ones(len(points), dtype=bool), triangulate(eyes, pixels), covariance(eyes, pixels)

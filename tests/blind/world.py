@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from .arms import Arm
-from .arrays import FloatArray
+from .arrays import FloatArray, IntArray
 from .bullet import Bullet
 from .eyes import covariance, triangulate
 from .hidden import Hidden, Parameters
@@ -24,13 +24,19 @@ class Sight:
 
     Attributes:
         readings: of the joints [rad or m], shape (n, d).
+        at: true marker positions in the true left optical frame [m], shape (n, 3).
         pixels: centres ul, vl, ur, vr [px], shape (n, 4).
         x: positions that the described cameras make of them [m], shape (n, 3).
     """
 
     readings: FloatArray
+    at: FloatArray
     pixels: FloatArray
     x: FloatArray
+
+    def of(self, kept: IntArray) -> Sight:
+        """Some of the pairs."""
+        return Sight(self.readings[kept], self.at[kept], self.pixels[kept], self.x[kept])
 
 
 class World:
@@ -133,8 +139,9 @@ class World:
         return output
 
     def _sight(self, readings: FloatArray, output: FloatArray, t: FloatArray) -> Sight:
-        pixels = self._true.eyes.project(self.marker(output, t))
-        return Sight(readings, pixels, triangulate(self.arm.eyes, pixels))
+        at = self.marker(output, t)
+        pixels = self.eyes.project(at)
+        return Sight(readings, at, pixels, triangulate(self.arm.eyes, pixels))
 
     def _named(self, effect: str) -> list[Hidden]:
         return [hidden for hidden in self._effects if hidden.effect == effect]
