@@ -22,8 +22,8 @@ BALL_BGR = np.array([18.0, 20.0, 215.0])
 TO_LIGHT = np.array([-0.3, -0.8, -0.5]) / np.linalg.norm([-0.3, -0.8, -0.5])
 AMBIENT = 0.6
 SUPERSAMPLING = 4
-NOISE_GREY, NOISE_FIELDS = 5.0, 4
-PIXEL_SIGMA = 0.05  # about what the tracker reaches on these images
+NOISE_GREY, NOISE_FIELDS = 5.0, 2
+PIXEL_SIGMA = 0.02  # about what the tracker reaches on these images
 AROUND_PX = 6
 APART_S = 10.0  # between frames for the tracker: pairs are looked at singly, without its memory
 
@@ -34,11 +34,11 @@ class Studio:
     def __init__(self, eyes: TrueEyes, rng: np.random.Generator) -> None:
         self._eyes, self._rng = eyes, rng
         width, height = eyes.described.image_size_px
-        blotches = gaussian_filter(rng.normal(size=(2, height, width)), (0, 25, 25), mode="wrap")
+        blotches = gaussian_filter(rng.standard_normal((2, height, width), dtype=np.float32), (0, 25, 25), mode="wrap")
         grey = 120.0 + 25.0 * blotches / blotches.std()
         tint = np.array([1.05, 1.0, 0.97])
         self._rooms = np.clip(grey[..., None] * tint, 0.0, 255.0)
-        self._noise = rng.normal(0.0, NOISE_GREY, (NOISE_FIELDS, height, width, 3)).astype(np.float32)
+        self._noise = NOISE_GREY * rng.standard_normal((NOISE_FIELDS, height, width, 3), dtype=np.float32)
         self._empty = [[_grey_levels(room + noise) for noise in self._noise] for room in self._rooms]
 
     def frame(self, t: float, x: FloatArray) -> StereoFrame:
