@@ -181,7 +181,12 @@ def test_the_posed_world_shows_what_the_simulation_says(case, monkeypatch) -> No
 
 def doubled(case):
     name, where, source, values = case
-    return name, where, source, {key: value if key == "time_constant_s" else 2.0 * value for key, value in values.items()}
+    return (
+        name,
+        where,
+        source,
+        {key: value if key == "time_constant_s" else 2.0 * value for key, value in values.items()},
+    )
 
 
 @pytest.mark.parametrize("names", SEEN, ids="-".join)
