@@ -1,4 +1,4 @@
-"""The simulated world shows what the simulation says at every joint: on a head, at a slide, behind a joint held still."""
+"""The simulated world shows what the simulation says at every joint: a head's, a slide, behind one held still."""
 
 from __future__ import annotations
 
