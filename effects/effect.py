@@ -93,6 +93,11 @@ class Effect:
         """The places of the values that say how much."""
         return [k for k, parameter in enumerate(self.parameters) if parameter.is_amount]
 
+    @property
+    def is_possible(self) -> bool:
+        """Whether none of its numbers is negative that cannot be."""
+        return not any(p.never_negative and value < 0.0 for p, value in zip(self.parameters, self.values, strict=True))
+
     def with_values(self, values: FloatArray) -> Effect:
         """The same effect with other numbers (p,)."""
         return Effect(self.kind, self.where, self.source, frozen_array(values), self.prismatic)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
+from scipy.signal import lfilter
 
 from interfaces.records import FloatArray
 
@@ -145,7 +146,11 @@ class Backlash(EncoderEffect):
     remembers = True
 
     def parameters(self, prismatic: bool) -> tuple[Parameter, ...]:
-        return (Parameter("width_m", 0.002) if prismatic else Parameter("width_rad", 0.01),)
+        return (
+            Parameter("width_m", 0.002, never_negative=True)
+            if prismatic
+            else Parameter("width_rad", 0.01, never_negative=True),
+        )
 
     def columns(self, motion: Motion, place: Place, values: FloatArray) -> FloatArray:
         wider = self.correction(motion, place, values + _WIDTH_STEP)
@@ -157,16 +162,23 @@ class Backlash(EncoderEffect):
 
 
 class Settling(EncoderEffect):
-    """Read before the joint has come to rest: true angle = reading - fraction · last move."""
+    """Read before the joint has come to rest: what is missing is a fraction of the last move, and of what was before.
+
+    true angle = reading - e, with e_i = fraction · move_i + memory · e_{i-1}.
+    """
 
     name = "settling"
     remembers = True
 
     def parameters(self, prismatic: bool) -> tuple[Parameter, ...]:
-        return (Parameter("fraction", 0.05),)
+        return (Parameter("fraction", 0.05, never_negative=True), Parameter("memory", 0.0, None))
 
     def columns(self, motion: Motion, place: Place, values: FloatArray) -> FloatArray:
-        return -motion.moves[:, [place.joint]]
+        missing = motion.moves[:, place.joint].copy()
+        if values[1] != 0.0:
+            for first, end in motion.runs:
+                missing[first:end] = lfilter([1.0], [1.0, -float(values[1])], missing[first:end])
+        return np.stack([-missing, np.zeros_like(missing)], axis=1)
 
 
 class Play:

@@ -13,11 +13,13 @@ class Parameter:
         name: with its unit, as in `extended.toml` and `diagnosis.json`.
         usual: the size that it has where the effect is there [the parameter's unit]: what a search begins with.
         nominal: its value where it does nothing; None for a number that only says when or how (a moment, a period).
+        never_negative: a play, a spring or a lag that is negative is none.
     """
 
     name: str
     usual: float
     nominal: float | None = 0.0
+    never_negative: bool = False
 
     @property
     def is_amount(self) -> bool:

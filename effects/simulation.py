@@ -6,7 +6,7 @@ x_measured = drift(t) + residual(q(t)) + optics(camera(tool(structure(encoder(q(
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import ClassVar, Protocol
 
@@ -110,6 +110,7 @@ class Simulation:
             sum(e.value("scale_error") for e in self._of("camera_scale")),
             sum(e.value("focal_error") for e in self._of("camera_focal")),
             sum(e.value("k1") for e in self._of("lens_distortion")),
+            sum(e.value("k2") for e in self._of("lens_distortion")),
         )
 
     @property
@@ -271,11 +272,13 @@ class Simulated:
 
     def _optics(self, effect: Effect) -> FloatArray:
         optics, calibration = self.simulation.optics, self.simulation.robot.calibration
-        numbers = {"scale_error": optics.scale_error, "focal_error": optics.focal_error, "k1": optics.k1}
-        name = effect.parameters[0].name
-        more, less = (Optics(**(numbers | {name: numbers[name] + step})) for step in (_STEP, -_STEP))
-        change = more.reported(self.x_camera, calibration) - less.reported(self.x_camera, calibration)
-        return (change / (2.0 * _STEP))[:, :, None]
+        columns = []
+        for parameter in effect.parameters:
+            number = getattr(optics, parameter.name)
+            more, less = (replace(optics, **{parameter.name: number + step}) for step in (_STEP, -_STEP))
+            change = more.reported(self.x_camera, calibration) - less.reported(self.x_camera, calibration)
+            columns.append(change / (2.0 * _STEP))
+        return np.stack(columns, axis=2)
 
     def _latency(self, effect: Effect) -> FloatArray:
         # Through the encoders' own errors: they too are those of the moment before.

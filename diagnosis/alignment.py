@@ -1,0 +1,48 @@
+"""What robot.toml calls not known: fitted first, and never a finding."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from effects import Effect, Simulation
+from interfaces.records import FloatArray
+from interfaces.robot import RobotDescription
+
+from .fit import Fit, fitted
+from .observations import Observations
+
+_ROUNDS, _KEPT = 10, 0.8
+
+
+def aligned(observations: Observations, simulation: Simulation) -> Fit:
+    """The simulation with the free camera pose and the free marker fitted, where robot.toml does not know them."""
+    robot = simulation.robot
+    nuisances = free_effects(robot)
+    if not robot.camera.pose_known:
+        predicted = simulation.positions(observations.motion)
+        nuisances = [
+            e.with_values(placed(predicted, observations.x)) if e.name == "camera_pose" else e for e in nuisances
+        ]
+    own = [effect for effect in simulation.effects]
+    return fitted(observations, simulation.with_effects([*nuisances, *own]), len(nuisances) + len(own))
+
+
+def free_effects(robot: RobotDescription) -> list[Effect]:
+    """The effects that stand for what robot.toml does not know."""
+    names = [] if robot.camera.pose_known else ["camera_pose"]
+    names += [] if robot.robot.marker_known else ["tool_offset"]
+    return [Effect.at(robot, name) for name in names]
+
+
+def placed(predicted: FloatArray, x: FloatArray) -> FloatArray:
+    """The pose (6,) of a camera from which predicted points (n, 3) look like x (n, 3), for most of them."""
+    kept = np.ones(len(x), dtype=bool)
+    turn, shift = np.eye(3), np.zeros(3)
+    for _ in range(_ROUNDS):
+        centre, seen = predicted[kept].mean(axis=0), x[kept].mean(axis=0)
+        turn = Rotation.align_vectors(predicted[kept] - centre, x[kept] - seen)[0].as_matrix()
+        shift = centre - turn @ seen
+        distance = np.linalg.norm((predicted - shift) @ turn - x, axis=1)
+        kept = distance <= np.quantile(distance, _KEPT)
+    return np.concatenate([shift, Rotation.from_matrix(turn).as_rotvec()])

@@ -1,0 +1,199 @@
+"""A diagnosis in the words and figures of `diagnosis.json`."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from effects import Effect
+from interfaces.records import FloatArray
+
+from .advice import advice
+from .diagnosis import Diagnosis
+from .result import (
+    Cause,
+    DiagnosisFile,
+    Errors,
+    Gain,
+    Indistinguishable,
+    Interval,
+    Pairs,
+    Rejected,
+    Unexplained,
+    Verdict,
+)
+from .rivals import Rival, Standing
+from .scan import Scan
+from .words import evidence, sentence
+
+_HALF_WIDTH_95 = 1.959964
+# A cause that is less sure than this leaves the verdict open.
+SURE = 0.9
+
+
+def conclusion(diagnosis: Diagnosis) -> DiagnosisFile:
+    """All that machines need to know of a diagnosis."""
+    percent, interval = diagnosis.gain()
+    causes = _causes(diagnosis)
+    rms, mean = _errors(diagnosis, np.sqrt, np.square), _errors(diagnosis, lambda value: value, np.abs)
+    verdict = _verdict(diagnosis, causes)
+    gain = Gain(percent, interval)
+    return DiagnosisFile(
+        verdict=verdict,
+        sentence=sentence(verdict, causes, rms, gain),
+        pairs=Pairs(len(diagnosis.markers), len(diagnosis.markers), diagnosis.outliers),
+        rms_mm=rms,
+        mean_mm=mean,
+        gain=gain,
+        causes=causes,
+        rejected=_rejected(diagnosis),
+        unexplained=_unexplained(diagnosis),
+        stability=None,
+        advice=advice(diagnosis),
+        limitations=diagnosis.hypotheses.limitations,
+    )
+
+
+def _verdict(diagnosis: Diagnosis, causes: tuple[Cause, ...]) -> Verdict:
+    if diagnosis.left.is_there:
+        return "unexplained"
+    if not causes:
+        return "nothing_found"
+    open_ones = [c for c in causes if c.probability < SURE and any(r.by == "this_motion" for r in c.rivals)]
+    return "undecided" if open_ones else "explained"
+
+
+def _errors(diagnosis: Diagnosis, root: object, power: object) -> Errors:
+    assert callable(root)
+    assert callable(power)
+    kept = diagnosis.markers
+    figures = {name: float(1e3 * root(power(d[kept]).mean())) for name, d in diagnosis.held_out.items()}
+    expected = _expected_noise(diagnosis)
+    return Errors(**figures, noise_floor=float(1e3 * root(power(expected).mean())))
+
+
+def _expected_noise(diagnosis: Diagnosis) -> FloatArray:
+    """The noise's typical length at each row (n,) [m], from what is left once everything that can be is explained."""
+    fit = diagnosis.extended
+    spread = np.linalg.inv(fit.observations.whitening)
+    return fit.noise.sigma * np.sqrt(np.square(spread).sum(axis=(1, 2)))
+
+
+def _causes(diagnosis: Diagnosis) -> tuple[Cause, ...]:
+    fit, kept = diagnosis.extended, diagnosis.markers
+    full = float(np.square(diagnosis.held_out["extended"][kept]).sum())
+    losses = [max(float(np.square(diagnosis.without[c.key][kept]).sum()) - full, 0.0) for c in fit.causes]
+    causes = []
+    for cause, standing, loss in zip(fit.causes, diagnosis.standings, losses, strict=True):
+        causes.append(
+            Cause(
+                effect=cause.name,
+                where=cause.where,
+                source=cause.source,
+                parameters=_parameters(diagnosis, cause),
+                probability=standing.probability,
+                share_of_gain_percent=100.0 * loss / max(sum(losses), 1e-300),
+                held_out_gain_percent=100.0 * (1.0 - np.sqrt(full / max(full + loss, 1e-300))),
+                stability_percent=float("nan"),
+                indistinguishable_from=tuple(_named(r) for r in standing.rivals if r.is_same_here),
+                rivals=tuple(_named(r) for r in standing.rivals),
+                evidence=evidence(cause, standing),
+            )
+        )
+    if diagnosis.outliers_are_found:
+        causes.append(_outliers(diagnosis))
+    return tuple(causes)
+
+
+def _named(rival: Rival) -> Indistinguishable:
+    effect = rival.effect
+    by = "any_motion" if rival.is_same_anywhere else "this_motion"
+    return Indistinguishable(effect.name, effect.where, effect.source, by, rival.probability)
+
+
+def _outliers(diagnosis: Diagnosis) -> Cause:
+    n, found = len(diagnosis.markers), diagnosis.outliers
+    share = found / n
+    half = _HALF_WIDTH_95 * np.sqrt(share * (1.0 - share) / n)
+    return Cause(
+        effect="outliers",
+        where=None,
+        source=None,
+        parameters={"share": Interval(share, (max(share - half, 0.0), share + half))},
+        probability=1.0,
+        share_of_gain_percent=0.0,
+        held_out_gain_percent=0.0,
+        stability_percent=float("nan"),
+        indistinguishable_from=(),
+        rivals=(),
+        evidence=f"{found} of {n} fixes are farther from all others than the noise can put them.",
+    )
+
+
+def _parameters(diagnosis: Diagnosis, cause: Effect) -> dict[str, Interval]:
+    fit = diagnosis.extended
+    first = 0
+    for effect in fit.simulation.effects:
+        if effect is cause:
+            break
+        first += len(effect.amounts)
+    amounts = cause.amounts
+    covariance = fit.covariance[first : first + len(amounts), first : first + len(amounts)]
+    halves = _HALF_WIDTH_95 * np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    numbers = {}
+    for k, parameter in enumerate(cause.parameters):
+        value = float(cause.values[k])
+        if parameter.is_amount:
+            half = float(halves[amounts.index(k)])
+            numbers[parameter.name] = Interval(value, (value - half, value + half))
+        else:
+            numbers[parameter.name] = Interval(value, _shape_interval(diagnosis, cause))
+    return numbers | _derived(cause, covariance)
+
+
+def _shape_interval(diagnosis: Diagnosis, cause: Effect) -> tuple[float, float]:
+    others = [effect for effect in diagnosis.causes if effect.key != cause.key]
+    again = Scan(diagnosis.extended.with_causes(others)).candidate(cause)
+    value = float(cause.values[-1])
+    if again is None or again.interval is None:
+        return (value, value)
+    return (min(again.interval[0], value), max(again.interval[1], value))
+
+
+def _derived(cause: Effect, covariance: FloatArray) -> dict[str, Interval]:
+    """Amplitude and phase of what has a sine and a cosine: value · sin(period · angle + phase)."""
+    names = [parameter.name for parameter in cause.parameters]
+    if names[0] not in ("sine_rad", "sine_m"):
+        return {}
+    unit = names[0].removeprefix("sine_")
+    sine, cosine = cause.values[:2]
+    amplitude = float(np.hypot(sine, cosine))
+    radial = np.array([sine, cosine]) / max(amplitude, 1e-300)
+    half = _HALF_WIDTH_95 * float(np.sqrt(max(radial @ covariance[:2, :2] @ radial, 0.0)))
+    across = np.array([-cosine, sine]) / max(amplitude, 1e-300)
+    turn = _HALF_WIDTH_95 * float(np.sqrt(max(across @ covariance[:2, :2] @ across, 0.0))) / max(amplitude, 1e-300)
+    phase = float(np.arctan2(cosine, sine))
+    return {
+        f"amplitude_{unit}": Interval(amplitude, (max(amplitude - half, 0.0), amplitude + half)),
+        "phase_rad": Interval(phase, (phase - turn, phase + turn)),
+    }
+
+
+def _rejected(diagnosis: Diagnosis) -> tuple[Rejected, ...]:
+    tried = max(len(diagnosis.hypotheses.effects), 1)
+    rows = [
+        Rejected(c.effect.name, c.effect.where, c.effect.source, a.held_out_gain_percent, min(1.0, a.p_value * tried))
+        for c, a in diagnosis.rejected
+    ]
+    return tuple(sorted(rows, key=lambda row: row.held_out_gain_percent, reverse=True))
+
+
+def _unexplained(diagnosis: Diagnosis) -> Unexplained:
+    left, joints = diagnosis.left, diagnosis.extended.simulation.robot.joints
+    names = [joints[k] for k in left.joints] + (["time"] if left.with_time else [])
+    rms = 1e3 * float(np.sqrt(np.square(left.explained).sum(axis=1).mean()))
+    return Unexplained(rms, tuple(names), left.p_value)
+
+
+def standing_of(diagnosis: Diagnosis, cause: Effect) -> Standing:
+    """How a cause stands."""
+    return diagnosis.standings[[c.key for c in diagnosis.causes].index(cause.key)]

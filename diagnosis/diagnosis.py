@@ -1,0 +1,154 @@
+"""From a recording and a simulation to what the simulation gets wrong."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from effects import Effect, Simulation
+from interfaces.recording import Recording
+from interfaces.records import FloatArray
+
+from .alignment import aligned
+from .fit import Fit, fitted
+from .held_out import Added, Blocks, HeldOut, added, gain_percent, is_marker, without_cause
+from .hypotheses import Hypotheses
+from .instrument import instrument_factor
+from .leftover import Leftover, leftover
+from .observations import Observations
+from .rivals import Standing, standings
+from .scan import Candidate, Scan
+from .search import Search
+
+Told = Callable[[str], None]
+# Fewer fixes than this that are not the marker are no finding.
+_FEWEST_OUTLIERS = 3
+# So much more probable it has to be that there are some [nats].
+_OUTLIERS_NAMED = 15.0
+# Of the instrument's noise, another size than that is taken up (in logarithms).
+_SAME_NOISE = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class Diagnosis:
+    """What a simulation gets wrong, and all that a report shows of it.
+
+    Attributes:
+        hypotheses: what was tested, and what could not be.
+        nominal: the simulation as it is.
+        aligned: with what robot.toml does not know.
+        geometry: with all lengths, axes, zeros, the tool and the camera's pose free.
+        extended: with the causes.
+        standings: how each cause stands against its rivals.
+        left: what no effect fits.
+        blocks: of time, by which rows were held out.
+        seed: of the resampling.
+    """
+
+    hypotheses: Hypotheses
+    nominal: Fit
+    aligned: Fit
+    geometry: Fit
+    extended: Fit
+    standings: tuple[Standing, ...]
+    left: Leftover
+    blocks: Blocks
+    seed: int
+
+    @property
+    def causes(self) -> tuple[Effect, ...]:
+        """The effects found."""
+        return self.extended.causes
+
+    @cached_property
+    def held_out(self) -> dict[str, FloatArray]:
+        """Distances (n,) [m] of each simulation on rows that it was not fitted to."""
+        fits = {"nominal": self.nominal, "aligned": self.aligned, "geometry": self.geometry, "extended": self.extended}
+        return {name: HeldOut(fit, self.blocks).distances for name, fit in fits.items()}
+
+    @cached_property
+    def markers(self) -> np.ndarray:
+        """Which fixes are probably the marker (n,)."""
+        return is_marker(self.extended)
+
+    @property
+    def outliers(self) -> int:
+        """How many are not."""
+        return int((~self.markers).sum())
+
+    @property
+    def outliers_are_found(self) -> bool:
+        """Whether there are so many, so far off, that it is a finding."""
+        worth = self.extended.noise.log_likelihood - self.extended.without_outliers
+        return self.outliers >= _FEWEST_OUTLIERS and worth > _OUTLIERS_NAMED
+
+    def gain(self) -> tuple[float, tuple[float, float]]:
+        """By how much the RMS falls from aligned to extended [%], with its 95 % interval."""
+        kept = np.where(self.markers, 1.0, 0.0)
+        return gain_percent(self.held_out["aligned"] * kept, self.held_out["extended"] * kept, self.blocks, self.seed)
+
+    @cached_property
+    def without(self) -> dict[tuple[str, str | None, str | None], FloatArray]:
+        """Distances (n,) [m] on rows not fitted, without each of the causes."""
+        return {c.key: HeldOut(without_cause(self.extended, c), self.blocks).distances for c in self.causes}
+
+    @cached_property
+    def rejected(self) -> list[tuple[Candidate, Added]]:
+        """The hypotheses that were not taken, as each would do best beside the causes."""
+        present = {cause.key for cause in self.causes}
+        candidates = Scan(self.extended).candidates(h for h in self.hypotheses.effects if h.key not in present)
+        return [(candidate, added(self.extended, candidate, self.blocks)) for candidate in candidates]
+
+
+def diagnose(
+    recording: Recording,
+    simulation: Simulation,
+    *,
+    only: Collection[str] = (),
+    without: Collection[str] = (),
+    seed: int = 0,
+    tell: Told = lambda _: None,
+) -> Diagnosis:
+    """What `simulation` gets wrong of a recording.
+
+    Args:
+        only, without: names of effects to test, all by default, and not to test.
+        tell: is told what happens, in a few words.
+    """
+    observations = Observations.of(recording, simulation)
+    start = aligned(observations, simulation)
+    hypotheses = Hypotheses.of(simulation, observations, only=only, without=without)
+    tell(f"{len(hypotheses.effects)} hypotheses")
+    search = Search(hypotheses.effects, tell)
+    extended = search.run(start)
+    factor = instrument_factor(extended)
+    if abs(np.log(factor)) > _SAME_NOISE:
+        observations = observations.with_factor(factor)
+        start = aligned(observations, simulation)
+        extended = search.run(start.with_causes(extended.causes))
+    tell("asking what else it could be")
+    return Diagnosis(
+        hypotheses=hypotheses,
+        nominal=fitted(observations, simulation, len(simulation.effects)),
+        aligned=start,
+        geometry=_geometry(start),
+        extended=extended,
+        standings=tuple(standings(extended, hypotheses.effects, search)),
+        left=leftover(extended),
+        blocks=Blocks.cut(len(recording)),
+        seed=seed,
+    )
+
+
+def _geometry(start: Fit) -> Fit:
+    """The best purely geometric model."""
+    robot = start.simulation.robot
+    present = {effect.key for effect in start.simulation.effects}
+    wanted = [Effect.at(robot, "camera_pose"), Effect.at(robot, "tool_offset")]
+    wanted += [Effect.at(robot, "link_geometry", joint) for joint in robot.joints]
+    free = [effect for effect in wanted if effect.key not in present]
+    effects = [*start.simulation.effects, *free]
+    return fitted(start.observations, start.simulation.with_effects(effects), len(effects), start.noise)

@@ -1,0 +1,224 @@
+"""Fitting the numbers of effects to measured positions, some of which are not the marker at all."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.ndimage import uniform_filter1d
+
+from effects import Effect, Simulated, Simulation
+from interfaces.records import FloatArray
+
+from .observations import Observations
+
+# An effect is not expected to be larger than so many times its usual size; what cannot be told stays near nothing.
+LARGEST = 30.0
+# Steps until the likelihood rises by less than this [nats].
+_ROUNDS, _ENOUGH = 12, 0.02
+_FEWEST_OUTLIERS = 1e-4
+_EM_ROUNDS = 6
+# So large a share of so many rows is no outliers.
+_WINDOW, _BURST = 21, 0.45
+
+
+@dataclass(frozen=True, eq=False)
+class Noise:
+    """A mixture: most fixes have the shape of the stated noise, `sigma` times its size; a share lie anywhere.
+
+    Fixes that are not the marker are scattered. Where many in a row are off, something has changed.
+
+    Attributes:
+        sigma: size of the noise, in units of the stated one.
+        share: of the fixes that are not the marker.
+        weights: how probably each fix is the marker (n,).
+        log_likelihood: of all residuals [nats].
+    """
+
+    sigma: float
+    share: float
+    weights: FloatArray
+    log_likelihood: float
+
+    @classmethod
+    def of(cls, residuals: FloatArray, outlier_density: FloatArray, start: Noise | None = None) -> Noise:
+        """The most probable noise of residuals (n, 3), by expectation maximisation."""
+        squares = np.einsum("ni,ni->n", residuals, residuals)
+        # Of three squared normal coordinates the median is 2.366.
+        sigma = float(np.sqrt(max(np.median(squares) / 2.366, 1e-18)))
+        share = 0.02 if start is None else start.share
+        weights, total = np.ones(len(squares)), -np.inf
+        for _ in range(_EM_ROUNDS):
+            inlier = np.log1p(-share) - 1.5 * np.log(2.0 * np.pi * sigma**2) - 0.5 * squares / sigma**2
+            outlier = np.log(share) + outlier_density
+            both = np.logaddexp(inlier, outlier)
+            weights = np.exp(inlier - both)
+            bursts = uniform_filter1d(1.0 - weights, _WINDOW, mode="nearest") > _BURST
+            weights[bursts] = 1.0
+            total = float(np.where(bursts, inlier, both).sum())
+            sigma = float(np.sqrt(max((weights @ squares) / (3.0 * max(weights.sum(), 1.0)), 1e-18)))
+            share = float(np.clip(1.0 - weights.mean(), _FEWEST_OUTLIERS, 0.5))
+        return cls(sigma, share, weights, total)
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """A simulation fitted to observations.
+
+    Attributes:
+        observations: what it was fitted to.
+        simulation: with all effects, the nuisances first.
+        nuisances: how many of its effects are no findings.
+        run: the simulation over the observed motion.
+        residuals: (n, 3) in units of the stated noise.
+        noise: what is known of it.
+    """
+
+    observations: Observations
+    simulation: Simulation
+    nuisances: int
+    run: Simulated
+    residuals: FloatArray
+    noise: Noise
+
+    @property
+    def causes(self) -> tuple[Effect, ...]:
+        """The effects that are findings."""
+        return self.simulation.effects[self.nuisances :]
+
+    @cached_property
+    def without_outliers(self) -> float:
+        """The log-likelihood if all fixes were the marker [nats]."""
+        squares = np.square(self.residuals).sum(axis=1)
+        variance = max(float(squares.mean()) / 3.0, 1e-18)
+        return float(-1.5 * len(squares) * (np.log(2.0 * np.pi * variance) + 1.0))
+
+    @property
+    def log_likelihood(self) -> float:
+        """Of the observations, less what implausibly large effects cost [nats]."""
+        return self.noise.log_likelihood - _cost(self.simulation.effects[self.nuisances :])
+
+    @cached_property
+    def root_weights(self) -> FloatArray:
+        """Square roots of the weights (n, 1)."""
+        return np.sqrt(self.noise.weights)[:, None]
+
+    @cached_property
+    def run_columns(self) -> FloatArray:
+        """Derivatives (n, 3, p) of what is measured by all amounts [m]."""
+        return _amount_columns(self.run, self.simulation.effects)
+
+    @cached_property
+    def columns(self) -> FloatArray:
+        """`run_columns`, whitened and weighted."""
+        return self.weighted(self.run_columns)
+
+    def weighted(self, columns: FloatArray) -> FloatArray:
+        """Columns (n, 3, p) [m] whitened and weighted."""
+        return self.observations.whitened(columns) * self.root_weights[:, :, None]
+
+    @cached_property
+    def orthogonal(self) -> FloatArray:
+        """An orthonormal basis (n, 3, r) of what the amounts can change."""
+        n, _, p = self.columns.shape
+        flat = self.columns.reshape(3 * n, p)
+        scales = np.linalg.norm(flat, axis=0)
+        flat = flat / np.where(scales > 0.0, scales, 1.0)
+        left, values, _ = np.linalg.svd(flat, full_matrices=False)
+        return left[:, values > 1e-9 * max(values.max(initial=0.0), 1e-300)].reshape(n, 3, -1)
+
+    @cached_property
+    def left(self) -> FloatArray:
+        """Weighted residuals (n, 3)."""
+        return self.residuals * self.root_weights
+
+    @cached_property
+    def covariance(self) -> FloatArray:
+        """Of all amounts (p, p), nuisances first."""
+        n, _, p = self.columns.shape
+        flat = self.columns.reshape(3 * n, p)
+        information = flat.T @ flat / self.noise.sigma**2 + np.diag(prior_precision(self.simulation, self.nuisances))
+        return np.linalg.pinv(information, rcond=1e-14, hermitian=True)
+
+    def with_causes(self, causes: Sequence[Effect]) -> Fit:
+        """Other causes in the place of these, all refitted."""
+        effects = (*self.simulation.effects[: self.nuisances], *causes)
+        return fitted(self.observations, self.simulation.with_effects(effects), self.nuisances, self.noise)
+
+
+def fitted(observations: Observations, simulation: Simulation, nuisances: int, start: Noise | None = None) -> Fit:
+    """The most probable amounts of all effects of `simulation`, by Gauss-Newton steps that are halved where too far.
+
+    Moments, periods and time constants stay as they are.
+    """
+    fit = _at(observations, simulation, nuisances, start)
+    for _ in range(_ROUNDS):
+        if not fit.columns.shape[2]:
+            return fit
+        step = _step(fit)
+        best = None
+        for shortened in (1.0, 0.3, 0.05):
+            tried = _at(observations, _moved(fit.simulation, shortened * step), nuisances, fit.noise)
+            if tried.log_likelihood > fit.log_likelihood:
+                best = tried
+                break
+        if best is None:
+            return fit
+        gained = best.log_likelihood - fit.log_likelihood
+        fit = best
+        if gained < _ENOUGH:
+            break
+    return fit
+
+
+def _at(observations: Observations, simulation: Simulation, nuisances: int, start: Noise | None) -> Fit:
+    run = simulation.run(observations.motion)
+    residuals = observations.residuals(run.measured)
+    noise = Noise.of(residuals, observations.outlier_density, start)
+    return Fit(observations, simulation, nuisances, run, residuals, noise)
+
+
+def _step(fit: Fit) -> FloatArray:
+    n, _, p = fit.columns.shape
+    flat = fit.columns.reshape(3 * n, p)
+    precision = prior_precision(fit.simulation, fit.nuisances) * fit.noise.sigma**2
+    values = np.concatenate([effect.values[effect.amounts] for effect in fit.simulation.effects])
+    normal = flat.T @ flat + np.diag(precision)
+    gradient = flat.T @ fit.left.ravel() - precision * values
+    scales = np.sqrt(np.maximum(np.diag(normal), 1e-300))
+    solved = np.linalg.lstsq(normal / np.outer(scales, scales), gradient / scales, rcond=1e-12)[0]
+    return solved / scales
+
+
+def _moved(simulation: Simulation, step: FloatArray) -> Simulation:
+    effects, first = [], 0
+    for effect in simulation.effects:
+        values = effect.values.copy()
+        values[effect.amounts] += step[first : first + len(effect.amounts)]
+        first += len(effect.amounts)
+        effects.append(effect.with_values(values))
+    return simulation.with_effects(effects)
+
+
+def prior_precision(simulation: Simulation, nuisances: int) -> FloatArray:
+    """Of all amounts (p,): what is not known beforehand may be anything."""
+    parts = []
+    for k, effect in enumerate(simulation.effects):
+        usual = np.array([effect.parameters[j].usual for j in effect.amounts])
+        parts.append(1.0 / np.square((LARGEST if k >= nuisances else 1e4) * usual))
+    return np.concatenate(parts) if parts else np.empty(0)
+
+
+def _cost(causes: Sequence[Effect]) -> float:
+    total = 0.0
+    for effect in causes:
+        for k in effect.amounts:
+            total += 0.5 * (effect.values[k] / (LARGEST * effect.parameters[k].usual)) ** 2
+    return float(total)
+
+
+def _amount_columns(run: Simulated, effects: Sequence[Effect]) -> FloatArray:
+    parts = [run.columns(effect)[:, :, effect.amounts] for effect in effects]
+    return np.concatenate(parts, axis=2) if parts else np.empty((len(run.motion), 3, 0))

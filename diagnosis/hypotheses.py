@@ -1,0 +1,99 @@
+"""What could be the cause: every effect of the table at every place where it can sit, and what this data can test."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+
+import numpy as np
+
+from effects import KINDS, Effect, Kind, Simulation
+
+from .observations import Observations
+
+# A joint that moves less than this tells nothing of itself [rad, m].
+_STILL = 1e-4
+_FEWEST_ROWS = 20
+
+
+@dataclass(frozen=True, eq=False)
+class Hypotheses:
+    """What is tested, and what is not.
+
+    Attributes:
+        effects: one of each, at rest.
+        limitations: why some were left out, a sentence each.
+    """
+
+    effects: tuple[Effect, ...]
+    limitations: tuple[str, ...]
+
+    @classmethod
+    def of(
+        cls,
+        simulation: Simulation,
+        observations: Observations,
+        *,
+        only: Collection[str] = (),
+        without: Collection[str] = (),
+    ) -> Hypotheses:
+        """All that this recording of this robot can test, of the effects asked for."""
+        limits = _Limits(simulation, observations)
+        robot = simulation.robot
+        effects = []
+        for kind in KINDS.values():
+            if (only and kind.name not in only) or kind.name in without or limits.excludes(kind):
+                continue
+            if not kind.at_joint:
+                effects.append(Effect.at(robot, kind.name))
+                continue
+            for k, joint in enumerate(robot.joints):
+                if (kind.turns_only and robot.chain.prismatic[k]) or limits.still[k]:
+                    continue
+                sources = [s for j, s in enumerate(robot.joints) if s != joint and not limits.still[j]]
+                effects += [Effect.at(robot, kind.name, joint, s) for s in (sources if kind.takes_source else [None])]
+        return cls(tuple(effects), tuple(limits.sentences))
+
+
+class _Limits:
+    """What this recording cannot test."""
+
+    def __init__(self, simulation: Simulation, observations: Observations) -> None:
+        self._simulation, self._motion = simulation, observations.motion
+        robot = simulation.robot
+        self.still = np.ptp(observations.motion.q, axis=0) < _STILL
+        self.sentences: list[str] = []
+        standing = [joint for joint, still in zip(robot.joints, self.still, strict=True) if still]
+        if standing:
+            self.sentences.append(
+                f"{', '.join(standing)} never moved: nothing can be said of {'it' if len(standing) == 1 else 'them'}."
+            )
+        if observations.motion.t is None:
+            self.sentences.append("The recording has no times: late images and drift cannot be tested.")
+        if robot.calibration is None:
+            self.sentences.append(
+                "robot.toml has no stereo calibration: a wrong focal length and lens distortion cannot be tested."
+            )
+        if robot.robot.hold == "torque_free":
+            self.sentences.append(
+                "The arm was guided torque-free: the hand bore its weight, so no joint gave under it."
+            )
+        elif not simulation.gravity.known:
+            self.sentences.append(
+                "The URDF states no masses: joints that give under the arm's weight cannot be tested."
+            )
+
+    def excludes(self, kind: Kind) -> bool:
+        """Whether no effect of this kind can be tested, or all of it is free anyway."""
+        robot = self._simulation.robot
+        if kind.name == "joint_compliance":
+            return robot.robot.hold == "torque_free" or not self._simulation.gravity.known
+        if kind.name == "camera_pose":
+            return not robot.camera.pose_known
+        if kind.name == "tool_offset":
+            return not robot.robot.marker_known
+        if kind.needs_times and self._motion.t is None:
+            return True
+        if kind.needs_stereo and robot.calibration is None:
+            return True
+        return len(self._motion) < _FEWEST_ROWS

@@ -1,0 +1,121 @@
+"""`diagnosis.json`: what was found, for machines."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import msgspec
+
+Verdict = Literal["explained", "nothing_found", "undecided", "unexplained"]
+
+
+class Interval(msgspec.Struct, frozen=True):
+    """A number with its 95 % interval."""
+
+    value: float
+    ci95: tuple[float, float]
+
+
+class Gain(msgspec.Struct, frozen=True, rename={"from_": "from"}):
+    """By how much the RMS falls on rows that were not fitted, counted from the aligned simulation [%]."""
+
+    held_out_percent: float
+    ci95: tuple[float, float]
+    from_: str = "aligned"
+
+
+class Indistinguishable(msgspec.Struct, frozen=True):
+    """What a cause cannot be told from.
+
+    Attributes:
+        by: "this_motion" where another motion would tell them apart, "any_motion" where none would.
+        probability: that it is this one.
+    """
+
+    effect: str
+    where: str | None
+    source: str | None
+    by: Literal["this_motion", "any_motion"]
+    probability: float
+
+
+class Cause(msgspec.Struct, frozen=True):
+    """One cause with its numbers."""
+
+    effect: str
+    where: str | None
+    source: str | None
+    parameters: dict[str, Interval]
+    probability: float
+    share_of_gain_percent: float
+    held_out_gain_percent: float
+    stability_percent: float
+    indistinguishable_from: tuple[Indistinguishable, ...]
+    rivals: tuple[Indistinguishable, ...]
+    evidence: str
+
+
+class Rejected(msgspec.Struct, frozen=True):
+    """A hypothesis that was tested and is not there.
+
+    Attributes:
+        held_out_gain_percent: what it would bring on top of the causes.
+        p_value: of no gain at all, for all hypotheses that were tried together.
+    """
+
+    effect: str
+    where: str | None
+    source: str | None
+    held_out_gain_percent: float
+    p_value: float
+
+
+class Unexplained(msgspec.Struct, frozen=True):
+    """Structure that no effect fits: how large, on which joints it depends (`time` among them), how improbable."""
+
+    rms_mm: float
+    depends_on: tuple[str, ...]
+    p_value: float
+
+
+class Pairs(msgspec.Struct, frozen=True):
+    """How many pairs there were, were predicted without having been fitted, and were not the marker."""
+
+    total: int
+    held_out: int
+    outliers: int
+
+
+class Errors(msgspec.Struct, frozen=True):
+    """Errors on rows that were not fitted [mm]."""
+
+    nominal: float
+    aligned: float
+    geometry: float | None
+    extended: float
+    noise_floor: float | None
+
+
+class Stability(msgspec.Struct, frozen=True):
+    """How often the same causes come out of resampled blocks."""
+
+    resampled: int
+    same_causes: int
+
+
+class DiagnosisFile(msgspec.Struct, frozen=True):
+    """The contents of `diagnosis.json`."""
+
+    verdict: Verdict
+    sentence: str
+    pairs: Pairs
+    rms_mm: Errors
+    mean_mm: Errors
+    gain: Gain
+    causes: tuple[Cause, ...]
+    rejected: tuple[Rejected, ...]
+    unexplained: Unexplained
+    stability: Stability | None
+    advice: tuple[str, ...]
+    limitations: tuple[str, ...]
+    schema: int = 1

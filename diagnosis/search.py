@@ -1,0 +1,153 @@
+"""Which causes: added one by one, taken away again when a better one makes them redundant, exchanged for rivals."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from scipy import stats
+
+from effects import Effect
+
+from .fit import Fit
+from .held_out import Blocks, block_p_value
+from .scan import Candidate, Scan
+
+# A cause has to be so much more probable than its absence [nats].
+NAMED = 3.0
+# Candidates within this share of the best gain are refitted in full, so many at most.
+_NEAR, _MOST = 0.4, 6
+_MOST_CAUSES = 12
+# So many sets of causes are looked at, and none twice.
+_MOST_SETS = 60
+Key = tuple[str, str | None, str | None]
+# What a number costs at least [nats].
+_CHEAPEST = 1.5
+
+
+def nats(gain: float, dof: int) -> float:
+    """How much more probable `dof` more numbers are, which raise twice the log-likelihood by `gain`, than none.
+
+    What explains the gain best is taken as their usual size: a Gaussian prior, scaled by empirical Bayes (George and
+    Foster 2000, equation 5), but never so narrow that a number costs less than `_CHEAPEST`.
+    """
+    if dof < 0:
+        return -nats(-gain, -dof)
+    if dof == 0:
+        return 0.5 * gain
+    return 0.5 * gain - dof * max(0.5 + 0.5 * float(np.log(max(gain, 1e-300) / dof)), _CHEAPEST)
+
+
+class Search:
+    """Greedy, with second thoughts.
+
+    Args:
+        hypotheses: what could be the cause.
+        tell: is told what happens, in a few words.
+    """
+
+    def __init__(self, hypotheses: Sequence[Effect], tell: Callable[[str], None]) -> None:
+        self._hypotheses, self._tell = hypotheses, tell
+        self._doubt = np.log(max(len(hypotheses), 1))
+
+    def run(self, start: Fit) -> Fit:
+        """The causes on top of what `start` has fitted."""
+        fit = start
+        self._seen: set[frozenset[Key]] = set()
+        for _ in range(_MOST_CAUSES):
+            better = self._added(fit)
+            if better is None:
+                break
+            causes = frozenset(effect.key for effect in better.causes)
+            if causes in self._seen:
+                break
+            self._seen.add(causes)
+            fit = self._reviewed(better)
+        return fit
+
+    def _added(self, fit: Fit) -> Fit | None:
+        """With one more cause; None where nothing is probable enough."""
+        present = {effect.key for effect in fit.causes}
+        others = [h for h in self._hypotheses if h.key not in present]
+        best, most = None, NAMED
+        for candidate in self.shortlist(fit, others):
+            if self._agreed(fit, candidate) < NAMED:
+                continue
+            tried = self.refined(fit.with_causes([*fit.causes, candidate.effect]), candidate.effect.key)
+            worth = nats(2.0 * (tried.log_likelihood - fit.log_likelihood), candidate.dof) - self.doubt(candidate)
+            if worth > most and tried.causes[-1].is_possible:
+                best, most = tried, worth
+        if best is not None:
+            self._tell(f"found {describe(best.causes[-1])}")
+        return best
+
+    def doubt(self, candidate: Candidate) -> float:
+        """What having looked for it in so many places costs [nats]."""
+        return float(self._doubt + np.log(candidate.trials))
+
+    def _agreed(self, fit: Fit, candidate: Candidate) -> float:
+        """What a candidate is worth by the agreement of blocks of time, which need not be white inside [nats]."""
+        effect = candidate.effect
+        columns = fit.weighted(fit.run.columns(effect)[:, :, effect.amounts])
+        chance = block_p_value(fit, columns, Blocks.cut(len(fit.observations)))
+        gain = float(stats.chi2.isf(max(chance, 1e-290), candidate.dof))
+        return nats(gain, candidate.dof) - self.doubt(candidate)
+
+    def shortlist(self, fit: Fit, hypotheses: Sequence[Effect]) -> list[Candidate]:
+        """The candidates that may be the best when all is refitted, the most probable first."""
+        scanned = Scan(fit).candidates(hypotheses)
+        ranked = sorted(scanned, key=lambda c: nats(c.gain, c.dof) - self.doubt(c), reverse=True)
+        if not ranked:
+            return []
+        floor = _NEAR * ranked[0].gain
+        return [c for c in ranked[: 3 * _MOST] if c.gain >= floor][:_MOST]
+
+    def refined(self, fit: Fit, key: tuple[str, str | None, str | None]) -> Fit:
+        """With the moment or period of one cause sought again beside the others as they are now fitted."""
+        cause = next(effect for effect in fit.causes if effect.key == key)
+        if all(parameter.is_amount for parameter in cause.parameters):
+            return fit
+        others = [effect for effect in fit.causes if effect.key != key]
+        again = Scan(fit.with_causes(others)).candidate(cause)
+        if again is None or np.allclose(again.effect.values, cause.values):
+            return fit
+        tried = fit.with_causes([*others, again.effect])
+        return tried if tried.log_likelihood > fit.log_likelihood else fit
+
+    def _reviewed(self, fit: Fit) -> Fit:
+        """Without what has become redundant, and with better ones in the place of others."""
+        changed = len(fit.causes) > 1
+        while changed and len(self._seen) < _MOST_SETS:
+            fit, changed = self._second_thoughts(fit)
+            causes = frozenset(effect.key for effect in fit.causes)
+            changed = changed and causes not in self._seen
+            self._seen.add(causes)
+        return fit
+
+    def _second_thoughts(self, fit: Fit) -> tuple[Fit, bool]:
+        for cause in fit.causes:
+            others = [effect for effect in fit.causes if effect.key != cause.key]
+            without = fit.with_causes(others)
+            present = {effect.key for effect in fit.causes}
+            itself = Scan(without).candidate(cause)
+            dof = 1 if itself is None else itself.dof
+            lost = nats(2.0 * (fit.log_likelihood - without.log_likelihood), dof)
+            if lost < NAMED + (0.0 if itself is None else self.doubt(itself)):
+                self._tell(f"dropped {describe(cause)}")
+                return without, True
+            rivals = [h for h in self._hypotheses if h.key not in present]
+            for candidate in self.shortlist(without, rivals):
+                if candidate.gain < 0.5 * 2.0 * (fit.log_likelihood - without.log_likelihood):
+                    continue
+                tried = self.refined(fit.with_causes([*others, candidate.effect]), candidate.effect.key)
+                worth = nats(2.0 * (tried.log_likelihood - fit.log_likelihood), candidate.dof - dof)
+                if worth > 1.0 and tried.causes[-1].is_possible:
+                    self._tell(f"exchanged {describe(cause)} for {describe(candidate.effect)}")
+                    return tried, True
+        return fit, False
+
+
+def describe(effect: Effect) -> str:
+    """An effect and its place in a few words."""
+    place = "" if effect.where is None else f" at {effect.where}"
+    return f"{effect.name}{place}{'' if effect.source is None else f' from {effect.source}'}"

@@ -1,0 +1,117 @@
+"""Causes in words that a mechanic understands."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from effects import Effect
+
+from .result import Cause, Errors, Gain, Verdict
+from .rivals import Standing
+
+_DEG = 180.0 / np.pi
+
+
+def finding(name: str, where: str | None, source: str | None, numbers: dict[str, float]) -> str:
+    """One cause as a clause: what is wrong, where, by how much."""
+    at = f"joint {where}"
+
+    def size(*names: str) -> float:
+        return float(np.linalg.norm([numbers[n] for n in names if n in numbers]))
+
+    def turned(base: str) -> str:
+        if f"{base}_rad" in numbers:
+            return f"{numbers[f'{base}_rad'] * _DEG:+.3g}°"
+        return f"{numbers[f'{base}_m'] * 1e3:+.3g} mm"
+
+    shift = f"{1e3 * size('x_m', 'y_m', 'z_m'):.3g} mm"
+    turn = f"{size('rx_rad', 'ry_rad', 'rz_rad') * _DEG:.2g}°"
+    when = f" at t = {numbers['t0']:.1f}" if "t0" in numbers else ""
+    match name:
+        case "joint_offset":
+            return f"the zero of {at} is off by {turned('offset')}"
+        case "joint_scale":
+            return f"{at} turns {100 * numbers['scale_error']:+.3g} % more than its encoder says"
+        case "joint_eccentricity":
+            return f"the encoder of {at} sits off its axis: ±{numbers['amplitude_rad'] * _DEG:.2g}° once a turn"
+        case "joint_ripple":
+            amplitude = (
+                f"{numbers['amplitude_rad'] * _DEG:.2g}°"
+                if "amplitude_rad" in numbers
+                else (f"{1e3 * numbers['amplitude_m']:.2g} mm")
+            )
+            often = (
+                f"{numbers['cycles_per_turn']:.3g} times a turn"
+                if "cycles_per_turn" in numbers
+                else f"{numbers['cycles_per_m']:.3g} times a metre"
+            )
+            return f"{at} has a ripple of ±{amplitude}, {often}"
+        case "joint_coupling":
+            return f"{at} moves by {100 * numbers['ratio']:+.3g} % of joint {source}'s angle"
+        case "encoder_jump":
+            return f"the zero of {at} jumped by {turned('jump')}{when}"
+        case "backlash":
+            return f"{at} has {turned('width').lstrip('+')} of play"
+        case "settling":
+            return f"{at} was read before it came to rest: {100 * numbers['fraction']:.2g} % of each move was missing"
+        case "joint_compliance":
+            if "compliance_rad_per_Nm" in numbers:
+                return f"{at} gives by {numbers['compliance_rad_per_Nm'] * _DEG:.2g}°/N·m under the arm's weight"
+            return f"{at} gives by {1e3 * numbers['compliance_m_per_N']:.2g} mm/N under the arm's weight"
+        case "link_geometry":
+            return f"the link before {at} is off by {shift} and {turn}"
+        case "tool_offset":
+            return f"the marker sits {shift} beside its place on the hand"
+        case "tool_slip":
+            return f"the marker slipped by {shift}{when}"
+        case "camera_pose":
+            return f"the camera stands {shift} and {turn} off"
+        case "camera_moved":
+            return f"the camera was bumped by {shift} and {turn}{when}"
+        case "camera_scale":
+            return f"all that is measured is {100 * numbers['scale_error']:+.3g} % too large: the baseline is wrong"
+        case "camera_focal":
+            return f"the focal length is {100 * numbers['focal_error']:+.3g} % off: depth is scaled"
+        case "lens_distortion":
+            return f"the lenses still distort: k1 = {numbers['k1']:+.3g}"
+        case "camera_latency":
+            return f"images are stamped {1e3 * numbers['latency_s']:.3g} ms late"
+        case "thermal_drift":
+            return f"what is measured drifts by {shift} with a time constant of {numbers['time_constant_s']:.0f} s"
+        case _:
+            return f"{100 * numbers['share']:.2g} % of the fixes are not the marker"
+
+
+def sentence(verdict: Verdict, causes: Sequence[Cause], rms: Errors, gain: Gain) -> str:
+    """The verdict in one sentence."""
+    figures = f"{rms.aligned:.3g} mm → {rms.extended:.3g} mm on data not used in the fit"
+    if verdict == "nothing_found":
+        return f"The simulation is right to within the noise: nothing found in {rms.aligned:.3g} mm of error"
+    if not causes:
+        return "What is measured differs from the simulation in a way that none of the known effects explains"
+    told = [finding(c.effect, c.where, c.source, {k: v.value for k, v in c.parameters.items()}) for c in causes]
+    ordered = [text for _, text in sorted(zip(causes, told, strict=True), key=lambda p: -p[0].share_of_gain_percent)]
+    head = ordered[0][0].upper() + ordered[0][1:]
+    if len(ordered) > 1:
+        head += f"; {', '.join(ordered[1:-1])}{', and ' if len(ordered) > 2 else ''}{ordered[-1]}"
+    what = "it explains" if len(ordered) == 1 else "together they explain"
+    ends = {
+        "explained": "",
+        "undecided": ". Other causes would explain it nearly as well",
+        "unexplained": ". Something is left that none of the known effects explains",
+    }
+    return f"{head}: {what} {gain.held_out_percent:.0f} % of the error ({figures}){ends[verdict]}"
+
+
+def evidence(cause: Effect, standing: Standing) -> str:
+    """Why a cause was named, in one sentence."""
+    text = (
+        f"Without it the fit is worse by Δχ² = {standing.gain:.0f} for {standing.dof} number{'s' * (standing.dof > 1)}"
+    )
+    if not standing.rivals:
+        return f"{text}; nothing else comes near."
+    rival = standing.rivals[0]
+    place = "" if rival.effect.where is None else f" at {rival.effect.where}"
+    return f"{text}; the nearest rival is {rival.effect.name}{place} ({100 * rival.probability:.0f} %)."

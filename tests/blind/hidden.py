@@ -1,0 +1,124 @@
+"""What was hidden, and of which size it is drawn."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from .arms import Arm
+from .arrays import FloatArray
+from .motion import Motion
+
+Parameters = dict[str, float]
+
+
+@dataclass(frozen=True)
+class Hidden:
+    """One effect that was hidden.
+
+    Attributes:
+        effect: its name in the table of effects, or a name of the hider's own when `outside`.
+        where: the joint it sits at, or None.
+        source: the other joint of a coupling, or None.
+        parameters: physical quantities; the unit is the end of each name, SI without one.
+        sign: what positive parameters mean.
+        outside: whether it is in no table: to be called unexplained.
+        drivers: with `outside`, the joints on which the hidden error itself depends.
+        size: RMS of the noise-free residual of the nominal chain under this effect alone, whitened: 1 is as large as
+            the noise along each axis, that of pixels and of ticks.
+        rms_m: the same residual in metres.
+        shows_on: with `outside`, for each joint the share (0..1) of that residual's variance that goes when the other
+            joints stay and this one is drawn anew.
+    """
+
+    effect: str
+    where: str | None
+    source: str | None
+    parameters: Parameters
+    sign: str
+    outside: bool = False
+    drivers: tuple[str, ...] = ()
+    size: float = math.nan
+    rms_m: float = math.nan
+    shows_on: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Site:
+    """Where and when an effect is drawn."""
+
+    arm: Arm
+    motion: Motion
+    where: str | None
+    source: str | None
+
+    @property
+    def prismatic(self) -> bool:
+        """Whether the joint slides."""
+        return self.where is not None and self.arm.joint(self.where).kind == "prismatic"
+
+    @property
+    def unit(self) -> str:
+        """Unit of the joint's position as the end of a parameter's name."""
+        return "m" if self.prismatic else "rad"
+
+    @property
+    def duration_s(self) -> float:
+        """From the first to the last pair."""
+        return float(self.motion.stamps[-1] - self.motion.stamps[0])
+
+
+@dataclass(frozen=True)
+class Kind:
+    """One kind of effect.
+
+    Attributes:
+        at: "joint" (any), "pair" (a joint and a source), "robot" (no joint).
+        amplitudes: the parameters that are scaled to reach a size; the others are its shape.
+        draw: parameters of unit amplitude.
+        most: largest value of any amplitude.
+        sign: what positive parameters mean.
+        bears: only where the joints bear the arm's weight.
+        styles: the kinds of motion that show it.
+        outside, drivers: whether it is in no table, and then on which joints the error depends.
+        beside_only: only where the cameras stand beside the arm.
+    """
+
+    at: str
+    amplitudes: tuple[str, ...]
+    draw: Callable[[Site, np.random.Generator], Parameters]
+    most: float
+    sign: str
+    bears: bool = False
+    styles: tuple[str, ...] = ("walk", "stepped", "held")
+    outside: bool = False
+    drivers: Callable[[Site], tuple[str, ...]] | None = None
+    beside_only: bool = False
+
+    def scaled(self, parameters: Parameters, factor: float) -> tuple[Parameters, bool]:
+        """The parameters with amplitudes `factor` times as large, and whether the largest value stopped them."""
+        largest = max(abs(parameters[name]) for name in self.amplitudes if name in parameters)
+        allowed = min(factor, self.most / largest)
+        scaled = {name: value * (allowed if name in self.amplitudes else 1.0) for name, value in parameters.items()}
+        return scaled, allowed < factor
+
+
+def moment(site: Site, rng: np.random.Generator) -> float:
+    """A moment in the middle three fifths of the recording, between two pairs [s]."""
+    count = len(site.motion.stamps)
+    index = int(rng.integers(max(1, count // 5), max(2, 4 * count // 5)))
+    return float(site.motion.stamps[index - 1 : index + 1].mean())
+
+
+def sign(rng: np.random.Generator) -> float:
+    """±1."""
+    return float(rng.choice([-1.0, 1.0]))
+
+
+def direction(rng: np.random.Generator, size: int = 3) -> FloatArray:
+    """A unit vector of any direction."""
+    v = rng.normal(size=size)
+    return v / np.linalg.norm(v)
