@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from scipy import stats
 
 from effects import Effect, Simulation
 from interfaces.recording import Recording
@@ -30,6 +31,8 @@ Told = Callable[[str], None]
 _FEWEST_OUTLIERS = 3
 # So much more probable it has to be that there are some [nats].
 _OUTLIERS_NAMED = 15.0
+# That outliers and motion have to do with each other, by chance.
+_BY_CHANCE = 1e-3
 # Of the instrument's noise, another size than that is taken up (in logarithms).
 _SAME_NOISE = 0.1
 
@@ -87,7 +90,16 @@ class Diagnosis:
     def outliers_are_found(self) -> bool:
         """Whether there are so many, so far off, that it is a finding."""
         worth = self.extended.noise.log_likelihood - self.extended.without_outliers
-        return self.outliers >= _FEWEST_OUTLIERS and worth > _OUTLIERS_NAMED
+        return self.outliers >= _FEWEST_OUTLIERS and worth > _OUTLIERS_NAMED and not self._off_where_fast()
+
+    def _off_where_fast(self) -> bool:
+        """Whether the fixes that are off are those at the fastest rows: then it is motion that is not understood."""
+        motion = self.extended.observations.motion
+        steps = np.linalg.norm(motion.moves, axis=1)
+        duration = np.ones(len(motion)) if motion.t is None else np.append(np.inf, np.diff(motion.t))
+        speed = steps / np.maximum(duration, 1e-9)
+        off = ~self.markers
+        return min(stats.mannwhitneyu(v[off], v[~off]).pvalue for v in (steps, speed)) < _BY_CHANCE
 
     def gain(self) -> tuple[float, tuple[float, float]]:
         """By how much the RMS falls from aligned to extended [%], with its 95 % interval."""

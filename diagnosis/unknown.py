@@ -23,6 +23,8 @@ _HARMONICS, _TIMES = 5, 4
 TIME = -1
 # What has no name has to be so much more probable than what has one [nats].
 _NO_NAME = 4.0
+# What one of its numbers costs [nats].
+_NUMBER = 2.0
 # Directions of a family's columns of which less is left, as a share of the strongest and of the whole, tell nothing.
 _TOLD, _LEFT = 1e-6, 1e-7
 # Whether blocks of time agree is asked of so many of a family's directions.
@@ -187,7 +189,7 @@ class Unknowns:
             told &= values > _LEFT
             explained = float(np.square(vectors[:, told].T @ toward[part] / np.sqrt(values[told])).sum())
             gain = -3.0 * rows * float(np.log1p(-min(explained / rss, 0.999999)))
-            worths.append(nats(gain, int(told.sum())) if told.any() else -np.inf)
+            worths.append(0.5 * gain - _NUMBER * int(told.sum()))
         index = int(np.argmax(worths))
         return index, worths[index] - self._doubt
 
