@@ -101,7 +101,9 @@ class Truth:
         hidden, effect = self.hidden[index], self.effects[index]
         others = self.beside(index)
         rivals = self.scene.rivals(self.target, others, [effect])
-        apart = next((fit for fit in rivals if fit.chi2 >= TOLD or not self.same_anywhere(index, fit.effects[-1])), None)
+        apart = next(
+            (fit for fit in rivals if fit.chi2 >= TOLD or not self.same_anywhere(index, fit.effects[-1])), None
+        )
         seen = self.scene.fitted(self.target, others).chi2
         return TruthJudged(
             *effect.key,
@@ -186,9 +188,7 @@ def judge(case: HiddenCase, scenario: str = "", command: str = "") -> Judgement:
     )
 
 
-def compared(
-    truth: Truth, file: DiagnosisFile
-) -> tuple[tuple[TruthJudged, ...], tuple[CauseJudged, ...], Outcome]:
+def compared(truth: Truth, file: DiagnosisFile) -> tuple[tuple[TruthJudged, ...], tuple[CauseJudged, ...], Outcome]:
     """The hidden effects, the named causes, and what comes of both."""
     named = [n for cause in file.causes if (n := Named.of(cause, truth.robot)) is not None]
     found = matched(truth, named)
@@ -307,9 +307,7 @@ def judged_false_fixes(case: HiddenCase, file: DiagnosisFile) -> CauseJudged | N
             given = next(iter(cause.parameters.values()))
             share = count / len(case.measured.outlier)
             numbers = (_number("share", share, given),) if count else ()
-            return CauseJudged(
-                "outliers", None, None, cause.probability, count > 0, False, 0, (), (), numbers, {}
-            )
+            return CauseJudged("outliers", None, None, cause.probability, count > 0, False, 0, (), (), numbers, {})
     return None
 
 

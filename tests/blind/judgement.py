@@ -76,7 +76,7 @@ class CauseJudged(msgspec.Struct, frozen=True):
     left_out: dict[str, str]
 
 
-class Judgement(msgspec.Struct, frozen=True):
+class Judgement(msgspec.Struct, frozen=True, tag="judged"):
     """One case.
 
     Attributes:
@@ -127,3 +127,25 @@ def written(key: Key) -> str:
     """`effect@where:source`."""
     effect, where, source = key
     return effect + (f"@{where}" if where else "") + (f":{source}" if source else "")
+
+
+class Crash(msgspec.Struct, frozen=True, tag="crashed"):
+    """A case in which the diagnosis broke."""
+
+    scenario: str
+    seed: int
+    truth: tuple[str, ...]
+    error: str
+    command: str
+
+
+def told(record: Judgement | Crash) -> str:
+    """A record in a line."""
+    if isinstance(record, Crash):
+        return f"{record.scenario} {record.seed} crashed: {record.error.strip().splitlines()[-1]}"
+    there = ", ".join(f"{written((t.effect, t.where, t.source))} ({t.size:.2g})" for t in record.truth) or "nothing"
+    named = (
+        ", ".join(f"{written((c.effect, c.where, c.source))} {c.probability:.2f}" for c in record.causes) or "nothing"
+    )
+    case = f"{record.scenario} {record.seed} {record.outcome}"
+    return f"{case}: {there} -> {named} [{record.verdict}] {record.seconds:.1f} s"

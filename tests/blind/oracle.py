@@ -97,7 +97,7 @@ class Scene:
         return self.whitened(np.concatenate(parts, axis=2) if parts else np.empty((len(self.motion), 3, 0)))
 
     def with_shape(self, target: FloatArray, others: Sequence[Effect], effect: Effect) -> Effect:
-        """The effect with the moment, period, width or time constant that comes nearest beside others, to first order."""
+        """The effect with the moment, period, width or time constant that comes nearest, to first order."""
         return self._nearest(target, others, [effect])[0][1]
 
     def rivals(self, target: FloatArray, others: Sequence[Effect], but: Iterable[Effect]) -> list[Fitted]:
@@ -157,7 +157,9 @@ class Scene:
         pulled = np.einsum("ni,ni->n", port, left.reshape(-1, 3))
         square = np.square(port).sum(axis=1)
         phases = q[:, None] * cycles * (2.0 * np.pi if effect.prismatic else 1.0)
-        power = sum(np.square(pulled @ f(phases)) / np.maximum(square @ np.square(f(phases)), 1e-12) for f in (np.sin, np.cos))
+        power = sum(
+            np.square(pulled @ f(phases)) / np.maximum(square @ np.square(f(phases)), 1e-12) for f in (np.sin, np.cos)
+        )
         best = cycles[np.argsort(np.asarray(power))[::-1][:6]]
         return [effect.with_values(np.array([0.0, 0.0, float(c)])) for c in best]
 
