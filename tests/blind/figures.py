@@ -74,14 +74,9 @@ def _goals(scenario: str, cases: Sequence[Judgement]) -> list[tuple[str, str, st
         "none": _of_nothing,
         "outside": _of_strange,
     }.get(scenario, lambda c: _of_named(scenario, c))(cases)
-    seconds = np.array([case.seconds for case in cases])
-    rows.append(
-        (
-            "seconds: median, 95 %",
-            f"≤ {SECONDS_WANTED:.0f}",
-            f"{np.median(seconds):.1f}, {np.quantile(seconds, 0.95):.1f}",
-        )
-    )
+    for what, seconds in (("clock", [c.seconds for c in cases]), ("processor", [c.cpu_seconds for c in cases])):
+        typical, most = np.median(seconds), np.quantile(seconds, 0.95)
+        rows.append((f"seconds by the {what}: median, 95 %", f"≤ {SECONDS_WANTED:.0f}", f"{typical:.1f}, {most:.1f}"))
     rows.append(("memory [MB]", f"≤ {MEGABYTES_WANTED:.0f}", f"{max(case.memory_mb for case in cases):.0f}"))
     return rows
 

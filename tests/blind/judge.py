@@ -155,10 +155,10 @@ def judge(case: HiddenCase, scenario: str = "", command: str = "") -> Judgement:
     """Diagnose measured.csv and compare with what was hidden."""
     robot = RobotDescription.load(case.robot_file)
     recording = Recording.read(case.folder / "measured.csv", robot.joints)
-    begun = time.perf_counter()
+    begun, begun_cpu = time.perf_counter(), time.process_time()
     diagnosis = diagnose(recording, Simulation(robot))
     file = conclusion(diagnosis)
-    seconds = time.perf_counter() - begun
+    seconds, cpu_seconds = time.perf_counter() - begun, time.process_time() - begun_cpu
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
     truth = Truth.of(case, robot, Motion.of(recording))
     truths, causes, outcome = compared(truth, file)
@@ -183,6 +183,7 @@ def judge(case: HiddenCase, scenario: str = "", command: str = "") -> Judgement:
         joints_right=joints_right(truth.strange[0], file.unexplained.depends_on) if truth.strange else None,
         smooth_ratio=smooth_ratio(truth, diagnosis),
         seconds=seconds,
+        cpu_seconds=cpu_seconds,
         memory_mb=memory,
         command=command,
     )

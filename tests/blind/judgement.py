@@ -88,6 +88,7 @@ class Judgement(msgspec.Struct, frozen=True, tag="judged"):
         depends_on, shows_on: with an effect outside the table, what was said and what is so.
         joints_right: whether that agrees.
         smooth_ratio: held-out error after the smooth model over the noise floor.
+        seconds, cpu_seconds: that the diagnosis took, by the clock and of the processor.
         command: to look at it again.
     """
 
@@ -109,6 +110,7 @@ class Judgement(msgspec.Struct, frozen=True, tag="judged"):
     joints_right: bool | None
     smooth_ratio: float | None
     seconds: float
+    cpu_seconds: float
     memory_mb: float
     command: str
 

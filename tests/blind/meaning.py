@@ -41,14 +41,7 @@ def meant(hidden: Hidden, robot: RobotDescription) -> Meant | None:
         return None
     name, values = _named(hidden)
     effect = Effect.at(robot, name, hidden.where, hidden.source, {k: v for k, v in values.items() if not math.isnan(v)})
-    return Meant(effect, frozenset(values) - _not_told(hidden, values))
-
-
-def _not_told(hidden: Hidden, values: Parameters) -> set[str]:
-    unknown = {name for name, value in values.items() if math.isnan(value)}
-    if hidden.effect == "lens_distortion" and hidden.parameters["k2"]:
-        return unknown | {"k1"}  # what k1 alone makes of k1 and k2 depends on where in the image the marker was
-    return unknown
+    return Meant(effect, frozenset(name for name, value in values.items() if not math.isnan(value)))
 
 
 def _named(hidden: Hidden) -> tuple[str, Parameters]:
@@ -67,7 +60,7 @@ def _named(hidden: Hidden) -> tuple[str, Parameters]:
         case "backlash":
             return name, {f"width_{unit}": p[f"play_{unit}"]}
         case "settling":
-            return name, {"fraction": p.get("left", math.nan)}
+            return name, _settling(p)
         case "tool_offset" | "tool_slip":
             return name, _shifts(p) | _moment(p)
         case "camera_pose" | "camera_moved" | "link_geometry":
@@ -75,7 +68,7 @@ def _named(hidden: Hidden) -> tuple[str, Parameters]:
         case "camera_focal":
             return name, {"focal_error": p["scale"]}
         case "lens_distortion":
-            return name, {"k1": p["k1"]}
+            return name, {"k1": p["k1"], "k2": p["k2"]}
         case "thermal_drift":
             return name, _shifts(p) | {"time_constant_s": p["tau_s"]}
         case _:  # coupling, compliance, latency: the same quantity under the same name
@@ -91,6 +84,13 @@ def _periodic(name: str, p: Parameters) -> tuple[str, Parameters]:
         return "joint_ripple", {"sine_m": arm * a, "cosine_m": -arm * b, "cycles_per_m": poles / p["turn_m"]}
     numbers = {"sine_rad": a / poles, "cosine_rad": -b / poles}
     return name, numbers if name == "joint_eccentricity" else numbers | {"cycles_per_turn": poles}
+
+
+def _settling(p: Parameters) -> Parameters:
+    """What is left of a move, and of that after the next one; on a walk without rests there are no such numbers."""
+    if "left" not in p:
+        return {"fraction": math.nan, "memory": math.nan}
+    return {"fraction": p["left"], "memory": math.exp(-(p["move_s"] + p["rest_s"]) / p["tau_s"])}
 
 
 def _shifts(p: Parameters) -> Parameters:

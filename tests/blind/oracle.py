@@ -22,6 +22,7 @@ MOMENTS = 40  # not at the ends, where what begins at a moment becomes what was 
 CYCLES = np.arange(2.0, 101.0)
 WIDTHS = np.geomspace(2e-4, 0.1, 8)
 SETTLED = (0.03, 0.1, 0.3, 1.0, 3.0)
+MEMORIES = (0.0, 0.2, 0.4, 0.6)
 NEAREST = 6  # rivals that are fitted in full
 WIDE_ROWS, STOPS_EVERY = 400, 4
 IN_FRONT_M = 0.15
@@ -142,6 +143,8 @@ class Scene:
             case "thermal_drift":
                 span = float(clock[-1] - clock[0])
                 return [effect.with_values(np.append(np.zeros(3), share * span)) for share in SETTLED]
+            case "settling":
+                return [effect.with_values(np.array([0.0, memory])) for memory in MEMORIES]
             case "backlash":
                 return [effect.with_values(np.array([width])) for width in WIDTHS]
             case _:

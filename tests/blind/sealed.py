@@ -70,7 +70,7 @@ SCENARIOS = {
 def main() -> None:
     """The command."""
     given = _arguments()
-    names = list(SCENARIOS) if given.scenario == "all" else [given.scenario]
+    names = list(SCENARIOS) if "all" in given.scenario else given.scenario
     records = read(given.json) if given.json else []
     done = {(record.scenario, record.seed) for record in records}
     wanted = [(name, seed) for seed in range(given.first_seed, given.first_seed + given.seeds) for name in names]
@@ -141,7 +141,7 @@ def _arguments() -> argparse.Namespace:
     )
     parser.add_argument("--seeds", type=int, required=True, help="how many")
     parser.add_argument("--first-seed", type=int, default=1)
-    parser.add_argument("--scenario", choices=[*SCENARIOS, "all"], default="one")
+    parser.add_argument("--scenario", choices=[*SCENARIOS, "all"], nargs="+", default=["one"])
     parser.add_argument("--processes", type=int, default=1)
     parser.add_argument("--json", type=Path, help="one record a line; what is there already is not run again")
     parser.add_argument("--show", action="store_true", help="print the records in full")
