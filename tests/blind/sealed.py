@@ -67,14 +67,30 @@ SCENARIOS = {
 }
 
 
+@dataclass(frozen=True)
+class Case:
+    """A scenario and a seed; `pairs` in the place of the scenario's own."""
+
+    scenario: str
+    seed: int
+    pairs: int | None = None
+
+    @property
+    def command(self) -> str:
+        """To look at it again."""
+        pairs = "" if self.pairs is None else f" --pairs {self.pairs}"
+        return f"python -m tests.blind.sealed --scenario {self.scenario} --first-seed {self.seed} --seeds 1{pairs}"
+
+
 def main() -> None:
     """The command."""
     given = _arguments()
     names = list(SCENARIOS) if "all" in given.scenario else given.scenario
     records = read(given.json) if given.json else []
     done = {(record.scenario, record.seed) for record in records}
-    wanted = [(name, seed) for seed in range(given.first_seed, given.first_seed + given.seeds) for name in names]
-    for record in judged([case for case in wanted if case not in done], given.processes):
+    seeds = range(given.first_seed, given.first_seed + given.seeds)
+    wanted = [Case(name, seed, given.pairs) for seed in seeds for name in names]
+    for record in judged([case for case in wanted if (case.scenario, case.seed) not in done], given.processes):
         records.append(record)
         print(told(record), file=sys.stderr, flush=True)
         if given.json:
@@ -87,7 +103,7 @@ def main() -> None:
     print(markdown(chosen))
 
 
-def judged(cases: Iterable[tuple[str, int]], processes: int = 1) -> Iterator[Record]:
+def judged(cases: Iterable[Case], processes: int = 1) -> Iterator[Record]:
     """Each case as soon as it is judged; what cannot be hidden is left out."""
     if processes == 1:
         results = map(run, cases)
@@ -99,27 +115,26 @@ def judged(cases: Iterable[tuple[str, int]], processes: int = 1) -> Iterator[Rec
                 yield record
 
 
-def run(case: tuple[str, int]) -> Record | None:
+def run(case: Case) -> Record | None:
     """One case; None where the effects that were drawn show nowhere on the arm that was drawn."""
-    name, seed = case
-    scenario, command = SCENARIOS[name], f"python -m tests.blind.sealed --scenario {name} --first-seed {seed} --seeds 1"
+    scenario, seed = SCENARIOS[case.scenario], case.seed
     with tempfile.TemporaryDirectory() as folder:
         try:
             hidden = hide(
                 seed,
                 Path(folder),
                 scenario.effects,
-                pairs=scenario.pairs,
+                pairs=case.pairs or scenario.pairs,
                 size=scenario.size(seed),
                 outliers=scenario.outliers,
             )
         except NoEffect:
             return None
         try:
-            return judge(hidden, name, command)
+            return judge(hidden, case.scenario, case.command)
         except Exception:  # a diagnosis that breaks is a result, too
             truth = tuple(f"{h.effect} {h.where or ''}" for h in hidden.truth)
-            return Crash(name, seed, truth, traceback.format_exc(), command)
+            return Crash(case.scenario, seed, truth, traceback.format_exc(), case.command)
 
 
 def encoded(record: Record) -> bytes:
@@ -142,6 +157,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--seeds", type=int, required=True, help="how many")
     parser.add_argument("--first-seed", type=int, default=1)
     parser.add_argument("--scenario", choices=[*SCENARIOS, "all"], nargs="+", default=["one"])
+    parser.add_argument("--pairs", type=int, help="in the place of the scenario's own")
     parser.add_argument("--processes", type=int, default=1)
     parser.add_argument("--json", type=Path, help="one record a line; what is there already is not run again")
     parser.add_argument("--show", action="store_true", help="print the records in full")
