@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import binomtest
 
-from .judge import TOLD
+from .judge import FEWEST_FALSE_FIXES, TOLD
 from .judgement import CauseJudged, Crash, Judgement, TruthJudged, written
 
 BINS = 10
@@ -130,15 +130,8 @@ def _of_named(scenario: str, cases: Sequence[Judgement]) -> list[tuple[str, str,
 
 def all_named(case: Judgement) -> bool:
     """Whether every hidden effect is named, whatever else is."""
-    fixes = scenario_has_false_fixes(case)
-    return all(t.found_as is not None for t in case.truth) and (
-        not fixes or any(c.effect == "outliers" for c in case.causes)
-    )
-
-
-def scenario_has_false_fixes(case: Judgement) -> bool:
-    """Whether false fixes were added."""
-    return case.scenario == "outliers"
+    fixes = any(cause.effect == "outliers" for cause in case.causes)
+    return all(t.found_as is not None for t in case.truth) and (fixes or case.false_fixes < FEWEST_FALSE_FIXES)
 
 
 def is_strange(case: Judgement) -> bool:
@@ -259,7 +252,7 @@ def failures(cases: Sequence[Judgement], crashes: Sequence[Crash]) -> str:
             f"{written((t.effect, t.where, t.source))} {t.size:.2g}σ Δχ² {t.told_chi2:.0f}"
             f"{' to ' + written(t.rival) if t.rival else ''}{'' if t.found_as or t.outside else ' NOT NAMED'}"
             for t in case.truth
-        )
+        ) + (f"; {case.false_fixes} false fixes" if case.false_fixes else "")
         false = "; ".join(f"{written((c.effect, c.where, c.source))} p {c.probability:.2f}" for c in case.false_causes)
         depends = f" ({', '.join(case.depends_on)})" if case.verdict == "unexplained" else ""
         rows.append((case.outcome, hidden, false or "–", case.verdict + depends, f"`{case.command}`"))

@@ -186,6 +186,7 @@ def judge(case: HiddenCase, scenario: str = "", command: str = "") -> Judgement:
         cpu_seconds=cpu_seconds,
         memory_mb=memory,
         command=command,
+        false_fixes=int(case.measured.outlier.sum()),
     )
 
 

@@ -90,6 +90,7 @@ class Judgement(msgspec.Struct, frozen=True, tag="judged"):
         smooth_ratio: held-out error after the smooth model over the noise floor.
         seconds, cpu_seconds: that the diagnosis took, by the clock and of the processor.
         command: to look at it again.
+        false_fixes: how many fixes truly are not the marker.
     """
 
     scenario: str
@@ -113,6 +114,7 @@ class Judgement(msgspec.Struct, frozen=True, tag="judged"):
     cpu_seconds: float
     memory_mb: float
     command: str
+    false_fixes: int = 0
 
     @property
     def told_chi2(self) -> float:
@@ -145,7 +147,9 @@ def told(record: Judgement | Crash) -> str:
     """A record in a line."""
     if isinstance(record, Crash):
         return f"{record.scenario} {record.seed} crashed: {record.error.strip().splitlines()[-1]}"
-    there = ", ".join(f"{written((t.effect, t.where, t.source))} ({t.size:.2g})" for t in record.truth) or "nothing"
+    effects = [f"{written((t.effect, t.where, t.source))} ({t.size:.2g})" for t in record.truth]
+    fixes = [f"{record.false_fixes} false fixes"] if record.false_fixes else []
+    there = ", ".join(effects + fixes) or "nothing"
     named = (
         ", ".join(f"{written((c.effect, c.where, c.source))} {c.probability:.2f}" for c in record.causes) or "nothing"
     )
