@@ -293,12 +293,16 @@ def judged_numbers(truth: Truth, named: Named, index: int) -> tuple[tuple[Number
         elif parameter.is_amount and np.ptp(given.ci95) > TELLS_LITTLE * parameter.usual:
             left_out[parameter.name] = "not told by this motion"
         else:
-            numbers.append(_number(parameter.name, float(value), given))
+            low, high = _between_rows(truth.scene.motion, given) if parameter.name == "t0" else given.ci95
+            numbers.append(Number(parameter.name, float(value), given.value, (low, high)))
     return tuple(numbers), left_out
 
 
-def _number(name: str, truth: float, given: Interval) -> Number:
-    return Number(name, truth, given.value, (given.ci95[0], given.ci95[1]))
+def _between_rows(motion: Motion, moment: Interval) -> tuple[float, float]:
+    """The interval of a moment from row to row: all moments between two rows are one."""
+    low, high = moment.ci95
+    before, after = motion.clock[motion.clock <= low], motion.clock[motion.clock >= high]
+    return float(before.max(initial=-np.inf)), float(after.min(initial=np.inf))
 
 
 def judged_false_fixes(case: HiddenCase, file: DiagnosisFile) -> CauseJudged | None:
@@ -308,7 +312,7 @@ def judged_false_fixes(case: HiddenCase, file: DiagnosisFile) -> CauseJudged | N
             count = int(case.measured.outlier.sum())
             given = next(iter(cause.parameters.values()))
             share = count / len(case.measured.outlier)
-            numbers = (_number("share", share, given),) if count else ()
+            numbers = (Number("share", share, given.value, given.ci95),) if count else ()
             return CauseJudged("outliers", None, None, cause.probability, count > 0, False, 0, (), (), numbers, {})
     return None
 

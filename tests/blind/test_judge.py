@@ -193,6 +193,17 @@ def test_numbers_are_judged_by_their_interval(truth_of: Hide) -> None:
     assert [n.is_inside for _, causes, _ in (inside, outside) for n in causes[0].numbers] == [True, False]
 
 
+def test_a_moment_between_the_right_rows_is_right(truth_of: Hide) -> None:
+    truth = truth_of("encoder_jump@elbow")
+    clock, t0 = truth.scene.motion.clock, truth.meanings[0].effect.value("t0")
+    inside = []
+    for off in (0, 3):
+        moment = float(clock[clock >= t0][off]) - 1e-6
+        cause = _cause("encoder_jump@elbow", t0=Interval(moment, (moment, moment)))
+        inside += [n.is_inside for n in compared(truth, _file(cause))[1][0].numbers]
+    assert inside == [True, False]
+
+
 def test_a_number_that_the_motion_does_not_tell_is_left_out(truth_of: Hide) -> None:
     _, causes, _ = compared(truth_of(ELBOW), _file(_cause(ELBOW, offset_rad=Interval(0.0, (-3.0, 3.0)))))
     assert (causes[0].numbers, causes[0].left_out) == ((), {"offset_rad": "not told by this motion"})
