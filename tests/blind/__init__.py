@@ -1,7 +1,8 @@
-"""Hides effects in recordings by their physics, for whoever claims to find them.
+"""Hides effects in recordings by their physics, for whoever claims to find them; and judges what they claim.
 
-It shares nothing with the code that finds effects: neither formulas, nor constants, nor helpers. Positions come from
-pybullet, measurements from pixel coordinates, gear play and springs from their own equations of motion and balance.
+What hides (`hide` and all that it imports) shares nothing with the code that finds effects: neither formulas, nor
+constants, nor helpers. Positions come from pybullet, measurements from pixel coordinates, gear play and springs from
+their own equations of motion and balance. What judges (`judge`, `sealed`, `oracle`, `meaning`) knows both sides.
 
 `hide.hide` makes a case; what it goes through, in this order:
 

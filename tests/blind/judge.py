@@ -1,0 +1,375 @@
+"""Judges a diagnosis of a hidden case: whether it names what is there, how sure, with which numbers, for which gain."""
+
+from __future__ import annotations
+
+import resource
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from diagnosis.conclusion import conclusion
+from diagnosis.diagnosis import Diagnosis, diagnose
+from diagnosis.result import Cause, DiagnosisFile, Indistinguishable, Interval
+from effects import Effect, Motion, Simulation
+from interfaces.recording import Recording
+from interfaces.robot import RobotDescription
+
+from .arrays import FloatArray
+from .cases import HiddenCase
+from .hidden import Hidden
+from .judgement import CauseJudged, Judgement, Key, Number, Outcome, TruthJudged, written
+from .meaning import Meant, meant
+from .oracle import Fitted, Scene, wide
+
+TOLD = 25.0  # chi-square by which an oracle tells two effects apart
+SAME_SHARE = 1e-4  # what is left of a signal, of its chi-square, by an effect that is the same in every motion
+SURE = 0.9
+FEWEST_FALSE_FIXES = 3
+SHOWS, HIDDEN_FROM = 0.25, 0.02  # share of the variance from which a joint has to be named, and below which it must not
+TELLS_LITTLE = 10.0  # usual sizes: a wider interval says that the motion does not tell the number
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """What is hidden in a case, in the words of the table, and what an oracle knows of it.
+
+    Attributes:
+        scene: the measured motion.
+        wide: a way through all postures, in the place of any motion.
+        nuisances: what robot.toml does not know, with its true numbers.
+        hidden, meanings: the effects that a row of the table describes, in the same order.
+        strange: those that none does.
+    """
+
+    case: HiddenCase
+    robot: RobotDescription
+    scene: Scene
+    wide: Scene
+    nuisances: tuple[Effect, ...]
+    hidden: tuple[Hidden, ...]
+    meanings: tuple[Meant, ...]
+    strange: tuple[Hidden, ...]
+
+    @classmethod
+    def of(cls, case: HiddenCase, robot: RobotDescription, motion: Motion) -> Truth:
+        """From a case and the motion that was recorded."""
+        scene = Scene.of(robot, motion, case.measured.covariance)
+        nuisances = tuple(m.effect for h in case.nuisances if (m := meant(h, robot)) is not None)
+        both = [(h, m) for h in case.truth if (m := meant(h, robot)) is not None]
+        strange = tuple(h for h in case.truth if h.outside)
+        hidden, meanings = tuple(h for h, _ in both), tuple(m for _, m in both)
+        return cls(case, robot, scene, wide(scene), nuisances, hidden, meanings, strange)
+
+    @cached_property
+    def fitted(self) -> Fitted:
+        """The true effects with the numbers that come nearest to the measured positions free of noise."""
+        effects = [*self.nuisances, *(m.effect for m in self.meanings)]
+        return self.scene.fitted(self.case.measured.x_noise_free, effects)
+
+    @cached_property
+    def effects(self) -> tuple[Effect, ...]:
+        """Of `fitted`, without the nuisances."""
+        return self.fitted.effects[len(self.nuisances) :]
+
+    @cached_property
+    def target(self) -> FloatArray:
+        """Positions (n, 3) [m] that an oracle compares rivals with: at the readings as they were rounded."""
+        return self.case.measured.x_noise_free if self.strange else self.scene.positions(self.fitted.effects)
+
+    def beside(self, index: int) -> tuple[Effect, ...]:
+        """All that is true but one of the effects."""
+        return (*self.nuisances, *(e for k, e in enumerate(self.effects) if k != index))
+
+    def same_anywhere(self, index: int, other: Effect) -> bool:
+        """Whether no motion tells another effect from a true one, since it can be all that this is."""
+        others = self.beside(index)
+        target = self.wide.positions([*others, self.effects[index]])
+        signal = self.wide.fitted(target, others).chi2
+        there = self.wide.fitted(target, [*others, self.wide.with_shape(target, others, other)])
+        return there.chi2 < SAME_SHARE * max(signal, 1e-9)
+
+    def behind(self, index: int, other: Effect) -> float:
+        """Chi-square by which another effect in the place of a true one stays behind on the measured motion."""
+        others = self.beside(index)
+        return self.scene.fitted(self.target, [*others, self.scene.with_shape(self.target, others, other)]).chi2
+
+    def judged(self, index: int, found_as: Key | None, among_rivals: bool) -> TruthJudged:
+        """How well an oracle sees one of the true effects, and tells it from its best rival."""
+        hidden, effect = self.hidden[index], self.effects[index]
+        others = self.beside(index)
+        rivals = self.scene.rivals(self.target, others, [effect])
+        apart = next(
+            (fit for fit in rivals if fit.chi2 >= TOLD or not self.same_anywhere(index, fit.effects[-1])), None
+        )
+        seen = self.scene.fitted(self.target, others).chi2
+        return TruthJudged(
+            *effect.key,
+            size=hidden.size,
+            outside=False,
+            seen_chi2=seen,
+            told_chi2=seen if apart is None else min(apart.chi2, seen),
+            rival=None if apart is None else apart.effects[-1].key,
+            found_as=found_as,
+            among_rivals=among_rivals,
+        )
+
+    def strange_judged(self, hidden: Hidden) -> TruthJudged:
+        """How far the best single effect of the table stays behind one that is outside of it."""
+        others = self.beside(-1)
+        target = self.case.measured.x_noise_free
+        floor = self.fitted_strange_floor
+        seen = max(self.scene.fitted(target, others).chi2 - floor, 0.0)
+        best = self.scene.rivals(target, others, [])[0]
+        told = min(max(best.chi2 - floor, 0.0), seen)
+        key = (hidden.effect, hidden.where, hidden.source)
+        return TruthJudged(*key, hidden.size, True, seen, told, best.effects[-1].key, None, False)
+
+    @cached_property
+    def fitted_strange_floor(self) -> float:
+        """Chi-square that rounded readings leave in positions free of noise."""
+        rounding = self.scene.rounding
+        return float(np.einsum("nij,njk,nik->", self.scene.whitening, rounding, self.scene.whitening))
+
+
+@dataclass(frozen=True, eq=False)
+class Named:
+    """A named cause as an effect with numbers."""
+
+    cause: Cause
+    effect: Effect
+
+    @classmethod
+    def of(cls, cause: Cause, robot: RobotDescription) -> Named | None:
+        """None for outliers, which are no effect of the simulation."""
+        if cause.effect == "outliers":
+            return None
+        effect = Effect.at(robot, cause.effect, cause.where, cause.source)
+        values = {p.name: cause.parameters[p.name].value for p in effect.parameters if p.name in cause.parameters}
+        return cls(cause, Effect.at(robot, cause.effect, cause.where, cause.source, values))
+
+
+def judge(case: HiddenCase, scenario: str = "", command: str = "") -> Judgement:
+    """Diagnose measured.csv and compare with what was hidden."""
+    robot = RobotDescription.load(case.robot_file)
+    recording = Recording.read(case.folder / "measured.csv", robot.joints)
+    begun, begun_cpu = time.perf_counter(), time.process_time()
+    diagnosis = diagnose(recording, Simulation(robot))
+    file = conclusion(diagnosis)
+    seconds, cpu_seconds = time.perf_counter() - begun, time.process_time() - begun_cpu
+    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
+    truth = Truth.of(case, robot, Motion.of(recording))
+    truths, causes, outcome = compared(truth, file)
+    gain, of_truth = gains(truth, diagnosis, Recording.read(case.folder / "fresh.csv", robot.joints))
+    shows = truth.strange[0].shows_on if truth.strange else {}
+    return Judgement(
+        scenario=scenario,
+        seed=case.seed,
+        arm=case.arm.name,
+        hold=case.hold,
+        style=case.style,
+        pairs=len(recording),
+        verdict=file.verdict,
+        outcome=outcome,
+        truth=truths,
+        causes=causes,
+        gain=gain,
+        gain_of_truth=of_truth,
+        stated_gain_percent=file.gain.held_out_percent,
+        depends_on=file.unexplained.depends_on,
+        shows_on=shows,
+        joints_right=joints_right(truth.strange[0], file.unexplained.depends_on) if truth.strange else None,
+        smooth_ratio=smooth_ratio(truth, diagnosis),
+        seconds=seconds,
+        cpu_seconds=cpu_seconds,
+        memory_mb=memory,
+        command=command,
+        false_fixes=int(case.measured.outlier.sum()),
+    )
+
+
+def compared(truth: Truth, file: DiagnosisFile) -> tuple[tuple[TruthJudged, ...], tuple[CauseJudged, ...], Outcome]:
+    """The hidden effects, the named causes, and what comes of both."""
+    named = [n for cause in file.causes if (n := Named.of(cause, truth.robot)) is not None]
+    found = matched(truth, named)
+    rivals = {(r.effect, r.where, r.source) for n in named for r in (*n.cause.rivals, *n.cause.indistinguishable_from)}
+    hidden = [
+        truth.judged(k, None if k not in found else found[k].effect.key, effect.key in rivals)
+        for k, effect in enumerate(truth.effects)
+    ]
+    hidden += [truth.strange_judged(strange) for strange in truth.strange]
+    index_of = {id(n): k for k, n in found.items()}
+    whole = len(found) == len(truth.effects) == len(named) and not truth.strange
+    causes = [cause_judged(truth, n, index_of.get(id(n)), whole) for n in named]
+    false_fixes = judged_false_fixes(truth.case, file)
+    causes += [cause for cause in (false_fixes,) if cause is not None]
+    expected = truth.case.measured.outlier.sum() >= FEWEST_FALSE_FIXES
+    missed_fixes = bool(expected) and false_fixes is None
+    return tuple(hidden), tuple(causes), outcome(file, hidden, causes, missed_fixes)
+
+
+def matched(truth: Truth, named: Sequence[Named]) -> dict[int, Named]:
+    """Which cause names which true effect: by the same name, or by one that is as simple and the same in any motion."""
+    found: dict[int, Named] = {}
+    for k, effect in enumerate(truth.effects):
+        same = [n for n in named if n.effect.key == effect.key]
+        if same and not (effect.name == "link_geometry" and _is_camera_pose(truth, k)):
+            found[k] = same[0]
+    for k, effect in enumerate(truth.effects):
+        free = [n for n in named if n not in found.values() and _rank(n.effect) <= _rank(effect)]
+        if k not in found:
+            same = [n for n in free if n.effect.key != effect.key and truth.same_anywhere(k, n.effect)]
+            found |= {k: same[0]} if same else {}
+    return found
+
+
+def _rank(effect: Effect) -> tuple[int, bool]:
+    """The simpler comes first: fewer numbers, then no joint."""
+    return len(effect.parameters), effect.where is not None
+
+
+def _is_camera_pose(truth: Truth, index: int) -> bool:
+    """Whether a link's geometry is no more than the camera's pose, which is its simpler name."""
+    return truth.robot.camera.pose_known and truth.same_anywhere(index, Effect.at(truth.robot, "camera_pose"))
+
+
+def cause_judged(truth: Truth, named: Named, index: int | None, whole: bool) -> CauseJudged:
+    """One cause; `index` of the true effect that it names."""
+    cause = named.cause
+    true_keys = {effect.key for effect in truth.effects}
+    rivals = {(r.effect, r.where, r.source) for r in (*cause.rivals, *cause.indistinguishable_from)}
+    needless: list[str] = []
+    wrong_reach: list[str] = []
+    if index is not None:
+        for member in cause.indistinguishable_from:
+            needless += _needless(truth, index, member)
+            wrong_reach += _wrong_reach(truth, index, member)
+    numbers, left_out = judged_numbers(truth, named, index) if index is not None and whole else ((), {})
+    return CauseJudged(
+        *named.effect.key,
+        probability=cause.probability,
+        is_right=index is not None,
+        open=bool(rivals & true_keys) and cause.probability < SURE,
+        listed=len(cause.indistinguishable_from),
+        needless=tuple(needless),
+        wrong_reach=tuple(wrong_reach),
+        numbers=numbers,
+        left_out=left_out,
+    )
+
+
+def _member(truth: Truth, member: Indistinguishable) -> Effect:
+    return Effect.at(truth.robot, member.effect, member.where, member.source)
+
+
+def _needless(truth: Truth, index: int, member: Indistinguishable) -> list[str]:
+    effect = _member(truth, member)
+    if effect.key in {e.key for e in truth.effects}:
+        return []
+    behind = truth.behind(index, effect)
+    return [f"{written(effect.key)} (Δχ² {behind:.0f})"] if behind >= TOLD else []
+
+
+def _wrong_reach(truth: Truth, index: int, member: Indistinguishable) -> list[str]:
+    effect = _member(truth, member)
+    if effect.key in {e.key for e in truth.effects}:
+        return []
+    same = truth.same_anywhere(index, effect)
+    return [f"{written(effect.key)} by {member.by}"] if same != (member.by == "any_motion") else []
+
+
+def judged_numbers(truth: Truth, named: Named, index: int) -> tuple[tuple[Number, ...], dict[str, str]]:
+    """The numbers of a cause beside the true ones."""
+    meaning = truth.meanings[index]
+    if named.effect.key != meaning.key:
+        return (), {"all": "named otherwise"}
+    numbers, left_out = [], {}
+    for parameter, value in zip(meaning.effect.parameters, meaning.effect.values, strict=True):
+        given = named.cause.parameters.get(parameter.name)
+        if given is None or parameter.name not in meaning.told:
+            left_out[parameter.name] = "the mechanism has no such number" if given else "not stated"
+        elif parameter.is_amount and np.ptp(given.ci95) > TELLS_LITTLE * parameter.usual:
+            left_out[parameter.name] = "not told by this motion"
+        else:
+            low, high = _between_rows(truth.scene.motion, given) if parameter.name == "t0" else given.ci95
+            numbers.append(Number(parameter.name, float(value), given.value, (low, high)))
+    return tuple(numbers), left_out
+
+
+def _between_rows(motion: Motion, moment: Interval) -> tuple[float, float]:
+    """The interval of a moment from row to row: all moments between two rows are one."""
+    low, high = moment.ci95
+    before, after = motion.clock[motion.clock <= low], motion.clock[motion.clock >= high]
+    return float(before.max(initial=-np.inf)), float(after.min(initial=np.inf))
+
+
+def judged_false_fixes(case: HiddenCase, file: DiagnosisFile) -> CauseJudged | None:
+    """The cause that says that some fixes are not the marker; None where it is not named."""
+    for cause in file.causes:
+        if cause.effect == "outliers":
+            count = int(case.measured.outlier.sum())
+            given = next(iter(cause.parameters.values()))
+            share = count / len(case.measured.outlier)
+            numbers = (Number("share", share, given.value, given.ci95),) if count else ()
+            return CauseJudged("outliers", None, None, cause.probability, count > 0, False, 0, (), (), numbers, {})
+    return None
+
+
+def outcome(
+    file: DiagnosisFile, hidden: Sequence[TruthJudged], causes: Sequence[CauseJudged], missed_fixes: bool
+) -> Outcome:
+    """What the diagnosis as a whole is."""
+    false = [cause for cause in causes if not cause.is_right]
+    if any(truth.outside for truth in hidden):
+        if file.verdict == "unexplained":
+            return "wrong" if any(cause.probability >= SURE for cause in false) else "right"
+        unseen = all(truth.seen_chi2 < TOLD for truth in hidden)
+        return "honest" if unseen and not false else "wrong" if false else "missed"
+    if any(not cause.open for cause in false) or file.verdict == "unexplained":
+        return "wrong"
+    lost = [t for t in hidden if t.found_as is None and not t.among_rivals]
+    if missed_fixes or any(truth.seen_chi2 >= TOLD for truth in lost):
+        return "missed"
+    return "honest" if false or any(truth.found_as is None for truth in hidden) else "right"
+
+
+def gains(truth: Truth, diagnosis: Diagnosis, fresh: Recording) -> tuple[float | None, float | None]:
+    """How much of the error on a fresh recording goes with the causes found, and with the true ones."""
+    if not truth.effects and not truth.strange:
+        return None, None
+    motion, there = Motion.of(fresh), truth.case.fresh.x_noise_free
+
+    def rms(simulation: Simulation) -> float:
+        return float(np.sqrt(np.mean(np.sum((simulation.positions(motion) - there) ** 2, axis=1))))
+
+    before = rms(diagnosis.aligned.simulation)
+    after = rms(diagnosis.extended.simulation)
+    best = None if truth.strange else rms(Simulation(truth.robot, truth.fitted.effects))
+    return 1.0 - after / before, None if best is None else 1.0 - best / before
+
+
+def joints_right(hidden: Hidden, depends_on: Sequence[str]) -> bool:
+    """Whether all joints are named on which the error clearly shows, and none on which it does not.
+
+    An error that changes with time alone has to be named by time.
+    """
+    if not hidden.drivers and hidden.effect in ("wandering_zero", "growing_link"):
+        return "time" in depends_on
+    shares = hidden.shows_on
+    needed = {joint for joint, share in shares.items() if share >= SHOWS}
+    idle = {joint for joint, share in shares.items() if share < HIDDEN_FROM}
+    return needed <= set(depends_on) and not idle & set(depends_on)
+
+
+def smooth_ratio(truth: Truth, diagnosis: Diagnosis) -> float | None:
+    """Error on data not fitted after the smooth model of what is unexplained, over the noise; None where there is none.
+
+    Against positions free of noise nothing needs to be held out: what was fitted to the noise counts as an error.
+    """
+    if not truth.strange or not diagnosis.left.is_there:
+        return None
+    modelled = diagnosis.extended.run.measured + diagnosis.left.explained
+    off = np.square(modelled - truth.case.measured.x_noise_free).sum(axis=1).mean()
+    return float(np.sqrt(1.0 + off / truth.case.sigma_m**2))

@@ -1,0 +1,157 @@
+"""What the judge says of one case, as it is kept."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import msgspec
+
+Outcome = Literal["right", "honest", "missed", "wrong"]
+Key = tuple[str, str | None, str | None]
+
+
+class Number(msgspec.Struct, frozen=True):
+    """A number that was found beside the true one."""
+
+    name: str
+    truth: float
+    value: float
+    ci95: tuple[float, float]
+
+    @property
+    def is_inside(self) -> bool:
+        """Whether its interval holds the truth."""
+        return self.ci95[0] <= self.truth <= self.ci95[1]
+
+
+class TruthJudged(msgspec.Struct, frozen=True):
+    """One hidden effect.
+
+    Attributes:
+        effect, where, source: in the table's words.
+        size: in units of the noise.
+        outside: whether no row of the table describes it.
+        seen_chi2: what leaving it out costs an oracle.
+        told_chi2: what putting its best rival in its place costs an oracle.
+        rival: that rival.
+        found_as: the cause that names it; None when none does.
+        among_rivals: whether a wrong cause names it as what it may be as well.
+    """
+
+    effect: str
+    where: str | None
+    source: str | None
+    size: float
+    outside: bool
+    seen_chi2: float
+    told_chi2: float
+    rival: Key | None
+    found_as: Key | None
+    among_rivals: bool
+
+
+class CauseJudged(msgspec.Struct, frozen=True):
+    """One named cause.
+
+    Attributes:
+        is_right: whether it is a hidden effect, or the simplest name of one.
+        open: whether its rivals hold a hidden effect and it is not said to be sure.
+        listed: how many others it is said not to be told from.
+        needless: those from which this motion tells it.
+        wrong_reach: those of which it is wrongly said that no motion tells them, or that another one would.
+        numbers: of a right cause in a right diagnosis.
+        left_out: numbers that were not judged, and why.
+    """
+
+    effect: str
+    where: str | None
+    source: str | None
+    probability: float
+    is_right: bool
+    open: bool
+    listed: int
+    needless: tuple[str, ...]
+    wrong_reach: tuple[str, ...]
+    numbers: tuple[Number, ...]
+    left_out: dict[str, str]
+
+
+class Judgement(msgspec.Struct, frozen=True, tag="judged"):
+    """One case.
+
+    Attributes:
+        outcome: right: all causes and no other. honest: what is not right is left open. missed: a cause is not
+            named though an oracle sees it. wrong: something is named that is not there, or left unexplained.
+        gain: by how much the extended simulation's error falls on a fresh recording, counted from the aligned one,
+            against positions free of noise (0..1); None where nothing is hidden.
+        gain_of_truth: the same with the true effects.
+        depends_on, shows_on: with an effect outside the table, what was said and what is so.
+        joints_right: whether that agrees.
+        smooth_ratio: held-out error after the smooth model over the noise floor.
+        seconds, cpu_seconds: that the diagnosis took, by the clock and of the processor.
+        command: to look at it again.
+        false_fixes: how many fixes truly are not the marker.
+    """
+
+    scenario: str
+    seed: int
+    arm: str
+    hold: str
+    style: str
+    pairs: int
+    verdict: str
+    outcome: Outcome
+    truth: tuple[TruthJudged, ...]
+    causes: tuple[CauseJudged, ...]
+    gain: float | None
+    gain_of_truth: float | None
+    stated_gain_percent: float
+    depends_on: tuple[str, ...]
+    shows_on: dict[str, float]
+    joints_right: bool | None
+    smooth_ratio: float | None
+    seconds: float
+    cpu_seconds: float
+    memory_mb: float
+    command: str
+    false_fixes: int = 0
+
+    @property
+    def told_chi2(self) -> float:
+        """Of the hidden effect that is hardest to tell."""
+        return min((truth.told_chi2 for truth in self.truth), default=float("inf"))
+
+    @property
+    def false_causes(self) -> list[CauseJudged]:
+        """What is named and not there."""
+        return [cause for cause in self.causes if not cause.is_right]
+
+
+def written(key: Key) -> str:
+    """`effect@where:source`."""
+    effect, where, source = key
+    return effect + (f"@{where}" if where else "") + (f":{source}" if source else "")
+
+
+class Crash(msgspec.Struct, frozen=True, tag="crashed"):
+    """A case in which the diagnosis broke."""
+
+    scenario: str
+    seed: int
+    truth: tuple[str, ...]
+    error: str
+    command: str
+
+
+def told(record: Judgement | Crash) -> str:
+    """A record in a line."""
+    if isinstance(record, Crash):
+        return f"{record.scenario} {record.seed} crashed: {record.error.strip().splitlines()[-1]}"
+    effects = [f"{written((t.effect, t.where, t.source))} ({t.size:.2g})" for t in record.truth]
+    fixes = [f"{record.false_fixes} false fixes"] if record.false_fixes else []
+    there = ", ".join(effects + fixes) or "nothing"
+    named = (
+        ", ".join(f"{written((c.effect, c.where, c.source))} {c.probability:.2f}" for c in record.causes) or "nothing"
+    )
+    case = f"{record.scenario} {record.seed} {record.outcome}"
+    return f"{case}: {there} -> {named} [{record.verdict}] {record.seconds:.1f} s"

@@ -1,0 +1,325 @@
+"""The judge itself: what it calls right and wrong, fed with diagnoses that were made up."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from diagnosis.result import Cause, DiagnosisFile, Errors, Gain, Indistinguishable, Interval, Pairs, Unexplained
+from effects import Motion
+from interfaces.recording import Recording
+from interfaces.robot import RobotDescription
+
+from .cases import HiddenCase, hide
+from .figures import Rate, calibration, confusion, coverage, error_of_probability, failures, goals
+from .hidden import Hidden
+from .judge import Truth, compared, joints_right, judge, outcome
+from .judgement import CauseJudged, Crash, Judgement, Number, TruthJudged
+from .kinds import KINDS
+from .sealed import encoded, read
+
+PAIRS = 250
+ELBOW = "joint_offset@elbow"
+Hide = Callable[..., Truth]
+
+
+@pytest.fixture(scope="module")
+def truth_of(tmp_path_factory: pytest.TempPathFactory) -> Hide:
+    """A function that hides effects and gives the truth; each case is made once."""
+    made: dict[tuple[object, ...], Truth] = {}
+
+    def truth(*effects: str, arm: str = "humanoid", size: float = 4.0, **more: object) -> Truth:
+        key = (effects, arm, size, *sorted(more.items()))
+        if key not in made:
+            case = _hidden(tmp_path_factory.mktemp("case"), *effects, arm=arm, size=size, **more)
+            robot = RobotDescription.load(case.robot_file)
+            motion = Motion.of(Recording.read(case.folder / "measured.csv", robot.joints))
+            made[key] = Truth.of(case, robot, motion)
+        return made[key]
+
+    return truth
+
+
+def _hidden(folder: Path, *effects: str, **more: object) -> HiddenCase:
+    return hide(11, folder, list(effects), pairs=PAIRS, **more)  # pyright: ignore[reportArgumentType]
+
+
+def _cause(name: str, *listed: Indistinguishable, probability: float = 0.99, **numbers: Interval) -> Cause:
+    """A cause `effect@where:source`."""
+    effect, _, at = name.partition("@")
+    where, _, source = at.partition(":")
+    return Cause(
+        effect=effect,
+        where=where or None,
+        source=source or None,
+        parameters=numbers,
+        probability=probability,
+        share_of_gain_percent=100.0,
+        held_out_gain_percent=50.0,
+        stability_percent=100.0,
+        indistinguishable_from=listed,
+        rivals=listed,
+        evidence="",
+    )
+
+
+def _like(name: str, by: str) -> Indistinguishable:
+    cause = _cause(name)
+    return msgspec.convert(
+        {"effect": cause.effect, "where": cause.where, "source": cause.source, "by": by, "probability": 0.4},
+        Indistinguishable,
+    )
+
+
+def _file(*causes: Cause, verdict: str = "explained", depends_on: tuple[str, ...] = ()) -> DiagnosisFile:
+    """A diagnosis with these causes."""
+    errors = Errors(10.0, 10.0, 5.0, 2.0, 2.0)
+    return DiagnosisFile(
+        verdict=verdict,  # pyright: ignore[reportArgumentType]
+        sentence="",
+        pairs=Pairs(PAIRS, PAIRS, 0),
+        rms_mm=errors,
+        mean_mm=errors,
+        gain=Gain(80.0, (79.0, 81.0)),
+        causes=causes,
+        rejected=(),
+        unexplained=Unexplained(0.0, depends_on, 0.5),
+        stability=None,
+        advice=(),
+        limitations=(),
+    )
+
+
+def test_the_hidden_cause_at_its_joint_is_right(truth_of: Hide) -> None:
+    hidden, causes, said = compared(truth_of(ELBOW), _file(_cause(ELBOW)))
+    assert (said, causes[0].is_right, hidden[0].found_as) == ("right", True, ("joint_offset", "elbow", None))
+
+
+def test_the_right_effect_at_another_joint_is_wrong(truth_of: Hide) -> None:
+    _, causes, said = compared(truth_of(ELBOW), _file(_cause("joint_offset@shoulder_pitch")))
+    assert (said, causes[0].is_right) == ("wrong", False)
+
+
+def test_another_effect_at_the_right_joint_is_wrong(truth_of: Hide) -> None:
+    assert compared(truth_of(ELBOW), _file(_cause("backlash@elbow")))[2] == "wrong"
+
+
+def test_a_cause_beside_the_right_one_is_wrong(truth_of: Hide) -> None:
+    assert compared(truth_of(ELBOW), _file(_cause(ELBOW), _cause("camera_scale")))[2] == "wrong"
+
+
+def test_finding_nothing_of_a_large_effect_is_missing_it(truth_of: Hide) -> None:
+    assert compared(truth_of(ELBOW), _file(verdict="nothing_found"))[2] == "missed"
+
+
+def test_naming_one_of_two_is_missing_the_other(truth_of: Hide) -> None:
+    assert compared(truth_of(ELBOW, "camera_scale"), _file(_cause(ELBOW)))[2] == "missed"
+
+
+def test_a_right_cause_called_unexplained_is_wrong(truth_of: Hide) -> None:
+    assert compared(truth_of(ELBOW), _file(_cause(ELBOW), verdict="unexplained"))[2] == "wrong"
+
+
+def test_a_wrong_cause_that_leaves_the_right_one_open_is_honest(truth_of: Hide) -> None:
+    rival = _cause("joint_scale@elbow", _like(ELBOW, "this_motion"), probability=0.5)
+    assert compared(truth_of(ELBOW), _file(rival, verdict="undecided"))[2] == "honest"
+
+
+def test_a_wrong_cause_that_is_said_to_be_sure_is_wrong_whatever_its_rivals(truth_of: Hide) -> None:
+    rival = _cause("joint_scale@elbow", _like(ELBOW, "this_motion"), probability=0.97)
+    assert compared(truth_of(ELBOW), _file(rival, verdict="undecided"))[2] == "wrong"
+
+
+def test_a_needless_member_is_needless(truth_of: Hide) -> None:
+    _, causes, _ = compared(truth_of(ELBOW), _file(_cause(ELBOW, _like("camera_scale", "this_motion"))))
+    assert len(causes[0].needless) == 1
+
+
+def test_what_no_motion_tells_apart_may_be_listed(truth_of: Hide) -> None:
+    _, causes, _ = compared(truth_of(ELBOW), _file(_cause(ELBOW, _like("link_geometry@elbow", "any_motion"))))
+    assert (causes[0].needless, causes[0].wrong_reach) == ((), ())
+
+
+def test_saying_that_another_motion_would_tell_what_none_tells_is_wrong(truth_of: Hide) -> None:
+    _, causes, _ = compared(truth_of(ELBOW), _file(_cause(ELBOW, _like("link_geometry@elbow", "this_motion"))))
+    assert len(causes[0].wrong_reach) == 1
+
+
+def test_the_first_link_is_the_camera_pose_which_is_simpler(truth_of: Hide) -> None:
+    truth = truth_of("link_geometry@shoulder_pitch")
+    named = [compared(truth, _file(_cause(name)))[2] for name in ("camera_pose", "link_geometry@shoulder_pitch")]
+    assert named == ["right", "wrong"]
+
+
+def test_the_camera_pose_is_not_the_first_link(truth_of: Hide) -> None:
+    assert compared(truth_of("camera_pose"), _file(_cause("link_geometry@shoulder_pitch")))[2] == "wrong"
+
+
+def test_an_oracle_is_not_asked_to_tell_what_no_motion_tells(truth_of: Hide) -> None:
+    hidden, _, _ = compared(truth_of(ELBOW), _file(_cause(ELBOW)))
+    assert hidden[0].told_chi2 > 25.0
+    assert hidden[0].rival is not None
+    assert hidden[0].rival[0] != "link_geometry"
+
+
+def test_chi_square_grows_with_the_square_of_the_effect(truth_of: Hide) -> None:
+    small, large = (truth_of("camera_scale", size=size).judged(0, None, False) for size in (1.0, 3.0))
+    assert large.seen_chi2 / small.seen_chi2 == pytest.approx(9.0, rel=0.15)
+    assert large.told_chi2 / small.told_chi2 == pytest.approx(9.0, rel=0.3)
+
+
+@pytest.mark.parametrize("name", [name for name in KINDS if name != "outliers"])
+def test_the_table_says_with_the_meant_numbers_what_the_world_shows(name: str, truth_of: Hide) -> None:
+    truth = truth_of(name)
+    target, effect = truth.case.measured.x_noise_free, truth.meanings[0].effect
+    if name == "settling":
+        assert truth.meanings[0].told == {"fraction", "memory"}
+    nothing, best = truth.scene.chi2(target, []), truth.fitted.chi2
+    assert truth.scene.chi2(target, [effect]) < best + 0.02 * (nothing - best)
+
+
+def test_numbers_are_judged_by_their_interval(truth_of: Hide) -> None:
+    truth = truth_of(ELBOW)
+    value = float(truth.meanings[0].effect.values[0])
+    inside, outside = (
+        compared(
+            truth, _file(_cause(ELBOW, offset_rad=Interval(value + off, (value + off - 1e-3, value + off + 1e-3))))
+        )
+        for off in (5e-4, -2e-3)
+    )
+    assert [n.is_inside for _, causes, _ in (inside, outside) for n in causes[0].numbers] == [True, False]
+
+
+def test_a_moment_between_the_right_rows_is_right(truth_of: Hide) -> None:
+    truth = truth_of("encoder_jump@elbow")
+    clock, t0 = truth.scene.motion.clock, truth.meanings[0].effect.value("t0")
+    inside = []
+    for off in (0, 3):
+        moment = float(clock[clock >= t0][off]) - 1e-6
+        cause = _cause("encoder_jump@elbow", t0=Interval(moment, (moment, moment)))
+        inside += [n.is_inside for n in compared(truth, _file(cause))[1][0].numbers]
+    assert inside == [True, False]
+
+
+def test_a_number_that_the_motion_does_not_tell_is_left_out(truth_of: Hide) -> None:
+    _, causes, _ = compared(truth_of(ELBOW), _file(_cause(ELBOW, offset_rad=Interval(0.0, (-3.0, 3.0)))))
+    assert (causes[0].numbers, causes[0].left_out) == ((), {"offset_rad": "not told by this motion"})
+
+
+def test_false_fixes_that_are_not_named_are_missed(truth_of: Hide) -> None:
+    truth = truth_of(ELBOW, outliers=0.1)
+    share = float(truth.case.measured.outlier.mean())
+    named = _cause("outliers", share=Interval(share, (0.5 * share, 2.0 * share)))
+    found, missed = (compared(truth, _file(_cause(ELBOW), *more))[2] for more in ((named,), ()))
+    assert (found, missed) == ("right", "missed")
+
+
+def test_false_fixes_where_there_are_none_are_wrong(truth_of: Hide) -> None:
+    named = _cause("outliers", share=Interval(0.02, (0.01, 0.03)))
+    assert compared(truth_of(ELBOW), _file(_cause(ELBOW), named))[2] == "wrong"
+
+
+def test_what_is_outside_the_table_is_right_when_unexplained_and_wrong_under_a_name(truth_of: Hide) -> None:
+    truth = truth_of("square_of_other@elbow:shoulder_pitch")
+    unexplained = _file(verdict="unexplained", depends_on=("elbow", "shoulder_pitch"))
+    named = _file(_cause("joint_scale@elbow"))
+    assert (compared(truth, unexplained)[2], compared(truth, named)[2]) == ("right", "wrong")
+
+
+def test_the_right_joints_are_those_on_which_it_shows() -> None:
+    hidden = Hidden("link_bend", "a", None, {}, "", True, ("b",), shows_on={"a": 0.01, "b": 0.8, "c": 0.1})
+    said = [("b",), ("b", "c"), ("c",), ("a", "b")]
+    assert [joints_right(hidden, joints) for joints in said] == [True, True, False, False]
+
+
+def test_what_wanders_is_said_to_depend_on_time() -> None:
+    hidden = Hidden("wandering_zero", "a", None, {}, "", True)
+    assert [joints_right(hidden, joints) for joints in (("a", "time"), ("a",))] == [True, False]
+
+
+def test_a_small_effect_that_nobody_sees_may_be_left_out() -> None:
+    hidden = TruthJudged("backlash", "a", None, 0.01, False, 3.0, 2.0, None, None, False)
+    assert outcome(_file(verdict="nothing_found"), [hidden], [], False) == "honest"
+
+
+def test_a_diagnosis_of_a_large_offset_is_judged_right(tmp_path: Path) -> None:
+    judgement = judge(_hidden(tmp_path, ELBOW, arm="humanoid", size=8.0), "one", "command")
+    assert judgement.outcome == "right"
+    assert judgement.gain == pytest.approx(judgement.gain_of_truth, abs=0.05)
+
+
+def _judgement(*causes: CauseJudged, **changed: object) -> Judgement:
+    truth = TruthJudged("backlash", "a", None, 2.0, False, 900.0, 400.0, ("settling", "a", None), None, False)
+    plain = Judgement(
+        scenario="one",
+        seed=3,
+        arm="humanoid",
+        hold="held",
+        style="held",
+        pairs=PAIRS,
+        verdict="explained",
+        outcome="right",
+        truth=(msgspec.structs.replace(truth, found_as=("backlash", "a", None)),),
+        causes=causes,
+        gain=0.9,
+        gain_of_truth=0.91,
+        stated_gain_percent=60.0,
+        depends_on=(),
+        shows_on={},
+        joints_right=None,
+        smooth_ratio=None,
+        seconds=1.0,
+        cpu_seconds=1.0,
+        memory_mb=200.0,
+        command="python again",
+    )
+    return msgspec.structs.replace(plain, **changed)
+
+
+def _named(right: bool, probability: float, *numbers: Number) -> CauseJudged:
+    return CauseJudged("backlash", "a", None, probability, right, False, 0, (), (), numbers, {})
+
+
+def test_the_calibration_error_is_the_distance_of_what_is_said_from_what_is() -> None:
+    cases = [_judgement(_named(right, 0.85)) for right in (True, True, True, False)]
+    assert error_of_probability(cases) == pytest.approx(0.10)
+    assert "3 of 4" in calibration(cases)
+
+
+def test_coverage_counts_the_intervals_that_hold_the_truth() -> None:
+    numbers = [Number("width_rad", 1.0, 1.1, ci95) for ci95 in ((0.9, 1.3), (1.05, 1.15))]
+    assert "1 of 2" in coverage([_judgement(_named(True, 0.9, number)) for number in numbers])
+
+
+def test_a_wrong_name_stands_in_the_confusion_matrix_and_among_the_failures() -> None:
+    lost = msgspec.structs.replace(_judgement().truth[0], found_as=None)
+    wrong = CauseJudged("settling", "a", None, 0.99, False, False, 0, (), (), (), {})
+    case = _judgement(wrong, truth=(lost,), outcome="wrong")
+    assert "| backlash | 1 | 0 | 0 | settling 1 |" in confusion([case])
+    assert "`python again`" in failures([case], [])
+
+
+def test_a_case_below_the_oracle_counts_by_itself() -> None:
+    near = msgspec.structs.replace(_judgement().truth[0], told_chi2=10.0)
+    rows = goals([_judgement(), _judgement(truth=(near,), outcome="wrong")])
+    assert "| one | Δχ² ≥ 25: all named | ≥ 99 % | 100.0 %" in rows
+    assert "| one | Δχ² < 25: named wrongly | ≤ 1 % | 100.0 %" in rows
+
+
+def test_a_rate_tells_its_interval() -> None:
+    assert str(Rate(97, 100)) == "97.0 % (91 to 99), 97 of 100"
+
+
+def test_a_run_goes_on_from_its_records(tmp_path: Path) -> None:
+    records = [_judgement(_named(True, 0.9)), Crash("one", 4, ("backlash a",), "Error: broke", "python again")]
+    file = tmp_path / "run.jsonl"
+    file.write_bytes(b"".join(encoded(record) + b"\n" for record in records))
+    assert read(file) == records
+
+
+def test_a_broken_diagnosis_is_a_failure() -> None:
+    crash = Crash("one", 4, ("backlash a",), "Traceback\nError: broke", "python again")
+    assert "| crashed | backlash a | Error: broke |" in failures([], [crash])
