@@ -14,7 +14,7 @@ from interfaces.recording import Recording
 from interfaces.records import FloatArray
 
 from .alignment import aligned
-from .explanation import explain
+from .explanation import explain, without_one
 from .fit import Fit, fitted
 from .held_out import Added, Blocks, HeldOut, added, gain_percent, is_marker, without_cause
 from .hypotheses import Hypotheses
@@ -33,6 +33,8 @@ _FEWEST_OUTLIERS = 3
 _OUTLIERS_NAMED = 15.0
 # That outliers and motion have to do with each other, by chance.
 _BY_CHANCE = 1e-3
+# Beside what has no name a cause stays named only if it is more probable than not.
+_HALF = 0.5
 # Of the instrument's noise, another size than that is taken up (in logarithms).
 _SAME_NOISE = 0.1
 
@@ -148,15 +150,20 @@ def diagnose(
     tell("asking whether something without a name is at work")
     unknowns, blocks = Unknowns(start), Blocks.cut(len(recording))
     explanation = explain(extended, search.path, unknowns, search, tell)
-    extended = explanation.fit
     tell("asking what else it could be")
+    stands = standings(explanation.fit, hypotheses.effects, search)
+    while explanation.unknown and any(standing.probability < _HALF for standing in stands):
+        weakest = int(np.argmin([standing.probability for standing in stands]))
+        explanation = without_one(explanation, explanation.fit.causes[weakest], unknowns, search)
+        stands = standings(explanation.fit, hypotheses.effects, search)
+    extended = explanation.fit
     return Diagnosis(
         hypotheses=hypotheses,
         nominal=fitted(observations, simulation, len(simulation.effects)),
         aligned=start,
         geometry=_geometry(start),
         extended=extended,
-        standings=tuple(standings(extended, hypotheses.effects, search)),
+        standings=tuple(stands),
         left=leftover(explanation, unknowns, blocks),
         blocks=blocks,
         seed=seed,

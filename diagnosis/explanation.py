@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+
+from effects import Effect
 
 from .fit import Fit
 from .search import NAMED, Search
@@ -78,6 +80,7 @@ def _pruned(explanation: Explanation, unknowns: Unknowns, search: Search) -> Exp
     return explanation
 
 
-def named(families: Sequence[int], unknowns: Unknowns) -> list[str]:
-    """What families are, in words."""
-    return [unknowns.families[index].what for index in families]
+def without_one(explanation: Explanation, cause: Effect, unknowns: Unknowns, search: Search) -> Explanation:
+    """The explanation without one of its causes."""
+    others = [effect for effect in explanation.fit.causes if effect.key != cause.key]
+    return _with_unknown(explanation.fit.with_causes(others), unknowns, search)

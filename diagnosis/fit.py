@@ -55,7 +55,7 @@ class Noise:
             outlier = np.log(share) + outlier_density
             both = np.logaddexp(inlier, outlier)
             weights = np.exp(inlier - both)
-            bursts = uniform_filter1d(1.0 - weights, _WINDOW, mode="nearest") > _BURST
+            bursts = uniform_filter1d(1.0 - weights, _WINDOW, mode="constant") > _BURST
             weights[bursts] = 1.0
             total = float(np.where(bursts, inlier, both).sum())
             sigma = float(np.sqrt(max((weights @ squares) / (3.0 * max(weights.sum(), 1.0)), 1e-18)))

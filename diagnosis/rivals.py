@@ -19,6 +19,8 @@ from .search import Search, nats
 SAME = 6.0
 # A rival less probable than this is none.
 PROBABLE = 0.02
+# What explains a smaller share of what a cause explains is none either.
+_COMES_NEAR = 0.7
 # Poses of the motion over the whole range of the joints, which stands for any motion.
 _POSES = 400
 
@@ -55,7 +57,7 @@ class Standing:
     """How one cause stands against all others.
 
     Attributes:
-        probability: of the cause.
+        probability: of the cause, or of what no motion tells from it.
         worth: how much more probable the causes are with it than without any in its place [nats].
         dof: how many of its amounts the data tell.
         gain: twice the log-likelihood that it brings.
@@ -83,7 +85,7 @@ def _standing(fit: Fit, cause: Effect, hypotheses: Sequence[Effect], search: Sea
     others = [h for h in hypotheses if h.key not in present]
     tried = []
     for candidate in search.shortlist(without, others):
-        if candidate.gain < 0.5 * gain:
+        if candidate.gain < _COMES_NEAR * itself.gain:
             continue
         rival = search.refined(without.with_causes([*without.causes, candidate.effect]), candidate.effect.key)
         behind = nats(2.0 * (rival.log_likelihood - fit.log_likelihood), candidate.dof - itself.dof)
@@ -97,9 +99,9 @@ def _standing(fit: Fit, cause: Effect, hypotheses: Sequence[Effect], search: Sea
         for (rival, key, _), share in zip(tried, shares[2:], strict=True)
         if share >= PROBABLE
     ]
-    return Standing(
-        float(shares[0]), worth, itself.dof, gain, tuple(sorted(rivals, key=lambda r: r.probability, reverse=True))
-    )
+    same = sum(rival.probability for rival in rivals if rival.is_same_anywhere)
+    ordered = tuple(sorted(rivals, key=lambda rival: rival.probability, reverse=True))
+    return Standing(float(shares[0]) + same, worth, itself.dof, gain, ordered)
 
 
 def _effect(fit: Fit, key: tuple[str, str | None, str | None]) -> Effect:

@@ -23,6 +23,10 @@ _MOST_SETS = 40
 Key = tuple[str, str | None, str | None]
 # What a number costs at least [nats].
 _CHEAPEST = 1.5
+# What explains a smaller share of what a cause explains is no rival of it; within so much two are as probable [nats].
+_COMES_NEAR, _EQUAL = 0.8, 0.3
+# The camera's pose and the marker's place are simpler than the link next to them.
+_OF_A_LINK = 1
 
 
 def nats(gain: float, dof: int) -> float:
@@ -125,7 +129,7 @@ class Search:
 
     def _reviewed(self, fit: Fit) -> Fit:
         """Without what has become redundant, and with better ones in the place of others."""
-        changed = len(fit.causes) > 1
+        changed = len(fit.causes) > 0
         while changed and len(self._seen) < _MOST_SETS:
             fit, changed = self._second_thoughts(fit)
             causes = frozenset(effect.key for effect in fit.causes)
@@ -134,27 +138,32 @@ class Search:
         return fit
 
     def _second_thoughts(self, fit: Fit) -> tuple[Fit, bool]:
+        present = {effect.key for effect in fit.causes}
+        rivals = [h for h in self._hypotheses if h.key not in present]
         for cause in fit.causes:
             others = [effect for effect in fit.causes if effect.key != cause.key]
             without = fit.with_causes(others)
-            present = {effect.key for effect in fit.causes}
-            itself = Scan(without).candidate(cause)
-            dof = 1 if itself is None else itself.dof
-            lost = nats(2.0 * (fit.log_likelihood - without.log_likelihood), dof)
-            if lost < NAMED + (0.0 if itself is None else self.doubt(itself)):
+            itself = Scan(without).candidate(cause) or Candidate(cause, 0.0, 1)
+            lost = nats(2.0 * (fit.log_likelihood - without.log_likelihood), itself.dof)
+            if lost < NAMED + self.doubt(itself):
                 self._tell(f"dropped {describe(cause)}")
                 return without, True
-            rivals = [h for h in self._hypotheses if h.key not in present]
             for candidate in self.shortlist(without, rivals):
-                if candidate.gain < 0.5 * 2.0 * (fit.log_likelihood - without.log_likelihood):
+                if candidate.gain < _COMES_NEAR * itself.gain:
                     continue
                 tried = self.refined(fit.with_causes([*others, candidate.effect]), candidate.effect.key)
-                worth = nats(2.0 * (tried.log_likelihood - fit.log_likelihood), candidate.dof - dof)
-                worth += self.doubt_of(cause) - self.doubt(candidate)
-                if worth > 1.0 and tried.causes[-1].is_possible:
+                worth = nats(2.0 * (tried.log_likelihood - fit.log_likelihood), candidate.dof - itself.dof)
+                worth += self.doubt(itself) - self.doubt(candidate)
+                better = worth > 1.0 or (abs(worth) < _EQUAL and simplicity(candidate.effect) < simplicity(cause))
+                if better and tried.causes[-1].is_possible:
                     self._tell(f"exchanged {describe(cause)} for {describe(candidate.effect)}")
                     return tried, True
         return fit, False
+
+
+def simplicity(effect: Effect) -> int:
+    """The smaller, the simpler: of causes that are as probable the simplest is named."""
+    return len(effect.amounts) + (_OF_A_LINK if effect.name == "link_geometry" else 0)
 
 
 def describe(effect: Effect) -> str:
