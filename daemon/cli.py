@@ -16,6 +16,7 @@ COMMANDS = {
     "config": "Write, check or show robot.toml: begin here with your robot.",
     "replay": "Learn a recording; prints the error before and after.",
     "calibrate": "Camera, tool and joint zeros from pairs; writes a URDF.",
+    "diagnose": "What the simulation gets wrong, why, and how it gets better.",
     "reproduce": "Run the paper's experiments again, its figures beside ours.",
     "run": "Start sampler and learner, and keep them running.",
     "sampler": "Only the sampler: encoders and cameras in, pairs out.",
