@@ -10,7 +10,7 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
-from diagnosis.numbers import chance, mm, named, numbers_of, percent, place, telling
+from diagnosis.numbers import chance, mm, named, numbers_of, percent, place, share, telling
 from diagnosis.result import Cause, DiagnosisFile, Errors, Indistinguishable, Verdict
 
 # So many hypotheses that were rejected are shown.
@@ -115,8 +115,8 @@ def _errors(diagnosis: DiagnosisFile) -> Table:
     return table
 
 
-def _bar(share: float) -> str:
-    return "█" * max(round(_BAR * min(share, 1.0)), 1) + ("…" if share > 1.001 else "")
+def _bar(part: float) -> str:
+    return "█" * max(round(_BAR * min(part, 1.0)), 1) + ("…" if part > 1.001 else "")
 
 
 def _of(errors: Errors, name: str) -> float | None:
@@ -127,24 +127,20 @@ def _causes(causes: Sequence[Cause], timed: bool) -> Table:
     table = _table("Causes")
     table.add_column("effect", overflow="fold")
     table.add_column("number", no_wrap=True)
-    table.add_column("with 95 %", no_wrap=True)
+    table.add_column("± for 95 %", no_wrap=True)
     for name in ("sure", "share", "gain"):
         table.add_column(name, justify="right", no_wrap=True)
     for cause in sorted(causes, key=lambda c: -c.share_of_gain_percent):
         numbers = telling(numbers_of(cause, timed=timed))
-        figures = (percent(cause.probability), _whole(cause.share_of_gain_percent), _whole(cause.held_out_gain_percent))
+        figures = (percent(cause.probability), share(cause.share_of_gain_percent), share(cause.held_out_gain_percent))
         for row, number in enumerate(numbers):
             first = (place(cause), *figures) if row == 0 else ("", "", "", "")
             table.add_row(Text(first[0]), number.label, str(number), *first[1:])
     return table
 
 
-def _whole(share: float) -> str:
-    return f"{round(share) + 0} %"
-
-
 def _rejected(diagnosis: DiagnosisFile) -> Table:
-    table = _table(f"Looked for and not there: the nearest of {len(diagnosis.rejected)}")
+    table = _table(f"Not there (nearest of {len(diagnosis.rejected)})")
     table.add_column("effect", overflow="fold")
     table.add_column("would gain", justify="right", no_wrap=True)
     table.add_column("p-value", justify="right", no_wrap=True)

@@ -26,7 +26,7 @@ _LABELS = {
     "focal_error": "focal length",
     "cycles_per_turn": "cycles a turn",
     "cycles_per_m": "cycles a metre",
-    "t0": "from",
+    "t0": "at",
     "width": "play",
     "fraction": "missing of a move",
     "rx": "turn about x",
@@ -42,6 +42,10 @@ _LABELS = {
 # What an amplitude and a phase say again.
 _SAID_AGAIN = ("sine_rad", "cosine_rad", "sine_m", "cosine_m")
 _LEAST_DIGITS, _MOST_DIGITS = 0, 6
+# Half widths from which on a recording tells nothing of a length [m] or an angle [rad].
+_UNTOLD = (("_rad", 0.5), ("_m", 0.1))
+# Numbers that say when and how, not how much.
+_SAYS_HOW = ("t0", "cycles", "phase", "time_constant")
 # An interval whose halves differ by more than this share is written with both its ends.
 _LOPSIDED = 0.3
 
@@ -54,12 +58,14 @@ class Number:
         label: what it is.
         value, interval: with unit; the interval as a half width or as both ends, "" where there is none.
         may_be_none: whether its interval holds zero.
+        is_told: whether the recording tells it at all.
     """
 
     label: str
     value: str
     interval: str
     may_be_none: bool
+    is_told: bool = True
 
     def __str__(self) -> str:
         return f"{self.value} {self.interval}".rstrip()
@@ -76,8 +82,9 @@ def numbers_of(cause: Cause, *, timed: bool) -> list[Number]:
 
 
 def telling(numbers: list[Number]) -> list[Number]:
-    """Those that are surely not zero; all where none is."""
-    return [n for n in numbers if not n.may_be_none] or numbers
+    """Those that are told and surely not zero; where none is, those that are told."""
+    told = [n for n in numbers if n.is_told] or numbers
+    return [n for n in told if not n.may_be_none] or told
 
 
 def number(name: str, interval: Interval, *, timed: bool = True) -> Number:
@@ -85,12 +92,25 @@ def number(name: str, interval: Interval, *, timed: bool = True) -> Number:
     factor, unit = _unit(name, timed)
     value, low, high = (factor * v for v in (interval.value, *interval.ci95))
     half = 0.5 * (high - low)
-    signed = "+" if low < 0.0 < high or name.endswith(_SIGNED) else ""
     digits = _digits(half if half > 0.0 else 0.01 * abs(value))
-    base = name.removesuffix("_rad_per_Nm").removesuffix("_m_per_N")
-    base = base.removesuffix("_rad").removesuffix("_m").removesuffix("_s")
-    text = f"{'row ' if name == 't0' and not timed else ''}{_fixed(value, digits, signed)}{unit}"
-    return Number(_LABELS.get(name, _LABELS.get(base, base)), text, _range(value, low, high, digits), low <= 0 <= high)
+    row = "row " if name == "t0" and not timed else ""
+    return Number(
+        label=_label(name),
+        value=f"{row}{_fixed(value, digits, '+' if name.endswith(_SIGNED) else '')}{unit}",
+        interval=_range(value, low, high, digits),
+        may_be_none=low <= 0.0 <= high and not name.startswith(_SAYS_HOW),
+        is_told=not any(name.endswith(end) and half > factor * limit for end, limit in _UNTOLD),
+    )
+
+
+def _label(name: str) -> str:
+    if name in _LABELS:
+        return _LABELS[name]
+    for end in ("_rad_per_Nm", "_m_per_N", "_rad", "_m", "_s"):
+        if name.endswith(end):
+            base = name.removesuffix(end)
+            return _LABELS.get(base, base)
+    return name
 
 
 def place(what: Cause | Rejected) -> str:
@@ -116,6 +136,11 @@ def percent(share: float) -> str:
     if share >= 0.995:
         return "> 99 %"
     return "< 1 %" if share < 0.005 else f"{100.0 * share:.0f} %"
+
+
+def share(of_hundred: float) -> str:
+    """A share of a gain [%]."""
+    return "< 1 %" if 0.05 <= of_hundred < 0.5 else f"{of_hundred + 0.0:.0f} %"
 
 
 def mm(value: float | None) -> str:

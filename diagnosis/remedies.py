@@ -104,7 +104,7 @@ class _Workshop:
         )
 
     def backlash(self, cause: Cause, numbers: Mapping[str, float]) -> str:
-        play = self._turn(cause, numbers, "width").lstrip("+")
+        play = self._turn(cause, numbers, "width").replace("+", "")
         return (
             f"Tighten or preload the gear of {cause.where}. Until then come to each pose from the same side, by more "
             f"than {play}."
@@ -255,13 +255,15 @@ def _signed(value: float) -> str:
 
 
 def _list(values: FloatArray) -> str:
-    return f"[{', '.join(f'{round(value, 5) + 0.0:g}' for value in values.tolist())}]"
+    return f"[{', '.join(_short(value, 5) for value in values.tolist())}]"
+
+
+def _short(value: float, digits: int) -> str:
+    return f"{round(value, digits) + 0.0:.{digits}f}".rstrip("0").rstrip(".")
 
 
 def _origin(pose: FloatArray) -> str:
-    xyz, rpy = (
-        " ".join(f"{round(v, 6) + 0.0:g}" for v in part.tolist()) for part in (pose[:3, 3], rpy_of(pose[:3, :3]))
-    )
+    xyz, rpy = (" ".join(_short(v, 6) for v in part.tolist()) for part in (pose[:3, 3], rpy_of(pose[:3, :3])))
     return f'origin xyz="{xyz}" rpy="{rpy}"'
 
 

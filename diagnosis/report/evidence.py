@@ -26,6 +26,16 @@ def evidence_panels(residuals: Residuals, effect: Effect) -> list[Panel]:
     return [_BY_EFFECT.get(effect.name, _measured_against_predicted)(residuals, effect)]
 
 
+def outlier_panel(residuals: Residuals) -> Panel:
+    """Fixes that are not the marker, beside those that are, over time."""
+    length = 1e3 * np.linalg.norm(residuals.after, axis=1)
+    away = np.flatnonzero(~residuals.diagnosis.markers)
+    plot = Plot(residuals.clock_label, "error [mm]", span(residuals.clock), (0.0, 1.05 * float(length.max())))
+    parts = [(residuals.some(POINTS), "pale after"), (residuals.some(POINTS, away), "away")]
+    marks = [plot.dots(residuals.clock[rows], length[rows], look) for rows, look in parts]
+    return Panel("Fixes that are not the marker, beside those that are", plot.svg(*marks))
+
+
 def _partial(residuals: Residuals, effect: Effect) -> tuple[FloatArray, FloatArray]:
     """What is left (n, 3) [m] when all other causes are taken away, and what the effect makes of it."""
     own = residuals.contribution(effect)
@@ -44,7 +54,8 @@ def _drawn(
     x, y = points
     some = residuals.some(POINTS, rows)
     bins = binned(x[rows], y[rows])
-    plot = Plot(*axes, span(x[rows]), span(y[rows], cut=_CUT))
+    low, high = np.quantile(y[rows], [_CUT, 1.0 - _CUT])
+    plot = Plot(*axes, span(x[rows]), span(np.array([low, high]), curve[1]))
     marks = (
         plot.dots(x[some], y[some], "pale after"),
         plot.line(*curve, "fit"),
@@ -122,7 +133,7 @@ def _backlash(residuals: Residuals, effect: Effect) -> Panel:
         f"{effect.where} [{residuals.unit(k)[1]}]",
         f"{effect.where}: true less read [{residuals.unit(k)[1]}]",
         span(x[rows]),
-        span(y[rows], np.array([-half, half]), cut=_CUT),
+        span(y[rows], cut=_CUT),
     )
     marks = []
     ends = np.array(plot.x)
@@ -134,7 +145,9 @@ def _backlash(residuals: Residuals, effect: Effect) -> Panel:
         marks.append(plot.dots(x[some], y[some], f"pale {look}"))
         marks.append(plot.line(ends, np.full(2, -way * half), f"fit {look}"))
         marks.append(plot.bars(bins.x, bins.y, bins.half, look))
-    title = f"How far {effect.where} is from its reading, moving up (filled) and down; lines: half the play each way"
+    title = (
+        f"How far {effect.where} is from its reading, moving up (blue) and down (orange); lines: half the play each way"
+    )
     return Panel(title, plot.svg(*marks))
 
 
@@ -143,8 +156,8 @@ def _since(residuals: Residuals, effect: Effect) -> Panel:
     begins = float(residuals.clock[0]) - 1.0
     always = residuals.instead(effect, np.append(effect.values[:-1], begins))
     partial, _ = _partial(residuals, effect)
-    size = np.maximum(np.linalg.norm(always, axis=1), 1e-12)
-    y = 1e3 * np.einsum("ni,ni->n", always, partial) / size
+    size = np.linalg.norm(always, axis=1)
+    y = 1e3 * residuals.amount(always, partial) * size
     fitted = 1e3 * size * after(residuals.motion, effect)
     rows = residuals.rows
     curve = (residuals.clock[rows], fitted[rows])
@@ -165,8 +178,7 @@ def _latency(residuals: Residuals, effect: Effect) -> Panel:
     partial, own = _partial(residuals, effect)
     velocity = np.einsum("nij,nj->ni", residuals.run.by_joint, residuals.motion.rates)
     speed = np.linalg.norm(velocity, axis=1)
-    way = velocity / np.maximum(speed, 1e-9)[:, None]
-    y, fitted = (1e3 * np.einsum("ni,ni->n", way, e) for e in (partial, own))
+    y, fitted = (1e3 * speed * residuals.amount(velocity, e) for e in (partial, own))
     rows, x = residuals.rows, 1e3 * speed
     slope = float(x[rows] @ fitted[rows]) / max(float(x[rows] @ x[rows]), 1e-12)
     ends = np.array([0.0, x[rows].max()])

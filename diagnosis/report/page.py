@@ -16,7 +16,7 @@ from ..numbers import chance, mm
 from ..result import Cause, DiagnosisFile, Verdict
 from ..words import finding
 from . import tables
-from .evidence import evidence_panels
+from .evidence import evidence_panels, outlier_panel
 from .panels import Panel, panels
 from .residuals import Residuals
 from .spread import arrows, histogram
@@ -55,14 +55,14 @@ def page(diagnosis: Diagnosis, file: DiagnosisFile, remedies: Sequence[str], abo
     """The page.
 
     Args:
-        remedies: what to do about the causes, as sentences.
+        remedies: what to do about each cause, in the order of `remedies()`.
     """
     residuals = Residuals(diagnosis)
     body = [
         _head(file, about),
-        _glance(file),
-        _causes(residuals, file),
-        _actions(file, remedies),
+        _glance(residuals, file),
+        _causes(residuals, file, remedies),
+        _advice(file),
         _where(residuals),
         _against(residuals),
         _hypotheses(file),
@@ -102,7 +102,7 @@ def _equals(p: float) -> str:
     return text if text.startswith("<") else f"= {text}"
 
 
-def _glance(file: DiagnosisFile) -> str:
+def _glance(residuals: Residuals, file: DiagnosisFile) -> str:
     rms, gain = file.rms_mm, file.gain
     tiles = [
         (f"{mm(rms.aligned)} → {mm(rms.extended)} mm", "RMS before → after"),
@@ -114,17 +114,20 @@ def _glance(file: DiagnosisFile) -> str:
         same = f"{file.stability.same_causes} of {file.stability.resampled}"
         tiles.append((same, "resampled, with the same causes"))
     items = "".join(f"<div><b>{value}</b><span>{escape(label)}</span></div>" for value, label in tiles)
-    return f'<section><div class="tiles">{items}</div>{tables.errors(file)}</section>'
+    return (
+        f'<section><div class="tiles">{items}</div><div class="beside"><div>{_panels([histogram(residuals)])}</div>'
+        f"<div>{tables.errors(file)}</div></div></section>"
+    )
 
 
-def _causes(residuals: Residuals, file: DiagnosisFile) -> str:
+def _causes(residuals: Residuals, file: DiagnosisFile, remedies: Sequence[str]) -> str:
     if not file.causes:
         return ""
     ordered = sorted(file.causes, key=lambda cause: -cause.share_of_gain_percent)
     effects = {effect.key: effect for effect in residuals.diagnosis.causes}
     articles = [
-        _cause(residuals, cause, effects.get((cause.effect, cause.where, cause.source)), opened=k < _OPEN)
-        for k, cause in enumerate(ordered)
+        _cause(residuals, cause, effects.get((cause.effect, cause.where, cause.source)), remedy, opened=k < _OPEN)
+        for k, (cause, remedy) in enumerate(zip(ordered, remedies, strict=True))
     ]
     return (
         f'<section id="causes"><h2>Causes</h2>{tables.causes(file, timed=residuals.timed)}'
@@ -133,25 +136,23 @@ def _causes(residuals: Residuals, file: DiagnosisFile) -> str:
     )
 
 
-def _cause(residuals: Residuals, cause: Cause, effect: Effect | None, *, opened: bool) -> str:
+def _cause(residuals: Residuals, cause: Cause, effect: Effect | None, remedy: str, *, opened: bool) -> str:
     said = finding(
         cause.effect, cause.where, cause.source, {name: interval.value for name, interval in cause.parameters.items()}
     )
-    plots = [histogram(residuals)] if effect is None else evidence_panels(residuals, effect)
+    plots = [outlier_panel(residuals)] if effect is None else evidence_panels(residuals, effect)
     state = " open" if opened else ""
     return (
         f'<details class="cause"{state}><summary>{escape(said[0].upper() + said[1:])}</summary><div class="beside">'
-        f"{_panels(plots)}<div><p>{escape(cause.evidence)}</p>{tables.rivals(cause)}</div></div></details>"
+        f"{_panels(plots)}<div><p>{tables.numbers(cause, timed=residuals.timed)}</p><p>{escape(cause.evidence)}</p>"
+        f"{tables.rivals(cause)}<p><b>What to do.</b> {escape(remedy)}</p></div></div></details>"
     )
 
 
-def _actions(file: DiagnosisFile, remedies: Sequence[str]) -> str:
-    parts = []
-    if remedies:
-        parts.append(f'<section id="do"><h2>What to do</h2><ol>{_items(remedies)}</ol></section>')
-    if file.advice:
-        parts.append(f'<section id="next"><h2>What to measure next</h2><ul>{_items(file.advice)}</ul></section>')
-    return "".join(parts)
+def _advice(file: DiagnosisFile) -> str:
+    if not file.advice:
+        return ""
+    return f'<section id="next"><h2>What to measure next</h2><ul>{_items(file.advice)}</ul></section>'
 
 
 def _where(residuals: Residuals) -> str:
@@ -159,9 +160,7 @@ def _where(residuals: Residuals) -> str:
     return (
         '<section id="where"><h2>Where the marker is, and where it should be</h2>'
         f"<p>From where the simulation expects it (dot) to where it was measured, {stretch:g} times as long as it is. "
-        f'{_KEY}</p><div class="views">{_panels(views)}</div>'
-        f'<div class="panels">{_panels([histogram(residuals)])}</div>'
-        '<p class="key">The line is what noise alone would be.</p></section>'
+        f'{_KEY}</p><div class="views">{_panels(views)}</div></section>'
     )
 
 

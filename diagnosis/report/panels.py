@@ -7,22 +7,21 @@ from dataclasses import dataclass
 from html import escape
 
 import numpy as np
+from numpy.typing import NDArray
 
 from interfaces.records import FloatArray
 
-from .plot import HEIGHT, WIDTH, Plot, round_up, span
+from .plot import ASPECT, Plot, round_up, span
 from .residuals import POINTS, Residuals, binned, structure
 
 # Of the variance of the errors, so much has to go with something to be shown at first sight.
 _TELLING = 0.02
 # Of single errors, so many at each end do not set the range of a plot.
 _CUT = 0.01
-_CELLS = (8, 6)
+_CELLS = (10, 6)
 _FEWEST_IN_A_CELL = 3
 # So much of a cell the longest mean arrow is long.
-_OF_A_CELL = 0.9
-# A gap between axes' names and what is drawn, in an image.
-_MARGIN = 22
+_OF_A_CELL = 1.0
 
 
 @dataclass(frozen=True)
@@ -144,62 +143,44 @@ def _with_moments(residuals: Residuals, svg: str) -> str:
         for effect in residuals.diagnosis.causes
         if effect.kind.begins
     ]
-    return svg.replace("</svg>", f"{''.join(moments)}</svg>")
+    return f"{svg.removesuffix('</svg>')}{''.join(moments)}</svg>"
 
 
 def _by_image(residuals: Residuals) -> Iterator[Panel]:
-    calibration = residuals.calibration
-    if calibration is None:
+    """Mean errors in the cells of the part of the image where the marker was."""
+    if residuals.calibration is None:
         return
-    rows = residuals.rows
-    x = residuals.diagnosis.extended.observations.x
-    at = residuals.pixels(x[rows])
-    means = {
-        look: _cell_means(at, at - residuals.pixels(x[rows] - errors[rows]), calibration.image_size_px)
-        for look, errors in (("before", residuals.before), ("after", residuals.after))
+    x = residuals.diagnosis.extended.observations.x[residuals.rows]
+    at = residuals.pixels(x)
+    errors = {
+        look: at - residuals.pixels(x - error[residuals.rows])
+        for look, error in (("before", residuals.before), ("after", residuals.after))
     }
-    lengths = np.concatenate([np.linalg.norm(arrows[:, 2:], axis=1) for arrows in means.values()])
-    longest = round_up(float(lengths.max(initial=1e-6)))
-    cell = calibration.image_size_px[0] / _CELLS[0]
-    svg = _image(calibration.image_size_px, means, _OF_A_CELL * cell / longest)
-    tells = [
-        max(structure(at[:, axis], residual[:, along]) for axis in (0, 1) for along in (0, 1))
-        for residual in (at - residuals.pixels(x[rows] - residuals.before[rows]),)
-    ]
-    yield Panel(f"Over the image: mean error in each part of it; a cell's width is {longest:.3g} px", svg, tells[0])
+    low, high = _framed(at.min(axis=0), at.max(axis=0))
+    cells = np.clip(((at - low) / (high - low) * _CELLS).astype(np.intp), 0, np.array(_CELLS) - 1) @ (1, _CELLS[0])
+    means = {look: _cell_means(cells, at, error) for look, error in errors.items()}
+    longest = round_up(max(float(np.linalg.norm(m[:, 2:], axis=1).max(initial=1e-6)) for m in means.values()))
+    stretch = _OF_A_CELL * float(high[0] - low[0]) / _CELLS[0] / longest
+    plot = Plot("u in the left image [px]", "v [px]", (low[0], high[0]), (high[1], low[1]))
+    marks = [plot.arrows(m[:, 0], m[:, 1], stretch * m[:, 2], stretch * m[:, 3], look) for look, m in means.items()]
+    tells = max(structure(at[:, i], error[:, j]) for error in errors.values() for i in (0, 1) for j in (0, 1))
+    title = f"Over the image: mean errors; an arrow as long as a tenth of the width is {longest:.3g} px"
+    yield Panel(title, plot.svg(*marks), tells)
 
 
-def _cell_means(at: FloatArray, error: FloatArray, size: tuple[int, int]) -> FloatArray:
+def _framed(low: FloatArray, high: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Corners (2,) [px] of an area around points, in which both axes have the same scale."""
+    middle, size = 0.5 * (low + high), 1.08 * (high - low)
+    size = np.maximum(size, [ASPECT * size[1], size[0] / ASPECT])
+    return middle - 0.5 * size, middle + 0.5 * size
+
+
+def _cell_means(cells: NDArray[np.intp], at: FloatArray, error: FloatArray) -> FloatArray:
     """Middles of the cells and mean errors in them (c, 4) [px]."""
-    columns, lines = _CELLS
-    across = np.clip((at[:, 0] / size[0] * columns).astype(np.intp), 0, columns - 1)
-    down = np.clip((at[:, 1] / size[1] * lines).astype(np.intp), 0, lines - 1)
-    cell = down * columns + across
-    arrows = []
-    for k in np.unique(cell):
-        inside = cell == k
-        if inside.sum() >= _FEWEST_IN_A_CELL:
-            arrows.append(np.concatenate([at[inside].mean(axis=0), error[inside].mean(axis=0)]))
-    return np.array(arrows).reshape(-1, 4)
-
-
-def _image(size: tuple[int, int], means: dict[str, FloatArray], stretch: float) -> str:
-    """An image with an arrow in each cell."""
-    scale = min((WIDTH - 2 * _MARGIN) / size[0], (HEIGHT - 2 * _MARGIN) / size[1])
-    left, top = 0.5 * (WIDTH - scale * size[0]), 0.5 * (HEIGHT - scale * size[1])
-    parts = [
-        f'<rect class="frame" x="{left:.1f}" y="{top:.1f}" width="{scale * size[0]:.1f}" '
-        f'height="{scale * size[1]:.1f}"/>'
+    inside = [cells == k for k in np.unique(cells)]
+    arrows = [
+        np.concatenate([at[rows].mean(axis=0), error[rows].mean(axis=0)])
+        for rows in inside
+        if rows.sum() >= _FEWEST_IN_A_CELL
     ]
-    for look, arrows in means.items():
-        ends = arrows[:, 2:] * stretch * scale
-        starts = arrows[:, :2] * scale + [left, top]
-        path = "".join(f"M{x:.1f} {y:.1f}l{dx:.1f} {dy:.1f}" for (x, y), (dx, dy) in zip(starts, ends, strict=True))
-        dots = "".join(f"M{x:.1f} {y:.1f}h0" for x, y in starts)
-        parts.append(f'<path class="arrows {look}" d="{path}"/><path class="feet {look}" d="{dots}"/>')
-    parts.append(
-        f'<text class="label" x="{WIDTH / 2}" y="{HEIGHT - 6}" text-anchor="middle">as the left camera sees</text>'
-    )
-    return (
-        f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="mean errors over the image">{"".join(parts)}</svg>'
-    )
+    return np.array(arrows).reshape(-1, 4)

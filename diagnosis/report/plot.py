@@ -15,6 +15,7 @@ WIDTH, HEIGHT = 380, 236
 _LEFT, _RIGHT, _TOP, _BOTTOM = 52, 10, 10, 40
 _STEPS = (1.0, 2.0, 2.5, 5.0, 10.0)
 _TICKS = 5
+ASPECT = (WIDTH - _LEFT - _RIGHT) / (HEIGHT - _TOP - _BOTTOM)
 
 
 @dataclass(frozen=True)
@@ -23,7 +24,7 @@ class Plot:
 
     Attributes:
         x_label, y_label: with units.
-        x, y: their ranges.
+        x, y: their ranges; from high to low where the axis runs the other way.
         names: of whole numbers on the x axis, in the place of figures.
     """
 
@@ -36,7 +37,9 @@ class Plot:
     def svg(self, *marks: str) -> str:
         """The plot with marks, the first at the back."""
         label = escape(f"{self.y_label} against {self.x_label}", quote=True)
-        inside = f'<g clip-path="inset(0)">{"".join(marks)}</g>'
+        box = (_LEFT, _TOP, WIDTH - _LEFT - _RIGHT, HEIGHT - _TOP - _BOTTOM)
+        place = " ".join(f'{name}="{value}"' for name, value in zip(("x", "y", "width", "height"), box, strict=True))
+        inside = f'<svg {place} viewBox="{" ".join(map(str, box))}">{"".join(marks)}</svg>'
         return f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{label}">{self._grid()}{inside}</svg>'
 
     def dots(self, x: FloatArray, y: FloatArray, look: str) -> str:
@@ -46,7 +49,7 @@ class Plot:
     def line(self, x: FloatArray, y: FloatArray, look: str) -> str:
         """A curve through points in their order."""
         left, top = self._at(x, y)
-        points = " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(left, self._within(top), strict=True))
+        points = " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(left, top, strict=True))
         return f'<polyline class="line {look}" points="{points}"/>'
 
     def bars(self, x: FloatArray, y: FloatArray, half: FloatArray, look: str) -> str:
@@ -54,7 +57,7 @@ class Plot:
         left, top = self._at(x, y)
         _, upper = self._at(x, y + half)
         _, lower = self._at(x, y - half)
-        ends = zip(left, self._within(upper), self._within(lower), strict=True)
+        ends = zip(left, upper, lower, strict=True)
         path = "".join(f"M{a:.1f} {b:.1f}V{c:.1f}" for a, b, c in ends)
         inside = self._inside(x, y)
         middle = "".join(f"M{a:.1f} {b:.1f}h0" for a, b in zip(left[inside], top[inside], strict=True))
@@ -63,9 +66,18 @@ class Plot:
     def area(self, x: FloatArray, y: FloatArray, look: str) -> str:
         """Down to the x axis."""
         left, top = self._at(x, y)
-        points = " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(left, self._within(top), strict=True))
+        points = " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(left, top, strict=True))
         bottom = HEIGHT - _BOTTOM
         return f'<polygon class="area {look}" points="{left[0]:.1f},{bottom} {points} {left[-1]:.1f},{bottom}"/>'
+
+    def arrows(self, x: FloatArray, y: FloatArray, dx: FloatArray, dy: FloatArray, look: str) -> str:
+        """Arrows from their feet."""
+        left, top = self._at(x, y)
+        right, end = self._at(x + dx, y + dy)
+        path = "".join(
+            f"M{a:.1f} {b:.1f}l{c - a:.1f} {d - b:.1f}" for a, b, c, d in zip(left, top, right, end, strict=True)
+        )
+        return f'<path class="arrows {look}" d="{path}"/><path class="feet {look}" d="{self._points(x, y)}"/>'
 
     def moment(self, x: float, text: str) -> str:
         """An upright line with a name."""
@@ -83,21 +95,18 @@ class Plot:
         return "".join(f"M{a:.1f} {b:.1f}h0" for a, b in zip(left, top, strict=True))
 
     def _inside(self, x: FloatArray, y: FloatArray) -> np.ndarray:
-        return (x >= self.x[0]) & (x <= self.x[1]) & (y >= self.y[0]) & (y <= self.y[1])
+        (left, right), (low, high) = sorted(self.x), sorted(self.y)
+        return (x >= left) & (x <= right) & (y >= low) & (y <= high)
 
     def _at(self, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
         across = (x - self.x[0]) / (self.x[1] - self.x[0])
         up = (y - self.y[0]) / (self.y[1] - self.y[0])
         return _LEFT + across * (WIDTH - _LEFT - _RIGHT), HEIGHT - _BOTTOM - up * (HEIGHT - _TOP - _BOTTOM)
 
-    @staticmethod
-    def _within(top: FloatArray) -> FloatArray:
-        return np.clip(top, _TOP, HEIGHT - _BOTTOM)
-
     def _grid(self) -> str:
         bottom, right = HEIGHT - _BOTTOM, WIDTH - _RIGHT
         parts = []
-        for value in ticks(*self.y):
+        for value in ticks(*sorted(self.y)):
             y = self._at(np.array([self.x[0]]), np.array([value]))[1][0]
             zero = " zero" if value == 0.0 else ""
             parts.append(f'<line class="grid{zero}" x1="{_LEFT}" x2="{right}" y1="{y:.1f}" y2="{y:.1f}"/>')

@@ -93,19 +93,29 @@ class Residuals:
         """Factor and name of what a joint is shown in."""
         return (1e3, "mm") if self.slides(joint) else (np.degrees(1.0), "°")
 
+    def amount(self, way: FloatArray, errors: FloatArray) -> FloatArray:
+        """How many times `way` (n, 3) errors (n, 3) [m] most probably go (n,), given the shape of the noise."""
+        expected, seen = (np.einsum("nij,nj->ni", self.whitening, vectors) for vectors in (way, errors))
+        return np.einsum("ni,ni->n", expected, seen) / np.maximum(np.square(expected).sum(axis=1), 1e-300)
+
+    @property
+    def whitening(self) -> FloatArray:
+        """(n, 3, 3): makes the noise round."""
+        return self.diagnosis.extended.observations.whitening
+
     def along(self, joint: int, errors: FloatArray) -> FloatArray:
         """Errors (n,) [mm] along the way on which a joint moves the marker."""
         way = self.run.by_joint[:, :, joint]
-        return 1e3 * np.einsum("ni,ni->n", way, errors) / np.maximum(np.linalg.norm(way, axis=1), 1e-9)
+        return 1e3 * self.amount(way, errors) * np.linalg.norm(way, axis=1)
 
     def as_angle(self, joint: int, errors: FloatArray) -> FloatArray:
         """By how much a joint would have to be elsewhere (n,) [°, mm] for errors (n, 3)."""
-        way = self.run.by_joint[:, :, joint]
-        return self.unit(joint)[0] * np.einsum("ni,ni->n", way, errors) / np.maximum(np.square(way).sum(axis=1), 1e-12)
+        return self.unit(joint)[0] * self.amount(self.run.by_joint[:, :, joint], errors)
 
     def telling(self, joint: int) -> NDArray[np.intp]:
         """The rows in which a joint moves the marker well."""
-        arm = np.linalg.norm(self.run.by_joint[:, :, joint], axis=1)[self.rows]
+        way = np.einsum("nij,nj->ni", self.whitening, self.run.by_joint[:, :, joint])
+        arm = np.linalg.norm(way, axis=1)[self.rows]
         return self.rows[arm >= _TELLS * np.median(arm)]
 
     @cached_property

@@ -34,7 +34,10 @@ def histogram(residuals: Residuals) -> Panel:
     top = max(float(share.max()) for share in shares.values())
     plot = Plot("error [mm]", "share of the pairs [%]", (0.0, end), (0.0, 1.06 * top))
     marks = [plot.area(middle, shares[look], look) for look in ("before", "after")]
-    return Panel("How large the errors are", plot.svg(*marks, plot.line(middle, shares["noise"], "noise")))
+    return Panel(
+        "How large the errors are: before, after, and what noise alone would be (line)",
+        plot.svg(*marks, plot.line(middle, shares["noise"], "noise")),
+    )
 
 
 def _noise(residuals: Residuals) -> FloatArray:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from html import escape
 
-from ..numbers import chance, mm, named, numbers_of, percent, place
+from ..numbers import Number, chance, mm, named, numbers_of, percent, place, share, telling
 from ..result import Cause, DiagnosisFile, Indistinguishable, Rejected
 
 # So many of the rejected hypotheses are shown at first sight.
@@ -34,23 +34,29 @@ def errors(diagnosis: DiagnosisFile) -> str:
 
 
 def causes(diagnosis: DiagnosisFile, *, timed: bool) -> str:
-    """Every cause with its numbers."""
+    """Every cause with those of its numbers that are not zero."""
     rows = []
     for cause in sorted(diagnosis.causes, key=lambda c: -c.share_of_gain_percent):
         figures = (
-            f"<td>{percent(cause.probability)}<td>{cause.share_of_gain_percent:.0f} %"
+            f"<td>{percent(cause.probability)}<td>{share(cause.share_of_gain_percent)}"
             f"<td>{cause.held_out_gain_percent:.1f} %"
         )
-        rows.append(f"<tr><td>{escape(place(cause))}<td class=text>{numbers(cause, timed=timed)}{figures}</tr>")
+        rows.append(
+            f"<tr><td>{escape(place(cause))}<td class=text>{_lines(telling(numbers_of(cause, timed=timed)))}{figures}</tr>"
+        )
     return _table(("Cause", "Numbers, ± for 95 %", "Sure", "Share of the gain", "Gain"), rows)
 
 
 def numbers(cause: Cause, *, timed: bool) -> str:
-    """The numbers of a cause, a line each."""
-    return "<br>".join(
-        f"{escape(n.label)} <b>{escape(n.value)}</b> <small>{escape(n.interval)}</small>"
-        for n in numbers_of(cause, timed=timed)
-    )
+    """All numbers of a cause, a line each, and which the recording does not tell."""
+    every = numbers_of(cause, timed=timed)
+    hidden = ", ".join(n.label for n in every if not n.is_told)
+    untold = f"<br><small>not told by this motion: {escape(hidden)}</small>" if hidden else ""
+    return f"{_lines(n for n in every if n.is_told)}{untold}"
+
+
+def _lines(shown: Iterable[Number]) -> str:
+    return "<br>".join(f"{escape(n.label)} <b>{escape(n.value)}</b> <small>{escape(n.interval)}</small>" for n in shown)
 
 
 def rivals(cause: Cause) -> str:
