@@ -17,6 +17,8 @@ COMMANDS = {
     "replay": "Learn a recording; prints the error before and after.",
     "calibrate": "Camera, tool and joint zeros from pairs; writes a URDF.",
     "diagnose": "What the simulation gets wrong, why, and how it gets better.",
+    "simulate": "What the simulation would have measured at the same angles.",
+    "compare": "How far two recordings are apart, row by row.",
     "reproduce": "Run the paper's experiments again, its figures beside ours.",
     "run": "Start sampler and learner, and keep them running.",
     "sampler": "Only the sampler: encoders and cameras in, pairs out.",
@@ -70,6 +72,9 @@ def main() -> None:
         sys.exit(1)
     except KeyboardInterrupt:
         sys.exit(130)
+    except BrokenPipeError:  # whoever read our output has had enough, as `head` has
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(1)
 
 
 if __name__ == "__main__":

@@ -19,6 +19,8 @@ import msgspec
 from msgspec import Meta
 
 from drivers.config import DriversConfig
+from effects import Simulation, simulation_of
+from interfaces.calibrated_files import EXTENSIONS
 from interfaces.errors import ConfigError
 from interfaces.robot import CameraSection, RobotDescription, RobotSection
 from interfaces.suggest import did_you_mean, hint_at, with_choices
@@ -104,7 +106,7 @@ class LearnerConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Tables(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """All tables of robot.toml; [robot] and [camera] are checked by `interfaces.robot`."""
+    """All tables of robot.toml; [robot] and [camera] are checked by `interfaces.robot`, the last two by `effects`."""
 
     robot: dict[str, Any]
     camera: dict[str, Any]
@@ -114,15 +116,22 @@ class Tables(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     vision: VisionConfig = VisionConfig()
     learner: LearnerConfig = LearnerConfig()
     sim: SimConfig = SimConfig()
+    effects: tuple[dict[str, Any], ...] = ()
+    unexplained: dict[str, Any] | None = None
 
 
 @dataclass(frozen=True)
 class Config:
-    """Everything that robot.toml says, checked."""
+    """Everything that robot.toml says, checked.
+
+    Attributes:
+        simulation: the robot with the effects that the file adds to it.
+    """
 
     file: Path
     robot: RobotDescription
     tables: Tables
+    simulation: Simulation
 
     @classmethod
     def load(cls, file: Path, environment: Mapping[str, str] = os.environ) -> Config:
@@ -137,8 +146,9 @@ class Config:
             if name not in known:
                 line = line_of(text, (name,))
                 raise ConfigError(f"unknown table [{name}]", file=file, line=line, remedy=did_you_mean(name, known))
-        overridden = _override(raw, known, environment)
+        overridden = _override(raw, [name for name in known if name not in EXTENSIONS], environment)
         robot = RobotDescription.from_tables(overridden, text, file)
+        simulation = simulation_of(robot, overridden, text)
         tables = convert(overridden, Tables, file=file, text=text)
         if tables.daemon.min_step_deg >= tables.daemon.max_step_deg:
             line = line_of(text, ("daemon", "min_step_deg"))
@@ -151,7 +161,7 @@ class Config:
                 line=line_of(text, ("vision", "radius_m")),
                 remedy="Give metres",
             )
-        return cls(file, robot, tables)
+        return cls(file, robot, tables, simulation)
 
     def require_learnable(self) -> None:
         """ConfigError when there are more joints than the learner can keep up with."""

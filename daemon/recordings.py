@@ -72,6 +72,17 @@ def stored_pairs(file: Path) -> StoredPairs:
         return StoredPairs(pairs[0].store, from_pairs(pairs, reader.joints))
 
 
+def opened(source: Path, joints: tuple[str, ...]) -> Recording:
+    """The recording, or the pairs of the store, in `source`.
+
+    Raises:
+        StoreError, RecordingError: it cannot be read, or is of other joints.
+    """
+    if source.suffix.lower() in STORE_ENDINGS:
+        return of_robot(from_store(source), joints, source)
+    return Recording.read(source, joints)
+
+
 def of_robot(recording: Recording, joints: tuple[str, ...], file: Path) -> Recording:
     """The recording; RecordingError when it is not of these joints in this order."""
     if recording.joints != joints:

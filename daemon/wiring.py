@@ -71,7 +71,7 @@ def _simulated(config: Config) -> Iterator[Sources]:
     from vision.tracked_camera import TrackedCamera
     from vision.tracker import StereoTracker
 
-    with SimWorld(config.robot, config.tables.sim) as world:
+    with SimWorld(config.robot, config.tables.sim, config.simulation) as world:
         marker = TrackedCamera(world.camera, StereoTracker(world.camera.calibration, config.tables.vision))
         yield Sources(world.joints, marker, world.clock, world)
 
@@ -89,8 +89,8 @@ def open_postures(config: Config, count: int) -> Iterator[Sources]:
     from vision.tracked_camera import TrackedCamera
     from vision.tracker import StereoTracker
 
-    postures = visible_postures(config.robot, config.tables.sim, count)
-    with PosedWorld(config.robot, config.tables.sim, postures) as world:
+    postures = visible_postures(config.robot, config.tables.sim, count, config.simulation)
+    with PosedWorld(config.robot, config.tables.sim, postures, config.simulation) as world:
         marker = TrackedCamera(world.camera, StereoTracker(world.camera.calibration, config.tables.vision))
         yield Sources(world.joints, marker, world.clock)
 
@@ -99,7 +99,7 @@ def simulated_truth(config: Config) -> RigidChain:
     """The true chain of the robot that the simulation makes of this description, for judges."""
     from sim_backend import true_chain
 
-    return true_chain(config.robot, config.tables.sim)
+    return true_chain(config.robot, config.tables.sim, extension=config.simulation)
 
 
 def _recorded(config: Config, file: Path) -> Sources:

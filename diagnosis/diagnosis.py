@@ -26,6 +26,8 @@ from .search import Search
 Told = Callable[[str], None]
 # Fewer fixes than this that are not the marker are no finding.
 _FEWEST_OUTLIERS = 3
+# So much more probable it has to be that there are some [nats].
+_OUTLIERS_NAMED = 15.0
 # Of the instrument's noise, another size than that is taken up (in logarithms).
 _SAME_NOISE = 0.1
 
@@ -79,8 +81,9 @@ class Diagnosis:
 
     @property
     def outliers_are_found(self) -> bool:
-        """Whether there are so many that it is a finding."""
-        return self.outliers >= _FEWEST_OUTLIERS
+        """Whether there are so many, so far off, that it is a finding."""
+        worth = self.extended.noise.log_likelihood - self.extended.without_outliers
+        return self.outliers >= _FEWEST_OUTLIERS and worth > _OUTLIERS_NAMED
 
     def gain(self) -> tuple[float, tuple[float, float]]:
         """By how much the RMS falls from aligned to extended [%], with its 95 % interval."""

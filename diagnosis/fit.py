@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from scipy.ndimage import uniform_filter1d
 
 from effects import Effect, Simulated, Simulation
 from interfaces.records import FloatArray
@@ -19,11 +20,15 @@ LARGEST = 30.0
 _ROUNDS, _ENOUGH = 12, 0.02
 _FEWEST_OUTLIERS = 1e-4
 _EM_ROUNDS = 6
+# So large a share of so many rows is no outliers.
+_WINDOW, _BURST = 21, 0.45
 
 
 @dataclass(frozen=True, eq=False)
 class Noise:
     """A mixture: most fixes have the shape of the stated noise, `sigma` times its size; a share lie anywhere.
+
+    Fixes that are not the marker are scattered. Where many in a row are off, something has changed.
 
     Attributes:
         sigma: size of the noise, in units of the stated one.
@@ -49,7 +54,10 @@ class Noise:
             inlier = np.log1p(-share) - 1.5 * np.log(2.0 * np.pi * sigma**2) - 0.5 * squares / sigma**2
             outlier = np.log(share) + outlier_density
             both = np.logaddexp(inlier, outlier)
-            weights, total = np.exp(inlier - both), float(both.sum())
+            weights = np.exp(inlier - both)
+            bursts = uniform_filter1d(1.0 - weights, _WINDOW, mode="nearest") > _BURST
+            weights[bursts] = 1.0
+            total = float(np.where(bursts, inlier, both).sum())
             sigma = float(np.sqrt(max((weights @ squares) / (3.0 * max(weights.sum(), 1.0)), 1e-18)))
             share = float(np.clip(1.0 - weights.mean(), _FEWEST_OUTLIERS, 0.5))
         return cls(sigma, share, weights, total)
@@ -79,6 +87,13 @@ class Fit:
     def causes(self) -> tuple[Effect, ...]:
         """The effects that are findings."""
         return self.simulation.effects[self.nuisances :]
+
+    @cached_property
+    def without_outliers(self) -> float:
+        """The log-likelihood if all fixes were the marker [nats]."""
+        squares = np.square(self.residuals).sum(axis=1)
+        variance = max(float(squares.mean()) / 3.0, 1e-18)
+        return float(-1.5 * len(squares) * (np.log(2.0 * np.pi * variance) + 1.0))
 
     @property
     def log_likelihood(self) -> float:

@@ -20,7 +20,7 @@ from .observations import IntArray
 from .scan import Candidate
 
 # Blocks of time, and how many folds they are dealt to in turn.
-_MOST_BLOCKS, _FOLDS = 40, 5
+_MOST_BLOCKS, _FOLDS = 80, 5
 _FEWEST_ROWS_A_BLOCK = 10
 _BOOTSTRAPS = 2000
 # A fix that is more probably not the marker counts in no figure.
@@ -132,27 +132,30 @@ def added(fit: Fit, candidate: Candidate, blocks: Blocks) -> Added:
 
 
 def block_p_value(fit: Fit, columns: FloatArray, blocks: Blocks) -> float:
-    """Of columns (n, 3, k) that explain nothing of what is left, judged by how the blocks agree (Hotelling's T²).
+    """Of columns (n, 3, k) that explain nothing of what is left, judged by how the blocks agree.
 
-    The blocks' contributions to the score are independent even where neighbouring rows are not.
+    The noise of the scores comes from the blocks' own, with the columns fitted: so it is right where neighbouring rows
+    are not independent, as when a joint stands still and is rounded in the same way again and again (Liang and Zeger
+    1986; Hotelling's T² for so few blocks).
     """
     basis = fit.orthogonal
-    removed = np.einsum("nir,nik->rk", basis, columns)
-    beside = columns - basis @ removed
-    scores = blocks.sums(np.einsum("nik,ni->nk", beside, fit.left))
-    k = scores.shape[1]
-    spread = scores.T @ scores
-    scales = np.sqrt(np.maximum(np.diag(spread), 1e-300))
-    spread = spread / np.outer(scales, scales)
-    total = scores.sum(axis=0) / scales
-    values, vectors = np.linalg.eigh(spread)
-    told = values > 1e-8
+    beside = columns - basis @ np.einsum("nir,nik->rk", basis, columns)
+    inner = np.einsum("nia,nib->ab", beside, beside)
+    scales = np.sqrt(np.maximum(np.diag(inner), 1e-300))
+    values, vectors = np.linalg.eigh(inner / np.outer(scales, scales))
+    told = values > 1e-7
     k = int(told.sum())
     if not 0 < k < blocks.count:
         return 1.0
-    share = float(np.square(vectors[:, told].T @ total / np.sqrt(values[told])).sum()) / blocks.count
-    share = min(share, 1.0 - 1e-12)  # of the summed squared scores, what their mean explains
-    return float(stats.f.sf((blocks.count - k) / k * share / (1.0 - share), k, blocks.count - k))
+    # Orthonormal columns: the amounts that fit best are the scores themselves.
+    beside = beside @ (vectors[:, told] / np.sqrt(values[told]) / scales[:, None])
+    scores = np.einsum("nik,ni->nk", beside, fit.left)
+    total = scores.sum(axis=0)
+    fitted = scores - np.einsum("nik,nil,l->nk", beside, beside, total, optimize=True)
+    spread = blocks.sums(fitted)
+    spread = spread.T @ spread * blocks.count / (blocks.count - 1.0)
+    statistic = float(total @ np.linalg.lstsq(spread, total, rcond=1e-12)[0])
+    return float(stats.f.sf(statistic * (blocks.count - k) / (k * (blocks.count - 1.0)), k, blocks.count - k))
 
 
 def is_marker(fit: Fit) -> np.ndarray:

@@ -6,7 +6,7 @@ With what the fitted amounts can change projected out, a column c explains (c·r
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -20,7 +20,11 @@ from .fit import LARGEST, Fit
 _MOST_CYCLES = 100
 # Widths of a play that are tried [rad, m], and time constants as shares of the recording's time.
 _WIDTHS = np.geomspace(2e-4, 0.15, 14)
-_TIME_CONSTANTS = np.array([0.03, 0.1, 0.3, 1.0, 3.0])
+_TIME_CONSTANTS = np.geomspace(0.02, 4.0, 24)
+# How much of what was missing is still missing at the next reading.
+_MEMORIES = np.linspace(0.0, 0.9, 19)
+# As so many independent shapes those of a smooth family count.
+_COARSE = 5
 # Rows that have to lie on either side of a moment.
 _BESIDE = 8
 # Twice the fall of the log-likelihood at the ends of a 95 % interval.
@@ -82,9 +86,26 @@ class Scan:
             case "thermal_drift":
                 clock = self._fit.observations.motion.clock
                 span = float(clock[-1] - clock[0])
-                return self._shapes(effect, [np.array([0.0, 0.0, 0.0, c * span]) for c in _TIME_CONSTANTS])
+                return self._finely(effect, span * _TIME_CONSTANTS)
+            case "settling":
+                return self._finely(effect, _MEMORIES)
             case _:
                 return self._shapes(effect, [effect.values])
+
+    def _finely(self, effect: Effect, shapes: FloatArray) -> Candidate | None:
+        """The best of an effect whose last number is its shape, over increasing shapes (m,), then between them."""
+        best, interval = None, None
+        for _ in range(2):
+            tried = [(s, self._shapes(effect, [np.append(effect.values[:-1], s)])) for s in shapes]
+            found = [(s, candidate) for s, candidate in tried if candidate is not None]
+            if not found:
+                return None
+            gains = np.array([candidate.gain for _, candidate in found])
+            place = int(np.argmax(gains))
+            best, interval = found[place][1], _interval(np.array([s for s, _ in found]), gains)
+            around = [found[max(place - 1, 0)][0], found[min(place + 1, len(found) - 1)][0]]
+            shapes = np.linspace(*around, 13)
+        return replace(best, trials=_COARSE, interval=interval)
 
     def _shapes(self, effect: Effect, shapes: list[FloatArray], *, scaled: bool = False) -> Candidate | None:
         """The best of some shapes. `scaled`: the shape's own size is the amount, as a play's width."""

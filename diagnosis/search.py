@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 import numpy as np
+from scipy import stats
 
 from effects import Effect
 
 from .fit import Fit
+from .held_out import Blocks, block_p_value
 from .scan import Candidate, Scan
 
 # A cause has to be so much more probable than its absence [nats].
@@ -69,6 +71,8 @@ class Search:
         others = [h for h in self._hypotheses if h.key not in present]
         best, most = None, NAMED
         for candidate in self.shortlist(fit, others):
+            if self._agreed(fit, candidate) < NAMED:
+                continue
             tried = self.refined(fit.with_causes([*fit.causes, candidate.effect]), candidate.effect.key)
             worth = nats(2.0 * (tried.log_likelihood - fit.log_likelihood), candidate.dof) - self.doubt(candidate)
             if worth > most and tried.causes[-1].is_possible:
@@ -80,6 +84,14 @@ class Search:
     def doubt(self, candidate: Candidate) -> float:
         """What having looked for it in so many places costs [nats]."""
         return float(self._doubt + np.log(candidate.trials))
+
+    def _agreed(self, fit: Fit, candidate: Candidate) -> float:
+        """What a candidate is worth by the agreement of blocks of time, which need not be white inside [nats]."""
+        effect = candidate.effect
+        columns = fit.weighted(fit.run.columns(effect)[:, :, effect.amounts])
+        chance = block_p_value(fit, columns, Blocks.cut(len(fit.observations)))
+        gain = float(stats.chi2.isf(max(chance, 1e-290), candidate.dof))
+        return nats(gain, candidate.dof) - self.doubt(candidate)
 
     def shortlist(self, fit: Fit, hypotheses: Sequence[Effect]) -> list[Candidate]:
         """The candidates that may be the best when all is refitted, the most probable first."""

@@ -12,6 +12,8 @@ from .result import Cause, Errors, Gain, Verdict
 from .rivals import Standing
 
 _DEG = 180.0 / np.pi
+# A sentence names so many causes; of more, the smallest are counted.
+_TOLD = 4
 
 
 def finding(name: str, where: str | None, source: str | None, numbers: dict[str, float]) -> str:
@@ -93,6 +95,9 @@ def sentence(verdict: Verdict, causes: Sequence[Cause], rms: Errors, gain: Gain)
         return "What is measured differs from the simulation in a way that none of the known effects explains"
     told = [finding(c.effect, c.where, c.source, {k: v.value for k, v in c.parameters.items()}) for c in causes]
     ordered = [text for _, text in sorted(zip(causes, told, strict=True), key=lambda p: -p[0].share_of_gain_percent)]
+    if len(ordered) > _TOLD:
+        smaller = len(ordered) - _TOLD + 1
+        ordered = [*ordered[: _TOLD - 1], f"{smaller} smaller causes act beside"]
     head = ordered[0][0].upper() + ordered[0][1:]
     if len(ordered) > 1:
         head += f"; {', '.join(ordered[1:-1])}{', and ' if len(ordered) > 2 else ''}{ordered[-1]}"

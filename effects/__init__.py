@@ -4,10 +4,31 @@ What `diagnosis` fits is what `sim_backend` applies.
 """
 
 from .effect import Effect
+from .files import load_simulation, read_effects, read_unexplained, simulation_of, write_extended
 from .gravity import GravityLoad
 from .kinds import KINDS, Kind
+from .live import LiveEncoders
 from .motion import Motion
 from .parameter import Parameter
-from .simulation import Simulated, Simulation
+from .simulation import Residual, Simulated, Simulation
+from .unexplained import StoredModel, Unexplained
 
-__all__ = ["KINDS", "Effect", "GravityLoad", "Kind", "Motion", "Parameter", "Simulated", "Simulation"]
+__all__ = [
+    "KINDS",
+    "Effect",
+    "GravityLoad",
+    "Kind",
+    "LiveEncoders",
+    "Motion",
+    "Parameter",
+    "Residual",
+    "Simulated",
+    "Simulation",
+    "StoredModel",
+    "Unexplained",
+    "load_simulation",
+    "read_effects",
+    "read_unexplained",
+    "simulation_of",
+    "write_extended",
+]

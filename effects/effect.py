@@ -67,7 +67,8 @@ class Effect:
             raise RobotError(f"{name}: where and source are the same joint", remedy="Name another joint as source")
         prismatic = where is not None and bool(robot.chain.prismatic[robot.joints.index(where)])
         if prismatic and kind.turns_only:
-            raise RobotError(f"{name} cannot sit at {where!r}, which slides", remedy="Name a joint that turns")
+            remedy = "An eccentric pinion of a slide is a joint_ripple of its turns a metre (cycles_per_m)"
+            raise RobotError(f"{name} cannot sit at {where!r}, which slides", remedy=remedy)
         if kind.needs_stereo and robot.calibration is None:
             raise RobotError(f"{name} needs a stereo camera", remedy="Add focal_px and its fellows to [camera]")
         return cls(kind, where, source, _values(kind.parameters(prismatic), values, name), prismatic)

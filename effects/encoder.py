@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
+from scipy.signal import lfilter
 
 from interfaces.records import FloatArray
 
@@ -117,6 +118,7 @@ class JointCoupling(EncoderEffect):
         return (Parameter("ratio", 0.02),)
 
     def columns(self, motion: Motion, place: Place, values: FloatArray) -> FloatArray:
+        assert place.source is not None
         return motion.q[:, [place.source]]
 
 
@@ -160,31 +162,52 @@ class Backlash(EncoderEffect):
 
 
 class Settling(EncoderEffect):
-    """Read before the joint has come to rest: true angle = reading - fraction · last move."""
+    """Read before the joint has come to rest: what is missing is a fraction of the last move, and of what was before.
+
+    true angle = reading - e, with e_i = fraction · move_i + memory · e_{i-1}.
+    """
 
     name = "settling"
     remembers = True
 
     def parameters(self, prismatic: bool) -> tuple[Parameter, ...]:
-        return (Parameter("fraction", 0.05, never_negative=True),)
+        return (Parameter("fraction", 0.05, never_negative=True), Parameter("memory", 0.0, None))
 
     def columns(self, motion: Motion, place: Place, values: FloatArray) -> FloatArray:
-        return -motion.moves[:, [place.joint]]
+        missing = motion.moves[:, place.joint].copy()
+        if values[1] != 0.0:
+            for first, end in motion.runs:
+                missing[first:end] = lfilter([1.0], [1.0, -float(values[1])], missing[first:end])
+        return np.stack([-missing, np.zeros_like(missing)], axis=1)
+
+
+class Play:
+    """A play of a width [rad, m], driven reading by reading: its output follows when the input has crossed it."""
+
+    def __init__(self, width: float) -> None:
+        self._half = 0.5 * width
+        self._output: float | None = None
+
+    def begin(self, reading: float, leading: float) -> None:
+        """The input stands at `reading` and leads by half the width, in the direction of `leading`; 0: centred."""
+        self._output = reading - self._half * float(np.sign(leading))
+
+    def follow(self, reading: float) -> float:
+        """The output for the next reading."""
+        output = reading if self._output is None else self._output
+        self._output = min(max(output, reading - self._half), reading + self._half)
+        return self._output
 
 
 def played(q: FloatArray, runs: list[tuple[int, int]], width: float) -> FloatArray:
     """Output minus input (n,) of a play of `width` that is driven by q (n,); each run begins where q leads first."""
-    half = 0.5 * width
     lag = np.zeros_like(q)
     for first, end in runs:
         moves = np.diff(q[first:end])
         leading = moves[np.flatnonzero(moves)[:1]]
-        output = float(q[first]) - (half * float(np.sign(leading[0])) if len(leading) else 0.0)
-        outputs = []
-        for reading in q[first:end].tolist():
-            output = min(max(output, reading - half), reading + half)
-            outputs.append(output)
-        lag[first:end] = outputs - q[first:end]
+        play = Play(width)
+        play.begin(float(q[first]), float(leading[0]) if len(leading) else 0.0)
+        lag[first:end] = [play.follow(reading) for reading in q[first:end].tolist()] - q[first:end]
     return lag
 
 

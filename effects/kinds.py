@@ -89,7 +89,7 @@ KINDS: dict[str, Kind] = {
         _free("camera_moved", "camera", *_SHIFT, *_TURN, T0),
         _free("camera_scale", "camera", Parameter("scale_error", 0.01)),
         _free("camera_focal", "camera", Parameter("focal_error", 0.01), needs_stereo=True),
-        _free("lens_distortion", "camera", Parameter("k1", 0.05), needs_stereo=True),
+        _free("lens_distortion", "camera", Parameter("k1", 0.02), Parameter("k2", 0.02), needs_stereo=True),
         _free("camera_latency", "time", Parameter("latency_s", 0.02), needs_times=True),
         _free("thermal_drift", "time", *_SHIFT, Parameter("time_constant_s", 600.0, None), needs_times=True),
     )

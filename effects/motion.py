@@ -20,11 +20,13 @@ class Motion:
         q: joint angles as read [rad] (m for a prismatic joint), shape (n, d).
         t: increasing times [s], shape (n,); None when nothing is known of them.
         segment: numbers of the runs, shape (n,): what lies between two of them was not seen.
+        begun_at: when whatever drifts began to [s]; None: at the first row.
     """
 
     q: FloatArray
     t: FloatArray | None
     segment: NDArray[np.int64]
+    begun_at: float | None = None
 
     @classmethod
     def of(cls, recording: Recording) -> Motion:
@@ -32,8 +34,18 @@ class Motion:
         segment = np.zeros(len(recording), dtype=np.int64) if recording.segment is None else recording.segment
         return cls(recording.q, None if recording.t is None else recording.play_times, segment)
 
+    @classmethod
+    def at(cls, q: FloatArray, t: float, begun_at: float | None = None) -> Motion:
+        """One row: the readings q (d,) at the time t [s]."""
+        return cls(q[None], np.array([t]), np.zeros(1, dtype=np.int64), begun_at)
+
     def __len__(self) -> int:
         return len(self.q)
+
+    @property
+    def began(self) -> float:
+        """When whatever drifts began to, by the `clock`."""
+        return float(self.clock[0]) if self.begun_at is None else self.begun_at
 
     @property
     def clock(self) -> FloatArray:
@@ -78,7 +90,8 @@ class Motion:
         """The readings that the encoders gave `lag_s` before each row, to second order in the lag."""
         if lag_s == 0.0 or self.t is None:
             return self
-        return Motion(frozen_array(self.q - lag_s * self.rates + 0.5 * lag_s**2 * self._bends), self.t, self.segment)
+        q = self.q - lag_s * self.rates + 0.5 * lag_s**2 * self._bends
+        return Motion(frozen_array(q), self.t, self.segment, self.begun_at)
 
     @cached_property
     def _bends(self) -> FloatArray:

@@ -17,30 +17,40 @@ class Optics:
     Attributes:
         scale_error: measured over true distances, minus one: the nominal baseline over the true one.
         focal_error: true over nominal focal length, minus one.
-        k1: first radial distortion left in the images: a ray (x, y, 1) is seen at (x, y)·(1 + k1·(x² + y²)).
+        k1, k2: radial distortion left in the images: a ray (x, y, 1) is seen at (x, y)·(1 + k1·r² + k2·r⁴), r² = x² + y².
     """
 
     scale_error: float = 0.0
     focal_error: float = 0.0
     k1: float = 0.0
+    k2: float = 0.0
 
     @property
     def inside(self) -> bool:
         """Whether it takes a stereo calibration to say what they do."""
-        return self.focal_error != 0.0 or self.k1 != 0.0
+        return (self.focal_error, self.k1, self.k2) != (0.0, 0.0, 0.0)
 
     def reported(self, x: FloatArray, calibration: StereoCalibration | None) -> FloatArray:
         """What the nominal calibration triangulates (n, 3) [m] of points (n, 3) [m] in the true left optical frame."""
         if not self.inside:
             return x * (1.0 + self.scale_error)
         assert calibration is not None
-        true_baseline = calibration.baseline_m / (1.0 + self.scale_error)
-        left = self._seen(x[:, 0] / x[:, 2], x[:, 1] / x[:, 2])
-        right = self._seen((x[:, 0] - true_baseline) / x[:, 2], x[:, 1] / x[:, 2])
+        left, right = self.rays(x, calibration)
         depth = calibration.baseline_m / (left[:, 0] - right[:, 0])
         return np.stack([left[:, 0] * depth, 0.5 * (left[:, 1] + right[:, 1]) * depth, depth], axis=1)
 
+    def rays(self, x: FloatArray, calibration: StereoCalibration) -> tuple[FloatArray, FloatArray]:
+        """Where the left and the right eye see points (n, 3) [m]: (n, 2) each, as the nominal calibration reads it.
+
+        A ray (a, b) is that along (a, b, 1) in the eye's own optical frame.
+        """
+        true_baseline = calibration.baseline_m / (1.0 + self.scale_error)
+        left = self._seen(x[:, 0] / x[:, 2], x[:, 1] / x[:, 2])
+        right = self._seen((x[:, 0] - true_baseline) / x[:, 2], x[:, 1] / x[:, 2])
+        return left, right
+
     def _seen(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """Nominal rays (n, 2) of what the true camera sees along the rays (x, y, 1)."""
-        factor = (1.0 + self.focal_error) * (1.0 + self.k1 * (x * x + y * y))
+        r2 = x * x + y * y
+        factor = (1.0 + self.focal_error) * (1.0 + r2 * (self.k1 + self.k2 * r2))
         return np.stack([x * factor, y * factor], axis=1)

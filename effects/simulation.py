@@ -1,14 +1,14 @@
 """The simulation as a pipeline: encoder, structure, tool, camera, time; the nominal one with effects added.
 
-x_measured = drift(t) + optics(camera(tool(structure(encoder(q(t - latency))))))
+x_measured = drift(t) + residual(q(t)) + optics(camera(tool(structure(encoder(q(t - latency))))))
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import ClassVar
+from typing import ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +29,16 @@ from .optics import Optics
 _SPRING_ROUNDS = 3
 # Of the numerical derivatives by the optics' numbers and by a point.
 _STEP = 1e-6
+# ... and by a latency [s].
+_STEP_S = 1e-5
+
+
+class Residual(Protocol):
+    """What no effect explains, as a smooth function of the readings."""
+
+    def predict(self, q: FloatArray) -> FloatArray:
+        """How far (n, 3) [m] what is measured is from what the effects give, at the readings q (n, d) [rad, m]."""
+        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,10 +48,13 @@ class Simulation:
     Attributes:
         robot: the robot as described.
         effects: what is added to it.
+        residual: what is added to what is measured; None for nothing. It depends on the readings alone, so no effect
+            changes it.
     """
 
     robot: RobotDescription
     effects: tuple[Effect, ...] = ()
+    residual: Residual | None = None
 
     @cached_property
     def gravity(self) -> GravityLoad:
@@ -49,8 +62,8 @@ class Simulation:
         return GravityLoad(self.robot)
 
     def with_effects(self, effects: Sequence[Effect]) -> Simulation:
-        """The same robot with these effects in the place of its own."""
-        changed = Simulation(self.robot, tuple(effects))
+        """The same robot and residual with these effects in the place of its own."""
+        changed = Simulation(self.robot, tuple(effects), self.residual)
         changed.__dict__["gravity"] = self.gravity
         return changed
 
@@ -60,25 +73,29 @@ class Simulation:
 
     def run(self, motion: Motion) -> Simulated:
         """The pipeline, with all that is on the way."""
-        readings = motion.earlier(sum(e.value("latency_s") for e in self._of("camera_latency")))
+        readings = motion.earlier(self.latency_s)
+        q = self.unloaded(readings)
+        q += self.given_way(q)
+        chain = self._chain()
+        frames = chain.frames(q)
+        marker = frames[:, -1]
+        x_true = marker[:, :3, 3] + np.einsum("nij,nj->ni", marker[:, :3, :3], self.tool_shift(motion))
+        x_placed = (x_true - self.camera_pose[:3, 3]) @ self.camera_pose[:3, :3]
+        x_camera = x_placed
+        if self._of("camera_moved"):
+            T_placed_camera = self.camera_moves(motion)
+            x_camera = np.einsum("nji,nj->ni", T_placed_camera[:, :3, :3], x_placed - T_placed_camera[:, :3, 3])
+        measured = self.optics.reported(x_camera, self.robot.calibration) + self.added(motion)
+        return Simulated(self, motion, readings, q, chain, frames, x_true, x_placed, x_camera, measured)
+
+    def unloaded(self, readings: Motion) -> FloatArray:
+        """True joint angles (n, d) [rad, m] where no weight bends the joints."""
         q = readings.q.copy()
         for effect in self.effects:
             if effect.kind.encoder is not None:
                 place = self.place(effect)
                 q[:, place.joint] += effect.kind.encoder.correction(readings, place, effect.values)
-        q += self._given_way(q)
-        chain = self._chain()
-        frames = chain.frames(q)
-        marker = frames[:, -1]
-        x_true = marker[:, :3, 3] + np.einsum("nij,nj->ni", marker[:, :3, :3], self._tool(motion))
-        x_placed = x_true
-        for effect in self._of("camera_pose"):
-            x_placed = _from(effect.values, x_placed)
-        x_camera = x_placed
-        for effect in self._of("camera_moved"):
-            x_camera = np.where(after(motion, effect)[:, None], _from(effect.values, x_camera), x_camera)
-        measured = self.optics.reported(x_camera, self.robot.calibration) + self._drift(motion)
-        return Simulated(self, motion, readings, q, chain, frames, x_true, x_placed, x_camera, measured)
+        return q
 
     def place(self, effect: Effect) -> Place:
         """Where an effect of the first stage sits."""
@@ -93,18 +110,29 @@ class Simulation:
             sum(e.value("scale_error") for e in self._of("camera_scale")),
             sum(e.value("focal_error") for e in self._of("camera_focal")),
             sum(e.value("k1") for e in self._of("lens_distortion")),
+            sum(e.value("k2") for e in self._of("lens_distortion")),
         )
+
+    @property
+    def latency_s(self) -> float:
+        """How late the images' time stamps are [s]."""
+        return sum(e.value("latency_s") for e in self._of("camera_latency"))
 
     def _of(self, name: str) -> list[Effect]:
         return [effect for effect in self.effects if effect.name == name]
 
-    def _given_way(self, q: FloatArray) -> FloatArray:
-        """How far the joints give under the arm's weight (n, d) [rad, m]."""
+    @property
+    def bears_weight(self) -> bool:
+        """Whether the joints bear the arm's weight; where they are torque-free, the guiding hand does."""
+        return self.robot.robot.hold != "torque_free"
+
+    def given_way(self, q: FloatArray) -> FloatArray:
+        """How far the joints give under the arm's weight (n, d) [rad, m], their springs unloaded at q (n, d)."""
         springs = np.zeros(q.shape[1])
         for effect in self._of("joint_compliance"):
             springs[self.place(effect).joint] += effect.values[0]
         given = np.zeros_like(q)
-        if springs.any():
+        if springs.any() and self.bears_weight:
             for _ in range(_SPRING_ROUNDS):
                 given = springs * self.gravity.torques(q + given)
         return given
@@ -113,9 +141,7 @@ class Simulation:
         """The chain with its links as they are."""
         chain = self.robot.chain
         fixed = chain.fixed.copy()
-        for effect in self._of("link_geometry"):
-            k = self.place(effect).joint
-            moved = transforms(effect.values[None])[0]
+        for k, moved in self.link_moves:
             if self.upward[k]:
                 fixed[k + 1] = inverse(moved) @ fixed[k + 1]
             else:
@@ -123,12 +149,17 @@ class Simulation:
         return RigidChain(fixed, chain.axes, chain.prismatic)
 
     @cached_property
+    def link_moves(self) -> list[tuple[int, FloatArray]]:
+        """By how much joints' frames are moved: the place in q, and the pose (4, 4) in the frame of the drawing."""
+        return [(self.place(effect).joint, transforms(effect.values[None])[0]) for effect in self._of("link_geometry")]
+
+    @cached_property
     def upward(self) -> list[bool]:
         """Which joints are walked from child to parent on the way from camera to marker (d,)."""
         way = self.robot.tree.path(self.robot.camera.parent_link, self.robot.robot.marker_link)
         return [upward for joint, upward in way if joint.name in self.robot.joints]
 
-    def _tool(self, motion: Motion) -> FloatArray:
+    def tool_shift(self, motion: Motion) -> FloatArray:
         """How far the marker is from its place (n, 3) [m], in its link."""
         shift = np.zeros((len(motion), 3))
         for effect in self._of("tool_offset"):
@@ -137,9 +168,27 @@ class Simulation:
             shift[after(motion, effect)] += effect.values[:3]
         return shift
 
-    def _drift(self, motion: Motion) -> FloatArray | float:
-        """How far what is measured has drifted (n, 3) [m]."""
-        return sum((settled(motion, e.values[3])[:, None] * e.values[:3] for e in self._of("thermal_drift")), 0.0)
+    @property
+    def camera_pose(self) -> FloatArray:
+        """Where the camera was set up (4, 4), in the frame that the description gives it."""
+        T = np.eye(4)
+        for effect in self._of("camera_pose"):
+            T = T @ transforms(effect.values[None])[0]
+        return T
+
+    def camera_moves(self, motion: Motion) -> FloatArray:
+        """Where the camera is (n, 4, 4) in its frame where it was set up."""
+        T = np.tile(np.eye(4), (len(motion), 1, 1))
+        for effect in self._of("camera_moved"):
+            T[after(motion, effect)] @= transforms(effect.values[None, :6])[0]
+        return T
+
+    def added(self, motion: Motion) -> FloatArray:
+        """What is added to what the cameras report (n, 3) [m]: drift and residual."""
+        shift = np.zeros((len(motion), 3)) if self.residual is None else self.residual.predict(motion.q)
+        for effect in self._of("thermal_drift"):
+            shift = shift + settled(motion, effect.values[3])[:, None] * effect.values[:3]
+        return shift
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,6 +240,8 @@ class Simulated:
 
     def _compliance(self, effect: Effect) -> FloatArray:
         k = self.simulation.place(effect).joint
+        if not self.simulation.bears_weight:
+            return np.zeros((len(self.q), 3, 1))
         return self.by_joint[:, :, [k]] * self.torques[:, None, [k]]
 
     def _link(self, effect: Effect) -> FloatArray:
@@ -221,14 +272,19 @@ class Simulated:
 
     def _optics(self, effect: Effect) -> FloatArray:
         optics, calibration = self.simulation.optics, self.simulation.robot.calibration
-        numbers = {"scale_error": optics.scale_error, "focal_error": optics.focal_error, "k1": optics.k1}
-        name = effect.parameters[0].name
-        more, less = (Optics(**(numbers | {name: numbers[name] + step})) for step in (_STEP, -_STEP))
-        change = more.reported(self.x_camera, calibration) - less.reported(self.x_camera, calibration)
-        return (change / (2.0 * _STEP))[:, :, None]
+        columns = []
+        for parameter in effect.parameters:
+            number = getattr(optics, parameter.name)
+            more, less = (replace(optics, **{parameter.name: number + step}) for step in (_STEP, -_STEP))
+            change = more.reported(self.x_camera, calibration) - less.reported(self.x_camera, calibration)
+            columns.append(change / (2.0 * _STEP))
+        return np.stack(columns, axis=2)
 
     def _latency(self, effect: Effect) -> FloatArray:
-        return -np.einsum("nij,nj->ni", self.by_joint, self.motion.rates)[:, :, None]
+        # Through the encoders' own errors: they too are those of the moment before.
+        latency = self.simulation.latency_s
+        later, sooner = (self.simulation.unloaded(self.motion.earlier(latency + s)) for s in (_STEP_S, -_STEP_S))
+        return np.einsum("nij,nj->ni", self.by_joint, (later - sooner) / (2.0 * _STEP_S))[:, :, None]
 
     def _drift(self, effect: Effect) -> FloatArray:
         return _with_moment(settled(self.motion, effect.values[3])[:, None, None] * np.eye(3))
@@ -291,8 +347,8 @@ def transforms(values: FloatArray) -> FloatArray:
 
 
 def settled(motion: Motion, time_constant_s: float) -> FloatArray:
-    """How much of a drift has come (n,), from 0 at the first row towards 1."""
-    return -np.expm1(-(motion.clock - motion.clock[0]) / time_constant_s)
+    """How much of a drift has come (n,), from 0 when the motion began towards 1."""
+    return -np.expm1(-(motion.clock - motion.began) / time_constant_s)
 
 
 def after(motion: Motion, effect: Effect) -> NDArray[np.bool_]:
@@ -304,11 +360,6 @@ def _rotation(values: FloatArray) -> tuple[FloatArray, FloatArray]:
     """The rotation (3, 3) of a pose's values (6, ...), and by how much it turns for a change of its numbers (3, 3)."""
     turns, jacobians = exponentials(values[None, 3:6])
     return turns[0], jacobians[0]
-
-
-def _from(values: FloatArray, x: FloatArray) -> FloatArray:
-    """Points (n, 3) in the frame of a camera that has the pose `values` (6, ...) in theirs."""
-    return (x - values[:3]) @ _rotation(values)[0]
 
 
 def _of_camera(effect: Effect, x: FloatArray) -> FloatArray:

@@ -24,6 +24,8 @@ from .toml_text import toml_text
 CAMERA_LINK = "calibrated_camera"
 MARKER_LINK = "calibrated_marker"
 ROBOT_FILE = "robot.toml"
+# What an extended.toml adds to robot.toml: `effects.files` reads and writes it.
+EXTENSIONS = ("effects", "unexplained")
 _ROUNDING = 1e-12
 # What is next to nothing for a simulator, which would else give a link without a mass one of its own.
 _NO_MASS = (
@@ -128,28 +130,43 @@ def _moved_mesh(name: str, urdf: Path, folder: Path) -> str:
     return _relative(name, urdf.parent, folder)
 
 
-def _relative(path: str, old: Path, new: Path) -> str:
+def _relative(path: str | Path, old: Path, new: Path) -> str:
+    """The name by which a file that is called `path` from the folder `old` is found from the folder `new`."""
     return Path(os.path.relpath(old.resolve() / path, new.resolve())).as_posix()
 
 
-def _tables(robot: RobotDescription, geometry: CalibratedGeometry, folder: Path) -> dict[str, Any]:
-    """The tables of the nominal robot.toml, with what has been learnt in its place."""
+def tables_elsewhere(robot: RobotDescription, folder: Path) -> dict[str, Any]:
+    """The tables of robot.toml for a robot.toml in `folder`, of the same URDF, with a store of its own.
+
+    Raises:
+        ConfigError: the robot.toml cannot be read any more.
+    """
     tables, _ = read_toml(robot.file)
     tables["daemon"] = tables.get("daemon", {}) | {"state_dir": STATE_DIR}
     if "recording" in tables.get("drivers", {}):
         tables["drivers"]["recording"] = _relative(tables["drivers"]["recording"], robot.file.parent, folder)
     described = {key: value for key, value in msgspec.to_builtins(robot.robot).items() if value != {}}
-    tables["robot"] = described | {
+    tables["robot"] = described | {"urdf": _relative(robot.robot.urdf, robot.file.parent, folder)}
+    camera = msgspec.to_builtins(robot.camera)
+    tables["camera"] = {key: value for key, value in camera.items() if value is not None}
+    return tables
+
+
+def _tables(robot: RobotDescription, geometry: CalibratedGeometry, folder: Path) -> dict[str, Any]:
+    """The tables of the nominal robot.toml, with what has been learnt in its place."""
+    tables = tables_elsewhere(robot, folder)
+    for added in EXTENSIONS:  # the geometry was learnt without them
+        tables.pop(added, None)
+    tables["robot"] |= {
         "urdf": robot.tree.file.name,
         "marker_xyz": geometry.marker_xyz.tolist(),
         "marker_known": True,
     }
-    camera = msgspec.to_builtins(robot.camera) | {
+    tables["camera"] |= {
         "xyz": geometry.T_parent_camera[:3, 3].tolist(),
         "rpy": rpy_of(geometry.T_parent_camera[:3, :3]).tolist(),
         "pose_known": True,
     }
-    tables["camera"] = {key: value for key, value in camera.items() if value is not None}
     return tables
 
 

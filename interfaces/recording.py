@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
-from typing import Self
+from typing import Self, TextIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,8 +15,10 @@ from .errors import RecordingError
 from .recording_columns import (
     CENTRES,
     COVARIANCE,
+    EXTRA_PREFIXES,
     ORIENTATION,
     POSITION,
+    RESERVED,
     SIGMA,
     Fault,
     Table,
@@ -26,8 +28,8 @@ from .recording_columns import (
     extra_columns,
     full_covariances,
 )
-from .recording_csv import FIRST_ROW_LINE, read_csv_table, write_csv_rows
-from .recording_parquet import INTEGER_COLUMNS, read_parquet_table, write_parquet_table
+from .recording_csv import FIRST_ROW_LINE, csv_columns, read_csv_table, write_csv_rows
+from .recording_parquet import INTEGER_COLUMNS, parquet_columns, read_parquet_table, write_parquet_table
 from .records import FloatArray, frozen_array
 
 CSV, PARQUET = ".csv", ".parquet"
@@ -177,14 +179,18 @@ class Recording:
         Raises:
             RecordingError: the file cannot be written.
         """
-        table = self.to_table()
-        integers = frozenset(i for i, name in enumerate(table.names) if name in INTEGER_COLUMNS)
         try:
             with file.open("w", encoding="utf-8", newline="\n") as out:
-                out.write(",".join(table.names) + "\n")
-                write_csv_rows(out, table.values.tolist(), integers)
+                self.write_csv_to(out)
         except OSError as error:
             raise RecordingError(f"cannot be written: {error.strerror or error}", file=file) from error
+
+    def write_csv_to(self, out: TextIO) -> None:
+        """Write CSV to an open file; OSError when that fails."""
+        table = self.to_table()
+        integers = frozenset(i for i, name in enumerate(table.names) if name in INTEGER_COLUMNS)
+        out.write(",".join(table.names) + "\n")
+        write_csv_rows(out, table.values.tolist(), integers)
 
     def write_parquet(self, file: Path) -> None:
         """Write Parquet; reading it gives every number back exactly.
@@ -236,6 +242,29 @@ class Recording:
         check_header(table.names, self.joints)
         check_finite(table)
         check_values(table)
+
+
+def joints_in(file: Path) -> tuple[str, ...]:
+    """The joints of a recording, by its columns: all that have no name of another meaning, in their order.
+
+    Raises:
+        RecordingError: the file cannot be read.
+    """
+    readers = {CSV: csv_columns, PARQUET: parquet_columns}
+    reader = readers.get(file.suffix.lower())
+    if reader is None:
+        raise RecordingError(f"recordings end in {CSV} or {PARQUET}", file=file, remedy="Rename or convert it")
+    try:
+        names = reader(file)
+    except Fault as fault:
+        raise _located(fault, file) from None
+    except OSError as error:
+        raise _unreadable(file, error) from error
+    others = {prefix + name for prefix in EXTRA_PREFIXES for name in names}
+    joints = tuple(name for name in names if name not in RESERVED and name not in others)
+    if not joints:
+        raise RecordingError("no column is a joint's", file=file, remedy="Name a recording of joints and positions")
+    return joints
 
 
 def _unreadable(file: Path, error: OSError) -> RecordingError:

@@ -45,6 +45,20 @@ def read_csv_table(file: Path, joints: tuple[str, ...]) -> Table:
     return table
 
 
+def csv_columns(file: Path) -> tuple[str, ...]:
+    """The names of the columns of `file`.
+
+    Raises:
+        Fault: it is no text, or empty.
+        OSError: it cannot be read.
+    """
+    with file.open("rb") as stream:
+        header = _decoded(stream.readline()).rstrip("\r\n")
+    if not header.strip():
+        raise Fault("the file is empty", remedy="A recording has a header line and at least one row")
+    return tuple(name.strip() for name in header.split(","))
+
+
 def write_csv_rows(out: TextIO, rows: Iterable[Iterable[float]], integers: frozenset[int]) -> None:
     """Append rows; columns whose index is in `integers` are written without a decimal point."""
     out.writelines(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -21,15 +23,9 @@ def read_parquet_table(file: Path, joints: tuple[str, ...]) -> Table:
         Fault: something is wrong with the file.
         OSError: the file cannot be read.
     """
-    arrow, parquet = _modules(file)
-    with file.open("rb") as stream:
-        try:
-            content = parquet.ParquetFile(stream).read()
-        except (arrow.ArrowException, OSError, ValueError) as error:
-            raise Fault(
-                f"not a whole Parquet file: {_first_line(error)}",
-                remedy="Write it again; a Parquet file whose writing was cut off cannot be read",
-            ) from error
+    arrow, _ = _modules(file)
+    with _opened(file) as parquet:
+        content = parquet.read()
     names = tuple(content.column_names)
     check_header(names, joints)
     if content.num_rows == 0:
@@ -38,6 +34,26 @@ def read_parquet_table(file: Path, joints: tuple[str, ...]) -> Table:
     table = Table(names, values)
     check_finite(table)
     return table
+
+
+def parquet_columns(file: Path) -> tuple[str, ...]:
+    """The names of the columns of `file`; raises as `read_parquet_table`."""
+    with _opened(file) as parquet:
+        return tuple(parquet.schema_arrow.names)
+
+
+@contextmanager
+def _opened(file: Path) -> Iterator[Any]:
+    """The Parquet file; a Fault where what is read of it inside is not whole."""
+    arrow, parquet = _modules(file)
+    with file.open("rb") as stream:
+        try:
+            yield parquet.ParquetFile(stream)
+        except (arrow.ArrowException, OSError, ValueError) as error:
+            raise Fault(
+                f"not a whole Parquet file: {_first_line(error)}",
+                remedy="Write it again; a Parquet file whose writing was cut off cannot be read",
+            ) from error
 
 
 def write_parquet_table(file: Path, table: Table) -> None:

@@ -78,6 +78,28 @@ def convert(tables: object, kind: type[T], *, file: Path, text: str, prefix: tup
         raise _located(str(error), kind, file, text, prefix) from error
 
 
+def line_in_entry(text: str, name: str, place: int, key: str | None = None) -> int | None:
+    """The line (from 1) of `key` in the entry `place` (from 0) of the list of tables [[name]].
+
+    That of the entry's heading where it has no such key, that of the list where it is written in another way.
+    """
+    lines = text.splitlines()
+    headings = [k for k, line in enumerate(lines) if (m := _HEADER.match(line)) and _is_entry(line, m[1], name)]
+    if place >= len(headings):
+        return line_of(text, (name,))
+    first = headings[place]
+    for number, line in enumerate(lines[first + 1 :], first + 2):
+        if _HEADER.match(line):
+            break
+        if key is not None and (given := _KEY.match(line)) and _dotted(given[1]) == (key,):
+            return number
+    return first + 1
+
+
+def _is_entry(line: str, header: str, name: str) -> bool:
+    return line.lstrip().startswith("[[") and _dotted(header) == (name,)
+
+
 def line_of(text: str, keys: tuple[str, ...]) -> int | None:
     """The line (from 1) that gives the longest leading part of the key path `keys`; None when no line gives any."""
     best: int | None = None

@@ -16,13 +16,31 @@ def toml_text(tables: Mapping[str, Any]) -> str:
 
 
 def _tables(path: tuple[str, ...], table: Mapping[str, Any]) -> list[list[str]]:
-    """One list of lines for each table: plain values first, since they belong to the last heading."""
-    own = [f"[{'.'.join(map(_key, path))}]"] if path else []
-    own += [f"{_key(name)} = {_value(value)}" for name, value in table.items() if not isinstance(value, Mapping)]
-    inner = [
-        lines for name, value in table.items() if isinstance(value, Mapping) for lines in _tables((*path, name), value)
-    ]
-    return [own, *inner] if own else inner
+    """One list of lines for each table, under its heading."""
+    heading = [f"[{_dotted(path)}]"] if path else []
+    own, inner = _parts(path, table)
+    return [heading + own, *inner] if heading or own else inner
+
+
+def _parts(path: tuple[str, ...], table: Mapping[str, Any]) -> tuple[list[str], list[list[str]]]:
+    """The lines of a table's plain values, which come first since they belong to the last heading; then its tables."""
+    own: list[str] = []
+    inner: list[list[str]] = []
+    for name, value in table.items():
+        below = (*path, name)
+        if isinstance(value, Mapping):
+            inner += _tables(below, value)
+        elif isinstance(value, list | tuple) and value and all(isinstance(entry, Mapping) for entry in value):
+            for entry in value:
+                plain, tables = _parts(below, entry)
+                inner += [[f"[[{_dotted(below)}]]", *plain], *tables]
+        else:
+            own.append(f"{_key(name)} = {_value(value)}")
+    return own, inner
+
+
+def _dotted(path: tuple[str, ...]) -> str:
+    return ".".join(map(_key, path))
 
 
 def _value(value: object) -> str:

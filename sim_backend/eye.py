@@ -40,19 +40,18 @@ class StereoEyes:
         self._bgr = np.array(config.ball_rgb[::-1])
 
     def paint(
-        self, number: int, T_world_camera: FloatArray, x_world: FloatArray, images: tuple[ImageArray, ImageArray]
+        self, number: int, T_world_camera: FloatArray, x_eyes: FloatArray, images: tuple[ImageArray, ImageArray]
     ) -> None:
         """Paint frame `number` into the left and the right image (height, width, 3), BGR.
 
         Args:
             T_world_camera: pose of the left eye (4, 4).
-            x_world: centre of the ball (3,) [m].
+            x_eyes: where the ball's centre looks to be in each eye's optical frame (2, 3) [m].
         """
         far = background(self._room, self._directions, T_world_camera[:3, :3])
         rng = generator(self._seed, Stream.IMAGE_NOISE, number)
         T_world_eye = T_world_camera.copy()
-        for image in images:
-            x_eye = T_world_eye[:3, :3].T @ (x_world - T_world_eye[:3, 3])
+        for image, x_eye in zip(images, x_eyes, strict=True):
             self._paint_scene(image, T_world_eye, far)
             self._paint_ball(image, T_world_eye, x_eye)
             self._add_noise(image, rng)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from contextlib import ExitStack
-from dataclasses import dataclass
 from math import lcm
 from types import TracebackType
 from typing import Self
@@ -19,41 +18,16 @@ from .config import SimConfig
 from .encoders import Encoders
 from .gaze import Gaze
 from .hand import VirtualHand
+from .joints import JointPaths
 from .path import GuidePath
 from .physics_urdf import physics_urdf
 from .randomness import Stream, generator
 from .roles import JointRoles
+from .scene import Scene, scene_of
 from .sight import Sight
 from .truth import TrueRobot
 
 _SLOWEST_PHYSICS_HZ = 240
-
-
-@dataclass(frozen=True, slots=True)
-class Scene:
-    """What a frame shows.
-
-    Attributes:
-        angles: true joint angles [rad or m], shape (d,).
-        T_world_camera: pose of the left eye, shape (4, 4).
-        x_world: centre of the ball [m], shape (3,).
-    """
-
-    angles: FloatArray
-    T_world_camera: FloatArray
-    x_world: FloatArray
-
-
-def scene_of(body: Body, truth: TrueRobot, marker_xyz: FloatArray) -> Scene:
-    """What a frame shows of a body as it stands, with its tool's marker described at `marker_xyz` (3,) [m]."""
-    robot = truth.robot
-    T_world_hand = body.link_pose(robot.robot.marker_link)
-    marker = truth.marker(marker_xyz)
-    return Scene(
-        angles=body.angles(),
-        T_world_camera=body.link_pose(robot.camera.parent_link) @ truth.T_parent_camera,
-        x_world=T_world_hand[:3, :3] @ marker + T_world_hand[:3, 3],
-    )
 
 
 def physics_rate(encoder_hz: int, camera_hz: int) -> int:
@@ -74,6 +48,7 @@ class Physics:
         self._encoders = Encoders(
             config.encoders, truth.offsets, truth.robot.chain.prismatic, generator(config.seed, Stream.ENCODERS)
         )
+        self._paths = JointPaths(truth, self.rate_hz, config.camera.rate_hz, begins=1.0 / config.camera.rate_hz)
         self._exit = ExitStack()
 
     def __enter__(self) -> Self:
@@ -81,6 +56,8 @@ class Physics:
         with ExitStack() as stack:
             self.body = stack.enter_context(Body(self.urdf, robot.joints, dt=1 / self.rate_hz))
             watched = stack.enter_context(Body(self.urdf, robot.joints))
+            # What the cameras see stands where the joints really are.
+            self._seen = self.body if self._paths.plain else stack.enter_context(Body(self.urdf, robot.joints))
             roles = JointRoles.of(robot)
             self._gazing = list(roles.gaze)
             self._gaze = Gaze(robot, self._calibration, roles.gaze, config.guide.gaze_speed_rad_s)
@@ -96,6 +73,7 @@ class Physics:
             self._hand = VirtualHand(self.body, self._truth, roles, config.guide, self._path.waypoints)
             start = self._path.waypoints[0]
             self.body.set_angles(start - self._truth.offsets)
+            self._paths.record(self.body.angles(), 0.0)
             self._command = start[self._gazing]
             self._plan(start)
             self._arm = TorqueFreeArm(
@@ -117,16 +95,19 @@ class Physics:
         self._next += 1
         self._arm.step(self._command - self._truth.offsets[self._gazing])
         self.steps += 1
+        self._paths.record(self.body.angles(), self.steps / self.rate_hz)
 
     def read_encoders(self) -> FloatArray:
         """A reading (d,) of all encoders; the gaze follows it."""
-        q = self._encoders.read(self.body.angles())
+        q = self._encoders.read(self._paths.read)
         self._command = self._gaze.track(q, self._command, 1 / self._config.encoders.rate_hz)
         return q
 
     def scene(self) -> Scene:
         """What a frame taken now shows."""
-        return scene_of(self.body, self._truth, self.marker_xyz)
+        if not self._paths.plain:
+            self._seen.set_angles(self._paths.seen)
+        return scene_of(self._seen, self._truth, self.marker_xyz, self._calibration, self._paths.row)
 
     def change_tool(self, marker_xyz: FloatArray) -> None:
         """From now on the hand holds a tool with its marker at `marker_xyz` (3,) [m] in the marker link."""

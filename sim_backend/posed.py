@@ -9,6 +9,7 @@ from typing import Self
 
 import numpy as np
 
+from effects import Motion, Simulation
 from interfaces.clock import SystemClock
 from interfaces.errors import SourceEnded
 from interfaces.records import FloatArray, JointReading, StereoFrame, frozen_array
@@ -18,10 +19,10 @@ from kbmaps import RigidChain
 from .bullet import Body
 from .config import SimConfig
 from .encoders import Encoders
-from .physics import scene_of
 from .physics_urdf import physics_urdf
 from .randomness import Stream, generator
 from .render_client import RenderProcess
+from .scene import Scene, scene_of
 from .sources import SimClock, SimJoints, SimStereoCamera
 from .truth import TrueRobot
 from .world import stereo_calibration, stereo_frame
@@ -40,13 +41,17 @@ class PosedWorld:
     Args:
         robot: the robot as described; it needs a stereo calibration.
         postures: reported joint angles (n, d) [rad or m] to go to; encoders report them in whole ticks.
+        extension: the robot with effects, to which the drawn errors come; None: it has none. A late time stamp is none
+            of a robot that stands still.
 
     Raises:
         ConfigError: [camera] has no stereo calibration, or pybullet is not installed (both on entering).
     """
 
-    def __init__(self, robot: RobotDescription, config: SimConfig, postures: FloatArray) -> None:
-        self.robot, self.config = robot, config
+    def __init__(
+        self, robot: RobotDescription, config: SimConfig, postures: FloatArray, extension: Simulation | None = None
+    ) -> None:
+        self.robot, self.config, self._extension = robot, config, extension
         self.clock = SimClock(self.now)
         self._postures = frozen_array(postures)
         self._fetching = threading.Lock()
@@ -54,8 +59,8 @@ class PosedWorld:
         self._read = self._asked = self._delivered = 0
 
     def __enter__(self) -> Self:
-        calibration = stereo_calibration(self.robot)
-        self._truth = TrueRobot.draw(self.robot, self.config)
+        self._calibration = calibration = stereo_calibration(self.robot)
+        self._truth = TrueRobot.draw(self.robot, self.config, self._extension)
         self._marker = np.array(self.robot.robot.marker_xyz)
         self._encoders = Encoders(
             self.config.encoders,
@@ -63,13 +68,13 @@ class PosedWorld:
             self.robot.chain.prismatic,
             generator(self.config.seed, Stream.ENCODERS),
         )
+        self._angles = self._true_angles()
         urdf = physics_urdf(self._truth)
         with ExitStack() as stack:
             self._body = stack.enter_context(Body(urdf, self.robot.joints))
             link = self.robot.robot.marker_link
-            renderer = RenderProcess(urdf, self.robot.joints, link, calibration, self.config)
+            renderer = RenderProcess(urdf, self.robot.joints, link, self._truth.true_eyes(calibration), self.config)
             self._renderer = stack.enter_context(renderer)
-            self._renderer.hold_tool(self._truth.marker(self._marker))
             self._exit = stack.pop_all()
         self.joints = SimJoints(self)
         self.camera = SimStereoCamera(self, calibration)
@@ -121,6 +126,19 @@ class PosedWorld:
 
     def _ask_ahead(self) -> None:
         while self._asked < min(self._delivered + _AHEAD, len(self._postures)):
-            self._body.set_angles(self._postures[self._asked] - self._truth.offsets)
-            self._renderer.request(self._asked, scene_of(self._body, self._truth, self._marker))
+            self._renderer.request(self._asked, self.scene(self._asked))
             self._asked += 1
+
+    def scene(self, number: int) -> Scene:
+        """What the frame of posture `number` shows."""
+        self._body.set_angles(self._angles[number])
+        row = Motion.at(self._postures[number], (number + 1) * PERIOD_S, PERIOD_S)
+        return scene_of(self._body, self._truth, self._marker, self._calibration, row)
+
+    def _true_angles(self) -> FloatArray:
+        """True joint angles in all postures (n, d) [rad or m]."""
+        count = len(self._postures)
+        times = PERIOD_S * np.arange(1.0, count + 1.0)
+        beyond, motion = self._truth.beyond, Motion(self._postures, times, np.zeros(count, dtype=np.int64))
+        unloaded = beyond.unloaded(motion) - self._truth.offsets
+        return unloaded + beyond.given_way(unloaded)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from effects import Simulation
 from interfaces.errors import ConfigError
 from interfaces.records import FloatArray
 from interfaces.robot import RobotDescription
@@ -24,14 +25,19 @@ _MOST_BATCHES = 400
 _WANDER = np.radians(20.0)
 
 
-def visible_postures(robot: RobotDescription, config: SimConfig, count: int) -> FloatArray:
+def visible_postures(
+    robot: RobotDescription, config: SimConfig, count: int, extension: Simulation | None = None
+) -> FloatArray:
     """Postures (count, d) [rad or m], as encoders report them: guided joints uniform over their ranges, the head about
     where it would look at the marker, uniform as well, as far as the true cameras see the marker.
+
+    Args:
+        extension: the robot with effects; those that no chain has in it are not counted.
 
     Raises:
         ConfigError: the cameras see the marker in too few of the postures that were drawn.
     """
-    calibration, truth = stereo_calibration(robot), TrueRobot.draw(robot, config)
+    calibration, truth = stereo_calibration(robot), TrueRobot.draw(robot, config, extension)
     roles, rng = JointRoles.of(robot), generator(config.seed, Stream.WAYPOINTS)
     guided, gaze = list(roles.guided), list(roles.gaze)
     found: list[FloatArray] = []

@@ -16,11 +16,11 @@ import numpy as np
 
 from interfaces.camera import StereoCalibration
 from interfaces.errors import SourceLost
-from interfaces.records import FloatArray, ImageArray
+from interfaces.records import ImageArray
 
 from .config import SimConfig
-from .physics import Scene
 from .render_messages import SLOTS, Frame, Setup, Tool, frame_bytes, send, slot_images
+from .scene import Scene
 
 _END_S = 5.0
 
@@ -67,6 +67,7 @@ class RenderProcess:
             stack.callback(self._end)
             stack.callback(os.close, self._requests)
             self._send(self._setup)
+            self._tip: tuple[float, float, float] | None = None
             self._exit = stack.pop_all()
         return self
 
@@ -75,18 +76,18 @@ class RenderProcess:
     ) -> None:
         self._exit.__exit__(kind, error, trace)
 
-    def hold_tool(self, tip: FloatArray) -> None:
-        """Frames requested from now on show a stick to `tip` (3,) [m] in the marker link."""
-        self._send(Tool(tip=(float(tip[0]), float(tip[1]), float(tip[2]))))
-
     def request(self, number: int, scene: Scene) -> None:
-        """Ask for frame `number`."""
+        """Ask for frame `number`, with a stick from the hand to where the tool ends."""
+        tip = (float(scene.tip[0]), float(scene.tip[1]), float(scene.tip[2]))
+        if tip != self._tip:
+            self._send(Tool(tip=tip))
+            self._tip = tip
         self._send(
             Frame(
                 number=number,
                 angles=scene.angles.tolist(),
                 T_world_camera=scene.T_world_camera.ravel().tolist(),
-                x_world=scene.x_world.tolist(),
+                x_eyes=scene.x_eyes.ravel().tolist(),
             )
         )
 

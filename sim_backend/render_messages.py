@@ -44,13 +44,13 @@ class Frame(msgspec.Struct, frozen=True, tag=True):
     Attributes:
         angles: true joint angles [rad or m].
         T_world_camera: pose of the left eye, row by row, 16 numbers.
-        x_world: centre of the ball [m].
+        x_eyes: where the ball's centre looks to be in the left, then in the right eye's frame [m], 6 numbers.
     """
 
     number: int
     angles: list[float]
     T_world_camera: list[float]
-    x_world: list[float]
+    x_eyes: list[float]
 
 
 Message = Setup | Tool | Frame

@@ -92,7 +92,8 @@ def serve(memory: int, requests: int, answers: int) -> None:
 def _paint(frame: Frame, body: Body, stick: Stick, eyes: StereoEyes, images: tuple[ImageArray, ImageArray]) -> None:
     body.set_angles(np.array(frame.angles))
     stick.follow()
-    eyes.paint(frame.number, np.array(frame.T_world_camera).reshape(4, 4), np.array(frame.x_world), images)
+    T_world_camera, x_eyes = np.array(frame.T_world_camera).reshape(4, 4), np.array(frame.x_eyes).reshape(2, 3)
+    eyes.paint(frame.number, T_world_camera, x_eyes, images)
 
 
 def _next(requests: int) -> Message | None:

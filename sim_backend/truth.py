@@ -7,6 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from effects import Effect, Simulation
+from interfaces.camera import StereoCalibration
 from interfaces.records import FloatArray, frozen_array
 from interfaces.robot import RobotDescription
 from interfaces.urdf import MOVING, UrdfJoint, UrdfTree, chain_between
@@ -18,6 +20,8 @@ from .randomness import Stream, generator
 
 # A slide's zero is known better than a turn's: metres for radians, at this rate.
 _METRES_PER_RADIAN = 0.1
+# Effects that a true kinematic chain has in it.
+GEOMETRY = frozenset({"joint_offset", "link_geometry", "tool_offset", "camera_pose"})
 
 
 @dataclass(frozen=True)
@@ -26,6 +30,7 @@ class TrueRobot:
 
     Attributes:
         robot: its description, the nominal model.
+        beyond: the robot with those of its effects, and the residual, that no chain has in it.
         tree: its true kinematics; joints that are not learnt are locked (kind fixed, their position in their origin).
         offsets: reported minus true angle [rad or m], shape (d,), in the order of `robot.joints`.
         T_parent_camera: true pose of the left eye in the camera's parent link, shape (4, 4).
@@ -33,43 +38,64 @@ class TrueRobot:
     """
 
     robot: RobotDescription
+    beyond: Simulation
     tree: UrdfTree
     offsets: FloatArray
     T_parent_camera: FloatArray
     tool_error: FloatArray
 
     @classmethod
-    def draw(cls, robot: RobotDescription, config: SimConfig) -> TrueRobot:
-        """Draw the true robot; the same description and configuration give the same one."""
+    def draw(cls, robot: RobotDescription, config: SimConfig, extension: Simulation | None = None) -> TrueRobot:
+        """Draw the true robot; the same arguments give the same one.
+
+        Args:
+            extension: the robot with effects, to which the drawn errors come; None: it has none.
+        """
+        extension = Simulation(robot) if extension is None else extension
         rng = generator(config.seed, Stream.ERRORS)
         errors = config.errors
         way = [joint.name for joint, _ in robot.tree.path(robot.camera.parent_link, robot.robot.marker_link)]
         moving = [name for name in way if robot.tree.joints[name].kind in MOVING]
         offsets = {name: _offset(robot.tree.joints[name], errors, rng) for name in moving}
+        for effect in _named(extension, "joint_offset"):
+            offsets[effect.where or ""] -= effect.values[0]
         joints = dict(robot.tree.joints)
+        for place, moved in extension.link_moves:
+            joint = joints[robot.joints[place]]
+            joints[joint.name] = replace(joint, T_parent_joint=frozen_array(joint.T_parent_joint @ moved))
         for name in moving:
             error = _pose_error(errors.link_length_m, errors.link_axis_rad, rng)
             joints[name] = replace(joints[name], T_parent_joint=frozen_array(joints[name].T_parent_joint @ error))
         camera_error = _pose_error(errors.camera_position_m, errors.camera_rotation_rad, rng)
         tool_error = errors.tool_m * rng.standard_normal(3)
+        for effect in _named(extension, "tool_offset"):
+            tool_error = tool_error + effect.values
         for name, joint in joints.items():
             if joint.kind in MOVING and name not in robot.joints:
                 held_at = robot.robot.held_at.get(name, 0.0) - offsets.get(name, 0.0)
                 joints[name] = _locked(joint, held_at)
         return cls(
             robot=robot,
+            beyond=extension.with_effects([effect for effect in extension.effects if effect.name not in GEOMETRY]),
             tree=replace(robot.tree, joints=joints),
             offsets=frozen_array([offsets[name] for name in robot.joints]),
-            T_parent_camera=frozen_array(robot.camera.pose @ camera_error),
+            T_parent_camera=frozen_array(robot.camera.pose @ extension.camera_pose @ camera_error),
             tool_error=frozen_array(tool_error),
         )
+
+    def true_eyes(self, calibration: StereoCalibration) -> StereoCalibration:
+        """The described calibration with the true distance of the eyes."""
+        return replace(calibration, baseline_m=calibration.baseline_m / (1.0 + self.beyond.optics.scale_error))
 
     def marker(self, marker_xyz: FloatArray) -> FloatArray:
         """Where the marker of a tool described by `marker_xyz` (3,) really is in the marker link [m]."""
         return marker_xyz + self.tool_error
 
     def chain(self, marker_xyz: FloatArray) -> RigidChain:
-        """True left eye to true marker over the reported angles, for a tool described by `marker_xyz` (3,) [m]."""
+        """True left eye to true marker over the reported angles, for a tool described by `marker_xyz` (3,) [m].
+
+        Without the effects that are `beyond` any chain.
+        """
         chain = chain_between(
             self.tree,
             self.robot.joints,
@@ -88,6 +114,10 @@ def with_offsets(chain: RigidChain, offsets: FloatArray) -> RigidChain:
     for k, offset in enumerate(offsets):
         fixed[k + 1] = joint_motion(chain.axes[k], bool(chain.prismatic[k]), -offset) @ fixed[k + 1]
     return RigidChain(fixed=fixed, axes=chain.axes, prismatic=chain.prismatic)
+
+
+def _named(simulation: Simulation, name: str) -> list[Effect]:
+    return [effect for effect in simulation.effects if effect.name == name]
 
 
 def _offset(joint: UrdfJoint, errors: ErrorConfig, rng: np.random.Generator) -> float:

@@ -13,6 +13,7 @@ from typing import Self
 
 import numpy as np
 
+from effects import Simulation
 from interfaces.camera import StereoCalibration
 from interfaces.clock import SystemClock
 from interfaces.errors import ConfigError, SourceEnded, SourceError
@@ -50,13 +51,14 @@ class SimWorld:
 
     Args:
         robot: the robot as described; it needs a stereo calibration.
+        extension: the robot with effects, to which the drawn errors come; None: it has none.
 
     Raises:
         ConfigError: [camera] has no stereo calibration, or pybullet is not installed (both on entering).
     """
 
-    def __init__(self, robot: RobotDescription, config: SimConfig) -> None:
-        self.robot, self.config = robot, config
+    def __init__(self, robot: RobotDescription, config: SimConfig, extension: Simulation | None = None) -> None:
+        self.robot, self.config, self._extension = robot, config, extension
         self.clock = SimClock(self.now)
         self.stats = WorldStats()
         self._moved = threading.Condition()
@@ -71,15 +73,18 @@ class SimWorld:
 
     def __enter__(self) -> Self:
         calibration = stereo_calibration(self.robot)
-        self._truth = TrueRobot.draw(self.robot, self.config)
+        self._truth = TrueRobot.draw(self.robot, self.config, self._extension)
         with ExitStack() as stack:
             self._physics = stack.enter_context(Physics(self._truth, calibration, self.config))
             self._renderer = stack.enter_context(
                 RenderProcess(
-                    self._physics.urdf, self.robot.joints, self.robot.robot.marker_link, calibration, self.config
+                    self._physics.urdf,
+                    self.robot.joints,
+                    self.robot.robot.marker_link,
+                    self._truth.true_eyes(calibration),
+                    self.config,
                 )
             )
-            self._renderer.hold_tool(self._truth.marker(self._physics.marker_xyz))
             self.joints = SimJoints(self)
             self.camera = SimStereoCamera(self, calibration)
             self._exit = stack.pop_all()
@@ -118,7 +123,10 @@ class SimWorld:
             return self.now()
 
     def true_chain(self) -> RigidChain:
-        """The truth, for judges: true left eye to true marker over the angles that the encoders report."""
+        """The truth, for judges: true left eye to true marker over the angles that the encoders report.
+
+        Of the effects that `extension` has, only those that a chain can have in it.
+        """
         with self._moved:
             wanted = self._physics.marker_xyz if self._wanted_tool is None else self._wanted_tool
             return self._truth.chain(wanted)
@@ -188,7 +196,6 @@ class SimWorld:
         """The frames that were under way are lost."""
         self._renderer.__exit__(None, None, None)
         self._renderer.__enter__()
-        self._renderer.hold_tool(self._truth.marker(self._physics.marker_xyz))
         self._delivered = self._taken
         self._frame_times.clear()
 
@@ -225,7 +232,6 @@ class SimWorld:
         if self._wanted_tool is None:
             return
         self._physics.change_tool(self._wanted_tool)
-        self._renderer.hold_tool(self._truth.marker(self._wanted_tool))
         self._wanted_tool = None
         self.stats.tool_changes += 1
 
@@ -236,15 +242,20 @@ def _check_open(is_open: bool) -> None:
 
 
 def true_chain(
-    robot: RobotDescription, config: SimConfig, marker_xyz: tuple[float, float, float] | FloatArray | None = None
+    robot: RobotDescription,
+    config: SimConfig,
+    marker_xyz: tuple[float, float, float] | FloatArray | None = None,
+    *,
+    extension: Simulation | None = None,
 ) -> RigidChain:
     """The truth of the world that `robot` and `config` would open, for judges in another process; needs no pybullet.
 
     Args:
         marker_xyz: the described marker of the tool in the hand [m]; None for that of robot.toml.
+        extension: the robot with effects; those that no chain has in it are left out.
     """
     described = robot.robot.marker_xyz if marker_xyz is None else marker_xyz
-    return TrueRobot.draw(robot, config).chain(np.array(described, dtype=np.float64))
+    return TrueRobot.draw(robot, config, extension).chain(np.array(described, dtype=np.float64))
 
 
 def stereo_calibration(robot: RobotDescription) -> StereoCalibration:

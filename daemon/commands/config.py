@@ -14,6 +14,7 @@ from daemon.commands.options import HERE, RobotFile, flag
 
 if TYPE_CHECKING:
     from daemon.robot_template import Guess
+    from effects import Effect
     from interfaces.robot import RobotDescription
     from interfaces.urdf import UrdfTree
 
@@ -89,6 +90,10 @@ def check(*, robot: RobotFile = HERE) -> None:
     )
     stereo = "described" if description.calibration else "not described: no images can be used, recordings can"
     say(f"  stereo calibration {stereo}")
+    for effect in checked.simulation.effects:
+        say(f"  effect {effect_line(effect)}")
+    if checked.tables.unexplained is not None:
+        say(f"  what is unexplained is learnt over {', '.join(checked.tables.unexplained['joints'])}")
     say(f"  sampler on {zenoh.sampler}, learner on {zenoh.learner}")
     say(f"  state in {checked.state_dir}")
 
@@ -110,6 +115,14 @@ def show(*, robot: RobotFile = HERE) -> None:
     tables["robot"] = msgspec.to_builtins(checked.robot.robot)
     tables["camera"] = msgspec.to_builtins(checked.robot.camera)
     say(msgspec.json.format(msgspec.json.encode(tables)).decode())
+
+
+def effect_line(effect: Effect) -> str:
+    """An effect in one line: name, place, numbers."""
+    place = "" if effect.where is None else f" at {effect.where}"
+    source = "" if effect.source is None else f", from {effect.source}"
+    numbers = (f"{p.name} = {value:.4g}" for p, value in zip(effect.parameters, effect.values, strict=True))
+    return f"{effect.name}{place}{source}: {', '.join(numbers)}"
 
 
 def _numbers(values: Iterable[float]) -> str:

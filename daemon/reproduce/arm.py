@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from daemon.config import Config, DaemonConfig, Tables
 from daemon.wiring import demonstration_model
+from effects import Simulation
 from interfaces.records import FloatArray
 from interfaces.robot import RobotDescription
 from interfaces.toml_file import read_toml
@@ -59,7 +60,7 @@ def configuration(joints: Sequence[str], state_dir: Path, rules: DaemonConfig, *
     tables["sim"] = {**tables.get("sim", {}), "seed": sim_seed}
     robot = RobotDescription.from_tables(tables, text, file)
     parsed = msgspec.structs.replace(msgspec.convert(tables, Tables), daemon=rules)
-    return Config(file, robot, parsed).with_state_dir(state_dir)
+    return Config(file, robot, parsed, Simulation(robot)).with_state_dir(state_dir)
 
 
 def arm(joints: int | Sequence[str]) -> RigidChain:

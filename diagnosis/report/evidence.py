@@ -95,32 +95,43 @@ def _cycles(effect: Effect) -> float | None:
     return float(effect.values[2]) / (1.0 if effect.prismatic else 2.0 * np.pi)
 
 
-def _over(residuals: Residuals, effect: Effect, x: FloatArray, label: str) -> Panel:
-    """A joint's error over something that is no reading, with the fitted one."""
+def _over(residuals: Residuals, effect: Effect, x: FloatArray, label: str, correction: FloatArray) -> Panel:
+    """A joint's error over something that is no reading, with the fitted correction (n,) [rad, m]."""
     k = residuals.run.simulation.place(effect).joint
-    partial, own = _partial(residuals, effect)
+    factor, unit = residuals.unit(k)
+    partial, _ = _partial(residuals, effect)
     rows = residuals.telling(k)
-    fitted = residuals.as_angle(k, own)
     order = rows[np.argsort(x[rows], kind="stable")]
+    curve = (x[order], factor * correction[order])
+    axes = (label, f"{effect.where}: true less read [{unit}]")
     title = f"How far {effect.where} is from its reading"
-    axes = (label, f"{effect.where}: true less read [{residuals.unit(k)[1]}]")
-    return _drawn(residuals, rows, (x, residuals.as_angle(k, partial)), (x[order], fitted[order]), title, axes)
+    return _drawn(residuals, rows, (x, residuals.as_angle(k, partial)), curve, title, axes)
+
+
+def _remembered(residuals: Residuals, effect: Effect) -> FloatArray:
+    """The correction (n,) of an effect that depends on the order of the readings."""
+    assert effect.kind.encoder is not None
+    place = residuals.run.simulation.place(effect)
+    return effect.kind.encoder.correction(residuals.run.readings, place, effect.values)
 
 
 def _jump(residuals: Residuals, effect: Effect) -> Panel:
-    return _over(residuals, effect, residuals.clock, residuals.clock_label)
+    correction = _remembered(residuals, effect)
+    return _over(residuals, effect, residuals.clock, residuals.clock_label, correction)
 
 
 def _settling(residuals: Residuals, effect: Effect) -> Panel:
     k = residuals.run.simulation.place(effect).joint
     factor, unit = residuals.unit(k)
-    return _over(residuals, effect, factor * residuals.motion.moves[:, k], f"last move of {effect.where} [{unit}]")
+    label = f"last move of {effect.where} [{unit}]"
+    return _over(residuals, effect, factor * residuals.motion.moves[:, k], label, _remembered(residuals, effect))
 
 
 def _compliance(residuals: Residuals, effect: Effect) -> Panel:
     k = residuals.run.simulation.place(effect).joint
-    unit = "N" if residuals.slides(k) else "N·m"
-    return _over(residuals, effect, residuals.run.torques[:, k], f"gravity on {effect.where} [{unit}]")
+    torque = residuals.run.torques[:, k]
+    label = f"gravity on {effect.where} [{'N' if residuals.slides(k) else 'N·m'}]"
+    return _over(residuals, effect, torque, label, effect.values[0] * torque)
 
 
 def _backlash(residuals: Residuals, effect: Effect) -> Panel:

@@ -12,8 +12,8 @@ from ..result import Cause, DiagnosisFile, Indistinguishable, Rejected
 NEAREST = 12
 _ERRORS = (
     ("nominal", "The simulation as it is"),
-    ("aligned", "Placed as well as it can be: the error to explain"),
-    ("geometry", "The best that geometry can do"),
+    ("aligned", "Placed as well as it can be"),
+    ("geometry", "The best geometry"),
     ("extended", "With the causes"),
     ("noise_floor", "Noise alone"),
 )
@@ -30,7 +30,7 @@ def errors(diagnosis: DiagnosisFile) -> str:
         share = min(value / longest, 1.0)
         bar = f'<span class="bar {name}" style="width:{100 * share:.1f}%"></span>'
         rows.append(f"<tr><td>{label}<td>{mm(value)}<td>{mm(getattr(mean, name))}<td class=wide>{bar}</tr>")
-    return _table(("Error on data not used in the fit", "RMS [mm]", "mean [mm]", ""), rows)
+    return _table(("Not used in the fit", "RMS [mm]", "mean [mm]", ""), rows)
 
 
 def causes(diagnosis: DiagnosisFile, *, timed: bool) -> str:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import cast
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from kbmaps.arrays import FloatArray
 from kbmaps.chains.belief import ChainBelief
@@ -48,16 +49,20 @@ class _Update:
 class RigidFilter:
     """Takes one pair after the other into a chain's change and its covariance, at a constant cost.
 
-    Each pair is linearised once, where the chain is when the pair comes; the curvature left out is taken for noise, so
-    that early pairs do not make it too sure.
+    Each pair is linearised once: where the last fit left the chain, or, before any, where it is when the pair comes.
+    The curvature left out is taken for noise, so that early pairs do not make it too sure.
 
     Attributes:
         change: the parameters (size,) as in `ChainParameters`.
+        origin: where pairs are linearised (size,); None: at `change`. Many directions of a chain show in no position,
+            and others hardly. With one origin for all pairs they are the same directions for each of them; linearised
+            here and there, pairs seem to tell of them, and the chain moves along them for no reason (Huang, Mourikis
+            and Roumeliotis 2010).
         noise_square: the estimated variance [m²] of a coordinate of the pairs that came without their sigma.
         noise_coordinates: how many coordinates that rests on.
     """
 
-    STORED = ("change", "covariance", "noise")
+    STORED = ("change", "covariance", "noise", "origin")
 
     def __init__(self, parameters: ChainParameters, tolerances: ChainTolerances, noise: float) -> None:
         self.parameters = parameters
@@ -70,6 +75,7 @@ class RigidFilter:
         self._reach = parameters.reach
         self._kernel = self._filter_kernel()
         self.change = np.zeros(parameters.size)
+        self.origin: FloatArray | None = None
         self._covariance: FloatArray = np.diag(np.square(std[self._active] / self._scales))
         self.noise_square = noise**2
         self.noise_coordinates = NOISE_COORDINATES
@@ -89,10 +95,38 @@ class RigidFilter:
         for k in range(len(q)):
             self._learn_one(q[k : k + 1], x[k], float(sigma[k]))
 
-    def go_on_from(self, belief: ChainBelief) -> None:
-        """Takes what is believed of the same chain for what the pairs so far say."""
+    def learn_plain(self, q: ArrayLike, x: ArrayLike, sigma: ArrayLike | None, row: FloatArray) -> bool:
+        """Learns one pair and writes q, x and sigma to `row` (d + 4), if the kernel can take them as they are.
+
+        False, and nothing has changed, where there is no kernel, or anything has to be converted or complained of.
+        """
+        if self._kernel is None:
+            return False
+        noise = self._kernel.learn_one(
+            self.change,
+            self._covariance,
+            row,
+            q,
+            x,
+            sigma,
+            self.origin,
+            self.noise_square,
+            self.noise_coordinates,
+        )
+        if noise is None:
+            return False
+        self.noise_square, self.noise_coordinates = noise
+        return True
+
+    def go_on_from(self, belief: ChainBelief, *, fitted: bool) -> None:
+        """Takes what is believed of the same chain for what the pairs so far say.
+
+        Args:
+            fitted: whether its mean is where those pairs are linearised, and near enough for those that come.
+        """
         active = self._active
         self.change = np.array(belief.mean)
+        self.origin = np.array(belief.mean) if fitted else None
         self._covariance = belief.covariance[np.ix_(active, active)] / np.outer(self._scales, self._scales)
 
     def with_variance(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -104,19 +138,23 @@ class RigidFilter:
     def arrays(self) -> dict[str, FloatArray]:
         """For `kbmaps.packed`."""
         noise = np.array([self.noise_square, self.noise_coordinates])
-        return {"change": self.change, "covariance": self._covariance, "noise": noise}
+        origin = np.empty(0) if self.origin is None else self.origin
+        return {"change": self.change, "covariance": self._covariance, "noise": noise, "origin": origin}
 
     def restore(self, arrays: Mapping[str, FloatArray]) -> None:
         """The state that `arrays` gave. Raises KeyError, ShapeError, NonFiniteError, SettingError."""
-        present = self.arrays()
-        for name in present:
-            if arrays[name].shape != present[name].shape:
-                raise ShapeError(name, str(present[name].shape), arrays[name].shape)
+        shapes = {name: array.shape for name, array in self.arrays().items()}
+        linearised = arrays["origin"].size > 0
+        shapes["origin"] = self.change.shape if linearised else (0,)
+        for name, shape in shapes.items():
+            if arrays[name].shape != shape:
+                raise ShapeError(name, str(shape), arrays[name].shape)
             if not np.isfinite(arrays[name]).all():
                 raise NonFiniteError(name)
         if not (arrays["noise"] > 0.0).all():
             raise SettingError("the noise must be greater than 0 m")
         self.change, self._covariance = np.array(arrays["change"]), np.array(arrays["covariance"])
+        self.origin = np.array(arrays["origin"]) if linearised else None
         self.noise_square, self.noise_coordinates = (float(number) for number in arrays["noise"])
 
     def _filter_kernel(self) -> FilterKernel | None:
@@ -135,6 +173,7 @@ class RigidFilter:
             np.ascontiguousarray(q),
             np.ascontiguousarray(x),
             np.ascontiguousarray(sigma),
+            self.origin,
             self.noise_square,
             self.noise_coordinates,
         )
@@ -142,7 +181,10 @@ class RigidFilter:
             raise np.linalg.LinAlgError("Singular matrix")
 
     def _linearised(self, change: FloatArray, q: FloatArray) -> tuple[FloatArray, FloatArray]:
-        x, jacobian = self.parameters.linearised(change, q)
+        """Positions (n, 3) of the chain at `change`, and their derivatives (n, 3, p) at the origin."""
+        x, jacobian = self.parameters.linearised(change if self.origin is None else self.origin, q)
+        if self.origin is not None:
+            x = self.parameters.positions(change, q)
         return x, jacobian[:, :, self._active] * self._scales
 
     def _learn_one(self, q: FloatArray, x: FloatArray, sigma: float) -> None:

@@ -72,6 +72,15 @@ class RigidWindow:
         rows[:, : self._joints], rows[:, self._joints : -1], rows[:, -1] = q, x, sigma
         self._count += len(q)
 
+    @property
+    def next_row(self) -> FloatArray:
+        """Where the next pair goes: q, x and sigma side by side (d + 4)."""
+        return self._rows[self._count]
+
+    def next_row_filled(self) -> None:
+        """Counts the pair that was written to `next_row`."""
+        self._count += 1
+
     def fitted(self, near: FloatArray) -> RigidFit:
         """The fit to at least one pair; `near` (size,) is where the chain is supposed to be."""
         q, x, sigma = self._pairs()

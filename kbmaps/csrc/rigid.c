@@ -1,143 +1,14 @@
-/* kbmaps._kernels.RigidFilter: the loop of kbmaps.rigid_filter over kbmaps.chain_parameters.linearised. */
-#include "common.h"
-#include "vectors.h"
-
-enum { AXES, POINTS, TANGENTS, FIXED_SLIDES, TIP_FRAME, SCALES, BENDS, CONSTANTS, FILTER_ARRAYS };
-enum { ITERATIONS, SMALL_BEND, GATE, NOISE_MEMORY, LEAST_SQUARE, SMALL_ANGLE, REACH, CONSTANT_COUNT };
-/* Numbers kept of each joint: effects of shifts (2) and tilts (2), the axis, a point of it, each a vector; its angle. */
-enum { SHIFTED = 0, TILTED = 6, AXIS = 12, CENTRE = 15, JOINT_NUMBERS = 18 };
-
-typedef struct {
-    PyObject_HEAD
-    index_t joints, size, active;
-    Py_buffer arrays[FILTER_ARRAYS];
-    index_t *places; /* of each parameter among the active ones, or -1 */
-    double *scales, *bends; /* of the active ones */
-} Filter;
+/* kbmaps._kernels.RigidFilter: the loop of kbmaps.chains.rigid_filter. */
+#include "chain.h"
 
 typedef struct {
     double variance, distance, bend;
     double precision[9];
 } Update;
 
-#define GIVEN(self, which) ((const double *)(self)->arrays[which].buf)
-#define CONSTANT(self, which) (GIVEN(self, CONSTANTS)[which])
-
-/* ---- the chain ------------------------------------------------------------------------------------------------- */
-
-/* Moves the frame (rotation, shift) by joint k at `angle`, and notes what its parameters do. */
-INLINE void pass_joint(const Filter *self, index_t k, const double *change, double q, double *rotation, double *shift,
-                       double *numbers)
-{
-    index_t d = self->joints;
-    const double *tangents = GIVEN(self, TANGENTS) + 6 * k, *tilt = change + 6 + 2 * k, *move = change + 6 + 2 * d + 2 * k;
-    double tilting[3], point[3], axis[3], turn[9], tilt_jacobian[9], motion[9], after[9], vector[3], moved[3];
-    double angle = q + change[6 + 4 * d + k];
-    for (int i = 0; i < 3; i++) {
-        tilting[i] = tangents[2 * i] * tilt[0] + tangents[2 * i + 1] * tilt[1];
-        point[i] = GIVEN(self, POINTS)[3 * k + i] + tangents[2 * i] * move[0] + tangents[2 * i + 1] * move[1];
-    }
-    exponential(tilting, CONSTANT(self, SMALL_ANGLE), turn, tilt_jacobian);
-    times(turn, GIVEN(self, AXES) + 3 * k, axis);
-    times(rotation, axis, numbers + AXIS);
-    times(rotation, point, numbers + CENTRE);
-    for (int i = 0; i < 3; i++)
-        numbers[CENTRE + i] += shift[i];
-    int slides = GIVEN(self, FIXED_SLIDES)[k] != 0.0;
-    if (!slides) {
-        rodrigues(axis, sin(angle), 1.0 - cos(angle), motion);
-        product(rotation, motion, after);
-    }
-    for (int side = 0; side < 2; side++) {
-        double tangent[3], turned[3], before_turned[3];
-        column_of(tangents, 2, side, tangent);
-        times(tilt_jacobian, tangent, turned);
-        if (slides) {
-            memset(numbers + SHIFTED + 3 * side, 0, 3 * sizeof(double));
-            cross(turned, axis, vector);
-            times(rotation, vector, moved);
-            for (int i = 0; i < 3; i++)
-                numbers[TILTED + 3 * side + i] = angle * moved[i];
-            continue;
-        }
-        times(rotation, tangent, moved);
-        times(after, tangent, vector);
-        times(rotation, turned, before_turned);
-        for (int i = 0; i < 3; i++)
-            numbers[SHIFTED + 3 * side + i] = moved[i] - vector[i];
-        times(after, turned, vector);
-        for (int i = 0; i < 3; i++)
-            numbers[TILTED + 3 * side + i] = before_turned[i] - vector[i];
-    }
-    if (slides) {
-        for (int i = 0; i < 3; i++)
-            shift[i] += angle * numbers[AXIS + i];
-        return;
-    }
-    times(after, point, vector);
-    for (int i = 0; i < 3; i++)
-        shift[i] = numbers[CENTRE + i] - vector[i];
-    memcpy(rotation, after, 9 * sizeof(double));
-}
-
-/* Writes the effect of one parameter on the marker, in its unit, if it is active. */
-INLINE void set_column(const Filter *self, index_t parameter, const double *effect, double *jacobian)
-{
-    index_t place = self->places[parameter];
-    for (int i = 0; i < 3 && place >= 0; i++)
-        jacobian[i * self->active + place] = effect[i] * self->scales[place];
-}
-
-/* Position (3) at q and its derivatives (3, active) by the change. `numbers` is working memory. */
-INLINE void linearise(const Filter *self, const double *change, const double *q, double *numbers, double *x,
-                      double *jacobian)
-{
-    index_t d = self->joints, tool = 6 + 5 * d;
-    double base[9], base_jacobian[9], rotation[9], shift[3], tip[3], effect[3], column[3], lever[3];
-    const double *frame = GIVEN(self, TIP_FRAME), *kept;
-    exponential(change, CONSTANT(self, SMALL_ANGLE), base, base_jacobian);
-    memcpy(rotation, base, sizeof base);
-    memcpy(shift, change + 3, sizeof shift);
-    for (index_t k = 0; k < d; k++)
-        pass_joint(self, k, change, q[k], rotation, shift, numbers + JOINT_NUMBERS * k);
-    for (int i = 0; i < 3; i++) {
-        const double *row = frame + 4 * i;
-        tip[i] = row[3] + row[0] * change[tool] + row[1] * change[tool + 1] + row[2] * change[tool + 2];
-    }
-    times(rotation, tip, x);
-    for (int i = 0; i < 3; i++) {
-        x[i] += shift[i];
-        lever[i] = change[3 + i] - x[i];
-    }
-    for (int j = 0; j < 3; j++) {
-        double unit[3] = {j == 0, j == 1, j == 2};
-        column_of(base_jacobian, 3, j, column);
-        cross(lever, column, effect);
-        set_column(self, j, effect, jacobian);
-        set_column(self, 3 + j, unit, jacobian);
-        column_of(frame, 4, j, column);
-        times(rotation, column, effect);
-        set_column(self, tool + j, effect, jacobian);
-    }
-    for (index_t k = 0; k < d; k++) {
-        kept = numbers + JOINT_NUMBERS * k;
-        int slides = GIVEN(self, FIXED_SLIDES)[k] != 0.0;
-        for (int i = 0; i < 3; i++)
-            lever[i] = kept[CENTRE + i] - x[i];
-        for (int side = 0; side < 2; side++) {
-            cross(lever, kept + TILTED + 3 * side, effect);
-            set_column(self, 6 + 2 * k + side, slides ? kept + TILTED + 3 * side : effect, jacobian);
-            set_column(self, 6 + 2 * d + 2 * k + side, kept + SHIFTED + 3 * side, jacobian);
-        }
-        cross(lever, kept + AXIS, effect);
-        set_column(self, 6 + 4 * d + k, slides ? kept + AXIS : effect, jacobian);
-    }
-}
-
-/* ---- the filter ------------------------------------------------------------------------------------------------ */
-
 typedef struct {
     double *numbers, *jacobian, *gains, *step, *present, *row, *change;
+    const double *origin; /* where to linearise (size), or NULL: at `change` */
 } Work;
 
 static size_t work_size(const Filter *self)
@@ -145,7 +16,7 @@ static size_t work_size(const Filter *self)
     return (size_t)(JOINT_NUMBERS * self->joints + 9 * self->active + self->size);
 }
 
-static Work divided(const Filter *self, double *memory)
+static Work divided(const Filter *self, double *memory, const double *origin)
 {
     Work work;
     index_t p = self->active;
@@ -156,6 +27,7 @@ static Work divided(const Filter *self, double *memory)
     work.present = work.step + p;
     work.row = work.present + p;
     work.change = work.row + p;
+    work.origin = origin;
     return work;
 }
 
@@ -183,13 +55,15 @@ INLINE double curvature(const Filter *self, const double *covariance, const Work
     return 0.25 * share * share;
 }
 
-/* RigidFilter._update, linearised at work.change, to which work.present led; 0 if it is singular. */
+/* RigidFilter._update at work.change, to which work.present led; 0 if it is singular. */
 INLINE int make_update(const Filter *self, const double *covariance, const double *q, const double *x,
                        double noise_square, double weight, const Work *work, Update *update)
 {
     index_t p = self->active;
     double position[3], innovation[3], weighted[3], matrix[9], moved = 0.0, turn = 0.0;
-    linearise(self, work->change, q, work->numbers, position, work->jacobian);
+    linearise(self, work->origin == NULL ? work->change : work->origin, q, work->numbers, position, work->jacobian);
+    if (work->origin != NULL)
+        locate(self, work->change, q, position);
     update->variance = noise_square + curvature(self, covariance, work);
     for (int c = 0; c < 3; c++) {
         combine(covariance, p, p, work->jacobian + c * p, work->gains + c * p);
@@ -261,16 +135,27 @@ FAST static int learn_pair(const Filter *self, double *change, double *covarianc
     return 1;
 }
 
-/* learn(change, covariance, q, x, sigma, noise_square, coordinates) -> (pairs learnt, noise_square, coordinates) */
+/* The view of where to linearise, empty for None; 0 and an exception where it is neither. */
+INLINE int take_origin(const Filter *self, PyObject *object, Py_buffer *view)
+{
+    memset(view, 0, sizeof *view);
+    return object == Py_None || take_all(&object, view, &self->size, 1);
+}
+
+/* learn(change, covariance, q, x, sigma, origin, noise_square, coordinates) -> (pairs learnt, noise_square, coordinates) */
 static PyObject *filter_learn(Filter *self, PyObject *const *args, index_t count)
 {
-    Py_buffer views[5];
+    Py_buffer views[6];
     index_t p = self->active, elements[5] = {self->size, p * p, -1, -1, -1};
-    if (count != 7)
-        return PyErr_Format(PyExc_TypeError, "seven arguments are needed");
-    double noise_square = PyFloat_AsDouble(args[5]), coordinates = PyFloat_AsDouble(args[6]);
-    if (PyErr_Occurred() || !take_all(args, views, elements, 5))
+    if (count != 8)
+        return PyErr_Format(PyExc_TypeError, "eight arguments are needed");
+    double noise_square = PyFloat_AsDouble(args[6]), coordinates = PyFloat_AsDouble(args[7]);
+    if (PyErr_Occurred() || !take_origin(self, args[5], &views[5]))
         return NULL;
+    if (!take_all(args, views, elements, 5)) {
+        release_all(views + 5, 1);
+        return NULL;
+    }
     index_t n = views[4].len / (index_t)sizeof(double), done = 0;
     double *memory = malloc(work_size(self) * sizeof(double));
     int sound = views[2].len == self->joints * views[4].len && views[3].len == 3 * views[4].len &&
@@ -280,7 +165,7 @@ static PyObject *filter_learn(Filter *self, PyObject *const *args, index_t count
     } else if (!sound) {
         PyErr_SetString(PyExc_TypeError, "q, x and sigma must be of one length, and the state writable");
     } else {
-        Work work = divided(self, memory);
+        Work work = divided(self, memory, views[5].buf);
         const double *q = views[2].buf, *x = views[3].buf, *sigma = views[4].buf;
         PyThreadState *thread = n > 1 ? PyEval_SaveThread() : NULL;
         while (done < n && learn_pair(self, views[0].buf, views[1].buf, q + done * self->joints, x + 3 * done,
@@ -290,8 +175,77 @@ static PyObject *filter_learn(Filter *self, PyObject *const *args, index_t count
             PyEval_RestoreThread(thread);
     }
     free(memory);
-    release_all(views, 5);
+    release_all(views, 6);
     return PyErr_Occurred() ? NULL : Py_BuildValue("(ndd)", done, noise_square, coordinates);
+}
+
+/* A vector (width,) of float64 in C order whose sum is finite, as kbmaps.arrays.vector wants it; 0 for anything else. */
+INLINE int plain_vector(PyObject *object, index_t width, Py_buffer *view)
+{
+    if (!plain(object, view))
+        return 0;
+    double sum = 0.0;
+    if (view->ndim == 1 && view->shape[0] == width)
+        for (index_t i = 0; i < width; i++)
+            sum += ((const double *)view->buf)[i];
+    else
+        sum = NAN;
+    if (isfinite(sum))
+        return 1;
+    PyBuffer_Release(view); /* which sets its obj to NULL */
+    return 0;
+}
+
+/* What a sigma stands for: NaN for None, a positive finite float as it is, 0 for anything else. */
+INLINE double plain_sigma(PyObject *sigma)
+{
+    if (sigma == Py_None)
+        return NAN;
+    double value = PyFloat_Check(sigma) ? PyFloat_AsDouble(sigma) : 0.0;
+    return value > 0.0 && isfinite(value) ? value : 0.0;
+}
+
+/* learn_one(change, covariance, row, q, x, sigma, origin, noise_square, coordinates) -> (noise_square, coordinates)
+ *
+ * Writes the pair to row (d + 4). None, and nothing has changed, where it is not float64 as it should be, or the
+ * innovation's covariance singular: the way over kbmaps.pairs.checked_pairs and learn converts it, or says what is wrong. */
+static PyObject *filter_learn_one(Filter *self, PyObject *const *args, index_t count)
+{
+    enum { CHANGE, COVARIANCE, ROW, ORIGIN, Q, X, VIEWS };
+    Py_buffer views[VIEWS];
+    index_t p = self->active, d = self->joints, elements[ORIGIN] = {self->size, p * p, d + 4};
+    if (count != 9)
+        return PyErr_Format(PyExc_TypeError, "nine arguments are needed");
+    double sigma = plain_sigma(args[5]), noise_square = PyFloat_AsDouble(args[7]), coordinates = PyFloat_AsDouble(args[8]);
+    if (PyErr_Occurred())
+        return NULL;
+    memset(views, 0, sizeof views);
+    int usable = sigma != 0.0 && plain_vector(args[3], d, &views[Q]) && plain_vector(args[4], 3, &views[X]), learnt = 0;
+    if (usable && take_origin(self, args[6], &views[ORIGIN]) && take_all(args, views, elements, ORIGIN)) {
+        double *memory = malloc(work_size(self) * sizeof(double)), *row = views[ROW].buf;
+        const double *q = views[Q].buf, *x = views[X].buf;
+        if (memory == NULL) {
+            PyErr_NoMemory();
+        } else if (views[CHANGE].readonly || views[COVARIANCE].readonly || views[ROW].readonly) {
+            PyErr_SetString(PyExc_TypeError, "the state and the row must be writable");
+        } else {
+            Work work = divided(self, memory, views[ORIGIN].buf);
+            learnt = learn_pair(self, views[CHANGE].buf, views[COVARIANCE].buf, q, x, sigma, &noise_square, &coordinates,
+                                &work);
+        }
+        if (learnt) {
+            memcpy(row, q, (size_t)d * sizeof(double));
+            memcpy(row + d, x, 3 * sizeof(double));
+            row[d + 3] = sigma;
+        }
+        free(memory);
+    }
+    release_all(views, VIEWS);
+    if (PyErr_Occurred())
+        return NULL;
+    if (!learnt)
+        Py_RETURN_NONE;
+    return Py_BuildValue("(dd)", noise_square, coordinates);
 }
 
 static int find_active(Filter *self)
@@ -346,6 +300,7 @@ static void filter_dealloc(Filter *self)
 
 static PyMethodDef filter_methods[] = {
     {"learn", (PyCFunction)(void (*)(void))filter_learn, METH_FASTCALL, NULL},
+    {"learn_one", (PyCFunction)(void (*)(void))filter_learn_one, METH_FASTCALL, NULL},
     {NULL, NULL, 0, NULL},
 };
 

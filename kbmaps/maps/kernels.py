@@ -35,7 +35,11 @@ class NetKernel(Protocol):
 
 
 class FilterKernel(Protocol):
-    """Takes pairs into the state of a `RigidFilter`; returns how many, its noise² and what that rests on."""
+    """Takes pairs into the state of a `RigidFilter`; returns how many, its noise² and what that rests on.
+
+    `learn_one` checks its pair and writes it to a row (d + 4). It returns None, and nothing has changed, for one that
+    is not yet float64 of the right shape, or is wrong.
+    """
 
     def learn(
         self,
@@ -44,10 +48,25 @@ class FilterKernel(Protocol):
         q: FloatArray,
         x: FloatArray,
         sigma: FloatArray,
+        origin: FloatArray | None,
         noise_square: float,
         noise_coordinates: float,
         /,
     ) -> tuple[int, float, float]: ...
+
+    def learn_one(
+        self,
+        change: FloatArray,
+        covariance: FloatArray,
+        row: FloatArray,
+        q: ArrayLike,
+        x: ArrayLike,
+        sigma: ArrayLike | None,
+        origin: FloatArray | None,
+        noise_square: float,
+        noise_coordinates: float,
+        /,
+    ) -> tuple[float, float] | None: ...
 
 
 class _Compiled(Protocol):

@@ -42,11 +42,11 @@ class Posterior(Protocol):
 
 
 class ChainPosterior:
-    """A rigid chain's posterior, linearised at the most probable chain.
+    """A rigid chain's posterior, linearised at the most probable chain, or where its learner has linearised the pairs.
 
     Args:
         nominal: the chain that the parameters change.
-        change: its most probable change (size,) as in `ChainParameters`.
+        change: where it is linearised (size,) as in `ChainParameters`.
         covariance: of the change (size, size) [rad², m²].
         noise: 1-sigma of a coordinate of a further pair [m].
         floor: 1-sigma of a coordinate that no rigid chain explains [m].
@@ -94,7 +94,8 @@ class ChainPosterior:
             found = learner.noise
         else:
             raise DegenerateDataError("without pairs there is no noise to go by; give the noise of further pairs")
-        return cls(learner.nominal, learner.change, learner.covariance, noise=found, floor=floor)
+        change = learner.origin if isinstance(learner, RecursiveRigidLearner) else learner.change
+        return cls(learner.nominal, change, learner.covariance, noise=found, floor=floor)
 
     @classmethod
     def of_belief(cls, belief: ChainBelief, *, noise: float, floor: float = 0.0) -> ChainPosterior:

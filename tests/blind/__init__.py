@@ -2,4 +2,18 @@
 
 It shares nothing with the code that finds effects: neither formulas, nor constants, nor helpers. Positions come from
 pybullet, measurements from pixel coordinates, gear play and springs from their own equations of motion and balance.
+
+`hide.hide` makes a case; what it goes through, in this order:
+
+| module | what it does |
+| --- | --- |
+| arms | the described arms, written as URDF |
+| choice | which effects, on which arm, at which joints, in which motion |
+| motion | the path of the motor shafts and when it is read |
+| kinds, outside, sizing | the parameters of effects inside and outside the table, scaled to a size |
+| joints | encoders, play, lag: from shaft to reading and to true position |
+| structure, bullet | the true arm with its springs, and where pybullet says that its marker is |
+| eyes, outliers | the true cameras' pixels, false fixes, and triangulation by the described cameras |
+| rendered | the same from painted images and the product's tracker |
+| cases, files | recordings with noise and ticks, written out |
 """

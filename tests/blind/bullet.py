@@ -38,6 +38,7 @@ class Body:
         self.moving = tuple(name for name in names if arm.joint(name).moves)
         self._indices = [names.index(name) for name in self.moving]
         self._marker, self._camera = links[arm.marker_link], links.get(arm.camera_link)
+        self._centres = [np.array(arm.mass(link).centre) for link in (arm.marker_link, arm.camera_link)]
         self._T_link_camera = (np.array(arm.camera_xyz), Rotation.from_euler("xyz", arm.camera_rpy).as_matrix())
 
     def marker_link_poses(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -47,13 +48,14 @@ class Body:
             q: positions of `moving` [rad or m], shape (n, number of moving joints).
         """
         links = [self._marker] if self._camera is None else [self._marker, self._camera]
-        states = np.array([self._link_states(row, links) for row in q.tolist()])
-        x, R = states[:, 0, :3], Rotation.from_quat(states[:, 0, 3:]).as_matrix()
+        states = np.array([self._mass_states(row, links) for row in q.tolist()])
+        R = Rotation.from_quat(states[:, 0, 3:]).as_matrix()
+        x = states[:, 0, :3] - R @ self._centres[0]
         c, R_camera = self._T_link_camera
         if self._camera is None:
             return (x - c) @ R_camera, R_camera.T @ R
         R_link = Rotation.from_quat(states[:, 1, 3:]).as_matrix()
-        eye = states[:, 1, :3] + R_link @ c
+        eye = states[:, 1, :3] + R_link @ (c - self._centres[1])
         R_world_camera = R_link @ R_camera
         return np.einsum("nij,ni->nj", R_world_camera, x - eye), np.einsum("nij,nik->njk", R_world_camera, R)
 
@@ -86,12 +88,14 @@ class Body:
         """Take the body out of pybullet."""
         pybullet.removeBody(self._body, physicsClientId=self._client)
 
-    def _link_states(self, q: list[float], links: list[int]) -> list[list[float]]:
+    def _mass_states(self, q: list[float], links: list[int]) -> list[list[float]]:
+        """Positions and orientations (quaternions x, y, z, w) of the links' centres of mass."""
         pybullet.resetJointStatesMultiDof(
             self._body, self._indices, [[value] for value in q], physicsClientId=self._client
         )
         states = pybullet.getLinkStates(self._body, links, computeForwardKinematics=True, physicsClientId=self._client)
-        return [[*state[4], *state[5]] for state in states]
+        # The pose of the centre of mass is exact; that of the link's frame went through single precision.
+        return [[*state[0], *state[1]] for state in states]
 
 
 class Bullet:

@@ -14,15 +14,16 @@ from .bullet import bullet
 from .choice import Wish, chosen_arm, chosen_motion, placed, wishes
 from .eyes import covariance, in_view, triangulate
 from .files import write_recording, write_robot
-from .hidden import Hidden, Site, direction
+from .hidden import Hidden, Parameters, Site, direction
 from .kinds import KINDS, SHIFT, SIX
-from .motion import SEGMENT_RAD, Motion, Style, move
+from .motion import SEGMENT_RAD, Motion, Style, move, narrowed
 from .outliers import false_fixes
+from .rendered import PIXEL_SIGMA, tracked
 from .sizing import NoEffect, Sizer, drawn
-from .world import Sight, World, time_constant
+from .world import World, noise, time_constant
 
 MARGIN_PX = 60.0
-SPARE = 0.02  # pairs recorded beyond those asked for: a hidden camera may lose some at the border
+SPARE = 0.05  # pairs recorded beyond those asked for: a hidden camera may lose some at the border
 RANDOM_SIZES = (0.2, 15.0)
 TRIES = 12
 Size = float | str | Sequence[float]
@@ -38,7 +39,8 @@ class Taken:
         q: encoder readings, quantised [rad or m], shape (n, d).
         x: measured marker positions [m], shape (n, 3).
         x_noise_free: what the described cameras would report without pixel noise and without false fixes, shape (n, 3).
-        covariance: of x for the pixel noise [m²], shape (n, 3, 3).
+        covariance: of x for the pixel noise [m²], which the recording may tell, shape (n, 3, 3).
+        noise: that and what rounding to ticks adds to a residual at the readings [m²], shape (n, 3, 3).
         outlier: which fixes are not the marker, shape (n,).
     """
 
@@ -48,6 +50,7 @@ class Taken:
     x: FloatArray
     x_noise_free: FloatArray
     covariance: FloatArray
+    noise: FloatArray
     outlier: BoolArray
 
 
@@ -62,7 +65,7 @@ class HiddenCase:
         nuisances: what is wrong but not a finding, since robot.toml calls it not known.
         measured, fresh: the recording, and another one of the same arm on another way. Moments (t0) count from the
             start of either.
-        sigma_m: RMS length of the noise of a measured position.
+        sigma_m: RMS length of the noise of a residual, that of ticks included.
     """
 
     folder: Path
@@ -93,8 +96,11 @@ def hide(
     size: Size = "random",
     outliers: float = 0.0,
     hold: str | None = None,
+    reach: float = 1.0,
+    still: Sequence[str] = (),
     marker_known: bool = True,
     pose_known: bool = True,
+    rendered: bool = False,
 ) -> HiddenCase:
     """Write a case into `folder`; everything is drawn from `seed`.
 
@@ -106,15 +112,22 @@ def hide(
         size: of each effect in units of the noise, one for all or one for each; "random" draws 0.2..15 each.
         outliers: fraction of false fixes, beside any effect.
         hold: torque_free, zero_force or held; any in which the effects show when None.
+        reach: part of each joint's range that both recordings go through, around a posture that is drawn.
+        still: joints that never move.
         marker_known, pose_known: False writes a rough marker or camera pose into robot.toml and says so there.
+        rendered: paint every image and look for the marker in it with the tracker (some tenths of a second a pair);
+            a pair whose marker is not found is left out.
 
     Raises:
         ValueError: an effect cannot sit there, or does not show in this motion.
     """
     streams = [np.random.default_rng(child) for child in np.random.SeedSequence(seed).spawn(6)]
     choosing, building, moving, freshly, noising, rough = streams
-    wished = wishes(effects, hold, choosing)
+    nuisances = _rough(rough, marker_known=marker_known, pose_known=pose_known)
+    wished = wishes(effects, hold, [nuisance.effect for nuisance in nuisances], choosing)
     described = chosen_arm(arm, wished, building)
+    if rendered:
+        described = replace(described, eyes=replace(described.eyes, pixel_sigma=PIXEL_SIGMA))
     hold, style = chosen_motion(hold, wished, choosing)
     if outliers > 0.0 and "outliers" not in [wish.effect for wish in wished]:
         wished.append(Wish("outliers"))
@@ -122,15 +135,15 @@ def hide(
         nominal = World(client, described, [])
         spare = int(np.ceil(SPARE * pairs)) + 2
         visible = _visibility(nominal)
-        motion = move(moving, style, described.ranges, pairs + spare, visible)
+        ranges = narrowed(moving, described.ranges, visible, reach, [described.read.index(name) for name in still])
+        motion = move(moving, style, ranges, pairs + spare, visible)
         truth = _hidden(wished, size, outliers, Sizer(client, nominal, motion), motion, described, choosing)
-        nuisances = _rough(rough, marker_known=marker_known, pose_known=pose_known)
         world = World(client, described, [*truth, *nuisances])
         fraction = sum(hidden.parameters["fraction"] for hidden in truth if hidden.effect == "outliers")
-        measured = _taken(world, motion, pairs, fraction, noising)
+        measured = _taken(nominal, world, motion, pairs, fraction, noising, rendered=rendered)
         again = fresh_pairs or pairs
-        other = move(freshly, style, described.ranges, again + spare, visible)
-        fresh = _taken(world, other, again, fraction, noising)
+        other = move(freshly, style, ranges, again + spare, visible)
+        fresh = _taken(nominal, world, other, again, fraction, noising, rendered=rendered)
     write_robot(folder, described, hold, marker_known=marker_known, pose_known=pose_known)
     tells_noise = bool(choosing.random() < 0.6)
     for name, taken in (("measured", measured), ("fresh", fresh)):
@@ -143,7 +156,7 @@ def hide(
             taken.x,
             taken.covariance if tells_noise else None,
         )
-    sigma_m = float(np.sqrt(np.mean(np.trace(measured.covariance, axis1=1, axis2=2))))
+    sigma_m = float(np.sqrt(np.mean(np.trace(measured.noise, axis1=1, axis2=2))))
     return HiddenCase(folder, seed, described, hold, style, truth, nuisances, measured, fresh, sigma_m)
 
 
@@ -223,34 +236,56 @@ def _rough(rng: np.random.Generator, *, marker_known: bool, pose_known: bool) ->
     """What is wrong with a marker and a camera pose that are only roughly known."""
     nuisances = []
     if not marker_known:
-        p = dict(zip(SHIFT, (0.015 * direction(rng)).tolist(), strict=True))
-        nuisances.append(Hidden("tool_offset", None, None, p, KINDS["tool_offset"].sign))
+        shift: Parameters = dict(zip(SHIFT, (0.015 * direction(rng)).tolist(), strict=True))
+        nuisances.append(Hidden("tool_offset", None, None, shift, KINDS["tool_offset"].sign))
     if not pose_known:
         six = np.concatenate([0.03 * direction(rng), 0.04 * direction(rng)])
-        p = dict(zip(SIX, six.tolist(), strict=True))
-        nuisances.append(Hidden("camera_pose", None, None, p, KINDS["camera_pose"].sign))
+        pose: Parameters = dict(zip(SIX, six.tolist(), strict=True))
+        nuisances.append(Hidden("camera_pose", None, None, pose, KINDS["camera_pose"].sign))
     return tuple(nuisances)
 
 
-def _taken(world: World, motion: Motion, pairs: int, fraction: float, rng: np.random.Generator) -> Taken:
+def _taken(
+    nominal: World,
+    world: World,
+    motion: Motion,
+    pairs: int,
+    fraction: float,
+    rng: np.random.Generator,
+    *,
+    rendered: bool,
+) -> Taken:
     """The first `pairs` pairs that the true cameras see, with noise, ticks and false fixes."""
     arm, sight = world.arm, world.measure(motion)
     width, height = arm.eyes.image_size_px
     inside = (sight.pixels > 0.0).all(axis=1) & (sight.pixels < [width, height, width, height]).all(axis=1)
     kept = np.flatnonzero(inside)[:pairs]
-    t, sight = motion.stamps[kept], Sight(sight.readings[kept], sight.pixels[kept], sight.x[kept])
+    sight = sight.of(kept)
+    points, outlier = false_fixes(world, sight, fraction, rng)
+    if rendered:
+        found, x, told = tracked(world.eyes, points, rng)
+    else:
+        found, x, told = _fixed(world, points, rng)
+    kept, sight, outlier, x, told = kept[found], sight.of(np.flatnonzero(found)), outlier[found], x[found], told[found]
     ticks = np.array([arm.quantum(name) for name in arm.read])
     q = np.rint(sight.readings / ticks) * ticks
-    pixels, outlier = false_fixes(world, sight, fraction, rng)
-    pixels = pixels + rng.normal(0.0, arm.eyes.pixel_sigma, pixels.shape)
     step = np.linalg.norm(np.diff(q, axis=0), axis=1)
     torn = (np.diff(motion.segment[kept]) > 0) | (step > SEGMENT_RAD[1])
     return Taken(
-        t=t,
+        t=motion.stamps[kept],
         segment=np.append(0, np.cumsum(torn)),
         q=q,
-        x=triangulate(arm.eyes, pixels),
+        x=x,
         x_noise_free=sight.x,
-        covariance=covariance(arm.eyes, pixels),
+        covariance=told,
+        noise=noise(nominal, q, sight.pixels),
         outlier=outlier,
     )
+
+
+def _fixed(world: World, points: FloatArray, rng: np.random.Generator) -> tuple[BoolArray, FloatArray, FloatArray]:
+    """Fixes from noisy pixel centres: all are found; positions and covariances."""
+    eyes = world.arm.eyes
+    pixels = world.eyes.project(points)
+    pixels = pixels + rng.normal(0.0, eyes.pixel_sigma, pixels.shape)
+    return np.ones(len(points), dtype=bool), triangulate(eyes, pixels), covariance(eyes, pixels)

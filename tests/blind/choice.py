@@ -45,15 +45,20 @@ class Wish:
         return cls(effect, where or None, source or None)
 
 
-def wishes(effects: int | str | Sequence[str], hold: str | None, rng: np.random.Generator) -> list[Wish]:
-    """The effects to hide: those named, "outside" for one outside the table, or a number of different ones drawn."""
+def wishes(
+    effects: int | str | Sequence[str], hold: str | None, rough: Sequence[str], rng: np.random.Generator
+) -> list[Wish]:
+    """The effects to hide: those named, "outside" for one outside the table, or a number of different ones drawn.
+
+    Those in `rough` are no findings in this case and not drawn.
+    """
     if isinstance(effects, str):
         effects = [effects]
     if not isinstance(effects, int):
         return [
             Wish(str(rng.choice(_shown(OUTSIDE, hold)))) if name == "outside" else Wish.parsed(name) for name in effects
         ]
-    names = _shown(KINDS, hold)
+    names = [name for name in _shown(KINDS, hold) if name not in rough]
     return [Wish(str(name)) for name in rng.choice(names, effects, replace=False)]
 
 

@@ -28,7 +28,7 @@ class Hidden:
         outside: whether it is in no table: to be called unexplained.
         drivers: with `outside`, the joints on which the hidden error itself depends.
         size: RMS of the noise-free residual of the nominal chain under this effect alone, whitened: 1 is as large as
-            the noise along each axis.
+            the noise along each axis, that of pixels and of ticks.
         rms_m: the same residual in metres.
         shows_on: with `outside`, for each joint the share (0..1) of that residual's variance that goes when the other
             joints stay and this one is drawn anew.

@@ -28,6 +28,7 @@ def main() -> None:
     parser.add_argument("--size", type=float, help="in units of the noise; drawn when not given")
     parser.add_argument("--outliers", type=float, default=0.0, help="fraction of false fixes")
     parser.add_argument("--hold", choices=HOLDS)
+    parser.add_argument("--rendered", action="store_true", help="paint images and track the marker in them")
     given = parser.parse_args()
     case = hide(
         given.seed,
@@ -38,6 +39,7 @@ def main() -> None:
         size="random" if given.size is None else given.size,
         outliers=given.outliers,
         hold=given.hold,
+        rendered=given.rendered,
     )
     print(told(case))
 

@@ -6,7 +6,7 @@ The *shaft* is the joint's position as its motor drives it. The encoder reads th
 from __future__ import annotations
 
 import numpy as np
-from scipy.optimize import brentq
+from scipy.optimize import root_scalar
 
 from .arrays import FloatArray
 
@@ -63,7 +63,8 @@ def lag_that_leaves(left: float, move_s: float, rest_s: float) -> float:
     def excess(log_tau: float) -> float:
         return left_of_move(float(np.exp(log_tau)), move_s, rest_s) - left
 
-    return float(np.exp(brentq(excess, np.log(0.02 * rest_s), np.log(100.0 * (move_s + rest_s)), xtol=1e-10)))
+    bracket = (np.log(0.02 * rest_s), np.log(100.0 * (move_s + rest_s)))
+    return float(np.exp(root_scalar(excess, bracket=bracket, xtol=1e-10).root))
 
 
 def wandering(t: FloatArray, normals: FloatArray, interval_s: float) -> FloatArray:

@@ -124,8 +124,8 @@ KINDS: dict[str, Kind] = {
         ("bias_sine", "bias_cosine"),
         _ripple,
         0.3,
-        "reading = atan2(sin Nq + bias_sine, cos Nq + bias_cosine) / N of the true angle q with N = poles a turn, so "
-        "reading minus true is about (bias_sine cos Nq − bias_cosine sin Nq) / N; a sliding joint turns once per turn_m",
+        "reading = atan2(sin Nq + bias_sine, cos Nq + bias_cosine) / N of the true angle q with N = poles a turn: "
+        "reading minus true is about (bias_sine cos Nq − bias_cosine sin Nq) / N; a slide turns once per turn_m",
     ),
     "joint_coupling": Kind(
         "pair", ("ratio",), _coupling, 0.2, "true position minus reading, per position of the source joint"
@@ -144,7 +144,7 @@ KINDS: dict[str, Kind] = {
         "joint",
         ("left", "tau_s"),
         _settling,
-        0.9,
+        0.5,
         "left is the part of the last move that the output still lacks when it is read: rest_s after the end of a move "
         "that took move_s; tau_s is the time constant with which it follows; a walk without rests has tau_s alone",
     ),
@@ -194,7 +194,7 @@ KINDS: dict[str, Kind] = {
         SHIFT,
         _drift,
         0.1,
-        "measured minus true position at the end of the drift, in the measurement frame; before that times 1 − exp(−t/tau)",
+        "measured minus true position at the drift's end, in the measurement frame; before that times 1 − exp(−t/tau)",
     ),
     "outliers": Kind("robot", (), _outliers, 1.0, "fraction of the fixes that are not the marker"),
 }

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -63,6 +63,17 @@ def move(rng: np.random.Generator, style: Style, ranges: FloatArray, pairs: int,
     if style == "held":
         return _held(rng, ranges, pairs, visible)
     return _Walk(rng, ranges, visible).motion(style, pairs)
+
+
+def narrowed(
+    rng: np.random.Generator, ranges: FloatArray, visible: Visible, reach: float, still: Sequence[int]
+) -> FloatArray:
+    """The ranges (d, 2) cut to the part `reach` of their widths around a visible posture, to nothing for `still`."""
+    centre = _Postures(rng, ranges, visible).draw()
+    width = reach * np.ptp(ranges, axis=1)
+    lower = np.clip(centre - 0.5 * width, ranges[:, 0], ranges[:, 1] - width)
+    lower[list(still)], width[list(still)] = centre[list(still)], 0.0
+    return np.column_stack([lower, lower + width])
 
 
 class _Postures:
@@ -130,7 +141,7 @@ class _Walk:
     def _steps(self, here: FloatArray, target: FloatArray) -> FloatArray:
         """A bent way from `here` to `target` in steps of the joint-space norm, without `here`."""
         distance = np.linalg.norm(target - here)
-        reach = np.cumsum(self._rng.uniform(*STEP_RAD, int(distance / STEP_RAD[0]) + 2))
+        reach = np.cumsum(self._rng.uniform(STEP_RAD[0], STEP_RAD[1], int(distance / STEP_RAD[0]) + 2))
         s = np.append(reach[reach < distance - STEP_RAD[0]], distance) / distance
         bow = self._rng.normal(0.0, 0.12 * distance, len(here)) / np.sqrt(len(here))
         way = here + s[:, None] * (target - here) + np.sin(np.pi * s)[:, None] * bow

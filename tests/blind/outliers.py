@@ -16,19 +16,19 @@ TRIES = 60
 
 
 def false_fixes(world: World, sight: Sight, fraction: float, rng: np.random.Generator) -> tuple[FloatArray, BoolArray]:
-    """Pixel centres with a `fraction` of them somewhere else, and which ones those are."""
-    count = len(sight.x)
+    """What is seen [m], in the true left optical frame, a `fraction` of it somewhere else, and which ones those are."""
+    count = len(sight.at)
     outlier = _runs(count, round(fraction * count), rng)
-    pixels = sight.pixels.copy()
-    mirror, lamps = _mirror(sight.x, rng), _elsewhere(world, sight.x, rng)
+    points = sight.at.copy()
+    mirror, lamps = _mirror(sight.at, rng), _elsewhere(world, sight.at, rng)
     for index in np.flatnonzero(outlier):
-        seen = _reflected(sight.x[index], mirror)
+        seen = _reflected(sight.at[index], mirror)
         if rng.random() < 0.5 or not in_view(world.arm.eyes, seen[None], INSIDE_PX)[0]:
             seen = lamps[rng.integers(len(lamps))]
-            while np.linalg.norm(seen - sight.x[index]) < NEAREST_M:
+            while np.linalg.norm(seen - sight.at[index]) < NEAREST_M:
                 seen = lamps[rng.integers(len(lamps))]
-        pixels[index] = world.eyes.project(seen[None])[0]
-    return pixels, outlier
+        points[index] = seen
+    return points, outlier
 
 
 def _runs(count: int, wanted: int, rng: np.random.Generator) -> BoolArray:

@@ -9,11 +9,12 @@ import numpy as np
 from .bullet import Bullet
 from .hidden import Hidden, Kind, Site
 from .motion import Motion
-from .world import World, residuals, whitened
+from .world import World, noise, residuals, whitened
 
 PAIRS_LOOKED_AT = 150
 CLOSE_ENOUGH = 0.03
-MOST_ROUNDS = 10
+MOST_ROUNDS = 12
+SMALLEST = 1e-6
 
 
 class NoEffect(ValueError):
@@ -26,6 +27,8 @@ class Sizer:
     def __init__(self, bullet: Bullet, nominal: World, motion: Motion) -> None:
         self._bullet, self._nominal = bullet, nominal
         self._motion = motion.thinned(PAIRS_LOOKED_AT)
+        plain = nominal.measure(self._motion)
+        self._noise = noise(nominal, plain.readings, plain.pixels)
 
     def scaled(self, hidden: Hidden, kind: Kind, size: float) -> Hidden:
         """The effect with parameters scaled so that the whitened RMS of its residual is about `size`.
@@ -33,15 +36,19 @@ class Sizer:
         Raises:
             NoEffect: no amplitude shows.
         """
+        tried: list[tuple[float, float]] = []  # logarithms of amplitude and of what it came to, over the size wanted
+        amplitude, best = 1.0, hidden
         for _ in range(MOST_ROUNDS):
-            hidden = self.sized(hidden)
-            if not hidden.size > 1e-6:
+            parameters, stopped = kind.scaled(hidden.parameters, amplitude)
+            best = self.sized(replace(hidden, parameters=parameters))
+            if not best.size > SMALLEST:
                 raise NoEffect(f"{hidden.effect} at {hidden.where} does not show")
-            parameters, stopped = kind.scaled(hidden.parameters, size / hidden.size)
-            if abs(size / hidden.size - 1.0) < CLOSE_ENOUGH or (stopped and parameters == hidden.parameters):
+            off = float(np.log(best.size / size))
+            if abs(off) < CLOSE_ENOUGH or (stopped and off < 0.0):
                 break
-            hidden = replace(hidden, parameters=parameters)
-        return self.sized(hidden)
+            tried.append((float(np.log(amplitude)), off))
+            amplitude = float(np.exp(_next(tried)))
+        return best
 
     def sized(self, hidden: Hidden) -> Hidden:
         """The effect with its size filled in."""
@@ -51,9 +58,9 @@ class Sizer:
         finally:
             world.close()
         off = residuals(self._nominal, sight)
-        noise = whitened(self._nominal.arm, sight, off)
+        in_noise = whitened(self._noise, off)
         return replace(
-            hidden, size=float(np.sqrt(np.mean(noise**2))), rms_m=float(np.sqrt(np.mean(np.sum(off**2, axis=1))))
+            hidden, size=float(np.sqrt(np.mean(in_noise**2))), rms_m=float(np.sqrt(np.mean(np.sum(off**2, axis=1))))
         )
 
     def shows_on(self, hidden: Hidden, rng: np.random.Generator) -> dict[str, float]:
@@ -78,6 +85,16 @@ class Sizer:
         finally:
             world.close()
         return shares
+
+
+def _next(tried: list[tuple[float, float]]) -> float:
+    """Logarithm of the amplitude to try next: between the nearest from below and above, else in proportion."""
+    below = max((point for point in tried if point[1] < 0.0), default=None)
+    above = min((point for point in tried if point[1] > 0.0), default=None)
+    if below is None or above is None:
+        return tried[-1][0] - tried[-1][1]
+    part = np.clip(below[1] / (below[1] - above[1]), 0.15, 0.85)
+    return below[0] + float(part) * (above[0] - below[0])
 
 
 def drawn(kind: Kind, effect: str, site: Site, rng: np.random.Generator) -> Hidden:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from .arms import Arm
-from .arrays import FloatArray
+from .arrays import FloatArray, IntArray
 from .bullet import Bullet
 from .eyes import covariance, triangulate
 from .hidden import Hidden, Parameters
@@ -24,13 +24,19 @@ class Sight:
 
     Attributes:
         readings: of the joints [rad or m], shape (n, d).
+        at: true marker positions in the true left optical frame [m], shape (n, 3).
         pixels: centres ul, vl, ur, vr [px], shape (n, 4).
         x: positions that the described cameras make of them [m], shape (n, 3).
     """
 
     readings: FloatArray
+    at: FloatArray
     pixels: FloatArray
     x: FloatArray
+
+    def of(self, kept: IntArray) -> Sight:
+        """Some of the pairs."""
+        return Sight(self.readings[kept], self.at[kept], self.pixels[kept], self.x[kept])
 
 
 class World:
@@ -53,7 +59,7 @@ class World:
         """What is read and seen of a motion."""
         taken = motion.stamps - sum(h.parameters["latency_s"] for h in self._named("camera_latency"))
         readings = self.readings(motion.at(motion.shaft, motion.stamps), motion.stamps)
-        return self._sight(readings, motion.at(self._outputs(motion), taken), taken)
+        return self._sight(readings, motion.at(self.outputs(motion), taken), taken)
 
     def standing(self, shaft: FloatArray, t: FloatArray) -> Sight:
         """What is read and seen of postures (n, d) at the times (n,) when no motion led there."""
@@ -115,7 +121,7 @@ class World:
             case _:
                 return read
 
-    def _outputs(self, motion: Motion) -> FloatArray:
+    def outputs(self, motion: Motion) -> FloatArray:
         """True joint positions along the whole path, shape (f, d)."""
         output = motion.shaft.copy()
         for h in self._named("backlash"):
@@ -133,8 +139,9 @@ class World:
         return output
 
     def _sight(self, readings: FloatArray, output: FloatArray, t: FloatArray) -> Sight:
-        pixels = self._true.eyes.project(self.marker(output, t))
-        return Sight(readings, pixels, triangulate(self.arm.eyes, pixels))
+        at = self.marker(output, t)
+        pixels = self.eyes.project(at)
+        return Sight(readings, at, pixels, triangulate(self.arm.eyes, pixels))
 
     def _named(self, effect: str) -> list[Hidden]:
         return [hidden for hidden in self._effects if hidden.effect == effect]
@@ -153,7 +160,19 @@ def residuals(nominal: World, sight: Sight) -> FloatArray:
     return sight.x - nominal.marker(sight.readings, np.zeros(len(sight.readings)))
 
 
-def whitened(arm: Arm, sight: Sight, x: FloatArray) -> FloatArray:
-    """Vectors (n, 3) in units of the noise of the positions seen."""
-    lower = np.linalg.cholesky(covariance(arm.eyes, sight.pixels))
-    return np.linalg.solve(lower, x[:, :, None])[:, :, 0]
+def noise(nominal: World, q: FloatArray, pixels: FloatArray) -> FloatArray:
+    """Covariance [m²] of residuals at readings (n, d), pixels (n, 4) and ticks adding to it, shape (n, 3, 3)."""
+    arm, t = nominal.arm, np.zeros(len(q))
+    total, here = covariance(arm.eyes, pixels), nominal.marker(q, t)
+    for index, name in enumerate(arm.read):
+        tick, beside = arm.quantum(name), q.copy()
+        beside[:, index] += tick
+        step = nominal.marker(beside, t) - here
+        total = total + step[:, :, None] * step[:, None, :] / 12.0  # a rounding error is even over one tick
+    return total
+
+
+def whitened(covariances: FloatArray, x: FloatArray) -> FloatArray:
+    """Vectors (n, 3) in units of their noise with covariances (n, 3, 3)."""
+    lower = np.linalg.cholesky(covariances)
+    return np.asarray(np.linalg.solve(lower, x[:, :, None])[:, :, 0], dtype=np.float64)

@@ -125,12 +125,57 @@ def test_bad_input_is_refused_in_the_same_words(ask, bad):
     assert call("compiled") == call("numpy")
 
 
-@pytest.mark.usefixtures("kernel_path")
-@pytest.mark.parametrize(
+BAD_PAIRS = {
+    **{f"q: {bad}": (bad, np.zeros(3), None) for bad in BAD_VECTORS},
+    **{f"x: {bad}": (np.zeros(2), bad, None) for bad in BAD_VECTORS},
+    **{
+        f"sigma: {bad}": (np.zeros(2), np.zeros(3), bad)
+        for bad in (0.0, -0.0, -1.0, math.nan, math.inf, [0.1, 0.1], "x")
+    },
+    "words": (["a", "b"], np.zeros(3), None),
+    "a sum without end": (np.full(2, 1e308), np.zeros(3), None),
+    "q and x both bad": (np.array([0.1, math.nan]), np.array([math.nan, 0.0, 0.0]), -1.0),
+    "rows beside a vector": (np.zeros((2, 2)), np.zeros(3), None),
+}
+
+
+@needs_both
+@pytest.mark.parametrize("bad", BAD_PAIRS.values(), ids=BAD_PAIRS)
+def test_a_bad_pair_of_a_rigid_chain_is_refused_in_the_same_words(bad):
+    arm = rough_arm(np.random.default_rng(3), "RR")
+
+    def call(path: str) -> tuple[type[Exception], str]:
+        with kernels.using(path):
+            learner = RecursiveRigidLearner(arm.nominal, ROUGH)
+        learner.learn(np.zeros(2), np.zeros(3))
+        before = learner.to_bytes()
+        refused = complaint(lambda pair: learner.learn(*pair), bad)
+        assert learner.to_bytes() == before
+        return refused
+
+    assert call("compiled") == call("numpy")
+
+
+CONVERSIONS = pytest.mark.parametrize(
     "convert",
     [list, tuple, np.float32, lambda q: q.astype(">f8"), lambda q: np.repeat(q, 2)[::2], lambda q: q.astype(int)],
     ids=["list", "tuple", "float32", "big-endian", "strided", "int"],
 )
+
+
+@pytest.mark.usefixtures("kernel_path")
+@CONVERSIONS
+def test_a_rigid_chain_takes_whatever_numpy_understands(convert):
+    arm = rough_arm(np.random.default_rng(4), "RRR")
+    one, other = (RecursiveRigidLearner(arm.nominal, ROUGH) for _ in range(2))
+    q, x = np.array([1.0, -2.0, 0.0]), np.array([1.0, 0.0, -1.0])
+    one.learn(q, x, 0.5)
+    other.learn(convert(q), convert(x), np.float32(0.5))
+    assert other.to_bytes() == one.to_bytes()
+
+
+@pytest.mark.usefixtures("kernel_path")
+@CONVERSIONS
 def test_whatever_numpy_understands_is_taken(convert):
     kbmap = random_map(np.random.default_rng(2), bases_for("RRR"))
     q = np.array([1.0, -2.0, 0.0])

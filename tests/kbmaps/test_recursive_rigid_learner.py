@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -22,6 +23,8 @@ from kbmaps import (
 pytestmark = pytest.mark.usefixtures("kernel_path")
 
 seeds = st.integers(0, 2**32 - 1)
+# Everything may be off, so that a third of the directions show in no position, and some others hardly.
+CRUDE = ChainTolerances(axes=0.05, points=0.015, zeros=0.05, tool=0.06, base_rotation=0.05, base_translation=0.015)
 SLIGHT = ChainTolerances(axes=1e-4, points=1e-4, zeros=1e-4, slide_zeros=1e-4, tool=1e-4, base_rotation=1e-4)
 
 
@@ -173,6 +176,55 @@ def test_along_a_path_from_a_crude_drawing_it_ends_where_a_batch_does():
     assert np.abs(other.x - one.x).max() < 1.5 * one.sigma.max()
 
 
+def most_apart_from_a_batch(seed: int) -> float:
+    """Of all moments between refits, the largest root mean square difference from a batch in the batch's sigma."""
+    rng = np.random.default_rng(seed)
+    arm = rough_arm(rng, "RRRRR", CRUDE)
+    q, x = arm.pairs(rng, 210, 5e-4, 60.0)
+    test = random_q(rng, arm.kinds, 100, 60)
+    learner, batch, apart = RecursiveRigidLearner(arm.nominal, CRUDE), RigidLearner(arm.nominal, CRUDE), []
+    for begin, end in itertools.pairwise([0, 140, *range(150, 211, 10)]):
+        learner.learn(q[begin:end], x[begin:end])
+        batch.learn(q[begin:end], x[begin:end])
+        expected = batch.estimate(test)
+        apart.append(np.sqrt(np.square((learner.predict(test) - expected.x) / expected.sigma).mean()))
+    return max(apart)
+
+
+def test_between_refits_it_stays_where_a_batch_is():
+    assert max(most_apart_from_a_batch(seed) for seed in range(4)) < 0.3
+
+
+@pytest.mark.soak
+def test_of_many_arms_hardly_one_leaves_the_batch_between_refits():
+    apart = [most_apart_from_a_batch(seed) for seed in range(100)]
+    assert np.quantile(apart, 0.95) < 0.3
+    assert max(apart) < 1.0
+
+
+def test_claims_between_refits_are_those_of_a_batch():
+    rng = np.random.default_rng(18)
+    arm = rough_arm(rng, "RRRRR", CRUDE)
+    q, x = arm.pairs(rng, 205, 5e-4, 60.0)
+    learner, batch = RecursiveRigidLearner(arm.nominal, CRUDE), RigidLearner(arm.nominal, CRUDE)
+    learner.learn(q, x, 5e-4)
+    batch.learn(q, x, 5e-4)
+    test = random_q(rng, arm.kinds, 100, 60)
+    np.testing.assert_allclose(learner.estimate(test).sigma, batch.estimate(test).sigma, rtol=0.1)
+
+
+@pytest.mark.parametrize("sigma", [None, 0.004])
+def test_vectors_and_rows_tell_the_same_to_the_last_bit(sigma):
+    rng = np.random.default_rng(19)
+    arm = rough_arm(rng, "RPR")
+    q, x = arm.pairs(rng, 30, 0.004)
+    in_vectors, in_rows = (RecursiveRigidLearner(arm.nominal, ROUGH) for _ in range(2))
+    for k in range(len(q)):
+        in_vectors.learn(q[k], x[k], sigma)
+    in_rows.learn(q, x, sigma)
+    assert in_vectors.to_bytes() == in_rows.to_bytes()
+
+
 @given(seed=seeds, cuts=st.lists(st.integers(1, 59), max_size=4))
 @settings(max_examples=8, deadline=None)
 def test_pairs_tell_the_same_in_whatever_portions_they_come(seed, cuts):
@@ -243,12 +295,14 @@ def test_a_wild_pair_leaves_finite_numbers():
 
 
 @pytest.mark.parametrize("sigma", [0.004, None])
-def test_bytes_give_a_learner_that_goes_on_to_the_last_bit(sigma):
+@pytest.mark.parametrize("tool_changed", [False, True])
+def test_bytes_give_a_learner_that_goes_on_to_the_last_bit(tool_changed, sigma):
     rng = np.random.default_rng(9)
     arm = rough_arm(rng, "RPRR")
     learner = RecursiveRigidLearner(arm.nominal, ROUGH, noise=0.02)
     learner.learn(*arm.pairs(rng, 30, 0.004), sigma)
-    learner.tool_changed(0.1)
+    if tool_changed:
+        learner.tool_changed(0.1)
     twin = RecursiveRigidLearner.from_bytes(learner.to_bytes())
     more = arm.pairs(rng, 20, 0.004)
     learner.learn(*more, sigma)

@@ -12,7 +12,8 @@ from interfaces.records import FloatArray
 from interfaces.robot import RobotDescription
 from interfaces.toml_file import read_toml
 from sim_backend import SimConfig, model_file
-from sim_backend.physics import Physics, Scene
+from sim_backend.physics import Physics
+from sim_backend.scene import Scene
 from sim_backend.truth import TrueRobot
 
 

@@ -31,7 +31,7 @@ def painted(bullet, x, config=PLAIN, seed=0, T_world_camera=None):
     T = np.eye(4) if T_world_camera is None else T_world_camera
     images = tuple(np.zeros((480, 640, 3), dtype=np.uint8) for _ in range(2))
     eyes = StereoEyes(Raster(*bullet, CALIBRATION, TO_LIGHT), CALIBRATION, config, seed)
-    eyes.paint(0, T, T[:3, :3] @ x + T[:3, 3], images)
+    eyes.paint(0, T, np.stack([x, x - [CALIBRATION.baseline_m, 0, 0]]), images)
     return images
 
 

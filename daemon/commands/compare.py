@@ -1,0 +1,49 @@
+"""`bodyschema compare`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+from daemon.commands.options import flag
+
+
+def compare(
+    first: Annotated[Path, Parameter(help="A recording (.csv, .parquet).")],
+    second: Annotated[Path, Parameter(help="Another, at the same joint angles.")],
+    /,
+    *,
+    robot: Annotated[
+        Path | None, Parameter(help="robot.toml, which names the joints; else all other columns are joints.")
+    ] = None,
+    as_json: Annotated[bool, flag("Print the figures as JSON.", name="--json")] = False,
+) -> None:
+    """How far the positions of two recordings are apart, row by row.
+
+    Rows count as the same where all joints agree to 1e-6 rad (1e-6 m of a joint that slides); others are said and
+    left out. Where the recordings have different numbers of rows, each is compared with the one at its joint angles.
+
+    Needs: two recordings at the same joint angles: one measured, one from `bodyschema simulate`, say.
+
+    Next: `bodyschema simulate` with another robot.toml; `bodyschema calibrate`.
+    """
+    import sys
+
+    from rich.console import Console
+
+    from daemon import recordings
+    from daemon.comparison import compared
+    from daemon.comparison_view import view
+    from daemon.wire import encode
+    from interfaces.recording import joints_in
+    from interfaces.robot import RobotDescription
+
+    joints = None if robot is None else RobotDescription.load(robot).joints
+    one, other = (recordings.opened(file, joints or joints_in(file)) for file in (first, second))
+    report = compared(one, other, (str(first), str(second)))
+    if as_json:
+        sys.stdout.write(encode(report).decode() + "\n")
+        return
+    Console(highlight=False).print(view(report))

@@ -1,0 +1,70 @@
+"""What a simulation would have measured at the joint angles of a recording."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from effects import Motion, Simulation
+from interfaces.camera import StereoCalibration
+from interfaces.errors import ConfigError, RecordingError
+from interfaces.recording import Recording
+from interfaces.records import FloatArray
+from kbmaps import KBMapsError
+
+
+def simulated(simulation: Simulation, like: Recording) -> Recording:
+    """The recording that the simulation would have given, with the times, runs and joint angles of `like`.
+
+    Raises:
+        RecordingError: the simulation gives no position at a row.
+    """
+    with np.errstate(all="ignore"):
+        try:
+            x = simulation.positions(Motion.of(like))
+        except KBMapsError as error:
+            raise RecordingError(f"the simulation cannot be run: {error}", file=like.file or "recording") from error
+    beyond = np.flatnonzero(~np.isfinite(x).all(axis=1))
+    if len(beyond):
+        raise RecordingError(
+            f"the simulation gives no position at row {beyond[0] + 1} ({len(beyond)} such rows): the marker lies in "
+            "the plane of the cameras there",
+            file=like.file or "recording",
+            remedy="Is the recording of this robot, and [camera] right?",
+        )
+    return Recording(joints=like.joints, q=like.q, x=x, t=like.t, segment=like.segment)
+
+
+def with_noise(simulation: Simulation, exact: Recording, like: Recording, rng: np.random.Generator) -> Recording:
+    """An exact recording with the noise that its positions would have had: by the covariances of `like`, else [camera].
+
+    Raises:
+        ConfigError: neither says how large it is.
+    """
+    calibration = simulation.robot.calibration
+    if like.cov is not None:
+        roots = np.linalg.cholesky(like.cov)
+        x = exact.x + np.einsum("nij,nj->ni", roots, rng.standard_normal(exact.x.shape))
+    elif calibration is not None:
+        x = _seen_again(calibration, exact.x, rng)
+    else:
+        raise ConfigError(
+            "nothing says how large the noise is: the recording has no covariances, [camera] no stereo pair",
+            file=simulation.robot.file,
+            remedy="Leave --noise away, or add columns sx, sy, sz to the recording",
+        )
+    return Recording(joints=exact.joints, q=exact.q, x=x, t=exact.t, segment=exact.segment)
+
+
+def without_times(simulation: Simulation, like: Recording) -> list[str]:
+    """The names of the effects that need the times which a recording does not have."""
+    return [effect.name for effect in simulation.effects if effect.kind.needs_times and like.t is None]
+
+
+def _seen_again(calibration: StereoCalibration, x: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Positions (n, 3) [m] triangulated from the images of x (n, 3) with noise in each coordinate."""
+    pixels = calibration.project(x)
+    u_left, v_left, u_right, v_right = (pixels + calibration.pixel_sigma * rng.standard_normal(pixels.shape)).T
+    cx, cy = calibration.principal_point_px
+    depth = calibration.focal_px * calibration.baseline_m / (u_left - u_right)
+    scale = depth / calibration.focal_px
+    return np.stack([(u_left - cx) * scale, (0.5 * (v_left + v_right) - cy) * scale, depth], axis=1)

@@ -1,0 +1,226 @@
+"""extended.toml: a robot.toml with `[[effects]]`, and perhaps `[unexplained]`, in it.
+
+[[effects]]
+effect = "joint_compliance"
+where = "shoulder"
+compliance_rad_per_Nm = 0.0031
+
+[unexplained]
+model = "unexplained.kbmap"     # relative to this file
+joints = ["shoulder", "elbow"]  # whose readings it takes
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from interfaces.calibrated_files import tables_elsewhere
+from interfaces.errors import ConfigError, RobotError
+from interfaces.robot import FARTHEST_CAMERA_M, LONGEST_TOOL_M, RobotDescription
+from interfaces.suggest import did_you_mean
+from interfaces.toml_file import convert, line_in_entry, line_of, read_toml
+from interfaces.toml_text import toml_text
+from kbmaps import ModelFormatError
+
+from .effect import Effect
+from .kinds import KINDS
+from .parameter import Parameter
+from .simulation import Simulation
+from .unexplained import Unexplained, stored_model
+
+EXTENDED_FILE = "extended.toml"
+MODEL_FILE = "unexplained.kbmap"
+EFFECTS, UNEXPLAINED = "effects", "unexplained"
+_HEAD = ("effect", "where", "source")
+# By the end of a number's name: what no sane one exceeds, the unit that it then looks like, and what to do.
+_UNITS: tuple[tuple[str, float, str, str], ...] = (
+    ("_rad_per_Nm", 1.0, "degrees or N·mm", "Give radians for each newton metre"),
+    ("_m_per_N", 0.1, "millimetres", "Give metres for each newton"),
+    ("_rad", math.pi, "degrees", "Give radians: 1° is 0.01745"),
+    ("_m", LONGEST_TOOL_M, "millimetres", "Give metres"),
+    ("latency_s", 5.0, "milliseconds", "Give seconds"),
+    ("_error", 0.9, "percent", "Give a fraction: 1 % is 0.01"),
+    ("ratio", 10.0, "percent", "Give a fraction: 1 % is 0.01"),
+    ("fraction", 1.0, "percent", "Give a fraction: 5 % is 0.05"),
+    ("k1", 50.0, "a coefficient for pixels", "Give it for rays: x' = x (1 + k1 r²) with r the tangent off the axis"),
+)
+
+
+class _UnexplainedTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The table [unexplained]."""
+
+    model: str
+    joints: tuple[str, ...]
+
+
+def load_simulation(file: Path) -> Simulation:
+    """The robot of robot.toml, or extended.toml, with the effects that it names.
+
+    Raises:
+        ConfigError: as `RobotDescription.load`, `read_effects` and `read_unexplained`.
+    """
+    tables, text = read_toml(file)
+    return simulation_of(RobotDescription.from_tables(tables, text, file), tables, text)
+
+
+def simulation_of(robot: RobotDescription, tables: Mapping[str, Any], text: str) -> Simulation:
+    """As `load_simulation`, from the tables and the text of the robot's file."""
+    effects = read_effects(robot, tables, text, robot.file)
+    return Simulation(robot, effects, read_unexplained(robot, tables, text, robot.file))
+
+
+def read_effects(robot: RobotDescription, tables: Mapping[str, Any], text: str, file: Path) -> tuple[Effect, ...]:
+    """The effects in `[[effects]]`, in their order; none without it.
+
+    Raises:
+        ConfigError: an effect, a joint or a number is unknown, missing, or of another unit; names line and remedy.
+    """
+    entries = tables.get(EFFECTS, [])
+    if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
+        remedy = "Write each effect under a heading [[effects]]"
+        raise ConfigError("effects is not a list of tables", file=file, line=line_of(text, (EFFECTS,)), remedy=remedy)
+    effects = []
+    for place, entry in enumerate(entries):
+        try:
+            effects.append(_effect(robot, entry))
+        except _WrongEntry as wrong:
+            line = line_in_entry(text, EFFECTS, place, wrong.key)
+            what = f"effect {place + 1}: {wrong.what}"
+            raise RobotError(what, file=file, line=line, remedy=wrong.remedy) from None
+    return tuple(effects)
+
+
+def read_unexplained(robot: RobotDescription, tables: Mapping[str, Any], text: str, file: Path) -> Unexplained | None:
+    """The model that `[unexplained]` names; None without it.
+
+    Raises:
+        ConfigError: a key or a joint is unknown, or the model's file is missing, damaged, or of other joints.
+    """
+    if UNEXPLAINED not in tables:
+        return None
+    table = convert(tables[UNEXPLAINED], _UnexplainedTable, file=file, text=text, prefix=(UNEXPLAINED,))
+    model_file, line = file.parent / table.model, line_of(text, (UNEXPLAINED, "model"))
+    try:
+        model = stored_model(model_file.read_bytes())
+    except OSError as error:
+        raise RobotError(
+            f"unexplained.model: {table.model} cannot be read: {error.strerror}",
+            file=file,
+            line=line,
+            remedy="Put the file there, or take the table [unexplained] out",
+        ) from error
+    except ModelFormatError as error:
+        raise RobotError(f"unexplained.model: {table.model}: {error}", file=file, line=line) from error
+    try:
+        return Unexplained.of(robot, model, table.joints)
+    except RobotError as error:
+        line = line_of(text, (UNEXPLAINED, "joints"))
+        raise RobotError(f"unexplained: {error.what}", file=file, line=line, remedy=error.remedy) from None
+
+
+def write_extended(simulation: Simulation, folder: Path, heading: str, *, replace: bool = False) -> Path:
+    """Write the simulation as `EXTENDED_FILE` into `folder`, which is made if need be.
+
+    The URDF stays where it is and is named relative to `folder`. The robot.toml's other tables are kept; store and
+    checkpoint will be in a folder of their own.
+
+    Args:
+        heading: one line for the top: where it comes from.
+        replace: replace an extended.toml that is there.
+
+    Returns:
+        The path of the extended.toml.
+
+    Raises:
+        ConfigError: the file is there already, or cannot be written.
+        ValueError: the simulation's residual is none that can be stored.
+    """
+    file = folder / EXTENDED_FILE
+    tables = tables_elsewhere(simulation.robot, folder)
+    tables.pop(EFFECTS, None)
+    tables.pop(UNEXPLAINED, None)
+    if simulation.effects:
+        tables[EFFECTS] = [effect.table() for effect in simulation.effects]
+    residual = simulation.residual
+    if residual is not None:
+        if not isinstance(residual, Unexplained):
+            raise ValueError(f"a residual that can be stored is an Unexplained, not a {type(residual).__name__}")
+        tables[UNEXPLAINED] = {"model": MODEL_FILE, "joints": list(residual.joints)}
+    text = f"# {heading}\n\n{toml_text(tables)}"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if file.exists() and not replace:
+            raise ConfigError("is there already", file=file, remedy="Give another folder")
+        if residual is not None:
+            (folder / MODEL_FILE).write_bytes(residual.model.to_bytes())
+        file.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(f"cannot be written: {error.strerror}", file=folder, remedy="Give another folder") from error
+    return file
+
+
+class _WrongEntry(Exception):
+    """What is wrong with one effect, and at which of its keys."""
+
+    def __init__(self, what: str, key: str | None = None, remedy: str = "") -> None:
+        self.what, self.key, self.remedy = what, key, remedy
+        super().__init__(what)
+
+
+def _effect(robot: RobotDescription, entry: Mapping[str, Any]) -> Effect:
+    name, where, source = (_text(entry, key) for key in _HEAD)
+    if name is None:
+        raise _WrongEntry("the key effect is missing", remedy=f"Name one of {', '.join(KINDS)}")
+    if name not in KINDS:
+        raise _WrongEntry(f"there is no effect {name!r}", "effect", did_you_mean(name, KINDS))
+    try:
+        resting = Effect.at(robot, name, where, source)
+    except RobotError as error:
+        raise _WrongEntry(error.what, _blamed(error.what), error.remedy) from None
+    names = [p.name for p in resting.parameters]
+    for key in entry:
+        if key not in (*names, *_HEAD):
+            raise _WrongEntry(f"{name} has no number {key!r}", key, did_you_mean(key, names))
+    values = [_number(entry, p, name) for p in resting.parameters]
+    if not any(p.name in entry for p in resting.parameters if p.is_amount):
+        raise _WrongEntry(f"{name} says of nothing how much", remedy=f"Give {', '.join(names)}")
+    try:
+        return Effect.at(robot, name, where, source, values)
+    except RobotError as error:
+        raise _WrongEntry(error.what, next((n for n in names if n in error.what), None), error.remedy) from None
+
+
+def _blamed(what: str) -> str | None:
+    """The key of the head that a message about an effect's place names."""
+    return next((key for key in ("source", "where") if f"{key} " in what or f"no {key}" in what), "where")
+
+
+def _text(entry: Mapping[str, Any], key: str) -> str | None:
+    value = entry.get(key)
+    if value is not None and not isinstance(value, str):
+        raise _WrongEntry(f"{key} = {value!r} is no text", key, "Write a name in quotes")
+    return value
+
+
+def _number(entry: Mapping[str, Any], parameter: Parameter, effect: str) -> float:
+    name, of_camera = parameter.name, effect.startswith("camera_")
+    if name not in entry:
+        if parameter.nominal is None:
+            raise _WrongEntry(f"{effect}: {name} is missing", remedy="It has no usual value: give it")
+        return parameter.nominal
+    value = entry[name]
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise _WrongEntry(f"{name} = {value!r} is no number", name, "Write it like 0.05 or 1e-3, without a unit")
+    if not math.isfinite(value):
+        raise _WrongEntry(f"{name} = {value} is not finite", name)
+    for ending, largest, unit, remedy in _UNITS:
+        if parameter.is_amount and name.endswith(ending):
+            if abs(value) > (FARTHEST_CAMERA_M if of_camera and ending == "_m" else largest):
+                raise _WrongEntry(f"{name} = {value:g}: this looks like {unit}", name, remedy)
+            break
+    return float(value)

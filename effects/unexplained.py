@@ -1,0 +1,97 @@
+"""What no effect explains, as a learnt map from some joints' readings to a shift of what is measured."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from interfaces.errors import RobotError
+from interfaces.records import FloatArray
+from interfaces.robot import RobotDescription
+from interfaces.suggest import did_you_mean
+from kbmaps import KBMap, KBMapsError, KernelLearner, ModelFormatError, ResidualModel, TensorTrain
+
+
+class StoredModel(Protocol):
+    """A map of kbmaps that predicts and can be stored."""
+
+    @property
+    def joints(self) -> int:
+        """Number of joints d."""
+        ...
+
+    def predict(self, q: ArrayLike) -> FloatArray:
+        """Outputs (n, 3) at q (n, d)."""
+        ...
+
+    def to_bytes(self) -> bytes:
+        """The map as one self-describing byte string."""
+        ...
+
+
+_READERS: tuple[Callable[[bytes], StoredModel], ...] = (
+    KBMap.from_bytes,
+    TensorTrain.from_bytes,
+    KernelLearner.from_bytes,
+    ResidualModel.from_bytes,
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Unexplained:
+    """A model of what no effect explains.
+
+    Attributes:
+        model: any map of kbmaps; its outputs are shifts of what is measured [m], in the measurement frame.
+        joints: the joints whose readings it takes, in its order.
+        columns: their places in q.
+    """
+
+    model: StoredModel
+    joints: tuple[str, ...]
+    columns: tuple[int, ...]
+
+    @classmethod
+    def of(cls, robot: RobotDescription, model: StoredModel, joints: tuple[str, ...]) -> Unexplained:
+        """The model over these joints of a robot.
+
+        Raises:
+            RobotError: a joint is unknown or named twice, or the model is not one of so many joints, or has learnt
+                nothing.
+        """
+        for joint in joints:
+            if joint not in robot.joints:
+                raise RobotError(f"{joint!r}: no joint of this robot", remedy=did_you_mean(joint, robot.joints))
+        if len(set(joints)) != len(joints):
+            raise RobotError("a joint is named twice", remedy="Name each once")
+        if model.joints != len(joints):
+            raise RobotError(
+                f"the model takes {model.joints} joints, not {len(joints)}", remedy="Name those that it was learnt over"
+            )
+        try:
+            model.predict(np.zeros((1, len(joints))))
+        except KBMapsError as error:
+            raise RobotError(f"the model cannot predict: {error}", remedy="Store one that has learnt") from error
+        return cls(model, joints, tuple(robot.joints.index(joint) for joint in joints))
+
+    def predict(self, q: FloatArray) -> FloatArray:
+        """Shifts (n, 3) [m] at the readings q (n, d) [rad, m] of all joints."""
+        return self.model.predict(q[:, self.columns])
+
+
+def stored_model(data: bytes) -> StoredModel:
+    """The map in `data`, of whatever kind.
+
+    Raises:
+        ModelFormatError: it is none that predicts by itself, or damaged.
+    """
+    for reader in _READERS:
+        try:
+            return reader(data)
+        except ModelFormatError:
+            continue
+    raise ModelFormatError("not a map of kbmaps that predicts by itself, or damaged")

@@ -1,0 +1,73 @@
+"""What a frame shows: the robot as it stands, and the ball as each eye sees it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from effects import Motion, Simulation
+from interfaces.camera import StereoCalibration
+from interfaces.records import FloatArray
+
+from .bullet import Body
+from .truth import TrueRobot
+
+
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """What a frame shows.
+
+    Attributes:
+        angles: true joint angles [rad or m], shape (d,).
+        T_world_camera: pose of the left eye, shape (4, 4).
+        x_world: centre of the ball [m], shape (3,).
+        tip: the same in the marker link, where the tool ends [m], shape (3,).
+        x_eyes: where it looks to be in the left and the right eye's optical frame [m], shape (2, 3): where it is,
+            unless the lenses differ from the calibration.
+        x_seen: what an ideal tracker with the described calibration makes of it [m], shape (3,).
+    """
+
+    angles: FloatArray
+    T_world_camera: FloatArray
+    x_world: FloatArray
+    tip: FloatArray
+    x_eyes: FloatArray
+    x_seen: FloatArray
+
+
+def scene_of(
+    body: Body, truth: TrueRobot, marker_xyz: FloatArray, calibration: StereoCalibration, row: Motion
+) -> Scene:
+    """What a frame shows of a body as it stands, with its tool's marker described at `marker_xyz` (3,) [m].
+
+    Args:
+        row: what the encoders read at the frame's time, one row.
+    """
+    robot, beyond = truth.robot, truth.beyond
+    T_world_hand = body.link_pose(robot.robot.marker_link)
+    tip = truth.marker(marker_xyz) + beyond.tool_shift(row)[0]
+    T_world_placed = body.link_pose(robot.camera.parent_link) @ truth.T_parent_camera
+    T_world_camera = T_world_placed @ beyond.camera_moves(row)[0]
+    x_world = T_world_hand[:3, :3] @ tip + T_world_hand[:3, 3]
+    x_camera = T_world_camera[:3, :3].T @ (x_world - T_world_camera[:3, 3])
+    x_eyes, x_seen = _through_lenses(beyond, calibration, x_camera, beyond.added(row)[0])
+    return Scene(body.angles(), T_world_camera, x_world, tip, x_eyes, x_seen)
+
+
+def _through_lenses(
+    simulation: Simulation, calibration: StereoCalibration, x_camera: FloatArray, added: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Where a point (3,) [m] looks to be in each eye (2, 3), and what is triangulated of it (3,).
+
+    What is `added` (3,) [m] to the triangulated position moves the images accordingly. The longer the focal length, the
+    larger the image, so the nearer the point looks.
+    """
+    optics = simulation.optics
+    rays = np.concatenate(optics.rays(x_camera[None], calibration))
+    reported = optics.reported(x_camera[None], calibration)[0]
+    eyes = np.array([[0.0, 0.0, 0.0], [calibration.baseline_m, 0.0, 0.0]])
+    before, after = reported - eyes, reported + added - eyes
+    rays += after[:, :2] / after[:, 2:] - before[:, :2] / before[:, 2:]
+    x_eyes = np.column_stack([rays, np.ones(2)]) * (x_camera[2] / (1.0 + optics.focal_error))
+    return x_eyes, reported + added

@@ -1,0 +1,37 @@
+"""The hider shares no code with those who look for what it hides."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+HERE = Path(__file__).parent
+OURS = {"kbmaps", "interfaces", "drivers", "vision", "sim_backend", "effects", "diagnosis", "daemon", "benchmarks"}
+INSTRUMENT = {"rendered.py": {"interfaces.camera", "interfaces.records", "vision.tracker"}}  # it looks at images
+GENERATOR = sorted(file for file in HERE.glob("*.py") if not file.name.startswith("test_"))
+
+
+def imported(file: Path) -> Iterator[str]:
+    """Full names of the modules that a file imports, those of its own folder left out."""
+    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.level == 0:
+            yield str(node.module)
+        elif isinstance(node, ast.ImportFrom) and node.level > 1:
+            yield "tests"
+
+
+@pytest.mark.parametrize("file", GENERATOR, ids=lambda file: file.stem)
+def test_the_generator_imports_nothing_of_the_product_but_the_tracker(file: Path) -> None:
+    ours = {name for name in imported(file) if name.partition(".")[0] in OURS | {"tests", "importlib"}}
+    assert ours <= INSTRUMENT.get(file.name, set())
+
+
+def test_the_check_sees_imports_inside_functions(tmp_path: Path) -> None:
+    file = tmp_path / "sly.py"
+    file.write_text("def late():\n    from effects.stages import backlash\n    return backlash\n", encoding="utf-8")
+    assert list(imported(file)) == ["effects.stages"]

@@ -1,0 +1,120 @@
+"""The derivatives that the fit takes are those of what the simulation measures."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from effect_arms import arm, everywhere, sized, walk
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from effects import KINDS, Simulation
+
+# Of the largest derivative. That a spring's deflection changes its own load is left out.
+EXACT, TO_FIRST_ORDER = 1e-5, 0.02
+MOTION = walk()
+OTHERS = (
+    ("joint_scale", "elbow", None),
+    ("joint_coupling", "elbow", "neck_yaw"),
+    ("backlash", "wrist", None),
+    ("link_geometry", "neck_tilt", None),
+    ("link_geometry", "elbow", None),
+    ("tool_slip", None, None),
+    ("camera_pose", None, None),
+    ("camera_moved", None, None),
+    ("camera_scale", None, None),
+    ("camera_focal", None, None),
+    ("lens_distortion", None, None),
+    ("thermal_drift", None, None),
+)
+
+
+@pytest.fixture(scope="module")
+def robot(tmp_path_factory):
+    return arm(tmp_path_factory.mktemp("arm"))
+
+
+PLACES = st.sampled_from([kind.name for kind in KINDS.values()])
+KNOWN = settings(deadline=None, max_examples=60)
+
+
+def drawn(data, robot):
+    name = data.draw(PLACES)
+    return data.draw(st.sampled_from([place for place in everywhere(robot) if place[0] == name]))
+
+
+def numerical(simulation, place, number, step):
+    """Derivative (n, 3) by one number of the effect at `place`."""
+    outcomes = []
+    for change in (step, -step):
+        effects = list(simulation.effects)
+        values = np.array(effects[place].values)
+        values[number] += change
+        effects[place] = effects[place].with_values(values)
+        outcomes.append(simulation.with_effects(effects).positions(MOTION))
+    return (outcomes[0] - outcomes[1]) / (2.0 * step)
+
+
+def check_columns(robot, others, effect):
+    simulation = Simulation(robot, (*others, effect))
+    columns = simulation.run(MOTION).columns(effect)
+    assert columns.shape == (len(MOTION), 3, len(effect.parameters))
+    for k, parameter in enumerate(effect.parameters):
+        if not parameter.is_amount:
+            assert not columns[:, :, k].any()
+            continue
+        expected = numerical(simulation, len(others), k, 1e-5 * parameter.usual)
+        allowed = TO_FIRST_ORDER if effect.name == "joint_compliance" else EXACT
+        assert np.abs(columns[:, :, k] - expected).max() <= allowed * max(np.abs(expected).max(), 1e-9)
+
+
+@KNOWN
+@given(st.data(), st.sampled_from([0.0, 0.5, 1.0]), st.integers(0, 5))
+def test_columns_are_the_derivatives_of_an_effect_alone(robot, data, share, seed) -> None:
+    check_columns(robot, (), sized(robot, drawn(data, robot), share, seed))
+
+
+@KNOWN
+@given(st.data(), st.sampled_from([0.0, 1.0]), st.integers(0, 5))
+def test_columns_are_the_derivatives_of_an_effect_among_others(robot, data, share, seed) -> None:
+    others = tuple(sized(robot, place, 1.0, seed) for place in OTHERS)
+    check_columns(robot, others, sized(robot, drawn(data, robot), share, seed))
+
+
+@pytest.mark.parametrize("kind", list(KINDS))
+def test_with_nominal_amounts_nothing_changes(robot, kind) -> None:
+    nominal = Simulation(robot).positions(MOTION)
+    for place in everywhere(robot):
+        if place[0] == kind:
+            same = Simulation(robot, (sized(robot, place, 0.0),)).positions(MOTION)
+            np.testing.assert_allclose(same, nominal, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("kind", list(KINDS))
+def test_half_the_usual_size_moves_positions(robot, kind) -> None:
+    nominal = Simulation(robot).positions(MOTION)
+    for place in everywhere(robot):
+        if place[0] == kind and place != ("joint_compliance", "neck_yaw", None):  # whose axis stands upright
+            moved = Simulation(robot, (sized(robot, place, 0.5),)).positions(MOTION) - nominal
+            assert np.linalg.norm(moved, axis=1).max() > 1e-6, place
+
+
+def test_where_joints_are_torque_free_the_hand_bears_the_weight(tmp_path) -> None:
+    robot = arm(tmp_path, hold="torque_free")
+    spring = sized(robot, ("joint_compliance", "elbow", None), 1.0)
+    run = Simulation(robot, (spring,)).run(MOTION)
+    np.testing.assert_array_equal(run.measured, Simulation(robot).positions(MOTION))
+    assert not run.columns(spring).any()
+
+
+def test_an_effect_cannot_be_changed_by_the_residual_nor_the_other_way_round(robot) -> None:
+    class Bump:
+        def predict(self, q):
+            return 0.01 * np.sin(q[:, :3])
+
+    effect = sized(robot, ("joint_scale", "elbow", None), 1.0)
+    alone, both = Simulation(robot, (effect,)), Simulation(robot, (effect,), Bump())
+    np.testing.assert_allclose(
+        both.positions(MOTION), alone.positions(MOTION) + 0.01 * np.sin(MOTION.q[:, :3]), atol=1e-15
+    )
+    np.testing.assert_array_equal(both.run(MOTION).columns(effect), alone.run(MOTION).columns(effect))

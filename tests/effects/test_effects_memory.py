@@ -1,0 +1,64 @@
+"""Effects that depend on the order of the readings: plays, and the first stage reading by reading."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from effect_arms import arm, everywhere, sized, walk
+from hypothesis import given
+from hypothesis import strategies as st
+
+from effects import LiveEncoders, Motion, Simulation
+from effects.encoder import ENCODER_EFFECTS, played
+
+PATHS = st.lists(st.floats(-1.0, 1.0), min_size=1, max_size=60).map(np.array)
+WIDTHS = st.floats(1e-4, 0.5)
+EACH = [effect.name for effect in ENCODER_EFFECTS]
+
+
+@pytest.fixture(scope="module")
+def robot(tmp_path_factory):
+    return arm(tmp_path_factory.mktemp("arm"))
+
+
+@given(PATHS, WIDTHS)
+def test_a_play_never_lags_by_more_than_half_its_width(q, width) -> None:
+    assert np.abs(played(q, [(0, len(q))], width)).max() <= 0.5 * width * (1 + 1e-12)
+
+
+@given(PATHS, WIDTHS)
+def test_the_output_of_a_play_moves_only_where_its_input_does_and_the_same_way(q, width) -> None:
+    output = q + played(q, [(0, len(q))], width)
+    assert (np.diff(output) * np.diff(q) >= -1e-15).all()
+
+
+@given(st.lists(st.floats(0.01, 0.1), min_size=2, max_size=40), WIDTHS)
+def test_a_play_that_is_driven_one_way_lags_by_half_its_width(steps, width) -> None:
+    q = np.cumsum(steps)
+    np.testing.assert_allclose(played(q, [(0, len(q))], width), -0.5 * width, atol=1e-12)
+
+
+def test_a_play_rests_until_its_width_is_crossed() -> None:
+    q = np.array([0.0, 0.1, 0.08, 0.05, 0.0])
+    output = q + played(q, [(0, 5)], 0.04)
+    np.testing.assert_allclose(output, [-0.02, 0.08, 0.08, 0.07, 0.02], atol=1e-15)
+
+
+def reading_by_reading(simulation, motion):
+    live, angles = LiveEncoders(simulation), []
+    for q, t, move in zip(motion.q, motion.clock, motion.moves, strict=True):
+        angles.append(live.true_angles(q, float(t), move))
+    return np.array(angles)
+
+
+@pytest.mark.parametrize("name", EACH)
+def test_reading_by_reading_the_first_stage_is_that_of_the_whole_motion(robot, name) -> None:
+    motion = walk(3)
+    motion = Motion(motion.q, motion.t, np.zeros(len(motion), dtype=np.int64))
+    simulation = Simulation(
+        robot, tuple(sized(robot, place, 1.0, 5) for place in everywhere(robot) if place[0] == name)
+    )
+    # Before it has moved, a live play does not know where it will be led.
+    after = slice(1, None)
+    expected = simulation.unloaded(motion)
+    np.testing.assert_allclose(reading_by_reading(simulation, motion)[after], expected[after], rtol=0, atol=1e-14)

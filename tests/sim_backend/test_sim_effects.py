@@ -1,0 +1,202 @@
+"""What the world shows is what `effects.Simulation` says that it shows, effect by effect."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from test_sim_truth import NO_ERRORS
+
+from effects import KINDS, Effect, Motion, Simulation
+from interfaces.records import MarkerFix
+from interfaces.robot import RobotDescription
+from interfaces.toml_file import read_toml
+from sim_backend import EncoderConfig, SimConfig, model_file
+from sim_backend.joints import JointPaths
+from sim_backend.physics import Physics
+from sim_backend.posed import PosedWorld
+from sim_backend.postures import visible_postures
+from sim_backend.truth import TrueRobot
+from vision.config import VisionConfig
+from vision.tracked_camera import TrackedCamera
+from vision.tracker import StereoTracker
+
+CLOSE_M = 1e-6
+FRAME_STEPS = 8
+# Readings as fine as numbers are, at every step of the physics.
+EXACT = EncoderConfig(ticks_per_turn=2**44, ticks_per_metre=2**44, noise_ticks=0.0, rate_hz=240)
+CONFIG = SimConfig(seed=4, errors=NO_ERRORS, encoders=EXACT)
+SHIFT = {"x_m": 0.011, "y_m": -0.007, "z_m": 0.009}
+TURN = {"rx_rad": 0.03, "ry_rad": -0.02, "rz_rad": 0.05}
+HEAD, ARM = "neck_pitch", "elbow_flexion"
+EFFECTS = [
+    ("joint_offset", HEAD, None, {"offset_rad": 0.04}),
+    ("joint_offset", ARM, None, {"offset_rad": -0.05}),
+    ("joint_scale", ARM, None, {"scale_error": 0.02}),
+    ("joint_eccentricity", ARM, None, {"sine_rad": 0.02, "cosine_rad": -0.01}),
+    ("joint_ripple", ARM, None, {"sine_rad": 0.01, "cosine_rad": 0.004, "cycles_per_turn": 11.0}),
+    ("joint_coupling", ARM, "shoulder_flexion", {"ratio": 0.03}),
+    ("encoder_jump", ARM, None, {"jump_rad": 0.03, "t0": 0.6}),
+    ("backlash", ARM, None, {"width_rad": 0.01}),
+    ("backlash", HEAD, None, {"width_rad": -0.02}),
+    ("settling", ARM, None, {"fraction": 0.1}),
+    ("joint_compliance", ARM, None, {"compliance_rad_per_Nm": 0.004}),
+    ("joint_compliance", "shoulder_flexion", None, {"compliance_rad_per_Nm": 0.002}),
+    ("link_geometry", HEAD, None, SHIFT | TURN),
+    ("link_geometry", ARM, None, SHIFT | TURN),
+    ("tool_offset", None, None, SHIFT),
+    ("tool_slip", None, None, SHIFT | {"t0": 0.7}),
+    ("camera_pose", None, None, SHIFT | TURN),
+    ("camera_moved", None, None, SHIFT | TURN | {"t0": 0.8}),
+    ("camera_scale", None, None, {"scale_error": 0.02}),
+    ("camera_focal", None, None, {"focal_error": 0.015}),
+    ("lens_distortion", None, None, {"k1": 0.08}),
+    ("camera_latency", None, None, {"latency_s": 0.0125}),
+    ("thermal_drift", None, None, SHIFT | {"time_constant_s": 0.5}),
+]  # fmt: skip
+
+
+# What happens to images on their way to the tracker.
+SEEN = (("camera_scale", "camera_focal", "lens_distortion"), ("camera_moved", "thermal_drift"))
+# Those without a memory of their own go through the same lines of the guided world.
+TOGETHER = (
+    {"joint_scale", "joint_eccentricity", "joint_ripple", "joint_coupling"},
+    {"tool_offset", "camera_pose", "camera_scale", "camera_focal", "lens_distortion"},
+)
+
+
+def groups() -> list[list]:
+    """The effects as the guided world tries them: in two groups, and each other one alone."""
+    grouped = [[case for case in EFFECTS if case[0] in names] for names in TOGETHER]
+    alone = [case for case in EFFECTS if not any(case[0] in names for names in TOGETHER)]
+    return grouped + [[case] for case in alone if case[0] != "camera_latency"]  # whose formula is of smooth paths
+
+
+def named(case) -> str:
+    return f"{case[0]}-{case[1]}" if case[1] else case[0]
+
+
+def held() -> RobotDescription:
+    """The shipped robot, whose joints bear its weight."""
+    file = model_file("upper_body")
+    tables, text = read_toml(file)
+    tables["robot"]["hold"] = "held"
+    return RobotDescription.from_tables(tables, text, file)
+
+
+def extended(*cases) -> Simulation:
+    robot = held()
+    return Simulation(robot, tuple(Effect.at(robot, *case) for case in cases))
+
+
+def guided(simulation: Simulation, config: SimConfig = CONFIG, seconds: float = 1.5) -> tuple[Motion, np.ndarray]:
+    """Readings at every step from the start, and what an ideal tracker sees in the frames; NaN between them."""
+    robot = simulation.robot
+    assert robot.calibration is not None
+    truth = TrueRobot.draw(robot, config, simulation)
+    with Physics(truth, robot.calibration, config) as physics:
+        q, x = [physics.read_encoders()], [np.full(3, np.nan)]
+        while physics.steps < seconds * physics.rate_hz:
+            physics.step()
+            q.append(physics.read_encoders())
+            x.append(physics.scene().x_seen if physics.steps % FRAME_STEPS == 0 else np.full(3, np.nan))
+    t = np.arange(len(q)) / physics.rate_hz
+    return Motion(np.array(q), t, np.zeros(len(q), dtype=np.int64), FRAME_STEPS / physics.rate_hz), np.array(x)
+
+
+def frames(motion: Motion) -> Motion:
+    """The rows at which frames were taken."""
+    at = slice(FRAME_STEPS, None, FRAME_STEPS)
+    assert motion.t is not None
+    return Motion(motion.q[at], motion.t[at], motion.segment[at])
+
+
+def test_every_effect_of_the_table_is_tried() -> None:
+    assert {case[0] for case in EFFECTS} == set(KINDS)
+
+
+@pytest.mark.parametrize("cases", groups(), ids=lambda cases: "-".join(map(named, cases)))
+def test_the_guided_world_shows_what_the_simulation_says(cases) -> None:
+    simulation = extended(*cases)
+    motion, x = guided(simulation)
+    at = slice(FRAME_STEPS, None, FRAME_STEPS)
+    if cases[0][0] == "settling":  # of the move since the last frame, which the first frame does not know
+        expected, seen = simulation.positions(frames(motion))[1:], x[at][1:]
+    else:
+        expected, seen = simulation.positions(motion)[at], x[at]
+    assert np.abs(seen - expected).max() < CLOSE_M
+
+
+def test_a_late_frame_shows_the_joints_of_the_past() -> None:
+    simulation, steps = extended(("camera_latency", None, None, {"latency_s": 3 / 240})), 3
+    motion, x = guided(simulation)
+    past = simulation.robot.chain.positions(motion.q[FRAME_STEPS - steps :: FRAME_STEPS])
+    assert np.abs(x[FRAME_STEPS::FRAME_STEPS] - past[: len(x[FRAME_STEPS::FRAME_STEPS])]).max() < CLOSE_M
+
+
+@pytest.mark.parametrize("latency_s", [0.0125, 0.031, -0.031])
+def test_on_a_smooth_path_a_late_stamp_is_what_the_simulation_says(latency_s: float) -> None:
+    simulation = extended(("camera_latency", None, None, {"latency_s": latency_s}))
+    truth = TrueRobot.draw(simulation.robot, CONFIG, simulation)
+    paths = JointPaths(truth, 240, 30, begins=0.0)
+    t = np.arange(120) / 240
+    speeds, bends = np.random.default_rng(5).uniform(-1, 1, (2, len(simulation.robot.joints), 1))
+    drives = (speeds * t + bends * t**2).T
+    read, seen = [], []
+    for angles, now in zip(drives, t, strict=True):
+        paths.record(angles, float(now))
+        read.append(paths.read)
+        seen.append(paths.seen)
+    motion = Motion(np.array(read), t, np.zeros(len(t), dtype=np.int64))
+    well_inside = slice(20, -2)
+    said = motion.earlier(simulation.latency_s).q
+    assert np.abs(np.array(seen) - said)[well_inside].max() < 1e-9
+
+
+class NoRenderer:
+    """In the renderer's place: nothing is painted."""
+
+    def __init__(self, *arguments) -> None: ...
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *error) -> None: ...
+
+
+@pytest.mark.parametrize("case", [case for case in EFFECTS if case[0] != "camera_latency"], ids=named)
+def test_the_posed_world_shows_what_the_simulation_says(case, monkeypatch) -> None:
+    monkeypatch.setattr("sim_backend.posed.RenderProcess", NoRenderer)
+    simulation = extended(case)
+    robot = simulation.robot
+    rng = np.random.default_rng(3)
+    postures = rng.uniform(0.7 * robot.lower, 0.7 * robot.upper, (40, len(robot.joints)))
+    postures[:, 0:2] = 0.0  # the head looks ahead
+    with PosedWorld(robot, CONFIG, postures, simulation) as world:
+        x = np.array([world.scene(number).x_seen for number in range(len(postures))])
+    motion = Motion(postures, np.arange(1.0, 41.0), np.zeros(40, dtype=np.int64))
+    ahead = simulation.run(motion).x_camera[:, 2] > 0.1
+    assert ahead.any()
+    assert np.abs(x - simulation.positions(motion))[ahead].max() < CLOSE_M
+
+
+def doubled(case):
+    name, where, source, values = case
+    return name, where, source, {key: value if key == "time_constant_s" else 2.0 * value for key, value in values.items()}
+
+
+@pytest.mark.parametrize("names", SEEN, ids="-".join)
+def test_the_tracker_measures_what_the_world_says_that_it_shows(names) -> None:
+    simulation = extended(*(doubled(case) for case in EFFECTS if case[0] in names))
+    plain = SimConfig(seed=4, errors=NO_ERRORS)
+    postures = visible_postures(simulation.robot, plain, 8)
+    with PosedWorld(simulation.robot, plain, postures, simulation) as world:
+        tracked = TrackedCamera(world.camera, StereoTracker(world.camera.calibration, VisionConfig()))
+        shown = np.array([world.scene(number).x_seen for number in range(len(postures))])
+        with tracked:
+            fixes = [tracked.read(20.0) for _ in postures]
+    seen = [k for k, fix in enumerate(fixes) if isinstance(fix, MarkerFix)]
+    misses = np.array([fixes[k].x for k in seen]) - shown[seen]
+    effects = shown[seen] - simulation.robot.chain.positions(postures[seen])
+    assert len(seen) >= 4
+    # A tenth of a pixel is two millimetres of depth at this distance.
+    assert np.linalg.norm(misses, axis=1).mean() < 0.1 * np.linalg.norm(effects, axis=1).mean()
