@@ -18,7 +18,7 @@ from diagnosis.observations import ticks
 from diagnosis.remedies import remedies
 from diagnosis.report import About, page
 from diagnosis.result import DiagnosisFile
-from effects import KINDS, Simulation
+from effects import KINDS, write_extended
 from interfaces.errors import BodyschemaError, RecordingError, RequestError
 from interfaces.recording import Recording
 from interfaces.records import FloatArray, Pair
@@ -99,10 +99,8 @@ def measured(config: Config, file: Path | None, *, live: bool) -> Source:
     if file is None:
         with client(config.tables.zenoh.sampler) as bus:
             recording, name = _history(History(bus, config.robot, 1), joints), f"the sampler of {config.robot.name}"
-    elif file.suffix.lower() in recordings.STORE_ENDINGS:
-        recording, name = recordings.of_robot(recordings.from_store(file), joints, file), file.name
     else:
-        recording, name = Recording.read(file, joints), file.name
+        recording, name = recordings.opened(file, joints), file.name
     require_units(config.robot, recording, file or Path(name))
     return Source(recording, name)
 
@@ -132,7 +130,7 @@ class Found:
     @property
     def json(self) -> str:
         """diagnosis.json."""
-        return msgspec.json.format(msgspec.json.encode(self.file), indent=1).decode()
+        return msgspec.json.format(msgspec.json.encode(self.file, enc_hook=float), indent=1).decode()
 
     @property
     def timed(self) -> bool:
@@ -162,7 +160,7 @@ def run(config: Config, source: Source, asked: Asked, tell: Tell) -> Found:
         )
     tell(f"{len(recording)} pairs of {source.name}")
     diagnosis = diagnosed(
-        recording, Simulation(robot), only=asked.only, without=asked.without, seed=asked.seed, tell=tell
+        recording, config.simulation, only=asked.only, without=asked.without, seed=asked.seed, tell=tell
     )
     if not diagnosis.hypotheses.effects:
         raise DiagnosisError(
@@ -187,9 +185,11 @@ def written(found: Found, folder: Path) -> None:
     """Write the files of DIR.
 
     Raises:
-        RecordingError: they cannot be written.
+        ConfigError, RecordingError: they cannot be written.
     """
     about = About(found.source.name, found.robot.name, version("bodyschema"))
+    heading = f"Found by bodyschema {about.version} in {len(found.source.recording)} pairs of {about.recording}"
+    write_extended(found.diagnosis.extended.simulation, folder, heading, replace=True)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         (folder / DIAGNOSIS).write_text(found.json + "\n", encoding="utf-8")

@@ -66,7 +66,11 @@ def diagnose(
     console = Console(highlight=False)
     console.print(view(found.file, found.remedies, timed=found.timed))
     if out is not None:
-        console.print(f"\nWritten: {out / 'report.html'} and diagnosis.json beside it.", markup=False, soft_wrap=True)
+        console.print(
+            f"\nOpen {out / 'report.html'}. Beside it are diagnosis.json and extended.toml, the simulation with what "
+            "was found, which takes the place of robot.toml.",
+            markup=False,
+        )
 
 
 @contextmanager
