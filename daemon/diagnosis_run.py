@@ -24,6 +24,7 @@ from interfaces.recording import Recording
 from interfaces.records import FloatArray, Pair
 from interfaces.robot import RobotDescription
 from interfaces.suggest import did_you_mean
+from kbmaps import KBMapsError, align
 
 from . import recordings
 from .bus import client
@@ -36,6 +37,8 @@ DIAGNOSIS, REPORT = "diagnosis.json", "report.html"
 ALWAYS = ("outliers",)
 # So many pairs for each joint are the fewest that say anything.
 FEWEST_PAIRS_A_JOINT = 5
+# A scale error from which on a joint turns the other way.
+BACKWARDS = -1.0
 
 Tell = Callable[[str], None]
 
@@ -159,6 +162,7 @@ def run(config: Config, source: Source, asked: Asked, tell: Tell) -> Found:
             f"Record at least {fewest}; some hundred are better"
         )
     tell(f"{len(recording)} pairs of {source.name}")
+    _require_columns(robot, recording, source.name)
     diagnosis = diagnosed(
         recording, config.simulation, only=asked.only, without=asked.without, seed=asked.seed, tell=tell
     )
@@ -166,15 +170,45 @@ def run(config: Config, source: Source, asked: Asked, tell: Tell) -> Found:
         raise DiagnosisError(
             f"{source.name}: nothing to look for. {' '.join(diagnosis.hypotheses.limitations)}".strip()
         )
+    _require_directions(diagnosis, source.name)
     _require_this_robot(robot, recording, diagnosis.extended.run.measured, source.name)
     return Found(diagnosis, source, robot)
+
+
+def _require_columns(robot: RobotDescription, recording: Recording, name: str) -> None:
+    """DiagnosisError where the joints' columns are mixed up, or count the other way.
+
+    Couplings and scales would fit that as well, as causes that are none.
+    """
+    known = {"pose_known": robot.camera.pose_known, "marker_known": robot.robot.marker_known}
+    try:
+        drawn = align(robot.chain, recording.q, recording.x, **known).chain.positions(recording.q)
+    except KBMapsError as error:
+        raise DiagnosisError(f"{name}: the simulation cannot be laid on the pairs: {error}") from error
+    if not is_far_off(robot, np.linalg.norm(drawn - recording.x, axis=1), _told_sigma(recording)):
+        return
+    if (changed := mixed_up(robot, recording)) is not None:
+        raise DiagnosisError(f"{name}: the columns of the joints seem to be mixed up. {changed}. Mend that first")
+
+
+def _require_directions(diagnosis: Diagnosis, name: str) -> None:
+    """DiagnosisError where a joint's scale says that it counts the other way."""
+    for cause in diagnosis.causes:
+        if cause.name == "joint_scale" and cause.values[0] < BACKWARDS:
+            raise DiagnosisError(f"{name}: {cause.where} counts the other way. Change its sign in the recording first")
+
+
+def _told_sigma(recording: Recording) -> float | None:
+    """1-sigma of a coordinate [m], where the recording tells it."""
+    if recording.cov is None:
+        return None
+    return float(np.sqrt(np.trace(recording.cov, axis1=1, axis2=2).mean() / 3.0))
 
 
 def _require_this_robot(robot: RobotDescription, recording: Recording, predicted: FloatArray, name: str) -> None:
     """DiagnosisError where the extended simulation is so far off that the pairs are hardly of this robot."""
     left = np.linalg.norm(predicted - recording.x, axis=1)
-    told = None if recording.cov is None else float(np.sqrt(np.trace(recording.cov, axis1=1, axis2=2).mean() / 3.0))
-    if is_far_off(robot, left, told):
+    if is_far_off(robot, left, _told_sigma(recording)):
         raise DiagnosisError(
             f"{name}: whatever is tried, half of the pairs are missed by over {1e3 * float(np.median(left)):.3g} mm: "
             f"they are hardly of this robot. {mixed_up(robot, recording) or OTHER_CAUSES}"

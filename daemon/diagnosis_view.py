@@ -35,6 +35,8 @@ _ERRORS = (
     ("extended", "with the causes"),
     ("noise_floor", "noise alone"),
 )
+# What says nothing new where it is the same as another.
+_SAME_AS = {"aligned": "nominal", "extended": "aligned"}
 _BAR = 24
 
 
@@ -110,7 +112,8 @@ def _errors(diagnosis: DiagnosisFile) -> Table:
     # Far off in its nominal place, an arm would leave no room for the rest.
     longest = max(rms.aligned, rms.extended, rms.noise_floor or 0.0, 1e-12)
     for name, label in _ERRORS:
-        if (value := _of(rms, name)) is not None:
+        value = _of(rms, name)
+        if value is not None and not (name in _SAME_AS and value == _of(rms, _SAME_AS[name])):
             table.add_row(label, mm(value), mm(_of(mean, name)), _bar(value / longest))
     return table
 
@@ -133,9 +136,8 @@ def _causes(causes: Sequence[Cause], timed: bool) -> Table:
     for cause in sorted(causes, key=lambda c: -c.share_of_gain_percent):
         numbers = telling(numbers_of(cause, timed=timed))
         figures = (percent(cause.probability), share(cause.share_of_gain_percent), share(cause.held_out_gain_percent))
-        for row, number in enumerate(numbers):
-            first = (place(cause), *figures) if row == 0 else ("", "", "", "")
-            table.add_row(Text(first[0]), number.label, str(number), *first[1:])
+        labels, values = ("\n".join(lines) for lines in ([n.label for n in numbers], [str(n) for n in numbers]))
+        table.add_row(Text(place(cause)), labels, values, *figures)
     return table
 
 

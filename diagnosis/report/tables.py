@@ -8,6 +8,8 @@ from html import escape
 from ..numbers import Number, chance, mm, named, numbers_of, percent, place, share, telling
 from ..result import Cause, DiagnosisFile, Indistinguishable, Rejected
 
+# What says nothing new where it is the same as another.
+_SAME_AS = {"aligned": "nominal", "extended": "aligned"}
 # So many of the rejected hypotheses are shown at first sight.
 NEAREST = 12
 _ERRORS = (
@@ -25,7 +27,8 @@ def errors(diagnosis: DiagnosisFile) -> str:
     longest = max(value for name, _ in _ERRORS[1:] if (value := getattr(rms, name)) is not None) or 1.0
     rows = []
     for name, label in _ERRORS:
-        if (value := getattr(rms, name)) is None:
+        value = getattr(rms, name)
+        if value is None or (name in _SAME_AS and value == getattr(rms, _SAME_AS[name])):
             continue
         share = min(value / longest, 1.0)
         bar = f'<span class="bar {name}" style="width:{100 * share:.1f}%"></span>'
