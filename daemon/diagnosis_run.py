@@ -29,7 +29,7 @@ from kbmaps import KBMapsError, align
 from . import recordings
 from .bus import client
 from .config import Config
-from .plausibility import OTHER_CAUSES, is_far_off, mixed_up, require_units
+from .plausibility import is_far_off, mixed_up, require_units
 from .recorder import History
 
 DIAGNOSIS, REPORT = "diagnosis.json", "report.html"
@@ -37,8 +37,10 @@ DIAGNOSIS, REPORT = "diagnosis.json", "report.html"
 ALWAYS = ("outliers",)
 # So many pairs for each joint are the fewest that say anything.
 FEWEST_PAIRS_A_JOINT = 5
-# A scale error from which on a joint turns the other way.
-BACKWARDS = -1.0
+# Of the arm's reach, so much left by the drawn arm in its best place makes other orders of the columns worth a try.
+SUSPECT = 0.005
+# What may be wrong where nothing is found that is.
+ELSE = "Are the columns in another order, does a joint count the other way, is a zero off by a quarter turn?"
 
 Tell = Callable[[str], None]
 
@@ -170,7 +172,6 @@ def run(config: Config, source: Source, asked: Asked, tell: Tell) -> Found:
         raise DiagnosisError(
             f"{source.name}: nothing to look for. {' '.join(diagnosis.hypotheses.limitations)}".strip()
         )
-    _require_directions(diagnosis, source.name)
     _require_this_robot(robot, recording, diagnosis.extended.run.measured, source.name)
     return Found(diagnosis, source, robot)
 
@@ -185,17 +186,15 @@ def _require_columns(robot: RobotDescription, recording: Recording, name: str) -
         drawn = align(robot.chain, recording.q, recording.x, **known).chain.positions(recording.q)
     except KBMapsError as error:
         raise DiagnosisError(f"{name}: the simulation cannot be laid on the pairs: {error}") from error
-    if not is_far_off(robot, np.linalg.norm(drawn - recording.x, axis=1), _told_sigma(recording)):
+    if not is_far_off(robot, np.linalg.norm(drawn - recording.x, axis=1), _told_sigma(recording), SUSPECT):
         return
     if (changed := mixed_up(robot, recording)) is not None:
         raise DiagnosisError(f"{name}: the columns of the joints seem to be mixed up. {changed}. Mend that first")
 
 
-def _require_directions(diagnosis: Diagnosis, name: str) -> None:
-    """DiagnosisError where a joint's scale says that it counts the other way."""
-    for cause in diagnosis.causes:
-        if cause.name == "joint_scale" and cause.values[0] < BACKWARDS:
-            raise DiagnosisError(f"{name}: {cause.where} counts the other way. Change its sign in the recording first")
+def _asked(robot: RobotDescription, recording: Recording) -> str:
+    changed = mixed_up(robot, recording)
+    return ELSE if changed is None else f"{changed}."
 
 
 def _told_sigma(recording: Recording) -> float | None:
@@ -211,7 +210,7 @@ def _require_this_robot(robot: RobotDescription, recording: Recording, predicted
     if is_far_off(robot, left, _told_sigma(recording)):
         raise DiagnosisError(
             f"{name}: whatever is tried, half of the pairs are missed by over {1e3 * float(np.median(left)):.3g} mm: "
-            f"they are hardly of this robot. {mixed_up(robot, recording) or OTHER_CAUSES}"
+            f"they are hardly of this robot. {_asked(robot, recording)}"
         )
 
 

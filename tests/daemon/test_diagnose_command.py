@@ -321,7 +321,7 @@ def test_a_mirrored_joint_is_seen(recording, tmp_path) -> None:
 
 def test_a_mirrored_joint_that_moves_the_marker_little_is_seen(recording, tmp_path) -> None:
     file = written(recording, tmp_path, q=recording.q * [1, 1, 1, -1])
-    assert "wrist_roll count" in refused(file, "--robot", DESK_ARM, *FEW)
+    assert "wrist_roll counting the other way" in refused(file, "--robot", DESK_ARM)
 
 
 def test_exchanged_columns_are_seen(recording, tmp_path) -> None:
