@@ -128,7 +128,7 @@ def _of(errors: Errors, name: str) -> float | None:
 
 def _causes(causes: Sequence[Cause], timed: bool) -> Table:
     table = _table("Causes")
-    table.add_column("effect", overflow="fold")
+    table.add_column("effect", overflow="fold", min_width=18)
     table.add_column("number", no_wrap=True)
     table.add_column("± for 95 %", no_wrap=True)
     for name in ("sure", "share", "gain"):
@@ -137,7 +137,7 @@ def _causes(causes: Sequence[Cause], timed: bool) -> Table:
         numbers = telling(numbers_of(cause, timed=timed))
         figures = (percent(cause.probability), share(cause.share_of_gain_percent), share(cause.held_out_gain_percent))
         labels, values = ("\n".join(lines) for lines in ([n.label for n in numbers], [str(n) for n in numbers]))
-        table.add_row(Text(place(cause)), labels, values, *figures)
+        table.add_row(Text(place(cause).replace(" ", "\n", 1)), labels, values, *figures)
     return table
 
 

@@ -140,7 +140,7 @@ def percent(share: float) -> str:
 
 def share(of_hundred: float) -> str:
     """A share of a gain [%]."""
-    return "< 1 %" if 0.05 <= of_hundred < 0.5 else f"{of_hundred + 0.0:.0f} %"
+    return "< 1 %" if 0.05 <= of_hundred < 0.5 else f"{round(of_hundred)} %"
 
 
 def mm(value: float | None) -> str:

@@ -37,16 +37,18 @@ def remedies(
     """
     workshop = _Workshop(robot, steps, torques, {cause.effect: cause for cause in diagnosis.causes})
     causes = sorted(diagnosis.causes, key=lambda cause: -cause.share_of_gain_percent)
-    return [_if_sure(cause) + workshop.remedy(cause) for cause in causes]
+    return [_if_sure(cause, workshop.remedy(cause)) for cause in causes]
 
 
-def _if_sure(cause: Cause) -> str:
-    """What to make sure of before anything is changed."""
+def _if_sure(cause: Cause, remedy: str) -> str:
+    """The remedy, with what to make sure of before anything is changed."""
     open_ones = [rival for rival in cause.rivals if rival.by == "this_motion"]
     if cause.probability >= _SURE or not open_ones:
-        return ""
+        return remedy
     rivals = " or ".join(named(rival.effect, rival.where, rival.source) for rival in open_ones[:2])
-    return f"If it is {named(cause.effect, cause.where, cause.source)} and not {rivals}: "
+    return (
+        f"If it is {named(cause.effect, cause.where, cause.source)} and not {rivals}: {remedy[0].lower()}{remedy[1:]}"
+    )
 
 
 @dataclass(frozen=True)

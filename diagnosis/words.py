@@ -35,7 +35,8 @@ def finding(name: str, where: str | None, source: str | None, numbers: dict[str,
         case "joint_offset":
             return f"the zero of {at} is off by {turned('offset')}"
         case "joint_scale":
-            return f"{at} turns {100 * numbers['scale_error']:+.3g} % more than its encoder says"
+            more = "more" if numbers["scale_error"] > 0.0 else "less"
+            return f"{at} turns {100 * abs(numbers['scale_error']):.3g} % {more} than its encoder says"
         case "joint_eccentricity":
             return f"the encoder of {at} sits off its axis: ±{numbers['amplitude_rad'] * _DEG:.2g}° once a turn"
         case "joint_ripple":
@@ -107,7 +108,7 @@ def sentence(verdict: Verdict, causes: Sequence[Cause], rms: Errors, gain: Gain)
         "undecided": ". Other causes would explain it nearly as well",
         "unexplained": ". Something is left that none of the known effects explains",
     }
-    return f"{head}: {what} {gain.held_out_percent:.0f} % of the error ({figures}){ends[verdict]}"
+    return f"{head}: {what} {round(gain.held_out_percent)} % of the error ({figures}){ends[verdict]}"
 
 
 def evidence(cause: Effect, standing: Standing) -> str:

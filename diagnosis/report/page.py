@@ -12,7 +12,7 @@ import numpy as np
 from effects import Effect
 
 from ..diagnosis import Diagnosis
-from ..numbers import chance, mm
+from ..numbers import chance, mm, share
 from ..result import Cause, DiagnosisFile, Verdict
 from ..words import finding
 from . import tables
@@ -106,7 +106,7 @@ def _glance(residuals: Residuals, file: DiagnosisFile) -> str:
     rms, gain = file.rms_mm, file.gain
     tiles = [
         (f"{mm(rms.aligned)} → {mm(rms.extended)} mm", "RMS before → after"),
-        (f"{gain.held_out_percent:.0f} %", f"gain, held out ({gain.ci95[0]:.0f} to {gain.ci95[1]:.0f} %)"),
+        (share(gain.held_out_percent), f"gain, held out ({share(gain.ci95[0])} to {share(gain.ci95[1])})"),
         (f"{mm(rms.noise_floor)} mm", "noise alone (RMS)"),
         (f"{file.pairs.outliers:,} of {file.pairs.total:,}", "fixes that are not the marker"),
     ]

@@ -10,7 +10,7 @@ from .panels import Panel
 from .plot import Plot, round_up
 from .residuals import ARROWS, Residuals
 
-_COLUMNS = 48
+_MOST_COLUMNS, _FEWEST_COLUMNS, _PAIRS_A_COLUMN = 48, 12, 12
 # The range of the histogram ends where so many of the errors before do; noise is drawn this many times for each row.
 _SHOWN, _DRAWN = 0.99, 20
 _SIDE, _MARGIN = 300, 26
@@ -25,7 +25,8 @@ def histogram(residuals: Residuals) -> Panel:
     before, after = (1e3 * np.linalg.norm(e[residuals.rows], axis=1) for e in (residuals.before, residuals.after))
     noise = 1e3 * _noise(residuals)
     end = float(np.quantile(np.concatenate([before, after]), _SHOWN)) or 1.0
-    edges = np.linspace(0.0, end, _COLUMNS + 1)
+    columns = int(np.clip(len(before) // _PAIRS_A_COLUMN, _FEWEST_COLUMNS, _MOST_COLUMNS))
+    edges = np.linspace(0.0, end, columns + 1)
     middle = 0.5 * (edges[1:] + edges[:-1])
     shares = {
         look: 100.0 * np.histogram(lengths, edges)[0] / len(lengths)

@@ -109,7 +109,7 @@ def test_a_cause_is_told_in_a_sentence_with_its_joint_and_number(told, robot) ->
     assert told.code == 0
     sentence = " ".join(told.out.split("Error on data")[0].split())
     assert "EXPLAINED" in sentence
-    assert f"Joint {robot.joints[2]} turns +" in sentence
+    assert f"Joint {robot.joints[2]} turns 2" in sentence
 
 
 def test_what_to_do_is_told(told) -> None:
