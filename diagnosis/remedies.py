@@ -129,7 +129,7 @@ class _Workshop:
             sag = f" (up to {1e3 * most:.2g} mm here)" if self._slides(cause) else f" (up to {most * _DEG:.2g}° here)"
         return (
             f"Check what bears the weight at {cause.where}: screws, gear, belt, the gain of its position loop{sag}. A "
-            "spring that stays belongs into the simulation: extended.toml has it."
+            "spring that stays belongs into the simulation, as in extended.toml."
         )
 
     def link(self, cause: Cause, _: Mapping[str, float]) -> str:

@@ -78,6 +78,6 @@ def _progress(console: Console) -> Iterator[Callable[[str], None]]:
     """One line that changes on a terminal; elsewhere a line for each step."""
     if console.is_terminal:
         with console.status("reading") as status:
-            yield lambda text: status.update(text)
+            yield status.update
         return
     yield lambda text: console.print(text, soft_wrap=True, markup=False)

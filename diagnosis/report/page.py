@@ -9,12 +9,12 @@ from pathlib import Path
 
 import numpy as np
 
+from diagnosis.diagnosis import Diagnosis
+from diagnosis.numbers import chance, mm, share
+from diagnosis.result import Cause, DiagnosisFile, Verdict
+from diagnosis.words import finding
 from effects import Effect
 
-from ..diagnosis import Diagnosis
-from ..numbers import chance, mm, share
-from ..result import Cause, DiagnosisFile, Verdict
-from ..words import finding
 from . import tables
 from .evidence import evidence_panels, outlier_panel
 from .panels import Panel, panels

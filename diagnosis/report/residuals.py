@@ -9,12 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
+from diagnosis.diagnosis import Diagnosis
+from diagnosis.held_out import HeldOut
 from effects import Effect, Simulation
 from interfaces.camera import StereoCalibration
 from interfaces.records import FloatArray
-
-from ..diagnosis import Diagnosis
-from ..held_out import HeldOut
 
 # So many points are drawn in a plot, and arrows in a projection.
 POINTS, ARROWS = 450, 220

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from html import escape
 
-from ..numbers import Number, chance, mm, named, numbers_of, percent, place, share, telling
-from ..result import Cause, DiagnosisFile, Indistinguishable, Rejected
+from diagnosis.numbers import Number, chance, mm, named, numbers_of, percent, place, share, telling
+from diagnosis.result import Cause, DiagnosisFile, Indistinguishable, Rejected
 
 # What says nothing new where it is the same as another.
 _SAME_AS = {"aligned": "nominal", "extended": "aligned"}
@@ -44,9 +44,8 @@ def causes(diagnosis: DiagnosisFile, *, timed: bool) -> str:
             f"<td>{percent(cause.probability)}<td>{share(cause.share_of_gain_percent)}"
             f"<td>{cause.held_out_gain_percent:.1f} %"
         )
-        rows.append(
-            f"<tr><td>{escape(place(cause))}<td class=text>{_lines(telling(numbers_of(cause, timed=timed)))}{figures}</tr>"
-        )
+        shown = _lines(telling(numbers_of(cause, timed=timed)))
+        rows.append(f"<tr><td>{escape(place(cause))}<td class=text>{shown}{figures}</tr>")
     return _table(("Cause", "Numbers, ± for 95 %", "Sure", "Share of the gain", "Gain"), rows)
 
 
