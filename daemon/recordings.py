@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from interfaces.errors import RecordingError
-from interfaces.recording import CSV, PARQUET, Recording
+from interfaces.recording import CSV, PARQUET, Recording, joints_in
 from interfaces.records import Pair
 
 from .mcap_export import write_mcap
@@ -72,15 +72,19 @@ def stored_pairs(file: Path) -> StoredPairs:
         return StoredPairs(pairs[0].store, from_pairs(pairs, reader.joints))
 
 
-def opened(source: Path, joints: tuple[str, ...]) -> Recording:
+def opened(source: Path, joints: tuple[str, ...] | None = None) -> Recording:
     """The recording, or the pairs of the store, in `source`.
+
+    Args:
+        joints: the robot's; None for those that `source` has.
 
     Raises:
         StoreError, RecordingError: it cannot be read, or is of other joints.
     """
     if source.suffix.lower() in STORE_ENDINGS:
-        return of_robot(from_store(source), joints, source)
-    return Recording.read(source, joints)
+        recording = from_store(source)
+        return recording if joints is None else of_robot(recording, joints, source)
+    return Recording.read(source, joints_in(source) if joints is None else joints)
 
 
 def of_robot(recording: Recording, joints: tuple[str, ...], file: Path) -> Recording:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from effects import Motion, Simulation
+from effects import KINDS, Motion, Simulation
 from interfaces.camera import StereoCalibration
 from interfaces.errors import ConfigError, RecordingError
 from interfaces.recording import Recording
@@ -55,9 +55,17 @@ def with_noise(simulation: Simulation, exact: Recording, like: Recording, rng: n
     return Recording(joints=exact.joints, q=exact.q, x=x, t=exact.t, segment=exact.segment)
 
 
-def without_times(simulation: Simulation, like: Recording) -> list[str]:
-    """The names of the effects that need the times which a recording does not have."""
-    return [effect.name for effect in simulation.effects if effect.kind.needs_times and like.t is None]
+def without_consequence(simulation: Simulation, like: Recording | None = None) -> list[str]:
+    """Sentences on the effects that change nothing: of this robot, and of a recording without times."""
+    said = []
+    for name in dict.fromkeys(effect.name for effect in simulation.effects):
+        if KINDS[name].needs_times and like is not None and like.t is None:
+            said.append(f"{name} changes nothing: the recording has no column t")
+        if name == "joint_compliance" and not simulation.bears_weight:
+            said.append(f'{name} changes nothing: with hold = "torque_free" the guiding hand bears the weight')
+        elif name == "joint_compliance" and not simulation.gravity.known:
+            said.append(f"{name} changes nothing: the URDF states no masses")
+    return said
 
 
 def _seen_again(calibration: StereoCalibration, x: FloatArray, rng: np.random.Generator) -> FloatArray:

@@ -24,7 +24,7 @@ def aligned(observations: Observations, simulation: Simulation) -> Fit:
         nuisances = [
             e.with_values(placed(predicted, observations.x)) if e.name == "camera_pose" else e for e in nuisances
         ]
-    own = [effect for effect in simulation.effects]
+    own = list(simulation.effects)
     return fitted(observations, simulation.with_effects([*nuisances, *own]), len(nuisances) + len(own))
 
 

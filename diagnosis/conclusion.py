@@ -96,7 +96,7 @@ def _causes(diagnosis: Diagnosis) -> tuple[Cause, ...]:
                 stability_percent=float("nan"),
                 indistinguishable_from=tuple(_named(r) for r in standing.rivals if r.is_same_here),
                 rivals=tuple(_named(r) for r in standing.rivals),
-                evidence=evidence(cause, standing),
+                evidence=evidence(standing),
             )
         )
     if diagnosis.outliers_are_found:
@@ -191,7 +191,7 @@ def _unexplained(diagnosis: Diagnosis) -> Unexplained:
     left, joints = diagnosis.left, diagnosis.extended.simulation.robot.joints
     names = [joints[k] for k in left.joints] + (["time"] if left.with_time else [])
     rms = 1e3 * float(np.sqrt(np.square(left.explained).sum(axis=1).mean()))
-    return Unexplained(rms, tuple(names), left.p_value)
+    return Unexplained(rms, tuple(names), left.p_value, left.what)
 
 
 def standing_of(diagnosis: Diagnosis, cause: Effect) -> Standing:

@@ -13,6 +13,7 @@ from interfaces.recording import Recording
 from interfaces.records import FloatArray
 
 from .alignment import aligned
+from .explanation import explain
 from .fit import Fit, fitted
 from .held_out import Added, Blocks, HeldOut, added, gain_percent, is_marker, without_cause
 from .hypotheses import Hypotheses
@@ -22,6 +23,7 @@ from .observations import Observations
 from .rivals import Standing, standings
 from .scan import Candidate, Scan
 from .search import Search
+from .unknown import Unknowns
 
 Told = Callable[[str], None]
 # Fewer fixes than this that are not the marker are no finding.
@@ -67,7 +69,9 @@ class Diagnosis:
     def held_out(self) -> dict[str, FloatArray]:
         """Distances (n,) [m] of each simulation on rows that it was not fitted to."""
         fits = {"nominal": self.nominal, "aligned": self.aligned, "geometry": self.geometry, "extended": self.extended}
-        return {name: HeldOut(fit, self.blocks).distances for name, fit in fits.items()}
+        errors = {name: HeldOut(fit, self.blocks).errors for name, fit in fits.items()}
+        errors["extended"] = errors["extended"] - self.left.held_out
+        return {name: np.linalg.norm(error, axis=1) for name, error in errors.items()}
 
     @cached_property
     def markers(self) -> np.ndarray:
@@ -129,6 +133,10 @@ def diagnose(
         observations = observations.with_factor(factor)
         start = aligned(observations, simulation)
         extended = search.run(start.with_causes(extended.causes))
+    tell("asking whether something without a name is at work")
+    unknowns, blocks = Unknowns(start), Blocks.cut(len(recording))
+    explanation = explain(extended, search.path, unknowns, search, tell)
+    extended = explanation.fit
     tell("asking what else it could be")
     return Diagnosis(
         hypotheses=hypotheses,
@@ -137,8 +145,8 @@ def diagnose(
         geometry=_geometry(start),
         extended=extended,
         standings=tuple(standings(extended, hypotheses.effects, search)),
-        left=leftover(extended),
-        blocks=Blocks.cut(len(recording)),
+        left=leftover(explanation, unknowns, blocks),
+        blocks=blocks,
         seed=seed,
     )
 

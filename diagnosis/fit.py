@@ -21,7 +21,7 @@ _ROUNDS, _ENOUGH = 12, 0.02
 _FEWEST_OUTLIERS = 1e-4
 _EM_ROUNDS = 6
 # So large a share of so many rows is no outliers.
-_WINDOW, _BURST = 21, 0.45
+_WINDOW, _BURST = 61, 0.45
 
 
 @dataclass(frozen=True, eq=False)

@@ -149,9 +149,15 @@ def block_p_value(fit: Fit, columns: FloatArray, blocks: Blocks) -> float:
         return 1.0
     # Orthonormal columns: the amounts that fit best are the scores themselves.
     beside = beside @ (vectors[:, told] / np.sqrt(values[told]) / scales[:, None])
-    scores = np.einsum("nik,ni->nk", beside, fit.left)
+    return scores_p_value(beside, fit.left, blocks)
+
+
+def scores_p_value(columns: FloatArray, left: FloatArray, blocks: Blocks) -> float:
+    """As `block_p_value`, of orthonormal columns (n, 3, k) that explain nothing of `left` (n, 3)."""
+    k = columns.shape[2]
+    scores = np.einsum("nik,ni->nk", columns, left)
     total = scores.sum(axis=0)
-    fitted = scores - np.einsum("nik,nil,l->nk", beside, beside, total, optimize=True)
+    fitted = scores - np.einsum("nik,nil,l->nk", columns, columns, total, optimize=True)
     spread = blocks.sums(fitted)
     spread = spread.T @ spread * blocks.count / (blocks.count - 1.0)
     statistic = float(total @ np.linalg.lstsq(spread, total, rcond=1e-12)[0])

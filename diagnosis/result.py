@@ -71,11 +71,16 @@ class Rejected(msgspec.Struct, frozen=True):
 
 
 class Unexplained(msgspec.Struct, frozen=True):
-    """Structure that no effect fits: how large, on which joints it depends (`time` among them), how improbable."""
+    """Structure that no effect fits: how large, on which joints it depends (`time` among them), how improbable.
+
+    Attributes:
+        what: what moves, and on what that depends, in words; the joints are named in `depends_on` too.
+    """
 
     rms_mm: float
     depends_on: tuple[str, ...]
     p_value: float
+    what: tuple[str, ...] = ()
 
 
 class Pairs(msgspec.Struct, frozen=True):

@@ -205,7 +205,7 @@ class Scan:
     def _solved(
         self, inner: FloatArray, gradient: FloatArray, raw: FloatArray, effect: Effect
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Gains (m,), amounts (m, k) and degrees of freedom (m,) of m systems (m, k, k) with what was left of raw (m, k)."""
+        """Gains (m,), amounts (m, k) and degrees of freedom (m,) of m systems (m, k, k), of raw squares (m, k)."""
         sigma2 = self._fit.noise.sigma**2
         usual = np.array([effect.parameters[j].usual for j in effect.amounts])
         # In units in which an amount that is as large as can be expected is one.

@@ -17,9 +17,9 @@ from .scan import Candidate, Scan
 NAMED = 3.0
 # Candidates within this share of the best gain are refitted in full, so many at most.
 _NEAR, _MOST = 0.4, 6
-_MOST_CAUSES = 12
+_MOST_CAUSES = 9
 # So many sets of causes are looked at, and none twice.
-_MOST_SETS = 60
+_MOST_SETS = 40
 Key = tuple[str, str | None, str | None]
 # What a number costs at least [nats].
 _CHEAPEST = 1.5
@@ -49,11 +49,14 @@ class Search:
     def __init__(self, hypotheses: Sequence[Effect], tell: Callable[[str], None]) -> None:
         self._hypotheses, self._tell = hypotheses, tell
         self._doubt = np.log(max(len(hypotheses), 1))
+        self._trials: dict[Key, int] = {}
+        self.path: list[Fit] = []
 
     def run(self, start: Fit) -> Fit:
         """The causes on top of what `start` has fitted."""
         fit = start
         self._seen: set[frozenset[Key]] = set()
+        self.path = [start]
         for _ in range(_MOST_CAUSES):
             better = self._added(fit)
             if better is None:
@@ -63,6 +66,7 @@ class Search:
                 break
             self._seen.add(causes)
             fit = self._reviewed(better)
+            self.path.append(fit)
         return fit
 
     def _added(self, fit: Fit) -> Fit | None:
@@ -83,7 +87,12 @@ class Search:
 
     def doubt(self, candidate: Candidate) -> float:
         """What having looked for it in so many places costs [nats]."""
+        self._trials[candidate.effect.key] = candidate.trials
         return float(self._doubt + np.log(candidate.trials))
+
+    def doubt_of(self, effect: Effect) -> float:
+        """The same of an effect that was a candidate."""
+        return float(self._doubt + np.log(self._trials.get(effect.key, 1)))
 
     def _agreed(self, fit: Fit, candidate: Candidate) -> float:
         """What a candidate is worth by the agreement of blocks of time, which need not be white inside [nats]."""
@@ -141,6 +150,7 @@ class Search:
                     continue
                 tried = self.refined(fit.with_causes([*others, candidate.effect]), candidate.effect.key)
                 worth = nats(2.0 * (tried.log_likelihood - fit.log_likelihood), candidate.dof - dof)
+                worth += self.doubt_of(cause) - self.doubt(candidate)
                 if worth > 1.0 and tried.causes[-1].is_possible:
                     self._tell(f"exchanged {describe(cause)} for {describe(candidate.effect)}")
                     return tried, True

@@ -6,8 +6,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from effects import Effect
-
 from .result import Cause, Errors, Gain, Verdict
 from .rivals import Standing
 
@@ -111,7 +109,7 @@ def sentence(verdict: Verdict, causes: Sequence[Cause], rms: Errors, gain: Gain)
     return f"{head}: {what} {round(gain.held_out_percent)} % of the error ({figures}){ends[verdict]}"
 
 
-def evidence(cause: Effect, standing: Standing) -> str:
+def evidence(standing: Standing) -> str:
     """Why a cause was named, in one sentence."""
     text = (
         f"Without it the fit is worse by Δχ² = {standing.gain:.0f} for {standing.dof} number{'s' * (standing.dof > 1)}"

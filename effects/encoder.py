@@ -16,6 +16,8 @@ from .parameter import Parameter
 
 # Of the numerical derivative of a play by its width [rad, m].
 _WIDTH_STEP = 1e-6
+# A magnet farther off its axis, as a share of its radius, is none that could be read.
+_FARTHEST_OFF = 0.95
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +82,10 @@ class JointScale(EncoderEffect):
 
 
 class JointEccentricity(EncoderEffect):
-    """The magnet of the encoder sits off the axis: an error with the period of a turn, to first order."""
+    """The magnet of the encoder sits off the axis by (sine, -cosine) of its radius.
+
+    The field's direction is that of (cos θ, sin θ) + e, so true angle = reading + asin(sine · sin + cosine · cos).
+    """
 
     name = "joint_eccentricity"
     turns_only = True
@@ -89,8 +94,18 @@ class JointEccentricity(EncoderEffect):
         return (Parameter("sine_rad", 0.02), Parameter("cosine_rad", 0.02))
 
     def columns(self, motion: Motion, place: Place, values: FloatArray) -> FloatArray:
+        ring = self._ring(motion, place)
+        return ring / np.sqrt(1.0 - np.square(self._sine(ring, values)))[:, None]
+
+    def correction(self, motion: Motion, place: Place, values: FloatArray) -> FloatArray:
+        return np.arcsin(self._sine(self._ring(motion, place), values))
+
+    def _ring(self, motion: Motion, place: Place) -> FloatArray:
         q = motion.q[:, place.joint]
         return np.stack([np.sin(q), np.cos(q)], axis=1)
+
+    def _sine(self, ring: FloatArray, values: FloatArray) -> FloatArray:
+        return np.clip(ring @ values, -_FARTHEST_OFF, _FARTHEST_OFF)
 
 
 class JointRipple(EncoderEffect):

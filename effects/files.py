@@ -47,7 +47,8 @@ _UNITS: tuple[tuple[str, float, str, str], ...] = (
     ("_error", 0.9, "percent", "Give a fraction: 1 % is 0.01"),
     ("ratio", 10.0, "percent", "Give a fraction: 1 % is 0.01"),
     ("fraction", 1.0, "percent", "Give a fraction: 5 % is 0.05"),
-    ("k1", 50.0, "a coefficient for pixels", "Give it for rays: x' = x (1 + k1 r²) with r the tangent off the axis"),
+    ("k2", 50.0, "a coefficient for pixels", "Give it for rays: r is the tangent of the angle off the axis"),
+    ("k1", 50.0, "a coefficient for pixels", "Give it for rays: r is the tangent of the angle off the axis"),
 )
 
 
@@ -218,6 +219,10 @@ def _number(entry: Mapping[str, Any], parameter: Parameter, effect: str) -> floa
         raise _WrongEntry(f"{name} = {value!r} is no number", name, "Write it like 0.05 or 1e-3, without a unit")
     if not math.isfinite(value):
         raise _WrongEntry(f"{name} = {value} is not finite", name)
+    if parameter.never_negative and value < 0.0:
+        raise _WrongEntry(f"{name} = {value:g}: it is never negative", name, "Take the minus away, or the effect")
+    if name == "memory" and not 0.0 <= value < 1.0:
+        raise _WrongEntry(f"{name} = {value:g} is no share", name, "Give a number from 0 to below 1")
     for ending, largest, unit, remedy in _UNITS:
         if parameter.is_amount and name.endswith(ending):
             if abs(value) > (FARTHEST_CAMERA_M if of_camera and ending == "_m" else largest):

@@ -50,26 +50,35 @@ class GravityLoad:
 
     def torques(self, q: FloatArray) -> FloatArray:
         """Torque of gravity about each joint, in the direction in which it counts [N·m, or N] (n, d), at q (n, d)."""
+        moments, forces = self.loads(q)
+        torques = np.zeros_like(q)
+        for k in self._outwards:
+            joint = self._bodies[k].joint
+            assert joint is not None
+            torques[:, k] = (moments if joint.kind in REVOLUTE else forces)[:, k] @ joint.axis
+        return torques
+
+    def loads(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """What gravity does to all that each joint carries: moments about its origin [N·m] and forces [N], (n, d, 3).
+
+        In the joint's frame on its parent link, at q (n, d).
+        """
         poses = self._poses(q)
         mass = {k: body.mass_kg for k, body in self._bodies.items()}
         moment = {
             k: body.mass_kg * poses[k][:, :3, 3] + poses[k][:, :3, :3] @ body.moment for k, body in self._bodies.items()
         }
-        torques = np.zeros_like(q)
+        moments, forces = np.zeros((2, *q.shape, 3))
         for k in reversed(self._outwards):
-            joint = self._bodies[k].joint
-            assert joint is not None
-            axis = poses[k][:, :3, :3] @ joint.axis
-            if joint.kind in REVOLUTE:
-                lever = moment[k] - mass[k] * poses[k][:, :3, 3]
-                # (lever × g) · axis with g along -z
-                torques[:, k] = -GRAVITY_M_S2 * (axis[:, 0] * lever[:, 1] - axis[:, 1] * lever[:, 0])
-            else:
-                torques[:, k] = -GRAVITY_M_S2 * mass[k] * axis[:, 2]
-            carrier = self._bodies[k].carrier
-            mass[carrier] = mass[carrier] + mass[k]
-            moment[carrier] = moment[carrier] + moment[k]
-        return torques
+            body = self._bodies[k]
+            turn = (poses[body.carrier] @ body.T_carrier_joint)[:, :3, :3]
+            lever = moment[k] - mass[k] * poses[k][:, :3, 3]
+            down = np.array([0.0, 0.0, -GRAVITY_M_S2])
+            moments[:, k] = np.einsum("nij,ni->nj", turn, np.cross(lever, down))
+            forces[:, k] = np.einsum("nij,i->nj", turn, mass[k] * down)
+            mass[body.carrier] = mass[body.carrier] + mass[k]
+            moment[body.carrier] = moment[body.carrier] + moment[k]
+        return moments, forces
 
     def _poses(self, q: FloatArray) -> dict[int | None, FloatArray]:
         """Pose (n, 4, 4) of each body in the root link."""

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections import deque
+
 import numpy as np
 
 from interfaces.records import FloatArray
 
 from .effect import Effect
-from .encoder import Backlash, Place, Play
+from .encoder import Backlash, Place, Play, Settling
 from .motion import Motion
 from .simulation import Simulation
 
@@ -16,32 +18,53 @@ class LiveEncoders:
     """True joint angles from what the encoders read, in the order in which they read it.
 
     A play is driven by every reading, and begins where the readings lead first: before any has changed, it is centred.
+
+    Args:
+        row_readings: how many readings later the next row comes: what an effect remembers of the row before.
     """
 
-    def __init__(self, simulation: Simulation) -> None:
+    def __init__(self, simulation: Simulation, row_readings: int = 1) -> None:
         encoder = [effect for effect in simulation.effects if effect.kind.encoder is not None]
         plays = [effect for effect in encoder if isinstance(effect.kind.encoder, Backlash)]
+        settling = [effect for effect in encoder if isinstance(effect.kind.encoder, Settling)]
         self._place = simulation.place
         self._plays = [_LivePlay(simulation.place(effect), float(effect.values[0])) for effect in plays]
-        self._others = [effect for effect in encoder if effect not in plays]
+        self._settling = [_LiveSettling(simulation.place(effect), effect, row_readings) for effect in settling]
+        self._others = [effect for effect in encoder if effect not in plays and effect not in settling]
 
     def true_angles(self, q: FloatArray, t: float, move: FloatArray) -> FloatArray:
         """True joint angles (d,) [rad, m] at the readings q (d,) and the time t [s].
 
         Args:
-            move: the move (d,) that ended with these readings, for what has not come to rest.
+            move: the move (d,) since the row before, for what has not come to rest.
         """
         angles = q.copy()
-        motion = Motion(np.stack([q - move, q]), np.array([t, t]), np.zeros(2, dtype=np.int64))
+        motion = Motion.at(q, t)
         for effect in self._others:
             angles[self._place(effect).joint] += self._correction(effect, motion)
+        for settling in self._settling:
+            angles[settling.joint] -= settling.missing(float(move[settling.joint]))
         for play in self._plays:
             angles[play.joint] += play.lag(float(q[play.joint]))
         return angles
 
     def _correction(self, effect: Effect, motion: Motion) -> float:
         assert effect.kind.encoder is not None
-        return float(effect.kind.encoder.correction(motion, self._place(effect), effect.values)[-1])
+        return float(effect.kind.encoder.correction(motion, self._place(effect), effect.values)[0])
+
+
+class _LiveSettling:
+    """What a joint that is read too soon still has to go, of the last move and of those before."""
+
+    def __init__(self, place: Place, effect: Effect, row_readings: int) -> None:
+        self.joint = place.joint
+        self._fraction, self._memory = effect.value("fraction"), effect.value("memory")
+        self._missing: deque[float] = deque([0.0] * row_readings, maxlen=row_readings)
+
+    def missing(self, move: float) -> float:
+        """How far it has to go [rad, m] after the move since the row before."""
+        self._missing.append(self._fraction * move + self._memory * self._missing[0])
+        return self._missing[-1]
 
 
 class _LivePlay:

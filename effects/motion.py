@@ -7,6 +7,7 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import PchipInterpolator
 
 from interfaces.recording import Recording
 from interfaces.records import FloatArray, frozen_array
@@ -66,38 +67,26 @@ class Motion:
         return frozen_array(moves)
 
     @cached_property
-    def rates(self) -> FloatArray:
-        """How fast the readings change at each row (n, d) [rad/s, m/s]: the parabola through it and its neighbours.
-
-        Rows that stand alone, and all rows without times, have none.
-        """
-        rates = np.zeros_like(self.q)
-        if self.t is None:
-            return rates
-        for first, end in self.runs:
-            if end - first >= 2:
-                edge_order = 2 if end - first > 2 else 1
-                rates[first:end] = np.gradient(self.q[first:end], self.t[first:end], axis=0, edge_order=edge_order)
-        return frozen_array(rates)
-
-    @cached_property
     def runs(self) -> list[tuple[int, int]]:
         """First row of each run and the row after its last."""
         firsts = np.flatnonzero(self.begins)
         return list(zip(firsts.tolist(), [*firsts[1:].tolist(), len(self.q)], strict=True))
 
     def earlier(self, lag_s: float) -> Motion:
-        """The readings that the encoders gave `lag_s` before each row, to second order in the lag."""
+        """The readings that the encoders gave `lag_s` before each row, interpolated without overshoot.
+
+        Before the first row of a run, and after its last, the nearest rate goes on. Rows that stand alone, and all
+        where there are no times, stay as they are (Fritsch and Butland 1984).
+        """
         if lag_s == 0.0 or self.t is None:
             return self
-        q = self.q - lag_s * self.rates + 0.5 * lag_s**2 * self._bends
-        return Motion(frozen_array(q), self.t, self.segment, self.begun_at)
-
-    @cached_property
-    def _bends(self) -> FloatArray:
-        bends = np.zeros_like(self.q)
-        assert self.t is not None
+        q = self.q.copy()
         for first, end in self.runs:
-            if end - first >= 3:
-                bends[first:end] = np.gradient(self.rates[first:end], self.t[first:end], axis=0)
-        return bends
+            if end - first < 2:
+                continue
+            t = self.t[first:end]
+            path = PchipInterpolator(t, self.q[first:end], axis=0)
+            asked = t - lag_s
+            inside = np.clip(asked, t[0], t[-1])
+            q[first:end] = path(inside) + (asked - inside)[:, None] * path(inside, 1)
+        return Motion(frozen_array(q), self.t, self.segment, self.begun_at)

@@ -17,7 +17,8 @@ class Optics:
     Attributes:
         scale_error: measured over true distances, minus one: the nominal baseline over the true one.
         focal_error: true over nominal focal length, minus one.
-        k1, k2: radial distortion left in the images: a ray (x, y, 1) is seen at (x, y)·(1 + k1·r² + k2·r⁴), r² = x² + y².
+        k1, k2: radial distortion left in the images: a ray (x, y, 1) is seen at (x, y)·(1 + k1·r² + k2·r⁴) with
+            r² = x² + y².
     """
 
     scale_error: float = 0.0

@@ -229,6 +229,11 @@ class Simulated:
         """Gravity's torques (n, d) [N·m, N]."""
         return self.simulation.gravity.torques(self.q)
 
+    @cached_property
+    def loads(self) -> FloatArray:
+        """Gravity's moments (n, d, 3) [N·m] about each joint's origin, in its frame on its parent link."""
+        return self.simulation.gravity.loads(self.q)[0]
+
     def columns(self, effect: Effect) -> FloatArray:
         """Derivative (n, 3, p) of what is measured by the effect's values, at its values; zeros for no amounts."""
         simulation = self.simulation

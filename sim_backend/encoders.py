@@ -10,7 +10,7 @@ from .config import EncoderConfig
 
 
 class Encoders:
-    """Turns true angles into readings: offset, noise, whole ticks.
+    """Turns true angles, or where the drives stand, into readings: offset, noise, whole ticks.
 
     Args:
         offsets: reported minus true angle [rad or m], shape (d,).

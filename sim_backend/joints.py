@@ -22,10 +22,10 @@ class JointPaths:
 
     A late time stamp shows as a frame of the past: it has the joints as they were. One that is early shows as readings
     of the past. What has not come to rest lags by a fraction of the move during the last frame's interval: so it is
-    that of the last move between pairs as long as every frame becomes a pair.
+    that of the last move between pairs as long as every frame becomes a pair; its memory is of the frame before.
 
     Args:
-        rate_hz: steps a second.
+        rate_hz: steps a second, a multiple of the frames.
         camera_hz: frames a second.
         begins: when what drifts begins to: the time of the first frame [s].
     """
@@ -34,8 +34,8 @@ class JointPaths:
         self._truth, self._begins = truth, begins
         latency = truth.beyond.latency_s
         self._late, self._early = max(latency, 0.0) * rate_hz, max(-latency, 0.0) * rate_hz
-        self._frame_steps = rate_hz / camera_hz
-        self._live = LiveEncoders(truth.beyond)
+        self._frame_steps = rate_hz // camera_hz
+        self._live = LiveEncoders(truth.beyond, self._frame_steps)
         longest = max(self._late + self._frame_steps, self._early)
         self._past: deque[FloatArray] = deque(maxlen=ceil(longest) + 3)
         self._t = 0.0

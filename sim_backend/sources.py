@@ -81,7 +81,7 @@ class SimStereoCamera:
 
     @property
     def calibration(self) -> StereoCalibration:
-        """The described calibration; the simulated lenses agree with it."""
+        """The described calibration; the simulated lenses agree with it, but for the effects that they are given."""
         return self._calibration
 
     def __enter__(self) -> Self:

@@ -11,7 +11,7 @@ from daemon.commands.options import flag
 
 
 def compare(
-    first: Annotated[Path, Parameter(help="A recording (.csv, .parquet).")],
+    first: Annotated[Path, Parameter(help="A recording (.csv, .parquet) or a pair store (.sqlite).")],
     second: Annotated[Path, Parameter(help="Another, at the same joint angles.")],
     /,
     *,
@@ -37,11 +37,10 @@ def compare(
     from daemon.comparison import compared
     from daemon.comparison_view import view
     from daemon.wire import encode
-    from interfaces.recording import joints_in
     from interfaces.robot import RobotDescription
 
     joints = None if robot is None else RobotDescription.load(robot).joints
-    one, other = (recordings.opened(file, joints or joints_in(file)) for file in (first, second))
+    one, other = (recordings.opened(file, joints) for file in (first, second))
     report = compared(one, other, (str(first), str(second)))
     if as_json:
         sys.stdout.write(encode(report).decode() + "\n")

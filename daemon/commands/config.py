@@ -68,6 +68,7 @@ def check(*, robot: RobotFile = HERE) -> None:
     Next: `bodyschema replay` for a recording that you have; `bodyschema run`.
     """
     from daemon.config import Config
+    from daemon.synthesis import without_consequence
     from interfaces.urdf import REVOLUTE
 
     checked = Config.load(robot)
@@ -91,7 +92,9 @@ def check(*, robot: RobotFile = HERE) -> None:
     stereo = "described" if description.calibration else "not described: no images can be used, recordings can"
     say(f"  stereo calibration {stereo}")
     for effect in checked.simulation.effects:
-        say(f"  effect {effect_line(effect)}")
+        say(f"  effect {_effect_line(effect)}")
+    for sentence in without_consequence(checked.simulation):
+        say(f"  {sentence}")
     if checked.tables.unexplained is not None:
         say(f"  what is unexplained is learnt over {', '.join(checked.tables.unexplained['joints'])}")
     say(f"  sampler on {zenoh.sampler}, learner on {zenoh.learner}")
@@ -117,7 +120,7 @@ def show(*, robot: RobotFile = HERE) -> None:
     say(msgspec.json.format(msgspec.json.encode(tables)).decode())
 
 
-def effect_line(effect: Effect) -> str:
+def _effect_line(effect: Effect) -> str:
     """An effect in one line: name, place, numbers."""
     place = "" if effect.where is None else f" at {effect.where}"
     source = "" if effect.source is None else f", from {effect.source}"

@@ -38,7 +38,7 @@ def simulate(
 
     from daemon import recordings
     from daemon.plausibility import require_units
-    from daemon.synthesis import simulated, with_noise, without_times
+    from daemon.synthesis import simulated, with_noise, without_consequence
     from effects import load_simulation
 
     if out is not None:
@@ -50,8 +50,8 @@ def simulate(
     if noise:
         result = with_noise(simulation, result, recording, np.random.default_rng(seed))
     told = Console(stderr=True, highlight=False, soft_wrap=True)
-    for name in without_times(simulation, recording):
-        told.print(f"{name} is left out of account: {like} has no column t", style="yellow", markup=False)
+    for sentence in without_consequence(simulation, recording):
+        told.print(sentence, style="yellow", markup=False)
     if out is None:
         result.write_csv_to(sys.stdout)
         return

@@ -17,6 +17,7 @@ from interfaces.toml_file import read_toml
 ROWS = 50
 EFFECT = '[[effects]]\neffect = "joint_offset"\nwhere = "waist"\noffset_rad = 0.05\n'
 LATE = '[[effects]]\neffect = "camera_latency"\nlatency_s = 0.02\n'
+SPRING = "compliance_rad_per_Nm = 0.01\n"
 STEREO = "focal_px = 700.0\nprincipal_point_px = [640.0, 480.0]\nbaseline_m = 0.2\nimage_size_px = [1280, 960]\n"
 
 
@@ -102,7 +103,7 @@ def test_noise_of_unknown_size_is_refused(tmp_path) -> None:
 def test_what_needs_times_that_are_not_there_is_said(tmp_path, capsys) -> None:
     measured(tmp_path / "like.csv", times=False)
     simulated(tmp_path, tables=LATE)
-    assert "camera_latency is left out of account" in capsys.readouterr().err
+    assert "camera_latency changes nothing: the recording has no column t" in capsys.readouterr().err
 
 
 def test_a_file_that_is_there_is_kept(tmp_path) -> None:
@@ -118,6 +119,14 @@ def test_a_file_that_is_there_is_kept(tmp_path) -> None:
 def test_config_check_names_the_effects(tmp_path, capsys) -> None:
     called("config", "check", "--robot", write_small_arm(tmp_path, EFFECT))
     assert "effect joint_offset at waist: offset_rad = 0.05" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("hold", "why"), [("torque_free", "the guiding hand bears"), ("held", "states no masses")])
+def test_a_spring_without_a_load_is_said_to_change_nothing(tmp_path, capsys, hold, why) -> None:
+    file = write_small_arm(tmp_path, '[[effects]]\neffect = "joint_compliance"\nwhere = "waist"\n' + SPRING)
+    file.write_text(file.read_text().replace("[camera]", f'hold = "{hold}"\n[camera]'))
+    called("config", "check", "--robot", file)
+    assert why in capsys.readouterr().out
 
 
 def test_a_wrong_effect_is_refused_wherever_the_file_is_read(tmp_path) -> None:

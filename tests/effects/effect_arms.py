@@ -104,9 +104,12 @@ def sized(robot: RobotDescription, where: tuple[str, str | None, str | None], sh
     values: FloatArray = np.array(effect.values)
     for k, parameter in enumerate(effect.parameters):
         if parameter.is_amount:
-            values[k] = (parameter.nominal or 0.0) + share * parameter.usual * rng.choice([-1.0, 1.0])
+            sign = rng.choice([-1.0, 1.0])
+            values[k] = share * parameter.usual * (1.0 if parameter.never_negative else sign)
         elif parameter.name == "t0":
             values[k] = 4.0
         elif parameter.name == "time_constant_s":
             values[k] = 3.0
+        elif parameter.name == "memory":
+            values[k] = 0.4
     return effect.with_values(values)

@@ -56,7 +56,7 @@ def kernel() -> KernelLearner:
 
 
 @settings(deadline=None, max_examples=40)
-@given(st.data(), st.floats(-1.0, 1.0), st.integers(0, 100))
+@given(st.data(), st.floats(0.0, 1.0), st.integers(0, 100))
 def test_effects_come_back_from_the_file_to_the_last_bit(robot, tmp_path_factory, data, share, seed) -> None:
     places = data.draw(st.lists(st.sampled_from(everywhere(robot)), max_size=6))
     written = Simulation(robot, tuple(sized(robot, place, share, seed) for place in places))
@@ -116,6 +116,8 @@ def test_a_file_that_is_there_is_not_replaced_unasked(robot, tmp_path) -> None:
             "cycles_per_turn = -3 cannot be",
             "cycles_per_turn",
         ),
+        ('effect = "backlash"\nwhere = "elbow"\nwidth_rad = -0.1', "is never negative", "width_rad"),
+        ('effect = "settling"\nwhere = "elbow"\nfraction = 0.1\nmemory = 1', "is no share", "memory"),
         ('effect = 3\nwhere = "elbow"', "is no text", "effect ="),
     ],
 )

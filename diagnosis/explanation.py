@@ -1,0 +1,83 @@
+"""Which part of what is wrong has names, and which has none."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+
+from .fit import Fit
+from .search import NAMED, Search
+from .unknown import Unknowns
+
+# What has no name is taken for so much more probability than the named causes alone [nats].
+_MARGIN = 3.0
+_MOST_UNKNOWNS = 3
+# What a number of a named cause costs when sets of causes are compared [nats].
+_NUMBER = 3.0
+
+
+@dataclass(frozen=True, eq=False)
+class Explanation:
+    """A set of causes, and ways to differ that have no name.
+
+    Attributes:
+        fit: with the causes.
+        unknown: which families, by their places in `Unknowns.families`.
+        worth: how probable they are together, in nats that count only beside those of others.
+    """
+
+    fit: Fit
+    unknown: tuple[int, ...]
+    worth: float
+
+
+def explain(
+    found: Fit, tried: Iterable[Fit], unknowns: Unknowns, search: Search, tell: Callable[[str], None]
+) -> Explanation:
+    """The causes found as they are, unless fewer of them and something without a name are clearly more probable.
+
+    Args:
+        found: with all causes that the search has named.
+        tried: the fits on its way there, the first without any cause.
+    """
+    best = _with_unknown(found, unknowns, search)
+    keys = {frozenset(effect.key for effect in found.causes)}
+    for fit in tried:
+        causes = frozenset(effect.key for effect in fit.causes)
+        if causes in keys:
+            continue
+        keys.add(causes)
+        other = _with_unknown(fit, unknowns, search)
+        if other.unknown and other.worth > best.worth + (0.0 if best.unknown else _MARGIN):
+            best = other
+    if best.unknown:
+        tell("something that none of the effects explains")
+        best = _pruned(best, unknowns, search)
+    return best
+
+
+def _with_unknown(fit: Fit, unknowns: Unknowns, search: Search) -> Explanation:
+    worth = fit.log_likelihood - sum(_NUMBER * len(effect.amounts) + search.doubt_of(effect) for effect in fit.causes)
+    chosen: list[int] = []
+    while len(chosen) < _MOST_UNKNOWNS:
+        index, more = unknowns.best(fit, chosen)
+        if more < NAMED or index in chosen or unknowns.agreed(fit, chosen, index) < 0.0:
+            break
+        chosen.append(index)
+        worth += more
+    return Explanation(fit, tuple(chosen), worth)
+
+
+def _pruned(explanation: Explanation, unknowns: Unknowns, search: Search) -> Explanation:
+    """Without causes that are not worth it beside what has no name."""
+    for cause in explanation.fit.causes:
+        others = [effect for effect in explanation.fit.causes if effect.key != cause.key]
+        fewer = _with_unknown(explanation.fit.with_causes(others), unknowns, search)
+        if fewer.unknown and fewer.worth > explanation.worth - NAMED:
+            return _pruned(fewer, unknowns, search)
+    return explanation
+
+
+def named(families: Sequence[int], unknowns: Unknowns) -> list[str]:
+    """What families are, in words."""
+    return [unknowns.families[index].what for index in families]

@@ -1,0 +1,80 @@
+"""The simulated world shows what the simulation says at every joint: a head's, a slide, behind one held still."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from effect_arms import arm, everywhere, sized, walk
+
+from effects import KINDS, Motion, Simulation
+from sim_backend import ErrorConfig, SimConfig
+from sim_backend.posed import PERIOD_S, PosedWorld
+from sim_backend.truth import GEOMETRY
+
+CLOSE_M = 1e-6
+NO_ERRORS = ErrorConfig(
+    joint_offset_rad=0, link_length_m=0, link_axis_rad=0, camera_position_m=0, camera_rotation_rad=0, tool_m=0
+)
+
+
+class NoRenderer:
+    """In the renderer's place: nothing is painted."""
+
+    def __init__(self, *arguments) -> None: ...
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *error) -> None: ...
+
+
+@pytest.fixture(scope="module")
+def robot(tmp_path_factory):
+    return arm(tmp_path_factory.mktemp("arm"))
+
+
+def shown(simulation: Simulation, postures, monkeypatch):
+    """What an ideal tracker would measure in the posed world (n, 3)."""
+    monkeypatch.setattr("sim_backend.posed.RenderProcess", NoRenderer)
+    with PosedWorld(simulation.robot, SimConfig(errors=NO_ERRORS), postures, simulation) as world:
+        return np.array([world.scene(number).x_seen for number in range(len(postures))])
+
+
+def rows(postures) -> Motion:
+    return Motion(postures, PERIOD_S * np.arange(1.0, len(postures) + 1), np.zeros(len(postures), dtype=np.int64))
+
+
+@pytest.mark.parametrize("name", [name for name in KINDS if name != "camera_latency"])
+def test_an_effect_at_any_joint_shows_in_the_world(robot, name, monkeypatch) -> None:
+    postures = walk(2).q[:20]
+    for place in everywhere(robot):
+        if place[0] == name:
+            simulation = Simulation(robot, (sized(robot, place, 1.0, 3),))
+            apart = shown(simulation, postures, monkeypatch) - simulation.positions(rows(postures))
+            assert np.abs(apart).max() < CLOSE_M, place
+
+
+def test_all_effects_at_once_show_in_the_world(robot, monkeypatch) -> None:
+    postures = walk(4).q[:20]
+    places = [place for place in everywhere(robot) if place[0] != "camera_latency"]
+    simulation = Simulation(robot, tuple(sized(robot, place, 0.3, k) for k, place in enumerate(places)), Wave())
+    apart = shown(simulation, postures, monkeypatch) - simulation.positions(rows(postures))
+    assert np.abs(apart).max() < CLOSE_M
+
+
+class Wave:
+    """A residual."""
+
+    def predict(self, q):
+        return 0.003 * np.cos(q[:, 2:5])
+
+
+def test_the_true_chain_has_geometric_effects_and_drawn_errors_in_it(robot, monkeypatch) -> None:
+    monkeypatch.setattr("sim_backend.posed.RenderProcess", NoRenderer)
+    postures = walk(5).q[:20]
+    places = [place for place in everywhere(robot) if place[0] in GEOMETRY]
+    simulation = Simulation(robot, tuple(sized(robot, place, 1.0, k) for k, place in enumerate(places)))
+    with PosedWorld(robot, SimConfig(seed=7), postures, simulation) as world:
+        x = np.array([world.scene(number).x_seen for number in range(len(postures))])
+        assert np.abs(x - world.true_chain().positions(postures)).max() < CLOSE_M
+    assert np.abs(x - simulation.positions(rows(postures))).max() > 0.01
