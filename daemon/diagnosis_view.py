@@ -74,7 +74,7 @@ def unexplained(diagnosis: DiagnosisFile) -> str:
     left = diagnosis.unexplained
     return (
         f"About {mm(left.rms_mm)} mm (RMS) is left that has structure and fits no known effect; it depends on "
-        f"{', '.join(left.depends_on)}."
+        f"{', '.join(left.depends_on)}.{''.join(f' {what[0].upper()}{what[1:]}.' for what in left.what)}"
     )
 
 

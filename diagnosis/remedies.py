@@ -22,6 +22,8 @@ _WHOLE_TURN = 0.01
 # A drift is over, and a move has ended, when this share of it is left.
 _OVER, _ENDED = 0.05, 0.001
 _TURN_ORIGIN = "turn the origin of joint {} by as much about"
+# A scale error beyond which a joint turns the other way.
+_BACKWARDS = -1.0
 # A cause that is less sure is made sure of first.
 _SURE = 0.9
 
@@ -70,6 +72,8 @@ class _Workshop:
         )
 
     def scale(self, cause: Cause, numbers: Mapping[str, float]) -> str:
+        if numbers["scale_error"] < _BACKWARDS:
+            return f"Give the readings of {cause.where} the other sign, in driver and recordings, and diagnose again."
         return (
             f"Multiply what the encoder of {cause.where} reads by {1.0 + numbers['scale_error']:.5f}: check its gear "
             "ratio and its counts per turn."

@@ -10,6 +10,8 @@ from .result import Cause, Errors, Gain, Verdict
 from .rivals import Standing
 
 _DEG = 180.0 / np.pi
+# A scale error beyond which a joint turns the other way.
+_BACKWARDS = -1.0
 # A sentence names so many causes; of more, the smallest are counted.
 _TOLD = 4
 
@@ -33,6 +35,8 @@ def finding(name: str, where: str | None, source: str | None, numbers: dict[str,
         case "joint_offset":
             return f"the zero of {at} is off by {turned('offset')}"
         case "joint_scale":
+            if numbers["scale_error"] < _BACKWARDS:
+                return f"{at} counts the other way than its encoder says"
             more = "more" if numbers["scale_error"] > 0.0 else "less"
             return f"{at} turns {100 * abs(numbers['scale_error']):.3g} % {more} than its encoder says"
         case "joint_eccentricity":

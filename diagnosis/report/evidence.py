@@ -187,7 +187,7 @@ def _drift(residuals: Residuals, effect: Effect) -> Panel:
 
 def _latency(residuals: Residuals, effect: Effect) -> Panel:
     partial, own = _partial(residuals, effect)
-    velocity = np.einsum("nij,nj->ni", residuals.run.by_joint, residuals.motion.rates)
+    velocity = -residuals.run.columns(effect)[:, :, 0]
     speed = np.linalg.norm(velocity, axis=1)
     y, fitted = (1e3 * speed * residuals.amount(velocity, e) for e in (partial, own))
     rows, x = residuals.rows, 1e3 * speed

@@ -93,7 +93,7 @@ def _unexplained(file: DiagnosisFile) -> str:
     return (
         f"<p>About <b>{mm(left.rms_mm)} mm</b> (RMS) is left that fits no known effect. It depends on "
         f"<b>{escape(', '.join(left.depends_on))}</b>; by chance that much is as improbable as p "
-        f"{_equals(left.p_value)}.</p>"
+        f"{_equals(left.p_value)}.</p>{f'<ul>{_items(left.what)}</ul>' if left.what else ''}"
     )
 
 

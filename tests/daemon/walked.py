@@ -11,7 +11,7 @@ from interfaces.recording import Recording
 from interfaces.robot import RobotDescription
 
 DESK_ARM = Path(__file__).parents[2] / "examples" / "desk_arm" / "robot.toml"
-PAIRS, SIGMA_M = 400, 3e-4
+PAIRS, SIGMA_M = 300, 3e-4
 
 
 def walked(robot: RobotDescription, *effects: Effect, seed: int = 3, timed: bool = True) -> Recording:

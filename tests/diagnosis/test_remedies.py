@@ -13,6 +13,7 @@ from walked import DESK_ARM
 from diagnosis.numbers import number, numbers_of, percent, telling
 from diagnosis.remedies import remedies
 from diagnosis.result import Cause, DiagnosisFile, Errors, Gain, Indistinguishable, Interval, Pairs, Unexplained
+from diagnosis.words import finding
 from effects import Effect, Motion, Simulation
 from interfaces.records import FloatArray
 from interfaces.robot import RobotDescription
@@ -128,6 +129,12 @@ def test_a_bump_counts_from_the_pose_that_was_found(robot) -> None:
 def test_a_spring_tells_how_far_it_gives(robot) -> None:
     effect = Effect.at(robot, "joint_compliance", "shoulder_pitch", values=[np.radians(0.2)])
     assert "up to 0.4° here" in told(robot, cause(effect), torque=2.0)[0]
+
+
+def test_a_joint_that_counts_the_other_way_is_called_so(robot) -> None:
+    effect = Effect.at(robot, "joint_scale", "wrist_roll", values=[-2.0])
+    assert "the other sign" in told(robot, cause(effect))[0]
+    assert "counts the other way" in finding("joint_scale", "wrist_roll", None, {"scale_error": -2.0})
 
 
 def test_of_a_cause_that_may_be_another_one_that_is_said_first(robot) -> None:
