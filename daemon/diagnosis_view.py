@@ -128,9 +128,10 @@ def _of(errors: Errors, name: str) -> float | None:
 
 def _causes(causes: Sequence[Cause], timed: bool) -> Table:
     table = _table("Causes")
+    table.padding = (0, 1, 0, 0)
     table.add_column("effect", overflow="fold", min_width=18)
     table.add_column("number", no_wrap=True)
-    table.add_column("± for 95 %", no_wrap=True)
+    table.add_column("± for 95 %", overflow="fold")
     for name in ("sure", "share", "gain"):
         table.add_column(name, justify="right", no_wrap=True)
     for cause in sorted(causes, key=lambda c: -c.share_of_gain_percent):
