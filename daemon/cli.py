@@ -16,6 +16,7 @@ COMMANDS = {
     "config": "Write, check or show robot.toml: begin here with your robot.",
     "replay": "Learn a recording; prints the error before and after.",
     "calibrate": "Camera, tool and joint zeros from pairs; writes a URDF.",
+    "diagnose": "What the simulation gets wrong, why, and how it gets better.",
     "simulate": "What the simulation would have measured at the same angles.",
     "compare": "How far two recordings are apart, row by row.",
     "reproduce": "Run the paper's experiments again, its figures beside ours.",

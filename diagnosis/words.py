@@ -10,6 +10,10 @@ from .result import Cause, Errors, Gain, Verdict
 from .rivals import Standing
 
 _DEG = 180.0 / np.pi
+# A scale error beyond which a joint turns the other way.
+_BACKWARDS = -1.0
+# A sentence names so many causes; of more, the smallest are counted.
+_TOLD = 4
 
 
 def finding(name: str, where: str | None, source: str | None, numbers: dict[str, float]) -> str:
@@ -31,7 +35,10 @@ def finding(name: str, where: str | None, source: str | None, numbers: dict[str,
         case "joint_offset":
             return f"the zero of {at} is off by {turned('offset')}"
         case "joint_scale":
-            return f"{at} turns {100 * numbers['scale_error']:+.3g} % more than its encoder says"
+            if numbers["scale_error"] < _BACKWARDS:
+                return f"{at} counts the other way than its encoder says"
+            more = "more" if numbers["scale_error"] > 0.0 else "less"
+            return f"{at} turns {100 * abs(numbers['scale_error']):.3g} % {more} than its encoder says"
         case "joint_eccentricity":
             return f"the encoder of {at} sits off its axis: ±{numbers['amplitude_rad'] * _DEG:.2g}° once a turn"
         case "joint_ripple":
@@ -91,6 +98,9 @@ def sentence(verdict: Verdict, causes: Sequence[Cause], rms: Errors, gain: Gain)
         return "What is measured differs from the simulation in a way that none of the known effects explains"
     told = [finding(c.effect, c.where, c.source, {k: v.value for k, v in c.parameters.items()}) for c in causes]
     ordered = [text for _, text in sorted(zip(causes, told, strict=True), key=lambda p: -p[0].share_of_gain_percent)]
+    if len(ordered) > _TOLD:
+        smaller = len(ordered) - _TOLD + 1
+        ordered = [*ordered[: _TOLD - 1], f"{smaller} smaller causes act beside"]
     head = ordered[0][0].upper() + ordered[0][1:]
     if len(ordered) > 1:
         head += f"; {', '.join(ordered[1:-1])}{', and ' if len(ordered) > 2 else ''}{ordered[-1]}"
@@ -100,7 +110,7 @@ def sentence(verdict: Verdict, causes: Sequence[Cause], rms: Errors, gain: Gain)
         "undecided": ". Other causes would explain it nearly as well",
         "unexplained": ". Something is left that none of the known effects explains",
     }
-    return f"{head}: {what} {gain.held_out_percent:.0f} % of the error ({figures}){ends[verdict]}"
+    return f"{head}: {what} {round(gain.held_out_percent)} % of the error ({figures}){ends[verdict]}"
 
 
 def evidence(standing: Standing) -> str:

@@ -1,0 +1,83 @@
+"""`bodyschema diagnose`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import Parameter
+from cyclopts.validators import Number
+
+from daemon.commands.options import SourceRobotFile, flag, robot_file
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+
+def diagnose(
+    recording: Annotated[
+        Path | None, Parameter(help="A recording (.csv, .parquet) or a pair store (.sqlite); or --live.")
+    ] = None,
+    /,
+    *,
+    live: Annotated[bool, flag("Take the running sampler's pairs, in the place of a recording.")] = False,
+    robot: SourceRobotFile = None,
+    out: Annotated[
+        Path | None, Parameter(help="Write diagnosis.json, report.html and extended.toml into this folder.")
+    ] = None,
+    effects: Annotated[str | None, Parameter(help="Look for these alone, as in backlash,joint_offset.")] = None,
+    exclude: Annotated[str | None, Parameter(help="Do not look for these.")] = None,
+    seed: Annotated[int, Parameter(help="Of the resampling behind the intervals.", validator=Number(gte=0))] = 0,
+    as_json: Annotated[bool, flag("Print diagnosis.json.", name="--json")] = False,
+) -> None:
+    """What the simulation gets wrong of a recording, why, and by how much it gets better.
+
+    Every effect that is known is tried at every joint, alone and together, and judged by blocks of rows that were not
+    fitted. What remains are causes with their numbers and how sure they are; or that nothing is wrong; or that this
+    recording cannot decide, or that no known effect explains it. The exit code is 0 whatever is found.
+
+    Without --out nothing is written.
+
+    Needs: a recording or a store and its robot.toml, no hardware; with --live a running sampler.
+
+    Next: open OUT/report.html; OUT/extended.toml takes the place of robot.toml in any command.
+    """
+    import sys
+
+    from rich.console import Console
+
+    from daemon.config import Config
+    from daemon.diagnosis_run import Asked, measured, run, written
+    from daemon.diagnosis_view import view
+
+    config = Config.load(robot_file(robot, recording))
+    asked = Asked.of(effects, exclude, seed)
+    source = measured(config, recording, live=live)
+    with _progress(Console(stderr=True, highlight=False)) as tell:
+        found = run(config, source, asked, tell)
+        if out is not None:
+            tell("writing the report")
+            written(found, out)
+    if as_json:
+        sys.stdout.write(found.json + "\n")
+        return
+    console = Console(highlight=False)
+    console.print(view(found.file, found.remedies, timed=found.timed))
+    if out is not None:
+        console.print(
+            f"\nOpen {out / 'report.html'}. Beside it are diagnosis.json and extended.toml, the simulation with what "
+            "was found, which takes the place of robot.toml.",
+            markup=False,
+        )
+
+
+@contextmanager
+def _progress(console: Console) -> Iterator[Callable[[str], None]]:
+    """One line that changes on a terminal; elsewhere a line for each step."""
+    if console.is_terminal:
+        with console.status("reading") as status:
+            yield status.update
+        return
+    yield lambda text: console.print(text, soft_wrap=True, markup=False)

@@ -1,0 +1,161 @@
+"""What a diagnosis found, for a terminal of 80 columns."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from rich import box
+from rich.console import Group, RenderableType
+from rich.padding import Padding
+from rich.table import Table
+from rich.text import Text
+
+from diagnosis.numbers import chance, mm, named, numbers_of, percent, place, share, telling
+from diagnosis.result import Cause, DiagnosisFile, Errors, Indistinguishable, Verdict
+
+# So many hypotheses that were rejected are shown.
+NEAREST = 6
+_HEADS: dict[Verdict, tuple[str, str]] = {
+    "explained": ("EXPLAINED", "bold white on dark_green"),
+    "nothing_found": ("NOTHING FOUND", "bold white on blue"),
+    "undecided": ("UNDECIDED", "bold black on yellow"),
+    "unexplained": ("NOT ALL EXPLAINED", "bold white on dark_red"),
+}
+_MEANING: dict[Verdict, str] = {
+    "explained": "",
+    "nothing_found": "",
+    "undecided": "The causes below describe the error, but this recording cannot tell some of them from others.",
+    "unexplained": "Something acts on this arm that is not among the effects that are known here. Take the causes "
+    "below as a description, and change nothing on the robot because of them alone.",
+}
+_ERRORS = (
+    ("nominal", "simulation as it is"),
+    ("aligned", "placed as well as it can be"),
+    ("geometry", "best geometry"),
+    ("extended", "with the causes"),
+    ("noise_floor", "noise alone"),
+)
+# What says nothing new where it is the same as another.
+_SAME_AS = {"aligned": "nominal", "extended": "aligned"}
+_BAR = 24
+
+
+def view(diagnosis: DiagnosisFile, remedies: Sequence[str], *, timed: bool) -> Group:
+    """The verdict, errors before and after, causes, what was rejected, what to do.
+
+    Args:
+        remedies: what to do about the causes.
+        timed: whether the recording has times.
+    """
+    head, style = _HEADS[diagnosis.verdict]
+    parts: list[RenderableType] = [Text.assemble((f" {head} ", style), "  ", (_sentence(diagnosis), "bold"))]
+    if meaning := _MEANING[diagnosis.verdict]:
+        parts.append(Text(meaning))
+    if diagnosis.unexplained.depends_on:
+        parts.append(Text(unexplained(diagnosis)))
+    parts.append(_errors(diagnosis))
+    if diagnosis.causes:
+        parts.append(_causes(diagnosis.causes, timed))
+    if rivals := [line for cause in diagnosis.causes for line in rival_lines(cause)]:
+        parts.append(_list("Not told apart", rivals))
+    if diagnosis.rejected:
+        parts.append(_rejected(diagnosis))
+    if remedies:
+        parts.append(_list("What to do", remedies, numbered=True))
+    if diagnosis.advice:
+        parts.append(_list("What to measure next", diagnosis.advice))
+    if diagnosis.limitations:
+        parts.append(_list("What this recording cannot show", diagnosis.limitations))
+    return Group(*(Padding(part, (0, 0, 1, 0), expand=False) for part in parts[:-1]), parts[-1])
+
+
+def unexplained(diagnosis: DiagnosisFile) -> str:
+    """What no effect fits, as a sentence."""
+    left = diagnosis.unexplained
+    return (
+        f"About {mm(left.rms_mm)} mm (RMS) is left that has structure and fits no known effect; it depends on "
+        f"{', '.join(left.depends_on)}.{''.join(f' {what[0].upper()}{what[1:]}.' for what in left.what)}"
+    )
+
+
+def rival_lines(cause: Cause) -> list[str]:
+    """What a cause could be instead, a sentence each."""
+    return [_rival(cause, rival) for rival in cause.rivals]
+
+
+def _rival(cause: Cause, rival: Indistinguishable) -> str:
+    instead = f"{place(cause)} may be {named(rival.effect, rival.where, rival.source)} ({percent(rival.probability)})"
+    if rival.by == "any_motion":
+        return f"{instead}; no motion tells them apart."
+    return f"{instead}; another motion can tell."
+
+
+def _sentence(diagnosis: DiagnosisFile) -> str:
+    return diagnosis.sentence.rstrip(".") + "."
+
+
+def _table(title: str) -> Table:
+    table = Table(
+        box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False, title=Text(title, style="bold"), title_justify="left"
+    )
+    table.title_style = ""
+    return table
+
+
+def _errors(diagnosis: DiagnosisFile) -> Table:
+    table = _table("Error on data not used in the fit [mm]")
+    table.add_column("")
+    for name in ("RMS", "mean"):
+        table.add_column(name, justify="right", no_wrap=True)
+    table.add_column("")
+    rms, mean = diagnosis.rms_mm, diagnosis.mean_mm
+    # Far off in its nominal place, an arm would leave no room for the rest.
+    longest = max(rms.aligned, rms.extended, rms.noise_floor or 0.0, 1e-12)
+    for name, label in _ERRORS:
+        value = _of(rms, name)
+        if value is not None and not (name in _SAME_AS and value == _of(rms, _SAME_AS[name])):
+            table.add_row(label, mm(value), mm(_of(mean, name)), _bar(value / longest))
+    return table
+
+
+def _bar(part: float) -> str:
+    return "█" * max(round(_BAR * min(part, 1.0)), 1) + ("…" if part > 1.001 else "")
+
+
+def _of(errors: Errors, name: str) -> float | None:
+    return getattr(errors, name)
+
+
+def _causes(causes: Sequence[Cause], timed: bool) -> Table:
+    table = _table("Causes")
+    table.padding = (0, 1, 0, 0)
+    table.add_column("effect", overflow="fold", min_width=18)
+    table.add_column("number", no_wrap=True)
+    table.add_column("± for 95 %", overflow="fold")
+    for name in ("sure", "share", "gain"):
+        table.add_column(name, justify="right", no_wrap=True)
+    for cause in sorted(causes, key=lambda c: -c.share_of_gain_percent):
+        numbers = telling(numbers_of(cause, timed=timed))
+        figures = (percent(cause.probability), share(cause.share_of_gain_percent), share(cause.held_out_gain_percent))
+        labels, values = ("\n".join(lines) for lines in ([n.label for n in numbers], [str(n) for n in numbers]))
+        table.add_row(Text(place(cause).replace(" ", "\n", 1)), labels, values, *figures)
+    return table
+
+
+def _rejected(diagnosis: DiagnosisFile) -> Table:
+    table = _table(f"Not there (nearest of {len(diagnosis.rejected)})")
+    table.add_column("effect", overflow="fold")
+    table.add_column("would gain", justify="right", no_wrap=True)
+    table.add_column("p-value", justify="right", no_wrap=True)
+    for row in diagnosis.rejected[:NEAREST]:
+        table.add_row(Text(place(row)), f"{row.held_out_gain_percent:+.2f} %", chance(row.p_value))
+    return table
+
+
+def _list(title: str, sentences: Sequence[str], *, numbered: bool = False) -> Group:
+    grid = Table.grid(padding=(0, 1))
+    grid.add_column(no_wrap=True)
+    grid.add_column(overflow="fold")
+    for k, sentence in enumerate(sentences, 1):
+        grid.add_row(f"{k}." if numbered else "-", Text(sentence))
+    return Group(Text(title, style="bold"), grid)

@@ -1,0 +1,184 @@
+"""Numbers of `diagnosis.json` for people: degrees, millimetres and percent, with as many digits as are told."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from .result import Cause, Interval, Rejected
+
+_DEG = math.degrees(1.0)
+# By the end of a number's name: its factor and unit. The first that fits is taken.
+_UNITS: tuple[tuple[str, float, str], ...] = (
+    ("_rad_per_Nm", _DEG, "°/N·m"),
+    ("_m_per_N", 1e3, " mm/N"),
+    ("_rad", _DEG, "°"),
+    ("_m", 1e3, " mm"),
+    ("latency_s", 1e3, " ms"),
+    ("_s", 1.0, " s"),
+    ("_error", 100.0, " %"),
+    ("ratio", 100.0, " %"),
+    ("fraction", 100.0, " %"),
+    ("share", 100.0, " %"),
+)
+_LABELS = {
+    "scale_error": "scale",
+    "focal_error": "focal length",
+    "cycles_per_turn": "cycles a turn",
+    "cycles_per_m": "cycles a metre",
+    "t0": "at",
+    "width": "play",
+    "fraction": "missing of a move",
+    "rx": "turn about x",
+    "ry": "turn about y",
+    "rz": "turn about z",
+    "x": "shift in x",
+    "y": "shift in y",
+    "z": "shift in z",
+    "latency": "late by",
+    "time_constant": "time constant",
+    "share": "of the fixes",
+}
+# What an amplitude and a phase say again.
+_SAID_AGAIN = ("sine_rad", "cosine_rad", "sine_m", "cosine_m")
+_LEAST_DIGITS, _MOST_DIGITS = 0, 6
+# Half widths from which on a recording tells nothing of a length [m] or an angle [rad].
+_UNTOLD = (("_rad", 0.5), ("_m", 0.1))
+# Numbers that say when and how, not how much.
+_SAYS_HOW = ("t0", "cycles", "phase", "time_constant")
+# An interval whose halves differ by more than this share is written with both its ends.
+_LOPSIDED = 0.3
+
+
+@dataclass(frozen=True, slots=True)
+class Number:
+    """One number of a cause, written out.
+
+    Attributes:
+        label: what it is.
+        value, interval: with unit; the interval as a half width or as both ends, "" where there is none.
+        may_be_none: whether its interval holds zero.
+        is_told: whether the recording tells it at all.
+    """
+
+    label: str
+    value: str
+    interval: str
+    may_be_none: bool
+    is_told: bool = True
+
+    def __str__(self) -> str:
+        return f"{self.value} {self.interval}".rstrip()
+
+
+def numbers_of(cause: Cause, *, timed: bool) -> list[Number]:
+    """The numbers of a cause.
+
+    Args:
+        timed: whether the recording has times; else a moment is the number of a row.
+    """
+    names = [name for name in cause.parameters if name not in _SAID_AGAIN or not _has_amplitude(cause)]
+    return [number(name, cause.parameters[name], timed=timed) for name in names]
+
+
+def telling(numbers: list[Number]) -> list[Number]:
+    """Those that are told and surely not zero; where none is, those that are told."""
+    told = [n for n in numbers if n.is_told] or numbers
+    return [n for n in told if not n.may_be_none] or told
+
+
+def number(name: str, interval: Interval, *, timed: bool = True) -> Number:
+    """One number with its interval."""
+    factor, unit = _unit(name, timed)
+    value, low, high = (factor * v for v in (interval.value, *interval.ci95))
+    half = 0.5 * (high - low)
+    digits = _digits(half if half > 0.0 else 0.01 * abs(value))
+    row = "row " if name == "t0" and not timed else ""
+    return Number(
+        label=_label(name),
+        value=f"{row}{_fixed(value, digits, '+' if name.endswith(_SIGNED) else '')}{unit}",
+        interval=_range(value, low, high, digits),
+        may_be_none=low <= 0.0 <= high and not name.startswith(_SAYS_HOW),
+        is_told=not any(name.endswith(end) and half > factor * limit for end, limit in _UNTOLD),
+    )
+
+
+def _label(name: str) -> str:
+    if name in _LABELS:
+        return _LABELS[name]
+    for end in ("_rad_per_Nm", "_m_per_N", "_rad", "_m", "_s"):
+        if name.endswith(end):
+            base = name.removesuffix(end)
+            return _LABELS.get(base, base)
+    return name
+
+
+def place(what: Cause | Rejected) -> str:
+    """Effect and joint, as in `joint_coupling of elbow with shoulder`."""
+    return named(what.effect, what.where, what.source)
+
+
+def named(effect: str, where: str | None, source: str | None) -> str:
+    """As `place`."""
+    at = "" if where is None else f" at {where}"
+    return f"{effect}{at}{'' if source is None else f' from {source}'}"
+
+
+def chance(p: float) -> str:
+    """A p-value."""
+    if p < 0.001:
+        return "< 0.001"
+    return "1" if p >= 0.995 else f"{p:.2g}"
+
+
+def percent(share: float) -> str:
+    """A probability that is never said to be certain."""
+    if share >= 0.995:
+        return "> 99 %"
+    return "< 1 %" if share < 0.005 else f"{100.0 * share:.0f} %"
+
+
+def share(of_hundred: float) -> str:
+    """A share of a gain [%]."""
+    return "< 1 %" if 0.05 <= of_hundred < 0.5 else f"{round(of_hundred)} %"
+
+
+def mm(value: float | None) -> str:
+    """A length that is in mm already."""
+    if value is None or not math.isfinite(value):
+        return "–"
+    return _fixed(value, 0 if value >= 100 else 1 if value >= 10 else 2 if value >= 0.1 else 3, "")
+
+
+_SIGNED = ("offset_rad", "offset_m", "jump_rad", "jump_m", "_error", "ratio", "x_m", "y_m", "z_m", "k1")
+_SIGNED += ("rx_rad", "ry_rad", "rz_rad")
+
+
+def _unit(name: str, timed: bool) -> tuple[float, str]:
+    if name == "t0":
+        return 1.0, " s" if timed else ""
+    return next(((factor, unit) for end, factor, unit in _UNITS if name.endswith(end)), (1.0, ""))
+
+
+def _has_amplitude(cause: Cause) -> bool:
+    return any(name.startswith("amplitude") for name in cause.parameters)
+
+
+def _digits(half: float) -> int:
+    """So that the half width has two figures."""
+    if half <= 0.0 or not math.isfinite(half):
+        return 3
+    return min(max(1 - math.floor(math.log10(half)), _LEAST_DIGITS), _MOST_DIGITS)
+
+
+def _fixed(value: float, digits: int, sign: str) -> str:
+    return f"{round(value, digits) + 0.0:{sign}.{digits}f}"
+
+
+def _range(value: float, low: float, high: float, digits: int) -> str:
+    half = 0.5 * (high - low)
+    if not half > 0.0:
+        return ""
+    if abs(0.5 * (low + high) - value) > _LOPSIDED * half:
+        return f"({_fixed(low, digits, '')} … {_fixed(high, digits, '')})"
+    return f"± {half:.{digits}f}"

@@ -1,0 +1,227 @@
+"""One self-contained page: verdict, figures, causes with their evidence, what was looked for, what was done."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from html import escape
+from pathlib import Path
+
+import numpy as np
+
+from diagnosis.diagnosis import Diagnosis
+from diagnosis.numbers import chance, mm, share
+from diagnosis.result import Cause, DiagnosisFile, Verdict
+from diagnosis.words import finding
+from effects import Effect
+
+from . import tables
+from .evidence import evidence_panels, outlier_panel
+from .panels import Panel, panels
+from .residuals import Residuals
+from .spread import arrows, histogram
+
+_STYLE = (Path(__file__).parent / "page.css").read_text(encoding="utf-8")
+_VERDICTS: dict[Verdict, tuple[str, str]] = {
+    "explained": ("Explained", "Every part of the error that is not noise has a cause with a name."),
+    "nothing_found": ("Nothing found", "What is left of the error is noise: there is nothing to correct."),
+    "undecided": (
+        "Undecided",
+        "The causes describe the error, but this recording cannot tell some of them from others. See below which, and "
+        "which motion would.",
+    ),
+    "unexplained": (
+        "Not all explained",
+        "Something acts on this arm that is not among the known effects. Take the causes as a description, and change "
+        "nothing on the robot because of them alone.",
+    ),
+}
+# So many rows that are not the marker are named.
+_NAMED_ROWS = 40
+# So many causes are opened out with their plots; more are one under the other in a list to open.
+_OPEN = 4
+
+
+@dataclass(frozen=True)
+class About:
+    """What a report is of: names of the recording and the robot, and the version that made it."""
+
+    recording: str
+    robot: str
+    version: str
+
+
+def page(diagnosis: Diagnosis, file: DiagnosisFile, remedies: Sequence[str], about: About) -> str:
+    """The page.
+
+    Args:
+        remedies: what to do about each cause, in the order of `remedies()`.
+    """
+    residuals = Residuals(diagnosis)
+    body = [
+        _head(file, about),
+        _glance(residuals, file),
+        _causes(residuals, file, remedies),
+        _advice(file),
+        _where(residuals),
+        _against(residuals),
+        _hypotheses(file),
+        _limits(file),
+        _done(diagnosis, file, about),
+    ]
+    return (
+        '<!doctype html><html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f"<title>{escape(about.robot)}: diagnosis of {escape(about.recording)}</title><style>{_STYLE}</style></head>"
+        f"<body><main>{''.join(body)}</main></body></html>\n"
+    )
+
+
+def _head(file: DiagnosisFile, about: About) -> str:
+    name, meaning = _VERDICTS[file.verdict]
+    return (
+        f'<header><p class="of">{escape(about.robot)} · {escape(about.recording)} · {file.pairs.total:,} pairs</p>'
+        f'<h1><span class="verdict {file.verdict}">{name}</span> {escape(file.sentence.rstrip("."))}.</h1>'
+        f"<p>{meaning}</p>{_unexplained(file)}</header>"
+    )
+
+
+def _unexplained(file: DiagnosisFile) -> str:
+    left = file.unexplained
+    if not left.depends_on:
+        return ""
+    return (
+        f"<p>About <b>{mm(left.rms_mm)} mm</b> (RMS) is left that fits no known effect. It depends on "
+        f"<b>{escape(', '.join(left.depends_on))}</b>; by chance that much is as improbable as p "
+        f"{_equals(left.p_value)}.</p>{f'<ul>{_items(left.what)}</ul>' if left.what else ''}"
+    )
+
+
+def _equals(p: float) -> str:
+    text = chance(p)
+    return text if text.startswith("<") else f"= {text}"
+
+
+def _glance(residuals: Residuals, file: DiagnosisFile) -> str:
+    rms, gain = file.rms_mm, file.gain
+    tiles = [
+        (f"{mm(rms.aligned)} → {mm(rms.extended)} mm", "RMS before → after"),
+        (share(gain.held_out_percent), f"gain, held out ({share(gain.ci95[0])} to {share(gain.ci95[1])})"),
+        (f"{mm(rms.noise_floor)} mm", "noise alone (RMS)"),
+        (f"{file.pairs.outliers:,} of {file.pairs.total:,}", "fixes that are not the marker"),
+    ]
+    if file.stability is not None:
+        same = f"{file.stability.same_causes} of {file.stability.resampled}"
+        tiles.append((same, "resampled, with the same causes"))
+    items = "".join(f"<div><b>{value}</b><span>{escape(label)}</span></div>" for value, label in tiles)
+    return (
+        f'<section><div class="tiles">{items}</div><div class="beside"><div>{_panels([histogram(residuals)])}</div>'
+        f"<div>{tables.errors(file)}</div></div></section>"
+    )
+
+
+def _causes(residuals: Residuals, file: DiagnosisFile, remedies: Sequence[str]) -> str:
+    if not file.causes:
+        return ""
+    ordered = sorted(file.causes, key=lambda cause: -cause.share_of_gain_percent)
+    effects = {effect.key: effect for effect in residuals.diagnosis.causes}
+    articles = [
+        _cause(residuals, cause, effects.get((cause.effect, cause.where, cause.source)), remedy, opened=k < _OPEN)
+        for k, (cause, remedy) in enumerate(zip(ordered, remedies, strict=True))
+    ]
+    return (
+        f'<section id="causes"><h2>Causes</h2>{tables.causes(file, timed=residuals.timed)}'
+        '<p class="key">In the plots: pale dots are single pairs, strong dots their means with 95 % intervals, the '
+        f'<span class="fitted">line</span> what was fitted.</p>{"".join(articles)}</section>'
+    )
+
+
+def _cause(residuals: Residuals, cause: Cause, effect: Effect | None, remedy: str, *, opened: bool) -> str:
+    said = finding(
+        cause.effect, cause.where, cause.source, {name: interval.value for name, interval in cause.parameters.items()}
+    )
+    plots = [outlier_panel(residuals)] if effect is None else evidence_panels(residuals, effect)
+    state = " open" if opened else ""
+    return (
+        f'<details class="cause"{state}><summary>{escape(said[0].upper() + said[1:])}</summary><div class="beside">'
+        f"{_panels(plots)}<div><p>{tables.numbers(cause, timed=residuals.timed)}</p><p>{escape(cause.evidence)}</p>"
+        f"{tables.rivals(cause)}<p><b>What to do.</b> {escape(remedy)}</p></div></div></details>"
+    )
+
+
+def _advice(file: DiagnosisFile) -> str:
+    if not file.advice:
+        return ""
+    return f'<section id="next"><h2>What to measure next</h2><ul>{_items(file.advice)}</ul></section>'
+
+
+def _where(residuals: Residuals) -> str:
+    views, stretch = arrows(residuals)
+    return (
+        '<section id="where"><h2>Where the marker is, and where it should be</h2>'
+        f"<p>From where the simulation expects it (dot) to where it was measured, {stretch:g} times as long as it is. "
+        f'{_KEY}</p><div class="views">{_panels(views)}</div></section>'
+    )
+
+
+_KEY = '<span class="before">■ before</span> <span class="after">■ after</span>, on data not used in the fit.'
+
+
+def _against(residuals: Residuals) -> str:
+    found = panels(residuals)
+    telling = [panel for panel in found if panel.is_telling]
+    silent = [panel for panel in found if not panel.is_telling]
+    shown = f'<div class="panels">{_panels(telling)}</div>' if telling else "<p>Nothing: the error depends on none.</p>"
+    folded = ""
+    if silent:
+        folded = (
+            f"<details><summary>{len(silent)} plots in which nothing is to be seen</summary>"
+            f'<div class="panels">{_panels(silent)}</div></details>'
+        )
+    return (
+        f'<section id="against"><h2>What the error depends on</h2><p>{_KEY} Pale dots are single pairs, strong dots '
+        "means with 95 % intervals. An error along a joint is counted on the way on which that joint moves the "
+        f"marker.</p>{shown}{folded}</section>"
+    )
+
+
+def _hypotheses(file: DiagnosisFile) -> str:
+    if not file.rejected:
+        return ""
+    return (
+        '<section id="hypotheses"><h2>What it is not</h2><p>By how much the squared error on data not used in the fit '
+        f"would fall with each of these beside the causes, and how probable it is by chance, over all of them together."
+        f"</p>{tables.hypotheses(file.rejected)}</section>"
+    )
+
+
+def _limits(file: DiagnosisFile) -> str:
+    if not file.limitations:
+        return ""
+    return f'<section id="limits"><h2>What this recording cannot show</h2><ul>{_items(file.limitations)}</ul></section>'
+
+
+def _done(diagnosis: Diagnosis, file: DiagnosisFile, about: About) -> str:
+    away = np.flatnonzero(~diagnosis.markers) + 1
+    rows = ", ".join(str(k) for k in away[:_NAMED_ROWS]) + (" …" if len(away) > _NAMED_ROWS else "")
+    left_out = f"<p>Not the marker, and left out: rows {rows}.</p>" if len(away) else ""
+    return (
+        '<section id="method"><h2>What was done</h2>'
+        f"<p>{len(diagnosis.hypotheses.effects)} hypotheses, each effect at each place where it can sit, were tried "
+        "as extensions of the simulation, alone and beside each other. Their numbers were fitted to all pairs together "
+        "by maximum likelihood, with a share of fixes that may be anything. One was added while it made the data more "
+        "probable by more than its freedom and the number of trials explain, and removed again when others made it "
+        f"needless. Every error on this page is that of pairs that were not fitted: {diagnosis.blocks.count} blocks of "
+        "time, left out in turn. Intervals of gains come from drawing blocks anew, since neighbouring pairs are not "
+        f"independent.</p>{left_out}"
+        f'<p class="of">bodyschema {escape(about.version)}, {file.pairs.total:,} pairs of {escape(about.recording)}, '
+        f"seed {diagnosis.seed}.</p></section>"
+    )
+
+
+def _panels(found: Sequence[Panel]) -> str:
+    return "".join(panel.html() for panel in found)
+
+
+def _items(sentences: Sequence[str]) -> str:
+    return "".join(f"<li>{escape(sentence)}" for sentence in sentences)

@@ -1,0 +1,157 @@
+"""Plots as inline SVG that follow the page's light or dark colours."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from html import escape
+
+import numpy as np
+
+from interfaces.records import FloatArray
+
+WIDTH, HEIGHT = 380, 236
+_LEFT, _RIGHT, _TOP, _BOTTOM = 52, 10, 10, 40
+_STEPS = (1.0, 2.0, 2.5, 5.0, 10.0)
+_TICKS = 5
+ASPECT = (WIDTH - _LEFT - _RIGHT) / (HEIGHT - _TOP - _BOTTOM)
+
+
+@dataclass(frozen=True)
+class Plot:
+    """Linear axes.
+
+    Attributes:
+        x_label, y_label: with units.
+        x, y: their ranges; from high to low where the axis runs the other way.
+        names: of whole numbers on the x axis, in the place of figures.
+    """
+
+    x_label: str
+    y_label: str
+    x: tuple[float, float]
+    y: tuple[float, float]
+    names: Sequence[str] = ()
+
+    def svg(self, *marks: str) -> str:
+        """The plot with marks, the first at the back."""
+        label = escape(f"{self.y_label} against {self.x_label}", quote=True)
+        box = (_LEFT, _TOP, WIDTH - _LEFT - _RIGHT, HEIGHT - _TOP - _BOTTOM)
+        place = " ".join(f'{name}="{value}"' for name, value in zip(("x", "y", "width", "height"), box, strict=True))
+        inside = f'<svg {place} viewBox="{" ".join(map(str, box))}">{"".join(marks)}</svg>'
+        return f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{label}">{self._grid()}{inside}</svg>'
+
+    def dots(self, x: FloatArray, y: FloatArray, look: str) -> str:
+        """Points that are inside; one path, so that hundreds are small."""
+        return f'<path class="dots {look}" d="{self._points(x, y)}"/>'
+
+    def line(self, x: FloatArray, y: FloatArray, look: str) -> str:
+        """A curve through points in their order."""
+        left, top = self._at(x, y)
+        points = " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(left, top, strict=True))
+        return f'<polyline class="line {look}" points="{points}"/>'
+
+    def bars(self, x: FloatArray, y: FloatArray, half: FloatArray, look: str) -> str:
+        """Means with their 95 % intervals."""
+        left, top = self._at(x, y)
+        _, upper = self._at(x, y + half)
+        _, lower = self._at(x, y - half)
+        ends = zip(left, upper, lower, strict=True)
+        path = "".join(f"M{a:.1f} {b:.1f}V{c:.1f}" for a, b, c in ends)
+        inside = self._inside(x, y)
+        middle = "".join(f"M{a:.1f} {b:.1f}h0" for a, b in zip(left[inside], top[inside], strict=True))
+        return f'<path class="bars {look}" d="{path}"/><path class="means {look}" d="{middle}"/>'
+
+    def area(self, x: FloatArray, y: FloatArray, look: str) -> str:
+        """Down to the x axis."""
+        left, top = self._at(x, y)
+        points = " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(left, top, strict=True))
+        bottom = HEIGHT - _BOTTOM
+        return f'<polygon class="area {look}" points="{left[0]:.1f},{bottom} {points} {left[-1]:.1f},{bottom}"/>'
+
+    def arrows(self, x: FloatArray, y: FloatArray, dx: FloatArray, dy: FloatArray, look: str) -> str:
+        """Arrows from their feet."""
+        left, top = self._at(x, y)
+        right, end = self._at(x + dx, y + dy)
+        path = "".join(
+            f"M{a:.1f} {b:.1f}l{c - a:.1f} {d - b:.1f}" for a, b, c, d in zip(left, top, right, end, strict=True)
+        )
+        return f'<path class="arrows {look}" d="{path}"/><path class="feet {look}" d="{self._points(x, y)}"/>'
+
+    def moment(self, x: float, text: str) -> str:
+        """An upright line with a name."""
+        left, _ = self._at(np.array([x]), np.array([0.0]))
+        side = "end" if x > 0.5 * sum(self.x) else "start"
+        shift = -4 if side == "end" else 4
+        return (
+            f'<line class="moment" x1="{left[0]:.1f}" x2="{left[0]:.1f}" y1="{_TOP}" y2="{HEIGHT - _BOTTOM}"/>'
+            f'<text class="named" x="{left[0] + shift:.1f}" y="{_TOP + 11}" text-anchor="{side}">{escape(text)}</text>'
+        )
+
+    def _points(self, x: FloatArray, y: FloatArray) -> str:
+        inside = self._inside(x, y)
+        left, top = self._at(x[inside], y[inside])
+        return "".join(f"M{a:.1f} {b:.1f}h0" for a, b in zip(left, top, strict=True))
+
+    def _inside(self, x: FloatArray, y: FloatArray) -> np.ndarray:
+        (left, right), (low, high) = sorted(self.x), sorted(self.y)
+        return (x >= left) & (x <= right) & (y >= low) & (y <= high)
+
+    def _at(self, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+        across = (x - self.x[0]) / (self.x[1] - self.x[0])
+        up = (y - self.y[0]) / (self.y[1] - self.y[0])
+        return _LEFT + across * (WIDTH - _LEFT - _RIGHT), HEIGHT - _BOTTOM - up * (HEIGHT - _TOP - _BOTTOM)
+
+    def _grid(self) -> str:
+        bottom, right = HEIGHT - _BOTTOM, WIDTH - _RIGHT
+        parts = []
+        for value in ticks(*sorted(self.y)):
+            y = self._at(np.array([self.x[0]]), np.array([value]))[1][0]
+            zero = " zero" if value == 0.0 else ""
+            parts.append(f'<line class="grid{zero}" x1="{_LEFT}" x2="{right}" y1="{y:.1f}" y2="{y:.1f}"/>')
+            parts.append(f'<text x="{_LEFT - 5}" y="{y + 4:.1f}" text-anchor="end">{_figure(value)}</text>')
+        marks = [(float(k), name) for k, name in enumerate(self.names)]
+        for value, name in marks or [(value, _figure(value)) for value in ticks(*self.x)]:
+            x = self._at(np.array([value]), np.array([self.y[0]]))[0][0]
+            parts.append(f'<text x="{x:.1f}" y="{bottom + 15}" text-anchor="middle">{escape(name)}</text>')
+        middle = 0.5 * (_LEFT + right)
+        parts.append(
+            f'<text class="label" x="{middle}" y="{HEIGHT - 6}" text-anchor="middle">{escape(self.x_label)}</text>'
+        )
+        turned = f"translate(11 {0.5 * (bottom + _TOP):.0f}) rotate(-90)"
+        parts.append(f'<text class="label" transform="{turned}" text-anchor="middle">{escape(self.y_label)}</text>')
+        return "".join(parts)
+
+
+def ticks(low: float, high: float) -> list[float]:
+    """Round figures in a range."""
+    step = round_up((high - low) / _TICKS)
+    first, last = math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9)
+    return [k * step for k in range(first, last + 1)]
+
+
+def round_up(value: float) -> float:
+    """The next figure of 1, 2, 2.5, 5 times a power of ten."""
+    power = 10.0 ** math.floor(math.log10(max(value, 1e-12)))
+    return next(factor * power for factor in _STEPS if factor * power >= value * (1.0 - 1e-9))
+
+
+def span(*values: FloatArray, cut: float = 0.0, around_zero: bool = False) -> tuple[float, float]:
+    """A range for values, with a margin.
+
+    Args:
+        cut: share of the values to leave out at each end.
+        around_zero: as far up as down.
+    """
+    together = np.concatenate([np.ravel(v) for v in values])
+    low, high = (float(v) for v in np.quantile(together, [cut, 1.0 - cut]))
+    if around_zero:
+        high = max(abs(low), abs(high))
+        low = -high
+    margin = 0.06 * (high - low) or max(abs(high), 1e-6)
+    return low - margin, high + margin
+
+
+def _figure(value: float) -> str:
+    return f"{value + 0.0:,.10g}" if abs(value) < 1e5 else f"{value:.3g}"

@@ -1,0 +1,181 @@
+"""What a report plots: errors before and after, and what they are plotted against."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from diagnosis.diagnosis import Diagnosis
+from diagnosis.held_out import HeldOut
+from effects import Effect, Simulation
+from interfaces.camera import StereoCalibration
+from interfaces.records import FloatArray
+
+# So many points are drawn in a plot, and arrows in a projection.
+POINTS, ARROWS = 450, 220
+# A joint that hardly moves the marker in some pose, beside how it does in others, says nothing there.
+_TELLS = 0.5
+_BINS, _FEWEST_IN_A_BIN = 16, 8
+# Structure that chance brings about more often than this is none.
+_SIGNIFICANT = 1e-3
+
+
+@dataclass(frozen=True)
+class Bins:
+    """Means of equally many rows each: x (b,), y (b,), and half the 95 % interval of y (b,)."""
+
+    x: FloatArray
+    y: FloatArray
+    half: FloatArray
+
+
+class Residuals:
+    """Errors (n, 3) [m] on rows that were not fitted, before and after, and the rows (n,) that are the marker."""
+
+    def __init__(self, diagnosis: Diagnosis) -> None:
+        self.diagnosis = diagnosis
+        self.run = diagnosis.extended.run
+        self.motion = self.run.motion
+        self.robot = self.run.simulation.robot
+        self.rows: NDArray[np.intp] = np.flatnonzero(diagnosis.markers)
+
+    @cached_property
+    def before(self) -> FloatArray:
+        """Of the aligned simulation."""
+        return HeldOut(self.diagnosis.aligned, self.diagnosis.blocks).errors
+
+    @cached_property
+    def after(self) -> FloatArray:
+        """Of the extended simulation."""
+        return HeldOut(self.diagnosis.extended, self.diagnosis.blocks).errors
+
+    def some(self, count: int, rows: NDArray[np.intp] | None = None) -> NDArray[np.intp]:
+        """At most so many of the rows, in their order, drawn with the diagnosis' seed."""
+        rows = self.rows if rows is None else rows
+        if len(rows) <= count:
+            return rows
+        return np.sort(np.random.default_rng(self.diagnosis.seed).choice(rows, count, replace=False))
+
+    @property
+    def calibration(self) -> StereoCalibration | None:
+        """The stereo pair."""
+        return self.robot.calibration
+
+    @property
+    def timed(self) -> bool:
+        """Whether there are times."""
+        return self.motion.t is not None
+
+    @cached_property
+    def clock(self) -> FloatArray:
+        """Times [s] or numbers of rows (n,)."""
+        return self.motion.clock
+
+    @property
+    def clock_label(self) -> str:
+        """What an axis of the clock is called."""
+        return "time [s]" if self.timed else "row"
+
+    def slides(self, joint: int) -> bool:
+        """Whether a joint is prismatic."""
+        return bool(self.robot.chain.prismatic[joint])
+
+    def angles(self, joint: int) -> FloatArray:
+        """What a joint reads (n,) [°, mm]."""
+        return self.motion.q[:, joint] * self.unit(joint)[0]
+
+    def unit(self, joint: int) -> tuple[float, str]:
+        """Factor and name of what a joint is shown in."""
+        return (1e3, "mm") if self.slides(joint) else (np.degrees(1.0), "°")
+
+    def amount(self, way: FloatArray, errors: FloatArray) -> FloatArray:
+        """How many times `way` (n, 3) errors (n, 3) [m] most probably go (n,), given the shape of the noise."""
+        expected, seen = (np.einsum("nij,nj->ni", self.whitening, vectors) for vectors in (way, errors))
+        return np.einsum("ni,ni->n", expected, seen) / np.maximum(np.square(expected).sum(axis=1), 1e-300)
+
+    @property
+    def whitening(self) -> FloatArray:
+        """(n, 3, 3): makes the noise round."""
+        return self.diagnosis.extended.observations.whitening
+
+    def along(self, joint: int, errors: FloatArray) -> FloatArray:
+        """Errors (n,) [mm] along the way on which a joint moves the marker."""
+        way = self.run.by_joint[:, :, joint]
+        return 1e3 * self.amount(way, errors) * np.linalg.norm(way, axis=1)
+
+    def as_angle(self, joint: int, errors: FloatArray) -> FloatArray:
+        """By how much a joint would have to be elsewhere (n,) [°, mm] for errors (n, 3)."""
+        return self.unit(joint)[0] * self.amount(self.run.by_joint[:, :, joint], errors)
+
+    def telling(self, joint: int) -> NDArray[np.intp]:
+        """The rows in which a joint moves the marker well."""
+        way = np.einsum("nij,nj->ni", self.whitening, self.run.by_joint[:, :, joint])
+        arm = np.linalg.norm(way, axis=1)[self.rows]
+        return self.rows[arm >= _TELLS * np.median(arm)]
+
+    @cached_property
+    def direction(self) -> NDArray[np.intp]:
+        """Which way each joint went last (n, d): 1, -1, or 0 where it has not moved in its run."""
+        signs = np.sign(self.motion.moves).astype(np.intp)
+        for first, end in self.motion.runs:
+            for k in range(first + 1, end):
+                signs[k] = np.where(signs[k] == 0, signs[k - 1], signs[k])
+        return signs
+
+    def contribution(self, effect: Effect) -> FloatArray:
+        """What an effect changes of what is measured (n, 3) [m]."""
+        return self.run.measured - self._simulated([e for e in self.run.simulation.effects if e is not effect])
+
+    def instead(self, effect: Effect, values: FloatArray) -> FloatArray:
+        """The same with other numbers of the effect."""
+        others = [e for e in self.run.simulation.effects if e is not effect]
+        return self._simulated([*others, effect.with_values(values)]) - self._simulated(others)
+
+    def _simulated(self, effects: list[Effect]) -> FloatArray:
+        simulation: Simulation = self.run.simulation.with_effects(effects)
+        return simulation.positions(self.motion)
+
+    def pixels(self, x: FloatArray) -> FloatArray:
+        """Where the left camera sees points (n, 3), (n, 2) [px]; it has to be described."""
+        assert self.calibration is not None
+        return self.calibration.project(x)[:, :2]
+
+
+def binned(x: FloatArray, y: FloatArray) -> Bins:
+    """Means of y where x is about the same."""
+    member = _members(x)
+    count = np.bincount(member).astype(np.float64)
+    mean_x, mean_y = np.bincount(member, x) / count, np.bincount(member, y) / count
+    spread = np.sqrt(np.bincount(member, np.square(y - mean_y[member])) / np.maximum(count - 1.0, 1.0))
+    return Bins(mean_x, mean_y, 1.96 * spread / np.sqrt(count))
+
+
+def structure(x: FloatArray, y: FloatArray) -> float:
+    """Which share of the variance of y goes with x, beyond chance; 0 where it may be chance (analysis of variance)."""
+    member = _members(x)
+    n, groups = len(y), int(member.max()) + 1
+    if groups < 2 or n <= groups:
+        return 0.0
+    means = np.bincount(member, y) / np.bincount(member)
+    inside = float(np.square(y - means[member]).sum())
+    between = float(np.square(means[member] - y.mean()).sum())
+    ratio = (between / (groups - 1)) / max(inside / (n - groups), 1e-300)
+    if stats.f.sf(ratio, groups - 1, n - groups) > _SIGNIFICANT:
+        return 0.0
+    share = between / max(between + inside, 1e-300)
+    return max(share - (groups - 1) / (n - 1), 0.0)
+
+
+def _members(x: FloatArray) -> NDArray[np.intp]:
+    """The bin of each row (n,): of equally many rows each; where x has few values, one for each."""
+    values, member = np.unique(np.round(x, 9), return_inverse=True)
+    if len(values) <= _BINS:
+        return member
+    bins = min(_BINS, max(len(x) // _FEWEST_IN_A_BIN, 1))
+    of_row = np.empty(len(x), dtype=np.intp)
+    of_row[np.argsort(x, kind="stable")] = np.arange(len(x)) * bins // len(x)
+    return of_row

@@ -1,0 +1,94 @@
+"""The tables of a report."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from html import escape
+
+from diagnosis.numbers import Number, chance, mm, named, numbers_of, percent, place, share, telling
+from diagnosis.result import Cause, DiagnosisFile, Indistinguishable, Rejected
+
+# What says nothing new where it is the same as another.
+_SAME_AS = {"aligned": "nominal", "extended": "aligned"}
+# So many of the rejected hypotheses are shown at first sight.
+NEAREST = 12
+_ERRORS = (
+    ("nominal", "The simulation as it is"),
+    ("aligned", "Placed as well as it can be"),
+    ("geometry", "The best geometry"),
+    ("extended", "With the causes"),
+    ("noise_floor", "Noise alone"),
+)
+
+
+def errors(diagnosis: DiagnosisFile) -> str:
+    """RMS and mean of each simulation."""
+    rms, mean = diagnosis.rms_mm, diagnosis.mean_mm
+    longest = max(value for name, _ in _ERRORS[1:] if (value := getattr(rms, name)) is not None) or 1.0
+    rows = []
+    for name, label in _ERRORS:
+        value = getattr(rms, name)
+        if value is None or (name in _SAME_AS and value == getattr(rms, _SAME_AS[name])):
+            continue
+        share = min(value / longest, 1.0)
+        bar = f'<span class="bar {name}" style="width:{100 * share:.1f}%"></span>'
+        rows.append(f"<tr><td>{label}<td>{mm(value)}<td>{mm(getattr(mean, name))}<td class=wide>{bar}</tr>")
+    return _table(("Not used in the fit", "RMS [mm]", "mean [mm]", ""), rows)
+
+
+def causes(diagnosis: DiagnosisFile, *, timed: bool) -> str:
+    """Every cause with those of its numbers that are not zero."""
+    rows = []
+    for cause in sorted(diagnosis.causes, key=lambda c: -c.share_of_gain_percent):
+        figures = (
+            f"<td>{percent(cause.probability)}<td>{share(cause.share_of_gain_percent)}"
+            f"<td>{cause.held_out_gain_percent:.1f} %"
+        )
+        shown = _lines(telling(numbers_of(cause, timed=timed)))
+        rows.append(f"<tr><td>{escape(place(cause))}<td class=text>{shown}{figures}</tr>")
+    return _table(("Cause", "Numbers, ± for 95 %", "Sure", "Share of the gain", "Gain"), rows)
+
+
+def numbers(cause: Cause, *, timed: bool) -> str:
+    """All numbers of a cause, a line each, and which the recording does not tell."""
+    every = numbers_of(cause, timed=timed)
+    hidden = ", ".join(n.label for n in every if not n.is_told)
+    untold = f"<br><small>not told by this motion: {escape(hidden)}</small>" if hidden else ""
+    return f"{_lines(n for n in every if n.is_told)}{untold}"
+
+
+def _lines(shown: Iterable[Number]) -> str:
+    return "<br>".join(f"{escape(n.label)} <b>{escape(n.value)}</b> <small>{escape(n.interval)}</small>" for n in shown)
+
+
+def rivals(cause: Cause) -> str:
+    """What a cause could be instead; nothing where it can be nothing else."""
+    if not cause.rivals:
+        return ""
+    items = "".join(f"<li>{_rival(rival)}" for rival in cause.rivals)
+    return f"<p>It could also be:<ul>{items}</ul>"
+
+
+def _rival(rival: Indistinguishable) -> str:
+    tell = "no motion tells them apart" if rival.by == "any_motion" else "another motion can tell"
+    what = escape(named(rival.effect, rival.where, rival.source))
+    return f"<b>{what}</b>, with a probability of {percent(rival.probability)}; {tell}"
+
+
+def hypotheses(rejected: Sequence[Rejected]) -> str:
+    """What was looked for and is not there, the nearest first, the rest folded away."""
+    rows = [
+        f"<tr><td>{escape(place(row))}<td>{row.held_out_gain_percent:+.2f} %<td>{chance(row.p_value)}</tr>"
+        for row in rejected
+    ]
+    heads = ("Not there", "would gain, held out", "p-value, corrected")
+    shown = _table(heads, rows[:NEAREST])
+    if len(rows) <= NEAREST:
+        return shown
+    rest = _table(heads, rows[NEAREST:])
+    return f"{shown}<details><summary>{len(rows) - NEAREST} more</summary>{rest}</details>"
+
+
+def _table(heads: Sequence[str], rows: Sequence[str]) -> str:
+    head = "".join(f"<th>{escape(text)}" for text in heads)
+    return f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>{"".join(rows)}</tbody></table></div>'

@@ -1,0 +1,170 @@
+"""What to do about a cause: done as it says, it makes the simulation right."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from walked import DESK_ARM
+
+from diagnosis.numbers import number, numbers_of, percent, telling
+from diagnosis.remedies import remedies
+from diagnosis.result import Cause, DiagnosisFile, Errors, Gain, Indistinguishable, Interval, Pairs, Unexplained
+from diagnosis.words import finding
+from effects import Effect, Motion, Simulation
+from interfaces.records import FloatArray
+from interfaces.robot import RobotDescription
+
+ERRORS = Errors(1.0, 1.0, 1.0, 1.0, 1.0)
+SIX = {"x_m": 0.004, "y_m": -0.003, "z_m": 0.002, "rx_rad": 0.01, "ry_rad": -0.02, "rz_rad": 0.015}
+
+
+@pytest.fixture
+def robot(tmp_path: Path) -> RobotDescription:
+    """The desk arm, in a folder of its own, with camera and marker that are known."""
+    text = DESK_ARM.read_text().replace("_known = false", "_known = true")
+    (tmp_path / "robot.toml").write_text(text)
+    (tmp_path / "desk_arm.urdf").write_text((DESK_ARM.parent / "desk_arm.urdf").read_text())
+    return RobotDescription.load(tmp_path / "robot.toml")
+
+
+def cause(effect: Effect, **more) -> Cause:
+    numbers = {p.name: Interval(v, (v, v)) for p, v in zip(effect.parameters, effect.values.tolist(), strict=True)}
+    told = {"probability": 1.0, "rivals": ()} | more
+    return Cause(
+        effect.name,
+        effect.where,
+        effect.source,
+        numbers,
+        told["probability"],
+        100.0,
+        1.0,
+        100.0,
+        (),
+        told["rivals"],
+        "",
+    )
+
+
+def told(robot: RobotDescription, *causes: Cause, step: float = 0.0, torque: float | None = None) -> list[str]:
+    file = DiagnosisFile(
+        "explained", "", Pairs(1, 1, 0), ERRORS, ERRORS, Gain(0.0, (0.0, 0.0)), causes, (), Unexplained(0.0, (), 1.0),
+        None, (), (),
+    )  # fmt: skip
+    d = len(robot.joints)
+    return remedies(file, robot, np.full(d, step), None if torque is None else np.full(d, torque))
+
+
+def positions(robot: RobotDescription, *effects: Effect) -> FloatArray:
+    q = np.random.default_rng(2).uniform(robot.lower, robot.upper, (50, len(robot.joints)))
+    return Simulation(robot, effects).positions(Motion(q, None, np.zeros(50, np.int64)))
+
+
+def edited(robot: RobotDescription, keys: str) -> RobotDescription:
+    """The robot with lines of robot.toml changed, as `xyz = [...], rpy = [...]`."""
+    text = robot.file.read_text()
+    for key, value in re.findall(r"(\w+) = (\[[^]]*\]|[0-9.]+)", keys):
+        text, count = re.subn(rf"^{key} = (\[[^]]*\]|[0-9.]+)", f"{key} = {value}", text, flags=re.MULTILINE)
+        assert count == 1
+    tomllib.loads(text)
+    robot.file.write_text(text)
+    return RobotDescription.load(robot.file)
+
+
+def test_an_offset_is_given_in_degrees_and_ticks(robot) -> None:
+    effect = Effect.at(robot, "joint_offset", "elbow_pitch", values={"offset_rad": np.radians(0.52)})
+    assert "Add +0.52° (+6 ticks of 4096 a turn)" in told(robot, cause(effect), step=2.0 * np.pi / 4096)[0]
+
+
+def test_ticks_are_not_spoken_of_where_none_are_seen(robot) -> None:
+    effect = Effect.at(robot, "joint_offset", "elbow_pitch", values={"offset_rad": 0.01})
+    assert "tick" not in told(robot, cause(effect))[0]
+
+
+@pytest.mark.parametrize("joint", ["shoulder_pitch", "elbow_pitch", "wrist_roll"])
+def test_a_urdf_with_the_origin_that_is_given_is_right(robot, joint) -> None:
+    effect = Effect.at(robot, "link_geometry", joint, values=SIX)
+    wanted = positions(robot, effect)
+    found = re.search(r'xyz="([^"]*)" rpy="([^"]*)"', told(robot, cause(effect))[0])
+    assert found is not None
+    urdf = robot.tree.file
+    begin, rest = urdf.read_text().split(f'<joint name="{joint}"')
+    rest = re.sub(r"<origin [^>]*/>", f'<origin xyz="{found[1]}" rpy="{found[2]}"/>', rest, count=1)
+    urdf.write_text(f'{begin}<joint name="{joint}"{rest}')
+    np.testing.assert_allclose(positions(RobotDescription.load(robot.file)), wanted, atol=5e-6)
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [("camera_pose", SIX), ("tool_offset", {axis: SIX[axis] for axis in ("x_m", "y_m", "z_m")}),
+     ("camera_scale", {"scale_error": 0.02}), ("camera_focal", {"focal_error": -0.01})],
+)  # fmt: skip
+def test_a_robot_toml_with_the_numbers_that_are_given_is_right(robot, name, values) -> None:
+    effect = Effect.at(robot, name, values=values)
+    remedy = told(robot, cause(effect))[0]
+    changed = edited(robot, remedy)
+    calibration, nominal = changed.calibration, robot.calibration
+    assert calibration is not None
+    assert nominal is not None
+    if name in ("camera_pose", "tool_offset"):
+        np.testing.assert_allclose(positions(changed), positions(robot, effect), atol=5e-5)
+        return
+    # The true camera's pixels, triangulated with the calibration that is advised, are where the marker is.
+    reported = positions(robot, effect)
+    pixels = nominal.project(reported)
+    depth = calibration.focal_px * calibration.baseline_m / (pixels[:, 0] - pixels[:, 2])
+    np.testing.assert_allclose(depth, positions(robot)[:, 2], rtol=1e-5)
+
+
+def test_a_bump_counts_from_the_pose_that_was_found(robot) -> None:
+    pose = Effect.at(robot, "camera_pose", values=SIX)
+    bump = Effect.at(robot, "camera_moved", values={**SIX, "t0": -1.0})
+    changed = edited(robot, told(robot, cause(pose), cause(bump))[1].split("is xyz")[1].join(["xyz", ""]))
+    np.testing.assert_allclose(positions(changed), positions(robot, pose, bump), atol=5e-5)
+
+
+def test_a_spring_tells_how_far_it_gives(robot) -> None:
+    effect = Effect.at(robot, "joint_compliance", "shoulder_pitch", values=[np.radians(0.2)])
+    assert "up to 0.4° here" in told(robot, cause(effect), torque=2.0)[0]
+
+
+def test_a_joint_that_counts_the_other_way_is_called_so(robot) -> None:
+    effect = Effect.at(robot, "joint_scale", "wrist_roll", values=[-2.0])
+    assert "the other sign" in told(robot, cause(effect))[0]
+    assert "counts the other way" in finding("joint_scale", "wrist_roll", None, {"scale_error": -2.0})
+
+
+def test_of_a_cause_that_may_be_another_one_that_is_said_first(robot) -> None:
+    effect = Effect.at(robot, "backlash", "elbow_pitch", values=[0.01])
+    rival = Indistinguishable("settling", "elbow_pitch", None, "this_motion", 0.4)
+    remedy = told(robot, cause(effect, probability=0.6, rivals=(rival,)))[0]
+    assert remedy.startswith("If it is backlash at elbow_pitch and not settling at elbow_pitch: tighten")
+
+
+def test_numbers_have_the_digits_that_their_interval_has() -> None:
+    shown = number("offset_rad", Interval(np.radians(0.5234), (np.radians(0.4934), np.radians(0.5534))))
+    assert (shown.label, shown.value, shown.interval) == ("offset", "+0.523°", "± 0.030")
+
+
+def test_a_lopsided_interval_is_told_by_its_ends() -> None:
+    assert number("t0", Interval(40.0, (39.0, 44.0))).interval == "(39.0 … 44.0)"
+
+
+def test_a_moment_without_times_is_a_row() -> None:
+    assert number("t0", Interval(40.0, (39.0, 41.0)), timed=False).value == "row 40.0"
+
+
+def test_numbers_that_a_motion_does_not_tell_are_kept_out(robot) -> None:
+    effect = Effect.at(robot, "link_geometry", "elbow_pitch", values=SIX)
+    known = cause(effect)
+    known.parameters["y_m"] = Interval(0.0, (-0.3, 0.3))
+    known.parameters["z_m"] = Interval(0.001, (-0.002, 0.004))
+    labels = [n.label for n in telling(numbers_of(known, timed=True))]
+    assert labels == ["shift in x", "turn about x", "turn about y", "turn about z"]
+
+
+def test_no_probability_is_called_certain() -> None:
+    assert (percent(1.0), percent(0.93), percent(0.0)) == ("> 99 %", "93 %", "< 1 %")
