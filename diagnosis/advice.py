@@ -1,11 +1,51 @@
-"""What to do about what was found, and what to measure next where something is still open."""
+"""What to measure next where something is still open."""
 
 from __future__ import annotations
 
+import numpy as np
+
+from effects import Effect
+
 from .diagnosis import Diagnosis
+from .rivals import Rival, apart_on, widened
+
+# Twice the log-likelihood by which a motion has to tell two causes apart to be worth advising.
+_TELLS = 25.0
 
 
 def advice(diagnosis: Diagnosis) -> tuple[str, ...]:
-    """Sentences."""
-    del diagnosis
-    return ()
+    """Sentences: which motion would tell causes apart that this one does not, and what to do about what has no name."""
+    told = []
+    for cause, standing in zip(diagnosis.causes, diagnosis.standings, strict=True):
+        for rival in standing.rivals:
+            if rival.is_same_anywhere:
+                told.append(f"No motion tells {_name(cause)} from {_name(rival.effect)}: mend whichever is easier.")
+            else:
+                told.append(_motion(diagnosis, cause, rival))
+    if diagnosis.left.is_there:
+        joints = [diagnosis.extended.simulation.robot.joints[k] for k in diagnosis.left.joints]
+        where = f" Look at {', '.join(joints)} first." if joints else ""
+        told.append(
+            f"None of the known effects fits {'; '.join(diagnosis.left.what)}.{where} "
+            "The extended simulation is right about it only where the recording has been."
+        )
+    return tuple(dict.fromkeys(told))
+
+
+def _motion(diagnosis: Diagnosis, cause: Effect, rival: Rival) -> str:
+    """Which joint, moved through its whole range, tells two causes apart best."""
+    robot, fit = diagnosis.extended.simulation.robot, diagnosis.extended
+    pair = f"{_name(cause)} from {_name(rival.effect)}"
+    apart = [apart_on(fit, rival.fit, widened(fit, [k])) for k in range(len(robot.joints))]
+    best = int(np.argmax(apart))
+    if apart[best] >= _TELLS:
+        low, high = max(robot.lower[best], -np.pi), min(robot.upper[best], np.pi)
+        unit, scale = ("mm", 1e3) if robot.chain.prismatic[best] else ("°", 180.0 / np.pi)
+        span = f"{low * scale:.0f}{unit} to {high * scale:.0f}{unit}"
+        return f"To tell {pair}, move joint {robot.joints[best]} through its whole range ({span}) in another recording."
+    return f"To tell {pair}, record poses over the whole range of all joints, with stops and at different speeds."
+
+
+def _name(effect: Effect) -> str:
+    at = "" if effect.where is None else f" at {effect.where}"
+    return f"{effect.name}{at}{'' if effect.source is None else f' from {effect.source}'}"

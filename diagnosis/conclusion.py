@@ -18,6 +18,7 @@ from .result import (
     Interval,
     Pairs,
     Rejected,
+    Stability,
     Unexplained,
     Verdict,
 )
@@ -34,7 +35,7 @@ def conclusion(diagnosis: Diagnosis) -> DiagnosisFile:
     """All that machines need to know of a diagnosis."""
     percent, interval = diagnosis.gain()
     causes = _causes(diagnosis)
-    rms, mean = _errors(diagnosis, np.sqrt, np.square), _errors(diagnosis, lambda value: value, np.abs)
+    rms = _rms_mm(diagnosis)
     verdict = _verdict(diagnosis, causes)
     gain = Gain(percent, interval)
     return DiagnosisFile(
@@ -42,12 +43,12 @@ def conclusion(diagnosis: Diagnosis) -> DiagnosisFile:
         sentence=sentence(verdict, causes, rms, gain),
         pairs=Pairs(len(diagnosis.markers), len(diagnosis.markers), diagnosis.outliers),
         rms_mm=rms,
-        mean_mm=mean,
+        mean_mm=_mean_mm(diagnosis),
         gain=gain,
         causes=causes,
         rejected=_rejected(diagnosis),
         unexplained=_unexplained(diagnosis),
-        stability=None,
+        stability=_stability(diagnosis),
         advice=advice(diagnosis),
         limitations=diagnosis.hypotheses.limitations,
     )
@@ -62,20 +63,21 @@ def _verdict(diagnosis: Diagnosis, causes: tuple[Cause, ...]) -> Verdict:
     return "undecided" if open_ones else "explained"
 
 
-def _errors(diagnosis: Diagnosis, root: object, power: object) -> Errors:
-    assert callable(root)
-    assert callable(power)
+def _rms_mm(diagnosis: Diagnosis) -> Errors:
     kept = diagnosis.markers
-    figures = {name: float(1e3 * root(power(d[kept]).mean())) for name, d in diagnosis.held_out.items()}
-    expected = _expected_noise(diagnosis)
-    return Errors(**figures, noise_floor=float(1e3 * root(power(expected).mean())))
+    figures = {name: 1e3 * float(np.sqrt(np.square(d[kept]).mean())) for name, d in diagnosis.held_out.items()}
+    traces = np.trace(diagnosis.noise[kept], axis1=1, axis2=2)
+    return Errors(**figures, noise_floor=1e3 * float(np.sqrt(traces.mean())))
 
 
-def _expected_noise(diagnosis: Diagnosis) -> FloatArray:
-    """The noise's typical length at each row (n,) [m], from what is left once everything that can be is explained."""
-    fit = diagnosis.extended
-    spread = np.linalg.inv(fit.observations.whitening)
-    return fit.noise.sigma * np.sqrt(np.square(spread).sum(axis=(1, 2)))
+def _mean_mm(diagnosis: Diagnosis) -> Errors:
+    kept = diagnosis.markers
+    figures = {name: 1e3 * float(d[kept].mean()) for name, d in diagnosis.held_out.items()}
+    # The mean length of a normal vector, to second order in the spread of its square.
+    noise = diagnosis.noise[kept]
+    traces = np.trace(noise, axis1=1, axis2=2)
+    lengths = np.sqrt(traces) * (1.0 - np.square(noise).sum(axis=(1, 2)) / (4.0 * np.square(traces)))
+    return Errors(**figures, noise_floor=1e3 * float(lengths.mean()))
 
 
 def _causes(diagnosis: Diagnosis) -> tuple[Cause, ...]:
@@ -92,8 +94,8 @@ def _causes(diagnosis: Diagnosis) -> tuple[Cause, ...]:
                 parameters=_parameters(diagnosis, cause),
                 probability=standing.probability,
                 share_of_gain_percent=100.0 * loss / max(sum(losses), 1e-300),
-                held_out_gain_percent=100.0 * (1.0 - np.sqrt(full / max(full + loss, 1e-300))),
-                stability_percent=float("nan"),
+                held_out_gain_percent=100.0 * (1.0 - float(np.sqrt(full / max(full + loss, 1e-300)))),
+                stability_percent=100.0 * float(standing.again.mean()),
                 indistinguishable_from=tuple(_named(r) for r in standing.rivals if r.is_same_here),
                 rivals=tuple(_named(r) for r in standing.rivals),
                 evidence=evidence(standing),
@@ -113,7 +115,7 @@ def _named(rival: Rival) -> Indistinguishable:
 def _outliers(diagnosis: Diagnosis) -> Cause:
     n, found = len(diagnosis.markers), diagnosis.outliers
     share = found / n
-    half = _HALF_WIDTH_95 * np.sqrt(share * (1.0 - share) / n)
+    half = _HALF_WIDTH_95 * float(np.sqrt(share * (1.0 - share) / n))
     return Cause(
         effect="outliers",
         where=None,
@@ -122,7 +124,7 @@ def _outliers(diagnosis: Diagnosis) -> Cause:
         probability=1.0,
         share_of_gain_percent=0.0,
         held_out_gain_percent=0.0,
-        stability_percent=float("nan"),
+        stability_percent=None,
         indistinguishable_from=(),
         rivals=(),
         evidence=f"{found} of {n} fixes are farther from all others than the noise can put them.",
@@ -185,6 +187,11 @@ def _rejected(diagnosis: Diagnosis) -> tuple[Rejected, ...]:
         for c, a in diagnosis.rejected
     ]
     return tuple(sorted(rows, key=lambda row: row.held_out_gain_percent, reverse=True))
+
+
+def _stability(diagnosis: Diagnosis) -> Stability | None:
+    again = [standing.again for standing in diagnosis.standings]
+    return Stability(len(again[0]), int(np.all(again, axis=0).sum())) if again else None
 
 
 def _unexplained(diagnosis: Diagnosis) -> Unexplained:

@@ -86,7 +86,11 @@ class Diagnosis:
     @property
     def outliers(self) -> int:
         """How many are not."""
-        return int((~self.markers).sum())
+        return int(self._off.sum())
+
+    @property
+    def _off(self) -> np.ndarray:
+        return ~self.markers & self.extended.observations.trusted
 
     @property
     def outliers_are_found(self) -> bool:
@@ -100,8 +104,8 @@ class Diagnosis:
         steps = np.linalg.norm(motion.moves, axis=1)
         duration = np.ones(len(motion)) if motion.t is None else np.append(np.inf, np.diff(motion.t))
         speed = steps / np.maximum(duration, 1e-9)
-        off = ~self.markers
-        return min(stats.mannwhitneyu(v[off], v[~off]).pvalue for v in (steps, speed)) < _BY_CHANCE
+        on, off = self.markers, self._off
+        return min(stats.mannwhitneyu(v[off], v[on]).pvalue for v in (steps, speed)) < _BY_CHANCE
 
     def gain(self) -> tuple[float, tuple[float, float]]:
         """By how much the RMS falls from aligned to extended [%], with its 95 % interval."""
@@ -111,7 +115,17 @@ class Diagnosis:
     @cached_property
     def without(self) -> dict[tuple[str, str | None, str | None], FloatArray]:
         """Distances (n,) [m] on rows not fitted, without each of the causes."""
-        return {c.key: HeldOut(without_cause(self.extended, c), self.blocks).distances for c in self.causes}
+        smooth = self.left.held_out
+        errors = {c.key: HeldOut(without_cause(self.extended, c), self.blocks).errors - smooth for c in self.causes}
+        return {key: np.linalg.norm(error, axis=1) for key, error in errors.items()}
+
+    @cached_property
+    def noise(self) -> FloatArray:
+        """Covariances (n, 3, 3) [m²] of the noise, from what is left when all is explained that can be."""
+        fit = self.extended
+        left = fit.observations.residuals(fit.run.measured + self.left.explained)[self.markers]
+        roots = np.linalg.inv(fit.observations.whitening)
+        return float(np.square(left).mean()) * roots @ np.swapaxes(roots, 1, 2)
 
     @cached_property
     def rejected(self) -> list[tuple[Candidate, Added]]:
@@ -151,11 +165,11 @@ def diagnose(
     unknowns, blocks = Unknowns(start), Blocks.cut(len(recording))
     explanation = explain(extended, search.path, unknowns, search, tell)
     tell("asking what else it could be")
-    stands = standings(explanation.fit, hypotheses.effects, search)
+    stands = standings(explanation.fit, hypotheses.effects, search, blocks, seed)
     while explanation.unknown and any(standing.probability < _HALF for standing in stands):
         weakest = int(np.argmin([standing.probability for standing in stands]))
         explanation = without_one(explanation, explanation.fit.causes[weakest], unknowns, search)
-        stands = standings(explanation.fit, hypotheses.effects, search)
+        stands = standings(explanation.fit, hypotheses.effects, search, blocks, seed)
     extended = explanation.fit
     return Diagnosis(
         hypotheses=hypotheses,

@@ -43,11 +43,12 @@ class Noise:
     log_likelihood: float
 
     @classmethod
-    def of(cls, residuals: FloatArray, outlier_density: FloatArray, start: Noise | None = None) -> Noise:
-        """The most probable noise of residuals (n, 3), by expectation maximisation."""
+    def of(cls, residuals: FloatArray, observations: Observations, start: Noise | None = None) -> Noise:
+        """The most probable noise of residuals (n, 3), by expectation maximisation; rows not trusted count nothing."""
+        trusted, outlier_density = observations.trusted, observations.outlier_density
         squares = np.einsum("ni,ni->n", residuals, residuals)
         # Of three squared normal coordinates the median is 2.366.
-        sigma = float(np.sqrt(max(np.median(squares) / 2.366, 1e-18)))
+        sigma = float(np.sqrt(max(np.median(squares[trusted]) / 2.366, 1e-18)))
         share = 0.02 if start is None else start.share
         weights, total = np.ones(len(squares)), -np.inf
         for _ in range(_EM_ROUNDS):
@@ -57,9 +58,10 @@ class Noise:
             weights = np.exp(inlier - both)
             bursts = uniform_filter1d(1.0 - weights, _WINDOW, mode="constant") > _BURST
             weights[bursts] = 1.0
-            total = float(np.where(bursts, inlier, both).sum())
+            share = float(np.clip(1.0 - weights[trusted].mean(), _FEWEST_OUTLIERS, 0.5))
+            weights[~trusted] = 0.0
+            total = float(np.where(bursts, inlier, both)[trusted].sum())
             sigma = float(np.sqrt(max((weights @ squares) / (3.0 * max(weights.sum(), 1.0)), 1e-18)))
-            share = float(np.clip(1.0 - weights.mean(), _FEWEST_OUTLIERS, 0.5))
         return cls(sigma, share, weights, total)
 
 
@@ -91,7 +93,7 @@ class Fit:
     @cached_property
     def without_outliers(self) -> float:
         """The log-likelihood if all fixes were the marker [nats]."""
-        squares = np.square(self.residuals).sum(axis=1)
+        squares = np.square(self.residuals[self.observations.trusted]).sum(axis=1)
         variance = max(float(squares.mean()) / 3.0, 1e-18)
         return float(-1.5 * len(squares) * (np.log(2.0 * np.pi * variance) + 1.0))
 
@@ -140,7 +142,7 @@ class Fit:
         n, _, p = self.columns.shape
         flat = self.columns.reshape(3 * n, p)
         information = flat.T @ flat / self.noise.sigma**2 + np.diag(prior_precision(self.simulation, self.nuisances))
-        return np.linalg.pinv(information, rcond=1e-14, hermitian=True)
+        return np.asarray(np.linalg.pinv(information, rcond=1e-14, hermitian=True), dtype=np.float64)
 
     def with_causes(self, causes: Sequence[Effect]) -> Fit:
         """Other causes in the place of these, all refitted."""
@@ -176,7 +178,7 @@ def fitted(observations: Observations, simulation: Simulation, nuisances: int, s
 def _at(observations: Observations, simulation: Simulation, nuisances: int, start: Noise | None) -> Fit:
     run = simulation.run(observations.motion)
     residuals = observations.residuals(run.measured)
-    noise = Noise.of(residuals, observations.outlier_density, start)
+    noise = Noise.of(residuals, observations, start)
     return Fit(observations, simulation, nuisances, run, residuals, noise)
 
 

@@ -165,7 +165,7 @@ def scores_p_value(columns: FloatArray, left: FloatArray, blocks: Blocks) -> flo
 
 
 def is_marker(fit: Fit) -> np.ndarray:
-    """Which fixes are probably the marker (n,)."""
+    """Which fixes are probably the marker (n,), of those rows that are trusted; the others are neither."""
     return fit.noise.weights >= _MARKER
 
 

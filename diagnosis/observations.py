@@ -21,6 +21,8 @@ _UNIT_M = 1e-3
 _OUTLIER_SPREAD = 2.0
 # A measured variance is never taken to be smaller than this share of the median one.
 _SMALLEST_VARIANCE = 1e-4
+# Runs shorter than this are single poses, not ways.
+_ROWS_A_RUN = 10
 # Readings nearer than this are one; so many different ones it takes to see a step, so far they may be off it.
 _SAME_READING, _FEWEST_GAPS, _OFF_A_MULTIPLE = 1e-9, 20, 0.02
 
@@ -60,7 +62,8 @@ class Observations:
     @cached_property
     def whitening(self) -> FloatArray:
         """(n, 3, 3): W (x - truth) has equal and independent noise in all coordinates, but for one factor."""
-        return np.linalg.inv(np.linalg.cholesky(self.stated_factor**2 * self.stated + self.rounding))
+        covariances = self.stated_factor**2 * self.stated + self.rounding
+        return np.asarray(np.linalg.inv(np.linalg.cholesky(covariances)), dtype=np.float64)
 
     def with_factor(self, stated_factor: float) -> Observations:
         """The same with another size of the instrument's noise beside that of the rounding."""
@@ -78,6 +81,14 @@ class Observations:
         return np.einsum("nij,nj->ni", self.whitening, self.x - predicted)
 
     @cached_property
+    def trusted(self) -> NDArray[np.bool_]:
+        """Rows (n,) of which the way there was seen: where a run begins, what has a memory is not known."""
+        begins = self.motion.begins
+        if begins.sum() * _ROWS_A_RUN > len(self):
+            return np.ones(len(self), dtype=np.bool_)
+        return ~begins
+
+    @cached_property
     def outlier_density(self) -> FloatArray:
         """Logarithm of the density (n,) of a fix that is not the marker, per unit volume of whitened space."""
         spread = _OUTLIER_SPREAD * np.linalg.norm(self.x - np.median(self.x, axis=0), axis=1).max()
@@ -89,7 +100,7 @@ def ticks(q: FloatArray) -> FloatArray:
     """The step (d,) [rad, m] in which each joint is read; 0 where its readings (n, d) are no multiples of any."""
     steps = np.zeros(q.shape[1])
     for k, column in enumerate(q.T):
-        gaps = np.diff(np.unique(column))
+        gaps: FloatArray = np.diff(np.unique(column))
         gaps = gaps[gaps > _SAME_READING]
         if len(gaps) < _FEWEST_GAPS:
             continue

@@ -40,7 +40,11 @@ class Indistinguishable(msgspec.Struct, frozen=True):
 
 
 class Cause(msgspec.Struct, frozen=True):
-    """One cause with its numbers."""
+    """One cause with its numbers.
+
+    Attributes:
+        stability_percent: how often it is named again from resampled blocks of time.
+    """
 
     effect: str
     where: str | None
@@ -49,7 +53,7 @@ class Cause(msgspec.Struct, frozen=True):
     probability: float
     share_of_gain_percent: float
     held_out_gain_percent: float
-    stability_percent: float
+    stability_percent: float | None
     indistinguishable_from: tuple[Indistinguishable, ...]
     rivals: tuple[Indistinguishable, ...]
     evidence: str

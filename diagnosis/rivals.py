@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from effects import Effect, Motion
 from interfaces.records import FloatArray
 
 from .fit import Fit
-from .held_out import without_cause
+from .held_out import Blocks, without_cause
 from .scan import Candidate, Scan
 from .search import Search, nats
+from .stability import named_again
 
 # Signals that differ by less than this, twice the log-likelihood that the right one is expected to gain, are one.
 SAME = 6.0
@@ -30,12 +32,14 @@ class Rival:
     """What could be there in the place of a cause.
 
     Attributes:
+        fit: with it in the place of the cause.
         effect: with the numbers with which it does best.
         probability: given that one of the rivals is there.
         difference: twice the log-likelihood that this motion is expected to tell them apart by.
         anywhere: the same for as many poses over the whole range of the joints.
     """
 
+    fit: Fit
     effect: Effect
     probability: float
     difference: float
@@ -62,6 +66,7 @@ class Standing:
         dof: how many of its amounts the data tell.
         gain: twice the log-likelihood that it brings.
         rivals: the probable ones, the most probable first.
+        again: in which of some resamplings of the blocks of time it would be named again.
     """
 
     probability: float
@@ -69,21 +74,24 @@ class Standing:
     dof: int
     gain: float
     rivals: tuple[Rival, ...]
+    again: NDArray[np.bool_]
 
 
-def standings(fit: Fit, hypotheses: Sequence[Effect], search: Search) -> list[Standing]:
+def standings(fit: Fit, hypotheses: Sequence[Effect], search: Search, blocks: Blocks, seed: int) -> list[Standing]:
     """One for each cause of a fit."""
-    return [_standing(fit, cause, hypotheses, search) for cause in fit.causes]
+    return [_standing(fit, cause, hypotheses, search, blocks, seed) for cause in fit.causes]
 
 
-def _standing(fit: Fit, cause: Effect, hypotheses: Sequence[Effect], search: Search) -> Standing:
+def _standing(
+    fit: Fit, cause: Effect, hypotheses: Sequence[Effect], search: Search, blocks: Blocks, seed: int
+) -> Standing:
     without = without_cause(fit, cause)
     gain = 2.0 * (fit.log_likelihood - without.log_likelihood)
     itself = Scan(without).candidate(cause) or Candidate(cause, gain, 1)
     worth = nats(gain, itself.dof) - search.doubt(itself)
     present = {effect.key for effect in fit.causes}
     others = [h for h in hypotheses if h.key not in present]
-    tried = []
+    tried, compared = [], []
     for candidate in search.shortlist(without, others):
         if candidate.gain < _COMES_NEAR * itself.gain:
             continue
@@ -95,13 +103,20 @@ def _standing(fit: Fit, cause: Effect, hypotheses: Sequence[Effect], search: Sea
     odds = np.exp(np.clip([0.0, -worth, *(behind for _, _, behind in tried)], -500.0, 50.0))
     shares = odds / odds.sum()
     rivals = [
-        Rival(_effect(rival, key), float(share), _difference(fit, rival), _anywhere(fit, rival))
+        Rival(rival, _effect(rival, key), float(share), _difference(fit, rival), _anywhere(fit, rival))
         for (rival, key, _), share in zip(tried, shares[2:], strict=True)
         if share >= PROBABLE
     ]
     same = sum(rival.probability for rival in rivals if rival.is_same_anywhere)
     ordered = tuple(sorted(rivals, key=lambda rival: rival.probability, reverse=True))
-    return Standing(float(shares[0]) + same, worth, itself.dof, gain, ordered)
+    return Standing(
+        float(shares[0]) + same,
+        worth,
+        itself.dof,
+        gain,
+        ordered,
+        named_again(without, itself, compared, search, blocks, seed),
+    )
 
 
 def _effect(fit: Fit, key: tuple[str, str | None, str | None]) -> Effect:
@@ -116,21 +131,29 @@ def _difference(one: Fit, other: Fit) -> float:
 
 def _anywhere(one: Fit, other: Fit) -> float:
     """The same for poses over the whole range of the joints, with what may be fitted to them refitted."""
-    robot = one.simulation.robot
+    return apart_on(one, other, widened(one, range(one.observations.motion.q.shape[1])))
+
+
+def widened(fit: Fit, joints: Iterable[int]) -> Motion:
+    """Some rows of a fit's motion, with some joints anywhere in their range, each pose followed by one nearby."""
+    robot, motion = fit.simulation.robot, fit.observations.motion
     rng = np.random.default_rng(0)
-    n = len(one.observations)
-    chosen = np.sort(rng.integers(n, size=min(n, _POSES)))
-    lower, upper = np.maximum(robot.lower, -np.pi), np.minimum(robot.upper, np.pi)
-    q = rng.uniform(lower, upper, (len(chosen), len(lower)))
-    motion = one.observations.motion
-    t = None if motion.t is None else np.linspace(motion.t[0], motion.t[-1], len(chosen))
-    wide = Motion(q, t, np.arange(len(chosen)) // 2)
-    if t is None:
-        wide = Motion(q, np.linspace(0.0, float(n), len(chosen)), wide.segment)
-    apart = one.simulation.positions(wide) - other.simulation.positions(wide)
-    left = _beside(apart, other, wide)
-    scale = np.linalg.det(one.observations.whitening[chosen]) ** (1.0 / 3.0)
-    return float(np.square(left * scale[:, None]).sum() / one.noise.sigma**2 * n / len(chosen))
+    n = len(motion)
+    rows = np.sort(rng.integers(n, size=min(n, _POSES)))
+    q = motion.q[rows].copy()
+    for k in joints:
+        q[:, k] = rng.uniform(max(robot.lower[k], -np.pi), min(robot.upper[k], np.pi), len(rows))
+    clock = motion.clock
+    return Motion(q, np.linspace(clock[0], clock[-1], len(rows)), np.arange(len(rows)) // 2)
+
+
+def apart_on(one: Fit, other: Fit, motion: Motion) -> float:
+    """Twice the log-likelihood by which two fits differ on a motion as long as theirs, the other refitted to it."""
+    apart = one.simulation.positions(motion) - other.simulation.positions(motion)
+    left = _beside(apart, other, motion)
+    scale = float(np.median(np.linalg.det(one.observations.whitening))) ** (1.0 / 3.0)
+    share = len(one.observations) / len(motion)
+    return float(np.square(left * scale).sum() / one.noise.sigma**2 * share)
 
 
 def _beside(apart: FloatArray, fit: Fit, motion: Motion) -> FloatArray:

@@ -94,18 +94,19 @@ class Scan:
 
     def _finely(self, effect: Effect, shapes: FloatArray) -> Candidate | None:
         """The best of an effect whose last number is its shape, over increasing shapes (m,), then between them."""
-        best, interval = None, None
-        for _ in range(2):
-            tried = [(s, self._shapes(effect, [np.append(effect.values[:-1], s)])) for s in shapes]
-            found = [(s, candidate) for s, candidate in tried if candidate is not None]
-            if not found:
-                return None
-            gains = np.array([candidate.gain for _, candidate in found])
-            place = int(np.argmax(gains))
-            best, interval = found[place][1], _interval(np.array([s for s, _ in found]), gains)
-            around = [found[max(place - 1, 0)][0], found[min(place + 1, len(found) - 1)][0]]
-            shapes = np.linspace(*around, 13)
-        return replace(best, trials=_COARSE, interval=interval)
+        coarse = self._each(effect, shapes)
+        if not coarse:
+            return None
+        place = int(np.argmax([candidate.gain for _, candidate in coarse]))
+        between = np.linspace(coarse[max(place - 1, 0)][0], coarse[min(place + 1, len(coarse) - 1)][0], 13)
+        fine = self._each(effect, np.asarray(between, dtype=np.float64)) or coarse
+        gains = np.array([candidate.gain for _, candidate in fine])
+        interval = _interval(np.array([shape for shape, _ in fine]), gains)
+        return replace(fine[int(np.argmax(gains))][1], trials=_COARSE, interval=interval)
+
+    def _each(self, effect: Effect, shapes: FloatArray) -> list[tuple[float, Candidate]]:
+        tried = [(float(s), self._shapes(effect, [np.append(effect.values[:-1], s)])) for s in shapes]
+        return [(shape, candidate) for shape, candidate in tried if candidate is not None]
 
     def _shapes(self, effect: Effect, shapes: list[FloatArray], *, scaled: bool = False) -> Candidate | None:
         """The best of some shapes. `scaled`: the shape's own size is the amount, as a play's width."""
@@ -134,12 +135,12 @@ class Scan:
         span = max(float(np.ptp(self._fit.run.readings.q[:, place.joint])), 1e-6)
         first, step = (2.0, 1.0) if not place.prismatic else (1.0 / span, 1.0 / span)
         coarse = first + step * np.arange(_MOST_CYCLES - 1)
-        gains, _, _ = self._rippled(effect, coarse)
+        gains, _, _ = self._rippled(effect, np.asarray(coarse, dtype=np.float64))
         # A peak is as wide as what turns the phase by one over the range.
         width = 1.0 / span if place.prismatic else 2.0 * np.pi / span
-        fine = coarse[int(np.argmax(gains))] + 0.5 * max(width, step) * np.linspace(-1.0, 1.0, 61)
+        fine: FloatArray = coarse[int(np.argmax(gains))] + 0.5 * max(width, step) * np.linspace(-1.0, 1.0, 61)
         fine = fine[fine > 0.5 * first]
-        gains, amounts, dofs = self._rippled(effect, fine)
+        gains, amounts, dofs = self._rippled(effect, np.asarray(fine, dtype=np.float64))
         best = int(np.argmax(gains))
         if not dofs[best]:
             return None

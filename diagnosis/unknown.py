@@ -218,7 +218,7 @@ class Unknowns:
             held_out[rows] = basis[rows] @ amounts
         weights = np.maximum(fit.root_weights, 1e-6)[:, :, None]
         both = np.stack([explained, held_out], axis=1).reshape(*fit.left.shape, 2) / weights
-        metres = np.linalg.solve(fit.observations.whitening, both)
+        metres = np.asarray(np.linalg.solve(fit.observations.whitening, both), dtype=np.float64)
         return metres[:, :, 0], metres[:, :, 1]
 
     def agreed(self, fit: Fit, others: Sequence[int], index: int) -> float:
