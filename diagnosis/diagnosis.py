@@ -168,7 +168,10 @@ def diagnose(
     stands = standings(explanation.fit, hypotheses.effects, search, blocks, seed)
     while explanation.unknown and any(standing.probability < _HALF for standing in stands):
         weakest = int(np.argmin([standing.probability for standing in stands]))
-        explanation = without_one(explanation, explanation.fit.causes[weakest], unknowns, search)
+        fewer = without_one(explanation, explanation.fit.causes[weakest], unknowns, search)
+        if not fewer.unknown:
+            break
+        explanation = fewer
         stands = standings(explanation.fit, hypotheses.effects, search, blocks, seed)
     extended = explanation.fit
     return Diagnosis(

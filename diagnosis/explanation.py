@@ -16,6 +16,8 @@ _MARGIN = 3.0
 _MOST_UNKNOWNS = 3
 # What a number of a named cause costs when sets of causes are compared [nats].
 _NUMBER = 3.0
+# What is worth more than this no rounding of readings that stand still brings about [nats].
+_BEYOND_DOUBT = 60.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +65,9 @@ def _with_unknown(fit: Fit, unknowns: Unknowns, search: Search) -> Explanation:
     chosen: list[int] = []
     while len(chosen) < _MOST_UNKNOWNS:
         index, more = unknowns.best(fit, chosen)
-        if more < NAMED or index in chosen or unknowns.agreed(fit, chosen, index) < 0.0:
+        if more < NAMED or index in chosen:
+            break
+        if more < _BEYOND_DOUBT and unknowns.agreed(fit, chosen, index) < 0.0:
             break
         chosen.append(index)
         worth += more
