@@ -156,11 +156,12 @@ def diagnose(
     tell(f"{len(hypotheses.effects)} hypotheses")
     search = Search(hypotheses.effects, tell)
     extended = search.run(start)
-    factor = instrument_factor(extended)
-    if abs(np.log(factor)) > _SAME_NOISE:
-        observations = observations.with_factor(factor)
+    factor, unknown_side = instrument_factor(extended), before_contact(extended)
+    if abs(np.log(factor)) > _SAME_NOISE or unknown_side.any():
+        observations = observations.with_factor(factor).without(unknown_side)
         start = aligned(observations, simulation)
         extended = search.run(start.with_causes(extended.causes))
+        search.path.insert(0, start)
     tell("asking whether something without a name is at work")
     unknowns, blocks = Unknowns(start), Blocks.cut(len(recording))
     explanation = explain(extended, search.path, unknowns, search, tell)
@@ -185,6 +186,20 @@ def diagnose(
         blocks=blocks,
         seed=seed,
     )
+
+
+def before_contact(fit: Fit) -> np.ndarray:
+    """Rows (n,) at which nobody knows on which side of its play a joint is: it has not crossed it in this run yet."""
+    motion = fit.observations.motion
+    rows = np.zeros(len(motion), dtype=np.bool_)
+    for cause in fit.causes:
+        if cause.name != "backlash":
+            continue
+        q = motion.q[:, fit.simulation.place(cause).joint]
+        for first, end in motion.runs:
+            crossed = np.maximum.accumulate(q[first:end]) - np.minimum.accumulate(q[first:end]) >= cause.values[0]
+            rows[first:end] |= ~crossed
+    return rows
 
 
 def _geometry(start: Fit) -> Fit:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
+import numpy as np
+
 from effects import Effect
 
 from .fit import Fit
@@ -12,10 +14,12 @@ from .search import NAMED, Search
 from .unknown import Unknowns
 
 # What has no name is taken for so much more probability than the named causes alone [nats].
-_MARGIN = 3.0
+_MARGIN = 15.0
 _MOST_UNKNOWNS = 3
 # What a number of a named cause costs when sets of causes are compared [nats].
 _NUMBER = 3.0
+# What is left of large causes because their form is not quite theirs is nothing without a name.
+_OF_THE_CAUSES = 0.05
 # What is worth more than this no rounding of readings that stand still brings about [nats].
 _BEYOND_DOUBT = 60.0
 
@@ -44,9 +48,12 @@ def explain(
         found: with all causes that the search has named.
         tried: the fits on its way there, the first without any cause.
     """
+    path = list(tried)
     best = _with_unknown(found, unknowns, search)
+    if best.unknown and unknowns.size(found, best.unknown) < _OF_THE_CAUSES * _size(path[0], found):
+        best = Explanation(found, (), best.worth)
     keys = {frozenset(effect.key for effect in found.causes)}
-    for fit in tried:
+    for fit in path:
         causes = frozenset(effect.key for effect in fit.causes)
         if causes in keys:
             continue
@@ -58,6 +65,12 @@ def explain(
         tell("something that none of the effects explains")
         best = _pruned(best, unknowns, search)
     return best
+
+
+def _size(start: Fit, found: Fit) -> float:
+    """How much the causes change (RMS), in units of the stated noise."""
+    changed = (found.run.measured - start.run.measured)[:, :, None]
+    return float(np.sqrt(np.square(found.observations.whitened(changed)).mean()))
 
 
 def _with_unknown(fit: Fit, unknowns: Unknowns, search: Search) -> Explanation:

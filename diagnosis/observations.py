@@ -37,6 +37,7 @@ class Observations:
         stated: covariance (n, 3, 3) [m²] of the instrument, right but for one factor.
         rounding: covariance (n, 3, 3) [m²] that comes from readings in whole ticks.
         stated_factor: by how much the instrument's standard deviations are larger than stated.
+        doubtful: rows (n,) at which something is not known that the simulation would need; None for none.
     """
 
     motion: Motion
@@ -44,6 +45,7 @@ class Observations:
     stated: FloatArray
     rounding: FloatArray
     stated_factor: float = 1.0
+    doubtful: NDArray[np.bool_] | None = None
 
     @classmethod
     def of(cls, recording: Recording, simulation: Simulation) -> Observations:
@@ -65,6 +67,10 @@ class Observations:
         covariances = self.stated_factor**2 * self.stated + self.rounding
         return np.asarray(np.linalg.inv(np.linalg.cholesky(covariances)), dtype=np.float64)
 
+    def without(self, doubtful: NDArray[np.bool_]) -> Observations:
+        """The same with rows (n,) that count nothing."""
+        return replace(self, doubtful=doubtful)
+
     def with_factor(self, stated_factor: float) -> Observations:
         """The same with another size of the instrument's noise beside that of the rounding."""
         return replace(self, stated_factor=stated_factor)
@@ -85,8 +91,8 @@ class Observations:
         """Rows (n,) of which the way there was seen: where a run begins, what has a memory is not known."""
         begins = self.motion.begins
         if begins.sum() * _ROWS_A_RUN > len(self):
-            return np.ones(len(self), dtype=np.bool_)
-        return ~begins
+            begins = np.zeros(len(self), dtype=np.bool_)
+        return ~begins if self.doubtful is None else ~(begins | self.doubtful)
 
     @cached_property
     def outlier_density(self) -> FloatArray:

@@ -61,6 +61,9 @@ class Search:
         fit = start
         self._seen: set[frozenset[Key]] = set()
         self.path = [start]
+        if start.causes:
+            fit = self._reviewed(start)
+            self.path.append(fit)
         for _ in range(_MOST_CAUSES):
             better = self._added(fit)
             if better is None:

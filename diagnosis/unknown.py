@@ -22,7 +22,7 @@ from .search import nats
 _HARMONICS, _TIMES = 5, 4
 TIME = -1
 # What has no name has to be so much more probable than what has one [nats].
-_NO_NAME = 4.0
+_NO_NAME = 8.0
 # What one of its numbers costs [nats].
 _NUMBER = 2.0
 # Directions of a family's columns of which less is left, as a share of the strongest and of the whole, tell nothing.
@@ -202,6 +202,12 @@ class Unknowns:
         rows = float(fit.noise.weights.sum())
         share = float(after @ after) / max(float(before @ before), 1e-300)
         return -3.0 * rows * float(np.log(max(share, 1e-12))), basis.shape[1] - fit.orthogonal.shape[2]
+
+    def size(self, fit: Fit, chosen: Sequence[int]) -> float:
+        """How much families explain (RMS) of what a fit leaves, in units of the stated noise."""
+        basis, _ = self.beside(fit, chosen)
+        own = basis[:, fit.orthogonal.shape[2] :]
+        return float(np.sqrt(np.square(own.T @ fit.left.ravel()).sum() / fit.left.size))
 
     def predicted(self, fit: Fit, chosen: Sequence[int], blocks: Blocks) -> tuple[FloatArray, FloatArray]:
         """What families predict of what a fit leaves (n, 3) [m]: of all rows, and of rows that were not fitted."""
