@@ -33,6 +33,8 @@ _FEWEST_OUTLIERS = 3
 _OUTLIERS_NAMED = 15.0
 # That outliers and motion have to do with each other, by chance.
 _BY_CHANCE = 1e-3
+# Where more rows than this are doubtful, leaving them out costs more than they do harm.
+_MOST_DOUBTFUL = 0.25
 # Beside what has no name a cause stays named only if it is more probable than not.
 _HALF = 0.5
 # Of the instrument's noise, another size than that is taken up (in logarithms).
@@ -199,7 +201,7 @@ def before_contact(fit: Fit) -> np.ndarray:
         for first, end in motion.runs:
             crossed = np.maximum.accumulate(q[first:end]) - np.minimum.accumulate(q[first:end]) >= cause.values[0]
             rows[first:end] |= ~crossed
-    return rows
+    return rows if rows.mean() <= _MOST_DOUBTFUL else np.zeros_like(rows)
 
 
 def _geometry(start: Fit) -> Fit:

@@ -21,7 +21,7 @@ from .scan import Candidate
 
 # Blocks of time, and how many folds they are dealt to in turn.
 _MOST_BLOCKS, _FOLDS = 80, 5
-_FEWEST_ROWS_A_BLOCK = 10
+_FEWEST_ROWS_A_BLOCK = 5
 _BOOTSTRAPS = 2000
 # A fix that is more probably not the marker counts in no figure.
 _MARKER = 0.5

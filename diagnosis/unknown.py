@@ -61,13 +61,15 @@ def families(run: Simulated) -> list[Family]:
             if j != k:
                 what = f"an error of {names[k]} that depends on itself and {names[j]} together"
                 found.append(Family(what, (k,), (k, j), _of_both(k, j)))
-        found.append(Family(f"an error of {names[k]} that changes with time", (k,), (TIME,), _of_time(k)))
-        found.append(Family(f"the link before {names[k]} changes with time", (k,), (TIME,), _link_over_time(k)))
+        if motion.t is not None:
+            found.append(Family(f"an error of {names[k]} that changes with time", (k,), (TIME,), _of_time(k)))
+            found.append(Family(f"the link before {names[k]} changes with time", (k,), (TIME,), _link_over_time(k)))
         if run.simulation.gravity.known:
             what = f"what carries {names[k]} gives under the arm's weight"
             found.append(Family(what, (k,), tuple(j for j in joints if j >= k), _link_under_weight(k)))
-    found.append(Family("the tool changes with time", (), (TIME,), _tool_over_time))
-    found.append(Family("the camera moves with time", (), (TIME,), _camera_over_time))
+    if motion.t is not None:
+        found.append(Family("the tool changes with time", (), (TIME,), _tool_over_time))
+        found.append(Family("the camera moves with time", (), (TIME,), _camera_over_time))
     found.append(Family("an error that depends on where the marker is in the image", (), tuple(joints), _in_image))
     return found
 
