@@ -51,6 +51,8 @@ GOALS: dict[str, tuple[float | None, float | None]] = {
 }
 # A solve of each kind after each of these totals; 2187 control points lie between the second and the third.
 STAGES = (600, 2000, 2200, 4000, 6000)
+# A recursive rigid chain that learns pair by pair: its first pairs, and those between a full window and this total.
+FIRST_PAIRS, FULL_WINDOW, STREAM = 100, 1000, 4000
 
 
 def start_map() -> KBMap:
@@ -225,10 +227,30 @@ def solve_ms(learner: ExactLearner, precision: float | Literal["evidence"] | Non
     return statistics.median(times)
 
 
-def some_pairs(rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
-    """q (600, 7) [rad] and x (600, 3) [m] of a guided path."""
-    q = guided_path(PAIRS, rng).q
-    return q, nominal_chain().with_tool([0.05, 0.0, 0.0]).positions(q) + NOISE_M * rng.normal(size=(PAIRS, 3))
+def stream_costs(path: kernels.KernelPath, rng: np.random.Generator) -> tuple[float, float]:
+    """What `RecursiveRigidLearner` costs a pair, its refits included [us]: over the first, with a full window."""
+    q, x = some_pairs(rng, STREAM)
+    with kernels.using(path):
+        learner = RecursiveRigidLearner(nominal_chain(), ROUGH, window=FULL_WINDOW)
+    took: list[float] = []
+    for one_q, one_x in zip(q, x, strict=True):
+        begin = time.thread_time()
+        learner.learn(one_q, one_x)
+        took.append(1e6 * (time.thread_time() - begin))
+    return statistics.mean(took[:FIRST_PAIRS]), statistics.mean(took[FULL_WINDOW:])
+
+
+def recursive_stream(rng: np.random.Generator) -> None:
+    print("recursive rigid chain, refits included [us a pair]")
+    for path in kernels.available():
+        first, full = stream_costs(path, rng)
+        print(f"  {path:9s} first {FIRST_PAIRS}: {first:6.0f}; pairs {FULL_WINDOW} to {STREAM}: {full:6.0f}")
+
+
+def some_pairs(rng: np.random.Generator, count: int = PAIRS) -> tuple[FloatArray, FloatArray]:
+    """q (count, 7) [rad] and x (count, 3) [m] of a guided path."""
+    q = guided_path(count, rng).q
+    return q, nominal_chain().with_tool([0.05, 0.0, 0.0]).positions(q) + NOISE_M * rng.normal(size=(count, 3))
 
 
 def main() -> None:
@@ -237,6 +259,7 @@ def main() -> None:
     load = os.getloadavg()[0]
     print(f"{JOINTS} joints (medians of interleaved rounds; {os.cpu_count()} cores, load average {load:.1f})")
     online(q, x)
+    recursive_stream(rng)
     exact_learner(start_map(), rng)
 
 
