@@ -31,8 +31,8 @@ Told = Callable[[str], None]
 _FEWEST_OUTLIERS = 3
 # So much more probable it has to be that there are some [nats].
 _OUTLIERS_NAMED = 15.0
-# That outliers and motion have to do with each other, by chance.
-_BY_CHANCE = 1e-3
+# Where they are off so often where the arm is faster, motion has to do with it.
+_MOSTLY = 0.8
 # Where more rows than this are doubtful, leaving them out costs more than they do harm.
 _MOST_DOUBTFUL = 0.25
 # Beside what has no name a cause stays named only if it is more probable than not.
@@ -107,7 +107,9 @@ class Diagnosis:
         duration = np.ones(len(motion)) if motion.t is None else np.append(np.inf, np.diff(motion.t))
         speed = steps / np.maximum(duration, 1e-9)
         on, off = self.markers, self._off
-        return min(stats.mannwhitneyu(v[off], v[on]).pvalue for v in (steps, speed)) < _BY_CHANCE
+        # How often a row that is off is faster than one that is not.
+        faster = [stats.mannwhitneyu(v[off], v[on]).statistic / (off.sum() * on.sum()) for v in (steps, speed)]
+        return max(faster) > _MOSTLY
 
     def gain(self) -> tuple[float, tuple[float, float]]:
         """By how much the RMS falls from aligned to extended [%], with its 95 % interval."""

@@ -24,7 +24,7 @@ from .sealed import Case, Record, judged
 pytestmark = pytest.mark.timeout(600)
 
 PAIRS = 600
-CASES = {"one": 7, "two": 3, "three": 2, "outliers": 3, "none": 4, "outside": 3}
+CASES = {"one": 7, "two": 3, "three": 2, "outliers": 3, "none": 4, "outside": 5}
 NAMED = ("one", "two", "three", "outliers")
 # Failures and cases in the sealed run.
 SEALED: dict[tuple[str, ...], tuple[int, int]] = {NAMED: (1, 18), ("none",): (0, 41)}
@@ -85,7 +85,9 @@ def test_what_is_outside_the_table_gets_no_name() -> None:
     _check(("outside",), GOAL_OUTSIDE)
 
 
-@pytest.mark.parametrize("names", list(SEALED))
-def test_each_threshold_can_be_missed(names: tuple[str, ...]) -> None:
+@pytest.mark.parametrize(
+    ("names", "rate"), [*((names, _rate(names)) for names in SEALED), (("outside",), GOAL_OUTSIDE)]
+)
+def test_each_threshold_can_be_missed(names: tuple[str, ...], rate: float) -> None:
     cases = sum(CASES[name] for name in names)
-    assert _allowed(_rate(names), cases) < cases
+    assert _allowed(rate, cases) < cases
