@@ -1,0 +1,155 @@
+"""Errors on rows that were not fitted, and p-values that mean what they say."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from planted_cases import BASE, ELBOW, SHOULDER, SIGMA_M, at_rest, desk_arm, measured, start_of, walk
+from scipy import stats
+
+from diagnosis.fit import Fit, fitted
+from diagnosis.held_out import Blocks, HeldOut, block_p_value, gain_percent
+from diagnosis.observations import Observations
+from effects import Effect, Motion, Simulation
+from interfaces.records import FloatArray
+from interfaces.robot import RobotDescription
+
+CHANCE = 1e-4
+SEEDS = range(150)
+# Rows that are read alike, one after the other: not as many as rows of a block.
+ALIKE, TICK_RAD = 7, 2.0 * np.pi / 512
+
+
+@pytest.fixture(scope="module")
+def robot() -> RobotDescription:
+    return desk_arm()
+
+
+def converged(fit: Fit) -> Fit:
+    """The fit, fitted again from where it ended."""
+    for _ in range(3):
+        fit = fitted(fit.observations, fit.simulation, fit.nuisances, fit.noise)
+    return fit
+
+
+@pytest.fixture(scope="module")
+def small(robot) -> Fit:
+    """Sixty poses, each a run of its own: what is left of them is measured as before."""
+    motion = walk(robot, 1, 60)
+    alone = Motion(motion.q, motion.t, np.arange(60))
+    truth = (
+        Effect.at(robot, "joint_offset", ELBOW, values=[0.02]),
+        Effect.at(robot, "joint_eccentricity", SHOULDER, values=[0.02, 0.01]),
+    )
+    return converged(start_of(robot, alone, truth, 1).with_causes([at_rest(effect) for effect in truth]))
+
+
+def kept(observations: Observations, rows: np.ndarray) -> Observations:
+    motion = observations.motion
+    assert motion.t is not None
+    return dataclasses.replace(
+        observations,
+        motion=Motion(motion.q[rows], motion.t[rows], motion.segment[rows]),
+        x=observations.x[rows],
+        stated=observations.stated[rows],
+        rounding=observations.rounding[rows],
+    )
+
+
+def test_errors_on_rows_held_out_are_those_of_fits_without_their_fold(small) -> None:
+    blocks = Blocks.cut(len(small.observations))
+    plain = small.observations.x - small.run.measured
+    expected = np.empty_like(plain)
+    for fold in np.unique(blocks.fold):
+        rows = blocks.fold == fold
+        part = kept(small.observations, ~rows)
+        without = converged(fitted(part, small.simulation, small.nuisances))
+        expected[rows] = (small.observations.x - without.simulation.positions(small.observations.motion))[rows]
+    errors = HeldOut(small, blocks).errors
+    difference = np.linalg.norm(errors - expected) / np.linalg.norm(plain - expected)
+    # The weights of the noise and the curvature of the arm move by so little when a fold is left out.
+    assert difference < 0.05
+
+
+def test_errors_on_rows_held_out_are_larger_than_those_on_fitted_rows(small) -> None:
+    plain = np.linalg.norm(small.observations.x - small.run.measured, axis=1)
+    distances = HeldOut(small, Blocks.cut(60)).distances
+    assert np.square(distances).mean() > np.square(plain).mean()
+
+
+def test_blocks_are_runs_of_neighbouring_rows_and_folds_are_dealt_in_turn() -> None:
+    blocks = Blocks.cut(600)
+    assert (np.diff(blocks.of_row) >= 0).all()
+    assert np.bincount(blocks.of_row).min() == np.bincount(blocks.of_row).max()
+    assert np.ptp(np.bincount(blocks.fold)) == 0
+
+
+def test_a_gain_is_the_fall_of_the_rms_inside_its_interval() -> None:
+    rng = np.random.default_rng(3)
+    before = np.abs(rng.normal(size=400)) + 1.0
+    percent, (low, high) = gain_percent(before, 0.7 * before * rng.uniform(0.9, 1.1, 400), Blocks.cut(400), 0)
+    assert percent == pytest.approx(30.0, abs=1.0)
+    assert low < percent < high
+
+
+def test_a_gain_of_nothing_is_none() -> None:
+    before = np.abs(np.random.default_rng(3).normal(size=400))
+    assert gain_percent(before, before, Blocks.cut(400), 0) == (0.0, (0.0, 0.0))
+
+
+def chances(robot: RobotDescription, starts: list[Fit], name: str, where: str | None) -> FloatArray:
+    """p-values of an effect that is not there."""
+    effect = Effect.at(robot, name, where)
+    return np.array(
+        [
+            block_p_value(f, f.weighted(f.run.columns(effect)[:, :, effect.amounts]), Blocks.cut(len(f.observations)))
+            for f in starts
+        ]
+    )
+
+
+ABSENT = (("joint_offset", SHOULDER), ("joint_eccentricity", ELBOW), ("link_geometry", ELBOW), ("joint_scale", BASE))
+
+
+@pytest.fixture(scope="module")
+def noisy(robot) -> list[Fit]:
+    return [start_of(robot, walk(robot, seed, 300), (), seed) for seed in SEEDS]
+
+
+def turned(robot: RobotDescription, seed: int) -> Fit:
+    """An arm that is read in whole ticks and stands still while it is: neighbouring rows have the same error."""
+    poses = walk(robot, seed, 86)
+    q = np.repeat(poses.q, ALIKE, axis=0)[:600]
+    motion = Motion(TICK_RAD * np.round(q / TICK_RAD), 0.25 * np.arange(600), np.zeros(600, np.int64))
+    really = Simulation(robot).positions(Motion(q, motion.t, motion.segment))
+    noise = SIGMA_M * np.random.default_rng([seed, 1]).normal(size=(600, 3))
+    return start_from(robot, motion, really + noise)
+
+
+def start_from(robot: RobotDescription, motion: Motion, x: FloatArray) -> Fit:
+    from diagnosis.alignment import aligned
+
+    simulation = Simulation(robot)
+    return aligned(Observations.of(measured(robot, motion, x), simulation), simulation)
+
+
+@pytest.fixture(scope="module")
+def in_runs(robot) -> list[Fit]:
+    return [turned(robot, seed) for seed in SEEDS]
+
+
+@pytest.mark.parametrize(("name", "where"), ABSENT)
+def test_p_values_of_what_is_not_there_are_uniform_under_noise(robot, noisy, name, where) -> None:
+    assert stats.kstest(chances(robot, noisy, name, where), "uniform").pvalue > CHANCE
+
+
+@pytest.mark.parametrize(("name", "where"), ABSENT)
+def test_p_values_are_uniform_where_rows_are_rounded_alike_in_runs(robot, in_runs, name, where) -> None:
+    assert stats.kstest(chances(robot, in_runs, name, where), "uniform").pvalue > CHANCE
+
+
+def test_what_is_there_has_a_small_p_value(robot) -> None:
+    start = start_of(robot, walk(robot, 1), (Effect.at(robot, "joint_scale", BASE, values=[0.005]),), 1)
+    assert chances(robot, [start], "joint_scale", BASE)[0] < 1e-6
