@@ -48,6 +48,12 @@ def walk(robot: RobotDescription, seed: int, rows: int = 300) -> Motion:
     return motion_of(robot.lower + (0.1 + 0.8 * shares) * (robot.upper - robot.lower))
 
 
+def scattered(robot: RobotDescription, seed: int, rows: int = 300) -> Motion:
+    """Poses that have nothing to do with each other, over most of the joints' range."""
+    shares = np.random.default_rng([seed, 2]).uniform(0.1, 0.9, size=(rows, len(robot.joints)))
+    return motion_of(robot.lower + shares * (robot.upper - robot.lower))
+
+
 def seen(robot: RobotDescription, motion: Motion, effects: tuple[Effect, ...], seed: int) -> Recording:
     """What is measured of an arm with `effects`, with round noise that is stated as it is."""
     n = len(motion)
@@ -58,7 +64,7 @@ def seen(robot: RobotDescription, motion: Motion, effects: tuple[Effect, ...], s
 def measured(robot: RobotDescription, motion: Motion, x: FloatArray) -> Recording:
     """Positions x (n, 3) [m], their noise stated as `SIGMA_M`."""
     cov = np.broadcast_to(SIGMA_M**2 * np.eye(3), (len(motion), 3, 3))
-    return Recording(joints=robot.joints, q=motion.q, x=x, t=motion.t, cov=cov)
+    return Recording(joints=robot.joints, q=motion.q, x=x, t=motion.t, cov=cov, segment=motion.segment)
 
 
 def observed(robot: RobotDescription, motion: Motion, effects: tuple[Effect, ...], seed: int) -> Observations:

@@ -61,9 +61,7 @@ def with_outliers(clean: Observations, rows: np.ndarray) -> Observations:
 @pytest.fixture(scope="module")
 def fits(robot) -> list[Fit]:
     truth = planted(robot)
-    return [
-        start_of(robot, walk(robot, seed), truth, seed).with_causes([at_rest(e) for e in truth]) for seed in SEEDS
-    ]
+    return [start_of(robot, walk(robot, seed), truth, seed).with_causes([at_rest(e) for e in truth]) for seed in SEEDS]
 
 
 def test_each_amount_lies_in_its_stated_interval_as_often_as_stated(robot, fits) -> None:

@@ -21,7 +21,7 @@ image_size_px = [640, 480]
 HELD = {'hold = "torque_free"': 'hold = "held"'}
 
 
-def tested(robot: RobotDescription, motion: Motion | None = None, **asked) -> Hypotheses:
+def asked_of(robot: RobotDescription, motion: Motion | None = None, **asked) -> Hypotheses:
     observations = observed(robot, walk(robot, 1) if motion is None else motion, (), 1)
     return Hypotheses.of(Simulation(robot), observations, **asked)
 
@@ -31,13 +31,13 @@ def names(hypotheses: Hypotheses) -> set[str]:
 
 
 def test_a_robot_without_masses_is_not_tested_for_joints_that_give() -> None:
-    found = tested(desk_arm(HELD))
+    found = asked_of(desk_arm(HELD))
     assert "joint_compliance" not in names(found)
     assert any("states no masses" in sentence for sentence in found.limitations)
 
 
 def test_an_arm_that_a_hand_bears_is_not_tested_for_joints_that_give() -> None:
-    found = tested(desk_arm())
+    found = asked_of(desk_arm())
     assert "joint_compliance" not in names(found)
     assert [s for s in found.limitations if "torque-free" in s]
     assert not [s for s in found.limitations if "masses" in s]
@@ -46,36 +46,38 @@ def test_an_arm_that_a_hand_bears_is_not_tested_for_joints_that_give() -> None:
 def test_a_recording_without_times_is_not_tested_for_latency_and_drift() -> None:
     robot = desk_arm()
     timed, untimed = walk(robot, 1), dataclasses.replace(walk(robot, 1), t=None)
-    assert names(tested(robot, timed)) - names(tested(robot, untimed)) == {k.name for k in KINDS.values() if k.needs_times}
-    assert any("no times" in sentence for sentence in tested(robot, untimed).limitations)
-    assert not any("no times" in sentence for sentence in tested(robot, timed).limitations)
+    assert names(asked_of(robot, timed)) - names(asked_of(robot, untimed)) == {
+        k.name for k in KINDS.values() if k.needs_times
+    }
+    assert any("no times" in sentence for sentence in asked_of(robot, untimed).limitations)
+    assert not any("no times" in sentence for sentence in asked_of(robot, timed).limitations)
 
 
 def test_a_joint_that_never_moved_is_no_place_and_no_source_of_anything() -> None:
     robot = desk_arm()
     q = walk(robot, 1).q.copy()
     q[:, robot.joints.index(ELBOW)] = 0.4
-    found = tested(robot, motion_of(q))
+    found = asked_of(robot, motion_of(q))
     assert not [effect for effect in found.effects if ELBOW in (effect.where, effect.source)]
     assert [effect for effect in found.effects if effect.where == SHOULDER]
     assert f"{ELBOW} never moved: nothing can be said of it." in found.limitations
 
 
 def test_a_camera_without_stereo_calibration_is_not_tested_for_its_lenses() -> None:
-    found = tested(desk_arm({STEREO: ""}))
-    assert names(tested(desk_arm())) - names(found) == {kind.name for kind in KINDS.values() if kind.needs_stereo}
+    found = asked_of(desk_arm({STEREO: ""}))
+    assert names(asked_of(desk_arm())) - names(found) == {kind.name for kind in KINDS.values() if kind.needs_stereo}
     assert any("no stereo calibration" in sentence for sentence in found.limitations)
 
 
 def test_what_is_fitted_in_any_case_is_no_hypothesis() -> None:
     free = {"camera_pose", "tool_offset"}
-    assert not free & names(tested(desk_arm()))
-    assert free <= names(tested(surveyed_arm()))
+    assert not free & names(asked_of(desk_arm()))
+    assert free <= names(asked_of(surveyed_arm()))
 
 
 def test_every_effect_is_tested_at_every_joint_once() -> None:
     robot = surveyed_arm()
-    found = tested(robot)
+    found = asked_of(robot)
     keys = [effect.key for effect in found.effects]
     assert len(set(keys)) == len(keys)
     d = len(robot.joints)
@@ -88,8 +90,8 @@ def test_every_effect_is_tested_at_every_joint_once() -> None:
 
 def test_only_what_is_asked_for_is_tested() -> None:
     robot = desk_arm()
-    assert names(tested(robot, only=("backlash", "joint_scale"))) == {"backlash", "joint_scale"}
-    assert "backlash" not in names(tested(robot, without=("backlash",)))
+    assert names(asked_of(robot, only=("backlash", "joint_scale"))) == {"backlash", "joint_scale"}
+    assert "backlash" not in names(asked_of(robot, without=("backlash",)))
 
 
 @pytest.mark.parametrize("rows", [3, 19])

@@ -13,6 +13,7 @@ from diagnosis.diagnosis import Diagnosis, diagnose
 from effects import Effect, Motion, Simulation
 from interfaces.robot import RobotDescription
 
+ROWS = 200
 ADVISED = re.compile(r"move joint (\w+) through its whole range \((-?\d+)° to (-?\d+)°\)")
 
 
@@ -24,7 +25,7 @@ def diagnosed(robot: RobotDescription, motion: Motion, truth: Effect, only: tupl
 def turned_camera() -> Diagnosis:
     robot = surveyed_arm()
     truth = Effect.at(robot, "camera_pose", values=[0.004, -0.003, 0.002, 0.01, -0.02, 0.015])
-    return diagnosed(robot, walk(robot, 2), truth, ("camera_pose", "link_geometry", "joint_offset"))
+    return diagnosed(robot, walk(robot, 2, ROWS), truth, ("camera_pose", "link_geometry", "joint_offset"))
 
 
 def test_the_pose_of_the_camera_and_the_first_links_geometry_are_the_same_in_any_motion(turned_camera) -> None:
@@ -53,7 +54,7 @@ PLANTED = (("joint_scale", 0.03), ("joint_offset", 0.03))
 
 def narrow(robot: RobotDescription) -> Motion:
     """All joints but one move widely: that stays near one place."""
-    q = walk(robot, 2).q.copy()
+    q = walk(robot, 2, ROWS).q.copy()
     q[:, 1] = 1.0 + 0.002 * np.sin(np.arange(len(q)))
     return motion_of(q)
 
@@ -101,6 +102,6 @@ def test_a_cause_that_nothing_else_comes_near_has_no_rivals() -> None:
     robot = desk_arm()
     truth = Effect.at(robot, "joint_scale", SHOULDER, values=[0.02])
     kinds = ("joint_offset", "joint_scale", "joint_eccentricity", "backlash")
-    (standing,) = diagnosed(robot, walk(robot, 2), truth, kinds).standings
+    (standing,) = diagnosed(robot, walk(robot, 2, ROWS), truth, kinds).standings
     assert standing.rivals == ()
     assert standing.probability > 0.999
