@@ -96,8 +96,9 @@ def test_errors_on_rows_held_out_are_larger_than_those_on_fitted_rows(small) -> 
 def test_blocks_are_runs_of_neighbouring_rows_and_folds_are_dealt_in_turn() -> None:
     blocks = Blocks.cut(600)
     assert (np.diff(blocks.of_row) >= 0).all()
-    assert np.bincount(blocks.of_row).min() == np.bincount(blocks.of_row).max()
-    assert np.ptp(np.bincount(blocks.fold)) == 0
+    assert np.ptp(np.bincount(blocks.of_row)) <= 1
+    assert np.ptp(np.bincount(blocks.fold)) < 600 // 5 // 2
+    assert (np.diff(blocks.fold)[np.diff(blocks.of_row) > 0] != 0).all()
 
 
 def test_a_gain_is_the_fall_of_the_rms_inside_its_interval() -> None:

@@ -56,9 +56,7 @@ def test_a_cause_that_a_better_one_makes_redundant_is_dropped(robot) -> None:
     hypotheses = [worse, Effect.at(robot, "joint_eccentricity", SHOULDER)]
     misled = start.with_causes([at_rest(worse)])
     assert misled.log_likelihood - start.log_likelihood > 20.0
-    told: list[str] = []
-    assert names(Search(hypotheses, told.append).run(misled)) == {("joint_eccentricity", SHOULDER)}
-    assert "dropped joint_scale at shoulder_pitch" in told
+    assert names(Search(hypotheses, lambda _: None).run(misled)) == {("joint_eccentricity", SHOULDER)}
 
 
 def test_a_cause_is_exchanged_for_a_rival_that_explains_more(robot) -> None:
