@@ -52,9 +52,9 @@ def test_the_worth_of_an_exchange_is_the_negative_of_that_of_the_exchange_back(g
 def test_a_cause_that_a_better_one_makes_redundant_is_dropped(robot) -> None:
     truth = Effect.at(robot, "joint_eccentricity", SHOULDER, values=[0.03, 0.0])
     start = start_of(robot, walk(robot, 2), (truth,), 2)
-    worse = Effect.at(robot, "joint_scale", SHOULDER)
-    hypotheses = [worse, Effect.at(robot, "joint_eccentricity", SHOULDER)]
-    misled = start.with_causes([at_rest(worse)])
+    worse = [Effect.at(robot, name, SHOULDER) for name in ("joint_scale", "joint_offset")]
+    hypotheses = [*worse, Effect.at(robot, "joint_eccentricity", SHOULDER)]
+    misled = start.with_causes([at_rest(effect) for effect in worse])
     assert misled.log_likelihood - start.log_likelihood > 20.0
     assert names(Search(hypotheses, lambda _: None).run(misled)) == {("joint_eccentricity", SHOULDER)}
 
