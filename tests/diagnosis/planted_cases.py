@@ -1,0 +1,84 @@
+"""Small recordings of the desk arm of which it is known what was hidden in them."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+
+import numpy as np
+from walked import DESK_ARM
+
+from diagnosis.alignment import aligned
+from diagnosis.fit import Fit
+from diagnosis.observations import Observations
+from effects import Effect, Motion, Simulation
+from interfaces.recording import Recording
+from interfaces.records import FloatArray
+from interfaces.robot import RobotDescription
+
+SIGMA_M = 3e-4
+INTERVAL_S = 0.25
+BASE, SHOULDER, ELBOW, WRIST = "base_yaw", "shoulder_pitch", "elbow_pitch", "wrist_roll"
+
+
+def desk_arm(changes: Mapping[str, str] | None = None) -> RobotDescription:
+    """The desk arm with lines of its robot.toml changed."""
+    text = DESK_ARM.read_text()
+    for old, new in (changes or {}).items():
+        assert old in text
+        text = text.replace(old, new)
+    return RobotDescription.from_tables(tomllib.loads(text), text, DESK_ARM)
+
+
+def surveyed_arm() -> RobotDescription:
+    """The desk arm with camera and marker that are known."""
+    return desk_arm({"_known = false": "_known = true"})
+
+
+def motion_of(q: FloatArray) -> Motion:
+    """Readings (n, d) in one run, four a second."""
+    return Motion(q, INTERVAL_S * np.arange(len(q)), np.zeros(len(q), np.int64))
+
+
+def walk(robot: RobotDescription, seed: int, rows: int = 300) -> Motion:
+    """A walk over most of the joints' range."""
+    rng = np.random.default_rng(seed)
+    steps = np.cumsum(rng.normal(size=(rows, len(robot.joints))), axis=0)
+    shares = (steps - steps.min(axis=0)) / np.ptp(steps, axis=0)
+    return motion_of(robot.lower + (0.1 + 0.8 * shares) * (robot.upper - robot.lower))
+
+
+def scattered(robot: RobotDescription, seed: int, rows: int = 300) -> Motion:
+    """Poses that have nothing to do with each other, over most of the joints' range."""
+    shares = np.random.default_rng([seed, 2]).uniform(0.1, 0.9, size=(rows, len(robot.joints)))
+    return motion_of(robot.lower + shares * (robot.upper - robot.lower))
+
+
+def seen(robot: RobotDescription, motion: Motion, effects: tuple[Effect, ...], seed: int) -> Recording:
+    """What is measured of an arm with `effects`, with round noise that is stated as it is."""
+    n = len(motion)
+    noise = SIGMA_M * np.random.default_rng([seed, 1]).normal(size=(n, 3))
+    return measured(robot, motion, Simulation(robot, effects).positions(motion) + noise)
+
+
+def measured(robot: RobotDescription, motion: Motion, x: FloatArray) -> Recording:
+    """Positions x (n, 3) [m], their noise stated as `SIGMA_M`."""
+    cov = np.broadcast_to(SIGMA_M**2 * np.eye(3), (len(motion), 3, 3))
+    return Recording(joints=robot.joints, q=motion.q, x=x, t=motion.t, cov=cov, segment=motion.segment)
+
+
+def observed(robot: RobotDescription, motion: Motion, effects: tuple[Effect, ...], seed: int) -> Observations:
+    """`seen`, as the diagnosis takes it."""
+    return Observations.of(seen(robot, motion, effects, seed), Simulation(robot))
+
+
+def start_of(robot: RobotDescription, motion: Motion, effects: tuple[Effect, ...], seed: int) -> Fit:
+    """The fit that knows of no cause yet."""
+    return aligned(observed(robot, motion, effects, seed), Simulation(robot))
+
+
+def at_rest(effect: Effect) -> Effect:
+    """The same with amounts of zero; moments and periods stay."""
+    values = effect.values.copy()
+    values[effect.amounts] = 0.0
+    return effect.with_values(values)

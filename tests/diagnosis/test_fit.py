@@ -1,0 +1,154 @@
+"""Amounts are recovered within what is stated of them, and fixes that are not the marker do not matter."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from planted_cases import BASE, ELBOW, SHOULDER, at_rest, desk_arm, observed, start_of, walk
+from scipy import stats
+
+from diagnosis.alignment import aligned
+from diagnosis.fit import Fit
+from diagnosis.observations import Observations, stereo_covariances
+from diagnosis.scan import Scan
+from effects import Effect, Simulation
+from interfaces.camera import StereoCalibration
+from interfaces.records import FloatArray
+from interfaces.robot import RobotDescription
+
+SEEDS = range(40)
+# Of a bound that a right build breaks by chance.
+CHANCE = 1e-4
+JUMP_RAD = 0.3
+
+
+@pytest.fixture(scope="module")
+def robot() -> RobotDescription:
+    return desk_arm()
+
+
+def planted(robot: RobotDescription) -> tuple[Effect, ...]:
+    return (
+        Effect.at(robot, "joint_offset", ELBOW, values=[0.03]),
+        Effect.at(robot, "joint_scale", SHOULDER, values=[-0.02]),
+        Effect.at(robot, "joint_eccentricity", BASE, values=[0.02, -0.01]),
+    )
+
+
+def amounts(fit: Fit) -> FloatArray:
+    return np.concatenate([effect.values[effect.amounts] for effect in fit.causes])
+
+
+def covariance(fit: Fit) -> FloatArray:
+    """Of the causes' amounts alone."""
+    first = fit.covariance.shape[0] - len(amounts(fit))
+    return fit.covariance[first:, first:]
+
+
+def refitted(robot: RobotDescription, observations: Observations) -> Fit:
+    start = aligned(observations, Simulation(robot))
+    return start.with_causes([at_rest(effect) for effect in planted(robot)])
+
+
+def with_outliers(clean: Observations, rows: np.ndarray) -> Observations:
+    x = clean.x.copy()
+    x[rows] += np.random.default_rng(9).normal(0.0, 0.2, (len(rows), 3))
+    return dataclasses.replace(clean, x=x)
+
+
+@pytest.fixture(scope="module")
+def fits(robot) -> list[Fit]:
+    truth = planted(robot)
+    return [start_of(robot, walk(robot, seed), truth, seed).with_causes([at_rest(e) for e in truth]) for seed in SEEDS]
+
+
+def test_each_amount_lies_in_its_stated_interval_as_often_as_stated(robot, fits) -> None:
+    truth = np.concatenate([effect.values for effect in planted(robot)])
+    held = sum(np.abs(amounts(fit) - truth) <= 1.959964 * np.sqrt(np.diag(covariance(fit))) for fit in fits)
+    assert (held >= stats.binom.ppf(CHANCE, len(fits), 0.95)).all()
+
+
+def test_the_stated_covariance_is_neither_too_small_nor_too_large(robot, fits) -> None:
+    truth = np.concatenate([effect.values for effect in planted(robot)])
+    total = sum((amounts(f) - truth) @ np.linalg.solve(covariance(f), amounts(f) - truth) for f in fits)
+    low, high = stats.chi2.ppf([CHANCE, 1.0 - CHANCE], len(truth) * len(fits))
+    assert low < total < high
+
+
+def test_the_size_of_the_noise_is_that_of_the_recording(fits) -> None:
+    squares = np.mean([fit.noise.sigma**2 for fit in fits])
+    # Each fit has three coordinates a trusted row less its amounts: 9 of camera and marker, 4 of the causes.
+    coordinates = 3 * int(fits[0].observations.trusted.sum())
+    dof = len(fits) * (coordinates - 13)
+    low, high = stats.chi2.ppf([CHANCE, 1.0 - CHANCE], dof) / (len(fits) * coordinates)
+    assert low < squares < high
+
+
+@pytest.mark.parametrize("ends", [[], [0], [-1], [0, -1]], ids=["inside", "first row", "last row", "both ends"])
+def test_a_tenth_of_scattered_outliers_changes_the_amounts_no_more_than_their_absence_would(robot, ends) -> None:
+    clean = observed(robot, walk(robot, 5), planted(robot), 5)
+    n = len(clean)
+    inside = np.random.default_rng(6).choice(np.arange(1, n - 1), n // 10 - len(ends), replace=False)
+    rows = np.append(inside, np.array(ends, dtype=int) % n)
+    before, after = refitted(robot, clean), refitted(robot, with_outliers(clean, rows))
+    moved = amounts(after) - amounts(before)
+    distance = moved @ np.linalg.solve(covariance(before), moved)
+    # A share s of the rows less moves the amounts by about s / (1 - s) of their variance.
+    assert distance < stats.chi2.ppf(1.0 - CHANCE, len(moved)) / 9.0
+
+
+@pytest.mark.parametrize("ends", [[], [-1]], ids=["inside", "last row"])
+def test_scattered_outliers_are_told_from_the_marker(robot, ends) -> None:
+    clean = observed(robot, walk(robot, 5), planted(robot), 5)
+    n = len(clean)
+    inside = np.random.default_rng(6).choice(np.arange(1, n - 1), n // 10 - len(ends), replace=False)
+    rows = np.append(inside, np.array(ends, dtype=int) % n)
+    weights = refitted(robot, with_outliers(clean, rows)).noise.weights
+    others = np.setdiff1d(np.arange(1, n), rows)
+    assert weights[rows].max() < 0.5 < weights[others].min()
+
+
+@pytest.fixture(scope="module")
+def jumped(robot) -> Fit:
+    motion = walk(robot, 7)
+    t0 = motion.clock[210] - 0.1
+    return start_of(robot, motion, (Effect.at(robot, "encoder_jump", SHOULDER, values=[JUMP_RAD, t0]),), 7)
+
+
+def test_rows_after_a_jump_of_30_percent_of_the_recording_are_not_taken_for_outliers(jumped) -> None:
+    assert jumped.noise.weights[210:].mean() > 0.95
+
+
+def test_a_jump_of_30_percent_of_the_recording_is_found_from_a_fit_that_knows_nothing_of_it(robot, jumped) -> None:
+    candidate = Scan(jumped).candidate(Effect.at(robot, "encoder_jump", SHOULDER))
+    assert candidate is not None
+    found = jumped.with_causes([candidate.effect]).causes[0]
+    clock = jumped.observations.motion.clock
+    assert clock[209] < found.value("t0") < clock[210]
+    assert found.value("jump_rad") == pytest.approx(JUMP_RAD, abs=0.002)
+
+
+def triangulated(pixels: FloatArray, calibration: StereoCalibration) -> FloatArray:
+    """The point (3,) [m] of (ul, vl, ur, vr) [px], its row the mean of both eyes'."""
+    ul, vl, ur, vr = pixels
+    cx, cy = calibration.principal_point_px
+    z = calibration.focal_px * calibration.baseline_m / (ul - ur)
+    return np.array([(ul - cx) * z, (0.5 * (vl + vr) - cy) * z, calibration.focal_px * z]) / calibration.focal_px
+
+
+def test_stereo_covariances_are_those_of_numerical_derivatives_of_triangulation(robot) -> None:
+    calibration = robot.calibration
+    assert calibration is not None
+    x = np.random.default_rng(8).uniform([-0.4, -0.3, 0.4], [0.4, 0.3, 1.6], (20, 3))
+    step = 1e-4
+    for point, stated in zip(x, stereo_covariances(x, calibration), strict=True):
+        pixels = calibration.project(point)
+        moved = [
+            (triangulated(pixels + e, calibration) - triangulated(pixels - e, calibration)) / (2.0 * step)
+            for e in step * np.eye(4)
+        ]
+        by_pixel = np.stack(moved, axis=1)
+        expected = calibration.pixel_sigma**2 * by_pixel @ by_pixel.T
+        np.testing.assert_allclose(stated, expected, rtol=1e-5, atol=1e-5 * np.trace(expected))

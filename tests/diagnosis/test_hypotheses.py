@@ -1,0 +1,103 @@
+"""What a recording cannot test is said, and not tested."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from planted_cases import ELBOW, SHOULDER, desk_arm, motion_of, observed, surveyed_arm, walk
+
+from diagnosis.hypotheses import Hypotheses
+from diagnosis.observations import Observations
+from effects import KINDS, Motion, Simulation
+from interfaces.robot import RobotDescription
+
+STEREO = """focal_px = 600.0                # from the stereo calibration
+principal_point_px = [319.5, 239.5]
+baseline_m = 0.20
+image_size_px = [640, 480]
+"""
+HELD = {'hold = "torque_free"': 'hold = "held"'}
+
+
+def asked_of(robot: RobotDescription, motion: Motion | None = None, **asked) -> Hypotheses:
+    observations = observed(robot, walk(robot, 1) if motion is None else motion, (), 1)
+    return Hypotheses.of(Simulation(robot), observations, **asked)
+
+
+def names(hypotheses: Hypotheses) -> set[str]:
+    return {effect.name for effect in hypotheses.effects}
+
+
+def test_a_robot_without_masses_is_not_tested_for_joints_that_give() -> None:
+    found = asked_of(desk_arm(HELD))
+    assert "joint_compliance" not in names(found)
+    assert any("states no masses" in sentence for sentence in found.limitations)
+
+
+def test_an_arm_that_a_hand_bears_is_not_tested_for_joints_that_give() -> None:
+    found = asked_of(desk_arm())
+    assert "joint_compliance" not in names(found)
+    assert [s for s in found.limitations if "torque-free" in s]
+    assert not [s for s in found.limitations if "masses" in s]
+
+
+def test_a_recording_without_times_is_not_tested_for_latency_and_drift() -> None:
+    robot = desk_arm()
+    timed, untimed = walk(robot, 1), dataclasses.replace(walk(robot, 1), t=None)
+    assert names(asked_of(robot, timed)) - names(asked_of(robot, untimed)) == {
+        k.name for k in KINDS.values() if k.needs_times
+    }
+    assert any("no times" in sentence for sentence in asked_of(robot, untimed).limitations)
+    assert not any("no times" in sentence for sentence in asked_of(robot, timed).limitations)
+
+
+def test_a_joint_that_never_moved_is_no_place_and_no_source_of_anything() -> None:
+    robot = desk_arm()
+    q = walk(robot, 1).q.copy()
+    q[:, robot.joints.index(ELBOW)] = 0.4
+    found = asked_of(robot, motion_of(q))
+    assert not [effect for effect in found.effects if ELBOW in (effect.where, effect.source)]
+    assert [effect for effect in found.effects if effect.where == SHOULDER]
+    assert f"{ELBOW} never moved: nothing can be said of it." in found.limitations
+
+
+def test_a_camera_without_stereo_calibration_is_not_tested_for_its_lenses() -> None:
+    found = asked_of(desk_arm({STEREO: ""}))
+    assert names(asked_of(desk_arm())) - names(found) == {kind.name for kind in KINDS.values() if kind.needs_stereo}
+    assert any("no stereo calibration" in sentence for sentence in found.limitations)
+
+
+def test_what_is_fitted_in_any_case_is_no_hypothesis() -> None:
+    free = {"camera_pose", "tool_offset"}
+    assert not free & names(asked_of(desk_arm()))
+    assert free <= names(asked_of(surveyed_arm()))
+
+
+def test_every_effect_is_tested_at_every_joint_once() -> None:
+    robot = surveyed_arm()
+    found = asked_of(robot)
+    keys = [effect.key for effect in found.effects]
+    assert len(set(keys)) == len(keys)
+    d = len(robot.joints)
+    for name in names(found):
+        kind = KINDS[name]
+        places = 1 if not kind.at_joint else d * (d - 1) if kind.takes_source else d
+        assert sum(key[0] == name for key in keys) == places
+    assert names(found) == set(KINDS) - {"joint_compliance"}
+
+
+def test_only_what_is_asked_for_is_tested() -> None:
+    robot = desk_arm()
+    assert names(asked_of(robot, only=("backlash", "joint_scale"))) == {"backlash", "joint_scale"}
+    assert "backlash" not in names(asked_of(robot, without=("backlash",)))
+
+
+@pytest.mark.parametrize("rows", [3, 19])
+def test_so_few_rows_test_nothing(rows) -> None:
+    robot = desk_arm()
+    full = observed(robot, walk(robot, 1), (), 1)
+    motion = Motion(full.motion.q[:rows], np.arange(rows) / 4.0, np.zeros(rows, np.int64))
+    few = Observations(motion, full.x[:rows], full.stated[:rows], full.rounding[:rows])
+    assert Hypotheses.of(Simulation(robot), few).effects == ()

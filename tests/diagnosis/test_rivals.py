@@ -1,0 +1,107 @@
+"""What else a cause could be: the same in any motion, or in this one, and which motion would tell."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+from planted_cases import BASE, SHOULDER, desk_arm, motion_of, seen, surveyed_arm, walk
+
+from diagnosis.conclusion import conclusion
+from diagnosis.diagnosis import Diagnosis, diagnose
+from effects import Effect, Motion, Simulation
+from interfaces.robot import RobotDescription
+
+ROWS = 200
+ADVISED = re.compile(r"move joint (\w+) through its whole range \((-?\d+)° to (-?\d+)°\)")
+
+
+def diagnosed(robot: RobotDescription, motion: Motion, truth: Effect, only: tuple[str, ...]) -> Diagnosis:
+    return diagnose(seen(robot, motion, (truth,), 1), Simulation(robot), only=only)
+
+
+@pytest.fixture(scope="module")
+def turned_camera() -> Diagnosis:
+    robot = surveyed_arm()
+    truth = Effect.at(robot, "camera_pose", values=[0.004, -0.003, 0.002, 0.01, -0.02, 0.015])
+    return diagnosed(robot, walk(robot, 2, ROWS), truth, ("camera_pose", "link_geometry", "joint_offset"))
+
+
+def test_the_pose_of_the_camera_and_the_first_links_geometry_are_the_same_in_any_motion(turned_camera) -> None:
+    (cause,) = conclusion(turned_camera).causes
+    assert cause.effect == "camera_pose"
+    same = {(rival.effect, rival.where): rival.by for rival in cause.rivals}
+    assert same == {("link_geometry", BASE): "any_motion"}
+
+
+def test_a_cause_that_no_motion_tells_from_its_rival_is_as_sure_as_both_together(turned_camera) -> None:
+    (cause,) = conclusion(turned_camera).causes
+    assert cause.probability > 0.99
+    assert cause.rivals[0].probability > 0.02
+    assert conclusion(turned_camera).verdict == "explained"
+
+
+def test_of_causes_that_no_motion_tells_apart_the_advice_is_to_mend_either(turned_camera) -> None:
+    assert conclusion(turned_camera).advice == (
+        f"No motion tells camera_pose from link_geometry at {BASE}: mend whichever is easier.",
+    )
+
+
+NARROW = ("joint_offset", "joint_scale")
+PLANTED = (("joint_scale", 0.03), ("joint_offset", 0.03))
+
+
+def narrow(robot: RobotDescription) -> Motion:
+    """All joints but one move widely: that stays near one place."""
+    q = walk(robot, 2, ROWS).q.copy()
+    q[:, 1] = 1.0 + 0.002 * np.sin(np.arange(len(q)))
+    return motion_of(q)
+
+
+@pytest.fixture(scope="module", params=PLANTED, ids=[name for name, _ in PLANTED])
+def planted(request) -> Effect:
+    name, amount = request.param
+    return Effect.at(surveyed_arm(), name, SHOULDER, values=[amount])
+
+
+@pytest.fixture(scope="module")
+def open_case(planted) -> Diagnosis:
+    robot = surveyed_arm()
+    return diagnosed(robot, narrow(robot), planted, NARROW)
+
+
+def test_causes_that_a_narrow_motion_cannot_tell_apart_are_told_as_rivals_in_this_motion(open_case) -> None:
+    file = conclusion(open_case)
+    (cause,) = file.causes
+    (rival,) = cause.rivals
+    assert {cause.effect, rival.effect} == set(NARROW)
+    assert (cause.where, rival.where, rival.by) == (SHOULDER, SHOULDER, "this_motion")
+    assert cause.indistinguishable_from == (rival,)
+    assert cause.probability + rival.probability == pytest.approx(1.0, abs=0.01)
+    assert file.verdict == "undecided"
+
+
+def test_following_the_advice_tells_them_apart(planted, open_case) -> None:
+    robot = surveyed_arm()
+    (advice,) = conclusion(open_case).advice
+    match = ADVISED.search(advice)
+    assert match is not None
+    joint, low, high = match[1], *np.radians([float(match[2]), float(match[3])])
+    q = narrow(robot).q.copy()
+    share = 0.5 + 0.5 * np.sin(np.arange(len(q)) / 7.0)
+    q[:, robot.joints.index(joint)] = low + share * (high - low)
+    file = conclusion(diagnosed(robot, motion_of(q), planted, NARROW))
+    (cause,) = file.causes
+    assert (cause.effect, cause.where, cause.rivals) == (planted.name, SHOULDER, ())
+    assert file.verdict == "explained"
+    assert file.advice == ()
+
+
+def test_a_cause_that_nothing_else_comes_near_has_no_rivals() -> None:
+    robot = desk_arm()
+    truth = Effect.at(robot, "joint_scale", SHOULDER, values=[0.02])
+    kinds = ("joint_offset", "joint_scale", "joint_eccentricity", "backlash")
+    (standing,) = diagnosed(robot, walk(robot, 2, ROWS), truth, kinds).standings
+    assert standing.rivals == ()
+    assert standing.probability > 0.999

@@ -1,0 +1,130 @@
+"""Causes are named only where they are worth their numbers, the simplest of equals, and the search ends."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from planted_cases import BASE, ELBOW, SHOULDER, at_rest, desk_arm, start_of, surveyed_arm, walk
+
+from diagnosis.fit import Fit
+from diagnosis.search import NAMED, Search, nats, simplicity
+from effects import Effect
+from interfaces.robot import RobotDescription
+
+GAINS = st.floats(0.0, 1e5)
+NUMBERS = st.integers(1, 12)
+
+
+@pytest.fixture(scope="module")
+def robot() -> RobotDescription:
+    return desk_arm()
+
+
+def names(fit: Fit) -> set[tuple[str, str | None]]:
+    return {(effect.name, effect.where) for effect in fit.causes}
+
+
+def test_nothing_more_that_explains_nothing_is_worth_nothing() -> None:
+    assert nats(0.0, 0) == 0.0
+
+
+@given(NUMBERS)
+def test_numbers_that_explain_nothing_cost_something(dof: int) -> None:
+    assert nats(0.0, dof) < 0.0
+
+
+@given(GAINS, NUMBERS)
+def test_of_the_same_gain_more_numbers_are_worth_less(gain: float, dof: int) -> None:
+    assert nats(gain, dof + 1) < nats(gain, dof) < nats(gain, 0)
+
+
+@given(GAINS, st.floats(0.01, 1e3), NUMBERS)
+def test_more_gain_by_as_many_numbers_is_worth_more(gain: float, more: float, dof: int) -> None:
+    assert nats(gain + more, dof) > nats(gain, dof)
+
+
+@given(st.floats(-1e5, 1e5), st.integers(-12, 12))
+def test_the_worth_of_an_exchange_is_the_negative_of_that_of_the_exchange_back(gain: float, dof: int) -> None:
+    assert nats(-gain, -dof) == pytest.approx(-nats(gain, dof), abs=1e-9)
+
+
+def test_a_cause_that_a_better_one_makes_redundant_is_dropped(robot) -> None:
+    truth = Effect.at(robot, "joint_eccentricity", SHOULDER, values=[0.03, 0.0])
+    start = start_of(robot, walk(robot, 2), (truth,), 2)
+    worse = [Effect.at(robot, name, SHOULDER) for name in ("joint_scale", "joint_offset")]
+    hypotheses = [*worse, Effect.at(robot, "joint_eccentricity", SHOULDER)]
+    misled = start.with_causes([at_rest(effect) for effect in worse])
+    assert misled.log_likelihood - start.log_likelihood > 20.0
+    assert names(Search(hypotheses, lambda _: None).run(misled)) == {("joint_eccentricity", SHOULDER)}
+
+
+def test_a_cause_is_exchanged_for_a_rival_that_explains_more(robot) -> None:
+    coupling = Effect.at(robot, "joint_coupling", ELBOW, BASE, values=[0.02])
+    jump = Effect.at(robot, "encoder_jump", SHOULDER, values=[0.03, 40.1])
+    start = start_of(robot, walk(robot, 2), (coupling, jump), 2)
+    drift = Effect.at(robot, "thermal_drift")
+    hypotheses = [drift, Effect.at(robot, "encoder_jump", SHOULDER), Effect.at(robot, "joint_coupling", ELBOW, BASE)]
+    found = Search(hypotheses, lambda _: None).run(start.with_causes([at_rest(drift)]))
+    assert names(found) == {("joint_coupling", ELBOW), ("encoder_jump", SHOULDER)}
+
+
+@pytest.mark.parametrize("first", ["camera_pose", "link_geometry"])
+def test_of_two_causes_that_explain_the_same_the_simpler_one_is_named(first) -> None:
+    robot = surveyed_arm()
+    truth = Effect.at(robot, "link_geometry", BASE, values=[0.004, -0.003, 0.002, 0.01, -0.02, 0.015])
+    pose, link = Effect.at(robot, "camera_pose"), Effect.at(robot, "link_geometry", BASE)
+    assert simplicity(pose) < simplicity(link)
+    start = start_of(robot, walk(robot, 2), (truth,), 2)
+    hypotheses = [pose, link] if first == "camera_pose" else [link, pose]
+    assert names(Search(hypotheses, lambda _: None).run(start)) == {("camera_pose", None)}
+
+
+def test_an_offset_is_named_rather_than_a_link_that_can_do_the_same(robot) -> None:
+    truth = Effect.at(robot, "joint_offset", ELBOW, values=[0.02])
+    hypotheses = [Effect.at(robot, "link_geometry", ELBOW), Effect.at(robot, "joint_offset", ELBOW)]
+    found = Search(hypotheses, lambda _: None).run(start_of(robot, walk(robot, 2), (truth,), 2))
+    assert names(found) == {("joint_offset", ELBOW)}
+
+
+def test_several_causes_are_named_and_no_others(robot) -> None:
+    truth = (
+        Effect.at(robot, "joint_scale", SHOULDER, values=[0.01]),
+        Effect.at(robot, "backlash", ELBOW, values=[0.02]),
+        Effect.at(robot, "encoder_jump", BASE, values=[0.01, 40.1]),
+    )
+    kinds = ("joint_offset", "joint_scale", "joint_eccentricity", "backlash", "encoder_jump", "settling")
+    hypotheses = [Effect.at(robot, kind, joint) for kind in kinds for joint in (BASE, SHOULDER, ELBOW)]
+    search = Search(hypotheses, lambda _: None)
+    assert names(search.run(start_of(robot, walk(robot, 2), truth, 2))) == {(e.name, e.where) for e in truth}
+    sets = [frozenset(effect.key for effect in fit.causes) for fit in search.path]
+    assert len(set(sets)) == len(sets)
+
+
+def test_the_more_hypotheses_there_are_the_more_one_of_them_has_to_explain(robot) -> None:
+    start = start_of(robot, walk(robot, 2), (Effect.at(robot, "joint_offset", ELBOW, values=[0.02]),), 2)
+    offset = Effect.at(robot, "joint_offset", ELBOW)
+    few, many = Search([offset], lambda _: None), Search([offset] * 100, lambda _: None)
+    (candidate,) = few.shortlist(start, [offset])
+    assert many.doubt(candidate) > few.doubt(candidate) + NAMED
+
+
+class Undecided(Search):
+    """Exchanges one cause for the other whenever it is asked."""
+
+    asked = 0
+
+    def _second_thoughts(self, fit: Fit) -> tuple[Fit, bool]:
+        self.asked += 1
+        if self.asked > 20:
+            pytest.fail("the same sets of causes are tried again and again")
+        other = next(h for h in self._hypotheses if h.key != fit.causes[0].key)
+        return fit.with_causes([other]), True
+
+
+def test_a_search_that_would_exchange_two_causes_for_ever_ends_with_each_set_tried_once(robot) -> None:
+    truth = Effect.at(robot, "joint_offset", ELBOW, values=[0.02])
+    search = Undecided([at_rest(truth), Effect.at(robot, "joint_scale", ELBOW)], lambda _: None)
+    search.run(start_of(robot, walk(robot, 2), (truth,), 2))
+    # There, and back to a set that was seen.
+    assert search.asked <= 4

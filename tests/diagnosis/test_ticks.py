@@ -1,0 +1,87 @@
+"""Readings in whole ticks are seen as such, and how much of the noise is theirs."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from planted_cases import SIGMA_M, desk_arm, measured, walk
+
+from diagnosis.alignment import aligned
+from diagnosis.instrument import instrument_factor
+from diagnosis.observations import Observations, ticks
+from effects import Simulation
+from interfaces.records import FloatArray
+from interfaces.robot import RobotDescription
+
+TICK_RAD = 2.0 * np.pi / 4096
+# A coarser encoder: what its readings add to the noise is about as large as the instrument's own.
+COARSE_RAD = 2.0 * np.pi / 512
+
+
+@pytest.fixture(scope="module")
+def robot() -> RobotDescription:
+    return desk_arm()
+
+
+def rounded(q: FloatArray, tick: float) -> FloatArray:
+    return tick * np.round(q / tick)
+
+
+@pytest.mark.parametrize("tick", [TICK_RAD, COARSE_RAD, np.radians(0.1)])
+def test_the_tick_of_rounded_readings_is_found(robot, tick) -> None:
+    np.testing.assert_allclose(ticks(rounded(walk(robot, 1).q, tick)), tick, rtol=1e-6)
+
+
+def test_readings_that_are_not_rounded_have_no_tick(robot) -> None:
+    np.testing.assert_array_equal(ticks(walk(robot, 1).q), 0.0)
+
+
+def test_each_joint_has_its_own_tick(robot) -> None:
+    q = walk(robot, 1).q.copy()
+    q[:, 1], q[:, 2] = rounded(q[:, 1], TICK_RAD), rounded(q[:, 2], COARSE_RAD)
+    np.testing.assert_allclose(ticks(q), [0.0, TICK_RAD, COARSE_RAD, 0.0], rtol=1e-6)
+
+
+def test_a_joint_that_was_read_at_few_places_has_no_tick(robot) -> None:
+    q = np.repeat(rounded(walk(robot, 1).q[:15], TICK_RAD), 20, axis=0)
+    np.testing.assert_array_equal(ticks(q), 0.0)
+
+
+def noisy(robot: RobotDescription, factor: float, tick: float, seed: int) -> Observations:
+    """An instrument whose noise is `factor` times as large as it says, and encoders that read whole ticks."""
+    motion = walk(robot, seed, 400)
+    noise = factor * SIGMA_M * np.random.default_rng([seed, 1]).normal(size=(len(motion), 3))
+    x = Simulation(robot).positions(motion) + noise
+    read = dataclasses.replace(motion, q=rounded(motion.q, tick)) if tick else motion
+    return Observations.of(measured(robot, read, x), Simulation(robot))
+
+
+@pytest.mark.parametrize("factor", [0.5, 1.0, 2.0, 4.0])
+def test_the_size_of_the_instruments_noise_is_told_from_that_of_the_rounding(robot, factor) -> None:
+    found = [instrument_factor(aligned(noisy(robot, factor, COARSE_RAD, seed), Simulation(robot))) for seed in range(5)]
+    assert np.exp(np.mean(np.log(found))) == pytest.approx(factor, rel=0.15)
+
+
+@pytest.mark.parametrize("factor", [1.0, 3.0])
+def test_what_is_left_is_as_large_as_rounding_and_instrument_together_once_the_factor_is_known(robot, factor) -> None:
+    observations = noisy(robot, factor, COARSE_RAD, 1)
+    found = instrument_factor(aligned(observations, Simulation(robot)))
+    fit = aligned(observations.with_factor(found), Simulation(robot))
+    assert fit.noise.sigma == pytest.approx(1.0, abs=0.1)
+
+
+def test_the_rounding_of_whole_ticks_is_the_variance_that_the_joints_pass_on(robot) -> None:
+    observations = noisy(robot, 1.0, COARSE_RAD, 1)
+    simulation, motion = Simulation(robot), observations.motion
+    rng = np.random.default_rng(3)
+    offs = COARSE_RAD * rng.uniform(-0.5, 0.5, (400, *motion.q.shape))
+    shifts = [simulation.positions(dataclasses.replace(motion, q=motion.q + off)) for off in offs]
+    spread = np.var(shifts, axis=0).sum(axis=1)
+    ratio = np.trace(observations.rounding, axis1=1, axis2=2) / spread
+    assert np.median(ratio) == pytest.approx(1.0, abs=0.02)
+
+
+def test_without_ticks_the_stated_noise_is_kept(robot) -> None:
+    assert instrument_factor(aligned(noisy(robot, 3.0, 0.0, 1), Simulation(robot))) == 1.0
