@@ -97,6 +97,7 @@ def _standing(
             continue
         rival = search.refined(without.with_causes([*without.causes, candidate.effect]), candidate.effect.key)
         behind = nats(2.0 * (rival.log_likelihood - fit.log_likelihood), candidate.dof - itself.dof)
+        compared.append(candidate)
         tried.append(
             (rival, candidate.effect.key, behind - np.log(max(candidate.trials / max(itself.trials, 1), 1e-3)))
         )

@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 from effects import KINDS, Simulation
 
 # Of the largest derivative. That a spring's deflection changes its own load is left out.
-EXACT, AT_A_KNOT = 1e-3
-TO_FIRST_ORDER = 1e-5, 0.02
+EXACT, AT_A_KNOT, TO_FIRST_ORDER = 1e-5, 1e-3, 0.02
 MOTION = walk()
 OTHERS = (
     ("joint_scale", "elbow", None),
