@@ -4,18 +4,20 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import ClassVar
 
 import numpy as np
 from scipy.signal import lfilter
 
-from interfaces.records import FloatArray
+from interfaces.records import FloatArray, frozen_array
 
 from .motion import Motion
 from .parameter import Parameter
 
 # Of the numerical derivative of a play by its width [rad, m].
 _WIDTH_STEP = 1e-6
+_PLAYS_KEPT = 256
 # A magnet farther off its axis, as a share of its radius, is none that could be read.
 _FARTHEST_OFF = 0.95
 
@@ -172,8 +174,7 @@ class Backlash(EncoderEffect):
         return ((wider - self.correction(motion, place, values)) / _WIDTH_STEP)[:, None]
 
     def correction(self, motion: Motion, place: Place, values: FloatArray) -> FloatArray:
-        q = motion.q[:, place.joint]
-        return played(q, motion.runs, abs(float(values[0]))) * np.sign(values[0])
+        return _played(motion, place.joint, abs(float(values[0]))) * np.sign(values[0])
 
 
 class Settling(EncoderEffect):
@@ -224,6 +225,12 @@ def played(q: FloatArray, runs: list[tuple[int, int]], width: float) -> FloatArr
         play.begin(float(q[first]), float(leading[0]) if len(leading) else 0.0)
         lag[first:end] = [play.follow(reading) for reading in q[first:end].tolist()] - q[first:end]
     return lag
+
+
+@lru_cache(maxsize=_PLAYS_KEPT)
+def _played(motion: Motion, joint: int, width: float) -> FloatArray:
+    """`played` of one joint; a search asks for the same widths again and again."""
+    return frozen_array(played(motion.q[:, joint], motion.runs, width))
 
 
 ENCODER_EFFECTS: tuple[EncoderEffect, ...] = (
