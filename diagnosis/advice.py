@@ -8,6 +8,7 @@ from effects import Effect
 
 from .diagnosis import Diagnosis
 from .rivals import Rival, apart_on, widened
+from .search import describe
 
 # Twice the log-likelihood by which a motion has to tell two causes apart to be worth advising.
 _TELLS = 25.0
@@ -19,7 +20,9 @@ def advice(diagnosis: Diagnosis) -> tuple[str, ...]:
     for cause, standing in zip(diagnosis.causes, diagnosis.standings, strict=True):
         for rival in standing.rivals:
             if rival.is_same_anywhere:
-                told.append(f"No motion tells {_name(cause)} from {_name(rival.effect)}: mend whichever is easier.")
+                told.append(
+                    f"No motion tells {describe(cause)} from {describe(rival.effect)}: mend whichever is easier."
+                )
             else:
                 told.append(_motion(diagnosis, cause, rival))
     if diagnosis.left.is_there:
@@ -35,7 +38,7 @@ def advice(diagnosis: Diagnosis) -> tuple[str, ...]:
 def _motion(diagnosis: Diagnosis, cause: Effect, rival: Rival) -> str:
     """Which joint, moved through its whole range, tells two causes apart best."""
     robot, fit = diagnosis.extended.simulation.robot, diagnosis.extended
-    pair = f"{_name(cause)} from {_name(rival.effect)}"
+    pair = f"{describe(cause)} from {describe(rival.effect)}"
     apart = [apart_on(fit, rival.fit, widened(fit, [k])) for k in range(len(robot.joints))]
     best = int(np.argmax(apart))
     if apart[best] >= _TELLS:
@@ -44,8 +47,3 @@ def _motion(diagnosis: Diagnosis, cause: Effect, rival: Rival) -> str:
         span = f"{low * scale:.0f}{unit} to {high * scale:.0f}{unit}"
         return f"To tell {pair}, move joint {robot.joints[best]} through its whole range ({span}) in another recording."
     return f"To tell {pair}, record poses over the whole range of all joints, with stops and at different speeds."
-
-
-def _name(effect: Effect) -> str:
-    at = "" if effect.where is None else f" at {effect.where}"
-    return f"{effect.name}{at}{'' if effect.source is None else f' from {effect.source}'}"

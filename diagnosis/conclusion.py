@@ -22,7 +22,7 @@ from .result import (
     Unexplained,
     Verdict,
 )
-from .rivals import Rival, Standing
+from .rivals import Rival
 from .scan import Scan
 from .words import evidence, sentence
 
@@ -199,8 +199,3 @@ def _unexplained(diagnosis: Diagnosis) -> Unexplained:
     names = [joints[k] for k in left.joints] + (["time"] if left.with_time else [])
     rms = 1e3 * float(np.sqrt(np.square(left.explained).sum(axis=1).mean()))
     return Unexplained(rms, tuple(names), left.p_value, left.what)
-
-
-def standing_of(diagnosis: Diagnosis, cause: Effect) -> Standing:
-    """How a cause stands."""
-    return diagnosis.standings[[c.key for c in diagnosis.causes].index(cause.key)]

@@ -16,7 +16,7 @@ from interfaces.records import FloatArray
 from .alignment import aligned
 from .explanation import explain, without_one
 from .fit import Fit, fitted
-from .held_out import Added, Blocks, HeldOut, added, gain_percent, is_marker, without_cause
+from .held_out import Added, Blocks, HeldOut, added, gain_percent, is_marker
 from .hypotheses import Hypotheses
 from .instrument import instrument_factor
 from .leftover import Leftover, leftover
@@ -120,7 +120,7 @@ class Diagnosis:
     def without(self) -> dict[tuple[str, str | None, str | None], FloatArray]:
         """Distances (n,) [m] on rows not fitted, without each of the causes."""
         smooth = self.left.held_out
-        errors = {c.key: HeldOut(without_cause(self.extended, c), self.blocks).errors - smooth for c in self.causes}
+        errors = {c.key: HeldOut(self.extended.without(c), self.blocks).errors - smooth for c in self.causes}
         return {key: np.linalg.norm(error, axis=1) for key, error in errors.items()}
 
     @cached_property

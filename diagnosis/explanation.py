@@ -90,8 +90,7 @@ def _with_unknown(fit: Fit, unknowns: Unknowns, search: Search) -> Explanation:
 def _pruned(explanation: Explanation, unknowns: Unknowns, search: Search) -> Explanation:
     """Without causes that are not worth it beside what has no name."""
     for cause in explanation.fit.causes:
-        others = [effect for effect in explanation.fit.causes if effect.key != cause.key]
-        fewer = _with_unknown(explanation.fit.with_causes(others), unknowns, search)
+        fewer = without_one(explanation, cause, unknowns, search)
         if fewer.unknown and fewer.worth > explanation.worth - NAMED:
             return _pruned(fewer, unknowns, search)
     return explanation
@@ -99,5 +98,4 @@ def _pruned(explanation: Explanation, unknowns: Unknowns, search: Search) -> Exp
 
 def without_one(explanation: Explanation, cause: Effect, unknowns: Unknowns, search: Search) -> Explanation:
     """The explanation without one of its causes."""
-    others = [effect for effect in explanation.fit.causes if effect.key != cause.key]
-    return _with_unknown(explanation.fit.with_causes(others), unknowns, search)
+    return _with_unknown(explanation.fit.without(cause), unknowns, search)

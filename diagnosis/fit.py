@@ -144,6 +144,10 @@ class Fit:
         information = flat.T @ flat / self.noise.sigma**2 + np.diag(prior_precision(self.simulation, self.nuisances))
         return np.asarray(np.linalg.pinv(information, rcond=1e-14, hermitian=True), dtype=np.float64)
 
+    def without(self, cause: Effect) -> Fit:
+        """All causes but one, refitted."""
+        return self.with_causes([effect for effect in self.causes if effect.key != cause.key])
+
     def with_causes(self, causes: Sequence[Effect]) -> Fit:
         """Other causes in the place of these, all refitted."""
         effects = (*self.simulation.effects[: self.nuisances], *causes)
@@ -189,9 +193,13 @@ def _step(fit: Fit) -> FloatArray:
     values = np.concatenate([effect.values[effect.amounts] for effect in fit.simulation.effects])
     normal = flat.T @ flat + np.diag(precision)
     gradient = flat.T @ fit.left.ravel() - precision * values
+    return solved(normal, gradient)
+
+
+def solved(normal: FloatArray, gradient: FloatArray) -> FloatArray:
+    """The shortest solution (p,) of normal equations, in units in which each column has the same length."""
     scales = np.sqrt(np.maximum(np.diag(normal), 1e-300))
-    solved = np.linalg.lstsq(normal / np.outer(scales, scales), gradient / scales, rcond=1e-12)[0]
-    return solved / scales
+    return np.linalg.lstsq(normal / np.outer(scales, scales), gradient / scales, rcond=1e-12)[0] / scales
 
 
 def _moved(simulation: Simulation, step: FloatArray) -> Simulation:

@@ -12,10 +12,9 @@ from functools import cached_property
 import numpy as np
 from scipy import stats
 
-from effects import Effect
 from interfaces.records import FloatArray
 
-from .fit import Fit, prior_precision
+from .fit import LARGEST, Fit, prior_precision, solved
 from .observations import IntArray
 from .scan import Candidate
 
@@ -74,7 +73,7 @@ class HeldOut:
         metric = fit.run_columns
         for fold in range(_FOLDS):
             own = self._blocks.fold == fold
-            step = _without(fit.columns, fit.left, own, precision)
+            step = _solve(fit.columns[~own], fit.left[~own], precision)
             errors[own] -= metric[own] @ step
         return errors
 
@@ -117,7 +116,7 @@ def added(fit: Fit, candidate: Candidate, blocks: Blocks) -> Added:
     own = fit.weighted(fit.run.columns(effect)[:, :, effect.amounts])
     columns = np.concatenate([fit.columns, own], axis=2)
     usual = np.array([effect.parameters[j].usual for j in effect.amounts])
-    ridge = np.concatenate([prior_precision(fit.simulation, fit.nuisances), 1.0 / np.square(30.0 * usual)])
+    ridge = np.concatenate([prior_precision(fit.simulation, fit.nuisances), 1.0 / np.square(LARGEST * usual)])
     precision = np.diag(ridge) * fit.noise.sigma**2
     with_it, without = fit.left.copy(), fit.left.copy()
     for fold in range(_FOLDS):
@@ -169,19 +168,6 @@ def is_marker(fit: Fit) -> np.ndarray:
     return fit.noise.weights >= _MARKER
 
 
-def _without(columns: FloatArray, left: FloatArray, rows: np.ndarray, precision: FloatArray) -> FloatArray:
-    """How the amounts move (p,) when the rows are left out."""
-    return _solve(columns[~rows], left[~rows], precision)
-
-
 def _solve(columns: FloatArray, left: FloatArray, precision: FloatArray) -> FloatArray:
     flat = columns.reshape(-1, columns.shape[2])
-    normal = flat.T @ flat + precision
-    scales = np.sqrt(np.maximum(np.diag(normal), 1e-300))
-    solved = np.linalg.lstsq(normal / np.outer(scales, scales), flat.T @ left.ravel() / scales, rcond=1e-12)[0]
-    return solved / scales
-
-
-def without_cause(fit: Fit, cause: Effect) -> Fit:
-    """The fit without one of its causes, all others refitted."""
-    return fit.with_causes([effect for effect in fit.causes if effect.key != cause.key])
+    return solved(flat.T @ flat + precision, flat.T @ left.ravel())

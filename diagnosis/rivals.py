@@ -12,7 +12,7 @@ from effects import Effect, Motion
 from interfaces.records import FloatArray
 
 from .fit import Fit
-from .held_out import Blocks, without_cause
+from .held_out import Blocks
 from .scan import Candidate, Scan
 from .search import Search, nats
 from .stability import named_again
@@ -85,7 +85,7 @@ def standings(fit: Fit, hypotheses: Sequence[Effect], search: Search, blocks: Bl
 def _standing(
     fit: Fit, cause: Effect, hypotheses: Sequence[Effect], search: Search, blocks: Blocks, seed: int
 ) -> Standing:
-    without = without_cause(fit, cause)
+    without = fit.without(cause)
     gain = 2.0 * (fit.log_likelihood - without.log_likelihood)
     itself = Scan(without).candidate(cause) or Candidate(cause, gain, 1)
     worth = nats(gain, itself.dof) - search.doubt(itself)
