@@ -16,7 +16,7 @@ from interfaces.records import FloatArray
 from .alignment import aligned
 from .explanation import explain, without_one
 from .fit import Fit, fitted
-from .held_out import Added, Blocks, HeldOut, added, gain_percent, is_marker
+from .held_out import Added, Blocks, added, gain_percent, held_out_errors, is_marker
 from .hypotheses import Hypotheses
 from .instrument import instrument_factor
 from .leftover import Leftover, leftover
@@ -73,12 +73,17 @@ class Diagnosis:
         return self.extended.causes
 
     @cached_property
-    def held_out(self) -> dict[str, FloatArray]:
-        """Distances (n,) [m] of each simulation on rows that it was not fitted to."""
+    def errors(self) -> dict[str, FloatArray]:
+        """Measured minus predicted (n, 3) [m] by each simulation, on rows that it was not fitted to."""
         fits = {"nominal": self.nominal, "aligned": self.aligned, "geometry": self.geometry, "extended": self.extended}
-        errors = {name: HeldOut(fit, self.blocks).errors for name, fit in fits.items()}
-        errors["extended"] = errors["extended"] - self.left.held_out
-        return {name: np.linalg.norm(error, axis=1) for name, error in errors.items()}
+        errors = {name: held_out_errors(fit, self.blocks) for name, fit in fits.items()}
+        errors["extended"] -= self.left.held_out
+        return errors
+
+    @cached_property
+    def held_out(self) -> dict[str, FloatArray]:
+        """Lengths (n,) [m] of `errors`."""
+        return {name: np.linalg.norm(error, axis=1) for name, error in self.errors.items()}
 
     @cached_property
     def markers(self) -> np.ndarray:
@@ -120,7 +125,7 @@ class Diagnosis:
     def without(self) -> dict[tuple[str, str | None, str | None], FloatArray]:
         """Distances (n,) [m] on rows not fitted, without each of the causes."""
         smooth = self.left.held_out
-        errors = {c.key: HeldOut(self.extended.without(c), self.blocks).errors - smooth for c in self.causes}
+        errors = {c.key: held_out_errors(self.extended.without(c), self.blocks) - smooth for c in self.causes}
         return {key: np.linalg.norm(error, axis=1) for key, error in errors.items()}
 
     @cached_property
@@ -136,7 +141,7 @@ class Diagnosis:
         """The hypotheses that were not taken, as each would do best beside the causes."""
         present = {cause.key for cause in self.causes}
         candidates = Scan(self.extended).candidates(h for h in self.hypotheses.effects if h.key not in present)
-        return [(candidate, added(self.extended, candidate, self.blocks)) for candidate in candidates]
+        return list(zip(candidates, added(self.extended, candidates, self.blocks), strict=True))
 
 
 def diagnose(

@@ -6,12 +6,13 @@ of the other blocks and g the gradient of the block's own likelihood, the amount
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from scipy import stats
 
+from effects import Effect
 from interfaces.records import FloatArray
 
 from .fit import LARGEST, Fit, prior_precision, solved
@@ -56,31 +57,16 @@ class Blocks:
         return sums
 
 
-class HeldOut:
-    """Errors of one fit on rows that it was not fitted to."""
-
-    def __init__(self, fit: Fit, blocks: Blocks) -> None:
-        self._fit, self._blocks = fit, blocks
-
-    @cached_property
-    def errors(self) -> FloatArray:
-        """Measured minus predicted (n, 3) [m], each row predicted without its own fold."""
-        fit = self._fit
-        errors = fit.observations.x - fit.run.measured
-        if not fit.columns.shape[2]:
-            return errors
-        precision = np.diag(prior_precision(fit.simulation, fit.nuisances)) * fit.noise.sigma**2
-        metric = fit.run_columns
-        for fold in range(_FOLDS):
-            own = self._blocks.fold == fold
-            step = _solve(fit.columns[~own], fit.left[~own], precision)
-            errors[own] -= metric[own] @ step
+def held_out_errors(fit: Fit, blocks: Blocks) -> FloatArray:
+    """Measured minus predicted (n, 3) [m], each row predicted without its own fold."""
+    errors = fit.observations.x - fit.run.measured
+    if not fit.columns.shape[2]:
         return errors
-
-    @cached_property
-    def distances(self) -> FloatArray:
-        """Lengths (n,) of `errors` [m]."""
-        return np.linalg.norm(self.errors, axis=1)
+    precision = np.diag(prior_precision(fit.simulation, fit.nuisances)) * fit.noise.sigma**2
+    for fold in range(_FOLDS):
+        own = blocks.fold == fold
+        errors[own] -= fit.run_columns[own] @ _solve(fit.columns[~own], fit.left[~own], precision)
+    return errors
 
 
 def gain_percent(before: FloatArray, after: FloatArray, blocks: Blocks, seed: int) -> tuple[float, tuple[float, float]]:
@@ -110,24 +96,29 @@ class Added:
     p_value: float
 
 
-def added(fit: Fit, candidate: Candidate, blocks: Blocks) -> Added:
-    """What the candidate would bring on top of a fit, to first order."""
-    effect = candidate.effect
+def added(fit: Fit, candidates: Sequence[Candidate], blocks: Blocks) -> list[Added]:
+    """What each of the candidates would bring on top of a fit, to first order."""
+    before = _held_out_square(fit, fit.columns, prior_precision(fit.simulation, fit.nuisances), blocks)
+    return [_added(fit, candidate.effect, before, blocks) for candidate in candidates]
+
+
+def _added(fit: Fit, effect: Effect, before: float, blocks: Blocks) -> Added:
     own = fit.weighted(fit.run.columns(effect)[:, :, effect.amounts])
-    columns = np.concatenate([fit.columns, own], axis=2)
     usual = np.array([effect.parameters[j].usual for j in effect.amounts])
-    ridge = np.concatenate([prior_precision(fit.simulation, fit.nuisances), 1.0 / np.square(LARGEST * usual)])
-    precision = np.diag(ridge) * fit.noise.sigma**2
-    with_it, without = fit.left.copy(), fit.left.copy()
-    for fold in range(_FOLDS):
-        rows = blocks.fold == fold
-        train = ~rows
-        with_it[rows] -= columns[rows] @ _solve(columns[train], fit.left[train], precision)
-        if fit.columns.shape[2]:
-            k = fit.columns.shape[2]
-            without[rows] -= fit.columns[rows] @ _solve(fit.columns[train], fit.left[train], precision[:k, :k])
-    before, after = np.square(without).sum(), np.square(with_it).sum()
-    return Added(float(100.0 * (1.0 - after / max(before, 1e-300))), block_p_value(fit, own, blocks))
+    precision = [prior_precision(fit.simulation, fit.nuisances), 1.0 / np.square(LARGEST * usual)]
+    after = _held_out_square(fit, np.concatenate([fit.columns, own], axis=2), np.concatenate(precision), blocks)
+    return Added(100.0 * (1.0 - after / max(before, 1e-300)), block_p_value(fit, own, blocks))
+
+
+def _held_out_square(fit: Fit, columns: FloatArray, precision: FloatArray, blocks: Blocks) -> float:
+    """Sum of the squares that columns (n, 3, p) leave of what a fit has left, on rows that were not fitted."""
+    left = fit.left.copy()
+    if columns.shape[2]:
+        ridge = np.diag(precision) * fit.noise.sigma**2
+        for fold in range(_FOLDS):
+            rows = blocks.fold == fold
+            left[rows] -= columns[rows] @ _solve(columns[~rows], fit.left[~rows], ridge)
+    return float(np.square(left).sum())
 
 
 def block_p_value(fit: Fit, columns: FloatArray, blocks: Blocks) -> float:

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from diagnosis.diagnosis import Diagnosis
-from diagnosis.held_out import HeldOut
 from effects import Effect, Simulation
 from interfaces.camera import StereoCalibration
 from interfaces.records import FloatArray
@@ -46,12 +45,12 @@ class Residuals:
     @cached_property
     def before(self) -> FloatArray:
         """Of the aligned simulation."""
-        return HeldOut(self.diagnosis.aligned, self.diagnosis.blocks).errors
+        return self.diagnosis.errors["aligned"]
 
     @cached_property
     def after(self) -> FloatArray:
         """Of the extended simulation."""
-        return HeldOut(self.diagnosis.extended, self.diagnosis.blocks).errors
+        return self.diagnosis.errors["extended"]
 
     def some(self, count: int, rows: NDArray[np.intp] | None = None) -> NDArray[np.intp]:
         """At most so many of the rows, in their order, drawn with the diagnosis' seed."""
