@@ -14,6 +14,7 @@ from interfaces.recording import Recording
 from interfaces.records import FloatArray
 
 from .alignment import aligned
+from .contact import before_contact
 from .explanation import explain, without_one
 from .fit import Fit, fitted
 from .held_out import Added, Blocks, added, gain_percent, held_out_errors, is_marker
@@ -97,7 +98,7 @@ class Diagnosis:
 
     @property
     def _off(self) -> np.ndarray:
-        return ~self.markers & self.extended.observations.trusted
+        return ~self.markers & self.extended.observations.trusted & ~before_contact(self.extended)
 
     @property
     def outliers_are_found(self) -> bool:
@@ -166,8 +167,9 @@ def diagnose(
     search = Search(hypotheses.effects, tell)
     extended = search.run(start)
     factor, unknown_side = instrument_factor(extended), before_contact(extended)
-    if abs(np.log(factor)) > _SAME_NOISE or unknown_side.any():
-        observations = observations.with_factor(factor).without(unknown_side)
+    doubtful = unknown_side if unknown_side.mean() <= _MOST_DOUBTFUL else np.zeros_like(unknown_side)
+    if abs(np.log(factor)) > _SAME_NOISE or doubtful.any():
+        observations = observations.with_factor(factor).without(doubtful)
         start = aligned(observations, simulation)
         extended = search.run(start.with_causes(extended.causes))
         search.path.insert(0, start)
@@ -195,20 +197,6 @@ def diagnose(
         blocks=blocks,
         seed=seed,
     )
-
-
-def before_contact(fit: Fit) -> np.ndarray:
-    """Rows (n,) at which nobody knows on which side of its play a joint is: it has not crossed it in this run yet."""
-    motion = fit.observations.motion
-    rows = np.zeros(len(motion), dtype=np.bool_)
-    for cause in fit.causes:
-        if cause.name != "backlash":
-            continue
-        q = motion.q[:, fit.simulation.place(cause).joint]
-        for first, end in motion.runs:
-            crossed = np.maximum.accumulate(q[first:end]) - np.minimum.accumulate(q[first:end]) >= cause.values[0]
-            rows[first:end] |= ~crossed
-    return rows if rows.mean() <= _MOST_DOUBTFUL else np.zeros_like(rows)
 
 
 def _geometry(start: Fit) -> Fit:

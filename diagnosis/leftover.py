@@ -11,7 +11,8 @@ from interfaces.records import FloatArray
 
 from .explanation import Explanation
 from .held_out import Blocks
-from .unknown import TIME, Unknowns
+from .sensitivity import joints_of
+from .unknown import Unknowns
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,11 +53,12 @@ def leftover(explanation: Explanation, unknowns: Unknowns, blocks: Blocks) -> Le
     families = [unknowns.families[index] for index in explanation.unknown]
     gain, dof = unknowns.gain(fit, explanation.unknown)
     explained, held_out = unknowns.predicted(fit, explanation.unknown, blocks)
-    involved = {joint for family in families for joint in (*family.at, *family.drivers)}
+    numbers = unknowns.numbers(fit, explanation.unknown)
+    joints = [joints_of(family, own, fit.run) for family, own in zip(families, numbers, strict=True)]
     return Leftover(
         what=tuple(family.what for family in families),
-        joints=tuple(sorted(involved - {TIME})),
-        with_time=TIME in involved,
+        joints=tuple(sorted(frozenset[int]().union(*joints))),
+        with_time=any(family.over_time for family in families),
         p_value=float(stats.chi2.sf(gain, dof)),
         explained=explained,
         held_out=held_out,

@@ -1,26 +1,22 @@
-"""Ways to differ that no effect of the table covers: any smooth error of a joint, a link, the tool or the cameras.
+"""What has no name beside what has: families of linear functions that compete with the named effects.
 
-Each is a family of linear functions: what moves, times what it may depend on. They compete with the named effects, so
-that one of these is not named where something else is at work.
+So an effect is not named where something else is at work.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 
 import numpy as np
 from scipy import stats
 
-from effects import Effect, Simulated
 from interfaces.records import FloatArray
 
+from .families import families
 from .fit import Fit
 from .held_out import Blocks, scores_p_value
 from .search import nats
 
-_HARMONICS, _TIMES = 5, 4
-TIME = -1
 # What has no name has to be so much more probable than what has one [nats].
 _NO_NAME = 8.0
 # What one of its numbers costs [nats].
@@ -30,126 +26,6 @@ _TOLD, _LEFT = 1e-6, 1e-7
 # Whether blocks of time agree is asked of so many of a family's directions.
 _STRONGEST = 4
 _RIDGE = 1e-6
-
-
-@dataclass(frozen=True, eq=False)
-class Family:
-    """One way to differ.
-
-    Attributes:
-        what: in a few words.
-        at: the joints at which it acts, by their places in q.
-        drivers: the joints on which it may depend; `TIME` for time.
-        columns: derivatives (n, 3, p) of what is measured by its numbers [m].
-    """
-
-    what: str
-    at: tuple[int, ...]
-    drivers: tuple[int, ...]
-    columns: Callable[[Simulated], FloatArray]
-
-
-def families(run: Simulated) -> list[Family]:
-    """All that this motion can show."""
-    robot, motion = run.simulation.robot, run.motion
-    joints = [k for k in range(motion.q.shape[1]) if np.ptp(motion.q[:, k]) > 1e-4]
-    names = robot.joints
-    found = []
-    for k in joints:
-        for j in joints:
-            found.append(Family(f"an error of {names[k]} that depends on {names[j]}", (k,), (j,), _of_joint(k, j)))
-            if j != k:
-                what = f"an error of {names[k]} that depends on itself and {names[j]} together"
-                found.append(Family(what, (k,), (k, j), _of_both(k, j)))
-        if motion.t is not None:
-            found.append(Family(f"an error of {names[k]} that changes with time", (k,), (TIME,), _of_time(k)))
-            found.append(Family(f"the link before {names[k]} changes with time", (k,), (TIME,), _link_over_time(k)))
-        if run.simulation.gravity.known:
-            what = f"what carries {names[k]} gives under the arm's weight"
-            found.append(Family(what, (k,), tuple(j for j in joints if j >= k), _link_under_weight(k)))
-    if motion.t is not None:
-        found.append(Family("the tool changes with time", (), (TIME,), _tool_over_time))
-        found.append(Family("the camera moves with time", (), (TIME,), _camera_over_time))
-    found.append(Family("an error that depends on where the marker is in the image", (), tuple(joints), _in_image))
-    return found
-
-
-def _of_joint(k: int, j: int) -> Callable[[Simulated], FloatArray]:
-    return lambda run: _moved(run.by_joint[:, :, [k]], _with_one(_harmonics(run, j, _HARMONICS)))
-
-
-def _of_both(k: int, j: int) -> Callable[[Simulated], FloatArray]:
-    def columns(run: Simulated) -> FloatArray:
-        both = _harmonics(run, k, 2)[:, :, None] * _harmonics(run, j, 2)[:, None, :]
-        alone = [_harmonics(run, k, 2), _harmonics(run, j, 2)]
-        return _moved(run.by_joint[:, :, [k]], _with_one(np.concatenate([*alone, both.reshape(len(both), -1)], axis=1)))
-
-    return columns
-
-
-def _of_time(k: int) -> Callable[[Simulated], FloatArray]:
-    return lambda run: _moved(run.by_joint[:, :, [k]], _times(run, 2 * _TIMES))
-
-
-def _link(run: Simulated, k: int) -> FloatArray:
-    simulation = run.simulation
-    return run.columns(Effect.at(simulation.robot, "link_geometry", simulation.robot.joints[k]))
-
-
-def _link_over_time(k: int) -> Callable[[Simulated], FloatArray]:
-    return lambda run: _moved(_link(run, k), _times(run, _TIMES))
-
-
-def _link_under_weight(k: int) -> Callable[[Simulated], FloatArray]:
-    def columns(run: Simulated) -> FloatArray:
-        link = _link(run, k)
-        return np.concatenate([link, _moved(link[:, :, 3:], run.loads[:, k])], axis=2)
-
-    return columns
-
-
-def _tool_over_time(run: Simulated) -> FloatArray:
-    return _moved(run.columns(Effect.at(run.simulation.robot, "tool_offset")), _times(run, _TIMES))
-
-
-def _camera_over_time(run: Simulated) -> FloatArray:
-    return _moved(run.columns(Effect.at(run.simulation.robot, "camera_pose")), _times(run, _TIMES))
-
-
-def _in_image(run: Simulated) -> FloatArray:
-    x = run.measured
-    depth = np.where(np.abs(x[:, 2]) > 1e-3, x[:, 2], 1e-3)
-    scale = float(np.median(np.abs(depth)))
-    place = np.stack([x[:, 0] / depth, x[:, 1] / depth, depth / scale - 1.0], axis=1)
-    products = [place[:, [i]] * place[:, [j]] for i in range(3) for j in range(i, 3)]
-    cubes = [place[:, [i]] * place[:, [j]] * place[:, [k]] for i in range(3) for j in range(i, 3) for k in range(j, 3)]
-    amounts = np.concatenate([place, *products, *cubes], axis=1)
-    return _moved(np.broadcast_to(np.eye(3), (len(x), 3, 3)), _with_one(amounts))
-
-
-def _harmonics(run: Simulated, j: int, count: int) -> FloatArray:
-    """Sines and cosines (n, 2 count) of a joint's reading; of a slide, of its path as half a turn."""
-    q = run.motion.q[:, j]
-    if run.simulation.robot.chain.prismatic[j]:
-        q = np.pi * (q - q.min()) / max(float(np.ptp(q)), 1e-9)
-    return np.concatenate([f(h * q)[:, None] for h in range(1, count + 1) for f in (np.sin, np.cos)], axis=1)
-
-
-def _times(run: Simulated, count: int) -> FloatArray:
-    """One, and cosines (n, count + 1) over the time of the recording."""
-    clock = run.motion.clock
-    share = (clock - clock[0]) / max(float(clock[-1] - clock[0]), 1e-9)
-    return np.cos(np.pi * share[:, None] * np.arange(count + 1))
-
-
-def _with_one(amounts: FloatArray) -> FloatArray:
-    """The error may have a part that depends on nothing: it belongs to the same cause."""
-    return np.concatenate([np.ones((len(amounts), 1)), amounts], axis=1)
-
-
-def _moved(moves: FloatArray, amounts: FloatArray) -> FloatArray:
-    """Every move (n, 3, a) by every amount (n, b): (n, 3, a b)."""
-    return (moves[:, :, :, None] * amounts[:, None, None, :]).reshape(len(moves), 3, -1)
 
 
 class Unknowns:
@@ -164,7 +40,8 @@ class Unknowns:
         ends = np.cumsum([part.shape[2] for part in columns])
         self._slices = [slice(end - part.shape[2], end) for end, part in zip(ends, columns, strict=True)]
         self._columns = np.concatenate(columns, axis=2).reshape(start.left.size, -1)
-        self._columns /= np.maximum(np.linalg.norm(self._columns, axis=0), 1e-300)
+        self._scales = np.maximum(np.linalg.norm(self._columns, axis=0), 1e-300)
+        self._columns /= self._scales
         self._doubt = float(np.log(len(self.families))) + _NO_NAME
 
     def beside(self, fit: Fit, others: Sequence[int] = ()) -> tuple[FloatArray, FloatArray]:
@@ -228,6 +105,16 @@ class Unknowns:
         both = np.stack([explained, held_out], axis=1).reshape(*fit.left.shape, 2) / weights
         metres = np.asarray(np.linalg.solve(fit.observations.whitening, both), dtype=np.float64)
         return metres[:, :, 0], metres[:, :, 1]
+
+    def numbers(self, fit: Fit, chosen: Sequence[int]) -> list[FloatArray]:
+        """The numbers of families, each (p,), that explain most of what a fit leaves."""
+        basis = fit.orthogonal.reshape(fit.left.size, -1)
+        weights = np.repeat(fit.root_weights[:, 0], 3)[:, None]
+        columns = np.concatenate([self._columns[:, self._slices[index]] for index in chosen], axis=1) * weights
+        columns = columns - basis @ (basis.T @ columns)
+        solved = np.linalg.lstsq(columns, fit.left.ravel(), rcond=float(np.sqrt(_LEFT)))[0]
+        parts = np.split(solved, np.cumsum([self._columns[:, self._slices[index]].shape[1] for index in chosen])[:-1])
+        return [part / self._scales[self._slices[index]] for part, index in zip(parts, chosen, strict=True)]
 
     def agreed(self, fit: Fit, others: Sequence[int], index: int) -> float:
         """What a family is worth by the agreement of blocks of time [nats]."""

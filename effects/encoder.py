@@ -215,22 +215,23 @@ class Play:
         return self._output
 
 
-def played(q: FloatArray, runs: list[tuple[int, int]], width: float) -> FloatArray:
-    """Output minus input (n,) of a play of `width` that is driven by q (n,); each run begins where q leads first."""
-    lag = np.zeros_like(q)
-    for first, end in runs:
-        moves = np.diff(q[first:end])
-        leading = moves[np.flatnonzero(moves)[:1]]
-        play = Play(width)
-        play.begin(float(q[first]), float(leading[0]) if len(leading) else 0.0)
-        lag[first:end] = [play.follow(reading) for reading in q[first:end].tolist()] - q[first:end]
-    return lag
+def played(q: FloatArray, width: float) -> FloatArray:
+    """Output minus input (n,) of a play of `width` that is driven by q (n,), which leads in its first direction.
+
+    Between two runs it is driven straight from the last reading of one to the first of the next: on which side it was
+    left is known, and what goes far ends on the side to which it went.
+    """
+    moves = np.diff(q)
+    leading = moves[np.flatnonzero(moves)[:1]]
+    play = Play(width)
+    play.begin(float(q[0]), float(leading[0]) if len(leading) else 0.0)
+    return np.array([play.follow(reading) for reading in q.tolist()]) - q
 
 
 @lru_cache(maxsize=_PLAYS_KEPT)
 def _played(motion: Motion, joint: int, width: float) -> FloatArray:
     """`played` of one joint; a search asks for the same widths again and again."""
-    return frozen_array(played(motion.q[:, joint], motion.runs, width))
+    return frozen_array(played(motion.q[:, joint], width))
 
 
 ENCODER_EFFECTS: tuple[EncoderEffect, ...] = (

@@ -230,9 +230,12 @@ class Simulated:
         return self.simulation.gravity.torques(self.q)
 
     @cached_property
-    def loads(self) -> FloatArray:
-        """Gravity's moments (n, d, 3) [N·m] about each joint's origin, in its frame on its parent link."""
-        return self.simulation.gravity.loads(self.q)[0]
+    def wrenches(self) -> FloatArray:
+        """What gravity does to all that each joint carries (n, d, 6), in the joint's frame on its parent link.
+
+        Moments about its origin [N·m], then forces [N].
+        """
+        return np.concatenate(self.simulation.gravity.loads(self.q), axis=2)
 
     def columns(self, effect: Effect) -> FloatArray:
         """Derivative (n, 3, p) of what is measured by the effect's values, at its values; zeros for no amounts."""

@@ -23,24 +23,24 @@ def robot(tmp_path_factory):
 
 @given(PATHS, WIDTHS)
 def test_a_play_never_lags_by_more_than_half_its_width(q, width) -> None:
-    assert np.abs(played(q, [(0, len(q))], width)).max() <= 0.5 * width + 1e-12  # of readings around 1
+    assert np.abs(played(q, width)).max() <= 0.5 * width + 1e-12  # of readings around 1
 
 
 @given(PATHS, WIDTHS)
 def test_the_output_of_a_play_moves_only_where_its_input_does_and_the_same_way(q, width) -> None:
-    output = q + played(q, [(0, len(q))], width)
+    output = q + played(q, width)
     assert (np.diff(output) * np.diff(q) >= -1e-15).all()
 
 
 @given(st.lists(st.floats(0.01, 0.1), min_size=2, max_size=40), WIDTHS)
 def test_a_play_that_is_driven_one_way_lags_by_half_its_width(steps, width) -> None:
     q = np.cumsum(steps)
-    np.testing.assert_allclose(played(q, [(0, len(q))], width), -0.5 * width, atol=1e-12)
+    np.testing.assert_allclose(played(q, width), -0.5 * width, atol=1e-12)
 
 
 def test_a_play_rests_until_its_width_is_crossed() -> None:
     q = np.array([0.0, 0.1, 0.08, 0.05, 0.0])
-    output = q + played(q, [(0, 5)], 0.04)
+    output = q + played(q, 0.04)
     np.testing.assert_allclose(output, [-0.02, 0.08, 0.08, 0.07, 0.02], atol=1e-15)
 
 

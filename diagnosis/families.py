@@ -1,0 +1,157 @@
+"""Ways to differ that no effect of the table covers: any smooth error of a joint, a link, the tool or the cameras."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from effects import Effect, Simulated
+from interfaces.records import FloatArray
+
+_HARMONICS, _TIMES = 5, 4
+Columns = Callable[[Simulated], FloatArray]
+
+
+@dataclass(frozen=True, eq=False)
+class Family:
+    """One way to differ.
+
+    Attributes:
+        what: in a few words.
+        at: the joints that err, by their places in q.
+        over_time: whether it depends on time.
+        moves: what moves, by one unit each (n, 3, a) [m].
+        amounts: what it may depend on (n, b); each of the moves is any linear function of it.
+    """
+
+    what: str
+    at: tuple[int, ...]
+    over_time: bool
+    moves: Columns
+    amounts: Columns
+
+    def columns(self, run: Simulated) -> FloatArray:
+        """Derivatives (n, 3, a b) of what is measured by its numbers [m]."""
+        moves, amounts = self.moves(run), self.amounts(run)
+        return (moves[:, :, :, None] * amounts[:, None, None, :]).reshape(len(moves), 3, -1)
+
+    def moved_by(self, run: Simulated, numbers: FloatArray) -> FloatArray:
+        """By how much each of the moves is there (n, a) with these numbers (a b,)."""
+        amounts = self.amounts(run)
+        return amounts @ numbers.reshape(-1, amounts.shape[1]).T
+
+
+def families(run: Simulated) -> list[Family]:
+    """All that this motion can show."""
+    robot, motion = run.simulation.robot, run.motion
+    joints = [k for k in range(motion.q.shape[1]) if np.ptp(motion.q[:, k]) > 1e-4]
+    names, timed = robot.joints, motion.t is not None
+    found = []
+    for k in joints:
+        joint, link = _joint(k), _link(k)
+        for j in joints:
+            what = f"an error of {names[k]} that depends on {names[j]}"
+            found.append(Family(what, (k,), False, joint, _any_of_joint(j)))
+            if j != k:
+                what = f"an error of {names[k]} that depends on itself and {names[j]} together"
+                found.append(Family(what, (k,), False, joint, _any_of_both(k, j)))
+        if timed:
+            what = f"an error of {names[k]} that changes with time"
+            found.append(Family(what, (k,), True, joint, _any_of_time(2 * _TIMES)))
+            what = f"the link before {names[k]} changes with time"
+            found.append(Family(what, (k,), True, link, _any_of_time(_TIMES)))
+        if run.simulation.gravity.known:
+            what = f"what carries {names[k]} gives under the arm's weight"
+            found.append(Family(what, (), False, link, _moments(k)))
+            found.append(Family(what, (), False, link, _wrenches(k)))
+    if timed:
+        found.append(Family("the tool changes with time", (), True, _tool, _any_of_time(_TIMES)))
+        found.append(Family("the camera moves with time", (), True, _camera, _any_of_time(_TIMES)))
+    what = "an error that depends on where the marker is in the image"
+    found.append(Family(what, (), False, _anywhere, _places_in_image))
+    return found
+
+
+def _joint(k: int) -> Columns:
+    return lambda run: run.by_joint[:, :, [k]]
+
+
+def _link(k: int) -> Columns:
+    return lambda run: run.columns(
+        Effect.at(run.simulation.robot, "link_geometry", run.simulation.robot.joints[k])
+    )
+
+
+def _tool(run: Simulated) -> FloatArray:
+    return run.columns(Effect.at(run.simulation.robot, "tool_offset"))
+
+
+def _camera(run: Simulated) -> FloatArray:
+    return run.columns(Effect.at(run.simulation.robot, "camera_pose"))
+
+
+def _anywhere(run: Simulated) -> FloatArray:
+    return np.broadcast_to(np.eye(3), (len(run.motion), 3, 3))
+
+
+def _any_of_joint(j: int) -> Columns:
+    return lambda run: _with_one(np.concatenate([_trends(run, j), _harmonics(run, j, _HARMONICS)], axis=1))
+
+
+def _any_of_both(k: int, j: int) -> Columns:
+    def amounts(run: Simulated) -> FloatArray:
+        of_one, of_other = _harmonics(run, k, 2), _harmonics(run, j, 2)
+        both = of_one[:, :, None] * of_other[:, None, :]
+        return _with_one(np.concatenate([of_one, of_other, both.reshape(len(both), -1)], axis=1))
+
+    return amounts
+
+
+def _any_of_time(count: int) -> Columns:
+    """One, and cosines (n, count + 1) over the time of the recording."""
+
+    def amounts(run: Simulated) -> FloatArray:
+        clock = run.motion.clock
+        share = (clock - clock[0]) / max(float(clock[-1] - clock[0]), 1e-9)
+        return np.cos(np.pi * share[:, None] * np.arange(count + 1))
+
+    return amounts
+
+
+def _moments(k: int) -> Columns:
+    return lambda run: _with_one(run.wrenches[:, k, :3])
+
+
+def _wrenches(k: int) -> Columns:
+    return lambda run: _with_one(run.wrenches[:, k])
+
+
+def _places_in_image(run: Simulated) -> FloatArray:
+    x = run.measured
+    depth = np.where(np.abs(x[:, 2]) > 1e-3, x[:, 2], 1e-3)
+    scale = float(np.median(np.abs(depth)))
+    place = np.stack([x[:, 0] / depth, x[:, 1] / depth, depth / scale - 1.0], axis=1)
+    products = [place[:, [i]] * place[:, [j]] for i in range(3) for j in range(i, 3)]
+    cubes = [place[:, [i]] * place[:, [j]] * place[:, [k]] for i in range(3) for j in range(i, 3) for k in range(j, 3)]
+    return _with_one(np.concatenate([place, *products, *cubes], axis=1))
+
+
+def _trends(run: Simulated, j: int) -> FloatArray:
+    """A joint's reading and its square (n, 2)."""
+    q = run.motion.q[:, [j]]
+    return np.concatenate([q, np.square(q)], axis=1)
+
+
+def _harmonics(run: Simulated, j: int, count: int) -> FloatArray:
+    """Sines and cosines (n, 2 count) of a joint's reading; of a slide, of its path as half a turn."""
+    q = run.motion.q[:, j]
+    if run.simulation.robot.chain.prismatic[j]:
+        q = np.pi * (q - q.min()) / max(float(np.ptp(q)), 1e-9)
+    return np.concatenate([f(h * q)[:, None] for h in range(1, count + 1) for f in (np.sin, np.cos)], axis=1)
+
+
+def _with_one(amounts: FloatArray) -> FloatArray:
+    """The error may have a part that depends on nothing: it belongs to the same cause."""
+    return np.concatenate([np.ones((len(amounts), 1)), amounts], axis=1)
