@@ -78,7 +78,9 @@ class Diagnosis:
         """Measured minus predicted (n, 3) [m] by each simulation, on rows that it was not fitted to."""
         fits = {"nominal": self.nominal, "aligned": self.aligned, "geometry": self.geometry, "extended": self.extended}
         errors = {name: held_out_errors(fit, self.blocks) for name, fit in fits.items()}
-        errors["extended"] -= self.left.held_out
+        if self.left.is_there:
+            extended = self.extended
+            errors["extended"] = extended.observations.x - extended.run.measured - self.left.held_out
         return errors
 
     @cached_property

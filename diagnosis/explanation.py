@@ -11,7 +11,7 @@ from effects import Effect
 
 from .fit import Fit
 from .search import NAMED, Search
-from .unknown import Unknowns
+from .unknown import Apart, Unknowns
 
 # What has no name is taken for so much more probability than the named causes alone [nats].
 _MARGIN = 15.0
@@ -29,14 +29,27 @@ class Explanation:
     """A set of causes, and ways to differ that have no name.
 
     Attributes:
-        fit: with the causes.
-        unknown: which families, by their places in `Unknowns.families`.
+        fit: with the causes alone, with the numbers that they have beside what has no name.
+        apart: with what has no name taken away; None where there is nothing of the kind.
         worth: how probable they are together, in nats that count only beside those of others.
     """
 
     fit: Fit
-    unknown: tuple[int, ...]
+    apart: Apart | None
     worth: float
+
+    @property
+    def unknown(self) -> tuple[int, ...]:
+        """The families that have no name, by their places in `Unknowns.families`."""
+        return () if self.apart is None else self.apart.chosen
+
+    @property
+    def size(self) -> float:
+        """How much is without a name (RMS), in units of the stated noise."""
+        if self.apart is None:
+            return 0.0
+        change = (self.apart.predicted - self.fit.run.measured)[:, :, None]
+        return float(np.sqrt(np.square(self.fit.observations.whitened(change)).mean()))
 
 
 def explain(
@@ -50,8 +63,8 @@ def explain(
     """
     path = list(tried)
     best = _with_unknown(found, unknowns, search)
-    if best.unknown and unknowns.size(found, best.unknown) < _OF_THE_CAUSES * _size(path[0], found):
-        best = Explanation(found, (), best.worth)
+    if best.size < _OF_THE_CAUSES * _size(path[0], found):
+        best = Explanation(found, None, best.worth)
     keys = {frozenset(effect.key for effect in found.causes)}
     for fit in path:
         causes = frozenset(effect.key for effect in fit.causes)
@@ -74,17 +87,20 @@ def _size(start: Fit, found: Fit) -> float:
 
 
 def _with_unknown(fit: Fit, unknowns: Unknowns, search: Search) -> Explanation:
-    worth = fit.log_likelihood - sum(_NUMBER * len(effect.amounts) + search.doubt_of(effect) for effect in fit.causes)
-    chosen: list[int] = []
-    while len(chosen) < _MOST_UNKNOWNS:
-        index, more = unknowns.best(fit, chosen)
+    apart: Apart | None = None
+    while apart is None or len(apart.chosen) < _MOST_UNKNOWNS:
+        here, chosen = (fit, ()) if apart is None else (apart.fit, apart.chosen)
+        index, more = unknowns.best(here, chosen)
         if more < NAMED or index in chosen:
             break
-        if more < _BEYOND_DOUBT and unknowns.agreed(fit, chosen, index) < 0.0:
+        if more < _BEYOND_DOUBT and unknowns.agreed(here, chosen, index) < 0.0:
             break
-        chosen.append(index)
-        worth += more
-    return Explanation(fit, tuple(chosen), worth)
+        apart = unknowns.apart(fit, (*chosen, index), apart)
+    names = sum(_NUMBER * len(effect.amounts) + search.doubt_of(effect) for effect in fit.causes)
+    if apart is None:
+        return Explanation(fit, None, fit.log_likelihood - names)
+    worth = apart.fit.log_likelihood - names - unknowns.cost(apart)
+    return Explanation(fit.at(apart.fit.simulation), apart, worth)
 
 
 def _pruned(explanation: Explanation, unknowns: Unknowns, search: Search) -> Explanation:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import combinations_with_replacement
 
 import numpy as np
 
@@ -20,14 +21,16 @@ class Family:
 
     Attributes:
         what: in a few words.
-        at: the joints that err, by their places in q.
+        joint: the joint that errs, or before which a link does; None where it is no one joint.
+        turns: whether it is the joint that errs.
         over_time: whether it depends on time.
         moves: what moves, by one unit each (n, 3, a) [m].
         amounts: what it may depend on (n, b); each of the moves is any linear function of it.
     """
 
     what: str
-    at: tuple[int, ...]
+    joint: int | None
+    turns: bool
     over_time: bool
     moves: Columns
     amounts: Columns
@@ -53,24 +56,25 @@ def families(run: Simulated) -> list[Family]:
         joint, link = _joint(k), _link(k)
         for j in joints:
             what = f"an error of {names[k]} that depends on {names[j]}"
-            found.append(Family(what, (k,), False, joint, _any_of_joint(j)))
+            found.append(Family(what, k, True, False, joint, _any_of_joint(j)))
             if j != k:
                 what = f"an error of {names[k]} that depends on itself and {names[j]} together"
-                found.append(Family(what, (k,), False, joint, _any_of_both(k, j)))
+                found.append(Family(what, k, True, False, joint, _any_of_both(k, j)))
         if timed:
             what = f"an error of {names[k]} that changes with time"
-            found.append(Family(what, (k,), True, joint, _any_of_time(2 * _TIMES)))
+            found.append(Family(what, k, True, True, joint, _any_of_time(2 * _TIMES)))
             what = f"the link before {names[k]} changes with time"
-            found.append(Family(what, (k,), True, link, _any_of_time(_TIMES)))
+            found.append(Family(what, k, False, True, link, _any_of_time(_TIMES)))
         if run.simulation.gravity.known:
             what = f"what carries {names[k]} gives under the arm's weight"
-            found.append(Family(what, (), False, link, _moments(k)))
-            found.append(Family(what, (), False, link, _wrenches(k)))
+            found.append(Family(what, None, False, False, link, _moments(k)))
+            found.append(Family(what, None, False, False, link, _wrenches(k)))
     if timed:
-        found.append(Family("the tool changes with time", (), True, _tool, _any_of_time(_TIMES)))
-        found.append(Family("the camera moves with time", (), True, _camera, _any_of_time(_TIMES)))
+        found.append(Family("the tool changes with time", None, False, True, _tool, _any_of_time(_TIMES)))
+        found.append(Family("the camera moves with time", None, False, True, _camera, _any_of_time(_TIMES)))
     what = "an error that depends on where the marker is in the image"
-    found.append(Family(what, (), False, _anywhere, _places_in_image))
+    found.append(Family(what, None, False, False, _anywhere, _places_in_image(2)))
+    found.append(Family(what, None, False, False, _anywhere, _places_in_image(3)))
     return found
 
 
@@ -128,14 +132,18 @@ def _wrenches(k: int) -> Columns:
     return lambda run: _with_one(run.wrenches[:, k])
 
 
-def _places_in_image(run: Simulated) -> FloatArray:
-    x = run.measured
-    depth = np.where(np.abs(x[:, 2]) > 1e-3, x[:, 2], 1e-3)
-    scale = float(np.median(np.abs(depth)))
-    place = np.stack([x[:, 0] / depth, x[:, 1] / depth, depth / scale - 1.0], axis=1)
-    products = [place[:, [i]] * place[:, [j]] for i in range(3) for j in range(i, 3)]
-    cubes = [place[:, [i]] * place[:, [j]] * place[:, [k]] for i in range(3) for j in range(i, 3) for k in range(j, 3)]
-    return _with_one(np.concatenate([place, *products, *cubes], axis=1))
+def _places_in_image(degree: int) -> Columns:
+    """Monomials (n, b) up to a degree of the place in the image and the relative distance."""
+
+    def amounts(run: Simulated) -> FloatArray:
+        x = run.measured
+        depth = np.where(np.abs(x[:, 2]) > 1e-3, x[:, 2], 1e-3)
+        scale = float(np.median(np.abs(depth)))
+        place = np.stack([x[:, 0] / depth, x[:, 1] / depth, depth / scale - 1.0], axis=1)
+        chosen = [c for size in range(1, degree + 1) for c in combinations_with_replacement(range(3), size)]
+        return _with_one(np.stack([place[:, c].prod(axis=1) for c in chosen], axis=1))
+
+    return amounts
 
 
 def _trends(run: Simulated, j: int) -> FloatArray:

@@ -144,6 +144,10 @@ class Fit:
         information = flat.T @ flat / self.noise.sigma**2 + np.diag(prior_precision(self.simulation, self.nuisances))
         return np.asarray(np.linalg.pinv(information, rcond=1e-14, hermitian=True), dtype=np.float64)
 
+    def at(self, simulation: Simulation) -> Fit:
+        """Another simulation with the same nuisances, as it is."""
+        return _at(self.observations, simulation, self.nuisances, self.noise)
+
     def without(self, cause: Effect) -> Fit:
         """All causes but one, refitted."""
         return self.with_causes([effect for effect in self.causes if effect.key != cause.key])

@@ -23,6 +23,8 @@ from .scan import Candidate
 _MOST_BLOCKS, _FOLDS = 80, 5
 _FEWEST_ROWS_A_BLOCK = 5
 _BOOTSTRAPS = 2000
+# Precision of what is fitted without any prior.
+_RIDGE = 1e-6
 # A fix that is more probably not the marker counts in no figure.
 _MARKER = 0.5
 
@@ -57,15 +59,24 @@ class Blocks:
         return sums
 
 
-def held_out_errors(fit: Fit, blocks: Blocks) -> FloatArray:
-    """Measured minus predicted (n, 3) [m], each row predicted without its own fold."""
+def held_out_errors(fit: Fit, blocks: Blocks, more: FloatArray | None = None) -> FloatArray:
+    """Measured minus predicted (n, 3) [m], each row predicted without its own fold.
+
+    Args:
+        more: what else has been fitted (n, 3, m) [m], scaled so that it has about unit length in units of the noise.
+    """
     errors = fit.observations.x - fit.run.measured
-    if not fit.columns.shape[2]:
+    precision = prior_precision(fit.simulation, fit.nuisances) * fit.noise.sigma**2
+    raw, columns = fit.run_columns, fit.columns
+    if more is not None:
+        raw = np.concatenate([raw, more], axis=2)
+        columns = np.concatenate([columns, fit.weighted(more)], axis=2)
+        precision = np.append(precision, np.full(more.shape[2], _RIDGE))
+    if not columns.shape[2]:
         return errors
-    precision = np.diag(prior_precision(fit.simulation, fit.nuisances)) * fit.noise.sigma**2
     for fold in range(_FOLDS):
         own = blocks.fold == fold
-        errors[own] -= fit.run_columns[own] @ _solve(fit.columns[~own], fit.left[~own], precision)
+        errors[own] -= raw[own] @ _solve(columns[~own], fit.left[~own], np.diag(precision))
     return errors
 
 

@@ -11,8 +11,9 @@ from interfaces.records import FloatArray
 
 from .explanation import Explanation
 from .held_out import Blocks
+from .fit import Fit
 from .sensitivity import joints_of
-from .unknown import Unknowns
+from .unknown import Apart, Unknowns
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,23 +44,24 @@ class Leftover:
 
 def leftover(explanation: Explanation, unknowns: Unknowns, blocks: Blocks) -> Leftover:
     """What the families of an explanation say of what its causes leave."""
-    fit = explanation.fit
-    if not explanation.unknown:
-        index, _ = unknowns.best(fit)
-        gain, dof = unknowns.gain(fit, (index,))
-        p_value = float(min(1.0, stats.chi2.sf(gain, dof) * len(unknowns.families)))
-        nothing = np.zeros_like(fit.residuals)
-        return Leftover((), (), False, p_value, nothing, nothing)
-    families = [unknowns.families[index] for index in explanation.unknown]
-    gain, dof = unknowns.gain(fit, explanation.unknown)
-    explained, held_out = unknowns.predicted(fit, explanation.unknown, blocks)
-    numbers = unknowns.numbers(fit, explanation.unknown)
-    joints = [joints_of(family, own, fit.run) for family, own in zip(families, numbers, strict=True)]
+    fit, apart = explanation.fit, explanation.apart
+    if apart is None:
+        beside = unknowns.apart(fit, (unknowns.best(fit)[0],))
+        p_value = min(1.0, _chance(fit, beside, unknowns) * len(unknowns.families))
+        return Leftover((), (), False, p_value, np.zeros_like(fit.residuals), np.zeros_like(fit.residuals))
+    families = [unknowns.families[index] for index in apart.chosen]
+    joints = [joints_of(family, own, fit.run) for family, own in zip(families, apart.numbers, strict=True)]
     return Leftover(
         what=tuple(family.what for family in families),
         joints=tuple(sorted(frozenset[int]().union(*joints))),
         with_time=any(family.over_time for family in families),
-        p_value=float(stats.chi2.sf(gain, dof)),
-        explained=explained,
-        held_out=held_out,
+        p_value=_chance(fit, apart, unknowns),
+        explained=apart.predicted - fit.run.measured,
+        held_out=fit.observations.x - fit.run.measured - unknowns.held_out(apart, blocks),
     )
+
+
+def _chance(fit: Fit, apart: Apart, unknowns: Unknowns) -> float:
+    """Of so much structure where there is none."""
+    gain = 2.0 * (apart.fit.log_likelihood - fit.log_likelihood)
+    return float(stats.chi2.sf(max(gain, 0.0), max(unknowns.told(apart).shape[2], 1)))

@@ -12,7 +12,7 @@ from interfaces.records import FloatArray
 from .families import Family
 
 # From this share of its variance on an error depends on a joint.
-_SHOWS = 0.05
+_SHOWS = 0.01
 # What goes farther beyond all that was seen than this share of its range is not judged.
 _BEYOND = 0.1
 _SEED = 0
@@ -27,23 +27,29 @@ def joints_of(family: Family, numbers: FloatArray, run: Simulated) -> frozenset[
     Args:
         numbers: of the family (p,).
     """
+    found = set() if family.joint is None else {family.joint}
     if family.over_time:
-        return frozenset(family.at)
+        return frozenset(found)
     rng = np.random.default_rng(_SEED)
-    amounts = family.amounts(run)
+    amounts, moves = family.amounts(run), family.moves(run)
     low, high = amounts.min(axis=0), amounts.max(axis=0)
-    weights = np.sqrt(np.square(family.moves(run)).sum(axis=1).mean(axis=0))
-    as_is = family.moved_by(run, numbers) * weights
-    variance = max(float(as_is.var(axis=0).sum()), 1e-300)
-    found = set(family.at)
+    margin = _BEYOND * (high - low) + 1e-12
+    by = family.moved_by(run, numbers)
+    # Where each row's moves are and stay: how a joint carries the error along to the marker does not count.
+    lengths = np.einsum("nia,nib->nab", moves, moves)
+    variance = _square(lengths, by - by.mean(axis=0))
     for k in range(run.motion.q.shape[1]):
         q = run.motion.q.copy()
         q[:, k] = rng.permutation(q[:, k])
         other = run.simulation.run(replace(run.motion, q=q))
         there = family.amounts(other)
-        margin = _BEYOND * (high - low) + 1e-12
         seen = ((there >= low - margin) & (there <= high + margin)).all(axis=1)
-        change = family.moved_by(other, numbers)[seen] * weights - as_is[seen]
-        if seen.any() and 0.5 * float(np.square(change).sum(axis=1).mean()) >= _SHOWS * variance:
+        change = (family.moved_by(other, numbers) - by)[seen]
+        if seen.any() and 0.5 * _square(lengths[seen], change) >= _SHOWS * variance:
             found.add(k)
     return frozenset(found)
+
+
+def _square(lengths: FloatArray, by: FloatArray) -> float:
+    """Mean square of how far moves by (n, a) take the marker [m²]; `lengths` (n, a, a) are the moves' products."""
+    return float(np.einsum("na,nab,nb->n", by, lengths, by).mean())

@@ -6,6 +6,7 @@ So an effect is not named where something else is at work.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import stats
@@ -13,8 +14,9 @@ from scipy import stats
 from interfaces.records import FloatArray
 
 from .families import families
-from .fit import Fit
-from .held_out import Blocks, scores_p_value
+from .fit import Fit, fitted
+from .held_out import Blocks, held_out_errors, scores_p_value
+from .observations import Observations
 from .search import nats
 
 # What has no name has to be so much more probable than what has one [nats].
@@ -25,7 +27,30 @@ _NUMBER = 2.0
 _TOLD, _LEFT = 1e-6, 1e-7
 # Whether blocks of time agree is asked of so many of a family's directions.
 _STRONGEST = 4
-_RIDGE = 1e-6
+# Rounds in which families and causes are fitted in turn, until the likelihood rises by less than this [nats].
+_ROUNDS, _ENOUGH = 5, 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class Apart:
+    """A fit to what is left of the observations when families have taken away what they account for.
+
+    Attributes:
+        observations: all that was observed.
+        chosen: which families.
+        numbers: of each of them (p,).
+        fit: of the causes.
+    """
+
+    observations: Observations
+    chosen: tuple[int, ...]
+    numbers: tuple[FloatArray, ...]
+    fit: Fit
+
+    @property
+    def predicted(self) -> FloatArray:
+        """What is measured (n, 3) [m] by causes and families together."""
+        return self.fit.run.measured + (self.observations.x - self.fit.observations.x)
 
 
 class Unknowns:
@@ -35,7 +60,7 @@ class Unknowns:
     """
 
     def __init__(self, start: Fit) -> None:
-        self.families = families(start.run)
+        self.families, self._run = families(start.run), start.run
         columns = [start.observations.whitened(family.columns(start.run)) for family in self.families]
         ends = np.cumsum([part.shape[2] for part in columns])
         self._slices = [slice(end - part.shape[2], end) for end, part in zip(ends, columns, strict=True)]
@@ -72,49 +97,75 @@ class Unknowns:
         index = int(np.argmax(worths))
         return index, worths[index] - self._doubt
 
-    def gain(self, fit: Fit, chosen: Sequence[int]) -> tuple[float, int]:
-        """Twice the log-likelihood that families bring beside a fit, and with how many numbers."""
-        before = fit.left.ravel() - fit.orthogonal.reshape(fit.left.size, -1) @ (
-            fit.orthogonal.reshape(fit.left.size, -1).T @ fit.left.ravel()
-        )
-        basis, after = self.beside(fit, chosen)
-        rows = float(fit.noise.weights.sum())
-        share = float(after @ after) / max(float(before @ before), 1e-300)
-        return -3.0 * rows * float(np.log(max(share, 1e-12))), basis.shape[1] - fit.orthogonal.shape[2]
+    def apart(self, fit: Fit, chosen: Sequence[int], start: Apart | None = None) -> Apart:
+        """The causes of a fit and families, fitted in turn to what the others leave.
 
-    def size(self, fit: Fit, chosen: Sequence[int]) -> float:
-        """How much families explain (RMS) of what a fit leaves, in units of the stated noise."""
-        basis, _ = self.beside(fit, chosen)
-        own = basis[:, fit.orthogonal.shape[2] :]
-        return float(np.sqrt(np.square(own.T @ fit.left.ravel()).sum() / fit.left.size))
+        A joint that errs is turned in the readings, so that large errors are as exact as small ones.
 
-    def predicted(self, fit: Fit, chosen: Sequence[int], blocks: Blocks) -> tuple[FloatArray, FloatArray]:
-        """What families predict of what a fit leaves (n, 3) [m]: of all rows, and of rows that were not fitted."""
-        basis, _ = self.beside(fit, chosen)
-        own = basis[:, fit.orthogonal.shape[2] :]
-        left = fit.left.ravel()
-        explained = own @ (own.T @ left)
-        held_out = np.zeros_like(left)
-        folds = np.repeat(blocks.fold, 3)
-        for fold in np.unique(folds):
-            rows = folds == fold
-            inner = basis[~rows].T @ basis[~rows] + _RIDGE * np.eye(basis.shape[1])
-            amounts = np.linalg.solve(inner, basis[~rows].T @ left[~rows])
-            held_out[rows] = basis[rows] @ amounts
-        weights = np.maximum(fit.root_weights, 1e-6)[:, :, None]
-        both = np.stack([explained, held_out], axis=1).reshape(*fit.left.shape, 2) / weights
-        metres = np.asarray(np.linalg.solve(fit.observations.whitening, both), dtype=np.float64)
-        return metres[:, :, 0], metres[:, :, 1]
+        Args:
+            start: with some of the families.
+        """
+        here = Apart(fit.observations, tuple(chosen), tuple(np.zeros(self._size(index)) for index in chosen), fit)
+        if start is not None:
+            known = dict(zip(start.chosen, start.numbers, strict=True))
+            numbers = tuple(known.get(index, nothing) for index, nothing in zip(chosen, here.numbers, strict=True))
+            here = Apart(fit.observations, tuple(chosen), numbers, start.fit)
+        for _ in range(_ROUNDS):
+            steps = self._step(here.fit, chosen)
+            numbers = tuple(number + step for number, step in zip(here.numbers, steps, strict=True))
+            left = self._without(fit.observations, chosen, numbers)
+            tried = fitted(left, here.fit.simulation, fit.nuisances, here.fit.noise)
+            rise = tried.log_likelihood - here.fit.log_likelihood
+            if rise > 0.0:
+                here = Apart(fit.observations, tuple(chosen), numbers, tried)
+            if rise < _ENOUGH:
+                break
+        return here
 
-    def numbers(self, fit: Fit, chosen: Sequence[int]) -> list[FloatArray]:
-        """The numbers of families, each (p,), that explain most of what a fit leaves."""
+    def cost(self, apart: Apart) -> float:
+        """What the families and their numbers cost [nats]."""
+        return len(apart.chosen) * self._doubt + _NUMBER * self.told(apart).shape[2]
+
+    def told(self, apart: Apart) -> FloatArray:
+        """What families can change beside the causes (n, 3, r) [m], in directions that the data tell."""
+        fit = apart.fit
+        columns = np.concatenate([self._columns[:, self._slices[index]] for index in apart.chosen], axis=1)
+        basis = fit.orthogonal.reshape(fit.left.size, -1)
+        weighted = columns * np.repeat(fit.root_weights[:, 0], 3)[:, None]
+        _, values, mix = np.linalg.svd(weighted - basis @ (basis.T @ weighted), full_matrices=False)
+        there = values > np.sqrt(_LEFT)
+        directions = (columns @ (mix[there].T / values[there])).reshape(*fit.left.shape, -1)
+        return np.asarray(np.linalg.solve(fit.observations.whitening, directions), dtype=np.float64)
+
+    def held_out(self, apart: Apart, blocks: Blocks) -> FloatArray:
+        """Measured minus predicted (n, 3) [m], each row predicted without its own fold."""
+        return held_out_errors(apart.fit, blocks, self.told(apart))
+
+    def _size(self, index: int) -> int:
+        return self._slices[index].stop - self._slices[index].start
+
+    def _step(self, fit: Fit, chosen: Sequence[int]) -> list[FloatArray]:
+        """By how much the numbers of families change to explain most of what a fit leaves."""
         basis = fit.orthogonal.reshape(fit.left.size, -1)
         weights = np.repeat(fit.root_weights[:, 0], 3)[:, None]
         columns = np.concatenate([self._columns[:, self._slices[index]] for index in chosen], axis=1) * weights
         columns = columns - basis @ (basis.T @ columns)
-        solved = np.linalg.lstsq(columns, fit.left.ravel(), rcond=float(np.sqrt(_LEFT)))[0]
-        parts = np.split(solved, np.cumsum([self._columns[:, self._slices[index]].shape[1] for index in chosen])[:-1])
+        step = np.linalg.lstsq(columns, fit.left.ravel(), rcond=float(np.sqrt(_LEFT)))[0]
+        parts = np.split(step, np.cumsum([self._size(index) for index in chosen])[:-1])
         return [part / self._scales[self._slices[index]] for part, index in zip(parts, chosen, strict=True)]
+
+    def _without(
+        self, observations: Observations, chosen: Sequence[int], numbers: Sequence[FloatArray]
+    ) -> Observations:
+        """Observations without what families account for: a joint's error in the readings, all else in the positions."""
+        q, x = observations.motion.q.copy(), observations.x.copy()
+        for index, own in zip(chosen, numbers, strict=True):
+            family = self.families[index]
+            if family.turns:
+                q[:, family.joint] += family.moved_by(self._run, own)[:, 0]
+            else:
+                x -= family.columns(self._run) @ own
+        return replace(observations, motion=replace(observations.motion, q=q), x=x)
 
     def agreed(self, fit: Fit, others: Sequence[int], index: int) -> float:
         """What a family is worth by the agreement of blocks of time [nats]."""

@@ -351,16 +351,17 @@ def gains(truth: Truth, diagnosis: Diagnosis, fresh: Recording) -> tuple[float |
 
 
 def joints_right(hidden: Hidden, depends_on: Sequence[str]) -> bool:
-    """Whether all joints are named on which the error clearly shows, and none on which it does not.
+    """Whether the joint that errs is named, all joints that drive its error and on which it clearly shows, and no idle one.
 
     An error that changes with time alone has to be named by time.
     """
+    named = set(depends_on)
     if not hidden.drivers and hidden.effect in ("wandering_zero", "growing_link"):
-        return "time" in depends_on
-    shares = hidden.shows_on
-    needed = {joint for joint, share in shares.items() if share >= SHOWS}
-    idle = {joint for joint, share in shares.items() if share < HIDDEN_FROM}
-    return needed <= set(depends_on) and not idle & set(depends_on)
+        return "time" in named
+    pair = {str(hidden.where), hidden.source} if hidden.source is not None else set()
+    needed = pair | {joint for joint in hidden.drivers if hidden.shows_on[joint] >= SHOWS}
+    idle = {joint for joint, share in hidden.shows_on.items() if share < HIDDEN_FROM} - {hidden.where, hidden.source}
+    return needed <= named and not idle & named
 
 
 def smooth_ratio(truth: Truth, diagnosis: Diagnosis) -> float | None:

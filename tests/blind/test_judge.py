@@ -230,8 +230,8 @@ def test_what_is_outside_the_table_is_right_when_unexplained_and_wrong_under_a_n
 
 
 def test_the_right_joints_are_those_on_which_it_shows() -> None:
-    hidden = Hidden("link_bend", "a", None, {}, "", True, ("b",), shows_on={"a": 0.01, "b": 0.8, "c": 0.1})
-    said = [("b",), ("b", "c"), ("c",), ("a", "b")]
+    hidden = Hidden("link_bend", "a", None, {}, "", True, ("b",), shows_on={"a": 0.1, "b": 0.8, "c": 0.01})
+    said = [("b",), ("a", "b"), ("a",), ("b", "c")]
     assert [joints_right(hidden, joints) for joints in said] == [True, True, False, False]
 
 
