@@ -65,21 +65,22 @@ class GravityLoad:
         mass times centre of mass back.
         """
         turns = {k: _Turn.of(body.joint, q[:, k]) for k, body in self._bodies.items() if body.joint is not None}
-        down: dict[int | None, FloatArray] = {None: np.array([[0.0, 0.0, -GRAVITY_M_S2]])}
+        # Components first: what is done to a component of all rows is done at once.
+        down: dict[int | None, FloatArray] = {None: np.array([[0.0], [0.0], [-GRAVITY_M_S2]])}
         for k in self._outwards:
             body = self._bodies[k]
-            down[k] = turns[k].inverse(down[body.carrier] @ body.T_carrier_joint[:3, :3])
+            down[k] = turns[k].inverse(body.T_carrier_joint[:3, :3].T @ down[body.carrier])
         mass = {k: body.mass_kg for k, body in self._bodies.items()}
-        moment = {k: body.moment[None] for k, body in self._bodies.items()}
+        moment = {k: body.moment[:, None] for k, body in self._bodies.items()}
         moments, forces = np.zeros((2, *q.shape, 3))
         for k in reversed(self._outwards):
             body = self._bodies[k]
             turn, T = turns[k], body.T_carrier_joint
-            lever, downward = turn.apply(moment[k]), down[body.carrier] @ T[:3, :3]
-            moments[:, k] = np.cross(lever, downward)
-            forces[:, k] = mass[k] * downward
+            lever, downward = turn.apply(moment[k]), T[:3, :3].T @ down[body.carrier]
+            moments[:, k] = _cross(lever, downward).T
+            forces[:, k] = mass[k] * downward.T
             mass[body.carrier] += mass[k]
-            at_carrier = (lever + mass[k] * turn.slide) @ T[:3, :3].T + mass[k] * T[:3, 3]
+            at_carrier = T[:3, :3] @ (lever + mass[k] * turn.slide) + mass[k] * T[:3, 3:]
             moment[body.carrier] = moment[body.carrier] + at_carrier
         return moments, forces
 
@@ -122,29 +123,37 @@ def _carried(
 
 @dataclass(frozen=True, eq=False)
 class _Turn:
-    """A joint's own motion: a turn about a fixed axis (3,), given by sines and cosines (n, 1), and a slide (n, 3)."""
+    """A joint's own motion: a turn about a fixed axis, and a slide (3, n).
 
-    axis: FloatArray
-    cosine: FloatArray
+    Attributes:
+        across, over: the matrices (3, 3) of a product with the axis, once and twice.
+        sine, versine: sin and 1 - cos of the angle (n,).
+        slide: along the axis [m] (3, n).
+    """
+
+    across: FloatArray
+    over: FloatArray
     sine: FloatArray
+    versine: FloatArray
     slide: FloatArray
 
     @classmethod
     def of(cls, joint: UrdfJoint, q: FloatArray) -> _Turn:
         """At q (n,)."""
+        across = cross_matrix(joint.axis)
         if joint.kind in REVOLUTE:
-            return cls(joint.axis, np.cos(q)[:, None], np.sin(q)[:, None], np.zeros((1, 3)))
-        return cls(joint.axis, np.ones((1, 1)), np.zeros((1, 1)), q[:, None] * joint.axis)
+            return cls(across, across @ across, np.sin(q), 1.0 - np.cos(q), np.zeros((3, 1)))
+        return cls(across, across @ across, np.zeros(1), np.zeros(1), joint.axis[:, None] * q)
 
     def apply(self, vectors: FloatArray) -> FloatArray:
-        """Vectors (n, 3) turned (Rodrigues)."""
-        return self._turned(vectors, self.sine)
+        """Vectors (3, n) turned (Rodrigues)."""
+        return vectors + self.sine * (self.across @ vectors) + self.versine * (self.over @ vectors)
 
     def inverse(self, vectors: FloatArray) -> FloatArray:
-        """Vectors (n, 3) turned back."""
-        return self._turned(vectors, -self.sine)
+        """Vectors (3, n) turned back."""
+        return vectors - self.sine * (self.across @ vectors) + self.versine * (self.over @ vectors)
 
-    def _turned(self, vectors: FloatArray, sine: FloatArray) -> FloatArray:
-        along = (vectors @ self.axis)[:, None] * self.axis
-        across = vectors @ cross_matrix(self.axis).T
-        return along + self.cosine * (vectors - along) + sine * across
+
+def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
+    """a × b (3, n)."""
+    return np.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
