@@ -22,8 +22,8 @@ from .result import (
     Unexplained,
     Verdict,
 )
-from .rivals import Rival
-from .scan import Scan
+from .rivals import Rival, Standing
+from .scan import Candidate
 from .words import evidence, sentence
 
 _HALF_WIDTH_95 = 1.959964
@@ -91,7 +91,7 @@ def _causes(diagnosis: Diagnosis) -> tuple[Cause, ...]:
                 effect=cause.name,
                 where=cause.where,
                 source=cause.source,
-                parameters=_parameters(diagnosis, cause),
+                parameters=_parameters(diagnosis, cause, standing),
                 probability=standing.probability,
                 share_of_gain_percent=100.0 * loss / max(sum(losses), 1e-300),
                 held_out_gain_percent=100.0 * (1.0 - float(np.sqrt(full / max(full + loss, 1e-300)))),
@@ -131,7 +131,7 @@ def _outliers(diagnosis: Diagnosis) -> Cause:
     )
 
 
-def _parameters(diagnosis: Diagnosis, cause: Effect) -> dict[str, Interval]:
+def _parameters(diagnosis: Diagnosis, cause: Effect, standing: Standing) -> dict[str, Interval]:
     fit = diagnosis.extended
     first = 0
     for effect in fit.simulation.effects:
@@ -148,17 +148,15 @@ def _parameters(diagnosis: Diagnosis, cause: Effect) -> dict[str, Interval]:
             half = float(halves[amounts.index(k)])
             numbers[parameter.name] = Interval(value, (value - half, value + half))
         else:
-            numbers[parameter.name] = Interval(value, _shape_interval(diagnosis, cause))
+            numbers[parameter.name] = Interval(value, _shape_interval(cause, standing.itself))
     return numbers | _derived(cause, covariance)
 
 
-def _shape_interval(diagnosis: Diagnosis, cause: Effect) -> tuple[float, float]:
-    others = [effect for effect in diagnosis.causes if effect.key != cause.key]
-    again = Scan(diagnosis.extended.with_causes(others)).candidate(cause)
+def _shape_interval(cause: Effect, itself: Candidate) -> tuple[float, float]:
     value = float(cause.values[-1])
-    if again is None or again.interval is None:
+    if itself.interval is None:
         return (value, value)
-    return (min(again.interval[0], value), max(again.interval[1], value))
+    return (min(itself.interval[0], value), max(itself.interval[1], value))
 
 
 def _derived(cause: Effect, covariance: FloatArray) -> dict[str, Interval]:

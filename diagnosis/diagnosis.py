@@ -128,8 +128,8 @@ class Diagnosis:
     def without(self) -> dict[tuple[str, str | None, str | None], FloatArray]:
         """Distances (n,) [m] on rows not fitted, without each of the causes."""
         smooth = self.left.held_out
-        errors = {c.key: held_out_errors(self.extended.without(c), self.blocks) - smooth for c in self.causes}
-        return {key: np.linalg.norm(error, axis=1) for key, error in errors.items()}
+        errors = [held_out_errors(standing.without, self.blocks) - smooth for standing in self.standings]
+        return {c.key: np.linalg.norm(error, axis=1) for c, error in zip(self.causes, errors, strict=True)}
 
     @cached_property
     def noise(self) -> FloatArray:
@@ -179,14 +179,14 @@ def diagnose(
     unknowns, blocks = Unknowns(start), Blocks.cut(len(recording))
     explanation = explain(extended, search.path, unknowns, search, tell)
     tell("asking what else it could be")
-    stands = standings(explanation.fit, hypotheses.effects, search, blocks, seed)
+    stands = standings(explanation.fit, search, blocks, seed)
     while explanation.unknown and any(standing.probability < _HALF for standing in stands):
         weakest = int(np.argmin([standing.probability for standing in stands]))
         fewer = without_one(explanation, explanation.fit.causes[weakest], unknowns, search)
         if not fewer.unknown:
             break
         explanation = fewer
-        stands = standings(explanation.fit, hypotheses.effects, search, blocks, seed)
+        stands = standings(explanation.fit, search, blocks, seed)
     extended = explanation.fit
     return Diagnosis(
         hypotheses=hypotheses,

@@ -18,6 +18,8 @@ from .observations import Observations
 LARGEST = 30.0
 # Steps until the likelihood rises by less than this [nats].
 _ROUNDS, _ENOUGH = 12, 0.02
+# A step that would raise it by less is not tried [nats].
+_NOT_TRIED = 1e-3
 _FEWEST_OUTLIERS = 1e-4
 _EM_ROUNDS = 6
 # So large a share of so many rows is no outliers.
@@ -167,7 +169,9 @@ def fitted(observations: Observations, simulation: Simulation, nuisances: int, s
     for _ in range(_ROUNDS):
         if not fit.columns.shape[2]:
             return fit
-        step = _step(fit)
+        step, promised = _step(fit)
+        if promised < _NOT_TRIED:
+            return fit
         best = None
         for shortened in (1.0, 0.3, 0.05):
             tried = _at(observations, _moved(fit.simulation, shortened * step), nuisances, fit.noise)
@@ -190,14 +194,16 @@ def _at(observations: Observations, simulation: Simulation, nuisances: int, star
     return Fit(observations, simulation, nuisances, run, residuals, noise)
 
 
-def _step(fit: Fit) -> FloatArray:
+def _step(fit: Fit) -> tuple[FloatArray, float]:
+    """The Gauss-Newton step of all amounts (p,), and by how much it would raise the likelihood [nats] at best."""
     n, _, p = fit.columns.shape
     flat = fit.columns.reshape(3 * n, p)
     precision = prior_precision(fit.simulation, fit.nuisances) * fit.noise.sigma**2
     values = np.concatenate([effect.values[effect.amounts] for effect in fit.simulation.effects])
     normal = flat.T @ flat + np.diag(precision)
     gradient = flat.T @ fit.left.ravel() - precision * values
-    return solved(normal, gradient)
+    step = solved(normal, gradient)
+    return step, 0.5 * float(step @ gradient) / fit.noise.sigma**2
 
 
 def solved(normal: FloatArray, gradient: FloatArray) -> FloatArray:

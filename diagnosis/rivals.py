@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,7 +13,7 @@ from interfaces.records import FloatArray
 
 from .fit import Fit
 from .held_out import Blocks
-from .scan import Candidate, Scan
+from .scan import Candidate
 from .search import Search, nats
 from .stability import named_again
 
@@ -61,6 +61,8 @@ class Standing:
     """How one cause stands against all others.
 
     Attributes:
+        without: the fit without it.
+        itself: the cause as it would explain most there.
         probability: of the cause, or of what no motion tells from it.
         worth: how much more probable the causes are with it than without any in its place [nats].
         dof: how many of its amounts the data tell.
@@ -69,6 +71,8 @@ class Standing:
         again: in which of some resamplings of the blocks of time it would be named again.
     """
 
+    without: Fit
+    itself: Candidate
     probability: float
     worth: float
     dof: int
@@ -77,22 +81,19 @@ class Standing:
     again: NDArray[np.bool_]
 
 
-def standings(fit: Fit, hypotheses: Sequence[Effect], search: Search, blocks: Blocks, seed: int) -> list[Standing]:
+def standings(fit: Fit, search: Search, blocks: Blocks, seed: int) -> list[Standing]:
     """One for each cause of a fit."""
-    return [_standing(fit, cause, hypotheses, search, blocks, seed) for cause in fit.causes]
+    return [_standing(fit, cause, search, blocks, seed) for cause in fit.causes]
 
 
-def _standing(
-    fit: Fit, cause: Effect, hypotheses: Sequence[Effect], search: Search, blocks: Blocks, seed: int
-) -> Standing:
-    without = fit.without(cause)
+def _standing(fit: Fit, cause: Effect, search: Search, blocks: Blocks, seed: int) -> Standing:
+    beside = search.beside(fit, cause)
+    without = beside.without
     gain = 2.0 * (fit.log_likelihood - without.log_likelihood)
-    itself = Scan(without).candidate(cause) or Candidate(cause, gain, 1)
+    itself = beside.itself or Candidate(cause, gain, 1)
     worth = nats(gain, itself.dof) - search.doubt(itself)
-    present = {effect.key for effect in fit.causes}
-    others = [h for h in hypotheses if h.key not in present]
     tried, compared = [], []
-    for candidate in search.shortlist(without, others):
+    for candidate in beside.candidates:
         if candidate.gain < _COMES_NEAR * itself.gain:
             continue
         rival = search.refined(without.with_causes([*without.causes, candidate.effect]), candidate.effect.key)
@@ -111,6 +112,8 @@ def _standing(
     same = sum(rival.probability for rival in rivals if rival.is_same_anywhere)
     ordered = tuple(sorted(rivals, key=lambda rival: rival.probability, reverse=True))
     return Standing(
+        without,
+        itself,
         float(shares[0]) + same,
         worth,
         itself.dof,

@@ -6,12 +6,12 @@ With what the fitted amounts can change projected out, a column c explains (c·r
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass
 
 import numpy as np
 
 from effects import Effect
+from effects.simulation import settled
 from interfaces.records import FloatArray
 
 from .fit import LARGEST, Fit
@@ -64,6 +64,7 @@ class Scan:
         self._left = (flat - basis @ (basis.T @ flat)).reshape(fit.left.shape)
         self._rss = float(np.square(self._left).sum())
         self._rows = float(fit.noise.weights.sum())
+        self._ports: dict[int, _Rows] = {}
 
     def candidates(self, hypotheses: Iterable[Effect]) -> list[Candidate]:
         """One for each hypothesis of which this data tell anything."""
@@ -82,7 +83,7 @@ class Scan:
             case "encoder_jump" | "tool_slip" | "camera_moved":
                 return self._moment(effect)
             case "backlash":
-                return self._shapes(effect, [np.array([w]) for w in _WIDTHS], scaled=True)
+                return self._play(effect)
             case "thermal_drift":
                 clock = self._fit.observations.motion.clock
                 span = float(clock[-1] - clock[0])
@@ -90,44 +91,52 @@ class Scan:
             case "settling":
                 return self._finely(effect, _MEMORIES)
             case _:
-                return self._shapes(effect, [effect.values])
+                columns = self._fit.weighted(self._fit.run.columns(effect)[:, :, effect.amounts])
+                gain, amounts, dof = self._explained(columns, effect)
+                return Candidate(_with_amounts(effect, amounts), gain, dof) if dof else None
 
     def _finely(self, effect: Effect, shapes: FloatArray) -> Candidate | None:
         """The best of an effect whose last number is its shape, over increasing shapes (m,), then between them."""
-        coarse = self._each(effect, shapes)
-        if not coarse:
+        gains, _, dofs = self._each(effect, shapes)
+        if not dofs.any():
             return None
-        place = int(np.argmax([candidate.gain for _, candidate in coarse]))
-        between = np.linspace(coarse[max(place - 1, 0)][0], coarse[min(place + 1, len(coarse) - 1)][0], 13)
-        fine = self._each(effect, np.asarray(between, dtype=np.float64)) or coarse
-        gains = np.array([candidate.gain for _, candidate in fine])
-        interval = _interval(np.array([shape for shape, _ in fine]), gains)
-        return replace(fine[int(np.argmax(gains))][1], trials=_COARSE, interval=interval)
+        told, gains = shapes[dofs > 0], gains[dofs > 0]
+        place = int(np.argmax(gains))
+        fine = np.linspace(told[max(place - 1, 0)], told[min(place + 1, len(told) - 1)], 13)
+        gains, amounts, dofs = self._each(effect, fine)
+        best = int(np.argmax(gains))
+        interval = _interval(fine, gains)
+        values = np.append(amounts[best], fine[best])
+        return Candidate(effect.with_values(values), float(gains[best]), int(dofs[best]), _COARSE, interval)
 
-    def _each(self, effect: Effect, shapes: FloatArray) -> list[tuple[float, Candidate]]:
-        tried = [(float(s), self._shapes(effect, [np.append(effect.values[:-1], s)])) for s in shapes]
-        return [(shape, candidate) for shape, candidate in tried if candidate is not None]
+    def _each(self, effect: Effect, shapes: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """`_solved` for each shape (m,), which scales the same columns row by row."""
+        run = self._fit.run
+        if effect.name == "thermal_drift":
+            constant = np.broadcast_to(np.eye(3), (len(run.motion), 3, 3))
+            rows = self._rows_of(self._fit.weighted(constant))
+            factors = [settled(run.motion, float(shape)) for shape in shapes]
+        else:
+            place, encoder = self._fit.simulation.place(effect), effect.kind.encoder
+            assert encoder is not None
+            rows = self._port(place.joint)
+            shaped = (np.append(effect.values[:-1], shape) for shape in shapes)
+            factors = [encoder.columns(run.readings, place, values)[:, 0] for values in shaped]
+        return self._solved(*rows.scaled(np.stack(factors, axis=1)), effect)
 
-    def _shapes(self, effect: Effect, shapes: list[FloatArray], *, scaled: bool = False) -> Candidate | None:
-        """The best of some shapes. `scaled`: the shape's own size is the amount, as a play's width."""
-        best = None
-        for values in shapes:
-            shaped = effect.with_values(values)
-            if scaled:
-                place = self._fit.simulation.place(effect)
-                assert effect.kind.encoder is not None
-                bent = effect.kind.encoder.correction(self._fit.run.readings, place, values) / values[0]
-                columns = self._ports[place.joint][:, :, None] * bent[:, None, None]
-            else:
-                columns = self._fit.weighted(self._fit.run.columns(shaped)[:, :, effect.amounts])
-            gain, amounts, dof = self._explained(columns, shaped)
-            if scaled:
-                # The width that the shape was made with, and the one that it would take.
-                off = abs(np.log(max(amounts[0], 1e-12) / values[0]))
-                gain = gain if off < np.log(3.0) else 0.5 * gain
-            if dof and (best is None or gain > best.gain):
-                best = Candidate(_with_amounts(shaped, amounts), gain, dof, len(shapes))
-        return best
+    def _play(self, effect: Effect) -> Candidate | None:
+        """Over widths: the shape's own size is the amount."""
+        place, encoder = self._fit.simulation.place(effect), effect.kind.encoder
+        assert encoder is not None
+        bent = [encoder.correction(self._fit.run.readings, place, np.array([w])) / w for w in _WIDTHS]
+        gains, amounts, dofs = self._solved(*self._port(place.joint).scaled(np.stack(bent, axis=1)), effect)
+        # The width that the shape was made with, and the one that it would take.
+        off = np.abs(np.log(np.maximum(amounts[:, 0], 1e-12) / _WIDTHS))
+        gains = np.where(dofs > 0, np.where(off < np.log(3.0), gains, 0.5 * gains), -np.inf)
+        best = int(np.argmax(gains))
+        if not dofs[best]:
+            return None
+        return Candidate(effect.with_values(amounts[best]), float(gains[best]), int(dofs[best]), len(_WIDTHS))
 
     def _ripple(self, effect: Effect) -> Candidate | None:
         """Over all whole numbers of cycles a turn, then beside the best; of a slide, over those its path can tell."""
@@ -149,21 +158,26 @@ class Scan:
         return Candidate(effect.with_values(values), float(gains[best]), int(dofs[best]), 2 * len(coarse), interval)
 
     def _rippled(self, effect: Effect, cycles: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """`_solved` for each number of cycles (m,)."""
+        """`_solved` for each of equally spaced numbers of cycles (m,)."""
         place = self._fit.simulation.place(effect)
-        q = self._fit.run.readings.q[:, place.joint]
-        phases = q[:, None] * cycles * (2.0 * np.pi if place.prismatic else 1.0)
-        port = self._ports[place.joint]
-        onto = np.einsum("nir,ni->nr", self._basis, port)
-        square, with_left = np.square(port).sum(axis=1), (port * self._left).sum(axis=1)
-        sine, cosine = np.sin(phases), np.cos(phases)
+        angle = self._fit.run.readings.q[:, place.joint] * (2.0 * np.pi if place.prismatic else 1.0)
+        # exp(i cycles angle), each from the one before.
+        waves = np.empty((len(angle), len(cycles)), dtype=np.complex128)
+        waves[:, 0] = np.exp(1j * cycles[0] * angle)
+        waves[:, 1:] = np.exp(1j * (cycles[1] - cycles[0]) * angle)[:, None]
+        np.multiply.accumulate(waves, axis=1, out=waves)
+        rows = self._port(place.joint)
+        square = rows.inner[:, 0]
+        doubled = square @ np.square(waves)
         inner = np.empty((len(cycles), 2, 2))
-        inner[:, 0, 0], inner[:, 1, 1] = square @ np.square(sine), square @ np.square(cosine)
-        inner[:, 0, 1] = inner[:, 1, 0] = square @ (sine * cosine)
+        inner[:, 0, 0], inner[:, 1, 1] = 0.5 * (square.sum() - doubled.real), 0.5 * (square.sum() + doubled.real)
+        inner[:, 0, 1] = inner[:, 1, 0] = 0.5 * doubled.imag
         raw = np.einsum("maa->ma", inner).copy()
-        removed = np.stack([sine.T @ onto, cosine.T @ onto], axis=1)
+        # Cosines and sines take turns.
+        flat = waves.view(np.float64)
+        removed = (flat.T @ rows.onto).reshape(len(cycles), 2, -1)[:, ::-1]
         inner -= removed @ np.swapaxes(removed, 1, 2)
-        gradient = np.stack([with_left @ sine, with_left @ cosine], axis=1)
+        gradient = (flat.T @ rows.toward[:, 0]).reshape(-1, 2)[:, ::-1]
         return self._solved(inner, gradient, raw, effect)
 
     def _moment(self, effect: Effect) -> Candidate | None:
@@ -173,19 +187,18 @@ class Scan:
             return None
         clock = self._fit.observations.motion.clock
         begun = effect.with_values(np.append(effect.values[:-1], -np.inf))
-        columns = self._fit.weighted(self._fit.run.columns(begun)[:, :, effect.amounts])
-        k = columns.shape[2]
+        rows = self._rows_of(self._fit.weighted(self._fit.run.columns(begun)[:, :, effect.amounts]))
+        k = rows.toward.shape[1]
         after = slice(_BESIDE, n - _BESIDE)
 
         def since(parts: FloatArray) -> FloatArray:
             return np.cumsum(parts[::-1], axis=0)[::-1][after]
 
-        inner = since(np.einsum("nia,nib->nab", columns, columns))
+        inner = since(rows.inner).reshape(-1, k, k)
         raw = np.einsum("taa->ta", inner).copy()
-        removed = since(np.einsum("nia,nir->nar", columns, self._basis).reshape(n, -1)).reshape(len(inner), k, -1)
+        removed = since(rows.onto).reshape(len(inner), k, -1)
         inner = inner - removed @ np.swapaxes(removed, 1, 2)
-        gradient = since(np.einsum("nia,ni->na", columns, self._left))
-        gains, amounts, dofs = self._solved(inner, gradient, raw, effect)
+        gains, amounts, dofs = self._solved(inner, since(rows.toward), raw, effect)
         best = int(np.argmax(gains))
         if not dofs[best]:
             return None
@@ -196,11 +209,13 @@ class Scan:
         return Candidate(effect.with_values(values), float(gains[best]), int(dofs[best]), len(gains), interval)
 
     def _explained(self, columns: FloatArray, effect: Effect) -> tuple[float, FloatArray, int]:
-        inner = np.einsum("nia,nib->ab", columns, columns)
-        removed = np.einsum("nia,nir->ar", columns, self._basis)
-        gradient = np.einsum("nia,ni->a", columns, self._left)
+        flat = columns.reshape(self._left.size, -1)
+        inner = flat.T @ flat
+        removed = flat.T @ self._basis.reshape(self._left.size, -1)
         raw = np.diag(inner).copy()
-        gains, amounts, dofs = self._solved((inner - removed @ removed.T)[None], gradient[None], raw[None], effect)
+        gains, amounts, dofs = self._solved(
+            (inner - removed @ removed.T)[None], (flat.T @ self._left.ravel())[None], raw[None], effect
+        )
         return float(gains[0]), amounts[0], int(dofs[0])
 
     def _solved(
@@ -222,10 +237,40 @@ class Scan:
         gains = -3.0 * self._rows * np.log1p(-explained / self._rss)
         return np.where(dofs > 0, gains, 0.0), amounts, dofs
 
-    @cached_property
-    def _ports(self) -> FloatArray:
-        """How the weighted prediction moves with each joint (d, n, 3)."""
-        return np.moveaxis(self._fit.weighted(self._fit.run.by_joint), 2, 0)
+    def _port(self, joint: int) -> _Rows:
+        """How the weighted prediction moves with a joint."""
+        if joint not in self._ports:
+            self._ports[joint] = self._rows_of(self._fit.weighted(self._fit.run.by_joint[:, :, [joint]]))
+        return self._ports[joint]
+
+    def _rows_of(self, columns: FloatArray) -> _Rows:
+        n, _, k = columns.shape
+        turned = np.swapaxes(columns, 1, 2)
+        toward = (turned @ self._left[:, :, None])[:, :, 0]
+        return _Rows((turned @ columns).reshape(n, k * k), (turned @ self._basis).reshape(n, -1), toward)
+
+
+@dataclass(frozen=True, eq=False)
+class _Rows:
+    """What each row adds to the normal equations of columns (n, 3, k).
+
+    Attributes:
+        inner: products with one another (n, k k).
+        onto: with what the fitted amounts can change (n, k r).
+        toward: with what is left (n, k).
+    """
+
+    inner: FloatArray
+    onto: FloatArray
+    toward: FloatArray
+
+    def scaled(self, factors: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Inner products (m, k, k) beside what is fitted, gradients and raw squares (m, k) of rows times (n, m)."""
+        k = self.toward.shape[1]
+        inner = (np.square(factors).T @ self.inner).reshape(-1, k, k)
+        raw = np.einsum("maa->ma", inner).copy()
+        removed = (factors.T @ self.onto).reshape(len(inner), k, -1)
+        return inner - removed @ np.swapaxes(removed, 1, 2), factors.T @ self.toward, raw
 
 
 def _interval(shapes: FloatArray, gains: FloatArray) -> tuple[float, float]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from scipy import stats
@@ -42,6 +43,21 @@ def nats(gain: float, dof: int) -> float:
     return 0.5 * gain - dof * max(0.5 + 0.5 * float(np.log(max(gain, 1e-300) / dof)), _CHEAPEST)
 
 
+@dataclass(frozen=True, eq=False)
+class Beside:
+    """A fit without one of its causes, and what would take its place.
+
+    Attributes:
+        without: the fit.
+        itself: the cause as it would explain most there.
+        candidates: those of the hypotheses that no cause is, the most probable first.
+    """
+
+    without: Fit
+    itself: Candidate | None
+    candidates: list[Candidate]
+
+
 class Search:
     """Greedy, with second thoughts.
 
@@ -54,6 +70,7 @@ class Search:
         self._hypotheses, self._tell = hypotheses, tell
         self._doubt = np.log(max(len(hypotheses), 1))
         self._trials: dict[Key, int] = {}
+        self._beside: tuple[Fit | None, dict[Key, Beside]] = (None, {})
         self.path: list[Fit] = []
 
     def run(self, start: Fit) -> Fit:
@@ -140,18 +157,28 @@ class Search:
             self._seen.add(causes)
         return fit
 
+    def beside(self, fit: Fit, cause: Effect) -> Beside:
+        """What there is in the place of a cause. That of the fit last asked about is kept."""
+        if self._beside[0] is not fit:
+            self._beside = (fit, {})
+        known = self._beside[1]
+        if cause.key not in known:
+            without = fit.without(cause)
+            present = {effect.key for effect in fit.causes}
+            rivals = [h for h in self._hypotheses if h.key not in present]
+            known[cause.key] = Beside(without, Scan(without).candidate(cause), self.shortlist(without, rivals))
+        return known[cause.key]
+
     def _second_thoughts(self, fit: Fit) -> tuple[Fit, bool]:
-        present = {effect.key for effect in fit.causes}
-        rivals = [h for h in self._hypotheses if h.key not in present]
         for cause in fit.causes:
-            others = [effect for effect in fit.causes if effect.key != cause.key]
-            without = fit.with_causes(others)
-            itself = Scan(without).candidate(cause) or Candidate(cause, 0.0, 1)
+            beside = self.beside(fit, cause)
+            without, others = beside.without, beside.without.causes
+            itself = beside.itself or Candidate(cause, 0.0, 1)
             lost = nats(2.0 * (fit.log_likelihood - without.log_likelihood), itself.dof)
             if lost < NAMED + self.doubt(itself):
                 self._tell(f"dropped {describe(cause)}")
                 return without, True
-            for candidate in self.shortlist(without, rivals):
+            for candidate in beside.candidates:
                 if candidate.gain < _COMES_NEAR * itself.gain:
                     continue
                 tried = self.refined(fit.with_causes([*others, candidate.effect]), candidate.effect.key)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import ClassVar
@@ -190,10 +191,11 @@ class Settling(EncoderEffect):
         return (Parameter("fraction", 0.05, never_negative=True), Parameter("memory", 0.0, None))
 
     def columns(self, motion: Motion, place: Place, values: FloatArray) -> FloatArray:
-        missing = motion.moves[:, place.joint].copy()
-        if values[1] != 0.0:
-            for first, end in motion.runs:
-                missing[first:end] = lfilter([1.0], [1.0, -float(values[1])], missing[first:end])
+        missing, memory = motion.moves[:, place.joint], float(values[1])
+        if memory != 0.0:
+            # One filter over all runs; what a run would remember of the one before is taken off again.
+            missing = lfilter([1.0], [1.0, -memory], missing)
+            missing = missing - missing[motion.begins][motion.run] * memory**motion.since_begin
         return np.stack([-missing, np.zeros_like(missing)], axis=1)
 
 
@@ -210,9 +212,20 @@ class Play:
 
     def follow(self, reading: float) -> float:
         """The output for the next reading."""
-        output = reading if self._output is None else self._output
-        self._output = min(max(output, reading - self._half), reading + self._half)
-        return self._output
+        return self.followed([reading])[0]
+
+    def followed(self, readings: Sequence[float]) -> list[float]:
+        """The outputs for the next readings."""
+        half, outputs = self._half, []
+        output = readings[0] if self._output is None else self._output
+        for reading in readings:
+            if output < reading - half:
+                output = reading - half
+            elif output > reading + half:
+                output = reading + half
+            outputs.append(output)
+        self._output = output
+        return outputs
 
 
 def played(q: FloatArray, width: float) -> FloatArray:
@@ -225,7 +238,7 @@ def played(q: FloatArray, width: float) -> FloatArray:
     leading = moves[np.flatnonzero(moves)[:1]]
     play = Play(width)
     play.begin(float(q[0]), float(leading[0]) if len(leading) else 0.0)
-    return np.array([play.follow(reading) for reading in q.tolist()]) - q
+    return np.array(play.followed(q.tolist())) - q
 
 
 @lru_cache(maxsize=_PLAYS_KEPT)

@@ -9,7 +9,7 @@ import numpy as np
 from interfaces.records import FloatArray, frozen_array
 from interfaces.robot import RobotDescription
 from interfaces.urdf import REVOLUTE, UrdfJoint, UrdfTree, standing
-from kbmaps.rotations import exponentials
+from kbmaps.rotations import cross_matrix
 
 GRAVITY_M_S2 = 9.80665  # down the root link's z axis, as simulators load a URDF
 
@@ -61,33 +61,28 @@ class GravityLoad:
     def loads(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
         """What gravity does to all that each joint carries: moments about its origin [N·m] and forces [N], (n, d, 3).
 
-        In the joint's frame on its parent link, at q (n, d).
+        In the joint's frame on its parent link, at q (n, d). Vectors are handed from frame to frame: gravity outwards,
+        mass times centre of mass back.
         """
-        poses = self._poses(q)
+        turns = {k: _Turn.of(body.joint, q[:, k]) for k, body in self._bodies.items() if body.joint is not None}
+        # Components first: what is done to a component of all rows is done at once.
+        down: dict[int | None, FloatArray] = {None: np.array([[0.0], [0.0], [-GRAVITY_M_S2]])}
+        for k in self._outwards:
+            body = self._bodies[k]
+            down[k] = turns[k].inverse(body.T_carrier_joint[:3, :3].T @ down[body.carrier])
         mass = {k: body.mass_kg for k, body in self._bodies.items()}
-        moment = {
-            k: body.mass_kg * poses[k][:, :3, 3] + poses[k][:, :3, :3] @ body.moment for k, body in self._bodies.items()
-        }
+        moment = {k: body.moment[:, None] for k, body in self._bodies.items()}
         moments, forces = np.zeros((2, *q.shape, 3))
         for k in reversed(self._outwards):
             body = self._bodies[k]
-            turn = (poses[body.carrier] @ body.T_carrier_joint)[:, :3, :3]
-            lever = moment[k] - mass[k] * poses[k][:, :3, 3]
-            down = np.array([0.0, 0.0, -GRAVITY_M_S2])
-            moments[:, k] = np.einsum("nij,ni->nj", turn, np.cross(lever, down))
-            forces[:, k] = np.einsum("nij,i->nj", turn, mass[k] * down)
-            mass[body.carrier] = mass[body.carrier] + mass[k]
-            moment[body.carrier] = moment[body.carrier] + moment[k]
+            turn, T = turns[k], body.T_carrier_joint
+            lever, downward = turn.apply(moment[k]), T[:3, :3].T @ down[body.carrier]
+            moments[:, k] = _cross(lever, downward).T
+            forces[:, k] = mass[k] * downward.T
+            mass[body.carrier] += mass[k]
+            at_carrier = T[:3, :3] @ (lever + mass[k] * turn.slide) + mass[k] * T[:3, 3:]
+            moment[body.carrier] = moment[body.carrier] + at_carrier
         return moments, forces
-
-    def _poses(self, q: FloatArray) -> dict[int | None, FloatArray]:
-        """Pose (n, 4, 4) of each body in the root link."""
-        poses: dict[int | None, FloatArray] = {None: np.broadcast_to(np.eye(4), (len(q), 4, 4))}
-        for k in self._outwards:
-            body = self._bodies[k]
-            assert body.joint is not None
-            poses[k] = poses[body.carrier] @ body.T_carrier_joint @ _motions(body.joint, q[:, k])
-        return poses
 
     def _order(self) -> list[int | None]:
         order: list[int | None] = [None]
@@ -126,11 +121,39 @@ def _carried(
     return None, T
 
 
-def _motions(joint: UrdfJoint, q: FloatArray) -> FloatArray:
-    """The joint's own motion (n, 4, 4) at q (n,)."""
-    T = np.tile(np.eye(4), (len(q), 1, 1))
-    if joint.kind in REVOLUTE:
-        T[:, :3, :3] = exponentials(q[:, None] * joint.axis)[0]
-    else:
-        T[:, :3, 3] = q[:, None] * joint.axis
-    return T
+@dataclass(frozen=True, eq=False)
+class _Turn:
+    """A joint's own motion: a turn about a fixed axis, and a slide (3, n).
+
+    Attributes:
+        across, over: the matrices (3, 3) of a product with the axis, once and twice.
+        sine, versine: sin and 1 - cos of the angle (n,).
+        slide: along the axis [m] (3, n).
+    """
+
+    across: FloatArray
+    over: FloatArray
+    sine: FloatArray
+    versine: FloatArray
+    slide: FloatArray
+
+    @classmethod
+    def of(cls, joint: UrdfJoint, q: FloatArray) -> _Turn:
+        """At q (n,)."""
+        across = cross_matrix(joint.axis)
+        if joint.kind in REVOLUTE:
+            return cls(across, across @ across, np.sin(q), 1.0 - np.cos(q), np.zeros((3, 1)))
+        return cls(across, across @ across, np.zeros(1), np.zeros(1), joint.axis[:, None] * q)
+
+    def apply(self, vectors: FloatArray) -> FloatArray:
+        """Vectors (3, n) turned (Rodrigues)."""
+        return vectors + self.sine * (self.across @ vectors) + self.versine * (self.over @ vectors)
+
+    def inverse(self, vectors: FloatArray) -> FloatArray:
+        """Vectors (3, n) turned back."""
+        return vectors - self.sine * (self.across @ vectors) + self.versine * (self.over @ vectors)
+
+
+def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
+    """a × b (3, n)."""
+    return np.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])

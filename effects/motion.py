@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +11,8 @@ from scipy.interpolate import PchipInterpolator
 
 from interfaces.recording import Recording
 from interfaces.records import FloatArray, frozen_array
+
+_EARLIER_KEPT = 16
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,6 +74,16 @@ class Motion:
         firsts = np.flatnonzero(self.begins)
         return list(zip(firsts.tolist(), [*firsts[1:].tolist(), len(self.q)], strict=True))
 
+    @cached_property
+    def run(self) -> NDArray[np.int64]:
+        """The run of each row (n,), counted from 0."""
+        return np.cumsum(self.begins) - 1
+
+    @cached_property
+    def since_begin(self) -> NDArray[np.int64]:
+        """How many rows of its run come before each row (n,)."""
+        return np.arange(len(self.q)) - np.flatnonzero(self.begins)[self.run]
+
     def earlier(self, lag_s: float) -> Motion:
         """The readings that the encoders gave `lag_s` before each row, interpolated without overshoot.
 
@@ -80,13 +92,20 @@ class Motion:
         """
         if lag_s == 0.0 or self.t is None:
             return self
-        q = self.q.copy()
-        for first, end in self.runs:
-            if end - first < 2:
-                continue
-            t = self.t[first:end]
-            path = PchipInterpolator(t, self.q[first:end], axis=0)
-            asked = t - lag_s
-            inside = np.clip(asked, t[0], t[-1])
-            q[first:end] = path(inside) + (asked - inside)[:, None] * path(inside, 1)
-        return Motion(frozen_array(q), self.t, self.segment, self.begun_at)
+        return _earlier(self, lag_s)
+
+
+@lru_cache(maxsize=_EARLIER_KEPT)
+def _earlier(motion: Motion, lag_s: float) -> Motion:
+    """A search asks for the same lags of the same motion again and again."""
+    assert motion.t is not None
+    q = motion.q.copy()
+    for first, end in motion.runs:
+        if end - first < 2:
+            continue
+        t = motion.t[first:end]
+        path = PchipInterpolator(t, motion.q[first:end], axis=0)
+        asked = t - lag_s
+        inside = np.clip(asked, t[0], t[-1])
+        q[first:end] = path(inside) + (asked - inside)[:, None] * path(inside, 1)
+    return Motion(frozen_array(q), motion.t, motion.segment, motion.begun_at)
