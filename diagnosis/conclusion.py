@@ -133,26 +133,22 @@ def _outliers(diagnosis: Diagnosis) -> Cause:
 
 def _parameters(diagnosis: Diagnosis, cause: Effect, standing: Standing) -> dict[str, Interval]:
     fit = diagnosis.extended
-    first = 0
-    for effect in fit.simulation.effects:
-        if effect is cause:
-            break
-        first += len(effect.amounts)
-    amounts = cause.amounts
-    covariance = fit.covariance[first : first + len(amounts), first : first + len(amounts)]
+    places = fit.places(cause)
+    covariance = fit.covariance[np.ix_(places, places)]
     halves = _HALF_WIDTH_95 * np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    fitted = [*cause.amounts, *cause.shapes]
     numbers = {}
     for k, parameter in enumerate(cause.parameters):
         value = float(cause.values[k])
-        if parameter.is_amount:
-            half = float(halves[amounts.index(k)])
+        if k in fitted:
+            half = float(halves[fitted.index(k)])
             numbers[parameter.name] = Interval(value, (value - half, value + half))
         else:
-            numbers[parameter.name] = Interval(value, _shape_interval(cause, standing.itself))
+            numbers[parameter.name] = Interval(value, _moment_interval(cause, standing.itself))
     return numbers | _derived(cause, covariance)
 
 
-def _shape_interval(cause: Effect, itself: Candidate) -> tuple[float, float]:
+def _moment_interval(cause: Effect, itself: Candidate) -> tuple[float, float]:
     value = float(cause.values[-1])
     if itself.interval is None:
         return (value, value)

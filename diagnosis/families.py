@@ -83,9 +83,7 @@ def _joint(k: int) -> Columns:
 
 
 def _link(k: int) -> Columns:
-    return lambda run: run.columns(
-        Effect.at(run.simulation.robot, "link_geometry", run.simulation.robot.joints[k])
-    )
+    return lambda run: run.columns(Effect.at(run.simulation.robot, "link_geometry", run.simulation.robot.joints[k]))
 
 
 def _tool(run: Simulated) -> FloatArray:

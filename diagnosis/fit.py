@@ -20,6 +20,10 @@ LARGEST = 30.0
 _ROUNDS, _ENOUGH = 12, 0.02
 # A step that would raise it by less is not tried [nats].
 _NOT_TRIED = 1e-3
+# How far a step may take a ripple's phase over its range [rad], what is left of a settling, and a time constant, as a
+# share of it.
+_OF_A_PEAK, _OF_A_MEMORY, _OF_A_TIME = 0.5, 0.1, 0.3
+_LONGEST_MEMORY = 0.95
 _FEWEST_OUTLIERS = 1e-4
 _EM_ROUNDS = 6
 # So large a share of so many rows is no outliers.
@@ -139,12 +143,65 @@ class Fit:
         return self.residuals * self.root_weights
 
     @cached_property
+    def shape_columns(self) -> FloatArray:
+        """Derivatives (n, 3, s) of what is measured by all periods and time constants, whitened and weighted."""
+        parts = [self.run.by_shape(effect) for effect in self.causes if effect.shapes]
+        return self.weighted(np.concatenate(parts, axis=2)) if parts else np.empty((len(self.run.motion), 3, 0))
+
+    @cached_property
     def covariance(self) -> FloatArray:
-        """Of all amounts (p, p), nuisances first."""
-        n, _, p = self.columns.shape
-        flat = self.columns.reshape(3 * n, p)
-        information = flat.T @ flat / self.noise.sigma**2 + np.diag(prior_precision(self.simulation, self.nuisances))
+        """Of all amounts (p, p), nuisances first, then of periods and time constants."""
+        flat = np.concatenate([self.columns, self.shape_columns], axis=2).reshape(self.left.size, -1)
+        precision = np.append(prior_precision(self.simulation, self.nuisances), self._shape_precision)
+        information = flat.T @ flat / self.noise.sigma**2 + np.diag(precision)
         return np.asarray(np.linalg.pinv(information, rcond=1e-14, hermitian=True), dtype=np.float64)
+
+    @property
+    def _shape_precision(self) -> FloatArray:
+        """Of periods and time constants (s,): how far one step may take them."""
+        reaches = [_reach(self.run, effect, k) for effect in self.causes for k in effect.shapes]
+        return 1.0 / np.square(np.array(reaches))
+
+    def step(self) -> tuple[FloatArray, float]:
+        """The Gauss-Newton step of amounts, periods and time constants, and how far it may raise the likelihood.
+
+        Returns:
+            (p + s,), and [nats].
+        """
+        flat = np.concatenate([self.columns, self.shape_columns], axis=2).reshape(self.left.size, -1)
+        prior = prior_precision(self.simulation, self.nuisances)
+        precision = np.append(prior, self._shape_precision) * self.noise.sigma**2
+        values = np.concatenate([effect.values[effect.amounts] for effect in self.simulation.effects])
+        normal = flat.T @ flat + np.diag(precision)
+        gradient = flat.T @ self.left.ravel()
+        gradient[: len(values)] -= precision[: len(values)] * values
+        step = solved(normal, gradient)
+        return step, 0.5 * float(step @ gradient) / self.noise.sigma**2
+
+    def places(self, cause: Effect) -> list[int]:
+        """Where the amounts of a cause, then its periods and time constants are in `covariance`."""
+        amounts, shapes = 0, self.columns.shape[2]
+        for index, effect in enumerate(self.simulation.effects):
+            own = effect.shapes if index >= self.nuisances else []
+            if effect is cause:
+                return [*range(amounts, amounts + len(effect.amounts)), *range(shapes, shapes + len(own))]
+            amounts, shapes = amounts + len(effect.amounts), shapes + len(own)
+        raise ValueError(f"{cause.name} is no effect of this fit")
+
+    def moved(self, step: FloatArray) -> Simulation:
+        """The simulation with its numbers moved by a step (p + s,)."""
+        effects, first = [], 0
+        shape = self.columns.shape[2]
+        for index, effect in enumerate(self.simulation.effects):
+            values = effect.values.copy()
+            values[effect.amounts] += step[first : first + len(effect.amounts)]
+            first += len(effect.amounts)
+            if index >= self.nuisances:
+                for k in effect.shapes:
+                    values[k] = _bounded(effect, k, values[k] + step[shape])
+                    shape += 1
+            effects.append(effect.with_values(values))
+        return self.simulation.with_effects(effects)
 
     def at(self, simulation: Simulation) -> Fit:
         """Another simulation with the same nuisances, as it is."""
@@ -163,18 +220,18 @@ class Fit:
 def fitted(observations: Observations, simulation: Simulation, nuisances: int, start: Noise | None = None) -> Fit:
     """The most probable amounts of all effects of `simulation`, by Gauss-Newton steps that are halved where too far.
 
-    Moments, periods and time constants stay as they are.
+    Periods and time constants of the causes move along; moments stay as they are.
     """
     fit = _at(observations, simulation, nuisances, start)
     for _ in range(_ROUNDS):
         if not fit.columns.shape[2]:
             return fit
-        step, promised = _step(fit)
+        step, promised = fit.step()
         if promised < _NOT_TRIED:
             return fit
         best = None
         for shortened in (1.0, 0.3, 0.05):
-            tried = _at(observations, _moved(fit.simulation, shortened * step), nuisances, fit.noise)
+            tried = _at(observations, fit.moved(shortened * step), nuisances, fit.noise)
             if tried.log_likelihood > fit.log_likelihood:
                 best = tried
                 break
@@ -194,32 +251,24 @@ def _at(observations: Observations, simulation: Simulation, nuisances: int, star
     return Fit(observations, simulation, nuisances, run, residuals, noise)
 
 
-def _step(fit: Fit) -> tuple[FloatArray, float]:
-    """The Gauss-Newton step of all amounts (p,), and by how much it would raise the likelihood [nats] at best."""
-    n, _, p = fit.columns.shape
-    flat = fit.columns.reshape(3 * n, p)
-    precision = prior_precision(fit.simulation, fit.nuisances) * fit.noise.sigma**2
-    values = np.concatenate([effect.values[effect.amounts] for effect in fit.simulation.effects])
-    normal = flat.T @ flat + np.diag(precision)
-    gradient = flat.T @ fit.left.ravel() - precision * values
-    step = solved(normal, gradient)
-    return step, 0.5 * float(step @ gradient) / fit.noise.sigma**2
-
-
 def solved(normal: FloatArray, gradient: FloatArray) -> FloatArray:
     """The shortest solution (p,) of normal equations, in units in which each column has the same length."""
     scales = np.sqrt(np.maximum(np.diag(normal), 1e-300))
     return np.linalg.lstsq(normal / np.outer(scales, scales), gradient / scales, rcond=1e-12)[0] / scales
 
 
-def _moved(simulation: Simulation, step: FloatArray) -> Simulation:
-    effects, first = [], 0
-    for effect in simulation.effects:
-        values = effect.values.copy()
-        values[effect.amounts] += step[first : first + len(effect.amounts)]
-        first += len(effect.amounts)
-        effects.append(effect.with_values(values))
-    return simulation.with_effects(effects)
+def _reach(run: Simulated, effect: Effect, k: int) -> float:
+    """How far one step may take a period or a time constant, so that the derivative still says something."""
+    if effect.name == "joint_ripple":
+        return _OF_A_PEAK / max(float(np.ptp(run.readings.q[:, run.simulation.place(effect).joint])), 1e-6)
+    return _OF_A_MEMORY if effect.name == "settling" else _OF_A_TIME * float(effect.values[k])
+
+
+def _bounded(effect: Effect, k: int, value: float) -> float:
+    """A period or a time constant that can be."""
+    if effect.name == "settling":
+        return float(np.clip(value, 0.0, _LONGEST_MEMORY))
+    return float(np.clip(value, 0.5 * effect.values[k], 2.0 * effect.values[k]))
 
 
 def prior_precision(simulation: Simulation, nuisances: int) -> FloatArray:

@@ -10,8 +10,8 @@ from scipy import stats
 from interfaces.records import FloatArray
 
 from .explanation import Explanation
-from .held_out import Blocks
 from .fit import Fit
+from .held_out import Blocks
 from .sensitivity import joints_of
 from .unknown import Apart, Unknowns
 

@@ -42,7 +42,7 @@ class Candidate:
         gain: twice the rise of the log-likelihood.
         dof: how many amounts of it the data tell.
         trials: among how many moments or periods it was chosen.
-        interval: where else the moment or period may be, at 95 %; None for an effect that has none.
+        interval: where else the moment may be, at 95 %; None for an effect that has none.
     """
 
     effect: Effect
@@ -105,9 +105,8 @@ class Scan:
         fine = np.linspace(told[max(place - 1, 0)], told[min(place + 1, len(told) - 1)], 13)
         gains, amounts, dofs = self._each(effect, fine)
         best = int(np.argmax(gains))
-        interval = _interval(fine, gains)
         values = np.append(amounts[best], fine[best])
-        return Candidate(effect.with_values(values), float(gains[best]), int(dofs[best]), _COARSE, interval)
+        return Candidate(effect.with_values(values), float(gains[best]), int(dofs[best]), _COARSE)
 
     def _each(self, effect: Effect, shapes: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """`_solved` for each shape (m,), which scales the same columns row by row."""
@@ -154,8 +153,7 @@ class Scan:
         if not dofs[best]:
             return None
         values = np.array([*amounts[best], fine[best]])
-        interval = _interval(fine, gains)
-        return Candidate(effect.with_values(values), float(gains[best]), int(dofs[best]), 2 * len(coarse), interval)
+        return Candidate(effect.with_values(values), float(gains[best]), int(dofs[best]), 2 * len(coarse))
 
     def _rippled(self, effect: Effect, cycles: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """`_solved` for each of equally spaced numbers of cycles (m,)."""

@@ -157,7 +157,7 @@ class Unknowns:
     def _without(
         self, observations: Observations, chosen: Sequence[int], numbers: Sequence[FloatArray]
     ) -> Observations:
-        """Observations without what families account for: a joint's error in the readings, all else in the positions."""
+        """Without what families account for: a joint's error in the readings, all else in the positions."""
         q, x = observations.motion.q.copy(), observations.x.copy()
         for index, own in zip(chosen, numbers, strict=True):
             family = self.families[index]

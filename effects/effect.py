@@ -94,6 +94,11 @@ class Effect:
         return [k for k, parameter in enumerate(self.parameters) if parameter.is_amount]
 
     @property
+    def shapes(self) -> list[int]:
+        """The places of the values that smoothly say how: periods and time constants."""
+        return [k for k, parameter in enumerate(self.parameters) if parameter.smooth]
+
+    @property
     def is_possible(self) -> bool:
         """Whether none of its numbers is negative that cannot be."""
         return not any(p.never_negative and value < 0.0 for p, value in zip(self.parameters, self.values, strict=True))

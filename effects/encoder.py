@@ -118,8 +118,10 @@ class JointRipple(EncoderEffect):
 
     def parameters(self, prismatic: bool) -> tuple[Parameter, ...]:
         if prismatic:
-            return (Parameter("sine_m", 0.001), Parameter("cosine_m", 0.001), Parameter("cycles_per_m", 100.0, None))
-        return (Parameter("sine_rad", 0.01), Parameter("cosine_rad", 0.01), Parameter("cycles_per_turn", 8.0, None))
+            cycles = Parameter("cycles_per_m", 100.0, None, smooth=True)
+            return (Parameter("sine_m", 0.001), Parameter("cosine_m", 0.001), cycles)
+        cycles = Parameter("cycles_per_turn", 8.0, None, smooth=True)
+        return (Parameter("sine_rad", 0.01), Parameter("cosine_rad", 0.01), cycles)
 
     def columns(self, motion: Motion, place: Place, values: FloatArray) -> FloatArray:
         phase = motion.q[:, place.joint] * values[2] * (2.0 * np.pi if place.prismatic else 1.0)
@@ -188,7 +190,7 @@ class Settling(EncoderEffect):
     remembers = True
 
     def parameters(self, prismatic: bool) -> tuple[Parameter, ...]:
-        return (Parameter("fraction", 0.05, never_negative=True), Parameter("memory", 0.0, None))
+        return (Parameter("fraction", 0.05, never_negative=True), Parameter("memory", 0.0, None, smooth=True))
 
     def columns(self, motion: Motion, place: Place, values: FloatArray) -> FloatArray:
         missing, memory = motion.moves[:, place.joint], float(values[1])

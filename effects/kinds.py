@@ -52,6 +52,7 @@ class Kind:
 
 
 T0 = Parameter("t0", 0.0, None)
+TIME_CONSTANT = Parameter("time_constant_s", 600.0, None, smooth=True)
 _SHIFT = tuple(Parameter(f"{axis}_m", 0.01) for axis in "xyz")
 _TURN = tuple(Parameter(f"r{axis}_rad", 0.02) for axis in "xyz")
 _LINK = (*(Parameter(f"{axis}_m", 0.005) for axis in "xyz"), *_TURN)
@@ -91,6 +92,6 @@ KINDS: dict[str, Kind] = {
         _free("camera_focal", "camera", Parameter("focal_error", 0.01), needs_stereo=True),
         _free("lens_distortion", "camera", Parameter("k1", 0.02), Parameter("k2", 0.02), needs_stereo=True),
         _free("camera_latency", "time", Parameter("latency_s", 0.02), needs_times=True),
-        _free("thermal_drift", "time", *_SHIFT, Parameter("time_constant_s", 600.0, None), needs_times=True),
+        _free("thermal_drift", "time", *_SHIFT, TIME_CONSTANT, needs_times=True),
     )
 }

@@ -31,6 +31,8 @@ _SPRING_ROUNDS = 3
 _STEP = 1e-6
 # ... and by a latency [s].
 _STEP_S = 1e-5
+# ... and by a period or a time constant, as a share of it.
+_SHAPE_STEP = 1e-3
 
 
 class Residual(Protocol):
@@ -245,6 +247,17 @@ class Simulated:
             by_value = effect.kind.encoder.columns(self.readings, place, effect.values)
             return self.by_joint[:, :, [place.joint]] * by_value[:, None, :]
         return self._BY_NAME[effect.name](self, effect)
+
+    def by_shape(self, effect: Effect) -> FloatArray:
+        """Derivative (n, 3, s) of what is measured by the effect's `shapes`, at its values."""
+        derivatives = []
+        for k in effect.shapes:
+            step = np.zeros(len(effect.values))
+            step[k] = _SHAPE_STEP * (abs(effect.values[k]) or 1.0)
+            above, below = (self.columns(effect.with_values(effect.values + sign * step)) for sign in (1.0, -1.0))
+            change = (above - below)[:, :, effect.amounts] @ effect.values[effect.amounts]
+            derivatives.append(change / (2.0 * step[k]))
+        return np.stack(derivatives, axis=2) if derivatives else np.empty((len(self.q), 3, 0))
 
     def _compliance(self, effect: Effect) -> FloatArray:
         k = self.simulation.place(effect).joint

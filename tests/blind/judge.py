@@ -351,7 +351,7 @@ def gains(truth: Truth, diagnosis: Diagnosis, fresh: Recording) -> tuple[float |
 
 
 def joints_right(hidden: Hidden, depends_on: Sequence[str]) -> bool:
-    """Whether the joint that errs is named, all joints that drive its error and on which it clearly shows, and no idle one.
+    """Whether the joint that errs is named, and those that drive it and on which it clearly shows, but no idle one.
 
     An error that changes with time alone has to be named by time.
     """

@@ -77,6 +77,27 @@ def test_the_stated_covariance_is_neither_too_small_nor_too_large(robot, fits) -
     assert low < total < high
 
 
+SHAPED = {
+    "thermal_drift": (None, [0.004, -0.003, 0.005, 30.0], 40.0),
+    "joint_ripple": (SHOULDER, [0.01, -0.01, 9.0], 9.15),
+    "settling": (ELBOW, [0.2, 0.5], 0.4),
+}
+
+
+@pytest.mark.parametrize("name", SHAPED)
+def test_a_period_or_time_constant_lies_in_its_stated_interval_as_often_as_stated(robot, name) -> None:
+    where, values, off = SHAPED[name]
+    truth = Effect.at(robot, name, where, values=values)
+    held = 0
+    for seed in SEEDS[:20]:
+        start = start_of(robot, walk(robot, seed), (truth,), seed)
+        fit = start.with_causes([truth.with_values(np.array([*values[:-1], off]))])
+        (cause,) = fit.causes
+        place = fit.places(cause)[-1]
+        held += abs(cause.values[-1] - values[-1]) <= 1.959964 * np.sqrt(fit.covariance[place, place])
+    assert held >= stats.binom.ppf(CHANCE, 20, 0.95)
+
+
 def test_the_size_of_the_noise_is_that_of_the_recording(fits) -> None:
     squares = np.mean([fit.noise.sigma**2 for fit in fits])
     # Each fit has three coordinates a trusted row less its amounts: 9 of camera and marker, 4 of the causes.
