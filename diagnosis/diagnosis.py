@@ -34,6 +34,9 @@ _FEWEST_OUTLIERS = 3
 _OUTLIERS_NAMED = 15.0
 # Where they are off so often where the arm is faster, motion has to do with it.
 _MOSTLY = 0.8
+# What depends on the way to a reading, not only on the reading; and how far off, in units of its size, is farther than
+# the way between two readings can explain.
+_BY_THE_WAY, _BY_SO_MUCH = ("backlash", "settling", "camera_latency"), 2.0
 # Where more rows than this are doubtful, leaving them out costs more than they do harm.
 _MOST_DOUBTFUL = 0.25
 # Beside what has no name a cause stays named only if it is more probable than not.
@@ -106,7 +109,19 @@ class Diagnosis:
     def outliers_are_found(self) -> bool:
         """Whether there are so many, so far off, that it is a finding."""
         worth = self.extended.noise.log_likelihood - self.extended.without_outliers
-        return self.outliers >= _FEWEST_OUTLIERS and worth > _OUTLIERS_NAMED and not self._off_where_fast()
+        named = self.outliers >= _FEWEST_OUTLIERS and worth > _OUTLIERS_NAMED
+        return named and not self._off_where_fast() and not self._off_by_what_moves()
+
+    def _off_by_what_moves(self) -> bool:
+        """Whether the fixes are off by no more than the way between two readings, which nobody has seen, may matter."""
+        fit = self.extended
+        moving = [cause for cause in fit.causes if cause.name in _BY_THE_WAY]
+        changes = sum(fit.run.columns(cause)[:, :, cause.amounts] @ cause.values[cause.amounts] for cause in moving)
+        if not moving:
+            return False
+        changed = np.square(fit.observations.whitened(np.asarray(changes)[:, :, None])).sum(axis=(1, 2))
+        off = np.square(fit.residuals[self._off]).sum(axis=1)
+        return bool(np.median(off) < _BY_SO_MUCH**2 * changed.mean())
 
     def _off_where_fast(self) -> bool:
         """Whether the fixes that are off are those at the fastest rows: then it is motion that is not understood."""
