@@ -14,6 +14,7 @@ from interfaces.recording import Recording
 from interfaces.records import FloatArray
 
 from .alignment import aligned
+from .alike import Alike, alike
 from .explanation import explain, without_one
 from .fit import Fit, fitted
 from .held_out import Added, Blocks, added, gain_percent, held_out_errors, is_marker
@@ -135,6 +136,11 @@ class Diagnosis:
         left = fit.observations.residuals(fit.run.measured + self.left.explained)[self.markers]
         roots = np.linalg.inv(fit.observations.whitening)
         return float(np.square(left).mean()) * roots @ np.swapaxes(roots, 1, 2)
+
+    @cached_property
+    def alike(self) -> tuple[Alike, ...]:
+        """Effects that share a direction beside the best geometry."""
+        return alike(self.geometry, self.hypotheses.effects)
 
     @cached_property
     def rejected(self) -> list[tuple[Candidate, Added]]:

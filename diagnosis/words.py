@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from .result import Cause, Errors, Gain, Verdict
+from .result import Alike, Cause, Errors, Gain, Verdict
 from .rivals import Standing
 
 _DEG = 180.0 / np.pi
@@ -111,6 +111,23 @@ def sentence(verdict: Verdict, causes: Sequence[Cause], rms: Errors, gain: Gain)
         "unexplained": ". Something is left that none of the known effects explains",
     }
     return f"{head}: {what} {round(gain.held_out_percent)} % of the error ({figures}){ends[verdict]}"
+
+
+def beside_geometry(rms: Errors, alike: Sequence[Alike]) -> list[str]:
+    """What the best geometry explains, and which other effects then say much the same; nothing where none do."""
+    if rms.geometry is None or not alike:
+        return []
+    told = [
+        f"The best geometry, with every link, zero, the tool and the camera free, brings {rms.aligned:.3g} mm to "
+        f"{rms.geometry:.3g} mm. What is left can be described in more than one way:"
+    ]
+    for pair in alike:
+        told.append(
+            f"{pair.effect} and {pair.other} at {pair.where} share a direction: alone they explain "
+            f"{pair.explains_percent:.0f} % and {pair.other_explains_percent:.0f} % of what is left, and "
+            f"{pair.shared_percent:.0f} % of the smaller part is the same (Δχ² = {pair.delta_chi2:.0f} for the first)."
+        )
+    return told
 
 
 def evidence(standing: Standing) -> str:
