@@ -18,12 +18,9 @@ import numpy as np
 from diagnosis.alignment import aligned
 from diagnosis.conclusion import conclusion
 from diagnosis.diagnosis import Diagnosis, diagnose
-from diagnosis.explanation import Explanation
 from diagnosis.fit import Fit
 from diagnosis.held_out import Blocks, held_out_errors
-from diagnosis.leftover import leftover
 from diagnosis.observations import Observations
-from diagnosis.unknown import Unknowns
 from effects import Simulation, load_simulation
 from interfaces.recording import Recording
 from interfaces.records import FloatArray
@@ -57,14 +54,9 @@ def at_random(rows: int, seed: int) -> Blocks:
     return Blocks(np.random.default_rng(seed).permutation(blocks.of_row), blocks.count)
 
 
-def distances_mm(diagnosis: Diagnosis, blocks: Blocks) -> FloatArray:
+def distances_mm(diagnosis: Diagnosis) -> FloatArray:
     """Errors (n,) of the extended simulation on rows that were not fitted, those left out that are not the marker."""
-    unknowns = Unknowns(diagnosis.aligned)
-    known = [family.what for family in unknowns.families]
-    chosen = tuple(known.index(what) for what in diagnosis.left.what)
-    smooth = leftover(Explanation(diagnosis.extended, chosen, 0.0), unknowns, blocks).held_out
-    errors = held_out_errors(diagnosis.extended, blocks) - smooth
-    return 1e3 * np.linalg.norm(errors, axis=1)[diagnosis.markers]
+    return 1e3 * diagnosis.held_out["extended"][diagnosis.markers]
 
 
 def rms(distances: FloatArray) -> float:
@@ -76,11 +68,10 @@ def held_out_mm(fit: Fit, kept: BoolArray) -> float:
     return 1e3 * rms(np.linalg.norm(held_out_errors(fit, Blocks.cut(len(kept))), axis=1)[kept])
 
 
-def row(name: str, diagnosis: Diagnosis, seconds: float, seed: int) -> str:
-    """One line of the table."""
+def row(name: str, diagnosis: Diagnosis, dealt: Diagnosis, seconds: float) -> str:
+    """One line of the table, from diagnoses with rows held out by blocks and at random."""
     file = conclusion(diagnosis)
-    n = len(diagnosis.markers)
-    blocks, scattered = distances_mm(diagnosis, Blocks.cut(n)), distances_mm(diagnosis, at_random(n, seed))
+    n, blocks, scattered = len(diagnosis.markers), distances_mm(diagnosis), distances_mm(dealt)
     other = [c for c in file.causes if c.effect not in ("link_geometry", "joint_offset", "outliers")]
     first = max(other, key=lambda c: c.share_of_gain_percent, default=None)
     told = "–" if first is None else f"{first.effect} at {first.where}"
@@ -119,7 +110,10 @@ def main(argv: Sequence[str] | None = None) -> None:
         arms[name] = Arm.load(args.data / name, args.every if name == ONE_DAY else 1)
         start = time.process_time()
         found[name] = diagnose(arms[name].recording, arms[name].simulation, seed=args.seed)
-        print(row(name, found[name], time.process_time() - start, args.seed), flush=True)
+        seconds = time.process_time() - start
+        random = at_random(len(arms[name].recording), args.seed)
+        dealt = diagnose(arms[name].recording, arms[name].simulation, seed=args.seed, blocks=random)
+        print(row(name, found[name], dealt, seconds), flush=True)
     if ONE_DAY in found and ANOTHER_DAY in found:
         print(f"\n{taken_along(found[ONE_DAY], arms[ANOTHER_DAY], found[ANOTHER_DAY])}")
 
