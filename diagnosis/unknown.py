@@ -152,6 +152,13 @@ def _moved(moves: FloatArray, amounts: FloatArray) -> FloatArray:
     return (moves[:, :, :, None] * amounts[:, None, None, :]).reshape(len(moves), 3, -1)
 
 
+def _unit_columns(start: Fit, family: Family) -> FloatArray:
+    """A family's columns (3 n, p), whitened and as long as one."""
+    columns = start.observations.whitened(family.columns(start.run)).reshape(start.left.size, -1)
+    columns /= np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
+    return columns
+
+
 class Unknowns:
     """All families as they stand beside fits of the same observations.
 
@@ -160,11 +167,7 @@ class Unknowns:
 
     def __init__(self, start: Fit) -> None:
         self.families = families(start.run)
-        columns = [start.observations.whitened(family.columns(start.run)) for family in self.families]
-        ends = np.cumsum([part.shape[2] for part in columns])
-        self._slices = [slice(end - part.shape[2], end) for end, part in zip(ends, columns, strict=True)]
-        self._columns = np.concatenate(columns, axis=2).reshape(start.left.size, -1)
-        self._columns /= np.maximum(np.linalg.norm(self._columns, axis=0), 1e-300)
+        self._columns = [_unit_columns(start, family) for family in self.families]
         self._doubt = float(np.log(len(self.families))) + _NO_NAME
 
     def beside(self, fit: Fit, others: Sequence[int] = ()) -> tuple[FloatArray, FloatArray]:
@@ -178,18 +181,17 @@ class Unknowns:
     def best(self, fit: Fit, others: Sequence[int] = ()) -> tuple[int, float]:
         """The family that is worth most beside a fit and other families, and how much [nats]."""
         basis, left = self.beside(fit, others)
-        weights = np.repeat(fit.root_weights[:, 0], 3)
-        columns = self._columns * weights[:, None]
-        onto, toward = basis.T @ columns, columns.T @ left
+        weights = np.repeat(fit.root_weights[:, 0], 3)[:, None]
         rss, rows = float(left @ left), float(fit.noise.weights.sum())
         worths = []
-        for part in self._slices:
-            own = columns[:, part]
-            inner = own.T @ own - onto[:, part].T @ onto[:, part]
+        for columns in self._columns:
+            own = columns * weights
+            onto, toward = basis.T @ own, own.T @ left
+            inner = own.T @ own - onto.T @ onto
             values, vectors = np.linalg.eigh(inner)
             told = values > _TOLD * max(float(values.max()), 1e-12)
             told &= values > _LEFT
-            explained = float(np.square(vectors[:, told].T @ toward[part] / np.sqrt(values[told])).sum())
+            explained = float(np.square(vectors[:, told].T @ toward / np.sqrt(values[told])).sum())
             gain = -3.0 * rows * float(np.log1p(-min(explained / rss, 0.999999)))
             worths.append(0.5 * gain - _NUMBER * int(told.sum()))
         index = int(np.argmax(worths))
@@ -242,7 +244,7 @@ class Unknowns:
 
     def _fresh(self, fit: Fit, basis: FloatArray, index: int) -> FloatArray:
         """An orthonormal basis (3 n, r) of what a family changes beside a basis."""
-        columns = self._columns[:, self._slices[index]] * np.repeat(fit.root_weights[:, 0], 3)[:, None]
+        columns = self._columns[index] * np.repeat(fit.root_weights[:, 0], 3)[:, None]
         columns = columns - basis @ (basis.T @ columns)
         left, values, _ = np.linalg.svd(columns, full_matrices=False)
         return left[:, values > np.sqrt(_LEFT)]
