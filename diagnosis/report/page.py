@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from diagnosis.diagnosis import Diagnosis
-from diagnosis.numbers import chance, mm, share
+from diagnosis.numbers import chance, mm, share, told_values
 from diagnosis.result import Cause, DiagnosisFile, Verdict
 from diagnosis.words import beside_geometry, finding
 from effects import Effect
@@ -138,9 +138,7 @@ def _causes(residuals: Residuals, file: DiagnosisFile, remedies: Sequence[str]) 
 
 
 def _cause(residuals: Residuals, cause: Cause, effect: Effect | None, remedy: str, *, opened: bool) -> str:
-    said = finding(
-        cause.effect, cause.where, cause.source, {name: interval.value for name, interval in cause.parameters.items()}
-    )
+    said = finding(cause.effect, cause.where, cause.source, told_values(cause))
     plots = [outlier_panel(residuals)] if effect is None else evidence_panels(residuals, effect)
     state = " open" if opened else ""
     return (
