@@ -12,6 +12,7 @@ from rich.text import Text
 
 from diagnosis.numbers import chance, mm, named, numbers_of, percent, place, share, telling
 from diagnosis.result import Cause, DiagnosisFile, Errors, Indistinguishable, Verdict
+from diagnosis.words import beside_geometry
 
 # So many hypotheses that were rejected are shown.
 NEAREST = 6
@@ -60,6 +61,8 @@ def view(diagnosis: DiagnosisFile, remedies: Sequence[str], *, timed: bool) -> G
         parts.append(_list("Not told apart", rivals))
     if diagnosis.rejected:
         parts.append(_rejected(diagnosis))
+    if alike := beside_geometry(diagnosis.rms_mm, diagnosis.alike):
+        parts.append(_list("Beside the best geometry", alike))
     if remedies:
         parts.append(_list("What to do", remedies, numbered=True))
     if diagnosis.advice:

@@ -10,6 +10,7 @@ from interfaces.records import FloatArray
 from .advice import advice
 from .diagnosis import Diagnosis
 from .result import (
+    Alike,
     Cause,
     DiagnosisFile,
     Errors,
@@ -51,6 +52,7 @@ def conclusion(diagnosis: Diagnosis) -> DiagnosisFile:
         stability=_stability(diagnosis),
         advice=advice(diagnosis),
         limitations=diagnosis.hypotheses.limitations,
+        alike=_alike(diagnosis),
     )
 
 
@@ -181,6 +183,21 @@ def _rejected(diagnosis: Diagnosis) -> tuple[Rejected, ...]:
         for c, a in diagnosis.rejected
     ]
     return tuple(sorted(rows, key=lambda row: row.held_out_gain_percent, reverse=True))
+
+
+def _alike(diagnosis: Diagnosis) -> tuple[Alike, ...]:
+    return tuple(
+        Alike(
+            where=str(pair.one.where),
+            effect=pair.one.name,
+            other=pair.other.name,
+            explains_percent=100.0 * pair.one_explains,
+            other_explains_percent=100.0 * pair.other_explains,
+            shared_percent=100.0 * pair.shared,
+            delta_chi2=pair.preferred,
+        )
+        for pair in diagnosis.alike
+    )
 
 
 def _stability(diagnosis: Diagnosis) -> Stability | None:

@@ -14,6 +14,7 @@ from interfaces.recording import Recording
 from interfaces.records import FloatArray
 
 from .alignment import aligned
+from .alike import Alike, alike
 from .contact import before_contact
 from .explanation import explain, without_one
 from .fit import Fit, fitted
@@ -143,8 +144,8 @@ class Diagnosis:
     def without(self) -> dict[tuple[str, str | None, str | None], FloatArray]:
         """Distances (n,) [m] on rows not fitted, without each of the causes."""
         smooth = self.left.held_out
-        errors = [held_out_errors(standing.without, self.blocks) - smooth for standing in self.standings]
-        return {c.key: np.linalg.norm(error, axis=1) for c, error in zip(self.causes, errors, strict=True)}
+        errors = {c.key: held_out_errors(self.extended.without(c), self.blocks) - smooth for c in self.causes}
+        return {key: np.linalg.norm(error, axis=1) for key, error in errors.items()}
 
     @cached_property
     def noise(self) -> FloatArray:
@@ -153,6 +154,11 @@ class Diagnosis:
         left = fit.observations.residuals(fit.run.measured + self.left.explained)[self.markers]
         roots = np.linalg.inv(fit.observations.whitening)
         return float(np.square(left).mean()) * roots @ np.swapaxes(roots, 1, 2)
+
+    @cached_property
+    def alike(self) -> tuple[Alike, ...]:
+        """Effects that share a direction beside the best geometry."""
+        return alike(self.geometry, self.hypotheses.effects)
 
     @cached_property
     def rejected(self) -> list[tuple[Candidate, Added]]:
@@ -169,12 +175,15 @@ def diagnose(
     only: Collection[str] = (),
     without: Collection[str] = (),
     seed: int = 0,
+    blocks: Blocks | None = None,
     tell: Told = lambda _: None,
 ) -> Diagnosis:
     """What `simulation` gets wrong of a recording.
 
     Args:
         only, without: names of effects to test, all by default, and not to test.
+        seed: of the resampling.
+        blocks: by which rows are held out; of time by default.
         tell: is told what happens, in a few words.
     """
     observations = Observations.of(recording, simulation)
@@ -191,7 +200,7 @@ def diagnose(
         extended = search.run(start.with_causes(extended.causes))
         search.path.insert(0, start)
     tell("asking whether something without a name is at work")
-    unknowns, blocks = Unknowns(start), Blocks.cut(len(recording))
+    unknowns, blocks = Unknowns(start), blocks or Blocks.cut(len(recording))
     explanation = explain(extended, search.path, unknowns, search, tell)
     tell("asking what else it could be")
     stands = standings(explanation.fit, search, blocks, seed)

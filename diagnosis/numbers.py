@@ -81,6 +81,12 @@ def numbers_of(cause: Cause, *, timed: bool) -> list[Number]:
     return [number(name, cause.parameters[name], timed=timed) for name in names]
 
 
+def told_values(cause: Cause) -> dict[str, float]:
+    """The numbers of a cause that the recording tells; all where it tells none."""
+    told = {name: of.value for name, of in cause.parameters.items() if number(name, of).is_told}
+    return told or {name: of.value for name, of in cause.parameters.items()}
+
+
 def telling(numbers: list[Number]) -> list[Number]:
     """Those that are told and surely not zero; where none is, those that are told."""
     told = [n for n in numbers if n.is_told] or numbers

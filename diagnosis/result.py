@@ -74,6 +74,26 @@ class Rejected(msgspec.Struct, frozen=True):
     p_value: float
 
 
+class Alike(msgspec.Struct, frozen=True):
+    """Two effects at one joint that share a direction beside the best geometry, each taken alone.
+
+    Attributes:
+        effect: the one that explains most there.
+        other: what says much the same.
+        explains_percent, other_explains_percent: of the squared error that the best geometry leaves.
+        shared_percent: of what `other` explains, `effect` explains so much too.
+        delta_chi2: by how much more `effect` raises twice the log-likelihood.
+    """
+
+    where: str
+    effect: str
+    other: str
+    explains_percent: float
+    other_explains_percent: float
+    shared_percent: float
+    delta_chi2: float
+
+
 class Unexplained(msgspec.Struct, frozen=True):
     """Structure that no effect fits: how large, on which joints it depends (`time` among them), how improbable.
 
@@ -127,4 +147,5 @@ class DiagnosisFile(msgspec.Struct, frozen=True):
     stability: Stability | None
     advice: tuple[str, ...]
     limitations: tuple[str, ...]
+    alike: tuple[Alike, ...] = ()
     schema: int = 1

@@ -61,7 +61,6 @@ class Standing:
     """How one cause stands against all others.
 
     Attributes:
-        without: the fit without it.
         itself: the cause as it would explain most there.
         probability: of the cause, or of what no motion tells from it.
         worth: how much more probable the causes are with it than without any in its place [nats].
@@ -71,7 +70,6 @@ class Standing:
         again: in which of some resamplings of the blocks of time it would be named again.
     """
 
-    without: Fit
     itself: Candidate
     probability: float
     worth: float
@@ -112,7 +110,6 @@ def _standing(fit: Fit, cause: Effect, search: Search, blocks: Blocks, seed: int
     same = sum(rival.probability for rival in rivals if rival.is_same_anywhere)
     ordered = tuple(sorted(rivals, key=lambda rival: rival.probability, reverse=True))
     return Standing(
-        without,
         itself,
         float(shares[0]) + same,
         worth,

@@ -224,13 +224,16 @@ class Scan:
         usual = np.array([effect.parameters[j].usual for j in effect.amounts])
         # In units in which an amount that is as large as can be expected is one.
         unit = LARGEST * usual
-        scaled = inner * unit[:, None] * unit + sigma2 * np.eye(len(unit))
-        solved = np.linalg.solve(scaled, (gradient * unit)[:, :, None])[:, :, 0]
+        scaled = inner * unit[:, None] * unit
+        if len(unit) == 1:
+            solved = gradient * unit / (scaled[:, 0] + sigma2)
+        else:
+            solved = np.linalg.solve(scaled + sigma2 * np.eye(len(unit)), (gradient * unit)[:, :, None])[:, :, 0]
         amounts = solved * unit
         explained = np.einsum("ma,ma->m", amounts, gradient)
         explained = np.clip(explained, 0.0, 0.999999 * self._rss)
-        shares = np.linalg.eigvalsh(inner / np.sqrt(np.maximum(raw[:, :, None] * raw[:, None, :], 1e-300)))
-        told = np.linalg.eigvalsh(inner * unit[:, None] * unit) > 10.0 * sigma2
+        shares = _eigenvalues(inner / np.sqrt(np.maximum(raw[:, :, None] * raw[:, None, :], 1e-300)))
+        told = _eigenvalues(scaled) > 10.0 * sigma2
         dofs = ((shares > _TOLD_APART) & told).sum(axis=1)
         gains = -3.0 * self._rows * np.log1p(-explained / self._rss)
         return np.where(dofs > 0, gains, 0.0), amounts, dofs
@@ -269,6 +272,11 @@ class _Rows:
         raw = np.einsum("maa->ma", inner).copy()
         removed = (factors.T @ self.onto).reshape(len(inner), k, -1)
         return inner - removed @ np.swapaxes(removed, 1, 2), factors.T @ self.toward, raw
+
+
+def _eigenvalues(matrices: FloatArray) -> FloatArray:
+    """Of symmetric matrices (m, k, k), increasing (m, k)."""
+    return matrices[:, 0] if matrices.shape[1] == 1 else np.linalg.eigvalsh(matrices)
 
 
 def _interval(shapes: FloatArray, gains: FloatArray) -> tuple[float, float]:

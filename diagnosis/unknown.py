@@ -13,7 +13,7 @@ from scipy import stats
 
 from interfaces.records import FloatArray
 
-from .families import families
+from .families import Family, families
 from .fit import Fit, fitted
 from .held_out import Blocks, held_out_errors, scores_p_value
 from .observations import Observations
@@ -53,6 +53,14 @@ class Apart:
         return self.fit.run.measured + (self.observations.x - self.fit.observations.x)
 
 
+def _unit_columns(start: Fit, family: Family) -> tuple[FloatArray, FloatArray]:
+    """A family's columns (3 n, p), whitened and made as long as one, and how long they were (p,)."""
+    columns = start.observations.whitened(family.columns(start.run)).reshape(start.left.size, -1)
+    scales = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
+    columns /= scales
+    return columns, scales
+
+
 class Unknowns:
     """All families as they stand beside fits of the same observations.
 
@@ -61,12 +69,8 @@ class Unknowns:
 
     def __init__(self, start: Fit) -> None:
         self.families, self._run = families(start.run), start.run
-        columns = [start.observations.whitened(family.columns(start.run)) for family in self.families]
-        ends = np.cumsum([part.shape[2] for part in columns])
-        self._slices = [slice(end - part.shape[2], end) for end, part in zip(ends, columns, strict=True)]
-        self._columns = np.concatenate(columns, axis=2).reshape(start.left.size, -1)
-        self._scales = np.maximum(np.linalg.norm(self._columns, axis=0), 1e-300)
-        self._columns /= self._scales
+        units = [_unit_columns(start, family) for family in self.families]
+        self._columns, self._scales = [columns for columns, _ in units], [scales for _, scales in units]
         self._doubt = float(np.log(len(self.families))) + _NO_NAME
 
     def beside(self, fit: Fit, others: Sequence[int] = ()) -> tuple[FloatArray, FloatArray]:
@@ -80,18 +84,17 @@ class Unknowns:
     def best(self, fit: Fit, others: Sequence[int] = ()) -> tuple[int, float]:
         """The family that is worth most beside a fit and other families, and how much [nats]."""
         basis, left = self.beside(fit, others)
-        weights = np.repeat(fit.root_weights[:, 0], 3)
-        columns = self._columns * weights[:, None]
-        onto, toward = basis.T @ columns, columns.T @ left
+        weights = np.repeat(fit.root_weights[:, 0], 3)[:, None]
         rss, rows = float(left @ left), float(fit.noise.weights.sum())
         worths = []
-        for part in self._slices:
-            own = columns[:, part]
-            inner = own.T @ own - onto[:, part].T @ onto[:, part]
+        for columns in self._columns:
+            own = columns * weights
+            onto, toward = basis.T @ own, own.T @ left
+            inner = own.T @ own - onto.T @ onto
             values, vectors = np.linalg.eigh(inner)
             told = values > _TOLD * max(float(values.max()), 1e-12)
             told &= values > _LEFT
-            explained = float(np.square(vectors[:, told].T @ toward[part] / np.sqrt(values[told])).sum())
+            explained = float(np.square(vectors[:, told].T @ toward / np.sqrt(values[told])).sum())
             gain = -3.0 * rows * float(np.log1p(-min(explained / rss, 0.999999)))
             worths.append(0.5 * gain - _NUMBER * int(told.sum()))
         index = int(np.argmax(worths))
@@ -105,7 +108,7 @@ class Unknowns:
         Args:
             start: with some of the families.
         """
-        here = Apart(fit.observations, tuple(chosen), tuple(np.zeros(self._size(index)) for index in chosen), fit)
+        here = Apart(fit.observations, tuple(chosen), tuple(np.zeros(self._columns[index].shape[1]) for index in chosen), fit)
         if start is not None:
             known = dict(zip(start.chosen, start.numbers, strict=True))
             numbers = tuple(known.get(index, nothing) for index, nothing in zip(chosen, here.numbers, strict=True))
@@ -129,7 +132,7 @@ class Unknowns:
     def told(self, apart: Apart) -> FloatArray:
         """What families can change beside the causes (n, 3, r) [m], in directions that the data tell."""
         fit = apart.fit
-        columns = np.concatenate([self._columns[:, self._slices[index]] for index in apart.chosen], axis=1)
+        columns = np.concatenate([self._columns[index] for index in apart.chosen], axis=1)
         basis = fit.orthogonal.reshape(fit.left.size, -1)
         weighted = columns * np.repeat(fit.root_weights[:, 0], 3)[:, None]
         _, values, mix = np.linalg.svd(weighted - basis @ (basis.T @ weighted), full_matrices=False)
@@ -141,18 +144,15 @@ class Unknowns:
         """Measured minus predicted (n, 3) [m], each row predicted without its own fold."""
         return held_out_errors(apart.fit, blocks, self.told(apart))
 
-    def _size(self, index: int) -> int:
-        return self._slices[index].stop - self._slices[index].start
-
     def _step(self, fit: Fit, chosen: Sequence[int]) -> list[FloatArray]:
         """By how much the numbers of families change to explain most of what a fit leaves."""
         basis = fit.orthogonal.reshape(fit.left.size, -1)
         weights = np.repeat(fit.root_weights[:, 0], 3)[:, None]
-        columns = np.concatenate([self._columns[:, self._slices[index]] for index in chosen], axis=1) * weights
+        columns = np.concatenate([self._columns[index] for index in chosen], axis=1) * weights
         columns = columns - basis @ (basis.T @ columns)
         step = np.linalg.lstsq(columns, fit.left.ravel(), rcond=float(np.sqrt(_LEFT)))[0]
-        parts = np.split(step, np.cumsum([self._size(index) for index in chosen])[:-1])
-        return [part / self._scales[self._slices[index]] for part, index in zip(parts, chosen, strict=True)]
+        parts = np.split(step, np.cumsum([self._columns[index].shape[1] for index in chosen])[:-1])
+        return [part / self._scales[index] for part, index in zip(parts, chosen, strict=True)]
 
     def _without(
         self, observations: Observations, chosen: Sequence[int], numbers: Sequence[FloatArray]
@@ -180,7 +180,7 @@ class Unknowns:
 
     def _fresh(self, fit: Fit, basis: FloatArray, index: int) -> FloatArray:
         """An orthonormal basis (3 n, r) of what a family changes beside a basis."""
-        columns = self._columns[:, self._slices[index]] * np.repeat(fit.root_weights[:, 0], 3)[:, None]
+        columns = self._columns[index] * np.repeat(fit.root_weights[:, 0], 3)[:, None]
         columns = columns - basis @ (basis.T @ columns)
         left, values, _ = np.linalg.svd(columns, full_matrices=False)
         return left[:, values > np.sqrt(_LEFT)]

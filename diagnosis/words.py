@@ -6,7 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from .result import Cause, Errors, Gain, Verdict
+from .numbers import told_values
+from .result import Alike, Cause, Errors, Gain, Verdict
 from .rivals import Standing
 
 _DEG = 180.0 / np.pi
@@ -17,7 +18,7 @@ _TOLD = 4
 
 
 def finding(name: str, where: str | None, source: str | None, numbers: dict[str, float]) -> str:
-    """One cause as a clause: what is wrong, where, by how much."""
+    """One cause as a clause: what is wrong, where, by how much. Of shifts and turns only those in `numbers` count."""
     at = f"joint {where}"
 
     def size(*names: str) -> float:
@@ -30,6 +31,7 @@ def finding(name: str, where: str | None, source: str | None, numbers: dict[str,
 
     shift = f"{1e3 * size('x_m', 'y_m', 'z_m'):.3g} mm"
     turn = f"{size('rx_rad', 'ry_rad', 'rz_rad') * _DEG:.2g}°"
+    moved = " and ".join(said for said, end in ((shift, "_m"), (turn, "_rad")) if any(n.endswith(end) for n in numbers))
     when = f" at t = {numbers['t0']:.1f}" if "t0" in numbers else ""
     match name:
         case "joint_offset":
@@ -66,15 +68,15 @@ def finding(name: str, where: str | None, source: str | None, numbers: dict[str,
                 return f"{at} gives by {numbers['compliance_rad_per_Nm'] * _DEG:.2g}°/N·m under the arm's weight"
             return f"{at} gives by {1e3 * numbers['compliance_m_per_N']:.2g} mm/N under the arm's weight"
         case "link_geometry":
-            return f"the link before {at} is off by {shift} and {turn}"
+            return f"the link before {at} is off by {moved}"
         case "tool_offset":
             return f"the marker sits {shift} beside its place on the hand"
         case "tool_slip":
             return f"the marker slipped by {shift}{when}"
         case "camera_pose":
-            return f"the camera stands {shift} and {turn} off"
+            return f"the camera stands {moved} off"
         case "camera_moved":
-            return f"the camera was bumped by {shift} and {turn}{when}"
+            return f"the camera was bumped by {moved}{when}"
         case "camera_scale":
             return f"all that is measured is {100 * numbers['scale_error']:+.3g} % too large: the baseline is wrong"
         case "camera_focal":
@@ -96,7 +98,7 @@ def sentence(verdict: Verdict, causes: Sequence[Cause], rms: Errors, gain: Gain)
         return f"The simulation is right to within the noise: nothing found in {rms.aligned:.3g} mm of error"
     if not causes:
         return "What is measured differs from the simulation in a way that none of the known effects explains"
-    told = [finding(c.effect, c.where, c.source, {k: v.value for k, v in c.parameters.items()}) for c in causes]
+    told = [finding(c.effect, c.where, c.source, told_values(c)) for c in causes]
     ordered = [text for _, text in sorted(zip(causes, told, strict=True), key=lambda p: -p[0].share_of_gain_percent)]
     if len(ordered) > _TOLD:
         smaller = len(ordered) - _TOLD + 1
@@ -104,13 +106,33 @@ def sentence(verdict: Verdict, causes: Sequence[Cause], rms: Errors, gain: Gain)
     head = ordered[0][0].upper() + ordered[0][1:]
     if len(ordered) > 1:
         head += f"; {', '.join(ordered[1:-1])}{', and ' if len(ordered) > 2 else ''}{ordered[-1]}"
-    what = "it explains" if len(ordered) == 1 else "together they explain"
     ends = {
         "explained": "",
         "undecided": ". Other causes would explain it nearly as well",
         "unexplained": ". Something is left that none of the known effects explains",
     }
-    return f"{head}: {what} {round(gain.held_out_percent)} % of the error ({figures}){ends[verdict]}"
+    explained = round(gain.held_out_percent)
+    if explained <= 0:
+        return f"{head}: this explains the pairs that were fitted and no others ({figures}){ends[verdict]}"
+    what = "it explains" if len(ordered) == 1 else "together they explain"
+    return f"{head}: {what} {explained} % of the error ({figures}){ends[verdict]}"
+
+
+def beside_geometry(rms: Errors, alike: Sequence[Alike]) -> list[str]:
+    """What the best geometry explains, and which other effects then say much the same; nothing where none do."""
+    if rms.geometry is None or not alike:
+        return []
+    told = [
+        f"The best geometry, with every link, zero, the tool and the camera free, brings {rms.aligned:.3g} mm to "
+        f"{rms.geometry:.3g} mm. What is left can be described in more than one way:"
+    ]
+    for pair in alike:
+        told.append(
+            f"{pair.effect} and {pair.other} at {pair.where} share a direction: alone they explain "
+            f"{pair.explains_percent:.0f} % and {pair.other_explains_percent:.0f} % of what is left, and "
+            f"{pair.shared_percent:.0f} % of the smaller part is the same (Δχ² = {pair.delta_chi2:.0f} for the first)."
+        )
+    return told
 
 
 def evidence(standing: Standing) -> str:

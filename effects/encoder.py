@@ -18,7 +18,7 @@ from .parameter import Parameter
 
 # Of the numerical derivative of a play by its width [rad, m].
 _WIDTH_STEP = 1e-6
-_PLAYS_KEPT = 256
+_PLAYS_KEPT, _MEMORIES_KEPT = 256, 256
 # A magnet farther off its axis, as a share of its radius, is none that could be read.
 _FARTHEST_OFF = 0.95
 
@@ -193,12 +193,19 @@ class Settling(EncoderEffect):
         return (Parameter("fraction", 0.05, never_negative=True), Parameter("memory", 0.0, None, smooth=True))
 
     def columns(self, motion: Motion, place: Place, values: FloatArray) -> FloatArray:
-        missing, memory = motion.moves[:, place.joint], float(values[1])
-        if memory != 0.0:
-            # One filter over all runs; what a run would remember of the one before is taken off again.
-            missing = lfilter([1.0], [1.0, -memory], missing)
-            missing = missing - missing[motion.begins][motion.run] * memory**motion.since_begin
+        missing = _missing(motion, place.joint, float(values[1]))
         return np.stack([-missing, np.zeros_like(missing)], axis=1)
+
+
+@lru_cache(maxsize=_MEMORIES_KEPT)
+def _missing(motion: Motion, joint: int, memory: float) -> FloatArray:
+    """What is missing of the last move and of what was before (n,); a search asks for the same ones again and again."""
+    missing = motion.moves[:, joint]
+    if memory == 0.0:
+        return missing
+    # One filter over all runs; what a run would remember of the one before is taken off again.
+    missing = np.asarray(lfilter([1.0], [1.0, -memory], missing), dtype=np.float64)
+    return frozen_array(missing - missing[motion.begins][motion.run] * memory**motion.since_begin)
 
 
 class Play:

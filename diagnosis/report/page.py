@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from diagnosis.diagnosis import Diagnosis
-from diagnosis.numbers import chance, mm, share
+from diagnosis.numbers import chance, mm, share, told_values
 from diagnosis.result import Cause, DiagnosisFile, Verdict
-from diagnosis.words import finding
+from diagnosis.words import beside_geometry, finding
 from effects import Effect
 
 from . import tables
@@ -62,6 +62,7 @@ def page(diagnosis: Diagnosis, file: DiagnosisFile, remedies: Sequence[str], abo
         _head(file, about),
         _glance(residuals, file),
         _causes(residuals, file, remedies),
+        _alike(file),
         _advice(file),
         _where(residuals),
         _against(residuals),
@@ -137,9 +138,7 @@ def _causes(residuals: Residuals, file: DiagnosisFile, remedies: Sequence[str]) 
 
 
 def _cause(residuals: Residuals, cause: Cause, effect: Effect | None, remedy: str, *, opened: bool) -> str:
-    said = finding(
-        cause.effect, cause.where, cause.source, {name: interval.value for name, interval in cause.parameters.items()}
-    )
+    said = finding(cause.effect, cause.where, cause.source, told_values(cause))
     plots = [outlier_panel(residuals)] if effect is None else evidence_panels(residuals, effect)
     state = " open" if opened else ""
     return (
@@ -147,6 +146,14 @@ def _cause(residuals: Residuals, cause: Cause, effect: Effect | None, remedy: st
         f"{_panels(plots)}<div><p>{tables.numbers(cause, timed=residuals.timed)}</p><p>{escape(cause.evidence)}</p>"
         f"{tables.rivals(cause)}<p><b>What to do.</b> {escape(remedy)}</p></div></div></details>"
     )
+
+
+def _alike(file: DiagnosisFile) -> str:
+    told = beside_geometry(file.rms_mm, file.alike)
+    if not told:
+        return ""
+    pairs = _items(told[1:])
+    return f'<section id="alike"><h2>Beside the best geometry</h2><p>{escape(told[0])}</p><ul>{pairs}</ul></section>'
 
 
 def _advice(file: DiagnosisFile) -> str:

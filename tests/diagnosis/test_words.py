@@ -1,0 +1,32 @@
+"""Causes in words."""
+
+from __future__ import annotations
+
+from diagnosis.result import Cause, Errors, Gain, Interval
+from diagnosis.words import finding, sentence
+
+SHIFT = {"x_m": 0.001, "y_m": 0.0, "z_m": 0.0}
+TURN = {"rx_rad": 0.0, "ry_rad": 0.01, "rz_rad": 0.0}
+
+
+def _link(untold_m: float) -> Cause:
+    """A link of which the recording tells a shift in x and the turns, and nothing of the other shifts."""
+    told = {name: Interval(value, (value - 1e-4, value + 1e-4)) for name, value in (SHIFT | TURN).items()}
+    untold = {name: Interval(0.05, (0.05 - untold_m, 0.05 + untold_m)) for name in ("y_m", "z_m")}
+    return Cause("link_geometry", "elbow", None, told | untold, 1.0, 100.0, 80.0, 100.0, (), (), "")
+
+
+def test_a_link_that_only_turns_is_off_by_an_angle_alone():
+    assert finding("link_geometry", "elbow", None, TURN) == "the link before joint elbow is off by 0.57°"
+
+
+def test_a_shift_that_the_recording_does_not_tell_is_in_no_sentence():
+    errors = Errors(5.0, 5.0, 1.0, 1.0, 0.9)
+    assert "1 mm and 0.57°" in sentence("explained", [_link(1.0)], errors, Gain(80.0, (75.0, 85.0)))
+
+
+def test_a_gain_on_fitted_pairs_alone_is_called_none():
+    errors = Errors(5.0, 3.6, 1.8, 3.9, 0.7)
+    said = sentence("unexplained", [_link(1.0)], errors, Gain(-9.0, (-20.0, 2.0)))
+    assert "no others" in said
+    assert "-9" not in said
