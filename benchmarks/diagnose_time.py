@@ -85,7 +85,7 @@ def walk(robot: RobotDescription, pairs: int, rng: np.random.Generator) -> Motio
         q[row] = at
     tick = 2.0 * np.pi / TICKS_A_TURN
     q = np.round(q / tick) * tick
-    t = INTERVAL_S * np.arange(len(q))
+    t: FloatArray = np.asarray(INTERVAL_S * np.arange(len(q)), dtype=np.float64)
     everywhere = Motion(q, t, np.zeros(len(q), dtype=np.int64))
     seen = np.flatnonzero(in_view(robot, Simulation(robot).positions(everywhere)))[:pairs]
     return Motion(q[seen], t[seen], np.cumsum(np.append(0, np.diff(seen) > 1)))

@@ -276,7 +276,8 @@ class _Rows:
 
 def _eigenvalues(matrices: FloatArray) -> FloatArray:
     """Of symmetric matrices (m, k, k), increasing (m, k)."""
-    return matrices[:, 0] if matrices.shape[1] == 1 else np.linalg.eigvalsh(matrices)
+    values = matrices[:, 0] if matrices.shape[1] == 1 else np.linalg.eigvalsh(matrices)
+    return np.asarray(values, dtype=np.float64)
 
 
 def _interval(shapes: FloatArray, gains: FloatArray) -> tuple[float, float]:
