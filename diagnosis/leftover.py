@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
 from scipy import stats
-
-from interfaces.records import FloatArray
 
 from .explanation import Explanation
 from .held_out import Blocks
+from .smooth import SmoothModel, smooth_model
 from .unknown import TIME, Unknowns
 
 
@@ -23,16 +21,16 @@ class Leftover:
         joints: at which joints it acts or on which it depends, by their places in q.
         with_time: whether it depends on time.
         p_value: of so much structure by chance.
-        explained: what smooth functions predict of it (n, 3) [m].
-        held_out: the same (n, 3) [m], of rows that they were not fitted to.
+        model: the causes beside a smooth model of it; None where nothing is left.
+        untold: what it depends on time, in words, so that it is in no model that can be stored.
     """
 
     what: tuple[str, ...]
     joints: tuple[int, ...]
     with_time: bool
     p_value: float
-    explained: FloatArray
-    held_out: FloatArray
+    model: SmoothModel | None = None
+    untold: tuple[str, ...] = ()
 
     @property
     def is_there(self) -> bool:
@@ -47,17 +45,15 @@ def leftover(explanation: Explanation, unknowns: Unknowns, blocks: Blocks) -> Le
         index, _ = unknowns.best(fit)
         gain, dof = unknowns.gain(fit, (index,))
         p_value = float(min(1.0, stats.chi2.sf(gain, dof) * len(unknowns.families)))
-        nothing = np.zeros_like(fit.residuals)
-        return Leftover((), (), False, p_value, nothing, nothing)
+        return Leftover((), (), False, p_value)
     families = [unknowns.families[index] for index in explanation.unknown]
     gain, dof = unknowns.gain(fit, explanation.unknown)
-    explained, held_out = unknowns.predicted(fit, explanation.unknown, blocks)
     involved = {joint for family in families for joint in (*family.at, *family.drivers)}
     return Leftover(
         what=tuple(family.what for family in families),
         joints=tuple(sorted(involved - {TIME})),
         with_time=TIME in involved,
         p_value=float(stats.chi2.sf(gain, dof)),
-        explained=explained,
-        held_out=held_out,
+        model=smooth_model(fit, families, blocks),
+        untold=tuple(family.what for family in families if TIME in family.drivers),
     )

@@ -11,6 +11,7 @@ from .live import LiveEncoders
 from .motion import Motion
 from .parameter import Parameter
 from .simulation import Residual, Simulated, Simulation
+from .smooth_map import smooth_map
 from .unexplained import StoredModel, Unexplained
 
 __all__ = [
@@ -30,5 +31,6 @@ __all__ = [
     "read_effects",
     "read_unexplained",
     "simulation_of",
+    "smooth_map",
     "write_extended",
 ]

@@ -8,6 +8,7 @@ compliance_rad_per_Nm = 0.0031
 [unexplained]
 model = "unexplained.kbmap"     # relative to this file
 joints = ["shoulder", "elbow"]  # whose readings it takes
+factors = [1.0, 1.0]            # what it takes them times; 1 where it is not given
 """
 
 from __future__ import annotations
@@ -57,6 +58,7 @@ class _UnexplainedTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True)
 
     model: str
     joints: tuple[str, ...]
+    factors: tuple[float, ...] | None = None
 
 
 def load_simulation(file: Path) -> Simulation:
@@ -118,9 +120,9 @@ def read_unexplained(robot: RobotDescription, tables: Mapping[str, Any], text: s
     except ModelFormatError as error:
         raise RobotError(f"unexplained.model: {table.model}: {error}", file=file, line=line) from error
     try:
-        return Unexplained.of(robot, model, table.joints)
+        return Unexplained.of(robot, model, table.joints, table.factors)
     except RobotError as error:
-        line = line_of(text, (UNEXPLAINED, "joints"))
+        line = line_of(text, (UNEXPLAINED, "factors" if "factor" in error.what else "joints"))
         raise RobotError(f"unexplained: {error.what}", file=file, line=line, remedy=error.remedy) from None
 
 
@@ -151,7 +153,7 @@ def write_extended(simulation: Simulation, folder: Path, heading: str, *, replac
     if residual is not None:
         if not isinstance(residual, Unexplained):
             raise ValueError(f"a residual that can be stored is an Unexplained, not a {type(residual).__name__}")
-        tables[UNEXPLAINED] = {"model": MODEL_FILE, "joints": list(residual.joints)}
+        tables[UNEXPLAINED] = {"model": MODEL_FILE, "joints": list(residual.joints), "factors": list(residual.factors)}
     text = f"# {heading}\n\n{toml_text(tables)}"
     try:
         folder.mkdir(parents=True, exist_ok=True)

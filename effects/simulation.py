@@ -27,6 +27,8 @@ from .optics import Optics
 
 # A spring's deflection changes its own load: each round brings the next order.
 _SPRING_ROUNDS = 3
+# Effects that a rigid chain can have in it.
+RIGID = ("joint_offset", "link_geometry", "tool_offset", "camera_pose")
 # Of the numerical derivatives by the optics' numbers and by a point.
 _STEP = 1e-6
 # ... and by a latency [s].
@@ -66,6 +68,13 @@ class Simulation:
         changed = Simulation(self.robot, tuple(effects), self.residual)
         changed.__dict__["gravity"] = self.gravity
         return changed
+
+    @cached_property
+    def rigid(self) -> Simulation:
+        """With those of its effects alone that a rigid chain can have in it, and without the residual."""
+        rigid = Simulation(self.robot, tuple(effect for effect in self.effects if effect.name in RIGID))
+        rigid.__dict__["gravity"] = self.gravity
+        return rigid
 
     def positions(self, motion: Motion) -> FloatArray:
         """What would be measured (n, 3) [m] in the measurement frame."""
