@@ -18,6 +18,7 @@ from diagnosis.observations import ticks
 from diagnosis.remedies import remedies
 from diagnosis.report import About, page
 from diagnosis.result import DiagnosisFile
+from diagnosis.words import modelled
 from effects import KINDS, write_extended
 from interfaces.errors import BodyschemaError, RecordingError, RequestError
 from interfaces.recording import Recording
@@ -222,6 +223,7 @@ def written(found: Found, folder: Path) -> None:
     """
     about = About(found.source.name, found.robot.name, version("bodyschema"))
     heading = f"Found by bodyschema {about.version} in {len(found.source.recording)} pairs of {about.recording}"
+    heading = " ".join(filter(None, [f"{heading}.", modelled(found.file.unexplained)]))
     write_extended(found.diagnosis.extended.simulation, folder, heading, replace=True)
     try:
         folder.mkdir(parents=True, exist_ok=True)

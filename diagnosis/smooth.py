@@ -9,10 +9,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import combinations_with_replacement
 
 import numpy as np
 
-from effects import Motion, Simulation, Unexplained, smooth_map
+from effects import Motion, Simulation, Unexplained, place_map, smooth_map
 from interfaces.records import FloatArray
 
 from .fit import Fit, fitted, prior_precision, solved
@@ -32,7 +33,7 @@ class SmoothModel:
 
     Attributes:
         fit: the causes beside what could be stored, which is in its simulation.
-        stored: the model that has been learnt; None where all changes with time.
+        stored: the model that has been learnt; None where all changes with time, or what seemed to last does not.
         explained: what is said of the rows (n, 3) [m].
         in_time: the part of it that is not in the fit's simulation, since it changes with time.
         unseen: by how much the stored simulation predicts each row otherwise for having been fitted to it (n, 3) [m].
@@ -51,9 +52,10 @@ def smooth_model(fit: Fit, families: Sequence[Family], blocks: Blocks) -> Smooth
     timed = [family for family in families if TIME in family.drivers]
     functions = _Functions(fit, lasting)
     amounts = _Amounts(fit, functions.columns, _timed(fit, timed), blocks)
-    if not lasting:
-        alone = _Amounts(fit, functions.columns, _timed(fit, ()), blocks)
-        return SmoothModel(fit, None, amounts.in_time, amounts.in_time, alone.unseen)
+    causes = _Amounts(fit, functions.columns[:, :, :0], _timed(fit, ()), blocks)
+    if not lasting or (timed and amounts.lasting_missed > causes.lasting_missed):
+        in_time = _Amounts(fit, functions.columns[:, :, :0], _timed(fit, timed), blocks).in_time
+        return SmoothModel(fit, None, in_time, in_time, causes.unseen)
     stored = functions.stored(amounts.of_functions, _LEFT_OUT * _noise_m(fit))
     simulation = Simulation(fit.simulation.robot, fit.simulation.effects, stored)
     beside = fitted(fit.observations, simulation, fit.nuisances, fit.noise)
@@ -90,8 +92,9 @@ class _Functions:
         # A slide's functions reach from its lowest reading to its highest.
         ends = [f(self._given[:, k]) for k in range(self._given.shape[1]) for f in (np.argmin, np.argmax)]
         self._ends = self._given[ends]
-        x = self._simulation.rigid.positions(Motion.still(self._given))
-        self._centre, self._spread = x.mean(axis=0), float(x.std()) + 1e-9
+        self._robot = fit.simulation.robot
+        self._x = self._robot.chain.positions(self._given)
+        self._centre, self._spread = self._x.mean(axis=0), self._x.std(axis=0) + 1e-9
         self._families = families
         wide = self._at(self._wide())
         self._scales = np.maximum(np.sqrt(3.0 * np.square(wide).mean(axis=(0, 1))), 1e-12)
@@ -105,28 +108,34 @@ class _Functions:
         """The functions times amounts (p,), and what the simulation has already, as a model."""
         before = self._simulation.residual
         shares = amounts / self._scales
+        if before is None and not any(family.at for family in self._families):
+            return place_map(self._robot, lambda x: self._of_place(x) @ shares, self._x, tolerance_m)
 
         def shift(q: FloatArray) -> FloatArray:
             new = self._at(q) @ shares
             return new if before is None else new + before.predict(q)
 
-        return smooth_map(self._simulation.robot, shift, self._given, tolerance_m)
+        return smooth_map(self._robot, shift, self._given, tolerance_m)
 
     def _at(self, q: FloatArray) -> FloatArray:
         run = self._simulation.rigid.run(Motion.still(np.concatenate([self._ends, q])))
-        columns = [family.columns(run) if family.at else self._of_place(run.measured) for family in self._families]
-        return _beside(columns, len(run.motion))[len(self._ends) :]
+        x = self._robot.chain.positions(run.motion.q)
+        columns = [family.columns(run) if family.at else self._of_place(x) for family in self._families]
+        return _beside(columns, len(x))[len(self._ends) :]
 
     def _of_place(self, x: FloatArray) -> FloatArray:
-        """Any square function (n, 3, 30) of where the marker is: what lies in a ray's place in the image has no end."""
+        """Any cubic function (n, 3, 60) of where the marker is: one of its rays has poles, which no map can have."""
         place = (x - self._centre) / self._spread
-        squares = [place[:, [i]] * place[:, [j]] for i in range(3) for j in range(i, 3)]
-        amounts = np.concatenate([np.ones((len(x), 1)), place, *squares], axis=1)
+        products = [np.ones((len(x), 1)), place]
+        for degree in (2, 3):
+            chosen = combinations_with_replacement(range(3), degree)
+            products += [place[:, indices].prod(axis=1, keepdims=True) for indices in map(list, chosen)]
+        amounts = np.concatenate(products, axis=1)
         return (np.eye(3)[:, :, None] * amounts[:, None, None, :]).reshape(len(x), 3, -1)
 
     def _wide(self) -> FloatArray:
         """Postures all over the joints' range; of slides, over that of the recording."""
-        robot, q = self._simulation.robot, self._given
+        robot, q = self._robot, self._given
         slides = robot.chain.prismatic
         low = np.where(slides, q.min(axis=0), np.maximum(robot.lower, -np.pi))
         high = np.where(slides, q.max(axis=0), np.minimum(robot.upper, np.pi))
@@ -159,6 +168,18 @@ class _Amounts:
         return self._columns[:, :, first:] @ self._all[first:]
 
     @property
+    def lasting_missed(self) -> float:
+        """What causes and lasting functions leave (sum of squares, whitened) of rows that were not fitted."""
+        left = self._fit.weighted((self._fit.observations.x - self._fit.run.measured - self._said + self.unseen)[:, :, None])
+        return float(np.square(left).sum())
+
+    @property
+    def _said(self) -> FloatArray:
+        """What causes and lasting functions say more of the rows (n, 3) [m]."""
+        lasting = slice(0, self._causes + self._lasting)
+        return self._columns[:, :, lasting] @ self._all[lasting]
+
+    @cached_property
     def unseen(self) -> FloatArray:
         """By how much causes and lasting functions say more of rows (n, 3) [m] than if these had not been fitted."""
         more = np.zeros_like(self._fit.residuals)

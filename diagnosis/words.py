@@ -6,7 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from .result import Cause, Errors, Gain, Verdict
+from effects.unexplained import PLACE
+
+from .result import Cause, Errors, Gain, Unexplained, Verdict
 from .rivals import Standing
 
 _DEG = 180.0 / np.pi
@@ -111,6 +113,22 @@ def sentence(verdict: Verdict, causes: Sequence[Cause], rms: Errors, gain: Gain)
         "unexplained": ". Something is left that none of the known effects explains",
     }
     return f"{head}: {what} {round(gain.held_out_percent)} % of the error ({figures}){ends[verdict]}"
+
+
+def modelled(left: Unexplained) -> str:
+    """What extended.toml has of what no effect fits, in one or two sentences; none where nothing is left."""
+    told = []
+    if left.model_joints:
+        over = "the marker's place" if left.model_joints == PLACE else f"the readings of {', '.join(left.model_joints)}"
+        told.append(f"extended.toml has a smooth model of it over {over}, as good as the recording is dense.")
+    elif left.what:
+        told.append("extended.toml has no model of it.")
+    if left.not_in_model:
+        told.append(
+            f"What changes with time is in no such model: {'; '.join(left.not_in_model)}. Another recording will "
+            "differ by it again."
+        )
+    return " ".join(told)
 
 
 def evidence(standing: Standing) -> str:

@@ -11,7 +11,7 @@ from .live import LiveEncoders
 from .motion import Motion
 from .parameter import Parameter
 from .simulation import Residual, Simulated, Simulation
-from .smooth_map import smooth_map
+from .smooth_map import place_map, smooth_map
 from .unexplained import StoredModel, Unexplained
 
 __all__ = [
@@ -28,6 +28,7 @@ __all__ = [
     "StoredModel",
     "Unexplained",
     "load_simulation",
+    "place_map",
     "read_effects",
     "read_unexplained",
     "simulation_of",

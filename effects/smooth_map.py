@@ -16,7 +16,7 @@ from interfaces.records import FloatArray
 from interfaces.robot import RobotDescription
 from kbmaps import JointBasis, KBMap
 
-from .unexplained import Unexplained
+from .unexplained import PLACE, Unexplained
 
 Shift = Callable[[FloatArray], FloatArray]
 # Harmonics above this are left out; a net has so many control points at most.
@@ -102,19 +102,29 @@ def smooth_map(robot: RobotDescription, shift: Shift, q: FloatArray, tolerance_m
         q: readings (n, d) where the function is wanted.
         tolerance_m: parts smaller than this (RMS) are left out, and with them the joints that do not matter.
     """
-    axes = [_axis(robot, shift, q, k, tolerance_m) for k in range(q.shape[1])]
+    return _learnt(robot, robot.joints, robot.chain.prismatic.tolist(), shift, q, tolerance_m)
+
+
+def place_map(robot: RobotDescription, shift: Shift, x: FloatArray, tolerance_m: float) -> Unexplained:
+    """The same of a function of where the robot as described has its marker, wanted at x (n, 3) [m]."""
+    return _learnt(robot, PLACE, [True] * len(PLACE), shift, x, tolerance_m)
+
+
+def _learnt(
+    robot: RobotDescription, names: Sequence[str], slides: Sequence[bool], shift: Shift, q: FloatArray, tolerance_m: float
+) -> Unexplained:
+    axes = [_axis(slides[k], shift, q, k, tolerance_m) for k in range(q.shape[1])]
     while np.prod([float(len(axis.grid)) for axis in axes]) > _LARGEST_GRID:
         most = max(range(len(axes)), key=lambda k: axes[k].harmonics)
         axes[most] = replace(axes[most], harmonics=axes[most].harmonics - 1)
     axes, amounts = _pruned(axes, _amounts(axes, shift), tolerance_m)
     if not any(axis.bases for axis in axes):
         axes[0], amounts = replace(axes[0], harmonics=1), np.pad(amounts, [(0, 2), *[(0, 0)] * (amounts.ndim - 1)])
-    return _stored(robot, axes, amounts)
+    return _stored(robot, names, axes, amounts)
 
 
-def _axis(robot: RobotDescription, shift: Shift, q: FloatArray, joint: int, tolerance_m: float) -> _Axis:
+def _axis(slides: bool, shift: Shift, q: FloatArray, joint: int, tolerance_m: float) -> _Axis:
     """How many harmonics of one joint there are, on some lines through readings."""
-    slides = bool(robot.chain.prismatic[joint])
     low, high = float(q[:, joint].min()), float(q[:, joint].max())
     if slides and high - low < 1e-6:
         low, high = low - 0.5, low + 0.5
@@ -166,12 +176,14 @@ def _pruned(axes: list[_Axis], amounts: FloatArray, tolerance_m: float) -> tuple
         axes[least] = replace(axes[least], harmonics=axes[least].harmonics - 1)
 
 
-def _stored(robot: RobotDescription, axes: Sequence[_Axis], amounts: FloatArray) -> Unexplained:
+def _stored(
+    robot: RobotDescription, names: Sequence[str], axes: Sequence[_Axis], amounts: FloatArray
+) -> Unexplained:
     net = np.moveaxis(amounts, -1, 0)
     for axis in axes:
         # The first axis of functions is always the next: what it becomes goes to the end.
         net = np.tensordot(net, axis.in_columns, axes=(1, 0))
-    joints = [joint for joint, axis in zip(robot.joints, axes, strict=True) for _ in axis.bases]
+    joints = [joint for joint, axis in zip(names, axes, strict=True) for _ in axis.bases]
     factors = [factor for axis in axes for factor in axis.factors]
     kbmap = KBMap(tuple(basis for axis in axes for basis in axis.bases), net)
     return Unexplained.of(robot, kbmap, tuple(joints), tuple(factors))

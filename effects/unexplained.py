@@ -16,6 +16,10 @@ from interfaces.suggest import did_you_mean
 from kbmaps import KBMap, KBMapsError, KernelLearner, ModelFormatError, ResidualModel, TensorTrain
 
 
+# The marker's coordinates, in the place of a joint.
+PLACE = ("marker.x", "marker.y", "marker.z")
+
+
 class StoredModel(Protocol):
     """A map of kbmaps that predicts and can be stored."""
 
@@ -47,15 +51,16 @@ class Unexplained:
 
     Attributes:
         model: any map of kbmaps; its outputs are shifts of what is measured [m], in the measurement frame.
-        joints: the joints whose readings it takes, in its order.
-        factors: what it takes each of these readings times.
-        columns: their places in q.
+        joints: the joints whose readings it takes, in its order; among them may be `PLACE`, the coordinates [m] at which
+            the robot as described has its marker at the readings.
+        factors: what it takes each of these numbers times.
+        robot: whose joints they are.
     """
 
     model: StoredModel
     joints: tuple[str, ...]
     factors: tuple[float, ...]
-    columns: tuple[int, ...]
+    robot: RobotDescription
 
     @classmethod
     def of(
@@ -76,7 +81,7 @@ class Unexplained:
                 joints, or has learnt nothing.
         """
         for joint in joints:
-            if joint not in robot.joints:
+            if joint not in (*robot.joints, *PLACE):
                 raise RobotError(f"{joint!r}: no joint of this robot", remedy=did_you_mean(joint, robot.joints))
         factors = (1.0,) * len(joints) if factors is None else factors
         if len(factors) != len(joints):
@@ -93,11 +98,15 @@ class Unexplained:
             model.predict(np.zeros((1, len(joints))))
         except KBMapsError as error:
             raise RobotError(f"the model cannot predict: {error}", remedy="Store one that has learnt") from error
-        return cls(model, joints, factors, tuple(robot.joints.index(joint) for joint in joints))
+        return cls(model, joints, factors, robot)
 
     def predict(self, q: FloatArray) -> FloatArray:
         """Shifts (n, 3) [m] at the readings q (n, d) [rad, m] of all joints."""
-        return self.model.predict(q[:, self.columns] * self.factors)
+        values = q
+        if set(self.joints) & set(PLACE):
+            values = np.concatenate([q, self.robot.chain.positions(q)], axis=1)
+        names = (*self.robot.joints, *PLACE)
+        return self.model.predict(values[:, [names.index(joint) for joint in self.joints]] * self.factors)
 
 
 def stored_model(data: bytes) -> StoredModel:

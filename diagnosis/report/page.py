@@ -94,6 +94,7 @@ def _unexplained(file: DiagnosisFile) -> str:
         f"<p>About <b>{mm(left.rms_mm)} mm</b> (RMS) is left that fits no known effect. It depends on "
         f"<b>{escape(', '.join(left.depends_on))}</b>; by chance that much is as improbable as p "
         f"{_equals(left.p_value)}.</p>{f'<ul>{_items(left.what)}</ul>' if left.what else ''}"
+        f"<p>{escape(modelled(left))}</p>"
     )
 
 
