@@ -76,6 +76,23 @@ class Simulation:
         rigid.__dict__["gravity"] = self.gravity
         return rigid
 
+    @property
+    def placed(self) -> Simulation:
+        """The same, with what the description calls not known in the description and no more among the effects.
+
+        The camera's pose and the marker's place go there exactly: both are the frames at the ends of the chain.
+        """
+        robot, gone = self.robot, set[str]()
+        pose, marker = robot.camera.pose, np.array(robot.robot.marker_xyz)
+        if not robot.camera.pose_known and self._of("camera_pose"):
+            pose, gone = pose @ self.camera_pose, gone | {"camera_pose"}
+        if not robot.robot.marker_known and (shifts := self._of("tool_offset")):
+            marker, gone = marker + sum(effect.values for effect in shifts), gone | {"tool_offset"}
+        if not gone:
+            return self
+        effects = tuple(effect for effect in self.effects if effect.name not in gone)
+        return Simulation(robot.with_placement(pose, marker), effects, self.residual)
+
     def positions(self, motion: Motion) -> FloatArray:
         """What would be measured (n, 3) [m] in the measurement frame."""
         return self.run(motion).measured

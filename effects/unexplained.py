@@ -100,10 +100,15 @@ class Unexplained:
             raise RobotError(f"the model cannot predict: {error}", remedy="Store one that has learnt") from error
         return cls(model, joints, factors, robot)
 
+    @property
+    def is_of_place(self) -> bool:
+        """Whether it takes a coordinate of the marker."""
+        return bool(set(self.joints) & set(PLACE))
+
     def predict(self, q: FloatArray) -> FloatArray:
         """Shifts (n, 3) [m] at the readings q (n, d) [rad, m] of all joints."""
         values = q
-        if set(self.joints) & set(PLACE):
+        if self.is_of_place:
             values = np.concatenate([q, self.robot.chain.positions(q)], axis=1)
         names = (*self.robot.joints, *PLACE)
         return self.model.predict(values[:, [names.index(joint) for joint in self.joints]] * self.factors)
