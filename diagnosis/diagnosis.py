@@ -136,8 +136,8 @@ class Diagnosis:
     def noise(self) -> FloatArray:
         """Covariances (n, 3, 3) [m²] of the noise, from what is left when all is explained that can be."""
         fit = self.extended
-        in_time = 0.0 if self.left.model is None else self.left.model.in_time
-        left = fit.observations.residuals(fit.run.measured + in_time)[self.markers]
+        unstored = 0.0 if self.left.model is None else self.left.model.unstored
+        left = fit.observations.residuals(fit.run.measured + unstored)[self.markers]
         roots = np.linalg.inv(fit.observations.whitening)
         return float(np.square(left).mean()) * roots @ np.swapaxes(roots, 1, 2)
 

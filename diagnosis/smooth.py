@@ -35,14 +35,14 @@ class SmoothModel:
         fit: the causes beside what could be stored, which is in its simulation.
         stored: the model that has been learnt; None where all changes with time, or what seemed to last does not.
         explained: what is said of the rows (n, 3) [m].
-        in_time: the part of it that is not in the fit's simulation, since it changes with time.
+        unstored: the part of it that is not in the fit's simulation, since it changes with time.
         unseen: by how much the stored simulation predicts each row otherwise for having been fitted to it (n, 3) [m].
     """
 
     fit: Fit
     stored: Unexplained | None
     explained: FloatArray
-    in_time: FloatArray
+    unstored: FloatArray
     unseen: FloatArray
 
 
@@ -54,8 +54,8 @@ def smooth_model(fit: Fit, families: Sequence[Family], blocks: Blocks) -> Smooth
     amounts = _Amounts(fit, functions.columns, _timed(fit, timed), blocks)
     causes = _Amounts(fit, functions.columns[:, :, :0], _timed(fit, ()), blocks)
     if not lasting or (timed and amounts.lasting_missed > causes.lasting_missed):
-        in_time = _Amounts(fit, functions.columns[:, :, :0], _timed(fit, timed), blocks).in_time
-        return SmoothModel(fit, None, in_time, in_time, causes.unseen)
+        said = amounts.said + amounts.in_time
+        return SmoothModel(fit, None, said, said, causes.unseen)
     stored = functions.stored(amounts.of_functions, _LEFT_OUT * _noise_m(fit))
     simulation = Simulation(fit.simulation.robot, fit.simulation.effects, stored)
     beside = fitted(fit.observations, simulation, fit.nuisances, fit.noise)
@@ -170,11 +170,11 @@ class _Amounts:
     @property
     def lasting_missed(self) -> float:
         """What causes and lasting functions leave (sum of squares, whitened) of rows that were not fitted."""
-        left = self._fit.weighted((self._fit.observations.x - self._fit.run.measured - self._said + self.unseen)[:, :, None])
+        left = self._fit.weighted((self._fit.observations.x - self._fit.run.measured - self.said + self.unseen)[:, :, None])
         return float(np.square(left).sum())
 
     @property
-    def _said(self) -> FloatArray:
+    def said(self) -> FloatArray:
         """What causes and lasting functions say more of the rows (n, 3) [m]."""
         lasting = slice(0, self._causes + self._lasting)
         return self._columns[:, :, lasting] @ self._all[lasting]

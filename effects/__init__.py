@@ -3,6 +3,7 @@
 What `diagnosis` fits is what `sim_backend` applies.
 """
 
+from .corrected import corrected_file, write_corrected
 from .effect import Effect
 from .files import load_simulation, read_effects, read_unexplained, simulation_of, write_extended
 from .gravity import GravityLoad
@@ -27,11 +28,13 @@ __all__ = [
     "Simulation",
     "StoredModel",
     "Unexplained",
+    "corrected_file",
     "load_simulation",
     "place_map",
     "read_effects",
     "read_unexplained",
     "simulation_of",
     "smooth_map",
+    "write_corrected",
     "write_extended",
 ]

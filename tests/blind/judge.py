@@ -370,6 +370,6 @@ def smooth_ratio(truth: Truth, diagnosis: Diagnosis) -> float | None:
     """
     if not truth.strange or diagnosis.left.model is None:
         return None
-    modelled = diagnosis.extended.run.measured + diagnosis.left.model.in_time
+    modelled = diagnosis.extended.run.measured + diagnosis.left.model.unstored
     off = np.square(modelled - truth.case.measured.x_noise_free).sum(axis=1).mean()
     return float(np.sqrt(1.0 + off / truth.case.sigma_m**2))
