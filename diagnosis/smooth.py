@@ -13,7 +13,7 @@ from itertools import combinations_with_replacement
 
 import numpy as np
 
-from effects import Motion, Simulation, Unexplained, place_map, smooth_map
+from effects import Motion, Simulated, Simulation, Unexplained, place_map, smooth_map
 from interfaces.records import FloatArray
 
 from .fit import Fit, fitted, prior_precision, solved
@@ -21,8 +21,10 @@ from .held_out import Blocks
 from .unknown import TIME, Family
 
 # How far a function may move the marker anywhere, in units of the noise; what predicts rows best is taken.
-_SIZES = (3.0, 10.0, 30.0, 100.0, 1000.0)
+_SIZES = (3.0, 10.0, 30.0, 100.0, 300.0)
 _WIDE = 400
+# Harmonics of one joint's angle beyond those by which a family was found.
+_FINER = (6, 14)
 # What is left out of a stored model, of the noise.
 _LEFT_OUT = 0.02
 
@@ -121,7 +123,16 @@ class _Functions:
         run = self._simulation.rigid.run(Motion.still(np.concatenate([self._ends, q])))
         x = self._robot.chain.positions(run.motion.q)
         columns = [family.columns(run) if family.at else self._of_place(x) for family in self._families]
+        columns += [self._finer(run, *f.at, *f.drivers) for f in self._families if len(f.at) == len(f.drivers) == 1]
         return _beside(columns, len(x))[len(self._ends) :]
+
+    def _finer(self, run: Simulated, joint: int, driver: int) -> FloatArray:
+        """An error of a joint that changes faster with another than its family has it (n, 3, p)."""
+        low, high = self._given[:, driver].min(), self._given[:, driver].max()
+        scale = np.pi / (high - low) if self._robot.chain.prismatic[driver] else 1.0
+        angles = scale * run.motion.q[:, [driver]] * np.arange(_FINER[0], _FINER[1] + 1)
+        waves = np.concatenate([np.cos(angles), np.sin(angles)], axis=1)
+        return run.by_joint[:, :, [joint]] * waves[:, None, :]
 
     def _of_place(self, x: FloatArray) -> FloatArray:
         """Any cubic function (n, 3, 60) of where the marker is: one of its rays has poles, which no map can have."""

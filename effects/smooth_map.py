@@ -1,7 +1,7 @@
 """Smooth functions of the readings as KB-Maps, some of whose joints count more than once.
 
-A KB-Map has {1, cos θ, sin θ} of each joint. With columns θ, 2θ and 4θ, as of three joints, it has all harmonics up to
-the seventh; and what is a sum of products of harmonics, as what moves a rigid chain is, it has exactly.
+A KB-Map has {1, cos θ, sin θ} of each joint. With columns θ, 2θ, 4θ and 8θ, as of four joints, it has all harmonics up
+to the fifteenth; and what is a sum of products of harmonics, as what moves a rigid chain is, it has exactly.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from .unexplained import PLACE, Unexplained
 
 Shift = Callable[[FloatArray], FloatArray]
 # Harmonics above this are left out; a net has so many control points at most.
-_MOST_HARMONICS, _LARGEST_NET = 7, 3**12
+_MOST_HARMONICS, _LARGEST_NET = 15, 3**12
 # Points along an axis and lines on which the harmonics of a function are looked for; rows at once.
-_POINTS, _LINES, _ROWS = 32, 12, 4096
+_POINTS, _LINES, _ROWS = 64, 12, 4096
 # How many points a grid may have.
 _LARGEST_GRID = 400_000
 
