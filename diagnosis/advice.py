@@ -28,9 +28,7 @@ def advice(diagnosis: Diagnosis) -> tuple[str, ...]:
     if diagnosis.left.is_there:
         joints = [diagnosis.extended.simulation.robot.joints[k] for k in diagnosis.left.joints]
         where = f" Look at {', '.join(joints)} first." if joints else ""
-        told.append(
-            f"None of the known effects fits {'; '.join(diagnosis.left.what)}.{where}{_reach(diagnosis)}"
-        )
+        told.append(f"None of the known effects fits {'; '.join(diagnosis.left.what)}.{where}{_reach(diagnosis)}")
     return tuple(dict.fromkeys(told))
 
 

@@ -181,7 +181,9 @@ class _Amounts:
     @property
     def lasting_missed(self) -> float:
         """What causes and lasting functions leave (sum of squares, whitened) of rows that were not fitted."""
-        left = self._fit.weighted((self._fit.observations.x - self._fit.run.measured - self.said + self.unseen)[:, :, None])
+        left = self._fit.weighted(
+            (self._fit.observations.x - self._fit.run.measured - self.said + self.unseen)[:, :, None]
+        )
         return float(np.square(left).sum())
 
     @property

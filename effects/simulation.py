@@ -29,6 +29,9 @@ from .optics import Optics
 _SPRING_ROUNDS = 3
 # Effects that a rigid chain can have in it.
 RIGID = ("joint_offset", "link_geometry", "tool_offset", "camera_pose")
+# What an effect with a moment is after it; what is not there when nothing moves.
+_STAYS = {"encoder_jump": "joint_offset", "tool_slip": "tool_offset", "camera_moved": "camera_pose"}
+_OF_MOTION = ("backlash", "settling", "camera_latency", "thermal_drift")
 # Of the numerical derivatives by the optics' numbers and by a point.
 _STEP = 1e-6
 # ... and by a latency [s].
@@ -75,6 +78,21 @@ class Simulation:
         rigid = Simulation(self.robot, tuple(effect for effect in self.effects if effect.name in RIGID))
         rigid.__dict__["gravity"] = self.gravity
         return rigid
+
+    @property
+    def since(self) -> Simulation:
+        """The arm as it is since all moments of its recording have passed, standing still and cold.
+
+        What jumped, slipped or was bumped stays where it is; what comes of motion or of warming up is not there.
+        """
+        own, later = [], []
+        for effect in self.effects:
+            if effect.name in _STAYS:
+                values = effect.values[:-1]
+                later.append(Effect.at(self.robot, _STAYS[effect.name], effect.where, values=values.tolist()))
+            elif effect.name not in _OF_MOTION:
+                own.append(effect)
+        return Simulation(self.robot, (*own, *later), self.residual)
 
     @property
     def placed(self) -> Simulation:
@@ -162,6 +180,27 @@ class Simulation:
             for _ in range(_SPRING_ROUNDS):
                 given = springs * self.gravity.torques(q + given)
         return given
+
+    @property
+    def rigid_chain(self) -> RigidChain:
+        """The chain from camera to marker with the effects that it can have in it, over the readings."""
+        rigid = self.rigid
+        chain = rigid._chain()
+        fixed = chain.fixed.copy()
+        fixed[0] = inverse(rigid.camera_pose) @ fixed[0]
+        for effect in rigid.effects:
+            if effect.name == "joint_offset":
+                k = rigid.place(effect).joint
+                fixed[k] = fixed[k] @ self._turned(k, effect.values[0])
+            elif effect.name == "tool_offset":
+                fixed[-1, :3, 3] += fixed[-1, :3, :3] @ effect.values
+        return RigidChain(fixed, chain.axes, chain.prismatic)
+
+    def _turned(self, joint: int, value: float) -> FloatArray:
+        """A joint's own motion (4, 4) along the way from camera to marker."""
+        chain, none = self.robot.chain, np.zeros(3)
+        along = value * chain.axes[joint]
+        return transforms(np.concatenate([along, none] if chain.prismatic[joint] else [none, along])[None])[0]
 
     def _chain(self) -> RigidChain:
         """The chain with its links as they are."""

@@ -49,7 +49,9 @@ class _Axis:
     def spread(self, count: int) -> FloatArray:
         """So many readings that tell the functions apart."""
         if self.slides:
-            return 0.5 * (self.low + self.high - (self.high - self.low) * np.cos(np.pi * np.arange(count) / (count - 1)))
+            return 0.5 * (
+                self.low + self.high - (self.high - self.low) * np.cos(np.pi * np.arange(count) / (count - 1))
+            )
         return 2.0 * np.pi * np.arange(count) / count
 
     @property
@@ -89,7 +91,9 @@ class _Axis:
         """(functions, m, ..., m): what the functions are in the bases of the columns."""
         q = self.spread(4 * _POINTS)
         columns = [basis.weights(factor * q) for basis, factor in zip(self.bases, self.factors, strict=True)]
-        products = reduce(lambda a, b: (a[:, :, None] * b[:, None, :]).reshape(len(q), -1), columns, np.ones((len(q), 1)))
+        products = reduce(
+            lambda a, b: (a[:, :, None] * b[:, None, :]).reshape(len(q), -1), columns, np.ones((len(q), 1))
+        )
         shares = np.linalg.lstsq(products, self.functions(q), rcond=1e-12)[0]
         return shares.T.reshape(-1, *(basis.size for basis in self.bases))
 
@@ -111,7 +115,12 @@ def place_map(robot: RobotDescription, shift: Shift, x: FloatArray, tolerance_m:
 
 
 def _learnt(
-    robot: RobotDescription, names: Sequence[str], slides: Sequence[bool], shift: Shift, q: FloatArray, tolerance_m: float
+    robot: RobotDescription,
+    names: Sequence[str],
+    slides: Sequence[bool],
+    shift: Shift,
+    q: FloatArray,
+    tolerance_m: float,
 ) -> Unexplained:
     axes = [_axis(slides[k], shift, q, k, tolerance_m) for k in range(q.shape[1])]
     while np.prod([float(len(axis.grid)) for axis in axes]) > _LARGEST_GRID:
@@ -176,9 +185,7 @@ def _pruned(axes: list[_Axis], amounts: FloatArray, tolerance_m: float) -> tuple
         axes[least] = replace(axes[least], harmonics=axes[least].harmonics - 1)
 
 
-def _stored(
-    robot: RobotDescription, names: Sequence[str], axes: Sequence[_Axis], amounts: FloatArray
-) -> Unexplained:
+def _stored(robot: RobotDescription, names: Sequence[str], axes: Sequence[_Axis], amounts: FloatArray) -> Unexplained:
     net = np.moveaxis(amounts, -1, 0)
     for axis in axes:
         # The first axis of functions is always the next: what it becomes goes to the end.

@@ -15,7 +15,6 @@ from interfaces.robot import RobotDescription
 from interfaces.suggest import did_you_mean
 from kbmaps import KBMap, KBMapsError, KernelLearner, ModelFormatError, ResidualModel, TensorTrain
 
-
 # The marker's coordinates, in the place of a joint.
 PLACE = ("marker.x", "marker.y", "marker.z")
 
@@ -51,8 +50,8 @@ class Unexplained:
 
     Attributes:
         model: any map of kbmaps; its outputs are shifts of what is measured [m], in the measurement frame.
-        joints: the joints whose readings it takes, in its order; among them may be `PLACE`, the coordinates [m] at which
-            the robot as described has its marker at the readings.
+        joints: the joints whose readings it takes, in its order; among them may be `PLACE`, the coordinates [m]
+            at which the robot as described has its marker at the readings.
         factors: what it takes each of these numbers times.
         robot: whose joints they are.
     """

@@ -12,7 +12,7 @@ import numpy as np
 from diagnosis.diagnosis import Diagnosis
 from diagnosis.numbers import chance, mm, share
 from diagnosis.result import Cause, DiagnosisFile, Verdict
-from diagnosis.words import finding
+from diagnosis.words import finding, modelled
 from effects import Effect
 
 from . import tables

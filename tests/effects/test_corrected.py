@@ -47,8 +47,23 @@ def test_effects_at_one_place_add_up(robot, tmp_path, where) -> None:
     names = ("tool_offset", "camera_pose") if where is None else ("link_geometry", "joint_offset")
     effects = tuple(sized(robot, (name, where, None), 3.0, seed) for name in names for seed in range(2))
     file = write_corrected(Simulation(robot, effects), tmp_path / "out", HEADING)
+    np.testing.assert_allclose(seen(robot, file), Simulation(robot, effects).positions(walk()), rtol=0.0, atol=1e-9)
+
+
+def test_the_rigid_chain_is_the_simulation_with_the_geometric_effects_alone(robot) -> None:
+    effects = tuple(sized(robot, where, 2.0, k) for k, where in enumerate(everywhere(robot)))
+    wanted = Simulation(robot, tuple(effect for effect in effects if effect.name in RIGID)).positions(walk())
+    chain = Simulation(robot, effects).rigid_chain
+    np.testing.assert_allclose(chain.positions(walk().q), wanted, rtol=0.0, atol=1e-9)
+
+
+def test_what_has_a_moment_is_as_it_was_after_it(robot) -> None:
+    names = ("encoder_jump", "tool_slip", "camera_moved", "camera_pose", "joint_eccentricity")
+    effects = tuple(sized(robot, where, 2.0, k) for k, where in enumerate(everywhere(robot)) if where[0] in names)
+    simulation, motion = Simulation(robot, effects), walk()
+    after = motion.t >= 4.0
     np.testing.assert_allclose(
-        seen(robot, file), Simulation(robot, effects).positions(walk()), rtol=0.0, atol=1e-9
+        simulation.since.positions(motion)[after], simulation.positions(motion)[after], rtol=0.0, atol=1e-9
     )
 
 
