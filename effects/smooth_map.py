@@ -95,7 +95,7 @@ class _Axis:
             lambda a, b: (a[:, :, None] * b[:, None, :]).reshape(len(q), -1), columns, np.ones((len(q), 1))
         )
         shares = np.linalg.lstsq(products, self.functions(q), rcond=1e-12)[0]
-        return shares.T.reshape(-1, *(basis.size for basis in self.bases))
+        return np.asarray(shares.T, dtype=np.float64).reshape(-1, *(basis.size for basis in self.bases))
 
 
 def smooth_map(robot: RobotDescription, shift: Shift, q: FloatArray, tolerance_m: float) -> Unexplained:
