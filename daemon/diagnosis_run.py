@@ -18,7 +18,8 @@ from diagnosis.observations import ticks
 from diagnosis.remedies import remedies
 from diagnosis.report import About, page
 from diagnosis.result import DiagnosisFile
-from effects import KINDS, write_extended
+from diagnosis.words import modelled
+from effects import KINDS, write_corrected, write_extended
 from interfaces.errors import BodyschemaError, RecordingError, RequestError
 from interfaces.recording import Recording
 from interfaces.records import FloatArray, Pair
@@ -222,7 +223,10 @@ def written(found: Found, folder: Path) -> None:
     """
     about = About(found.source.name, found.robot.name, version("bodyschema"))
     heading = f"Found by bodyschema {about.version} in {len(found.source.recording)} pairs of {about.recording}"
-    write_extended(found.diagnosis.extended.simulation, folder, heading, replace=True)
+    extended = found.diagnosis.extended.simulation
+    told = " ".join(filter(None, [f"{heading}.", modelled(found.file.unexplained)]))
+    write_extended(extended, folder, told, replace=True)
+    write_corrected(extended, folder, heading)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         (folder / DIAGNOSIS).write_text(found.json + "\n", encoding="utf-8")

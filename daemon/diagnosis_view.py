@@ -12,7 +12,7 @@ from rich.text import Text
 
 from diagnosis.numbers import chance, mm, named, numbers_of, percent, place, share, telling
 from diagnosis.result import Cause, DiagnosisFile, Errors, Indistinguishable, Verdict
-from diagnosis.words import beside_geometry
+from diagnosis.words import beside_geometry, modelled
 
 # So many hypotheses that were rejected are shown.
 NEAREST = 6
@@ -77,7 +77,8 @@ def unexplained(diagnosis: DiagnosisFile) -> str:
     left = diagnosis.unexplained
     return (
         f"About {mm(left.rms_mm)} mm (RMS) is left that has structure and fits no known effect; it depends on "
-        f"{', '.join(left.depends_on)}.{''.join(f' {what[0].upper()}{what[1:]}.' for what in left.what)}"
+        f"{', '.join(left.depends_on)}.{''.join(f' {what[0].upper()}{what[1:]}.' for what in left.what)} "
+        f"{modelled(left)}"
     )
 
 

@@ -51,7 +51,7 @@ class Learner:
         self._config, self._solver, self._bus, self._clock = config, solver, bus, clock
         self._settings, self._robot = config.tables.learner, config.robot
         self._keys = Keys(config.robot.name)
-        self._nominal = NominalModel.of(config.robot)
+        self._nominal = NominalModel.extended_by(config.simulation)
         self._learning = Learning(self._nominal, self._settings, solver)
         self._set_aside: str | None = None
         self._restore()

@@ -28,11 +28,13 @@ def advice(diagnosis: Diagnosis) -> tuple[str, ...]:
     if diagnosis.left.is_there:
         joints = [diagnosis.extended.simulation.robot.joints[k] for k in diagnosis.left.joints]
         where = f" Look at {', '.join(joints)} first." if joints else ""
-        told.append(
-            f"None of the known effects fits {'; '.join(diagnosis.left.what)}.{where} "
-            "The extended simulation is right about it only where the recording has been."
-        )
+        told.append(f"None of the known effects fits {'; '.join(diagnosis.left.what)}.{where}{_reach(diagnosis)}")
     return tuple(dict.fromkeys(told))
+
+
+def _reach(diagnosis: Diagnosis) -> str:
+    stored = diagnosis.left.model is not None and diagnosis.left.model.stored is not None
+    return " The extended simulation is right about it only where the recording has been." if stored else ""
 
 
 def _motion(diagnosis: Diagnosis, cause: Effect, rival: Rival) -> str:

@@ -208,5 +208,8 @@ def _stability(diagnosis: Diagnosis) -> Stability | None:
 def _unexplained(diagnosis: Diagnosis) -> Unexplained:
     left, joints = diagnosis.left, diagnosis.extended.simulation.robot.joints
     names = [joints[k] for k in left.joints] + (["time"] if left.with_time else [])
-    rms = 1e3 * float(np.sqrt(np.square(left.explained).sum(axis=1).mean()))
-    return Unexplained(rms, tuple(names), left.p_value, left.what)
+    if left.model is None:
+        return Unexplained(0.0, (), left.p_value)
+    rms = 1e3 * float(np.sqrt(np.square(left.model.explained).sum(axis=1).mean()))
+    stored = () if left.model.stored is None else tuple(dict.fromkeys(left.model.stored.joints))
+    return Unexplained(rms, tuple(names), left.p_value, left.what, stored, left.untold)

@@ -55,7 +55,7 @@ class Diagnosis:
         nominal: the simulation as it is.
         aligned: with what robot.toml does not know.
         geometry: with all lengths, axes, zeros, the tool and the camera's pose free.
-        extended: with the causes.
+        extended: with the causes, and the smooth model of what has no name.
         standings: how each cause stands against its rivals.
         left: what no effect fits.
         blocks: of time, by which rows were held out.
@@ -80,12 +80,15 @@ class Diagnosis:
     @cached_property
     def errors(self) -> dict[str, FloatArray]:
         """Measured minus predicted (n, 3) [m] by each simulation, on rows that it was not fitted to."""
-        fits = {"nominal": self.nominal, "aligned": self.aligned, "geometry": self.geometry, "extended": self.extended}
+        fits = {"nominal": self.nominal, "aligned": self.aligned, "geometry": self.geometry}
         errors = {name: held_out_errors(fit, self.blocks) for name, fit in fits.items()}
-        if self.left.is_there:
-            extended = self.extended
-            errors["extended"] = extended.observations.x - extended.run.measured - self.left.held_out
-        return errors
+        return errors | {"extended": self._extended_errors(self.extended)}
+
+    def _extended_errors(self, fit: Fit) -> FloatArray:
+        """Measured minus predicted (n, 3) [m] on rows that causes and smooth model have not seen."""
+        if self.left.model is None:
+            return held_out_errors(fit, self.blocks)
+        return fit.observations.x - fit.run.measured + self.left.model.unseen
 
     @cached_property
     def held_out(self) -> dict[str, FloatArray]:
@@ -143,15 +146,15 @@ class Diagnosis:
     @cached_property
     def without(self) -> dict[tuple[str, str | None, str | None], FloatArray]:
         """Distances (n,) [m] on rows not fitted, without each of the causes."""
-        smooth = self.left.held_out
-        errors = {c.key: held_out_errors(self.extended.without(c), self.blocks) - smooth for c in self.causes}
+        errors = {c.key: self._extended_errors(self.extended.without(c)) for c in self.causes}
         return {key: np.linalg.norm(error, axis=1) for key, error in errors.items()}
 
     @cached_property
     def noise(self) -> FloatArray:
         """Covariances (n, 3, 3) [m²] of the noise, from what is left when all is explained that can be."""
         fit = self.extended
-        left = fit.observations.residuals(fit.run.measured + self.left.explained)[self.markers]
+        unstored = 0.0 if self.left.model is None else self.left.model.unstored
+        left = fit.observations.residuals(fit.run.measured + unstored)[self.markers]
         roots = np.linalg.inv(fit.observations.whitening)
         return float(np.square(left).mean()) * roots @ np.swapaxes(roots, 1, 2)
 
@@ -211,15 +214,15 @@ def diagnose(
             break
         explanation = fewer
         stands = standings(explanation.fit, search, blocks, seed)
-    extended = explanation.fit
+    left = leftover(explanation, unknowns, blocks)
     return Diagnosis(
         hypotheses=hypotheses,
         nominal=fitted(observations, simulation, len(simulation.effects)),
         aligned=start,
         geometry=_geometry(start),
-        extended=extended,
+        extended=explanation.fit if left.model is None else left.model.fit,
         standings=tuple(stands),
-        left=leftover(explanation, unknowns, blocks),
+        left=left,
         blocks=blocks,
         seed=seed,
     )

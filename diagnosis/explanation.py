@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from effects import Effect
+from interfaces.records import FloatArray
 
 from .fit import Fit
 from .search import NAMED, Search
@@ -32,24 +33,18 @@ class Explanation:
         fit: with the causes alone, with the numbers that they have beside what has no name.
         apart: with what has no name taken away; None where there is nothing of the kind.
         worth: how probable they are together, in nats that count only beside those of others.
+        size: how much what has no name adds to what the causes alone can say (RMS), in units of the stated noise.
     """
 
     fit: Fit
     apart: Apart | None
     worth: float
+    size: float = 0.0
 
     @property
     def unknown(self) -> tuple[int, ...]:
         """The families that have no name, by their places in `Unknowns.families`."""
         return () if self.apart is None else self.apart.chosen
-
-    @property
-    def size(self) -> float:
-        """How much is without a name (RMS), in units of the stated noise."""
-        if self.apart is None:
-            return 0.0
-        change = (self.apart.predicted - self.fit.run.measured)[:, :, None]
-        return float(np.sqrt(np.square(self.fit.observations.whitened(change)).mean()))
 
 
 def explain(
@@ -63,16 +58,20 @@ def explain(
     """
     path = list(tried)
     best = _with_unknown(found, unknowns, search)
-    if best.size < _OF_THE_CAUSES * _size(path[0], found):
+    if best.size < _OF_THE_CAUSES * _apart(found, found.run.measured - path[0].run.measured):
         best = Explanation(found, None, best.worth)
     keys = {frozenset(effect.key for effect in found.causes)}
+    alone = unknowns.missed(found)
+    if best.apart is not None and unknowns.missed(found, best.apart) > alone:
+        best = Explanation(found, None, best.worth)
     for fit in path:
         causes = frozenset(effect.key for effect in fit.causes)
         if causes in keys:
             continue
         keys.add(causes)
         other = _with_unknown(fit, unknowns, search)
-        if other.unknown and other.worth > best.worth + (0.0 if best.unknown else _MARGIN):
+        more = other.worth - best.worth - (0.0 if best.unknown else _MARGIN)
+        if other.apart is not None and more > 0.0 and unknowns.missed(other.fit, other.apart) < alone:
             best = other
     if best.unknown:
         tell("something that none of the effects explains")
@@ -80,10 +79,9 @@ def explain(
     return best
 
 
-def _size(start: Fit, found: Fit) -> float:
-    """How much the causes change (RMS), in units of the stated noise."""
-    changed = (found.run.measured - start.run.measured)[:, :, None]
-    return float(np.sqrt(np.square(found.observations.whitened(changed)).mean()))
+def _apart(fit: Fit, change: FloatArray) -> float:
+    """How large a change (n, 3) [m] is (RMS), in units of the stated noise."""
+    return float(np.sqrt(np.square(fit.observations.whitened(change[:, :, None])).mean()))
 
 
 def _with_unknown(fit: Fit, unknowns: Unknowns, search: Search) -> Explanation:
@@ -100,7 +98,7 @@ def _with_unknown(fit: Fit, unknowns: Unknowns, search: Search) -> Explanation:
     if apart is None:
         return Explanation(fit, None, fit.log_likelihood - names)
     worth = apart.fit.log_likelihood - names - unknowns.cost(apart)
-    return Explanation(fit.at(apart.fit.simulation), apart, worth)
+    return Explanation(fit.at(apart.fit.simulation), apart, worth, _apart(fit, apart.predicted - fit.run.measured))
 
 
 def _pruned(explanation: Explanation, unknowns: Unknowns, search: Search) -> Explanation:

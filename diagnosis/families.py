@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import combinations_with_replacement
+from typing import Literal
 
 import numpy as np
 
@@ -21,16 +22,18 @@ class Family:
 
     Attributes:
         what: in a few words.
+        kind: what errs: a joint, a body (a link, the tool, the camera), or the place in the image.
         joint: the joint that errs, or before which a link does; None where it is no one joint.
-        turns: whether it is the joint that errs.
+        driver: the joint on which alone it depends; None for all else.
         over_time: whether it depends on time.
         moves: what moves, by one unit each (n, 3, a) [m].
         amounts: what it may depend on (n, b); each of the moves is any linear function of it.
     """
 
     what: str
+    kind: Literal["joint", "body", "place"]
     joint: int | None
-    turns: bool
+    driver: int | None
     over_time: bool
     moves: Columns
     amounts: Columns
@@ -56,25 +59,25 @@ def families(run: Simulated) -> list[Family]:
         joint, link = _joint(k), _link(k)
         for j in joints:
             what = f"an error of {names[k]} that depends on {names[j]}"
-            found.append(Family(what, k, True, False, joint, _any_of_joint(j)))
+            found.append(Family(what, "joint", k, j, False, joint, _any_of_joint(j)))
             if j != k:
                 what = f"an error of {names[k]} that depends on itself and {names[j]} together"
-                found.append(Family(what, k, True, False, joint, _any_of_both(k, j)))
+                found.append(Family(what, "joint", k, None, False, joint, _any_of_both(k, j)))
         if timed:
             what = f"an error of {names[k]} that changes with time"
-            found.append(Family(what, k, True, True, joint, _any_of_time(2 * _TIMES)))
+            found.append(Family(what, "joint", k, None, True, joint, _any_of_time(2 * _TIMES)))
             what = f"the link before {names[k]} changes with time"
-            found.append(Family(what, k, False, True, link, _any_of_time(_TIMES)))
+            found.append(Family(what, "body", k, None, True, link, _any_of_time(_TIMES)))
         if run.simulation.gravity.known:
             what = f"what carries {names[k]} gives under the arm's weight"
-            found.append(Family(what, None, False, False, link, _moments(k)))
-            found.append(Family(what, None, False, False, link, _wrenches(k)))
+            for loads in (_moments(k), _wrenches(k)):
+                found.append(Family(what, "body", None, None, False, link, loads))
     if timed:
-        found.append(Family("the tool changes with time", None, False, True, _tool, _any_of_time(_TIMES)))
-        found.append(Family("the camera moves with time", None, False, True, _camera, _any_of_time(_TIMES)))
+        for what, moves in (("the tool changes with time", _tool), ("the camera moves with time", _camera)):
+            found.append(Family(what, "body", None, None, True, moves, _any_of_time(_TIMES)))
     what = "an error that depends on where the marker is in the image"
-    found.append(Family(what, None, False, False, _anywhere, _places_in_image(2)))
-    found.append(Family(what, None, False, False, _anywhere, _places_in_image(3)))
+    for degree in (2, 3):
+        found.append(Family(what, "place", None, None, False, _anywhere, _places_in_image(degree)))
     return found
 
 

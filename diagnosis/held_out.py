@@ -23,8 +23,6 @@ from .scan import Candidate
 _MOST_BLOCKS, _FOLDS = 80, 5
 _FEWEST_ROWS_A_BLOCK = 5
 _BOOTSTRAPS = 2000
-# Precision of what is fitted without any prior.
-_RIDGE = 1e-6
 # A fix that is more probably not the marker counts in no figure.
 _MARKER = 0.5
 
@@ -59,24 +57,15 @@ class Blocks:
         return sums
 
 
-def held_out_errors(fit: Fit, blocks: Blocks, more: FloatArray | None = None) -> FloatArray:
-    """Measured minus predicted (n, 3) [m], each row predicted without its own fold.
-
-    Args:
-        more: what else has been fitted (n, 3, m) [m], scaled so that it has about unit length in units of the noise.
-    """
+def held_out_errors(fit: Fit, blocks: Blocks) -> FloatArray:
+    """Measured minus predicted (n, 3) [m], each row predicted without its own fold."""
     errors = fit.observations.x - fit.run.measured
-    precision = prior_precision(fit.simulation, fit.nuisances) * fit.noise.sigma**2
-    raw, columns = fit.run_columns, fit.columns
-    if more is not None:
-        raw = np.concatenate([raw, more], axis=2)
-        columns = np.concatenate([columns, fit.weighted(more)], axis=2)
-        precision = np.append(precision, np.full(more.shape[2], _RIDGE))
-    if not columns.shape[2]:
+    if not fit.columns.shape[2]:
         return errors
+    precision = np.diag(prior_precision(fit.simulation, fit.nuisances)) * fit.noise.sigma**2
     for fold in range(_FOLDS):
         own = blocks.fold == fold
-        errors[own] -= raw[own] @ _solve(columns[~own], fit.left[~own], np.diag(precision))
+        errors[own] -= fit.run_columns[own] @ _solve(fit.columns[~own], fit.left[~own], precision)
     return errors
 
 
@@ -109,7 +98,7 @@ class Added:
 
 def added(fit: Fit, candidates: Sequence[Candidate], blocks: Blocks) -> list[Added]:
     """What each of the candidates would bring on top of a fit, to first order."""
-    before = _held_out_square(fit, fit.columns, prior_precision(fit.simulation, fit.nuisances), blocks)
+    before = held_out_square(fit, fit.columns, prior_precision(fit.simulation, fit.nuisances), blocks)
     return [_added(fit, candidate.effect, before, blocks) for candidate in candidates]
 
 
@@ -117,11 +106,11 @@ def _added(fit: Fit, effect: Effect, before: float, blocks: Blocks) -> Added:
     own = fit.weighted(fit.run.columns(effect)[:, :, effect.amounts])
     usual = np.array([effect.parameters[j].usual for j in effect.amounts])
     precision = [prior_precision(fit.simulation, fit.nuisances), 1.0 / np.square(LARGEST * usual)]
-    after = _held_out_square(fit, np.concatenate([fit.columns, own], axis=2), np.concatenate(precision), blocks)
+    after = held_out_square(fit, np.concatenate([fit.columns, own], axis=2), np.concatenate(precision), blocks)
     return Added(100.0 * (1.0 - after / max(before, 1e-300)), block_p_value(fit, own, blocks))
 
 
-def _held_out_square(fit: Fit, columns: FloatArray, precision: FloatArray, blocks: Blocks) -> float:
+def held_out_square(fit: Fit, columns: FloatArray, precision: FloatArray, blocks: Blocks) -> float:
     """Sum of the squares that columns (n, 3, p) leave of what a fit has left, on rows that were not fitted."""
     left = fit.left.copy()
     if columns.shape[2]:

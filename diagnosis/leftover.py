@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-import numpy as np
 from scipy import stats
-
-from interfaces.records import FloatArray
 
 from .explanation import Explanation
 from .fit import Fit
 from .held_out import Blocks
 from .sensitivity import joints_of
+from .smooth import SmoothModel, smooth_model
 from .unknown import Apart, Unknowns
 
 
@@ -25,16 +23,16 @@ class Leftover:
         joints: at which joints it acts or on which it depends, by their places in q.
         with_time: whether it depends on time.
         p_value: of so much structure by chance.
-        explained: what smooth functions predict of it (n, 3) [m].
-        held_out: the same (n, 3) [m], of rows that they were not fitted to.
+        model: the causes beside a smooth model of it; None where nothing is left.
+        untold: what it depends on time, in words, so that it is in no model that can be stored.
     """
 
     what: tuple[str, ...]
     joints: tuple[int, ...]
     with_time: bool
     p_value: float
-    explained: FloatArray
-    held_out: FloatArray
+    model: SmoothModel | None = None
+    untold: tuple[str, ...] = ()
 
     @property
     def is_there(self) -> bool:
@@ -47,8 +45,7 @@ def leftover(explanation: Explanation, unknowns: Unknowns, blocks: Blocks) -> Le
     fit, apart = explanation.fit, explanation.apart
     if apart is None:
         beside = unknowns.apart(fit, (unknowns.best(fit)[0],))
-        p_value = min(1.0, _chance(fit, beside, unknowns) * len(unknowns.families))
-        return Leftover((), (), False, p_value, np.zeros_like(fit.residuals), np.zeros_like(fit.residuals))
+        return Leftover((), (), False, min(1.0, _chance(fit, beside, unknowns) * len(unknowns.families)))
     families = [unknowns.families[index] for index in apart.chosen]
     joints = [joints_of(family, own, fit.run) for family, own in zip(families, apart.numbers, strict=True)]
     return Leftover(
@@ -56,8 +53,8 @@ def leftover(explanation: Explanation, unknowns: Unknowns, blocks: Blocks) -> Le
         joints=tuple(sorted(frozenset[int]().union(*joints))),
         with_time=any(family.over_time for family in families),
         p_value=_chance(fit, apart, unknowns),
-        explained=apart.predicted - fit.run.measured,
-        held_out=fit.observations.x - fit.run.measured - unknowns.held_out(apart, blocks),
+        model=smooth_model(replace(fit, noise=apart.fit.noise), families, blocks),
+        untold=tuple(family.what for family in families if family.over_time),
     )
 
 

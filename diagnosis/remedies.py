@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from effects import corrected_file
 from effects.simulation import transforms
 from interfaces.records import FloatArray
 from interfaces.robot import RobotDescription
@@ -68,7 +69,7 @@ class _Workshop:
         move = "move the origin of joint {} by as much along" if self._slides(cause) else _TURN_ORIGIN
         return (
             f"Add {self._turn(cause, numbers, 'offset')} to what the encoder of {cause.where} reads, in its homing "
-            f"offset or in the driver. Or in the URDF: {move.format(cause.where)} its axis."
+            f"offset or in the driver. Or in the URDF: {move.format(cause.where)} its axis{self._in_urdf()}."
         )
 
     def scale(self, cause: Cause, numbers: Mapping[str, float]) -> str:
@@ -138,7 +139,7 @@ class _Workshop:
 
     def link(self, cause: Cause, _: Mapping[str, float]) -> str:
         origin = self.robot.tree.joint(cause.where or "").T_parent_joint @ self._pose(cause)
-        return f"In the URDF, give joint {cause.where} the {_origin(origin)}."
+        return f"In the URDF, give joint {cause.where} the {_origin(origin)}{self._in_urdf()}."
 
     def tool(self, _: Cause, numbers: Mapping[str, float]) -> str:
         return f"In robot.toml: marker_xyz = {self._marker(numbers)}, or put the marker back to where it was."
@@ -213,6 +214,9 @@ class _Workshop:
         if not self._slides(cause) and abs(per_turn - round(per_turn)) < _WHOLE_TURN * per_turn:
             of = f" of {round(per_turn)} a turn"
         return f" ({count:+d} tick{'' if abs(count) == 1 else 's'}{of})"
+
+    def _in_urdf(self) -> str:
+        return f" (--out writes {corrected_file(self.robot)}, which has it)"
 
     def _slides(self, cause: Cause) -> bool:
         return bool(self.robot.chain.prismatic[self.robot.joints.index(cause.where or "")])

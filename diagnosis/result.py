@@ -99,12 +99,16 @@ class Unexplained(msgspec.Struct, frozen=True):
 
     Attributes:
         what: what moves, and on what that depends, in words; the joints are named in `depends_on` too.
+        model_joints: whose readings the smooth model in extended.toml takes.
+        not_in_model: what of `what` changes with time, so that it is in no such model.
     """
 
     rms_mm: float
     depends_on: tuple[str, ...]
     p_value: float
     what: tuple[str, ...] = ()
+    model_joints: tuple[str, ...] = ()
+    not_in_model: tuple[str, ...] = ()
 
 
 class Pairs(msgspec.Struct, frozen=True):

@@ -14,8 +14,8 @@ from scipy import stats
 from interfaces.records import FloatArray
 
 from .families import Family, families
-from .fit import Fit, fitted
-from .held_out import Blocks, held_out_errors, scores_p_value
+from .fit import Fit, fitted, prior_precision, solved
+from .held_out import Blocks, held_out_square, scores_p_value
 from .observations import Observations
 from .search import nats
 
@@ -40,12 +40,14 @@ class Apart:
         chosen: which families.
         numbers: of each of them (p,).
         fit: of the causes.
+        ridge: on the families' numbers, in units in which their columns are as long as one.
     """
 
     observations: Observations
     chosen: tuple[int, ...]
     numbers: tuple[FloatArray, ...]
     fit: Fit
+    ridge: float
 
     @property
     def predicted(self) -> FloatArray:
@@ -108,19 +110,18 @@ class Unknowns:
         Args:
             start: with some of the families.
         """
-        here = Apart(fit.observations, tuple(chosen), tuple(np.zeros(self._columns[index].shape[1]) for index in chosen), fit)
-        if start is not None:
-            known = dict(zip(start.chosen, start.numbers, strict=True))
-            numbers = tuple(known.get(index, nothing) for index, nothing in zip(chosen, here.numbers, strict=True))
-            here = Apart(fit.observations, tuple(chosen), numbers, start.fit)
+        known = {} if start is None else dict(zip(start.chosen, start.numbers, strict=True))
+        numbers = tuple(known.get(index, np.zeros(self._columns[index].shape[1])) for index in chosen)
+        # No function is expected to be larger than twice all that is left.
+        ridge = 0.25 * fit.noise.sigma**2 / max(float(np.square(fit.left).sum()), 1e-300)
+        here = Apart(fit.observations, tuple(chosen), numbers, fit if start is None else start.fit, ridge)
         for _ in range(_ROUNDS):
-            steps = self._step(here.fit, chosen)
-            numbers = tuple(number + step for number, step in zip(here.numbers, steps, strict=True))
+            numbers = self._step(here)
             left = self._without(fit.observations, chosen, numbers)
             tried = fitted(left, here.fit.simulation, fit.nuisances, here.fit.noise)
             rise = tried.log_likelihood - here.fit.log_likelihood
             if rise > 0.0:
-                here = Apart(fit.observations, tuple(chosen), numbers, tried)
+                here = replace(here, numbers=numbers, fit=tried)
             if rise < _ENOUGH:
                 break
         return here
@@ -140,19 +141,29 @@ class Unknowns:
         directions = (columns @ (mix[there].T / values[there])).reshape(*fit.left.shape, -1)
         return np.asarray(np.linalg.solve(fit.observations.whitening, directions), dtype=np.float64)
 
-    def held_out(self, apart: Apart, blocks: Blocks) -> FloatArray:
-        """Measured minus predicted (n, 3) [m], each row predicted without its own fold."""
-        return held_out_errors(apart.fit, blocks, self.told(apart))
+    def missed(self, fit: Fit, apart: Apart | None = None) -> float:
+        """Mean square of what causes, and families, leave of rows that they were not fitted to, whitened."""
+        fit = fit if apart is None else apart.fit
+        columns, precision = fit.columns, prior_precision(fit.simulation, fit.nuisances)
+        if apart is not None:
+            more = fit.weighted(self.told(apart))
+            columns = np.concatenate([columns, more], axis=2)
+            precision = np.append(precision, np.full(more.shape[2], apart.ridge / fit.noise.sigma**2))
+        square = held_out_square(fit, columns, precision, Blocks.cut(len(fit.observations)))
+        return square / max(float(fit.noise.weights.sum()), 1.0)
 
-    def _step(self, fit: Fit, chosen: Sequence[int]) -> list[FloatArray]:
-        """By how much the numbers of families change to explain most of what a fit leaves."""
+    def _step(self, here: Apart) -> tuple[FloatArray, ...]:
+        """The numbers of families that explain most of what the causes leave and are not larger than they can be."""
+        fit, counts = here.fit, [len(number) for number in here.numbers]
         basis = fit.orthogonal.reshape(fit.left.size, -1)
         weights = np.repeat(fit.root_weights[:, 0], 3)[:, None]
-        columns = np.concatenate([self._columns[index] for index in chosen], axis=1) * weights
+        columns = np.concatenate([self._columns[index] for index in here.chosen], axis=1) * weights
         columns = columns - basis @ (basis.T @ columns)
-        step = np.linalg.lstsq(columns, fit.left.ravel(), rcond=float(np.sqrt(_LEFT)))[0]
-        parts = np.split(step, np.cumsum([self._columns[index].shape[1] for index in chosen])[:-1])
-        return [part / self._scales[index] for part, index in zip(parts, chosen, strict=True)]
+        scales = np.concatenate([self._scales[index] for index in here.chosen])
+        before = np.concatenate(here.numbers) * scales
+        normal = columns.T @ columns + here.ridge * np.eye(len(before))
+        step = solved(normal, columns.T @ fit.left.ravel() - here.ridge * before)
+        return tuple(np.split((before + step) / scales, np.cumsum(counts)[:-1]))
 
     def _without(
         self, observations: Observations, chosen: Sequence[int], numbers: Sequence[FloatArray]
@@ -161,7 +172,7 @@ class Unknowns:
         q, x = observations.motion.q.copy(), observations.x.copy()
         for index, own in zip(chosen, numbers, strict=True):
             family = self.families[index]
-            if family.turns:
+            if family.kind == "joint":
                 q[:, family.joint] += family.moved_by(self._run, own)[:, 0]
             else:
                 x -= family.columns(self._run) @ own

@@ -6,8 +6,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from effects.unexplained import PLACE
+
 from .numbers import told_values
-from .result import Alike, Cause, Errors, Gain, Verdict
+from .result import Alike, Cause, Errors, Gain, Unexplained, Verdict
 from .rivals import Standing
 
 _DEG = 180.0 / np.pi
@@ -133,6 +135,22 @@ def beside_geometry(rms: Errors, alike: Sequence[Alike]) -> list[str]:
             f"{pair.shared_percent:.0f} % of the smaller part is the same (Δχ² = {pair.delta_chi2:.0f} for the first)."
         )
     return told
+
+
+def modelled(left: Unexplained) -> str:
+    """What extended.toml has of what no effect fits, in one or two sentences; none where nothing is left."""
+    told = []
+    if left.model_joints:
+        over = "the marker's place" if left.model_joints == PLACE else f"the readings of {', '.join(left.model_joints)}"
+        told.append(f"extended.toml has a smooth model of it over {over}, as good as the recording is dense.")
+    elif left.what:
+        told.append("extended.toml has no model of it.")
+    if left.not_in_model:
+        told.append(
+            f"What changes with time is in no such model: {'; '.join(left.not_in_model)}. Another recording will "
+            "differ by it again."
+        )
+    return " ".join(told)
 
 
 def evidence(standing: Standing) -> str:

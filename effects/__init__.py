@@ -3,6 +3,7 @@
 What `diagnosis` fits is what `sim_backend` applies.
 """
 
+from .corrected import corrected_file, write_corrected
 from .effect import Effect
 from .files import load_simulation, read_effects, read_unexplained, simulation_of, write_extended
 from .gravity import GravityLoad
@@ -11,6 +12,7 @@ from .live import LiveEncoders
 from .motion import Motion
 from .parameter import Parameter
 from .simulation import Residual, Simulated, Simulation
+from .smooth_map import place_map, smooth_map
 from .unexplained import StoredModel, Unexplained
 
 __all__ = [
@@ -26,9 +28,13 @@ __all__ = [
     "Simulation",
     "StoredModel",
     "Unexplained",
+    "corrected_file",
     "load_simulation",
+    "place_map",
     "read_effects",
     "read_unexplained",
     "simulation_of",
+    "smooth_map",
+    "write_corrected",
     "write_extended",
 ]

@@ -8,6 +8,7 @@ compliance_rad_per_Nm = 0.0031
 [unexplained]
 model = "unexplained.kbmap"     # relative to this file
 joints = ["shoulder", "elbow"]  # whose readings it takes
+factors = [1.0, 1.0]            # what it takes them times; 1 where it is not given
 """
 
 from __future__ import annotations
@@ -18,10 +19,11 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+import numpy as np
 
 from interfaces.calibrated_files import tables_elsewhere
 from interfaces.errors import ConfigError, RobotError
-from interfaces.robot import FARTHEST_CAMERA_M, LONGEST_TOOL_M, RobotDescription
+from interfaces.robot import FARTHEST_CAMERA_M, LONGEST_TOOL_M, RobotDescription, Vector3
 from interfaces.suggest import did_you_mean
 from interfaces.toml_file import convert, line_in_entry, line_of, read_toml
 from interfaces.toml_text import toml_text
@@ -52,11 +54,26 @@ _UNITS: tuple[tuple[str, float, str, str], ...] = (
 )
 
 
+class _Placement(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The table [unexplained.placement]: where camera and marker are taken to be when a place is meant."""
+
+    camera_xyz: Vector3
+    camera_rpy: Vector3
+    marker_xyz: Vector3
+
+    def of(self, robot: RobotDescription) -> RobotDescription:
+        """The robot with its camera and marker there."""
+        camera = msgspec.structs.replace(robot.camera, xyz=self.camera_xyz, rpy=self.camera_rpy)
+        return robot.with_placement(camera.pose, np.array(self.marker_xyz))
+
+
 class _UnexplainedTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The table [unexplained]."""
 
     model: str
     joints: tuple[str, ...]
+    factors: tuple[float, ...] | None = None
+    placement: _Placement | None = None
 
 
 def load_simulation(file: Path) -> Simulation:
@@ -118,9 +135,10 @@ def read_unexplained(robot: RobotDescription, tables: Mapping[str, Any], text: s
     except ModelFormatError as error:
         raise RobotError(f"unexplained.model: {table.model}: {error}", file=file, line=line) from error
     try:
-        return Unexplained.of(robot, model, table.joints)
+        described = robot if table.placement is None else table.placement.of(robot)
+        return Unexplained.of(described, model, table.joints, table.factors)
     except RobotError as error:
-        line = line_of(text, (UNEXPLAINED, "joints"))
+        line = line_of(text, (UNEXPLAINED, "factors" if "factor" in error.what else "joints"))
         raise RobotError(f"unexplained: {error.what}", file=file, line=line, remedy=error.remedy) from None
 
 
@@ -128,7 +146,8 @@ def write_extended(simulation: Simulation, folder: Path, heading: str, *, replac
     """Write the simulation as `EXTENDED_FILE` into `folder`, which is made if need be.
 
     The URDF stays where it is and is named relative to `folder`. The robot.toml's other tables are kept; store and
-    checkpoint will be in a folder of their own.
+    checkpoint will be in a folder of their own. Where robot.toml does not know the camera's pose or the marker's place,
+    those of the simulation are written in their place, and stay not known.
 
     Args:
         heading: one line for the top: where it comes from.
@@ -142,6 +161,7 @@ def write_extended(simulation: Simulation, folder: Path, heading: str, *, replac
         ValueError: the simulation's residual is none that can be stored.
     """
     file = folder / EXTENDED_FILE
+    simulation = simulation.placed
     tables = tables_elsewhere(simulation.robot, folder)
     tables.pop(EFFECTS, None)
     tables.pop(UNEXPLAINED, None)
@@ -151,7 +171,7 @@ def write_extended(simulation: Simulation, folder: Path, heading: str, *, replac
     if residual is not None:
         if not isinstance(residual, Unexplained):
             raise ValueError(f"a residual that can be stored is an Unexplained, not a {type(residual).__name__}")
-        tables[UNEXPLAINED] = {"model": MODEL_FILE, "joints": list(residual.joints)}
+        tables[UNEXPLAINED] = _unexplained_table(residual)
     text = f"# {heading}\n\n{toml_text(tables)}"
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -163,6 +183,14 @@ def write_extended(simulation: Simulation, folder: Path, heading: str, *, replac
     except OSError as error:
         raise ConfigError(f"cannot be written: {error.strerror}", file=folder, remedy="Give another folder") from error
     return file
+
+
+def _unexplained_table(residual: Unexplained) -> dict[str, Any]:
+    table = {"model": MODEL_FILE, "joints": list(residual.joints), "factors": list(residual.factors)}
+    if residual.is_of_place:
+        robot = residual.robot
+        table["placement"] = msgspec.to_builtins(_Placement(robot.camera.xyz, robot.camera.rpy, robot.robot.marker_xyz))
+    return table
 
 
 class _WrongEntry(Exception):

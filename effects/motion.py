@@ -42,6 +42,11 @@ class Motion:
         """One row: the readings q (d,) at the time t [s]."""
         return cls(q[None], np.array([t]), np.zeros(1, dtype=np.int64), begun_at)
 
+    @classmethod
+    def still(cls, q: FloatArray) -> Motion:
+        """Postures q (n, d) that have nothing to do with each other, at no known times."""
+        return cls(q, None, np.arange(len(q), dtype=np.int64))
+
     def __len__(self) -> int:
         return len(self.q)
 

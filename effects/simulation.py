@@ -27,6 +27,11 @@ from .optics import Optics
 
 # A spring's deflection changes its own load: each round brings the next order.
 _SPRING_ROUNDS = 3
+# Effects that a rigid chain can have in it.
+RIGID = ("joint_offset", "link_geometry", "tool_offset", "camera_pose")
+# What an effect with a moment is after it; what is not there when nothing moves.
+_STAYS = {"encoder_jump": "joint_offset", "tool_slip": "tool_offset", "camera_moved": "camera_pose"}
+_OF_MOTION = ("backlash", "settling", "camera_latency", "thermal_drift")
 # Of the numerical derivatives by the optics' numbers and by a point.
 _STEP = 1e-6
 # ... and by a latency [s].
@@ -68,6 +73,45 @@ class Simulation:
         changed = Simulation(self.robot, tuple(effects), self.residual)
         changed.__dict__["gravity"] = self.gravity
         return changed
+
+    @cached_property
+    def rigid(self) -> Simulation:
+        """With those of its effects alone that a rigid chain can have in it, and without the residual."""
+        rigid = Simulation(self.robot, tuple(effect for effect in self.effects if effect.name in RIGID))
+        rigid.__dict__["gravity"] = self.gravity
+        return rigid
+
+    @property
+    def since(self) -> Simulation:
+        """The arm as it is since all moments of its recording have passed, standing still and cold.
+
+        What jumped, slipped or was bumped stays where it is; what comes of motion or of warming up is not there.
+        """
+        own, later = [], []
+        for effect in self.effects:
+            if effect.name in _STAYS:
+                values = effect.values[:-1]
+                later.append(Effect.at(self.robot, _STAYS[effect.name], effect.where, values=values.tolist()))
+            elif effect.name not in _OF_MOTION:
+                own.append(effect)
+        return Simulation(self.robot, (*own, *later), self.residual)
+
+    @property
+    def placed(self) -> Simulation:
+        """The same, with what the description calls not known in the description and no more among the effects.
+
+        The camera's pose and the marker's place go there exactly: both are the frames at the ends of the chain.
+        """
+        robot, gone = self.robot, set[str]()
+        pose, marker = robot.camera.pose, np.array(robot.robot.marker_xyz)
+        if not robot.camera.pose_known and self._of("camera_pose"):
+            pose, gone = pose @ self.camera_pose, gone | {"camera_pose"}
+        if not robot.robot.marker_known and (shifts := self._of("tool_offset")):
+            marker, gone = marker + sum(effect.values for effect in shifts), gone | {"tool_offset"}
+        if not gone:
+            return self
+        effects = tuple(effect for effect in self.effects if effect.name not in gone)
+        return Simulation(robot.with_placement(pose, marker), effects, self.residual)
 
     def positions(self, motion: Motion) -> FloatArray:
         """What would be measured (n, 3) [m] in the measurement frame."""
@@ -138,6 +182,27 @@ class Simulation:
             for _ in range(_SPRING_ROUNDS):
                 given = springs * self.gravity.torques(q + given)
         return given
+
+    @property
+    def rigid_chain(self) -> RigidChain:
+        """The chain from camera to marker with the effects that it can have in it, over the readings."""
+        rigid = self.rigid
+        chain = rigid._chain()
+        fixed = chain.fixed.copy()
+        fixed[0] = inverse(rigid.camera_pose) @ fixed[0]
+        for effect in rigid.effects:
+            if effect.name == "joint_offset":
+                k = rigid.place(effect).joint
+                fixed[k] = fixed[k] @ self._turned(k, effect.values[0])
+            elif effect.name == "tool_offset":
+                fixed[-1, :3, 3] += fixed[-1, :3, :3] @ effect.values
+        return RigidChain(fixed, chain.axes, chain.prismatic)
+
+    def _turned(self, joint: int, value: float) -> FloatArray:
+        """A joint's own motion (4, 4) along the way from camera to marker."""
+        chain, none = self.robot.chain, np.zeros(3)
+        along = value * chain.axes[joint]
+        return transforms(np.concatenate([along, none] if chain.prismatic[joint] else [none, along])[None])[0]
 
     def _chain(self) -> RigidChain:
         """The chain with its links as they are."""

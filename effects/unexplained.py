@@ -15,6 +15,9 @@ from interfaces.robot import RobotDescription
 from interfaces.suggest import did_you_mean
 from kbmaps import KBMap, KBMapsError, KernelLearner, ModelFormatError, ResidualModel, TensorTrain
 
+# The marker's coordinates, in the place of a joint.
+PLACE = ("marker.x", "marker.y", "marker.z")
+
 
 class StoredModel(Protocol):
     """A map of kbmaps that predicts and can be stored."""
@@ -47,27 +50,45 @@ class Unexplained:
 
     Attributes:
         model: any map of kbmaps; its outputs are shifts of what is measured [m], in the measurement frame.
-        joints: the joints whose readings it takes, in its order.
-        columns: their places in q.
+        joints: the joints whose readings it takes, in its order; among them may be `PLACE`, the coordinates [m]
+            at which the robot as described has its marker at the readings.
+        factors: what it takes each of these numbers times.
+        robot: whose joints they are.
     """
 
     model: StoredModel
     joints: tuple[str, ...]
-    columns: tuple[int, ...]
+    factors: tuple[float, ...]
+    robot: RobotDescription
 
     @classmethod
-    def of(cls, robot: RobotDescription, model: StoredModel, joints: tuple[str, ...]) -> Unexplained:
+    def of(
+        cls,
+        robot: RobotDescription,
+        model: StoredModel,
+        joints: tuple[str, ...],
+        factors: tuple[float, ...] | None = None,
+    ) -> Unexplained:
         """The model over these joints of a robot.
 
+        Args:
+            factors: what it takes each reading times, one for each joint; 1 where it is not given. So a joint can be
+                there more than once, and a map have its double angle, too.
+
         Raises:
-            RobotError: a joint is unknown or named twice, or the model is not one of so many joints, or has learnt
-                nothing.
+            RobotError: a joint is unknown, or named twice with the same factor, or the model is not one of so many
+                joints, or has learnt nothing.
         """
         for joint in joints:
-            if joint not in robot.joints:
+            if joint not in (*robot.joints, *PLACE):
                 raise RobotError(f"{joint!r}: no joint of this robot", remedy=did_you_mean(joint, robot.joints))
-        if len(set(joints)) != len(joints):
-            raise RobotError("a joint is named twice", remedy="Name each once")
+        factors = (1.0,) * len(joints) if factors is None else factors
+        if len(factors) != len(joints):
+            raise RobotError(f"{len(factors)} factors for {len(joints)} joints", remedy="Give one for each joint")
+        if not np.isfinite(factors).all():
+            raise RobotError("a factor is not finite")
+        if len(set(zip(joints, factors, strict=True))) != len(joints):
+            raise RobotError("a joint is named twice", remedy="Name each once, or with other factors")
         if model.joints != len(joints):
             raise RobotError(
                 f"the model takes {model.joints} joints, not {len(joints)}", remedy="Name those that it was learnt over"
@@ -76,11 +97,20 @@ class Unexplained:
             model.predict(np.zeros((1, len(joints))))
         except KBMapsError as error:
             raise RobotError(f"the model cannot predict: {error}", remedy="Store one that has learnt") from error
-        return cls(model, joints, tuple(robot.joints.index(joint) for joint in joints))
+        return cls(model, joints, factors, robot)
+
+    @property
+    def is_of_place(self) -> bool:
+        """Whether it takes a coordinate of the marker."""
+        return bool(set(self.joints) & set(PLACE))
 
     def predict(self, q: FloatArray) -> FloatArray:
         """Shifts (n, 3) [m] at the readings q (n, d) [rad, m] of all joints."""
-        return self.model.predict(q[:, self.columns])
+        values = q
+        if self.is_of_place:
+            values = np.concatenate([q, self.robot.chain.positions(q)], axis=1)
+        names = (*self.robot.joints, *PLACE)
+        return self.model.predict(values[:, [names.index(joint) for joint in self.joints]] * self.factors)
 
 
 def stored_model(data: bytes) -> StoredModel:

@@ -6,7 +6,7 @@ import math
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -21,6 +21,7 @@ from kbmaps import RigidChain
 from .camera import StereoCalibration
 from .errors import ConfigError, RobotError
 from .records import FloatArray, frozen_array
+from .rpy import rpy_of
 from .toml_file import convert, line_of, read_toml
 from .urdf import MOVING, UrdfJoint, UrdfTree, chain_between
 
@@ -132,6 +133,14 @@ class RobotDescription:
         camera = convert(tables["camera"], CameraSection, file=file, text=text, prefix=("camera",))
         return cls._assemble(robot, camera, text, file)
 
+    def with_placement(self, T_parent_camera: FloatArray, marker_xyz: FloatArray) -> RobotDescription:
+        """The same robot with its camera at a pose (4, 4) in its parent link, and its marker (3,) [m] elsewhere."""
+        x, y, z = T_parent_camera[:3, 3].tolist()
+        roll, pitch, yaw = rpy_of(T_parent_camera[:3, :3]).tolist()
+        camera = msgspec.structs.replace(self.camera, xyz=(x, y, z), rpy=(roll, pitch, yaw))
+        robot = msgspec.structs.replace(self.robot, marker_xyz=tuple(marker_xyz.tolist()))
+        return replace(self, robot=robot, camera=camera, chain=_chain(self.tree, robot, camera))
+
     @classmethod
     def _assemble(cls, robot: RobotSection, camera: CameraSection, text: str, file: Path) -> RobotDescription:
         blamed_on = partial(_blamed_on, file, text)
@@ -152,15 +161,7 @@ class RobotDescription:
             tree.require_link(robot.marker_link)
         _check_units(robot, camera, text, file)
         with blamed_on("robot", "joints"):
-            chain = chain_between(
-                tree,
-                robot.joints,
-                robot.held_at,
-                start=camera.parent_link,
-                end=robot.marker_link,
-                T_start_camera=camera.pose,
-                marker_xyz=np.array(robot.marker_xyz),
-            )
+            chain = _chain(tree, robot, camera)
         with blamed_on("camera"):
             calibration = _calibration(camera)
         return cls(
@@ -183,6 +184,18 @@ class RobotDescription:
     def joints(self) -> tuple[str, ...]:
         """Names of the joints in the order of q."""
         return self.robot.joints
+
+
+def _chain(tree: UrdfTree, robot: RobotSection, camera: CameraSection) -> RigidChain:
+    return chain_between(
+        tree,
+        robot.joints,
+        robot.held_at,
+        start=camera.parent_link,
+        end=robot.marker_link,
+        T_start_camera=camera.pose,
+        marker_xyz=np.array(robot.marker_xyz),
+    )
 
 
 def _check_name(table: Any, text: str, file: Path) -> None:

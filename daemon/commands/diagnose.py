@@ -25,7 +25,8 @@ def diagnose(
     live: Annotated[bool, flag("Take the running sampler's pairs, in the place of a recording.")] = False,
     robot: SourceRobotFile = None,
     out: Annotated[
-        Path | None, Parameter(help="Write diagnosis.json, report.html and extended.toml into this folder.")
+        Path | None,
+        Parameter(help="Write diagnosis.json, report.html, extended.toml and perhaps a corrected URDF here."),
     ] = None,
     effects: Annotated[str | None, Parameter(help="Look for these alone, as in backlash,joint_offset.")] = None,
     exclude: Annotated[str | None, Parameter(help="Do not look for these.")] = None,

@@ -5,11 +5,13 @@ from __future__ import annotations
 import hashlib
 import math
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from daemon.config import LearnerConfig
+from effects import Motion, Simulation
 from interfaces.records import FloatArray, frozen_array
 from interfaces.robot import RobotDescription
 from kbmaps import (
@@ -31,6 +33,8 @@ PAIRS_TO_REFIT = 5
 # A narrower stroke would make the basis needlessly stiff, and equal limits impossible.
 NARROWEST_STROKE_M = 0.1
 LARGEST_FIT = 1000
+# Postures at which an extended simulation is asked for a prior.
+LARGEST_GRID = 20_000
 
 
 @dataclass(frozen=True)
@@ -41,6 +45,7 @@ class NominalModel:
         chain: measurement frame to marker.
         lower, upper: joint limits, shape (d,) [rad or m].
         pose_known, marker_known: as in robot.toml.
+        extended: the simulation whose rigid part the chain is, where there is more in it than that.
         bases: what is learnt in: scaled orthonormal bases over the whole turn, or the stroke of a joint that slides.
     """
 
@@ -49,6 +54,7 @@ class NominalModel:
     upper: FloatArray
     pose_known: bool = True
     marker_known: bool = True
+    extended: Simulation | None = None
     bases: tuple[JointBasis, ...] = field(init=False)
 
     def __post_init__(self) -> None:
@@ -63,6 +69,19 @@ class NominalModel:
     def of(cls, robot: RobotDescription) -> NominalModel:
         """The nominal model of a robot description."""
         return cls(robot.chain, robot.lower, robot.upper, robot.camera.pose_known, robot.robot.marker_known)
+
+    @classmethod
+    def extended_by(cls, simulation: Simulation) -> NominalModel:
+        """The nominal model of a robot with effects, as it is since they are all there.
+
+        What a rigid chain can have in it is in the chain. The rest is in the prior, as far as a map has it: over the
+        joints' ranges, and only where the measurement frame is known.
+        """
+        since = simulation.since.placed
+        robot = since.robot
+        known = robot.camera.pose_known, robot.robot.marker_known
+        bent = len(since.effects) > len(since.rigid.effects) or since.residual is not None
+        return cls(since.rigid_chain, robot.lower, robot.upper, *known, since if bent and all(known) else None)
 
     @property
     def joints(self) -> int:
@@ -100,8 +119,33 @@ class NominalModel:
         return hashlib.blake2b(said.encode(), digest_size=8).hexdigest()
 
     def prior(self) -> KBMap:
-        """The chain as a map in the learning bases."""
-        return self.chain.to_kbmap(self.bases)
+        """The chain as a map in the learning bases, bent as the extended simulation is."""
+        return self._prior
+
+    @cached_property
+    def _prior(self) -> KBMap:
+        prior = self.chain.to_kbmap(self.bases)
+        if self.extended is None or (nodes := self._nodes()) is None:
+            return prior
+        q = np.stack(np.meshgrid(*nodes, indexing="ij"), axis=-1).reshape(-1, self.joints)
+        bent = self.extended.positions(Motion.still(q)) - self.chain.positions(q)
+        net = bent.T.reshape(3, *map(len, nodes))
+        for k, basis in enumerate(self.bases):
+            solve = np.linalg.pinv(basis.weights(nodes[k]))
+            net = np.moveaxis(np.tensordot(solve, net, axes=(1, k + 1)), 0, k + 1)
+        # A map that has the marker's axes too keeps them as the chain has them.
+        net = np.concatenate([prior.net[:3] + net, prior.net[3:]])
+        return KBMap(self.bases, net, prior.metadata)
+
+    def _nodes(self) -> list[FloatArray] | None:
+        """Values of each joint over its range, of which the grid tells a map; None where that would be too many."""
+        count = next((n for n in (5, 4, 3) if n**self.joints <= LARGEST_GRID), None)
+        if count is None:
+            return None
+        low = np.where(self.chain.prismatic, self.lower, np.maximum(self.lower, -np.pi))
+        high = np.where(self.chain.prismatic, self.upper, np.minimum(self.upper, np.pi))
+        shares = 0.5 * (1.0 + np.polynomial.legendre.leggauss(count)[0])
+        return [a + (b - a) * shares for a, b in zip(low, high, strict=True)]
 
     def belief(self, chain: RigidChain, tolerances: ChainTolerances) -> ChainBelief:
         """What is believed of the real chain before any pair.

@@ -12,7 +12,7 @@ import numpy as np
 from diagnosis.diagnosis import Diagnosis
 from diagnosis.numbers import chance, mm, share, told_values
 from diagnosis.result import Cause, DiagnosisFile, Verdict
-from diagnosis.words import beside_geometry, finding
+from diagnosis.words import beside_geometry, finding, modelled
 from effects import Effect
 
 from . import tables
@@ -95,6 +95,7 @@ def _unexplained(file: DiagnosisFile) -> str:
         f"<p>About <b>{mm(left.rms_mm)} mm</b> (RMS) is left that fits no known effect. It depends on "
         f"<b>{escape(', '.join(left.depends_on))}</b>; by chance that much is as improbable as p "
         f"{_equals(left.p_value)}.</p>{f'<ul>{_items(left.what)}</ul>' if left.what else ''}"
+        f"<p>{escape(modelled(left))}</p>"
     )
 
 

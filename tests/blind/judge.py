@@ -369,8 +369,8 @@ def smooth_ratio(truth: Truth, diagnosis: Diagnosis) -> float | None:
 
     Against positions free of noise nothing needs to be held out: what was fitted to the noise counts as an error.
     """
-    if not truth.strange or not diagnosis.left.is_there:
+    if not truth.strange or diagnosis.left.model is None:
         return None
-    modelled = diagnosis.extended.run.measured + diagnosis.left.explained
+    modelled = diagnosis.extended.run.measured + diagnosis.left.model.unstored
     off = np.square(modelled - truth.case.measured.x_noise_free).sum(axis=1).mean()
     return float(np.sqrt(1.0 + off / truth.case.sigma_m**2))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from planted_cases import ELBOW, SHOULDER, SIGMA_M, desk_arm, measured, motion_of, seen, walk
@@ -9,7 +11,10 @@ from planted_cases import ELBOW, SHOULDER, SIGMA_M, desk_arm, measured, motion_o
 from diagnosis.conclusion import conclusion
 from diagnosis.diagnosis import Diagnosis, diagnose
 from diagnosis.result import DiagnosisFile
-from effects import Effect, Simulation
+from diagnosis.words import modelled
+from effects import Effect, Motion, Simulation, load_simulation, write_extended
+from interfaces.recording import Recording
+from interfaces.records import FloatArray
 from interfaces.robot import RobotDescription
 
 PER_RAD = 0.03
@@ -20,14 +25,21 @@ def robot() -> RobotDescription:
     return desk_arm()
 
 
-def squared(robot: RobotDescription) -> Diagnosis:
+def squared_positions(robot: RobotDescription, motion: Motion) -> FloatArray:
     """Of an arm whose shoulder errs by `PER_RAD` times the elbow's square."""
-    motion = walk(robot, 1)
     q = motion.q.copy()
     q[:, robot.joints.index(SHOULDER)] += PER_RAD * np.square(motion.q[:, robot.joints.index(ELBOW)])
-    x = Simulation(robot).positions(motion_of(q))
-    noise = SIGMA_M * np.random.default_rng([1, 1]).normal(size=x.shape)
-    return diagnose(measured(robot, motion, x + noise), Simulation(robot))
+    return Simulation(robot).positions(motion_of(q))
+
+
+def squared_recording(robot: RobotDescription) -> Recording:
+    motion = walk(robot, 1)
+    x = squared_positions(robot, motion)
+    return measured(robot, motion, x + SIGMA_M * np.random.default_rng([1, 1]).normal(size=x.shape))
+
+
+def squared(robot: RobotDescription) -> Diagnosis:
+    return diagnose(squared_recording(robot), Simulation(robot))
 
 
 @pytest.fixture(scope="module")
@@ -57,6 +69,43 @@ def test_the_model_of_what_has_no_name_predicts_rows_that_it_was_not_fitted_to(f
 def test_the_advice_says_where_to_look(file) -> None:
     (advice,) = file.advice
     assert f"Look at {SHOULDER}, {ELBOW} first." in advice
+
+
+def stored(diagnosis: Diagnosis, folder: Path) -> Simulation:
+    return load_simulation(write_extended(diagnosis.extended.simulation, folder, "x"))
+
+
+def test_the_stored_model_makes_the_simulation_right_on_another_way(robot, diagnosis, tmp_path) -> None:
+    motion = walk(robot, 2)
+    left = stored(diagnosis, tmp_path).positions(motion) - squared_positions(robot, motion)
+    inside = np.abs(motion.q - np.median(walk(robot, 1).q, axis=0)) < 0.4 * np.ptp(walk(robot, 1).q, axis=0)
+    assert np.sqrt(np.square(left[inside.all(axis=1)]).sum(axis=1).mean()) < 0.5 * SIGMA_M * np.sqrt(3.0)
+
+
+def test_a_further_diagnosis_with_the_stored_model_finds_nothing(robot, diagnosis, tmp_path) -> None:
+    simulation = stored(diagnosis, tmp_path)
+    again = conclusion(diagnose(squared_recording(robot), simulation))
+    assert (again.verdict, again.causes, again.unexplained.depends_on) == ("nothing_found", (), ())
+
+
+def test_the_held_out_error_is_that_of_the_stored_model(robot, diagnosis, file, tmp_path) -> None:
+    motion = walk(robot, 1)
+    off = stored(diagnosis, tmp_path).positions(motion) - squared_positions(robot, motion)
+    truth_mm = 1e3 * np.sqrt(np.square(off).sum(axis=1).mean() + 3.0 * SIGMA_M**2)
+    assert abs(file.rms_mm.extended / truth_mm - 1.0) < 0.05
+
+
+def test_what_wanders_with_time_is_not_in_the_model_and_that_is_told(robot) -> None:
+    motion = walk(robot, 1, rows=600)
+    q = motion.q.copy()
+    q[:, robot.joints.index(SHOULDER)] += 0.02 * np.sin(np.linspace(0.0, 9.0, len(q)))
+    x = Simulation(robot).positions(motion_of(q))
+    noise = SIGMA_M * np.random.default_rng([1, 1]).normal(size=x.shape)
+    diagnosis = diagnose(measured(robot, motion, x + noise), Simulation(robot))
+    left = conclusion(diagnosis).unexplained
+    assert diagnosis.extended.simulation.residual is None
+    assert (left.model_joints, left.not_in_model) == ((), left.what)
+    assert "What changes with time is in no such model" in modelled(left)
 
 
 def test_where_nothing_is_hidden_nothing_is_found(robot) -> None:

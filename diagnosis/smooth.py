@@ -1,0 +1,253 @@
+"""A smooth model of what has no name: by how much of each function, and what can be stored of it.
+
+What is fitted are the functions of the families that were found, together with the causes' numbers. Those that depend
+on the readings alone become a KB-Map; what changes with time cannot be one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import combinations_with_replacement
+
+import numpy as np
+
+from effects import Motion, Simulated, Simulation, Unexplained, place_map, smooth_map
+from interfaces.records import FloatArray
+
+from .families import Family
+from .fit import Fit, fitted, prior_precision, solved
+from .held_out import Blocks
+
+# How far a function may move the marker anywhere, in units of the noise; what predicts rows best is taken.
+_SIZES = (0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0)
+_WIDE = 400
+# Of one joint's angle; rounds in which the arcs of joints that err are followed.
+_HARMONICS, _ROUNDS = 14, 3
+# What is left out of a stored model, of the noise.
+_LEFT_OUT = 0.02
+
+
+@dataclass(frozen=True, eq=False)
+class SmoothModel:
+    """What families say of what the causes of a fit leave.
+
+    Attributes:
+        fit: the causes beside what could be stored, which is in its simulation.
+        stored: the model that has been learnt; None where all changes with time, or what seemed to last does not.
+        explained: what is said of the rows (n, 3) [m].
+        unstored: the part of it that is not in the fit's simulation, since it changes with time.
+        unseen: by how much the stored simulation predicts each row otherwise for having been fitted to it (n, 3) [m].
+    """
+
+    fit: Fit
+    stored: Unexplained | None
+    explained: FloatArray
+    unstored: FloatArray
+    unseen: FloatArray
+
+
+def smooth_model(fit: Fit, families: Sequence[Family], blocks: Blocks) -> SmoothModel:
+    """Learn the families' functions beside the causes of `fit`."""
+    lasting = [family for family in families if not family.over_time]
+    timed = [family for family in families if family.over_time]
+    functions = _Functions(fit, lasting)
+    amounts = _Amounts(fit, functions.columns, _timed(fit, timed), blocks)
+    for _ in range(_ROUNDS if any(family.kind == "joint" for family in lasting) else 0):
+        amounts = _Amounts(fit, functions.columns, _timed(fit, timed), blocks, functions.bent(amounts.of_functions))
+    causes = _Amounts(fit, functions.columns[:, :, :0], _timed(fit, ()), blocks)
+    if not lasting or amounts.lasting_missed > causes.lasting_missed:
+        said = amounts.said + amounts.in_time
+        return SmoothModel(fit, None, said, said, causes.unseen)
+    stored = functions.stored(amounts.of_functions, _LEFT_OUT * _noise_m(fit))
+    simulation = Simulation(fit.simulation.robot, fit.simulation.effects, stored)
+    beside = fitted(fit.observations, simulation, fit.nuisances, fit.noise)
+    later = _Amounts(beside, functions.columns[:, :, :0], _timed(beside, timed), blocks)
+    explained = functions.shift(functions.given, amounts.of_functions) + later.in_time
+    return SmoothModel(beside, stored, explained, later.in_time, amounts.unseen)
+
+
+def _noise_m(fit: Fit) -> float:
+    """RMS length of the noise [m]."""
+    roots = np.linalg.inv(fit.observations.whitening)
+    return fit.noise.sigma * float(np.sqrt(np.square(roots).sum(axis=(1, 2)).mean()))
+
+
+def _timed(fit: Fit, families: Sequence[Family]) -> FloatArray:
+    """Columns (n, 3, p), each of an RMS of one, of what changes with time."""
+    columns = _beside([family.columns(fit.run) for family in families], len(fit.residuals))
+    return columns / np.maximum(np.sqrt(3.0 * np.square(columns).mean(axis=(0, 1))), 1e-300)
+
+
+def _beside(columns: Sequence[FloatArray], rows: int) -> FloatArray:
+    return np.concatenate([np.empty((rows, 3, 0)), *columns], axis=2)
+
+
+class _Functions:
+    """The functions of families that depend on the readings alone, each moving the marker by 1 m (RMS) all over.
+
+    They are taken along the rigid chain with the effects that it can have, so that they are functions of the readings
+    and of nothing else.
+    """
+
+    def __init__(self, fit: Fit, families: Sequence[Family]) -> None:
+        self._simulation, self.given = fit.simulation, fit.observations.motion.q
+        # A slide's functions reach from its lowest reading to its highest.
+        ends = [f(self.given[:, k]) for k in range(self.given.shape[1]) for f in (np.argmin, np.argmax)]
+        self._ends = self.given[ends]
+        self._robot = fit.simulation.robot
+        self._x = self._robot.chain.positions(self.given)
+        self._centre, self._spread = self._x.mean(axis=0), self._x.std(axis=0) + 1e-9
+        self._families = families
+        wide = self._at(self._wide())
+        self._scales = np.maximum(np.sqrt(3.0 * np.square(wide).mean(axis=(0, 1))), 1e-12)
+
+    @cached_property
+    def columns(self) -> FloatArray:
+        """At the rows of the fit (n, 3, p)."""
+        return self._at(self.given) / self._scales
+
+    def stored(self, amounts: FloatArray, tolerance_m: float) -> Unexplained:
+        """The functions times amounts (p,), and what the simulation has already, as a model."""
+        before = self._simulation.residual
+        shares = amounts / self._scales
+        if before is None and all(family.kind == "place" for family in self._families):
+            return place_map(self._robot, lambda x: self._of_place(x) @ shares, self._x, tolerance_m)
+
+        def shift(q: FloatArray) -> FloatArray:
+            new = self.shift(q, amounts)
+            return new if before is None else new + before.predict(q)
+
+        return smooth_map(self._robot, shift, self.given, tolerance_m)
+
+    def shift(self, q: FloatArray, amounts: FloatArray) -> FloatArray:
+        """What the functions times amounts (p,) say at readings (n, d), with joints that err turned (n, 3) [m]."""
+        run = self._run(q)
+        shares, errors = amounts / self._scales, np.zeros_like(run.motion.q)
+        shift, first = np.zeros((len(errors), 3)), 0
+        for family in self._families:
+            columns = self._columns(family, run)
+            own = shares[first : first + columns.shape[2]]
+            first += len(own)
+            if family.kind == "joint" and family.joint is not None:
+                errors[:, family.joint] += self._turns(family, run) @ own
+            else:
+                shift += columns @ own
+        if errors.any():
+            shift += run.simulation.positions(Motion.still(run.motion.q + errors)) - run.measured
+        return shift[len(self._ends) :]
+
+    def bent(self, amounts: FloatArray) -> FloatArray:
+        """How far the path of joints that err is off a straight one at the rows of the fit (n, 3) [m]."""
+        return self.shift(self.given, amounts) - self.columns @ amounts
+
+    def _run(self, q: FloatArray) -> Simulated:
+        return self._simulation.rigid.run(Motion.still(np.concatenate([self._ends, q])))
+
+    def _at(self, q: FloatArray) -> FloatArray:
+        run = self._run(q)
+        return _beside([self._columns(family, run) for family in self._families], len(run.q))[len(self._ends) :]
+
+    def _columns(self, family: Family, run: Simulated) -> FloatArray:
+        if family.kind == "place":
+            return self._of_place(self._robot.chain.positions(run.motion.q))
+        if family.kind == "joint":
+            return run.by_joint[:, :, [family.joint]] * self._turns(family, run)[:, None, :]
+        return family.columns(run)
+
+    def _turns(self, family: Family, run: Simulated) -> FloatArray:
+        """What the error of a joint may depend on (n, p): of one joint, finer than how its family is found."""
+        if family.driver is None:
+            return family.amounts(run)
+        low, high = self.given[:, family.driver].min(), self.given[:, family.driver].max()
+        scale = np.pi / (high - low) if self._robot.chain.prismatic[family.driver] else 1.0
+        angles = scale * run.motion.q[:, [family.driver]] * np.arange(_HARMONICS + 1)
+        return np.concatenate([np.cos(angles), np.sin(angles[:, 1:])], axis=1)
+
+    def _of_place(self, x: FloatArray) -> FloatArray:
+        """Any cubic function (n, 3, 60) of where the marker is: one of its rays has poles, which no map can have."""
+        place = (x - self._centre) / self._spread
+        products = [np.ones((len(x), 1)), place]
+        for degree in (2, 3):
+            chosen = combinations_with_replacement(range(3), degree)
+            products += [place[:, indices].prod(axis=1, keepdims=True) for indices in map(list, chosen)]
+        amounts = np.concatenate(products, axis=1)
+        return (np.eye(3)[:, :, None] * amounts[:, None, None, :]).reshape(len(x), 3, -1)
+
+    def _wide(self) -> FloatArray:
+        """Postures all over the joints' range; of slides, over that of the recording."""
+        robot, q = self._robot, self.given
+        slides = robot.chain.prismatic
+        low = np.where(slides, q.min(axis=0), np.maximum(robot.lower, -np.pi))
+        high = np.where(slides, q.max(axis=0), np.minimum(robot.upper, np.pi))
+        return low + (high - low) * np.random.default_rng(0).uniform(size=(_WIDE, q.shape[1]))
+
+
+class _Amounts:
+    """How much of each function, with the causes' numbers free beside them."""
+
+    def __init__(
+        self, fit: Fit, functions: FloatArray, timed: FloatArray, blocks: Blocks, bent: FloatArray | None = None
+    ) -> None:
+        self._fit, self._blocks = fit, blocks
+        self._left_m = fit.observations.x - fit.run.measured - (0.0 if bent is None else bent)
+        self._causes, self._lasting = fit.run_columns.shape[2], functions.shape[2]
+        self._columns = np.concatenate([fit.run_columns, functions, timed], axis=2)
+        weighted = fit.weighted(self._columns)
+        self._flat = weighted.reshape(fit.left.size, -1)
+        self._left = fit.weighted(self._left_m[:, :, None]).ravel()
+        self._folds = np.repeat(blocks.fold, 3)
+        tried = [(self._missed(size), size) for size in _SIZES]
+        self._size = min(tried)[1]
+        self._all = self._solved(np.ones(len(self._left), dtype=np.bool_), self._size)
+
+    @property
+    def of_functions(self) -> FloatArray:
+        """Of the functions that last (p,)."""
+        return self._all[self._causes :][: self._lasting]
+
+    @property
+    def in_time(self) -> FloatArray:
+        """What those that change with time say of the rows (n, 3) [m]."""
+        first = self._causes + self._lasting
+        return self._columns[:, :, first:] @ self._all[first:]
+
+    @property
+    def lasting_missed(self) -> float:
+        """What causes and lasting functions leave (sum of squares, whitened) of rows that were not fitted."""
+        left = self._fit.weighted((self._left_m - self.said + self.unseen)[:, :, None])
+        return float(np.square(left).sum())
+
+    @property
+    def said(self) -> FloatArray:
+        """What causes and lasting functions say more of the rows (n, 3) [m]."""
+        lasting = slice(0, self._causes + self._lasting)
+        return self._columns[:, :, lasting] @ self._all[lasting]
+
+    @cached_property
+    def unseen(self) -> FloatArray:
+        """By how much causes and lasting functions say more of rows (n, 3) [m] than if these had not been fitted."""
+        more = np.zeros_like(self._fit.residuals)
+        lasting = slice(0, self._causes + self._lasting)
+        for fold in np.unique(self._blocks.fold):
+            rows = self._blocks.fold == fold
+            change = self._all - self._solved(self._folds != fold, self._size)
+            more[rows] = self._columns[rows][:, :, lasting] @ change[lasting]
+        return more
+
+    def _missed(self, size: float) -> float:
+        """What is left (sum of squares) of rows that were not fitted."""
+        total = 0.0
+        for fold in np.unique(self._folds):
+            rows = self._folds == fold
+            total += float(np.square(self._left[rows] - self._flat[rows] @ self._solved(~rows, size)).sum())
+        return total
+
+    def _solved(self, rows: np.ndarray, size: float) -> FloatArray:
+        free = self._flat.shape[1] - self._causes
+        precision = [prior_precision(self._fit.simulation, self._fit.nuisances)]
+        precision.append(np.full(free, (size * _noise_m(self._fit)) ** -2))
+        ridge = np.diag(np.concatenate(precision)) * self._fit.noise.sigma**2
+        flat = self._flat[rows]
+        return solved(flat.T @ flat + ridge, flat.T @ self._left[rows])

@@ -1,0 +1,196 @@
+"""Smooth functions of the readings as KB-Maps, some of whose joints count more than once.
+
+A KB-Map has {1, cos θ, sin θ} of each joint. With columns θ, 2θ, 4θ and 8θ, as of four joints, it has all harmonics up
+to the fifteenth; and what is a sum of products of harmonics, as what moves a rigid chain is, it has exactly.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import reduce
+
+import numpy as np
+
+from interfaces.records import FloatArray
+from interfaces.robot import RobotDescription
+from kbmaps import JointBasis, KBMap
+
+from .unexplained import PLACE, Unexplained
+
+Shift = Callable[[FloatArray], FloatArray]
+# Harmonics above this are left out; a net has so many control points at most.
+_MOST_HARMONICS, _LARGEST_NET = 15, 3**12
+# Points along an axis and lines on which the harmonics of a function are looked for; rows at once.
+_POINTS, _LINES, _ROWS = 64, 12, 4096
+# How many points a grid may have.
+_LARGEST_GRID = 400_000
+
+
+@dataclass(frozen=True)
+class _Axis:
+    """One joint's functions: harmonics of a turn; of a slide, of twice its stroke, and each of them times the path.
+
+    Attributes:
+        low, high: of a slide, where the function is wanted [m].
+        harmonics: how many; none of a joint that turns says that it does not matter.
+    """
+
+    slides: bool
+    low: float
+    high: float
+    harmonics: int
+
+    @property
+    def scale(self) -> float:
+        """From readings to angles."""
+        return np.pi / (self.high - self.low) if self.slides else 1.0
+
+    def spread(self, count: int) -> FloatArray:
+        """So many readings that tell the functions apart."""
+        if self.slides:
+            return 0.5 * (
+                self.low + self.high - (self.high - self.low) * np.cos(np.pi * np.arange(count) / (count - 1))
+            )
+        return 2.0 * np.pi * np.arange(count) / count
+
+    @property
+    def grid(self) -> FloatArray:
+        """As few readings as tell all functions."""
+        return self.spread(4 * self.harmonics + 4 if self.slides else 2 * self.harmonics + 1)
+
+    def functions(self, q: FloatArray) -> FloatArray:
+        """(n, functions) at readings q (n,): by harmonics, the lowest first."""
+        angles = self.scale * q[:, None] * np.arange(1, self.harmonics + 1)
+        both = np.stack([np.cos(angles), np.sin(angles)], axis=2).reshape(len(q), -1)
+        waves = np.concatenate([np.ones((len(q), 1)), both], axis=1)
+        if not self.slides:
+            return waves
+        path = (q - self.low) / (self.high - self.low)
+        return np.stack([waves, path[:, None] * waves], axis=2).reshape(len(q), -1)
+
+    @property
+    def last(self) -> int:
+        """How many functions the highest harmonic has."""
+        return 4 if self.slides else 2
+
+    @property
+    def factors(self) -> list[float]:
+        """By which the readings are multiplied for the columns of a map."""
+        waves = [self.scale * 2.0**k for k in range(int(self.harmonics).bit_length())]
+        return [1.0, *waves] if self.slides else waves
+
+    @property
+    def bases(self) -> list[JointBasis]:
+        """Of these columns."""
+        waves = [JointBasis.trigonometric()] * int(self.harmonics).bit_length()
+        return [JointBasis.prismatic(self.low, self.high), *waves] if self.slides else waves
+
+    @property
+    def in_columns(self) -> FloatArray:
+        """(functions, m, ..., m): what the functions are in the bases of the columns."""
+        q = self.spread(4 * _POINTS)
+        columns = [basis.weights(factor * q) for basis, factor in zip(self.bases, self.factors, strict=True)]
+        products = reduce(
+            lambda a, b: (a[:, :, None] * b[:, None, :]).reshape(len(q), -1), columns, np.ones((len(q), 1))
+        )
+        shares = np.linalg.lstsq(products, self.functions(q), rcond=1e-12)[0]
+        return np.asarray(shares.T, dtype=np.float64).reshape(-1, *(basis.size for basis in self.bases))
+
+
+def smooth_map(robot: RobotDescription, shift: Shift, q: FloatArray, tolerance_m: float) -> Unexplained:
+    """A smooth function of the readings as a model that can be stored.
+
+    Args:
+        shift: positions' shifts (n, 3) [m] at readings (n, d); of joints that turn, for any angle.
+        q: readings (n, d) where the function is wanted.
+        tolerance_m: parts smaller than this (RMS) are left out, and with them the joints that do not matter.
+    """
+    return _learnt(robot, robot.joints, robot.chain.prismatic.tolist(), shift, q, tolerance_m)
+
+
+def place_map(robot: RobotDescription, shift: Shift, x: FloatArray, tolerance_m: float) -> Unexplained:
+    """The same of a function of where the robot as described has its marker, wanted at x (n, 3) [m]."""
+    return _learnt(robot, PLACE, [True] * len(PLACE), shift, x, tolerance_m)
+
+
+def _learnt(
+    robot: RobotDescription,
+    names: Sequence[str],
+    slides: Sequence[bool],
+    shift: Shift,
+    q: FloatArray,
+    tolerance_m: float,
+) -> Unexplained:
+    axes = [_axis(slides[k], shift, q, k, tolerance_m) for k in range(q.shape[1])]
+    while np.prod([float(len(axis.grid)) for axis in axes]) > _LARGEST_GRID:
+        most = max(range(len(axes)), key=lambda k: axes[k].harmonics)
+        axes[most] = replace(axes[most], harmonics=axes[most].harmonics - 1)
+    axes, amounts = _pruned(axes, _amounts(axes, shift), tolerance_m)
+    if not any(axis.bases for axis in axes):
+        axes[0], amounts = replace(axes[0], harmonics=1), np.pad(amounts, [(0, 2), *[(0, 0)] * (amounts.ndim - 1)])
+    return _stored(robot, names, axes, amounts)
+
+
+def _axis(slides: bool, shift: Shift, q: FloatArray, joint: int, tolerance_m: float) -> _Axis:
+    """How many harmonics of one joint there are, on some lines through readings."""
+    low, high = float(q[:, joint].min()), float(q[:, joint].max())
+    if slides and high - low < 1e-6:
+        low, high = low - 0.5, low + 0.5
+    axis = _Axis(slides, low, high, 0)
+    points = axis.spread(_POINTS)
+    lines = np.repeat(q[np.linspace(0, len(q) - 1, _LINES).round().astype(int)], _POINTS, axis=0)
+    lines[:, joint] = np.tile(points, _LINES)
+    values = np.swapaxes(shift(lines).reshape(_LINES, _POINTS, 3), 0, 1).reshape(_POINTS, -1)
+    for harmonics in range(_MOST_HARMONICS + 1):
+        axis = replace(axis, harmonics=harmonics)
+        functions = axis.functions(points)
+        left = values - functions @ np.linalg.lstsq(functions, values, rcond=1e-10)[0]
+        # A quarter, since there are several joints.
+        if np.sqrt(3.0 * np.square(left).mean()) < 0.25 * tolerance_m:
+            break
+    return axis
+
+
+def _amounts(axes: Sequence[_Axis], shift: Shift) -> FloatArray:
+    """Of all products of the axes' functions (functions, ..., functions, 3)."""
+    grids = [axis.grid for axis in axes]
+    q = np.stack(np.meshgrid(*grids, indexing="ij"), axis=-1).reshape(-1, len(axes))
+    values = np.concatenate([shift(q[first : first + _ROWS]) for first in range(0, len(q), _ROWS)])
+    amounts = values.reshape(*(len(grid) for grid in grids), 3)
+    for k, axis in enumerate(axes):
+        solve = np.linalg.pinv(axis.functions(grids[k]), rcond=1e-10)
+        amounts = np.moveaxis(np.tensordot(solve, amounts, axes=(1, k)), 0, k)
+    return amounts
+
+
+def _pruned(axes: list[_Axis], amounts: FloatArray, tolerance_m: float) -> tuple[list[_Axis], FloatArray]:
+    """Without the highest harmonics that do not matter; and, where the net would be too large, that matter least."""
+    squared = 0.0
+    while True:
+        parts = {}
+        for k, axis in enumerate(axes):
+            if axis.harmonics:
+                part = np.take(amounts, range(amounts.shape[k] - axis.last, amounts.shape[k]), axis=k)
+                # Of a wave the mean square is half of its amplitude's.
+                parts[k] = 0.5 * float(np.square(part).sum())
+        if not parts:
+            return axes, amounts
+        least = min(parts, key=lambda k: parts[k])
+        net = np.prod([float(basis.size) for axis in axes for basis in axis.bases])
+        if squared + parts[least] > tolerance_m**2 and net <= _LARGEST_NET:
+            return axes, amounts
+        squared += parts[least]
+        amounts = np.take(amounts, range(amounts.shape[least] - axes[least].last), axis=least)
+        axes[least] = replace(axes[least], harmonics=axes[least].harmonics - 1)
+
+
+def _stored(robot: RobotDescription, names: Sequence[str], axes: Sequence[_Axis], amounts: FloatArray) -> Unexplained:
+    net = np.moveaxis(amounts, -1, 0)
+    for axis in axes:
+        # The first axis of functions is always the next: what it becomes goes to the end.
+        net = np.tensordot(net, axis.in_columns, axes=(1, 0))
+    joints = [joint for joint, axis in zip(names, axes, strict=True) for _ in axis.bases]
+    factors = [factor for axis in axes for factor in axis.factors]
+    kbmap = KBMap(tuple(basis for axis in axes for basis in axis.bases), net)
+    return Unexplained.of(robot, kbmap, tuple(joints), tuple(factors))

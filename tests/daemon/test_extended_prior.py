@@ -1,0 +1,91 @@
+"""A robot.toml with effects gives the learner the extended simulation to begin with."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+
+import numpy as np
+import pytest
+from walked import DESK_ARM
+
+from daemon.config import Config, LearnerConfig
+from daemon.learning import DirectSolver, Learning, NominalModel
+from daemon.learning.nominal import chain_tolerances
+from effects import Effect, Motion, Simulation, write_extended
+from interfaces.records import FloatArray
+from interfaces.robot import RobotDescription
+
+LINK, TURN = [0.005, 0.003, -0.004, 0.02, 0.01, -0.02], [0.03, 0.02]
+RIGID: Mapping[str, list[float]] = {"link_geometry": LINK, "joint_offset": [0.03]}
+
+
+@pytest.fixture(scope="module")
+def robot() -> RobotDescription:
+    text = DESK_ARM.read_text().replace("_known = false", "_known = true")
+    return RobotDescription.from_tables(tomllib.loads(text), text, DESK_ARM)
+
+
+def at(robot: RobotDescription, name: str, joint: int | None, values: list[float]) -> Effect:
+    return Effect.at(robot, name, None if joint is None else robot.joints[joint], values=values)
+
+
+def poses(robot: RobotDescription) -> FloatArray:
+    shares = np.random.default_rng(3).uniform(0.05, 0.95, size=(300, len(robot.joints)))
+    return robot.lower + shares * (robot.upper - robot.lower)
+
+
+def error_m(nominal: NominalModel, simulation: Simulation) -> float:
+    """Mean error of what the learner says before any pair."""
+    q = poses(simulation.robot)
+    said = Learning(nominal, LearnerConfig(), DirectSolver()).snapshot.predict(q).x
+    return float(np.linalg.norm(said - simulation.positions(Motion.still(q)), axis=1).mean())
+
+
+def test_what_a_rigid_chain_can_have_is_known_from_the_start(robot) -> None:
+    simulation = Simulation(robot, tuple(at(robot, name, 2, values) for name, values in RIGID.items()))
+    assert error_m(NominalModel.of(robot), simulation) > 5e-3
+    assert error_m(NominalModel.extended_by(simulation), simulation) < 1e-9
+
+
+@pytest.mark.parametrize(
+    ("name", "joint", "values", "share"),
+    [
+        ("camera_scale", None, [0.02], 1e-6),
+        ("joint_eccentricity", 1, TURN, 0.7),
+        ("joint_scale", 2, [0.03], 0.7),
+    ],
+)
+def test_what_it_cannot_have_is_known_as_far_as_a_map_has_it(robot, name, joint, values, share) -> None:
+    simulation = Simulation(robot, (at(robot, name, joint, values),))
+    assert error_m(NominalModel.extended_by(simulation), simulation) < share * error_m(
+        NominalModel.of(robot), simulation
+    )
+
+
+def test_what_jumped_has_jumped_and_what_comes_of_motion_is_left_out(robot) -> None:
+    jump = Simulation(robot, (at(robot, "encoder_jump", 1, [0.05, 100.0]), at(robot, "backlash", 2, [0.1])))
+    offset = Simulation(robot, (at(robot, "joint_offset", 1, [0.05]),))
+    assert error_m(NominalModel.extended_by(jump), offset) < 1e-9
+
+
+def test_a_frame_that_is_not_known_keeps_the_geometry_of_the_arm(tmp_path) -> None:
+    robot = RobotDescription.load(DESK_ARM)
+    simulation = Simulation(robot, (at(robot, "link_geometry", 2, LINK), at(robot, "joint_eccentricity", 1, TURN)))
+    file = write_extended(simulation, tmp_path / "out", "x")
+    nominal = NominalModel.extended_by(Config.load(file).simulation)
+    assert not nominal.frame_known
+    np.testing.assert_allclose(nominal.chain.fixed, simulation.rigid_chain.fixed, atol=1e-12)
+
+
+def test_another_extended_file_is_another_nominal_model(robot) -> None:
+    tolerances = chain_tolerances(LearnerConfig())
+    fingerprints = {
+        nominal.fingerprint(tolerances)
+        for nominal in (
+            NominalModel.of(robot),
+            NominalModel.extended_by(Simulation(robot)),
+            NominalModel.extended_by(Simulation(robot, (at(robot, "joint_eccentricity", 1, TURN),))),
+        )
+    }
+    assert len(fingerprints) == 2
