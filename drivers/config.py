@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Annotated
 
 import msgspec
 from msgspec import Meta
+
+from interfaces.errors import ConfigError
+from interfaces.toml_file import line_of
 
 from .dynamixel.config import DynamixelConfig
 
@@ -28,3 +33,12 @@ class DriversConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     speed: NonNegative = 1.0
     recording_sigma_m: Positive | None = None
     dynamixel: DynamixelConfig | None = None
+
+    def check(self, joints: Sequence[str], file: Path, text: str) -> None:
+        """ConfigError when two things give the joints, or one that does not fit `joints`."""
+        if self.dynamixel is None:
+            return
+        if self.recording is not None:
+            line = line_of(text, ("drivers", "recording"))
+            raise ConfigError("both a recording and servos", file=file, line=line, remedy="Take one out of [drivers]")
+        self.dynamixel.check(joints, file, text)

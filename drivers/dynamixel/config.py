@@ -84,7 +84,7 @@ class DynamixelConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return BY_NAME[servo.model]
 
     def check(self, joints: Sequence[str], file: Path, text: str) -> None:
-        """ConfigError when the servos are not one for each of `joints`, on buses that there are, with IDs of their own."""
+        """ConfigError when the servos are not one for each of `joints`, each with a bus and an ID of its own."""
         for place, what, key, remedy in self._mistakes(joints):
             line = line_in_entry(text, "drivers.dynamixel.servos", place, key)
             raise ConfigError(what, file=file, line=line, remedy=remedy)

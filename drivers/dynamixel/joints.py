@@ -221,7 +221,8 @@ class DynamixelJoints:
                 raise SourceError(
                     f"joint {servo.joint!r} (ID {servo.id}) was at {math.degrees(was):.0f}° and is now at "
                     f"{math.degrees(now):.0f}°, or whole turns from there: its turn count is lost. "
-                    f"Turn it back to within {self._config.max_move_deg:.0f}° of where it was, or start anew"
+                    f"Turn it back to within {self._config.max_move_deg:.0f}° of where it was, or set max_move_deg "
+                    "in [drivers.dynamixel] to 179 to take the nearest turn"
                 )
             if count != samples[place].ticks:
                 log.info("joint %r: %+d turns are added to what its servo counts", *self._turns(place, count, samples))
