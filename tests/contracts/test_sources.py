@@ -164,6 +164,7 @@ ENDING_JOINTS = [replayed_joints, scripted_joints, pytest.param(simulated_joints
 JOINTS = [*ENDING_JOINTS, servos_on_the_bench]
 MARKERS = [replayed_marker, scripted_marker, pytest.param(tracked_camera, marks=SIMULATED)]
 CAMERAS = [pytest.param(simulated_camera, marks=SIMULATED)]
+STANDING_STILL = [*ENDING_JOINTS[2:], *MARKERS[2:], *CAMERAS]
 Make = Callable[[], AbstractContextManager[Rig]]
 
 

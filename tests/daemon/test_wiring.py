@@ -104,7 +104,7 @@ def test_servos_without_a_camera_make_no_pairs(tmp_path) -> None:
         ("id = 2", "id = 300", "drivers.dynamixel.servos.id: expected `int` <= 252"),
         ('"MX-28"', '"MX28"', "unknown model 'MX28'. Did you mean 'MX-28'"),
         ("id = 2", 'id = 2\nbus = "leg"', "unknown bus 'leg'"),
-        ("id = 2", "id = 2\nzero = 1", "unknown key 'zero' in .*Did you mean 'zero_ticks'"),
+        ("id = 2", "id = 2\nzero = 1", "unknown key 'zero' in .*Known are: .*zero_ticks"),
     ],
 )
 def test_a_mistake_about_servos_is_named_with_its_line(tmp_path, right, wrong, said) -> None:
@@ -113,12 +113,12 @@ def test_a_mistake_about_servos_is_named_with_its_line(tmp_path, right, wrong, s
 
 
 def test_a_rate_that_no_servo_has_is_refused(tmp_path) -> None:
-    with pytest.raises(ConfigError, match="buses.baud: 12345 is unknown, known are: 9600, 57600"):
+    with pytest.raises(ConfigError, match=r"buses\.baud: 12345 is unknown, known are: 9600, 57600"):
         load(tmp_path, SERVOS.replace("port =", "baud = 12345\nport ="))
 
 
 def test_a_joint_without_a_servo_is_named(tmp_path) -> None:
-    with pytest.raises(ConfigError, match="no servo .* for shoulder"):
+    with pytest.raises(ConfigError, match=r"no servo .* for shoulder"):
         load(tmp_path, SERVOS[: SERVOS.rindex("[[")])
 
 
