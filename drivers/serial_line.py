@@ -23,7 +23,9 @@ LATENCY_OF = "/sys/bus/usb-serial/devices/{}/latency_timer"
 class BusLost(SourceLost):
     """The port, or everything behind it, went away."""
 
-    def __init__(self, port: str, why: object) -> None:
+    def __init__(self, port: str, error: Exception) -> None:
+        number = next((part for part in error.args if isinstance(part, int)), None)
+        why = os.strerror(number) if number else str(error) or "it was unplugged"
         super().__init__(f"{port} is gone: {why}", retry_s=RETRY_S)
 
 
@@ -88,7 +90,7 @@ class SerialLine:
         except OSError as error:
             raise BusLost(str(self.device.port), error) from error
         if not data:
-            raise BusLost(str(self.device.port), "it was unplugged")
+            raise BusLost(str(self.device.port), OSError(errno.ENODEV, "unplugged"))
         return data
 
     def wait(self, until: float) -> bool:
@@ -117,4 +119,4 @@ def _refused(port: str, baud: int, error: Exception) -> SourceError:
         return SourceError(f"{port} is in use by another program. End that one (fuser {port} shows it)")
     if isinstance(error, ValueError):
         return SourceError(f"{port} cannot be opened at {baud} bit/s: {error}")
-    return BusLost(port, os.strerror(number) if number else error)
+    return BusLost(port, error)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from drivers.device_clock import DeviceClock
@@ -25,6 +26,8 @@ class Sample:
     """What a servo told.
 
     Attributes:
+        bus: which way it came.
+        expected: when it was so if nothing was held up [s].
         earliest, latest: between these times it was so [s].
         ticks: its position as it tells it.
         velocity: [rad/s], counted as the servo counts.
@@ -32,6 +35,8 @@ class Sample:
         alert: something is wrong with the servo; the position is right nevertheless.
     """
 
+    bus: str
+    expected: float
     earliest: float
     latest: float
     ticks: int
@@ -78,7 +83,8 @@ class Channel:
         model = self.servo.model
         amperes = None if model.current_unit is None else current * model.current_unit
         alert = bool(answer.status.error & ALERT)
-        return Sample(*between, position, velocity * model.velocity_unit, amperes, bool(moving), alert)
+        way = (self.servo.bus, answer.earliest)
+        return Sample(*way, *between, position, velocity * model.velocity_unit, amperes, bool(moving), alert)
 
     def _of_protocol1(self, answer: Answer) -> Sample | None:
         position, speed, _, voltage, temperature, registered, _, moving = BLOCK1.unpack(answer.status.data)
@@ -86,7 +92,8 @@ class Channel:
             return None
         velocity = (speed & NUMBER1) * self.servo.model.velocity_unit * (-1 if speed & SIGN1 else 1)
         alert = answer.status.error != 0
-        return Sample(answer.earliest, answer.latest, position, velocity, None, bool(moving), alert)
+        way = (self.servo.bus, answer.earliest)
+        return Sample(*way, answer.earliest, answer.latest, position, velocity, None, bool(moving), alert)
 
     def _is_possible(self, position: int) -> bool:
         if self.servo.model.ticks_per_turn is None:
@@ -101,3 +108,21 @@ class Channel:
             return False
         self._supply = (voltage, temperature)
         return True
+
+
+def middle(samples: Sequence[Sample]) -> float:
+    """The middle of the time in which the positions were taken [s].
+
+    On one bus only the question can have been held up: the servos answer as the wire goes on. So one delay, which is in
+    the bounds of all, moves them all.
+    """
+    total = 0.0
+    for bus in {sample.bus for sample in samples}:
+        there = [sample for sample in samples if sample.bus == bus]
+        least = max(sample.earliest - sample.expected for sample in there)
+        most = min(sample.latest - sample.expected for sample in there)
+        if least <= most:
+            total += sum(sample.expected for sample in there) + len(there) * (least + most) / 2
+        else:
+            total += sum(sample.earliest + sample.latest for sample in there) / 2
+    return total / len(samples)

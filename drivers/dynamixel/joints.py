@@ -17,10 +17,10 @@ from interfaces.protocols import Clock
 from interfaces.records import JointReading, frozen_array
 
 from .bus import Bus, Request
-from .channel import Channel, Sample
+from .channel import Channel, Sample, middle
 from .config import BusConfig, DynamixelConfig
 from .handshake import RETRY_S, FittedServo, identify, require_all, restore_torque, switch_torque_off
-from .models import HARDWARE_ERRORS
+from .models import HARDWARE_ERRORS, TICK_S
 from .plan import block_requests, state_request, torque_and_error
 from .port import Port, SafePort
 
@@ -32,6 +32,7 @@ DOUBTS = 5  # so many answers in a row that cannot be: the servo was restarted
 LOOK_AFTER_S = 0.1  # one servo's torque and health in turn
 ANCHOR_POLLS = 50
 SLACK_TICKS = 3
+GOLDEN = 0.618034  # multiples of it, modulo 1, are spread most evenly
 
 OpenPort = Callable[[BusConfig, Clock], tuple[Port, float]]
 
@@ -150,7 +151,7 @@ class DynamixelJoints:
                 self._wait_until(deadline)
                 return None
             if self._wait_until(self._next_poll):
-                self._next_poll = max(self._next_poll + 1 / self._config.rate_hz, self._clock.now())
+                self._next_poll = self._following_poll()
                 reading = self._poll()
                 if reading is not None:
                     return reading
@@ -178,7 +179,7 @@ class DynamixelJoints:
         self._gate = SpeedGate([speed / s.model.rad_per_tick for s in self.servos], [SLACK_TICKS] * len(self.servos))
         now = self._clock.now()
         self._believed_s, self._failures, self._next_poll, self._next_look = now, 0, now, now
-        self._looked = 0
+        self._looked = self._polls = 0
         self._why = "no answer"
 
     def _anchor(self) -> None:
@@ -191,7 +192,7 @@ class DynamixelJoints:
             if believed == 0:
                 self._counts = [self._nearest(place, sample.ticks) for place, sample in enumerate(samples)]
             counts = self._continued(samples)
-            believed = believed + 1 if self._gate.offer(_middle(samples), counts) is None else 0
+            believed = believed + 1 if self._gate.offer(middle(samples), counts) is None else 0
             if believed == 2:
                 self._counts = counts
                 self._check_turns(samples)
@@ -260,6 +261,12 @@ class DynamixelJoints:
             self._believed_s, self._failures = self._clock.now(), 0
         return reading
 
+    def _following_poll(self) -> float:
+        """When to ask next: not always at the same phase of the servos' ticks, which would tell nothing new of them."""
+        self._polls += 1
+        before, after = (self._polls - 1) * GOLDEN % 1, self._polls * GOLDEN % 1
+        return max(self._next_poll + 1 / self._config.rate_hz + (after - before) * TICK_S, self._clock.now())
+
     def _ask_all(self) -> list[Sample] | None:
         """A sample of each joint; None when one is missing or doubtful. All buses are asked at the same time."""
         samples: dict[int, Sample] = {}
@@ -292,7 +299,7 @@ class DynamixelJoints:
             bus.settle(question.protocol)
 
     def _judge(self, samples: list[Sample]) -> JointReading | None:
-        t = _middle(samples)
+        t = middle(samples)
         counts = self._continued(samples)
         refused = self._gate.offer(t, counts)
         if refused is not None:
@@ -316,7 +323,15 @@ class DynamixelJoints:
         self.dropped += 1
         self._failures += 1
         if self._failures >= FEW_POLLS and self._clock.now() - self._believed_s > LOST_AFTER_S:
-            raise SourceLost(self._why, retry_s=RETRY_S)
+            raise SourceLost(self._blame(), retry_s=RETRY_S)
+
+    def _blame(self) -> str:
+        """Who does not answer when asked alone, else what went wrong last."""
+        for servo in self.servos:
+            trouble = self._buses[servo.bus].ask(state_request(servo)).trouble
+            if trouble is not None:
+                return f"joint {servo.joint!r} (ID {servo.id}): {trouble}"
+        return self._why
 
     def _refuse_restarted(self, channel: Channel) -> None:
         if channel.doubts >= DOUBTS:
@@ -359,11 +374,6 @@ class DynamixelJoints:
 def _close(port: Port) -> None:
     with suppress(SourceError):
         port.close()
-
-
-def _middle(samples: Sequence[Sample]) -> float:
-    """The middle of the time in which the positions were taken [s]."""
-    return sum(sample.earliest + sample.latest for sample in samples) / (2 * len(samples))
 
 
 def _complaint(joint: str, bits: int) -> str:

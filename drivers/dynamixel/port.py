@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import Protocol
+from typing import Literal, Protocol
 
 import dynamixel_sdk as sdk
 
@@ -64,7 +64,7 @@ class SafePort(sdk.PortHandler):
             raise ConnectionError(f"{self.port_name} is not open")
         return self._line
 
-    def setupPort(self, cflag_baud: int) -> bool:
+    def setupPort(self, cflag_baud: int) -> Literal[True]:
         """Open it at the rate, for this program alone."""
         if self.is_open:
             self.closePort()

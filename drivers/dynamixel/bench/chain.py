@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import reduce
+from operator import and_
 
 from .faults import Faults, Reply
 from .frames import (
@@ -161,10 +163,7 @@ class Chain:
         packets = [_packet(servo, *told) for servo, told in done if _will_answer(servo, code)]
         if not packets:
             return []
-        mixed = packets[0]
-        for packet in packets[1:]:
-            mixed = bytes(a & b for a, b in zip(mixed, packet, strict=False))
-        return [Reply(servos[0].id, start, mixed)]
+        return [Reply(servos[0].id, start, _mixed(packets))]
 
     def _broadcast(self, servos: list[Servo], instruction: Instruction, t: float) -> list[Reply]:
         if instruction.code != Code.PING:
@@ -211,8 +210,8 @@ class Chain:
             if place == 0:
                 start = t + there[0].return_delay_s
             now = start + len(packet) * self._byte_s
-            error, data = self._read(there[0], address, size, now)
-            packet += fast_block(packet, id, _error_byte(there[0], error), data)
+            told = [(servo, *self._read(servo, address, size, now)) for servo in there]
+            packet += _mixed([fast_block(packet, id, _error_byte(servo, error), data) for servo, error, data in told])
         return [Reply(ids[0], start, packet)] if ids else []
 
     def _sync_write(self, servos: list[Servo], instruction: Instruction, t: float) -> list[Reply]:
@@ -248,6 +247,11 @@ def _agree(baud: int, other: int) -> bool:
 def _complain(servo: Servo, t: float) -> tuple[Error, bytes]:
     del servo, t
     return Error.CRC, b""
+
+
+def _mixed(packets: list[bytes]) -> bytes:
+    """What is heard when all talk at the same time."""
+    return bytes(reduce(and_, together) for together in zip(*packets, strict=False))
 
 
 def _will_answer(servo: Servo, code: int) -> bool:

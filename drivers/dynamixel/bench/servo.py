@@ -96,7 +96,7 @@ class Servo:
     def __getitem__(self, name: str) -> int:
         """The number in a register."""
         register = self.model.layout[name]
-        return register.value(self._memory[register.address : register.end])
+        return register.value(bytes(self._memory[register.address : register.end]))
 
     def __setitem__(self, name: str, value: int) -> None:
         """Put a number into a register as the servo itself does, past all locks."""

@@ -56,6 +56,7 @@ class VirtualPort:
         self._outwards, self._inwards = outwards, inwards
         self._arriving: list[tuple[float, int, bytes]] = []
         self._order = 0
+        self._newest = 0.0
 
     @property
     def baud(self) -> int:
@@ -72,7 +73,8 @@ class VirtualPort:
         for reply in self.chain.send(data, self._clock.now() + self._outwards(), self._baud):
             self._order += 1
             arrival = reply.start + len(reply.data) * byte_s + self._inwards()
-            heappush(self._arriving, (arrival, self._order, reply.data))
+            self._newest = max(self._newest, arrival)  # bytes do not overtake each other on their way in
+            heappush(self._arriving, (self._newest, self._order, reply.data))
 
     def receive(self, until: float) -> bytes:
         """What has arrived, else what arrives next; nothing when that is not before `until`."""
