@@ -1,4 +1,4 @@
-"""How many wrong readings the Dynamixel driver believes when answers are mute, late, corrupt, cut, swapped or in garbage.
+"""How many wrong readings the Dynamixel driver believes when answers are lost, late, corrupt, cut, swapped, in garbage.
 
 Virtual time, so millions of transactions in minutes. Type: python -m benchmarks.fault_storm --transactions 10_000_000
 """
@@ -73,8 +73,8 @@ def run(model: str, fast: str, transactions: int, intensity: float, seed: int) -
     share = believed / (believed + joints.dropped)
     possible = (1 - intensity) ** (1 if fast == "auto" else JOINTS)
     return (
-        f"{chain.instructions:,} transactions, {struck:,} faults, {believed:,} readings believed, {wrong} of them wrong "
-        f"(worst {math.degrees(worst):.2f}°), {share:.4f} of the readings where faults leave {possible:.4f}, "
+        f"{chain.instructions:,} transactions, {struck:,} faults, {believed:,} readings believed, "
+        f"{wrong} of them wrong (worst {math.degrees(worst):.2f}°), {share:.4f} of the readings where faults leave {possible:.4f}, "
         f"opened anew {losses} times"
     )
 

@@ -69,7 +69,8 @@ class Arm:
         self.chain = Chain(servos, self.faults)
         jitter = (lambda: rng.uniform(0, latency_s)) if latency_s else at_once
         self.port = HeardPort(self.chain, self.clock, outwards=at_once, inwards=jitter)
-        entries = tuple(ServoConfig(name, k, model) for k, (name, model) in enumerate(zip(self.names, models), 1))
+        fitted = zip(self.names, models, strict=True)
+        entries = tuple(ServoConfig(name, k, model) for k, (name, model) in enumerate(fitted, 1))
         self.config = DynamixelConfig({"arm": BusConfig("bench", fast_sync_read=fast)}, entries, **settings)
         self.joints = DynamixelJoints(
             self.config,

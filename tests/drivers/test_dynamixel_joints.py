@@ -106,10 +106,11 @@ def test_torque_is_switched_off_though_answers_get_lost() -> None:
 
 def test_torque_that_is_switched_on_meanwhile_is_found_and_switched_off() -> None:
     arm = Arm()
-    with arm.joints, pytest.raises(SourceLost, match="torque of joint 'joint3' was switched on by another program"):
+    with arm.joints:
         read(arm)
         arm.chain.servo(3)["torque"] = 1
-        read(arm, 1000)
+        with pytest.raises(SourceLost, match="torque of joint 'joint3' was switched on by another program"):
+            read(arm, 1000)
     with arm.joints:
         assert arm.chain.servo(3)["torque"] == 0
 
@@ -152,14 +153,14 @@ def test_a_missing_servo_and_a_wrong_one_are_shown_in_one_table() -> None:
 def test_two_servos_of_one_id_are_refused() -> None:
     arm = Arm()
     arm.chain.servos.append(Servo(BY_NAME["XL430-W250"], 2, swing(9), return_delay_s=0))
-    with pytest.raises(SourceError, match="joint2 .* two servos with this ID"), arm.joints:
+    with pytest.raises(SourceError, match=r"joint2 .* two servos with this ID"), arm.joints:
         pass
 
 
 def test_two_servos_of_one_id_and_model_are_refused_by_their_positions() -> None:
     arm = Arm()
     arm.chain.servos.append(Servo(BY_NAME["XM430-W350"], 2, swing(9), return_delay_s=0))
-    with pytest.raises(SourceError, match="cannot be read: joint 'joint2'|cannot be read: arm"), arm.joints:
+    with pytest.raises(SourceError, match=r"cannot be read: joint 'joint2'"), arm.joints:
         pass
 
 
@@ -173,7 +174,7 @@ def test_a_servo_that_answers_ping_only_is_told_apart() -> None:
 def test_a_servo_at_another_rate_does_not_answer() -> None:
     arm = Arm()
     arm.chain.servo(1)["baud"] = 1
-    with pytest.raises(SourceLost, match="joint1 .* no answer"), arm.joints:
+    with pytest.raises(SourceLost, match=r"joint1 .* no answer"), arm.joints:
         pass
 
 
@@ -233,10 +234,11 @@ def test_what_the_others_answered_is_kept_when_one_is_mute() -> None:
 
 def test_a_servo_that_stays_mute_is_named() -> None:
     arm = Arm()
-    with arm.joints, pytest.raises(SourceLost, match=r"joint 'joint2' \(ID 2\)"):
+    with arm.joints:
         read(arm)
         arm.chain.servos.pop(1)
-        read(arm, 1000)
+        with pytest.raises(SourceLost, match=r"joint 'joint2' \(ID 2\): no answer"):
+            read(arm, 1000)
 
 
 @pytest.mark.parametrize("fast", ["auto", "never"])
@@ -251,10 +253,11 @@ def test_an_encoder_s_glitch_is_not_believed(fast) -> None:
 
 def test_an_encoder_that_jumped_for_good_is_another_epoch() -> None:
     arm = Arm(limits=[(-2.0, 2.0)] * 3)
-    with arm.joints, pytest.raises(SourceLost, match="'joint2' .* a position where it cannot have come to"):
+    with arm.joints:
         read(arm)
         arm.chain.servo(2).glitch_ticks = 300
-        read(arm, 100)
+        with pytest.raises(SourceLost, match=r"'joint2' .* a position where it cannot have come to"):
+            read(arm, 100)
     with arm.joints:
         assert read(arm)[0].q[1] == pytest.approx(arm.paths[1](arm.clock.now()) + 300 * TICK, abs=0.01)
     assert arm.joints.epoch == 2
@@ -262,10 +265,11 @@ def test_an_encoder_that_jumped_for_good_is_another_epoch() -> None:
 
 def test_a_servo_that_was_restarted_is_another_epoch() -> None:
     arm = Arm()
-    with arm.joints, pytest.raises(SourceLost, match=r"joint 'joint3' \(ID 3\) was restarted"):
+    with arm.joints:
         read(arm)
         arm.chain.servo(3).reboot(arm.clock.now())
-        read(arm, 100)
+        with pytest.raises(SourceLost, match=r"joint 'joint3' \(ID 3\) was restarted"):
+            read(arm, 100)
     with arm.joints:
         assert arm.error(read(arm)[0]) < 2 * TICK
 
@@ -304,9 +308,7 @@ def test_a_joint_whose_turn_cannot_be_told_is_named() -> None:
         read(arm)
     arm.chain.power_cycle(arm.clock.now())
     place[0] = 11.5
-    with pytest.raises(
-        SourceError, match=r"joint 'joint1' \(ID 1\) was at 516° and is now at .* its turn count is lost"
-    ):
+    with pytest.raises(SourceError, match=r"joint 'joint1' \(ID 1\) was at 516° and is now .* turn count is lost"):
         arm.joints.__enter__()
     place[0] = 9.3
     with arm.joints:

@@ -52,7 +52,7 @@ def test_a_device_clock_narrows_an_event_to_a_fraction_of_what_the_host_knows() 
         assert between is not None
         assert between[0] - 2e-5 <= true <= between[1] + 2e-5
         widths.append(between[1] - between[0])
-    assert np.mean(widths[1000:]) < 1.2e-3  # of 3 ms
+    assert np.mean(widths[1000:]) < 1.5e-3  # of 3 ms
 
 
 @pytest.mark.parametrize("late_s", [0.003, 0.02, 1.0, 20.0])

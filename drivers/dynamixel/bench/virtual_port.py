@@ -49,14 +49,13 @@ class VirtualPort:
 
         Args:
             outwards: how long bytes need from the program to the wire [s], drawn anew for each packet.
-            inwards: how long from the wire to the program.
+            inwards: how long from the wire to the program, drawn anew for each question.
         """
         self.chain = chain
         self._clock, self._baud = clock, baud
         self._outwards, self._inwards = outwards, inwards
         self._arriving: list[tuple[float, int, bytes]] = []
         self._order = 0
-        self._newest = 0.0
 
     @property
     def baud(self) -> int:
@@ -69,12 +68,11 @@ class VirtualPort:
 
     def write(self, data: bytes) -> None:
         """Send `data`."""
-        byte_s = self.chain.byte_s(self._baud)
+        byte_s, inwards_s = self.chain.byte_s(self._baud), self._inwards()
         for reply in self.chain.send(data, self._clock.now() + self._outwards(), self._baud):
             self._order += 1
-            arrival = reply.start + len(reply.data) * byte_s + self._inwards()
-            self._newest = max(self._newest, arrival)  # bytes do not overtake each other on their way in
-            heappush(self._arriving, (self._newest, self._order, reply.data))
+            arrival = reply.start + len(reply.data) * byte_s + inwards_s
+            heappush(self._arriving, (arrival, self._order, reply.data))
 
     def receive(self, until: float) -> bytes:
         """What has arrived, else what arrives next; nothing when that is not before `until`."""
