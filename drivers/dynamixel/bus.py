@@ -16,7 +16,8 @@ SLOWEST_DELAY_S = 510e-6  # Return Delay Time at its largest
 HOST_MARGIN_S = 3e-3  # the operating system's part of an answer's delay
 TOO_EARLY = 0.9  # an answer within this share of its time on the wire is another question's
 LONGEST_NOISE_S = 0.25
-OWED_S = {1: 0.03, 2: 2e-3}  # how long an answer may be late; of Protocol 2.0 the servo's clock tells the later ones
+QUIET_S = 2e-3
+OWED_S = 0.06  # how long an answer of Protocol 1.0 may be late: in Protocol 2.0 the servo's clock tells
 
 
 # Errors of the question; the other bits tell of the servo's health. (e-Manual, status packets)
@@ -34,6 +35,9 @@ class Trouble(StrEnum):
     EARLY = "an answer before it could have come"
     REFUSED = "an error in answer"
     NOISE = "noise while nobody was asked"
+
+
+OWING = (Trouble.TIMEOUT, Trouble.FOREIGN, Trouble.EARLY, Trouble.WRONG_LENGTH)
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,28 +140,36 @@ class Bus:
         """Wait for the answers to what was sent last."""
         exchange = self._collect_fast(request) if request.is_fast else self._collect(request)
         self.counts.add(exchange.trouble)
+        if exchange.trouble in OWING and request.protocol == 1:
+            self._await_owed(packets_of(1).overhead + request.size)
         if exchange.trouble is not None:
-            self.settle(request.protocol)
+            self.settle()
         return exchange
 
     def tell(self, protocol: Version, packet: bytes, id: int) -> Exchange:
         """Send an instruction that is answered without data, or, as its status return level says, not at all."""
         return self.ask(Request(packet, (id,), 0, protocol))
 
-    def listen(self, until: float, protocol: Version) -> bool:
+    def listen(self, until: float) -> bool:
         """Wait; False when something came though nobody was asked: what came before is not to be trusted."""
         if not self._port.receive(until):
             return True
         self.counts.add(Trouble.NOISE)
-        self.settle(protocol)
+        self.settle()
         return False
 
-    def settle(self, protocol: Version) -> None:
-        """Wait until the line has been silent for as long as an answer may be late."""
-        quiet_s = max(OWED_S[protocol], 2 * self._latency_s)
+    def settle(self) -> None:
+        """Wait until the line has been silent for a while."""
+        quiet_s = max(QUIET_S, 2 * self._latency_s)
         end = self._clock.now() + LONGEST_NOISE_S
         while self._clock.now() < end and self._port.receive(self._clock.now() + quiet_s):
             pass
+
+    def _await_owed(self, size: int) -> None:
+        """Wait for an answer that may still come, which would be taken for that to the next question."""
+        end = self._clock.now() + OWED_S
+        while size > 0 and (data := self._port.receive(end)):
+            size -= len(data)
 
     def _deadline(self, request: Request) -> float:
         overhead = packets_of(request.protocol).overhead

@@ -18,6 +18,7 @@ BLOCK1 = struct.Struct("<hHHBBBBB")  # position, speed, load, voltage, temperatu
 LARGEST_PWM = 2009  # of the P series; the others have less
 SIGN1, NUMBER1 = 0x400, 0x3FF  # sign and magnitude of Protocol 1.0
 LARGEST_POSITION1 = 28_672  # in multi-turn mode
+SURPRISE_TICKS = 4
 VOLTAGE_STEP, TEMPERATURE_STEP = 15, 3  # these change slowly: 0.1 V, K
 
 
@@ -53,6 +54,7 @@ class Channel:
         servo: who it is.
         newest: the last sample that was believed.
         doubts: how many in a row were not.
+        surprising: the newest is not where the two before it led to.
     """
 
     def __init__(self, servo: FittedServo) -> None:
@@ -60,6 +62,8 @@ class Channel:
         self.servo = servo
         self.newest: Sample | None = None
         self.doubts = 0
+        self.surprising = True
+        self._trend: tuple[float, float, float] | None = None
         self._clock = DeviceClock(TICK_S, TICKS)
         self._supply: tuple[int, int] | None = None
 
@@ -70,8 +74,29 @@ class Channel:
         if sample is None:
             self.doubts += 1
             return None
+        self._compare(sample)
         self.newest, self.doubts = sample, 0
         return sample
+
+    def agrees(self, first: Sample, second: Sample, speed: float) -> bool:
+        """Whether a joint of at most `speed` [rad/s] can have told both."""
+        ticks = speed * abs(second.latest - first.earliest) / self.servo.model.rad_per_tick
+        return abs(self._step(second.ticks - first.ticks)) <= ticks + SURPRISE_TICKS
+
+    def _compare(self, sample: Sample) -> None:
+        """Whether it goes on from where the last ones led: time, ticks and ticks per second of them."""
+        t = (sample.earliest + sample.latest) / 2
+        if self._trend is None:
+            self._trend = (t, sample.ticks, 0.0)
+            return
+        before_t, before, speed = self._trend
+        moved = self._step(sample.ticks - before)
+        self.surprising = abs(moved - speed * (t - before_t)) > SURPRISE_TICKS
+        self._trend = (t, sample.ticks, moved / max(t - before_t, TICK_S))
+
+    def _step(self, ticks: float) -> float:
+        turn = self.servo.model.ticks_per_turn
+        return ticks if turn is None else (ticks + turn / 2) % turn - turn / 2
 
     def _of_protocol2(self, answer: Answer) -> Sample | None:
         stamp, moving, _, pwm, current, velocity, position = BLOCK2.unpack(answer.status.data)

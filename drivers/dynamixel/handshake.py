@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
 from interfaces.errors import SourceError, SourceLost
@@ -52,6 +52,23 @@ class FittedServo:
     def ticks(self, angle: float) -> float:
         """The position [ticks] at a joint's angle [rad]."""
         return self.zero_ticks + self.direction * angle / self.model.rad_per_tick
+
+    def record(self) -> Mapping[str, object]:
+        """Its identity and settings, to be kept with the data."""
+        return {
+            "joint": self.joint,
+            "bus": self.bus,
+            "id": self.id,
+            "model": self.model.name,
+            "firmware": self.firmware,
+            "drive_mode": self.drive_mode,
+            "operating_mode": self.operating_mode,
+            "homing_offset_ticks": self.homing_offset,
+            "zero_ticks": self.zero_ticks,
+            "direction": self.direction,
+            "rad_per_tick": self.model.rad_per_tick,
+            "return_delay_s": self.return_delay_s,
+        }
 
 
 @dataclass(frozen=True, slots=True)

@@ -113,7 +113,7 @@ class DynamixelJoints:
     @property
     def record(self) -> tuple[Mapping[str, object], ...]:
         """What is to be kept with the data: each servo's identity and settings."""
-        return tuple(_recorded(servo) for servo in self.servos)
+        return tuple(servo.record() for servo in self.servos)
 
     def __enter__(self) -> Self:
         with ExitStack() as stack:
@@ -288,7 +288,7 @@ class DynamixelJoints:
                 stale = True
                 self._why = f"joint {self._names[place]!r}: an answer from another time"
                 self._refuse_restarted(self._channels[place])
-            elif exchange.trouble is None:
+            elif exchange.trouble is None and self._is_confirmed(bus, question, self._channels[place], sample):
                 samples[place] = sample
         if exchange.trouble is not None and exchange.culprit is not None:
             servo = self.servos[self._at[bus.name, exchange.culprit]]
@@ -296,7 +296,15 @@ class DynamixelJoints:
         elif exchange.trouble is not None:
             self._why = f"{bus.name}: {exchange.trouble}"
         elif stale:
-            bus.settle(question.protocol)
+            bus.settle()
+
+    def _is_confirmed(self, bus: Bus, question: Request, channel: Channel, sample: Sample) -> bool:
+        """Ask again for a surprising position of Protocol 1.0, whose checksum lets one in 256 wrong answers through."""
+        if question.protocol != 1 or not channel.surprising:
+            return True
+        exchange = bus.ask(question)
+        again = channel.take(exchange.answers[0]) if exchange.trouble is None else None
+        return again is not None and channel.agrees(sample, again, math.radians(self._config.max_speed_deg_s))
 
     def _judge(self, samples: list[Sample]) -> JointReading | None:
         t = middle(samples)
@@ -343,8 +351,7 @@ class DynamixelJoints:
         if t <= self._clock.now():
             return True
         bus, *_ = self._buses.values()
-        protocol = self._requests[bus.name][0].protocol if self._requests[bus.name] else 2
-        return bus.listen(t, protocol)
+        return bus.listen(t)
 
     def _look_after_one(self) -> None:
         """Verify one servo's torque and health; SourceLost when its torque is on."""
@@ -379,20 +386,3 @@ def _close(port: Port) -> None:
 def _complaint(joint: str, bits: int) -> str:
     reasons = [text for bit, text in HARDWARE_ERRORS.items() if bits & bit]
     return f"joint {joint!r}: " + ("; ".join(reasons) or f"hardware error {bits:#04x}")
-
-
-def _recorded(servo: FittedServo) -> Mapping[str, object]:
-    return {
-        "joint": servo.joint,
-        "bus": servo.bus,
-        "id": servo.id,
-        "model": servo.model.name,
-        "firmware": servo.firmware,
-        "drive_mode": servo.drive_mode,
-        "operating_mode": servo.operating_mode,
-        "homing_offset_ticks": servo.homing_offset,
-        "zero_ticks": servo.zero_ticks,
-        "direction": servo.direction,
-        "rad_per_tick": servo.model.rad_per_tick,
-        "return_delay_s": servo.return_delay_s,
-    }
