@@ -74,7 +74,8 @@ def run(model: str, fast: str, transactions: int, intensity: float, seed: int) -
     possible = (1 - intensity) ** (1 if fast == "auto" else JOINTS)
     return (
         f"{chain.instructions:,} transactions, {struck:,} faults, {believed:,} readings believed, "
-        f"{wrong} of them wrong (worst {math.degrees(worst):.2f}°), {share:.4f} of the readings where faults leave {possible:.4f}, "
+        f"{wrong} of them wrong (worst {math.degrees(worst):.2f}°), "
+        f"{share:.4f} of the readings where faults leave {possible:.4f}, "
         f"opened anew {losses} times"
     )
 

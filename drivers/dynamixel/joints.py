@@ -86,7 +86,8 @@ class DynamixelJoints:
         self._buses: dict[str, Bus] = {}
         self._requests: dict[str, list[Request]] = {}
         self._opened = ExitStack()
-        self._is_open = False
+        self._is_open = self._is_lost = False
+        self._had_torque: set[str] = set()
         self._channels: list[Channel] = []
         self._at: dict[tuple[str, int], int] = {}
         self._counts: list[int] = []
@@ -126,7 +127,8 @@ class DynamixelJoints:
             self._anchor()
             stack.callback(self._restore)
             self._opened = stack.pop_all()
-        self._is_open = True
+        self._is_open, self._is_lost = True, False
+        self._had_torque.update(servo.joint for servo in self.servos if servo.had_torque)
         self.epoch += 1
         self._say_opened()
         return self
@@ -145,7 +147,13 @@ class DynamixelJoints:
         """
         if not self._is_open:
             raise SourceError("the servos are not open; use them in a with statement")
-        deadline = self._clock.now() + timeout_s
+        try:
+            return self._read_until(self._clock.now() + timeout_s)
+        except SourceLost:
+            self._is_lost = True
+            raise
+
+    def _read_until(self, deadline: float) -> JointReading | None:
         while True:
             if self._next_poll > deadline:
                 self._wait_until(deadline)
@@ -241,10 +249,10 @@ class DynamixelJoints:
             log.warning("the torque of %s was on and was switched off", ", ".join(switched))
 
     def _restore(self) -> None:
-        if not self._config.restore_torque:
+        if not self._config.restore_torque or self._is_lost:  # who was lost is opened again, in somebody's hands
             return
         for servo in self.servos:
-            if servo.had_torque:
+            if servo.joint in self._had_torque:
                 with suppress(SourceError):
                     restore_torque(self._buses[servo.bus], servo)
 

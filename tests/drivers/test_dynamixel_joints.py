@@ -125,6 +125,20 @@ def test_torque_is_restored_where_it_was_on_if_asked() -> None:
         assert abs(arm.chain.servo(id)["goal"] - arm.chain.servo(id).count(arm.clock.now())) <= 3
 
 
+def test_torque_is_not_restored_between_a_loss_and_the_next_opening() -> None:
+    arm = Arm(restore_torque=True)
+    arm.chain.servo(1)["torque"] = 1
+    with arm.joints:
+        read(arm)
+        arm.chain.servo(3).reboot(arm.clock.now())
+        with pytest.raises(SourceLost):
+            read(arm, 100)
+    assert arm.chain.servo(1)["torque"] == 0
+    with arm.joints:
+        read(arm)
+    assert [servo["torque"] for servo in arm.chain.servos] == [1, 0, 0]
+
+
 def test_what_each_servo_is_set_to_is_on_record() -> None:
     arm = Arm()
     arm.chain.servo(1)["homing_offset"] = -17
