@@ -31,6 +31,7 @@ FEW_POLLS = 3  # so many have to fail besides: the program itself may have been 
 DOUBTS = 5  # so many answers in a row that cannot be: the servo was restarted
 LOOK_AFTER_S = 0.1  # one servo's torque and health in turn
 ANCHOR_POLLS = 50
+LOOK_AGAIN_S = 1.0  # whether a joint was turned back
 SLACK_TICKS = 3
 GOLDEN = 0.618034  # multiples of it, modulo 1, are spread most evenly
 
@@ -218,7 +219,7 @@ class DynamixelJoints:
         return ticks
 
     def _check_turns(self, samples: list[Sample]) -> None:
-        """SourceError when a joint of several turns is not where it was: nothing tells its turn then."""
+        """SourceLost when a joint of several turns is not where it was: nothing tells its turn then."""
         if self._last_pose is None:
             return
         for place, (servo, count) in enumerate(zip(self.servos, self._counts, strict=True)):
@@ -227,11 +228,12 @@ class DynamixelJoints:
                 continue
             was, now = self._last_pose[place], servo.angle(count)
             if abs(now - was) > math.radians(self._config.max_move_deg):
-                raise SourceError(
+                raise SourceLost(
                     f"joint {servo.joint!r} (ID {servo.id}) was at {math.degrees(was):.0f}° and is now at "
                     f"{math.degrees(now):.0f}°, or whole turns from there: its turn count is lost. "
                     f"Turn it back to within {self._config.max_move_deg:.0f}° of where it was, or set max_move_deg "
-                    "in [drivers.dynamixel] to 179 to take the nearest turn"
+                    "in [drivers.dynamixel] to 179 to take the nearest turn",
+                    retry_s=LOOK_AGAIN_S,
                 )
             if count != samples[place].ticks:
                 log.info("joint %r: %+d turns are added to what its servo counts", *self._turns(place, count, samples))
