@@ -42,26 +42,28 @@ def test_places_that_agree_tell_a_jump_and_those_that_do_not_tell_none() -> None
         assert gate.jumped is agree
 
 
-def test_a_device_clock_narrows_an_event_to_a_fraction_of_what_the_host_knows() -> None:
+@pytest.mark.parametrize("drift", [50e-6, -0.01, 0.01])
+def test_a_device_clock_narrows_an_event_to_a_fraction_of_what_the_host_knows(drift) -> None:
     rng, clock, widths = Random(3), DeviceClock(1e-3, 32768), []
-    offset, drift = 57.1234, 50e-6
+    offset = 57.1234
     for k in range(20_000):  # through several wraps of the stamp
         true = 100.0 + k * 5.31e-3
         stamp = int((true * (1 + drift) - offset) / 1e-3) % 32768
         between = clock.narrow(true - rng.uniform(0, 3e-3), true + rng.uniform(0, 3e-3), stamp)
         assert between is not None
-        assert between[0] - 2e-5 <= true <= between[1] + 2e-5
+        if k >= 300:  # by then the rate is known
+            assert between[0] - 3e-4 <= true <= between[1] + 3e-4
         widths.append(between[1] - between[0])
-    assert np.mean(widths[1000:]) < 1.5e-3  # of 3 ms
+    assert np.mean(widths[1000:]) < 1.8e-3  # of 3 ms
 
 
 @pytest.mark.parametrize("late_s", [0.003, 0.02, 1.0, 20.0])
 def test_an_event_of_another_time_is_refused_and_does_no_harm(late_s) -> None:
     clock = DeviceClock(1e-3, 32768)
-    for k in range(100):
+    for k in range(300):
         t = 10.0 + k * 5.3e-3
         assert clock.narrow(t - 1e-4, t + 1e-4, int(t / 1e-3) % 32768) is not None
-    t = 10.0 + 100 * 5.3e-3
+    t = 10.0 + 300 * 5.3e-3
     assert clock.narrow(t - 1e-4, t + 1e-4, int((t - late_s) / 1e-3) % 32768) is None
     assert clock.narrow(t - 1e-4, t + 1e-4, int(t / 1e-3) % 32768) is not None
 

@@ -73,10 +73,11 @@ def instructions_in(stream: bytearray) -> tuple[list[Instruction], int]:
     found: list[Instruction] = []
     at = 0
     while True:
+        begun = at
         at = stream.find(HEADER1, at)
         if at < 0:
             keep = 1 if stream.endswith(b"\xff") else 0
-            return found, len(stream) - keep
+            return found, max(begun, len(stream) - keep)
         size = _size(stream, at)
         if size is None or (size > 0 and at + size > len(stream)):
             return found, at
