@@ -154,6 +154,7 @@ class Config:
             line = line_of(text, ("daemon", "min_step_deg"))
             raise ConfigError("min_step_deg is not below max_step_deg", file=file, line=line)
         _check_endpoints(tables.zenoh, file, text)
+        tables.drivers.check(robot.joints, file, text)
         if tables.vision.radius_m > LARGEST_BALL_M:
             raise ConfigError(
                 f"vision.radius_m = {tables.vision.radius_m:g}: this looks like millimetres",

@@ -8,10 +8,12 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from interfaces.errors import ConfigError
+from interfaces.protocols import Clock, JointSource
 from kbmaps import RigidChain
 
 from .config import Config
 from .sources import Sources
+from .store import PairReader
 
 
 @contextmanager
@@ -22,7 +24,8 @@ def open_sources(config: Config, *, sim: bool) -> Iterator[Sources]:
         ConfigError: no driver is configured, or the simulation cannot be made of this description.
         RecordingError: the configured recording cannot be read.
     """
-    recording = _chosen_recording(config, sim=sim)
+    _require_source(config, sim=sim)
+    recording = None if sim else _recording(config)
     if recording is not None:
         yield _recorded(config, recording)
     else:
@@ -32,21 +35,57 @@ def open_sources(config: Config, *, sim: bool) -> Iterator[Sources]:
 
 def check_sources(config: Config, *, sim: bool) -> None:
     """ConfigError when `open_sources` would find nothing to open; opens nothing."""
-    if _chosen_recording(config, sim=sim) is None:
+    _require_source(config, sim=sim)
+    if sim:
         require_simulation()
 
 
-def _chosen_recording(config: Config, *, sim: bool) -> Path | None:
-    """The recording to play; None for the simulation."""
-    if sim:
-        return None
-    if config.tables.drivers.recording is None:
+def open_joints(config: Config, clock: Clock) -> JointSource:
+    """The encoders alone of the arm that robot.toml describes, not opened yet.
+
+    Raises:
+        ConfigError: no servos are configured.
+        StoreError: the store, which tells where they were last, cannot be read.
+    """
+    from drivers.dynamixel.joints import DynamixelJoints
+
+    servos = config.tables.drivers.dynamixel
+    if servos is None:
         raise ConfigError(
-            "no driver is configured",
+            "no servos are configured", file=config.file, remedy="Add the table [drivers.dynamixel]: docs/hardware.md"
+        )
+    limits = list(zip(config.robot.lower.tolist(), config.robot.upper.tolist(), strict=True))
+    return DynamixelJoints(servos, config.robot.joints, clock, limits=limits, last_pose=_last_pose(config))
+
+
+def _last_pose(config: Config) -> list[float] | None:
+    """Where the joints were at the newest pair [rad]."""
+    if not config.store_file.exists():
+        return None
+    with PairReader(config.store_file) as pairs:
+        last = pairs.last()
+    return None if last is None or len(last.q) != len(config.robot.joints) else last.q.tolist()
+
+
+def _require_source(config: Config, *, sim: bool) -> None:
+    if sim or config.tables.drivers.recording is not None:
+        return
+    if config.tables.drivers.dynamixel is not None:
+        raise ConfigError(
+            "the joints are servos, but nothing tells where the marker is: no camera is configured",
             file=config.file,
             remedy="Give --sim for the simulated robot, or name a recording as recording in the table [drivers]",
         )
-    return config.file.parent / config.tables.drivers.recording
+    raise ConfigError(
+        "no driver is configured",
+        file=config.file,
+        remedy="Give --sim for the simulated robot, or name a recording as recording in the table [drivers]",
+    )
+
+
+def _recording(config: Config) -> Path | None:
+    recording = config.tables.drivers.recording
+    return None if recording is None else config.file.parent / recording
 
 
 def require_simulation() -> None:

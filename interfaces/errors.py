@@ -56,7 +56,11 @@ class SourceEnded(SourceError):
 
 
 class SourceLost(SourceError):
-    """The device went away; opening it again may help."""
+    """The device went away; opening it again may help, from `retry_s` on where the source knows that it is cheap."""
+
+    def __init__(self, message: str = "", *, retry_s: float | None = None) -> None:
+        self.retry_s = retry_s
+        super().__init__(message)
 
 
 class StoreError(BodyschemaError):

@@ -48,8 +48,9 @@ def hint_at(kind: Any, keys: Sequence[str]) -> Any:
 
 def struct_in(hint: Any) -> type[msgspec.Struct] | None:
     """The struct that a type is, or is made of."""
-    candidates = [hint, *get_args(hint)]
-    return next((c for c in candidates if isinstance(c, type) and issubclass(c, msgspec.Struct)), None)
+    if isinstance(hint, type) and issubclass(hint, msgspec.Struct):
+        return hint
+    return next((found for inner in get_args(hint) if (found := struct_in(inner)) is not None), None)
 
 
 def _choices(hint: Any) -> list[str]:

@@ -79,7 +79,7 @@ def convert(tables: object, kind: type[T], *, file: Path, text: str, prefix: tup
 
 
 def line_in_entry(text: str, name: str, place: int, key: str | None = None) -> int | None:
-    """The line (from 1) of `key` in the entry `place` (from 0) of the list of tables [[name]].
+    """The line (from 1) of `key` in the entry `place` (from 0) of the list of tables [[name]], which may be dotted.
 
     That of the entry's heading where it has no such key, that of the list where it is written in another way.
     """
@@ -97,7 +97,7 @@ def line_in_entry(text: str, name: str, place: int, key: str | None = None) -> i
 
 
 def _is_entry(line: str, header: str, name: str) -> bool:
-    return line.lstrip().startswith("[[") and _dotted(header) == (name,)
+    return line.lstrip().startswith("[[") and _dotted(header) == _dotted(name)
 
 
 def line_of(text: str, keys: tuple[str, ...]) -> int | None:

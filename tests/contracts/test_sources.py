@@ -5,14 +5,22 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.util import find_spec
+from itertools import count
 from typing import Any
 
 import numpy as np
 import pytest
 from scripted_sources import COV, Scripted
 
+from drivers.dynamixel.bench.chain import Chain, no_faults
+from drivers.dynamixel.bench.faults import Faults
+from drivers.dynamixel.bench.servo import Servo
+from drivers.dynamixel.bench.virtual_port import VirtualClock, VirtualPort
+from drivers.dynamixel.config import BusConfig, DynamixelConfig, ServoConfig
+from drivers.dynamixel.joints import DynamixelJoints
+from drivers.dynamixel.models import BY_NAME
 from drivers.replay import Replay
 from interfaces.errors import SourceEnded, SourceError
 from interfaces.protocols import JointSource, MarkerSource, StereoCamera
@@ -132,10 +140,31 @@ def tracked_camera() -> Iterator[Rig]:
         yield Rig(TrackedCamera(world.camera, StereoTracker(world.camera.calibration)), world.joints, close(world))
 
 
+@contextmanager
+def servos_on_the_bench(faults: Faults = no_faults) -> Iterator[Rig]:
+    clock = VirtualClock()
+    chain = Chain((Servo(BY_NAME["XM430-W350"], id, swinging(id)) for id in (1, 2)), faults)
+    config = DynamixelConfig(
+        {"arm": BusConfig("bench")}, tuple(ServoConfig(name, id, "XM430-W350") for name, id in (("a", 1), ("b", 2)))
+    )
+    yield Rig(DynamixelJoints(config, ("a", "b"), clock, open_port=lambda *_: (VirtualPort(chain, clock), 0.0)))
+
+
+def servos_that_fall_silent() -> AbstractContextManager[Rig]:
+    said = count()
+    return servos_on_the_bench(lambda reply: reply if next(said) < 30 else replace(reply, data=b""))
+
+
+def swinging(id: int) -> Callable[[float], float]:
+    return lambda t: float(np.sin(t + id))
+
+
 SIMULATED = pytest.mark.skipif(find_spec("pybullet") is None, reason="pybullet is not installed")
-JOINTS = [replayed_joints, scripted_joints, pytest.param(simulated_joints, marks=SIMULATED)]
+ENDING_JOINTS = [replayed_joints, scripted_joints, pytest.param(simulated_joints, marks=SIMULATED)]
+JOINTS = [*ENDING_JOINTS, servos_on_the_bench]
 MARKERS = [replayed_marker, scripted_marker, pytest.param(tracked_camera, marks=SIMULATED)]
 CAMERAS = [pytest.param(simulated_camera, marks=SIMULATED)]
+STANDING_STILL = [*ENDING_JOINTS[2:], *MARKERS[2:], *CAMERAS]
 Make = Callable[[], AbstractContextManager[Rig]]
 
 
@@ -189,7 +218,7 @@ def test_an_error_in_the_block_passes_through_the_closing(rig: Rig) -> None:
         raise ZeroDivisionError
 
 
-@pytest.mark.parametrize("make", [*JOINTS, *MARKERS, *CAMERAS])
+@pytest.mark.parametrize("make", [*ENDING_JOINTS, *MARKERS, *CAMERAS])
 def test_the_end_is_said_each_time_one_reads(make: Make) -> None:
     with make() as rig, rig.opened():
         rig.read(1)
@@ -202,7 +231,9 @@ def test_the_end_is_said_each_time_one_reads(make: Make) -> None:
 # --- waiting
 
 
-@pytest.mark.parametrize("make", [replayed_joints, replayed_marker, *JOINTS[2:], *MARKERS[2:], *CAMERAS])
+@pytest.mark.parametrize(
+    "make", [replayed_joints, replayed_marker, *ENDING_JOINTS[2:], servos_that_fall_silent, *MARKERS[2:], *CAMERAS]
+)
 def test_where_nothing_comes_in_time_none_is_returned(make: Make) -> None:
     with make() as rig, rig.opened():
         while rig.source.read(0.01) is not None:  # time stands still until the other side is read too

@@ -114,3 +114,12 @@ def test_a_source_that_is_lost_in_the_end_is_closed_once() -> None:
     with reopening(script) as source:
         source.read(0.1)
     assert script.closed == 1
+
+
+def test_a_source_that_can_be_looked_for_cheaply_is_opened_again_sooner() -> None:
+    gone = SourceLost("unplugged", retry_s=0.2)
+    script = Scripted([gone, READING], openings=[None, *[gone] * 20])
+    clock = SteppedClock()
+    with Reopening(script, "the encoders", clock, clock.sleep) as source:
+        read_until_reading(source)
+    assert clock.t == pytest.approx(100.0 + 21 * 0.2)

@@ -7,8 +7,9 @@ import pytest
 from small_arm import write_small_arm
 
 from daemon.config import Config
-from daemon.wiring import check_sources, demonstration_model, open_sources, require_simulation
-from interfaces.errors import ConfigError, RecordingError
+from daemon.wiring import check_sources, demonstration_model, open_joints, open_sources, require_simulation
+from interfaces.clock import SystemClock
+from interfaces.errors import ConfigError, RecordingError, SourceLost
 from interfaces.records import MarkerFix
 
 
@@ -64,3 +65,63 @@ def test_without_pybullet_the_simulation_names_the_extra(monkeypatch) -> None:
 
 def test_the_demonstration_model_is_a_robot_in_order() -> None:
     assert Config.load(demonstration_model(), {}).robot.calibration is not None
+
+
+SERVOS = """
+[drivers.dynamixel.buses.arm]
+port = "/dev/serial/by-id/none"
+
+[[drivers.dynamixel.servos]]
+joint = "waist"
+id = 1
+model = "XM430-W350"
+
+[[drivers.dynamixel.servos]]
+joint = "shoulder"
+id = 2
+model = "MX-28"
+"""
+
+
+def test_servos_in_robot_toml_are_the_joint_source(tmp_path) -> None:
+    source = open_joints(load(tmp_path, SERVOS), SystemClock())
+    assert source.joints == ("waist", "shoulder")
+    with pytest.raises(SourceLost, match=r"by-id/none is gone: No such file"), source:
+        pass
+
+
+def test_servos_without_a_camera_make_no_pairs(tmp_path) -> None:
+    with pytest.raises(ConfigError, match="nothing tells where the marker is"):
+        enter(load(tmp_path, SERVOS), sim=False)
+
+
+@pytest.mark.parametrize(
+    ("right", "wrong", "said"),
+    [
+        ('"waist"', '"waste"', r"unknown joint 'waste'. Did you mean 'waist'\?"),
+        ('"shoulder"', '"waist"', "a second servo for the joint 'waist'"),
+        ("id = 2", "id = 1", "the ID 1 is given twice on one bus"),
+        ("id = 2", "id = 300", "drivers.dynamixel.servos.id: expected `int` <= 252"),
+        ('"MX-28"', '"MX28"', "unknown model 'MX28'. Did you mean 'MX-28'"),
+        ("id = 2", 'id = 2\nbus = "leg"', "unknown bus 'leg'"),
+        ("id = 2", "id = 2\nzero = 1", "unknown key 'zero' in .*Known are: .*zero_ticks"),
+    ],
+)
+def test_a_mistake_about_servos_is_named_with_its_line(tmp_path, right, wrong, said) -> None:
+    with pytest.raises(ConfigError, match=rf"robot.toml, line \d+: .*{said}"):
+        load(tmp_path, SERVOS.replace(right, wrong))
+
+
+def test_a_rate_that_no_servo_has_is_refused(tmp_path) -> None:
+    with pytest.raises(ConfigError, match=r"buses\.baud: 12345 is unknown, known are: 9600, 57600"):
+        load(tmp_path, SERVOS.replace("port =", "baud = 12345\nport ="))
+
+
+def test_a_joint_without_a_servo_is_named(tmp_path) -> None:
+    with pytest.raises(ConfigError, match=r"no servo .* for shoulder"):
+        load(tmp_path, SERVOS[: SERVOS.rindex("[[")])
+
+
+def test_a_recording_and_servos_exclude_each_other(tmp_path) -> None:
+    with pytest.raises(ConfigError, match="both a recording and servos"):
+        load(tmp_path, '[drivers]\nrecording = "walk.csv"\n' + SERVOS)

@@ -1,0 +1,86 @@
+"""A device's own clock, which ticks coarsely, drifts and wraps, against the host's."""
+
+from __future__ import annotations
+
+RELEARN_AFTER_S = 30.0
+KNOWN_AFTER_S = 1.0
+WORST = 0.02  # difference of rates that is borne until the rate is known
+
+
+class DeviceClock:
+    """Narrows down when a device did something that it stamped with its own clock.
+
+    The host knows an interval for each event: not before it asked, not after it was told. The stamp knows another, one
+    tick wide, up to the offset of the two clocks. The intervals of all events have this offset in common, so it is
+    soon known to a fraction of a tick, and an event whose intervals do not meet is not what it pretends to be.
+
+    A device's rate that is not the host's is learnt: a clock without a crystal is wrong by a percent.
+    """
+
+    def __init__(self, tick_s: float, ticks: int, *, drift: float = 3e-4, slack_s: float = 0.5e-3) -> None:
+        """A clock of which nothing is known.
+
+        Args:
+            tick_s: length of a tick.
+            ticks: the stamps count from 0 to this, excluded.
+            drift: difference of the two clocks' rates, until more is known, and how much it changes then.
+            slack_s: intervals that miss each other by this are still believed.
+        """
+        self._tick_s, self._ticks, self._slack_s = tick_s, ticks, slack_s
+        self._rate, self._spread, self._drift = 1.0, drift, drift
+        self._low = self._high = 0.0  # bounds of host time minus device time
+        self._host_s = self._device_s = 0.0  # of the last event
+        self._is_known = False
+        self._begin: tuple[float, float, float] | None = None
+
+    def narrow(self, earliest: float, latest: float, stamp: int) -> tuple[float, float] | None:
+        """The bounds of an event's time that the stamp leaves of `earliest` .. `latest` [s].
+
+        None when the stamp belongs to another time; nothing is learnt from it then.
+        """
+        if self._begin is None:
+            self._device_s = stamp * self._tick_s
+            self._begin = (earliest, latest, self._device_s)
+            self._low, self._high = self._offsets(earliest, latest, self._device_s)
+            self._host_s = latest
+            return earliest, latest
+        spread = self._spread * abs(latest - self._host_s)
+        low, high = self._low - spread, self._high + spread
+        device_s = self._unwrapped(stamp, ((earliest + latest) - (low + high)) / (2 * self._rate))
+        first = device_s * self._rate + low
+        last = (device_s + self._tick_s) * self._rate + high
+        slack_s = self._slack_s if self._is_known else self._slack_s + WORST * (latest - self._begin[1])
+        if first > latest + slack_s or last < earliest - slack_s:
+            return None
+        offsets = self._offsets(earliest, latest, device_s)
+        common = max(low, offsets[0]), min(high, offsets[1])
+        # Where they have nothing in common the wire was slower or faster than thought: begin anew with this event.
+        self._low, self._high = common if common[0] <= common[1] else offsets
+        self._host_s, self._device_s = latest, device_s
+        first = max(earliest, device_s * self._rate + self._low)
+        last = min(latest, (device_s + self._tick_s) * self._rate + self._high)
+        self._learn_rate(earliest, latest)
+        return (first, last) if first <= last else (earliest, latest)
+
+    def _offsets(self, earliest: float, latest: float, device_s: float) -> tuple[float, float]:
+        return earliest - (device_s + self._tick_s) * self._rate, latest - device_s * self._rate
+
+    def _unwrapped(self, stamp: int, expected_s: float) -> float:
+        wrap_s = self._ticks * self._tick_s
+        device_s = stamp * self._tick_s
+        return device_s + wrap_s * round((expected_s - device_s - self._tick_s / 2) / wrap_s)
+
+    def _learn_rate(self, earliest: float, latest: float) -> None:
+        """Compare how long both clocks ran since the beginning, and begin anew now and then."""
+        if self._begin is None or self._device_s - self._begin[2] < KNOWN_AFTER_S:
+            return
+        self._is_known = True
+        passed_s = self._device_s - self._begin[2]
+        rate = (earliest + latest - self._begin[0] - self._begin[1]) / (2 * passed_s)
+        unsure_s = (latest - earliest + self._begin[1] - self._begin[0]) / 2 + self._tick_s
+        if unsure_s / passed_s < max(self._spread, abs(rate - self._rate)):
+            turned = (self._rate - rate) * self._device_s  # the offset now is not changed by the rate
+            self._low, self._high = self._low + turned, self._high + turned
+            self._rate, self._spread = rate, max(self._drift, unsure_s / passed_s)
+        if passed_s > RELEARN_AFTER_S:
+            self._begin = (earliest, latest, self._device_s)

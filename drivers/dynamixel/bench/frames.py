@@ -1,0 +1,135 @@
+"""What runs over the wire: instruction packets taken apart, status packets put together."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Literal
+
+from drivers.dynamixel.crc16 import crc16
+
+HEADER1, HEADER2 = b"\xff\xff", b"\xff\xff\xfd\x00"
+BROADCAST = 0xFE
+LONGEST = 1024
+STATUS = 0x55
+Protocol = Literal[1, 2]
+
+
+class Code(IntEnum):
+    """Instructions (ROBOTIS e-Manual, Protocols 1.0 and 2.0)."""
+
+    PING = 0x01
+    READ = 0x02
+    WRITE = 0x03
+    REG_WRITE = 0x04
+    ACTION = 0x05
+    FACTORY_RESET = 0x06
+    REBOOT = 0x08
+    CLEAR = 0x10
+    SYNC_READ = 0x82
+    SYNC_WRITE = 0x83
+    FAST_SYNC_READ = 0x8A
+    BULK_READ = 0x92
+    BULK_WRITE = 0x93
+
+
+class Error(IntEnum):
+    """What a status packet of Protocol 2.0 complains of."""
+
+    NONE = 0
+    RESULT = 1
+    INSTRUCTION = 2
+    CRC = 3
+    RANGE = 4
+    LENGTH = 5
+    LIMIT = 6
+    ACCESS = 7
+
+
+ALERT = 0x80
+ERRORS1 = {Error.INSTRUCTION: 0x40, Error.CRC: 0x10}  # the rest is 0x08, out of range, in Protocol 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Instruction:
+    """One packet from the host.
+
+    Attributes:
+        params: without stuffing.
+        intact: the checksum is right.
+        end: bytes of the stream up to its last.
+    """
+
+    protocol: Protocol
+    id: int
+    code: int
+    params: bytes
+    intact: bool
+    end: int
+
+
+def instructions_in(stream: bytearray) -> tuple[list[Instruction], int]:
+    """All complete instruction packets in `stream`, and how many of its bytes need not be seen again."""
+    found: list[Instruction] = []
+    at = 0
+    while True:
+        begun = at
+        at = stream.find(HEADER1, at)
+        if at < 0:
+            keep = 1 if stream.endswith(b"\xff") else 0
+            return found, max(begun, len(stream) - keep)
+        size = _size(stream, at)
+        if size is None or (size > 0 and at + size > len(stream)):
+            return found, at
+        if size == 0:
+            at += 1
+            continue
+        instruction = _instruction(bytes(stream[at : at + size]), at + size)
+        found.append(instruction)
+        at = instruction.end if instruction.intact else at + 1
+
+
+def _size(stream: bytearray, at: int) -> int | None:
+    """Bytes of the packet that begins at `at`: 0 when none does, None when that cannot be told yet."""
+    head = stream[at : at + 7]
+    if len(head) < 4:
+        return None
+    if head[:4] == HEADER2:
+        if len(head) < 7:
+            return None
+        length = head[5] | head[6] << 8
+        return 7 + length if 3 <= length <= LONGEST else 0
+    if head[2] == 0xFF or head[2] == 0xFD or head[3] < 2:
+        return 0
+    return 4 + head[3]
+
+
+def _instruction(packet: bytes, end: int) -> Instruction:
+    if packet[:4] == HEADER2:
+        intact = crc16(packet[:-2]) == packet[-2] | packet[-1] << 8
+        body = packet[7:-2].replace(b"\xff\xff\xfd\xfd", b"\xff\xff\xfd")
+        return Instruction(2, packet[4], body[0], body[1:], intact, end)
+    intact = sum(packet[2:]) & 0xFF == 0xFF
+    return Instruction(1, packet[2], packet[4], packet[5:-1], intact, end)
+
+
+def status_packet(protocol: Protocol, id: int, error: int, params: bytes) -> bytes:
+    """A servo's answer."""
+    if protocol == 1:
+        body = bytes((id, len(params) + 2, error)) + params
+        return HEADER1 + body + bytes((~sum(body) & 0xFF,))
+    body = bytes((STATUS, error)) + params
+    stuffed = body.replace(b"\xff\xff\xfd", b"\xff\xff\xfd\xfd")
+    packet = HEADER2 + bytes((id,)) + (len(stuffed) + 2).to_bytes(2, "little") + stuffed
+    return packet + crc16(packet).to_bytes(2, "little")
+
+
+def fast_header(blocks: int, length: int) -> bytes:
+    """How the common answer of so many servos to FAST_SYNC_READ begins, each with `length` bytes."""
+    return HEADER2 + bytes((BROADCAST,)) + (1 + blocks * (length + 4)).to_bytes(2, "little") + bytes((STATUS,))
+
+
+def fast_block(before: bytes, id: int, error: int, params: bytes) -> bytes:
+    """One servo's part of it, with the checksum of all that is on the wire by then; not stuffed."""
+    block = bytes((error, id)) + params
+    return block + crc16(before + block).to_bytes(2, "little")

@@ -1,0 +1,275 @@
+"""One servo: its control table, and the rules by which it changes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+from drivers.dynamixel.models import TICK_S, TICKS, Model, baud_of, baud_value
+
+from .frames import Error
+
+Angle = Callable[[float], float]
+
+POSITION_MODE = 3  # Operating Mode
+REVERSE = 0x01  # Drive Mode
+VELOCITY_STEP_S = 0.01
+TICKS_PER_REPLY_DELAY_US = 2
+
+FACTORY2 = {
+    "firmware": 46,
+    "id": 1,
+    "baud": 1,
+    "return_delay": 250,
+    "operating_mode": POSITION_MODE,
+    "moving_threshold": 10,
+    "shutdown": 52,
+    "status_return": 2,
+    "voltage": 120,
+    "temperature": 31,
+}
+FACTORY1 = {
+    "firmware": 24,
+    "id": 1,
+    "baud": 1,
+    "return_delay": 250,
+    "status_return": 2,
+    "shutdown": 36,
+    "voltage": 120,
+    "temperature": 31,
+}
+READ_ONLY = (
+    "model",
+    "firmware",
+    "hardware_error",
+    "voltage",
+    "temperature",
+    "moving",
+    "position",
+    "velocity",
+    "current",
+)
+LARGEST = {"id": 252, "torque": 1, "status_return": 2, "return_delay": 254}
+RAM_OF_FACTORY = ("status_return", "voltage", "temperature")
+
+
+class Servo:
+    """A servo on a bench.
+
+    Torque holds nothing here: the shaft is wherever `angle` says.
+
+    Attributes:
+        model: what it is.
+        glitch_ticks: the encoder is wrong by this.
+        fast: it knows FAST_SYNC_READ.
+    """
+
+    def __init__(
+        self,
+        model: Model,
+        id: int,
+        angle: Angle,
+        *,
+        baud: int = 1_000_000,
+        return_delay_s: float = 500e-6,
+        booted_s: float = 0.0,
+        fast: bool = True,
+    ) -> None:
+        """A servo as it leaves the factory, but for the arguments.
+
+        Args:
+            angle: where its shaft is at a time [s]: [rad], 0 in the middle of its range, any number of turns.
+            booted_s: when it got its power.
+        """
+        self.model, self.fast = model, fast
+        self.glitch_ticks = 0
+        self._angle = angle
+        self._memory = bytearray(model.layout.size)
+        self._reset_memory()
+        self["id"], self["baud"] = id, baud_value(model.layout, baud)
+        self["return_delay"] = round(return_delay_s * 1e6 / TICKS_PER_REPLY_DELAY_US)
+        self._registered: tuple[int, bytes] | None = None
+        self._booted_s = booted_s
+        self._base = 0
+        self._fold(booted_s)
+
+    def __getitem__(self, name: str) -> int:
+        """The number in a register."""
+        register = self.model.layout[name]
+        return register.value(bytes(self._memory[register.address : register.end]))
+
+    def __setitem__(self, name: str, value: int) -> None:
+        """Put a number into a register as the servo itself does, past all locks."""
+        register = self.model.layout[name]
+        self._memory[register.address : register.end] = register.bytes(value)
+
+    @property
+    def id(self) -> int:
+        """Its number on the bus."""
+        return self["id"]
+
+    @property
+    def baud(self) -> int:
+        """The rate at which it listens [bit/s]."""
+        return baud_of(self.model.layout, self["baud"])
+
+    @property
+    def return_delay_s(self) -> float:
+        """How long it waits before it answers."""
+        return self["return_delay"] * TICKS_PER_REPLY_DELAY_US * 1e-6
+
+    @property
+    def hardware_error(self) -> int:
+        """Bits of what is wrong with it."""
+        return self._error1 if self.model.protocol == 1 else self["hardware_error"]
+
+    def fail(self, bits: int) -> None:
+        """Something is wrong with it, until it is rebooted; torque goes off where `shutdown` says so."""
+        if self.model.protocol == 1:
+            self._error1 |= bits
+        else:
+            self["hardware_error"] |= bits
+        if bits & self["shutdown"]:
+            self["torque"] = 0
+
+    def angle(self, t: float) -> float:
+        """Where its shaft is at `t` [rad]."""
+        return self._angle(t)
+
+    def count(self, t: float) -> int:
+        """What its encoder counts at `t`, turns included, since ever."""
+        model = self.model
+        ticks = round(self._angle(t) / model.rad_per_tick) + model.zero_ticks
+        if model.ticks_per_turn is None:
+            return min(max(ticks, 0), 1023)
+        return -ticks if self._is_reversed else ticks
+
+    def position(self, t: float) -> int:
+        """Present Position at `t` [ticks]."""
+        counted = self.count(t) + self.glitch_ticks
+        if self.model.protocol == 1:
+            turn = self.model.ticks_per_turn
+            return counted if turn is None else counted % turn
+        return counted - self._base + self["homing_offset"]
+
+    def read(self, address: int, size: int, t: float) -> tuple[Error, bytes]:
+        """Bytes of the control table at `t`."""
+        if address + size > len(self._memory) or size == 0:
+            return Error.ACCESS, b""
+        block = self.model.layout.block
+        if address < block.end and address + size > block.address:
+            self._sense(t)
+        return Error.NONE, bytes(self._memory[address : address + size])
+
+    def write(self, address: int, data: bytes, t: float) -> Error:
+        """Change bytes of the control table, where that is allowed."""
+        error = self._refusal(address, data)
+        if error is not Error.NONE:
+            return error
+        had_torque = self["torque"]
+        self._memory[address : address + len(data)] = data
+        if self["torque"] and not had_torque and self._is_in_position_mode:
+            self._fold(t)  # e-Manual, Present Position: within one turn as soon as torque is on
+        return Error.NONE
+
+    def register_write(self, address: int, data: bytes) -> Error:
+        """Keep a write for ACTION."""
+        error = self._refusal(address, data)
+        if error is Error.NONE:
+            self._registered = (address, data)
+        return error
+
+    def action(self, t: float) -> Error:
+        """Do the write that was kept."""
+        if self._registered is None:
+            return Error.RESULT
+        address, data = self._registered
+        self._registered = None
+        return self.write(address, data, t)
+
+    def reboot(self, t: float) -> None:
+        """As by a power cycle: what stands in RAM is lost, and so is the number of turns."""
+        fresh = bytearray(len(self._memory))
+        fresh[: self.model.layout.ram] = self._memory[: self.model.layout.ram]
+        self._memory = fresh
+        for name in RAM_OF_FACTORY:
+            if self.model.layout[name].address >= self.model.layout.ram:
+                self[name] = self._factory[name]
+        self._registered, self._error1 = None, 0
+        self._booted_s = t
+        self._fold(t)
+
+    def factory_reset(self, option: int, t: float) -> Error:
+        """0xFF: everything; 1: all but the ID; 2: all but ID and baud rate."""
+        if option not in (0xFF, 1, 2):
+            return Error.RANGE
+        kept = {1: ("id",), 2: ("id", "baud")}.get(option, ())
+        values = {name: self[name] for name in kept}
+        self._reset_memory()
+        for name, value in values.items():
+            self[name] = value
+        self.reboot(t)
+        return Error.NONE
+
+    def clear_turns(self, t: float) -> Error:
+        """CLEAR: the position is within one turn again; refused while torque is on."""
+        if self["torque"]:
+            return Error.ACCESS
+        self._fold(t)
+        return Error.NONE
+
+    @property
+    def _factory(self) -> dict[str, int]:
+        return FACTORY1 if self.model.protocol == 1 else FACTORY2
+
+    @property
+    def _is_reversed(self) -> bool:
+        return self.model.protocol == 2 and bool(self["drive_mode"] & REVERSE)
+
+    @property
+    def _is_in_position_mode(self) -> bool:
+        return self.model.protocol == 2 and self["operating_mode"] == POSITION_MODE
+
+    def _reset_memory(self) -> None:
+        self._memory[:] = bytes(len(self._memory))
+        self._error1 = 0
+        self["model"] = self.model.number
+        for name, value in self._factory.items():
+            self[name] = value
+
+    def _fold(self, t: float) -> None:
+        turn = self.model.ticks_per_turn
+        if turn is None:
+            return
+        lowest = self.model.zero_ticks - turn // 2
+        self._base = math.floor((self.count(t) - lowest) / turn) * turn
+
+    def _sense(self, t: float) -> None:
+        """Put what is measured at `t` into the control table."""
+        rad_s = (self._angle(t) - self._angle(t - VELOCITY_STEP_S)) / VELOCITY_STEP_S
+        velocity = round(rad_s / self.model.velocity_unit)
+        if self.model.protocol == 1:
+            self["velocity"] = min(abs(velocity), 1023) | (0x400 if velocity < 0 else 0)
+            self["moving"] = int(velocity != 0)
+        else:
+            self["velocity"] = -velocity if self._is_reversed else velocity
+            self["moving"] = int(abs(velocity) > self["moving_threshold"])
+            self["tick"] = int((t - self._booted_s) / TICK_S) % TICKS
+        self["position"] = self.position(t)
+
+    def _refusal(self, address: int, data: bytes) -> Error:
+        layout, end = self.model.layout, address + len(data)
+        if end > len(self._memory) or not data:
+            return Error.ACCESS
+        if address < layout.ram and self["torque"] and self.model.protocol == 2:
+            return Error.ACCESS
+        for name in READ_ONLY:
+            if name in layout and layout[name].address < end and layout[name].end > address:
+                return Error.ACCESS
+        for name, largest in LARGEST.items():
+            register = layout[name]
+            if address <= register.address and register.end <= end:
+                value = register.value(data[register.address - address : register.end - address])
+                if value > largest:
+                    return Error.LIMIT
+        return Error.NONE

@@ -1,0 +1,217 @@
+"""Instruction packets, put together by dynamixel-sdk; status packets, taken apart strictly.
+
+The SDK's own reception is not used: it takes a late answer for that to the next question, drops error bytes and partial
+answers, and reads past garbage.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, Protocol
+
+import dynamixel_sdk as sdk
+
+from .crc16 import crc16
+
+HEADER2, HEADER1 = b"\xff\xff\xfd\x00", b"\xff\xff"
+STATUS = 0x55
+ALERT = 0x80
+LOOKS_LIKE_HEADER, STUFFED = b"\xff\xff\xfd", b"\xff\xff\xfd\xfd"
+BROADCAST = 0xFE
+Version = Literal[1, 2]
+PING, REBOOT = 1, 8
+
+
+class Garbled(Exception):
+    """These bytes are no intact status packet."""
+
+
+@dataclass(frozen=True, slots=True)
+class Status:
+    """A servo's answer.
+
+    Attributes:
+        id: who says that it is from them.
+        error: the error byte as it came.
+        data: without stuffing.
+        size: bytes on the wire.
+    """
+
+    id: int
+    error: int
+    data: bytes
+    size: int
+
+
+class Packets(Protocol):
+    """One version of the protocol."""
+
+    overhead: int
+
+    def ping(self, id: int) -> bytes:
+        """PING."""
+        ...
+
+    def read(self, id: int, address: int, size: int) -> bytes:
+        """READ."""
+        ...
+
+    def write(self, id: int, address: int, data: bytes) -> bytes:
+        """WRITE."""
+        ...
+
+    def take(self, received: bytes | bytearray, at: int) -> Status | None:
+        """The status packet that begins at `at`; None when it is not complete. Raises Garbled when there is none."""
+        ...
+
+
+class _Caught:
+    """In the place of a port: keeps what the SDK would send."""
+
+    is_using = False
+    packet = b""
+
+    def clearPort(self) -> None:
+        """Nothing to clear."""
+
+    def writePort(self, packet: list[int]) -> int:
+        """Keep it."""
+        self.packet = bytes(packet)
+        return len(packet)
+
+    def setPacketTimeout(self, length: int) -> None:
+        """Nothing waits."""
+
+
+class Packets2:
+    """Protocol 2.0."""
+
+    overhead = 11
+    _sdk: Any = sdk.PacketHandler(2.0)
+
+    def ping(self, id: int) -> bytes:
+        """PING."""
+        return self._of(lambda port: self._sdk.txPacket(port, [0, 0, 0, 0, id, 3, 0, PING, 0, 0]))
+
+    def reboot(self, id: int) -> bytes:
+        """REBOOT."""
+        return self._of(lambda port: self._sdk.txPacket(port, [0, 0, 0, 0, id, 3, 0, REBOOT, 0, 0]))
+
+    def read(self, id: int, address: int, size: int) -> bytes:
+        """READ."""
+        return self._of(lambda port: self._sdk.readTx(port, id, address, size))
+
+    def write(self, id: int, address: int, data: bytes) -> bytes:
+        """WRITE."""
+        packet = self._of(lambda port: self._sdk.writeTxOnly(port, id, address, len(data), list(data)))
+        return _stuffed(packet) if len(packet) == len(data) + 12 else packet
+
+    def sync_read(self, ids: Sequence[int], address: int, size: int, *, fast: bool) -> bytes:
+        """SYNC_READ, or FAST_SYNC_READ."""
+        return self._of(lambda port: self._sdk.syncReadTx(port, address, size, list(ids), len(ids), fast))
+
+    def _of(self, send: Any) -> bytes:
+        port = _Caught()
+        send(port)
+        return port.packet
+
+    def take(self, received: bytes | bytearray, at: int) -> Status | None:
+        """The status packet that begins at `at`; see `Packets.take`."""
+        packet = self._complete(received, at)
+        if packet is None:
+            return None
+        body = packet[7:-2].replace(STUFFED, LOOKS_LIKE_HEADER)
+        if len(body) < 2:
+            raise Garbled
+        return Status(packet[4], body[1], body[2:], len(packet))
+
+    def take_fast(self, received: bytes | bytearray, at: int, count: int, size: int) -> tuple[Status, ...] | None:
+        """The common answer of `count` servos with `size` bytes each, which is not stuffed; as `take` otherwise."""
+        packet = self._complete(received, at)
+        if packet is None:
+            return None
+        block = size + 4
+        if packet[4] != BROADCAST or len(packet) != 8 + count * block:
+            raise Garbled
+        parts = [packet[8 + k * block : 8 + (k + 1) * block] for k in range(count)]
+        # A servo goes on with the checksum of what it heard: if two talked at once before it, the last one still fits.
+        crc = crc16(packet[:8])
+        for part in parts:
+            crc = crc16(part[:-2], crc)
+            if crc != part[-2] | part[-1] << 8:
+                raise Garbled
+            crc = crc16(part[-2:], crc)
+        return tuple(Status(part[1], part[0], part[2:-2], block) for part in parts)
+
+    def _complete(self, received: bytes | bytearray, at: int) -> bytes | None:
+        head = bytes(received[at : at + 8])
+        if not HEADER2.startswith(head[:4]) or (len(head) > 7 and head[7] != STATUS):
+            raise Garbled
+        if len(head) < 8:
+            return None
+        size = 7 + (head[5] | head[6] << 8)
+        if not 11 <= size <= 1024:
+            raise Garbled
+        packet = bytes(received[at : at + size])
+        if len(packet) < size:
+            return None
+        if crc16(packet[:-2]) != packet[-2] | packet[-1] << 8:
+            raise Garbled
+        return packet
+
+
+class Packets1:
+    """Protocol 1.0."""
+
+    overhead = 6
+    _sdk: Any = sdk.PacketHandler(1.0)
+
+    def ping(self, id: int) -> bytes:
+        """PING."""
+        return self._of(lambda port: self._sdk.txPacket(port, [0, 0, id, 2, PING, 0]))
+
+    def read(self, id: int, address: int, size: int) -> bytes:
+        """READ."""
+        return self._of(lambda port: self._sdk.readTx(port, id, address, size))
+
+    def write(self, id: int, address: int, data: bytes) -> bytes:
+        """WRITE."""
+        return self._of(lambda port: self._sdk.writeTxOnly(port, id, address, len(data), list(data)))
+
+    def _of(self, send: Any) -> bytes:
+        port = _Caught()
+        send(port)
+        return port.packet
+
+    def take(self, received: bytes | bytearray, at: int) -> Status | None:
+        """The status packet that begins at `at`; see `Packets.take`."""
+        head = bytes(received[at : at + 4])
+        if not HEADER1.startswith(head[:2]) or (len(head) > 2 and head[2] >= BROADCAST):
+            raise Garbled
+        if len(head) < 4:
+            return None
+        if head[3] < 2:
+            raise Garbled
+        size = 4 + head[3]
+        packet = bytes(received[at : at + size])
+        if len(packet) < size:
+            return None
+        if sum(packet[2:]) & 0xFF != 0xFF:
+            raise Garbled
+        return Status(packet[2], packet[4], packet[5:-1], size)
+
+
+PACKETS2, PACKETS1 = Packets2(), Packets1()
+
+
+def packets_of(protocol: Version) -> Packets2 | Packets1:
+    """How to speak the protocol."""
+    return PACKETS2 if protocol == 2 else PACKETS1
+
+
+def _stuffed(packet: bytes) -> bytes:
+    """With the stuffing that dynamixel-sdk 4.1 works out and then does not send."""
+    body = packet[7:-2].replace(LOOKS_LIKE_HEADER, STUFFED)
+    packet = packet[:5] + (len(body) + 2).to_bytes(2, "little") + body
+    return packet + crc16(packet).to_bytes(2, "little")

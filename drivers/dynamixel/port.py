@@ -1,0 +1,122 @@
+"""dynamixel-sdk's port, hardened: opened alone, on a monotonic clock, without spinning, and lost with a clear error."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Literal, Protocol
+
+import dynamixel_sdk as sdk
+
+from drivers.serial_line import SerialLine
+
+TIMEOUT_MARGIN_S = 2e-3
+
+
+class Port(Protocol):
+    """What the driver needs of a serial port; `SafePort`, or a bench's."""
+
+    @property
+    def baud(self) -> int:
+        """Bits per second."""
+        ...
+
+    def write(self, data: bytes) -> None:
+        """Send `data`; BusLost when the port is gone."""
+        ...
+
+    def receive(self, until: float) -> bytes:
+        """What has arrived, else what arrives next; nothing when that is not before `until` on the clock."""
+        ...
+
+    def flush(self) -> None:
+        """Forget what has arrived."""
+        ...
+
+    def close(self) -> None:
+        """Give it free."""
+        ...
+
+
+class SafePort(sdk.PortHandler):
+    """An open port, for the driver and for whatever of dynamixel-sdk takes a PortHandler."""
+
+    def __init__(self, port: str, baud: int, *, latency_s: float, now: Callable[[], float] = time.monotonic) -> None:
+        """Not open yet: `openPort` raises SourceError where the original returns False.
+
+        Args:
+            latency_s: how long the adapter may keep bytes back.
+        """
+        super().__init__(port)
+        self.baudrate = baud
+        self._latency_s, self._now = latency_s, now
+        self._line: SerialLine | None = None
+
+    @property
+    def baud(self) -> int:
+        """Bits per second."""
+        return self.baudrate
+
+    @property
+    def line(self) -> SerialLine:
+        """The open port; ConnectionError when it is not."""
+        if self._line is None:
+            raise ConnectionError(f"{self.port_name} is not open")
+        return self._line
+
+    def setupPort(self, cflag_baud: int) -> Literal[True]:
+        """Open it at the rate, for this program alone."""
+        if self.is_open:
+            self.closePort()
+        self._line = SerialLine.open(self.port_name, cflag_baud, self._now)
+        self.ser = self._line.device
+        self.is_open, self.is_using = True, False
+        self.tx_time_per_byte = 10_000.0 / cflag_baud
+        self._line.flush()
+        return True
+
+    def closePort(self) -> None:
+        """Give it free."""
+        self.is_open = self.is_using = False
+        if self._line is not None:
+            self._line.close()
+            self._line = None
+
+    def clearPort(self) -> None:
+        """Forget what has arrived."""
+        self.line.flush()
+
+    def readPort(self, length: int) -> bytes:
+        """Up to `length` bytes; waits a moment for the first."""
+        return self.line.device.read(length) if self.line.wait(self._now() + TIMEOUT_MARGIN_S) else b""
+
+    def writePort(self, packet: bytes | list[int]) -> int:
+        """Send all of it."""
+        self.line.write(bytes(packet))
+        return len(packet)
+
+    def getCurrentTime(self) -> float:
+        """Monotonic time [ms]."""
+        return self._now() * 1e3
+
+    def setPacketTimeout(self, packet_length: int) -> None:
+        """The time-out of an answer of so many bytes, by this adapter's latency."""
+        self.packet_start_time = self.getCurrentTime()
+        waiting_s = 2 * self._latency_s + TIMEOUT_MARGIN_S
+        self.packet_timeout = self.tx_time_per_byte * packet_length + waiting_s * 1e3
+
+    def write(self, data: bytes) -> None:
+        """Send `data`."""
+        self.line.write(data)
+
+    def flush(self) -> None:
+        """Forget what has arrived."""
+        self.line.flush()
+
+    def close(self) -> None:
+        """Give it free."""
+        self.closePort()
+
+    def receive(self, until: float) -> bytes:
+        """What has arrived, else what arrives next; nothing when that is not before `until`."""
+        return self.line.receive(until)

@@ -1,0 +1,122 @@
+"""A serial port that two programs cannot open at once, that does not spin, and that says when it is gone."""
+
+from __future__ import annotations
+
+import errno
+import os
+import select
+import termios
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+
+import serial
+
+from interfaces.errors import SourceError, SourceLost
+
+RETRY_S = 0.2  # how soon a port that went away is looked for again
+DEFAULT_LATENCY_S = 4e-3  # of adapters that do not say
+LATENCY_OF = "/sys/bus/usb-serial/devices/{}/latency_timer"
+
+
+class BusLost(SourceLost):
+    """The port, or everything behind it, went away."""
+
+    def __init__(self, port: str, error: Exception) -> None:
+        number = next((part for part in error.args if isinstance(part, int)), None)
+        why = os.strerror(number) if number else str(error) or "it was unplugged"
+        super().__init__(f"{port} is gone: {why}", retry_s=RETRY_S)
+
+
+def adapter_latency_s(port: str, latency_of: str = LATENCY_OF) -> float:
+    """How long the USB adapter of `port` may keep bytes back [s]."""
+    file = Path(latency_of.format(Path(port).resolve().name))
+    try:
+        return int(file.read_text()) * 1e-3
+    except (OSError, ValueError):
+        return DEFAULT_LATENCY_S
+
+
+class SerialLine:
+    """An open serial port."""
+
+    def __init__(self, device: serial.Serial, now: Callable[[], float]) -> None:
+        """Made by `open`."""
+        self.device = device
+        self._now = now
+
+    @classmethod
+    def open(cls, port: str, baud: int, now: Callable[[], float] = time.monotonic) -> SerialLine:
+        """Open `port` for this program alone.
+
+        Raises:
+            BusLost: there is no such port (any more).
+            SourceError: it is in use, or not to be opened by this user.
+        """
+        try:
+            device = serial.Serial(port, baud, timeout=0, exclusive=True)
+        except (OSError, ValueError, termios.error) as error:
+            raise _refused(port, baud, error) from error
+        with suppress(OSError, ValueError):  # not every adapter knows it; those of FTDI wait 16 ms without
+            device.set_low_latency_mode(True)
+        return cls(device, now)
+
+    @property
+    def baud(self) -> int:
+        """Bits per second."""
+        return self.device.baudrate
+
+    def close(self) -> None:
+        """Give it free; closing again does no harm."""
+        try:
+            self.device.close()
+        except (OSError, termios.error) as error:
+            raise BusLost(str(self.device.port), error) from error
+
+    def write(self, data: bytes) -> None:
+        """Send `data`; BusLost when that is not possible."""
+        try:
+            self.device.write(data)
+        except (OSError, termios.error) as error:
+            raise BusLost(str(self.device.port), error) from error
+
+    def receive(self, until: float) -> bytes:
+        """What has arrived, else what arrives next; nothing when that is not before `until` on the clock."""
+        if not self.wait(until):
+            return b""
+        try:
+            data = os.read(self.device.fileno(), 4096)
+        except OSError as error:
+            raise BusLost(str(self.device.port), error) from error
+        if not data:
+            raise BusLost(str(self.device.port), OSError(errno.ENODEV, "unplugged"))
+        return data
+
+    def wait(self, until: float) -> bool:
+        """Whether there is something to receive before `until`."""
+        try:
+            readable, _, _ = select.select((self.device.fileno(),), (), (), max(0.0, until - self._now()))
+        except (OSError, ValueError) as error:
+            raise BusLost(str(self.device.port), error) from error
+        return bool(readable)
+
+    def flush(self) -> None:
+        """Forget what has arrived."""
+        try:
+            self.device.reset_input_buffer()
+        except (OSError, termios.error) as error:  # an unplugged port raises termios.error, which is no OSError
+            raise BusLost(str(self.device.port), error) from error
+
+
+def _refused(port: str, baud: int, error: Exception) -> SourceError:
+    number = getattr(error, "errno", None)
+    if number == errno.EACCES:
+        return SourceError(
+            f"{port} may not be opened by this user. Type: sudo usermod -aG dialout $USER, and log in again"
+        )
+    if number in (errno.EAGAIN, errno.EBUSY) or "exclusively lock" in str(error):
+        return SourceError(f"{port} is in use by another program. End that one (fuser {port} shows it)")
+    if isinstance(error, ValueError):
+        return SourceError(f"{port} cannot be opened at {baud} bit/s: {error}")
+    return BusLost(port, error)

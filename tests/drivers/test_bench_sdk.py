@@ -1,0 +1,226 @@
+"""The bench on a pseudo-terminal, spoken to by dynamixel-sdk as it is."""
+
+from __future__ import annotations
+
+import math
+import termios
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import dynamixel_sdk as sdk
+import pytest
+
+from drivers.dynamixel.bench.chain import Chain
+from drivers.dynamixel.bench.faults import Planned, half, mute, wrong_checksum
+from drivers.dynamixel.bench.pty_shell import PtyShell
+from drivers.dynamixel.bench.servo import Servo
+from drivers.dynamixel.models import BY_NAME
+
+XM, AX, MX1, PH = BY_NAME["XM430-W350"], BY_NAME["AX-12A"], BY_NAME["MX-28"], BY_NAME["PH54-200-S500"]
+ANGLES = {1: 0.5, 2: -1.0, 3: 7.0}
+HEADER_LIKE = [0xFF, 0xFF, 0xFD, 0xFD]
+P2, P1 = sdk.PacketHandler(2.0), sdk.PacketHandler(1.0)
+
+
+def ticks(id: int) -> int:
+    return round(ANGLES[id] * 4096 / (2 * math.pi)) + 2048
+
+
+@pytest.fixture
+def chain() -> Chain:
+    turning = [Servo(XM, id, lambda t, a=angle: a if t > 0 else 0.0, return_delay_s=0) for id, angle in ANGLES.items()]
+    old = [Servo(AX, 11, lambda t: 0.5, return_delay_s=0), Servo(MX1, 12, lambda t: -0.5, return_delay_s=0)]
+    return Chain([*turning, *old, Servo(PH, 21, lambda t: 1.0, return_delay_s=0)], Planned())
+
+
+@pytest.fixture
+def shell(chain: Chain, tmp_path: Path) -> Iterator[PtyShell]:
+    with PtyShell(chain, tmp_path / "bus") as shell:
+        yield shell
+
+
+@pytest.fixture
+def port(shell: PtyShell, monkeypatch: pytest.MonkeyPatch) -> Iterator[sdk.PortHandler]:
+    # The SDK spins while it waits, in this process: the bench may get its turn late.
+    monkeypatch.setattr(sdk.port_handler, "LATENCY_TIMER", 100)
+    port = sdk.PortHandler(str(shell.link))
+    assert port.openPort()
+    yield port
+    port.closePort()
+
+
+def signed(number: int) -> int:
+    return number - 2**32 if number >= 2**31 else number
+
+
+def test_ping_tells_the_model(port) -> None:
+    assert P2.ping(port, 2) == (1020, sdk.COMM_SUCCESS, 0)
+    assert P1.ping(port, 11) == (12, sdk.COMM_SUCCESS, 0)
+
+
+def test_broadcast_ping_finds_all_of_the_protocol(port) -> None:
+    found, result = P2.broadcastPing(port)
+    assert result == sdk.COMM_SUCCESS
+    assert found == {1: [1020, 46], 2: [1020, 46], 3: [1020, 46], 21: [2020, 46]}
+
+
+def test_an_id_that_is_not_there_does_not_answer(port) -> None:
+    assert P2.ping(port, 9)[1] == sdk.COMM_RX_TIMEOUT
+
+
+@pytest.mark.parametrize("id", ANGLES)
+def test_the_position_is_read_with_its_turns(port, id) -> None:
+    assert signed(P2.read4ByteTxRx(port, id, 132)[0]) == ticks(id)
+
+
+def test_positions_of_protocol_1_and_of_the_p_series_are_read(port) -> None:
+    assert P1.read2ByteTxRx(port, 11, 36)[0] == 512 + round(0.5 / (math.radians(300) / 1024))
+    assert P1.read2ByteTxRx(port, 12, 36)[0] == 2048 - round(0.5 * 4096 / (2 * math.pi))
+    assert P2.read4ByteTxRx(port, 21, 580)[0] == round(1003846 / (2 * math.pi))
+
+
+def test_sync_read_gives_each_servo_s_position(port) -> None:
+    group = sdk.GroupSyncRead(port, P2, 132, 4)
+    for id in ANGLES:
+        group.addParam(id)
+    assert group.txRxPacket() == sdk.COMM_SUCCESS
+    assert [signed(group.getData(id, 132, 4)) for id in ANGLES] == [ticks(1), ticks(2), ticks(3)]
+
+
+def test_fast_sync_read_gives_the_same(port) -> None:
+    group = sdk.GroupSyncRead(port, P2, 120, 16)
+    for id in ANGLES:
+        group.addParam(id)
+    assert group.fastSyncRead() == sdk.COMM_SUCCESS
+    assert [signed(group.getData(id, 132, 4)) for id in ANGLES] == [ticks(1), ticks(2), ticks(3)]
+
+
+def test_bulk_read_reads_other_registers_of_each(port) -> None:
+    group = sdk.GroupBulkRead(port, P2)
+    group.addParam(1, 132, 4)
+    group.addParam(2, 146, 1)
+    assert group.txRxPacket() == sdk.COMM_SUCCESS
+    assert (group.getData(1, 132, 4), group.getData(2, 146, 1)) == (ticks(1), 31)
+
+
+def test_sync_write_writes_all(port, chain) -> None:
+    group = sdk.GroupSyncWrite(port, P2, 64, 1)
+    group.addParam(1, [1])
+    group.addParam(3, [1])
+    assert group.txPacket() == sdk.COMM_SUCCESS
+    assert P2.read1ByteTxRx(port, 1, 64)[0] == 1
+    assert [chain.servo(id)["torque"] for id in ANGLES] == [1, 0, 1]
+
+
+def test_a_registered_write_waits_for_action(port, chain) -> None:
+    assert P2.regWriteTxRx(port, 1, 116, 4, [0, 8, 0, 0]) == (sdk.COMM_SUCCESS, 0)
+    assert chain.servo(1)["goal"] == 0
+    P2.action(port, sdk.BROADCAST_ID)
+    assert P2.read4ByteTxRx(port, 1, 116)[0] == 2048
+
+
+def test_bytes_that_look_like_a_header_pass_through_the_stuffing(port, chain) -> None:
+    chain.servo(1)["goal"] = int.from_bytes(bytes(HEADER_LIKE), "little", signed=True)
+    assert P2.readTxRx(port, 1, 116, 4) == (HEADER_LIKE, sdk.COMM_SUCCESS, 0)
+
+
+def test_eeprom_is_locked_while_torque_is_on(port) -> None:
+    assert P2.write1ByteTxRx(port, 1, 9, 0) == (sdk.COMM_SUCCESS, 0)
+    P2.write1ByteTxRx(port, 1, 64, 1)
+    assert P2.write1ByteTxRx(port, 1, 9, 10) == (sdk.COMM_SUCCESS, 7)
+    assert P2.read1ByteTxRx(port, 1, 9)[0] == 0
+
+
+def test_what_is_measured_cannot_be_written(port) -> None:
+    assert P2.write4ByteTxRx(port, 1, 132, 5) == (sdk.COMM_SUCCESS, 7)
+
+
+def test_a_value_beyond_its_limit_is_refused(port) -> None:
+    assert P2.write1ByteTxRx(port, 1, 64, 2) == (sdk.COMM_SUCCESS, 6)
+
+
+def test_status_return_level_1_answers_reads_only(port) -> None:
+    P2.write1ByteTxOnly(port, 1, 68, 1)
+    assert P2.write1ByteTxRx(port, 1, 65, 1)[0] == sdk.COMM_RX_TIMEOUT
+    assert P2.read1ByteTxRx(port, 1, 65) == (1, sdk.COMM_SUCCESS, 0)
+
+
+def test_status_return_level_0_answers_ping_only(port) -> None:
+    P2.write1ByteTxOnly(port, 1, 68, 0)
+    assert P2.read1ByteTxRx(port, 1, 65)[1] == sdk.COMM_RX_TIMEOUT
+    assert P2.ping(port, 1)[1] == sdk.COMM_SUCCESS
+
+
+@pytest.mark.parametrize("bits", [0x01, 0x04, 0x08, 0x10, 0x20])
+def test_each_hardware_error_sets_the_alert_bit_until_reboot(port, chain, bits) -> None:
+    chain.servo(1).fail(bits)
+    value, result, error = P2.read1ByteTxRx(port, 1, 70)
+    assert (value, result, error) == (bits, sdk.COMM_SUCCESS, 0x80)
+    assert P2.reboot(port, 1)[0] == sdk.COMM_SUCCESS
+    assert P2.read1ByteTxRx(port, 1, 70) == (0, sdk.COMM_SUCCESS, 0)
+
+
+def test_overload_switches_torque_off(port, chain) -> None:
+    P2.write1ByteTxRx(port, 1, 64, 1)
+    chain.servo(1).fail(0x20)
+    assert P2.read1ByteTxRx(port, 1, 64)[0] == 0
+
+
+def test_a_power_cycle_loses_turns_and_torque(port, chain) -> None:
+    chain.servo(3)["torque"] = 1
+    chain.power_cycle(time.monotonic())
+    assert P2.read4ByteTxRx(port, 3, 132)[0] == ticks(3) % 4096
+    assert P2.read1ByteTxRx(port, 3, 64)[0] == 0
+
+
+def test_torque_on_in_position_mode_falls_back_into_one_turn(port) -> None:
+    before = P2.read4ByteTxRx(port, 3, 132)[0]
+    P2.write1ByteTxRx(port, 3, 64, 1)
+    assert before == ticks(3)
+    assert P2.read4ByteTxRx(port, 3, 132)[0] == ticks(3) % 4096
+
+
+def test_the_homing_offset_is_added(port) -> None:
+    P2.write4ByteTxRx(port, 1, 20, 100)
+    assert P2.read4ByteTxRx(port, 1, 132)[0] == ticks(1) + 100
+
+
+def test_factory_reset_keeps_what_it_is_asked_to(port, chain) -> None:
+    chain.servo(2)["return_delay"] = 3
+    assert P2.factoryReset(port, 2, 0x02)[0] == sdk.COMM_SUCCESS
+    assert P2.read1ByteTxRx(port, 2, 9)[0] == 250
+
+
+def test_a_port_of_another_rate_hears_nothing(port) -> None:
+    assert port.setBaudRate(57600)
+    assert P2.ping(port, 1)[1] == sdk.COMM_RX_TIMEOUT
+    assert port.setBaudRate(1_000_000)
+    assert P2.ping(port, 1)[1] == sdk.COMM_SUCCESS
+
+
+def test_two_servos_of_one_id_garble_each_other(port, chain) -> None:
+    chain.servo(2)["id"] = 1
+    assert P2.read4ByteTxRx(port, 1, 132)[1] == sdk.COMM_RX_CORRUPT
+
+
+@pytest.mark.parametrize(
+    ("fault", "result"),
+    [(mute, sdk.COMM_RX_TIMEOUT), (wrong_checksum, sdk.COMM_RX_CORRUPT), (half, sdk.COMM_RX_CORRUPT)],
+)
+def test_a_fault_shows_at_the_sdk_and_passes(port, chain, fault, result) -> None:
+    chain.faults.add(1, fault, 1)
+    assert P2.read4ByteTxRx(port, 1, 132)[1] == result
+    assert P2.read4ByteTxRx(port, 1, 132) == (ticks(1), sdk.COMM_SUCCESS, 0)
+
+
+def test_a_program_that_has_it_open_notices_the_unplugging(port, shell) -> None:
+    shell.unplug()
+    assert not shell.link.exists()
+    with pytest.raises((termios.error, OSError)):
+        P2.ping(port, 1)
+    shell.plug_in()
+    again = sdk.PortHandler(str(shell.link))
+    assert again.openPort()
+    assert P2.ping(again, 1)[1] == sdk.COMM_SUCCESS
+    again.closePort()

@@ -1,0 +1,102 @@
+"""Question and answer at a port that says anything."""
+
+from __future__ import annotations
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from drivers.dynamixel.bench.frames import status_packet
+from drivers.dynamixel.bench.virtual_port import VirtualClock
+from drivers.dynamixel.bus import Answer, Bus, Trouble, read_request, sync_request
+from drivers.dynamixel.channel import Channel
+from drivers.dynamixel.handshake import FittedServo
+from drivers.dynamixel.models import BY_NAME
+from drivers.dynamixel.packets import Status
+
+DATA = bytes(range(16))
+PIECES = st.lists(
+    st.one_of(
+        st.binary(max_size=40),
+        st.builds(lambda id, size: status_packet(2, id, 0, DATA[:size]), st.integers(1, 3), st.sampled_from([16, 7])),
+        st.builds(lambda id: status_packet(1, id, 0, DATA[:11]), st.integers(1, 3)),
+    ),
+    max_size=6,
+)
+
+
+class TalkingPort:
+    """Says its pieces, a millisecond apart, whatever it is asked."""
+
+    baud = 1_000_000
+
+    def __init__(self, clock: VirtualClock, pieces: list[bytes]) -> None:
+        self._clock, self._pieces = clock, pieces
+
+    def write(self, data: bytes) -> None:
+        """It does not listen."""
+
+    def receive(self, until: float) -> bytes:
+        next_s = self._clock.now() + 1e-3
+        self._clock.wait_until(min(next_s, until))
+        return self._pieces.pop(0) if next_s <= until and self._pieces else b""
+
+    def flush(self) -> None:
+        """Nothing waits."""
+
+    def close(self) -> None:
+        """Nothing to close."""
+
+
+def fitted(model: str) -> FittedServo:
+    return FittedServo("joint", "arm", 1, BY_NAME[model], 1, 2048, 46, 0, 3, 0, 0.0)
+
+
+@given(PIECES)
+def test_only_intact_answers_of_who_was_asked_are_believed_whatever_comes(pieces) -> None:
+    clock = VirtualClock()
+    bus = Bus("arm", TalkingPort(clock, list(pieces)), clock, 0.0)
+    exchange = bus.ask(sync_request((1, 2), 120, 16, fast=False))
+    said = b"".join(pieces)
+    for answer, id in zip(exchange.answers, (1, 2), strict=False):
+        assert answer.status.id == id
+        assert status_packet(2, id, answer.status.error, answer.status.data) in said
+    assert (exchange.trouble is None) is (len(exchange.answers) == 2 and said.startswith(whole(exchange.answers)))
+    assert clock.now() < 101.0
+
+
+def whole(answers: tuple[Answer, ...]) -> bytes:
+    return b"".join(status_packet(2, a.status.id, a.status.error, a.status.data) for a in answers)
+
+
+@given(PIECES)
+def test_protocol_1_believes_no_more(pieces) -> None:
+    clock = VirtualClock()
+    bus = Bus("arm", TalkingPort(clock, list(pieces)), clock, 0.0)
+    exchange = bus.ask(read_request(1, 2, 36, 11))
+    assert exchange.trouble is not None or exchange.answers[0].status.id == 2
+    assert clock.now() < 101.0
+
+
+@given(st.binary(min_size=16, max_size=16))
+def test_any_block_of_protocol_2_is_a_sample_or_refused(data) -> None:
+    answer = Answer(Status(1, 0, data, 27), 100.0, 100.001)
+    sample = Channel(fitted("XM430-W350")).take(answer)
+    assert sample is None or sample.ticks == int.from_bytes(data[12:], "little", signed=True)
+
+
+@given(st.binary(min_size=11, max_size=11))
+def test_any_block_of_protocol_1_is_a_sample_or_refused(data) -> None:
+    answer = Answer(Status(1, 0, data, 17), 100.0, 100.001)
+    sample = Channel(fitted("AX-12A")).take(answer)
+    assert sample is None or 0 <= sample.ticks <= 1023
+
+
+def test_an_answer_before_the_wire_can_have_brought_it_is_refused() -> None:
+    clock = VirtualClock()
+
+    class Hasty(TalkingPort):
+        def receive(self, until: float) -> bytes:
+            return self._pieces.pop(0) if self._pieces else super().receive(until)
+
+    bus = Bus("arm", Hasty(clock, [status_packet(2, 1, 0, DATA)]), clock, 0.0)
+    assert bus.ask(read_request(2, 1, 120, 16)).trouble is Trouble.EARLY

@@ -1,0 +1,368 @@
+"""The driver over the bench, in virtual time."""
+
+from __future__ import annotations
+
+import logging
+import math
+from dataclasses import replace
+from random import Random
+
+import numpy as np
+import pytest
+from bench_arm import TICK, Arm, swing
+
+from drivers.dynamixel.bench.chain import Chain
+from drivers.dynamixel.bench.faults import corrupt, garbage, half, late, mute, storm, swapped, wrong_checksum
+from drivers.dynamixel.bench.servo import Servo
+from drivers.dynamixel.bench.virtual_port import VirtualClock, VirtualPort
+from drivers.dynamixel.config import BusConfig, DynamixelConfig, ServoConfig
+from drivers.dynamixel.joints import DynamixelJoints
+from drivers.dynamixel.models import BY_NAME
+from interfaces.errors import SourceError, SourceLost
+from interfaces.records import JointReading
+
+FAULTS = [mute, late(0.02), wrong_checksum, corrupt(), half, garbage(), swapped]
+MIXED = ("XM430-W350", "PH54-200-S500", "MX-28", "AX-12A", "MX-64(2.0)", "XL330-M288")
+FAST = 0.9  # [rad/s], what the arm moves at most; half a tick besides
+
+
+def read(arm: Arm, count: int = 1) -> list[JointReading]:
+    found = []
+    while len(found) < count:
+        reading = arm.joints.read(0.1)
+        if reading is not None:
+            found.append(reading)
+    return found
+
+
+@pytest.mark.parametrize("models", [("XM430-W350",) * 3, MIXED])
+@pytest.mark.parametrize("fast", ["auto", "never"])
+def test_a_reading_is_where_each_joint_was_when_it_was_asked(models, fast) -> None:
+    with (arm := Arm(models, fast=fast)).joints:
+        for _ in range(50):
+            reading = read(arm)[0]
+            for q, servo in zip(reading.q, arm.chain.servos, strict=True):
+                off = abs(q - arm.chain.samplings[servo.id].angle)
+                assert off <= servo.model.rad_per_tick / 2 + 1e-12
+
+
+def test_one_tick_is_exactly_a_turn_by_4096() -> None:
+    with (arm := Arm(paths=[lambda t: 1000 * TICK, lambda t: math.pi / 2, lambda t: -math.pi / 2])).joints:
+        assert read(arm)[0].q.tolist() == [1000 * TICK, math.pi / 2, -math.pi / 2]
+
+
+def test_direction_and_zero_come_from_the_configuration() -> None:
+    servo, clock = Servo(BY_NAME["XM430-W350"], 1, lambda t: 0.5), VirtualClock()
+    config = DynamixelConfig({"a": BusConfig("x")}, (ServoConfig("j", 1, "XM430-W350", direction=-1, zero_ticks=0),))
+    port = VirtualPort(Chain([servo]), clock)
+    with DynamixelJoints(config, ("j",), clock, open_port=lambda *_: (port, 0.0)) as joints:
+        reading = joints.read(0.1)
+    assert reading is not None
+    assert reading.q[0] == -(round(0.5 / TICK) + 2048) * TICK
+
+
+def test_two_buses_make_one_reading() -> None:
+    clock, config = VirtualClock(), {"left": BusConfig("l"), "right": BusConfig("r")}
+    entries = tuple(ServoConfig(bus, 1, "XM430-W350", bus=bus) for bus in config)
+    ports = {
+        name: VirtualPort(Chain([Servo(BY_NAME["XM430-W350"], 1, swing(k))]), clock) for k, name in enumerate("lr")
+    }
+    joints = DynamixelJoints(
+        DynamixelConfig(config, entries), ("left", "right"), clock, open_port=lambda bus, _: (ports[bus.port], 0.0)
+    )
+    with joints:
+        reading = joints.read(0.1)
+    assert reading is not None
+    assert reading.q == pytest.approx([swing(0)(reading.t), swing(1)(reading.t)], abs=TICK)
+
+
+# --- torque and settings
+
+
+def test_torque_is_off_before_the_first_reading_and_never_switched_on() -> None:
+    arm = Arm()
+    arm.chain.servo(2)["torque"] = 1
+    with arm.joints:
+        assert [servo["torque"] for servo in arm.chain.servos] == [0, 0, 0]
+        read(arm, 100)
+    assert arm.port.writes() == [(64, b"\x00")]
+    assert [servo.had_torque for servo in arm.joints.servos] == [False, True, False]
+
+
+@pytest.mark.parametrize("models", [("XM430-W350",) * 3, MIXED])
+def test_nothing_is_written_where_nothing_needs_to_be(models) -> None:
+    with (arm := Arm(models)).joints:
+        read(arm, 100)
+    assert arm.port.writes() == []
+
+
+def test_torque_is_switched_off_though_answers_get_lost() -> None:
+    arm = Arm()
+    arm.chain.servo(2)["torque"] = 1
+    arm.faults.add(2, mute, 2)
+    with arm.joints:
+        assert arm.chain.servo(2)["torque"] == 0
+
+
+def test_torque_that_is_switched_on_meanwhile_is_found_and_switched_off() -> None:
+    arm = Arm()
+    with arm.joints:
+        read(arm)
+        arm.chain.servo(3)["torque"] = 1
+        with pytest.raises(SourceLost, match="torque of joint 'joint3' was switched on by another program"):
+            read(arm, 1000)
+    with arm.joints:
+        assert arm.chain.servo(3)["torque"] == 0
+
+
+def test_torque_is_restored_where_it_was_on_if_asked() -> None:
+    arm = Arm(("XM430-W350", "AX-12A", "XM430-W350"), restore_torque=True)
+    arm.chain.servo(1)["torque"] = arm.chain.servo(2)["torque"] = 1
+    with arm.joints:
+        read(arm)
+    assert [servo["torque"] for servo in arm.chain.servos] == [1, 1, 0]
+    for id in (1, 2):
+        assert abs(arm.chain.servo(id)["goal"] - arm.chain.servo(id).count(arm.clock.now())) <= 3
+
+
+def test_torque_is_not_restored_between_a_loss_and_the_next_opening() -> None:
+    arm = Arm(restore_torque=True)
+    arm.chain.servo(1)["torque"] = 1
+    with arm.joints:
+        read(arm)
+        arm.chain.servo(3).reboot(arm.clock.now())
+        with pytest.raises(SourceLost):
+            read(arm, 100)
+    assert arm.chain.servo(1)["torque"] == 0
+    with arm.joints:
+        read(arm)
+    assert [servo["torque"] for servo in arm.chain.servos] == [1, 0, 0]
+
+
+def test_what_each_servo_is_set_to_is_on_record() -> None:
+    arm = Arm()
+    arm.chain.servo(1)["homing_offset"] = -17
+    with arm.joints:
+        kept = arm.joints.record[0]
+    assert (kept["model"], kept["firmware"], kept["homing_offset_ticks"]) == ("XM430-W350", 46, -17)
+
+
+# --- who is there
+
+
+def test_a_missing_servo_and_a_wrong_one_are_shown_in_one_table() -> None:
+    arm = Arm(("XM430-W350", "XM430-W350", "XL330-M288"))
+    arm.chain.servos[1:] = [Servo(BY_NAME["XL430-W250"], 3, swing(0))]
+    with pytest.raises(SourceError) as refusal, arm.joints:
+        pass
+    assert str(refusal.value).splitlines() == [
+        "the servos on bench are not those of robot.toml:",
+        "  joint   ID  expected    found",
+        "  joint1  1   XM430-W350  XM430-W350",
+        "  joint2  2   XM430-W350  no answer",
+        "  joint3  3   XL330-M288  XL430-W250: wrong model",
+    ]
+
+
+def test_two_servos_of_one_id_are_refused() -> None:
+    arm = Arm()
+    arm.chain.servos.append(Servo(BY_NAME["XL430-W250"], 2, swing(9), return_delay_s=0))
+    with pytest.raises(SourceError, match=r"joint2 .* two servos with this ID"), arm.joints:
+        pass
+
+
+def test_two_servos_of_one_id_and_model_are_refused_by_their_positions() -> None:
+    arm = Arm()
+    arm.chain.servos.append(Servo(BY_NAME["XM430-W350"], 2, swing(9), return_delay_s=0))
+    with pytest.raises(SourceError, match=r"cannot be read: joint 'joint2'"), arm.joints:
+        pass
+
+
+def test_a_servo_that_answers_ping_only_is_told_apart() -> None:
+    arm = Arm()
+    arm.chain.servo(1)["status_return"] = 0
+    with pytest.raises(SourceError, match="answers PING but no READ: its Status Return Level is 0"), arm.joints:
+        pass
+
+
+def test_a_servo_at_another_rate_does_not_answer() -> None:
+    arm = Arm()
+    arm.chain.servo(1)["baud"] = 1
+    with pytest.raises(SourceLost, match=r"joint1 .* no answer"), arm.joints:
+        pass
+
+
+@pytest.mark.parametrize(("knows", "fast"), [(True, True), (False, False)])
+def test_fast_sync_read_is_used_where_all_know_it(knows, fast) -> None:
+    arm = Arm()
+    arm.chain.servo(2).fast = knows
+    with arm.joints:
+        read(arm, 10)
+    assert (arm.port.heard[-1].code == 0x8A) is fast
+
+
+# --- faults
+
+
+@pytest.mark.parametrize("fault", FAULTS, ids=range(len(FAULTS)))
+@pytest.mark.parametrize("models", [("XM430-W350",) * 3, MIXED])
+@pytest.mark.parametrize("fast", ["auto", "never"])
+def test_a_fault_costs_a_reading_and_nothing_else(fault, models, fast) -> None:
+    with (arm := Arm(models, fast=fast)).joints:
+        read(arm, 10)
+        for id in range(1, len(models) + 1):
+            arm.faults.add(id, fault, 1)
+            readings = read(arm, 20)
+            assert max(arm.error(reading) for reading in readings) < 3e-3 + TICK * 2
+    assert arm.joints.epoch == 1
+
+
+def test_a_late_answer_is_not_taken_for_that_to_the_next_question() -> None:
+    steep = [lambda t: 8.0 * math.sin(t), lambda t: 0.0, lambda t: 0.0]
+    with (arm := Arm(paths=steep, fast="never")).joints:
+        for k in range(60):
+            arm.faults.add(1, lambda reply, _, by=k * 1e-3: replace(reply, start=reply.start + by), 1)
+            for reading in read(arm, 3):
+                assert abs(reading.q[0] - steep[0](reading.t)) < 8.0 * 0.6e-3 + TICK
+
+
+def test_an_answer_with_an_alert_is_as_good_and_the_remedy_is_told(caplog) -> None:
+    with caplog.at_level(logging.WARNING), (arm := Arm()).joints:
+        arm.chain.servo(2).fail(0x20)
+        assert max(arm.error(reading) for reading in read(arm, 200)) < 2 * TICK
+        assert arm.joints.health == ("joint 'joint2': it is overloaded: free the joint, then reboot the servo",)
+        assert len(caplog.messages) == 1
+        arm.chain.servo(2)["hardware_error"] = 0
+        read(arm, 200)
+        assert arm.joints.health == ()
+
+
+def test_what_the_others_answered_is_kept_when_one_is_mute() -> None:
+    with (arm := Arm(fast="never")).joints:
+        read(arm)
+        arm.faults.add(3, mute)
+        before = arm.joints.samples["joint1"]
+        assert arm.joints.read(0.02) is None
+        assert arm.joints.samples["joint1"] is not before
+
+
+def test_a_servo_that_stays_mute_is_named() -> None:
+    arm = Arm()
+    with arm.joints:
+        read(arm)
+        arm.chain.servos.pop(1)
+        with pytest.raises(SourceLost, match=r"joint 'joint2' \(ID 2\): no answer"):
+            read(arm, 1000)
+
+
+@pytest.mark.parametrize("fast", ["auto", "never"])
+def test_an_encoder_s_glitch_is_not_believed(fast) -> None:
+    with (arm := Arm(fast=fast)).joints:
+        read(arm)
+        arm.chain.servo(2).glitch_ticks = 300
+        assert arm.joints.read(0.008) is None
+        arm.chain.servo(2).glitch_ticks = 0
+        assert max(arm.error(reading) for reading in read(arm, 20)) < 2 * TICK
+
+
+def test_an_encoder_that_jumped_for_good_is_another_epoch() -> None:
+    arm = Arm(limits=[(-2.0, 2.0)] * 3)
+    with arm.joints:
+        read(arm)
+        arm.chain.servo(2).glitch_ticks = 300
+        with pytest.raises(SourceLost, match=r"'joint2' .* a position where it cannot have come to"):
+            read(arm, 100)
+    with arm.joints:
+        assert read(arm)[0].q[1] == pytest.approx(arm.paths[1](arm.clock.now()) + 300 * TICK, abs=0.01)
+    assert arm.joints.epoch == 2
+
+
+def test_a_servo_that_was_restarted_is_another_epoch() -> None:
+    arm = Arm()
+    with arm.joints:
+        read(arm)
+        arm.chain.servo(3).reboot(arm.clock.now())
+        with pytest.raises(SourceLost, match=r"joint 'joint3' \(ID 3\) was restarted"):
+            read(arm, 100)
+    with arm.joints:
+        assert arm.error(read(arm)[0]) < 2 * TICK
+
+
+# --- turns
+
+
+def turning(t: float) -> float:
+    return 4.0 * max(t - 100.0, 0.0)
+
+
+@pytest.mark.parametrize("model", ["XM430-W350", "MX-28", "PH42-020-S300"])
+def test_positions_go_on_across_turns(model) -> None:
+    with (arm := Arm((model,), [turning])).joints:
+        for reading in read(arm, 1500):
+            assert arm.error(reading) < 4.0 * 0.6e-3 + TICK
+    assert reading.q[0] > 3 * 2 * math.pi
+
+
+def test_a_turn_count_lost_with_the_power_is_restored_from_the_last_pose() -> None:
+    place = [0.0]
+    arm = Arm(("XM430-W350",), [lambda t: place[0] + (9.0 if t > 50 else 0.0)])
+    with arm.joints:
+        before = read(arm)[0].q[0]
+    arm.chain.power_cycle(arm.clock.now())
+    place[0] = 0.2
+    with arm.joints:
+        assert before == pytest.approx(9.0, abs=TICK)
+        assert read(arm)[0].q[0] == pytest.approx(9.2, abs=TICK)
+
+
+def test_a_joint_whose_turn_cannot_be_told_is_named() -> None:
+    place = [9.0]
+    arm = Arm(("XM430-W350",), [lambda t: place[0]], last_pose=[9.0])
+    with arm.joints:
+        read(arm)
+    arm.chain.power_cycle(arm.clock.now())
+    place[0] = 11.5
+    with pytest.raises(SourceError, match=r"joint 'joint1' \(ID 1\) was at 516° and is now .* turn count is lost"):
+        arm.joints.__enter__()
+    place[0] = 9.3
+    with arm.joints:
+        assert read(arm)[0].q[0] == pytest.approx(9.3, abs=TICK)
+
+
+def test_limits_within_a_turn_tell_the_turn() -> None:
+    place = [2.0]
+    arm = Arm(("XM430-W350",), [lambda t: place[0]], limits=[(0.5, 5.5)], last_pose=[0.6])
+    arm.chain.power_cycle(0.0)
+    place[0] = 4.0  # beyond the middle ± half a turn of the servo
+    arm.chain.power_cycle(1.0)
+    with arm.joints:
+        assert read(arm)[0].q[0] == pytest.approx(4.0, abs=TICK)
+
+
+# --- times, rates, storms
+
+
+@pytest.mark.parametrize("fast", ["auto", "never"])
+@pytest.mark.parametrize("delay_s", [0.0, 500e-6])
+def test_times_are_those_of_the_sampling_to_half_a_millisecond(fast, delay_s) -> None:
+    with (arm := Arm(("XM430-W350",) * 6, latency_s=2e-3, delay_s=delay_s, fast=fast)).joints:
+        off = [abs(reading.t - arm.sampled()) for reading in (read(arm)[0] for _ in range(1000))]
+    assert np.percentile(off, 99) < 0.5e-3
+
+
+def test_six_servos_are_read_two_hundred_times_a_second() -> None:
+    with (arm := Arm(("XM430-W350",) * 6, fast="never")).joints:
+        begin = arm.clock.now()
+        read(arm, 500)
+        assert 500 / (arm.clock.now() - begin) >= 200
+
+
+@pytest.mark.parametrize("models", [("XM430-W350",) * 6, MIXED])
+@pytest.mark.parametrize("fast", ["auto", "never"])
+def test_in_a_storm_of_faults_no_wrong_reading_is_believed(models, fast) -> None:
+    arm = Arm(models, fast=fast, seed=5)
+    with arm.joints:
+        arm.chain.faults = storm(0.02, Random(6))
+        readings = read(arm, 2000)
+    assert sum(arm.chain.faults.struck.values()) > 30
+    assert max(arm.error(reading) for reading in readings) < 0.01

@@ -1,0 +1,98 @@
+"""The driver over the bench on a pseudo-terminal: real time, a real port."""
+
+from __future__ import annotations
+
+import logging
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from bench_arm import swing
+
+from daemon.reopen import Reopening
+from drivers.dynamixel.bench.chain import Chain
+from drivers.dynamixel.bench.pty_shell import PtyShell
+from drivers.dynamixel.bench.servo import Servo
+from drivers.dynamixel.config import BusConfig, DynamixelConfig, ServoConfig
+from drivers.dynamixel.joints import DynamixelJoints
+from drivers.dynamixel.models import BY_NAME
+from interfaces.clock import SystemClock
+from interfaces.errors import SourceError
+from interfaces.records import JointReading
+
+SIX = range(1, 7)
+LIMIT_S = 20.0
+
+
+@pytest.fixture
+def shell(tmp_path: Path):
+    servos = [Servo(BY_NAME["XM430-W350"], id, swing(id), return_delay_s=0, booted_s=id * 0.1234) for id in SIX]
+    with PtyShell(Chain(servos), tmp_path / "bus") as shell:
+        yield shell
+
+
+def driver(shell: PtyShell, **bus) -> DynamixelJoints:
+    entries = tuple(ServoConfig(f"joint{id}", id, "XM430-W350") for id in SIX)
+    config = DynamixelConfig({"arm": BusConfig(str(shell.link), **bus)}, entries)
+    return DynamixelJoints(config, [entry.joint for entry in entries], SystemClock(), limits=[(-2.0, 2.0)] * 6)
+
+
+def wait_for_reading(source) -> JointReading:
+    deadline = time.monotonic() + LIMIT_S
+    while time.monotonic() < deadline:
+        if (reading := source.read(0.1)) is not None:
+            return reading
+    raise AssertionError("no reading came")
+
+
+@pytest.mark.parametrize("fast", ["auto", "never"])
+def test_readings_are_right_with_wire_time(shell, fast) -> None:
+    with driver(shell, fast_sync_read=fast) as joints:
+        for _ in range(50):
+            reading = wait_for_reading(joints)
+            assert reading.q == pytest.approx([swing(id)(reading.t) for id in SIX], abs=0.02)
+
+
+def test_most_times_are_those_of_the_sampling(shell) -> None:
+    off = []
+    with driver(shell) as joints:
+        for _ in range(200):
+            reading = wait_for_reading(joints)
+            off.append(abs(reading.t - np.mean([sampling.t for sampling in shell.chain.samplings.values()])))
+    assert np.median(off) < 0.5e-3
+
+
+def test_nobody_else_of_us_opens_the_port(shell) -> None:
+    with driver(shell) as joints:
+        wait_for_reading(joints)
+        with pytest.raises(SourceError, match="is in use by another program"):
+            driver(shell).__enter__()
+
+
+def test_waiting_costs_little_of_the_processor(shell) -> None:
+    with driver(shell) as joints:
+        wait_for_reading(joints)
+        begin, used = time.monotonic(), time.thread_time()
+        for _ in range(200):
+            wait_for_reading(joints)
+        assert time.thread_time() - used < 0.3 * (time.monotonic() - begin)
+
+
+def test_an_unplugged_bus_is_told_once_and_is_back_within_a_second_of_the_replug(shell, caplog) -> None:
+    joints = driver(shell)
+    source = Reopening(joints, "the encoders", SystemClock())
+    with caplog.at_level(logging.WARNING), source:
+        before = wait_for_reading(source)
+        shell.unplug()
+        for _ in range(20):
+            source.read(0.05)
+        assert source.trouble is not None
+        shell.plug_in()
+        begin = time.monotonic()
+        after = wait_for_reading(source)
+        assert time.monotonic() - begin < 1.0
+    assert len(caplog.messages) == 1
+    assert "is gone" in caplog.messages[0]
+    assert (source.losses, joints.epoch) == (1, 2)
+    assert after.t > before.t

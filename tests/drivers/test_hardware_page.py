@@ -1,0 +1,75 @@
+"""What docs/hardware.md shows is true of the code."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from drivers.config import DriversConfig
+from drivers.dynamixel.models import BY_NAME, Register
+
+PAGE = (Path(__file__).parents[2] / "docs" / "hardware.md").read_text()
+SHOWN = ("XM430-W350", "PH54-200-S500", "MX-28")
+ROWS = {
+    "model, firmware": ("model", "firmware"),
+    "Return Delay Time": ("return_delay",),
+    "Drive Mode, Operating Mode, Homing Offset": ("drive_mode", "operating_mode", "homing_offset"),
+    "Torque Enable": ("torque",),
+    "Goal Position": ("goal",),
+}
+
+
+def block(language: str) -> str:
+    found = re.search(rf"```{language}\n(.*?)```", PAGE, re.DOTALL)
+    assert found is not None
+    return found[1]
+
+
+@pytest.mark.parametrize("uncommented", [False, True])
+def test_the_tables_for_robot_toml_are_accepted_also_with_all_keys(uncommented) -> None:
+    text = re.sub(r"^# (?=[a-z_]+ =)", "", block("toml"), flags=re.MULTILINE) if uncommented else block("toml")
+    config = msgspec.convert(tomllib.loads(text)["drivers"], DriversConfig)
+    config.check(["shoulder"], Path("robot.toml"), text)
+    assert config.dynamixel is not None
+
+
+def test_the_defaults_that_are_shown_are_the_defaults() -> None:
+    shown = tomllib.loads(re.sub(r"^# (?=(rate|max|restore)[a-z_]* =)", "", block("toml"), flags=re.MULTILINE))
+    table = shown["drivers"]["dynamixel"]
+    plain = msgspec.convert({**tomllib.loads(block("toml"))["drivers"]["dynamixel"]}, type=type_of_table())
+    for key in ("rate_hz", "max_speed_deg_s", "max_move_deg", "restore_torque"):
+        assert table[key] == getattr(plain, key)
+
+
+def type_of_table():
+    from drivers.dynamixel.config import DynamixelConfig
+
+    return DynamixelConfig
+
+
+def test_the_bench_starts_as_shown(tmp_path, monkeypatch, capsys) -> None:
+    monkeypatch.chdir(tmp_path)
+    exec(block("python"), {})
+    assert capsys.readouterr().out == "speak to bus\n"
+
+
+@pytest.mark.parametrize("row", ROWS)
+def test_the_table_of_registers_has_their_addresses(row) -> None:
+    line = next(line for line in PAGE.splitlines() if line.startswith(f"| {row} |"))
+    cells = [cell.strip() for cell in line.split("|")][2:5]
+    for cell, model in zip(cells, SHOWN, strict=True):
+        layout = BY_NAME[model].layout
+        known = [str(layout[name].address) for name in ROWS[row] if name in layout]
+        assert cell == (", ".join(known) or "–")
+
+
+def test_the_blocks_are_where_the_table_says() -> None:
+    def span(register: Register) -> str:
+        return f"{register.address} … {register.end - 1}"
+
+    for model in SHOWN:
+        assert f"| {span(BY_NAME[model].layout.block)} |" in PAGE

@@ -1,0 +1,74 @@
+"""Turns, speeds and device clocks, whatever the device."""
+
+from __future__ import annotations
+
+from random import Random
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from drivers.device_clock import DeviceClock
+from drivers.serial_line import DEFAULT_LATENCY_S, adapter_latency_s
+from drivers.turns import SpeedGate, nearest_turn
+
+
+@given(st.integers(-(10**6), 10**6), st.floats(-1e6, 1e6))
+def test_the_nearest_turn_is_within_half_a_turn_and_whole_turns_away(raw, near) -> None:
+    there = nearest_turn(raw, near, 4096)
+    assert abs(there - near) <= 2048 + 1e-6
+    assert (there - raw) % 4096 == 0
+
+
+def test_a_sensor_without_turns_is_taken_as_it_is() -> None:
+    assert nearest_turn(1000, 0.0, None) == 1000
+
+
+def test_the_gate_takes_what_a_joint_can_do_and_refuses_the_rest() -> None:
+    gate = SpeedGate([10.0, 10.0], [0.1, 0.1])
+    assert gate.offer(0.0, [0.0, 0.0]) is None
+    assert gate.offer(0.1, [1.05, 0.0]) is None
+    assert gate.offer(0.2, [1.05, 1.2]) == 1
+    assert gate.offer(0.3, [1.05, 0.0]) is None
+
+
+def test_places_that_agree_tell_a_jump_and_those_that_do_not_tell_none() -> None:
+    for agree in (True, False):
+        gate = SpeedGate([1.0], [0.1])
+        gate.offer(0.0, [0.0])
+        for k in range(1, 7):
+            assert gate.offer(k * 0.01, [50.0 if agree else 50.0 * k]) == 0
+        assert gate.jumped is agree
+
+
+@pytest.mark.parametrize("drift", [50e-6, -0.01, 0.01])
+def test_a_device_clock_narrows_an_event_to_a_fraction_of_what_the_host_knows(drift) -> None:
+    rng, clock, widths = Random(3), DeviceClock(1e-3, 32768), []
+    offset = 57.1234
+    for k in range(20_000):  # through several wraps of the stamp
+        true = 100.0 + k * 5.31e-3
+        stamp = int((true * (1 + drift) - offset) / 1e-3) % 32768
+        between = clock.narrow(true - rng.uniform(0, 3e-3), true + rng.uniform(0, 3e-3), stamp)
+        assert between is not None
+        if k >= 300:  # by then the rate is known
+            assert between[0] - 3e-4 <= true <= between[1] + 3e-4
+        widths.append(between[1] - between[0])
+    assert np.mean(widths[1000:]) < 1.8e-3  # of 3 ms
+
+
+@pytest.mark.parametrize("late_s", [0.003, 0.02, 1.0, 20.0])
+def test_an_event_of_another_time_is_refused_and_does_no_harm(late_s) -> None:
+    clock = DeviceClock(1e-3, 32768)
+    for k in range(300):
+        t = 10.0 + k * 5.3e-3
+        assert clock.narrow(t - 1e-4, t + 1e-4, int(t / 1e-3) % 32768) is not None
+    t = 10.0 + 300 * 5.3e-3
+    assert clock.narrow(t - 1e-4, t + 1e-4, int((t - late_s) / 1e-3) % 32768) is None
+    assert clock.narrow(t - 1e-4, t + 1e-4, int(t / 1e-3) % 32768) is not None
+
+
+def test_the_adapter_s_latency_is_the_system_s_where_it_says(tmp_path) -> None:
+    (tmp_path / "ttyUSB7").write_text("16\n")
+    assert adapter_latency_s("/dev/ttyUSB7", str(tmp_path / "{}")) == 16e-3
+    assert adapter_latency_s("/dev/ttyACM0", str(tmp_path / "{}")) == DEFAULT_LATENCY_S
