@@ -153,7 +153,7 @@ class _Functions:
         if family.kind == "place":
             return self._of_place(self._robot.chain.positions(run.motion.q))
         if family.kind == "joint":
-            return run.by_joint[:, :, [family.joint]] * self._turns(family, run)[:, None, :]
+            return family.moves(run) * self._turns(family, run)[:, None, :]
         return family.columns(run)
 
     def _turns(self, family: Family, run: Simulated) -> FloatArray:
