@@ -37,7 +37,7 @@ _OUTLIERS_NAMED = 15.0
 _MOSTLY = 0.8
 # What depends on the way to a reading, not only on the reading; and how far off, in units of its size, is farther than
 # the way between two readings can explain.
-_BY_THE_WAY, _BY_SO_MUCH = ("backlash", "settling", "camera_latency"), 2.0
+_BY_THE_WAY, _BY_SO_MUCH = ("backlash", "settling", "camera_latency"), 4.0
 # Where more rows than this are doubtful, leaving them out costs more than they do harm.
 _MOST_DOUBTFUL = 0.25
 # Beside what has no name a cause stays named only if it is more probable than not.
@@ -114,18 +114,23 @@ class Diagnosis:
         """Whether there are so many, so far off, that it is a finding."""
         worth = self.extended.noise.log_likelihood - self.extended.without_outliers
         named = self.outliers >= _FEWEST_OUTLIERS and worth > _OUTLIERS_NAMED
-        return named and not self._off_where_fast() and not self._off_by_what_moves()
+        return named and not self._off_where_fast() and not self._off_by_what_is_inexact()
 
-    def _off_by_what_moves(self) -> bool:
-        """Whether the fixes are off by no more than the way between two readings, which nobody has seen, may matter."""
+    def _off_by_what_is_inexact(self) -> bool:
+        """Whether the fixes are off by no more than what is known only roughly may matter.
+
+        That is the way between two readings, which nobody has seen, and what has no name.
+        """
         fit = self.extended
         moving = [cause for cause in fit.causes if cause.name in _BY_THE_WAY]
-        changes = sum(fit.run.columns(cause)[:, :, cause.amounts] @ cause.values[cause.amounts] for cause in moving)
-        if not moving:
+        changes = [fit.run.columns(cause)[:, :, cause.amounts] @ cause.values[cause.amounts] for cause in moving]
+        if self.left.model is not None:
+            changes.append(self.left.model.explained)
+        if not changes:
             return False
-        changed = np.square(fit.observations.whitened(np.asarray(changes)[:, :, None])).sum(axis=(1, 2))
+        squares = np.square(fit.observations.whitened(np.stack(changes, axis=2))).sum(axis=1).mean(axis=0)
         off = np.square(fit.residuals[self._off]).sum(axis=1)
-        return bool(np.median(off) < _BY_SO_MUCH**2 * changed.mean())
+        return bool(np.median(off) < _BY_SO_MUCH**2 * squares.sum())
 
     def _off_where_fast(self) -> bool:
         """Whether the fixes that are off are those at the fastest rows: then it is motion that is not understood."""

@@ -23,7 +23,7 @@ _NOT_TRIED = 1e-3
 # How far a step may take a ripple's phase over its range [rad], what is left of a settling, and a time constant, as a
 # share of it.
 _OF_A_PEAK, _OF_A_MEMORY, _OF_A_TIME = 0.5, 0.1, 0.3
-_LONGEST_MEMORY = 0.95
+_LONGEST_MEMORY, _FEWEST_CYCLES = 0.95, 1.5
 _FEWEST_OUTLIERS = 1e-4
 _EM_ROUNDS = 6
 # So large a share of so many rows is no outliers.
@@ -268,6 +268,9 @@ def _bounded(effect: Effect, k: int, value: float) -> float:
     """A period or a time constant that can be."""
     if effect.name == "settling":
         return float(np.clip(value, 0.0, _LONGEST_MEMORY))
+    if effect.parameters[k].name == "cycles_per_turn":
+        # Once a turn it would be an eccentricity.
+        value = max(value, _FEWEST_CYCLES)
     return float(np.clip(value, 0.5 * effect.values[k], 2.0 * effect.values[k]))
 
 

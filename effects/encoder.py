@@ -9,7 +9,6 @@ from functools import lru_cache
 from typing import ClassVar
 
 import numpy as np
-from scipy.signal import lfilter
 
 from interfaces.records import FloatArray, frozen_array
 
@@ -183,7 +182,7 @@ class Backlash(EncoderEffect):
 class Settling(EncoderEffect):
     """Read before the joint has come to rest: what is missing is a fraction of the last move, and of what was before.
 
-    true angle = reading - e, with e_i = fraction · move_i + memory · e_{i-1}.
+    true angle = reading - e, with e_i = fraction · move_i + memory^(dt_i / usual dt) · e_{i-1}.
     """
 
     name = "settling"
@@ -200,12 +199,16 @@ class Settling(EncoderEffect):
 @lru_cache(maxsize=_MEMORIES_KEPT)
 def _missing(motion: Motion, joint: int, memory: float) -> FloatArray:
     """What is missing of the last move and of what was before (n,); a search asks for the same ones again and again."""
-    missing = motion.moves[:, joint]
+    moves = motion.moves[:, joint]
     if memory == 0.0:
-        return missing
-    # One filter over all runs; what a run would remember of the one before is taken off again.
-    missing = np.asarray(lfilter([1.0], [1.0, -memory], missing), dtype=np.float64)
-    return frozen_array(missing - missing[motion.begins][motion.run] * memory**motion.since_begin)
+        return moves
+    kept = np.sign(memory) * abs(memory) ** motion.pace
+    kept[motion.begins] = 0.0
+    missing, left = [], 0.0
+    for keep, move in zip(kept.tolist(), moves.tolist(), strict=True):
+        left = keep * left + move
+        missing.append(left)
+    return frozen_array(missing)
 
 
 class Play:

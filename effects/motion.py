@@ -74,20 +74,20 @@ class Motion:
         return frozen_array(moves)
 
     @cached_property
+    def pace(self) -> FloatArray:
+        """How long each row came after the one before (n,), as a multiple of the usual time; 1 where a run begins."""
+        usual = ~self.begins
+        pace = np.ones(len(self.q))
+        if usual.any():
+            pace[1:] = np.diff(self.clock) / max(float(np.median(np.diff(self.clock)[usual[1:]])), 1e-12)
+            pace[self.begins] = 1.0
+        return frozen_array(pace)
+
+    @cached_property
     def runs(self) -> list[tuple[int, int]]:
         """First row of each run and the row after its last."""
         firsts = np.flatnonzero(self.begins)
         return list(zip(firsts.tolist(), [*firsts[1:].tolist(), len(self.q)], strict=True))
-
-    @cached_property
-    def run(self) -> NDArray[np.int64]:
-        """The run of each row (n,), counted from 0."""
-        return np.cumsum(self.begins) - 1
-
-    @cached_property
-    def since_begin(self) -> NDArray[np.int64]:
-        """How many rows of its run come before each row (n,)."""
-        return np.arange(len(self.q)) - np.flatnonzero(self.begins)[self.run]
 
     def earlier(self, lag_s: float) -> Motion:
         """The readings that the encoders gave `lag_s` before each row, interpolated without overshoot.

@@ -88,13 +88,12 @@ class Truth:
         others = self.beside(index)
         target = self.wide.positions([*others, self.effects[index]])
         signal = self.wide.fitted(target, others).chi2
-        there = self.wide.fitted(target, [*others, self.wide.with_shape(target, others, other)])
-        return there.chi2 < SAME_SHARE * max(signal, 1e-9)
+        return self.wide.replaced(target, others, self.effects[index], other).chi2 < SAME_SHARE * max(signal, 1e-9)
 
     def behind(self, index: int, other: Effect) -> float:
         """Chi-square by which another effect in the place of a true one stays behind on the measured motion."""
         others = self.beside(index)
-        return self.scene.fitted(self.target, [*others, self.scene.with_shape(self.target, others, other)]).chi2
+        return self.scene.replaced(self.target, others, self.effects[index], other).chi2
 
     def judged(self, index: int, found_as: Key | None, among_rivals: bool) -> TruthJudged:
         """How well an oracle sees one of the true effects, and tells it from its best rival."""
@@ -283,10 +282,12 @@ def _wrong_reach(truth: Truth, index: int, member: Indistinguishable) -> list[st
 def judged_numbers(truth: Truth, named: Named, index: int) -> tuple[tuple[Number, ...], dict[str, str]]:
     """The numbers of a cause beside the true ones."""
     meaning = truth.meanings[index]
+    # What a lag leaves of a move hangs on how the move went; all else the mechanism has as a number of its own.
+    near = truth.effects[index] if meaning.effect.name == "settling" else meaning.effect
     if named.effect.key != meaning.key:
         return (), {"all": "named otherwise"}
     numbers, left_out = [], {}
-    for parameter, value in zip(meaning.effect.parameters, meaning.effect.values, strict=True):
+    for parameter, value in zip(meaning.effect.parameters, near.values, strict=True):
         given = named.cause.parameters.get(parameter.name)
         if given is None or parameter.name not in meaning.told:
             left_out[parameter.name] = "the mechanism has no such number" if given else "not stated"

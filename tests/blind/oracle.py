@@ -97,9 +97,12 @@ class Scene:
         parts = [run.columns(effect)[:, :, effect.amounts] for effect in effects]
         return self.whitened(np.concatenate(parts, axis=2) if parts else np.empty((len(self.motion), 3, 0)))
 
-    def with_shape(self, target: FloatArray, others: Sequence[Effect], effect: Effect) -> Effect:
-        """The effect with the moment, period, width or time constant that comes nearest, to first order."""
-        return self._nearest(target, others, [effect])[0][1]
+    def replaced(self, target: FloatArray, others: Sequence[Effect], true: Effect, effect: Effect) -> Fitted:
+        """An effect in the place of a true one, with the moment, period, width or time constant that comes nearest."""
+        starts = [effect, self._nearest(target, others, [effect])[0][1]]
+        if all(e.parameters[-1].name == "t0" for e in (true, effect)):
+            starts.append(effect.with_values(np.append(effect.values[:-1], true.values[-1])))
+        return min((self.fitted(target, [*others, start]) for start in starts), key=lambda fit: fit.chi2)
 
     def rivals(self, target: FloatArray, others: Sequence[Effect], but: Iterable[Effect]) -> list[Fitted]:
         """The single effects that come nearest to the target beside others, fitted in full, the nearest first."""

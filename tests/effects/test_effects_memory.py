@@ -8,7 +8,7 @@ from effect_arms import arm, everywhere, sized, walk
 from hypothesis import given
 from hypothesis import strategies as st
 
-from effects import LiveEncoders, Motion, Simulation
+from effects import Effect, LiveEncoders, Motion, Simulation
 from effects.encoder import ENCODER_EFFECTS, played
 
 PATHS = st.lists(st.floats(-1.0, 1.0), min_size=1, max_size=60).map(np.array)
@@ -54,7 +54,9 @@ def reading_by_reading(simulation, motion):
 @pytest.mark.parametrize("name", EACH)
 def test_reading_by_reading_the_first_stage_is_that_of_the_whole_motion(robot, name) -> None:
     motion = walk(3)
-    motion = Motion(motion.q, motion.t, np.zeros(len(motion), dtype=np.int64))
+    # Live rows come at constant intervals.
+    times = np.linspace(motion.clock[0], motion.clock[-1], len(motion))
+    motion = Motion(motion.q, times, np.zeros(len(motion), dtype=np.int64))
     simulation = Simulation(
         robot, tuple(sized(robot, place, 1.0, 5) for place in everywhere(robot) if place[0] == name)
     )
@@ -62,3 +64,13 @@ def test_reading_by_reading_the_first_stage_is_that_of_the_whole_motion(robot, n
     after = slice(1, None)
     expected = simulation.unloaded(motion)
     np.testing.assert_allclose(reading_by_reading(simulation, motion)[after], expected[after], rtol=0, atol=1e-14)
+
+
+def test_what_is_missing_fades_with_the_time_between_rows(robot) -> None:
+    q = np.zeros((4, len(robot.joints)))
+    q[1:, 0] = 0.1
+    settling = Effect.at(robot, "settling", robot.joints[0], values=[0.5, 0.25])
+    simulation = Simulation(robot, (settling,))
+    motion = Motion(q, np.array([0.0, 1.0, 2.0, 2.5]), np.zeros(4, dtype=np.int64))
+    missing = motion.q[:, 0] - simulation.unloaded(motion)[:, 0]
+    np.testing.assert_allclose(missing, [0.0, 0.05, 0.05 * 0.25, 0.05 * 0.25 * 0.5], atol=1e-15)
