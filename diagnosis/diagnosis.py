@@ -211,14 +211,14 @@ def diagnose(
     unknowns, blocks = Unknowns(start), blocks or Blocks.cut(len(recording))
     explanation = explain(extended, search.path, unknowns, search, tell)
     tell("asking what else it could be")
-    stands = standings(explanation.fit, search, blocks, seed)
+    stands = standings(explanation.beside, search, blocks, seed)
     while explanation.unknown and any(standing.probability < _HALF for standing in stands):
         weakest = int(np.argmin([standing.probability for standing in stands]))
         fewer = without_one(explanation, explanation.fit.causes[weakest], unknowns, search)
         if not fewer.unknown:
             break
         explanation = fewer
-        stands = standings(explanation.fit, search, blocks, seed)
+        stands = standings(explanation.beside, search, blocks, seed)
     left = leftover(explanation, unknowns, blocks)
     return Diagnosis(
         hypotheses=hypotheses,

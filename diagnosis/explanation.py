@@ -17,10 +17,14 @@ from .unknown import Apart, Unknowns
 # What has no name is taken for so much more probability than the named causes alone [nats].
 _MARGIN = 15.0
 _MOST_UNKNOWNS = 3
+# So many families are fitted to see which is the best, if to first order they are worth so large a share of it.
+_NEAREST, _NEAR = 3, 0.9
 # What a number of a named cause costs when sets of causes are compared [nats].
 _NUMBER = 3.0
 # What is left of large causes because their form is not quite theirs is nothing without a name.
 _OF_THE_CAUSES = 0.05
+# Less than this share of all is a rest.
+_REST = 0.25
 # What is worth more than this no rounding of readings that stand still brings about [nats].
 _BEYOND_DOUBT = 60.0
 
@@ -30,7 +34,7 @@ class Explanation:
     """A set of causes, and ways to differ that have no name.
 
     Attributes:
-        fit: with the causes alone, with the numbers that they have beside what has no name.
+        fit: with the causes alone.
         apart: with what has no name taken away; None where there is nothing of the kind.
         worth: how probable they are together, in nats that count only beside those of others.
         size: how much what has no name adds to what the causes alone can say (RMS), in units of the stated noise.
@@ -40,6 +44,11 @@ class Explanation:
     apart: Apart | None
     worth: float
     size: float = 0.0
+
+    @property
+    def beside(self) -> Fit:
+        """The causes beside what has no name."""
+        return self.fit if self.apart is None else self.apart.fit
 
     @property
     def unknown(self) -> tuple[int, ...]:
@@ -57,29 +66,31 @@ def explain(
         tried: the fits on its way there, the first without any cause.
     """
     path = list(tried)
-    best = _with_unknown(found, unknowns, search)
-    if best.size < _OF_THE_CAUSES * _apart(found, found.run.measured - path[0].run.measured):
+    whole = _length(found, found.run.measured - path[0].run.measured)
+    best, alone = _with_unknown(found, unknowns, search), unknowns.missed(found)
+    if best.apart is not None and (best.size < _OF_THE_CAUSES * whole or unknowns.missed(found, best.apart) > alone):
         best = Explanation(found, None, best.worth)
+    # Where the causes explain by far the most, they are not given up for what explains the rest.
+    is_rest = best.size < _REST * whole
+    margin = _MARGIN if is_rest else 0.0
     keys = {frozenset(effect.key for effect in found.causes)}
-    alone = unknowns.missed(found)
-    if best.apart is not None and unknowns.missed(found, best.apart) > alone:
-        best = Explanation(found, None, best.worth)
     for fit in path:
         causes = frozenset(effect.key for effect in fit.causes)
         if causes in keys:
             continue
         keys.add(causes)
         other = _with_unknown(fit, unknowns, search)
-        more = other.worth - best.worth - (0.0 if best.unknown else _MARGIN)
-        if other.apart is not None and more > 0.0 and unknowns.missed(other.fit, other.apart) < alone:
+        better = other.worth > best.worth + (margin if best.fit is found else 0.0)
+        if other.apart is not None and better and unknowns.missed(fit, other.apart) < alone:
             best = other
     if best.unknown:
         tell("something that none of the effects explains")
-        best = _pruned(best, unknowns, search)
+        if not (is_rest and best.fit is found):
+            best = _pruned(best, unknowns, search)
     return best
 
 
-def _apart(fit: Fit, change: FloatArray) -> float:
+def _length(fit: Fit, change: FloatArray) -> float:
     """How large a change (n, 3) [m] is (RMS), in units of the stated noise."""
     return float(np.sqrt(np.square(fit.observations.whitened(change[:, :, None])).mean()))
 
@@ -88,17 +99,18 @@ def _with_unknown(fit: Fit, unknowns: Unknowns, search: Search) -> Explanation:
     apart: Apart | None = None
     while apart is None or len(apart.chosen) < _MOST_UNKNOWNS:
         here, chosen = (fit, ()) if apart is None else (apart.fit, apart.chosen)
-        index, more = unknowns.best(here, chosen)
-        if more < NAMED or index in chosen:
+        ranked = [(index, more) for index, more in unknowns.ranked(here, chosen) if index not in chosen]
+        index, more = ranked[0]
+        if more < NAMED or (more < _BEYOND_DOUBT and unknowns.agreed(here, chosen, index) < 0.0):
             break
-        if more < _BEYOND_DOUBT and unknowns.agreed(here, chosen, index) < 0.0:
-            break
-        apart = unknowns.apart(fit, (*chosen, index), apart)
+        near = [index for index, other in ranked[:_NEAREST] if other > _NEAR * more]
+        tried = [unknowns.apart(fit, (*chosen, index), apart) for index in near]
+        apart = max(tried, key=lambda one: one.fit.log_likelihood - unknowns.cost(one))
     names = sum(_NUMBER * len(effect.amounts) + search.doubt_of(effect) for effect in fit.causes)
     if apart is None:
         return Explanation(fit, None, fit.log_likelihood - names)
     worth = apart.fit.log_likelihood - names - unknowns.cost(apart)
-    return Explanation(fit.at(apart.fit.simulation), apart, worth, _apart(fit, apart.predicted - fit.run.measured))
+    return Explanation(fit, apart, worth, _length(fit, apart.predicted - fit.run.measured))
 
 
 def _pruned(explanation: Explanation, unknowns: Unknowns, search: Search) -> Explanation:

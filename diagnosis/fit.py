@@ -204,7 +204,7 @@ class Fit:
         return self.simulation.with_effects(effects)
 
     def at(self, simulation: Simulation) -> Fit:
-        """Another simulation with the same nuisances, as it is."""
+        """A simulation with the same nuisances, as it is."""
         return _at(self.observations, simulation, self.nuisances, self.noise)
 
     def without(self, cause: Effect) -> Fit:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from scipy import stats
 
@@ -44,7 +44,7 @@ def leftover(explanation: Explanation, unknowns: Unknowns, blocks: Blocks) -> Le
     """What the families of an explanation say of what its causes leave."""
     fit, apart = explanation.fit, explanation.apart
     if apart is None:
-        beside = unknowns.apart(fit, (unknowns.best(fit)[0],))
+        beside = unknowns.apart(fit, (unknowns.ranked(fit)[0][0],))
         return Leftover((), (), False, min(1.0, _chance(fit, beside, unknowns) * len(unknowns.families)))
     families = [unknowns.families[index] for index in apart.chosen]
     joints = [joints_of(family, own, fit.run) for family, own in zip(families, apart.numbers, strict=True)]
@@ -53,7 +53,7 @@ def leftover(explanation: Explanation, unknowns: Unknowns, blocks: Blocks) -> Le
         joints=tuple(sorted(frozenset[int]().union(*joints))),
         with_time=any(family.over_time for family in families),
         p_value=_chance(fit, apart, unknowns),
-        model=smooth_model(replace(fit, noise=apart.fit.noise), families, blocks),
+        model=smooth_model(fit, apart, families, blocks),
         untold=tuple(family.what for family in families if family.over_time),
     )
 

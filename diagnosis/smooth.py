@@ -7,7 +7,7 @@ on the readings alone become a KB-Map; what changes with time cannot be one.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import combinations_with_replacement
 
@@ -19,14 +19,17 @@ from interfaces.records import FloatArray
 from .families import Family
 from .fit import Fit, fitted, prior_precision, solved
 from .held_out import Blocks
+from .unknown import Apart
 
 # How far a function may move the marker anywhere, in units of the noise; what predicts rows best is taken.
 _SIZES = (0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0)
 _WIDE = 400
 # Of one joint's angle; rounds in which the arcs of joints that err are followed.
 _HARMONICS, _ROUNDS = 14, 3
-# What is left out of a stored model, of the noise.
-_LEFT_OUT = 0.02
+# Arcs that predict rows worse than this, as a multiple of what they did before, are followed no further.
+_WORSE = 1.05
+# What is left out of a stored model, of the noise; what is farther off what it should be is not stored.
+_LEFT_OUT, _TOO_FAR_OFF = 0.02, 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,24 +51,47 @@ class SmoothModel:
     unseen: FloatArray
 
 
-def smooth_model(fit: Fit, families: Sequence[Family], blocks: Blocks) -> SmoothModel:
-    """Learn the families' functions beside the causes of `fit`."""
+def smooth_model(alone: Fit, apart: Apart, families: Sequence[Family], blocks: Blocks) -> SmoothModel:
+    """Learn the families' functions beside the causes of a fit.
+
+    Args:
+        apart: the same causes beside the families.
+    """
+    said = apart.predicted - alone.run.measured
     lasting = [family for family in families if not family.over_time]
     timed = [family for family in families if family.over_time]
-    functions = _Functions(fit, lasting)
-    amounts = _Amounts(fit, functions.columns, _timed(fit, timed), blocks)
-    for _ in range(_ROUNDS if any(family.kind == "joint" for family in lasting) else 0):
-        amounts = _Amounts(fit, functions.columns, _timed(fit, timed), blocks, functions.bent(amounts.of_functions))
-    causes = _Amounts(fit, functions.columns[:, :, :0], _timed(fit, ()), blocks)
+    # What the causes are is found from where they are by themselves, and from where they are beside the families.
+    starts = [replace(fit, noise=apart.fit.noise) for fit in (alone, alone.at(apart.fit.simulation))]
+    learnt = [_learnt(fit, lasting, timed, blocks) for fit in starts]
+    fit, functions, amounts = min(learnt, key=lambda one: one[2].lasting_missed)
+    causes = _Amounts(starts[0], functions.columns[:, :, :0], _timed(fit, ()), blocks)
+    none = SmoothModel(starts[0], None, said, said, causes.unseen)
     if not lasting or amounts.lasting_missed > causes.lasting_missed:
-        said = amounts.said + amounts.in_time
-        return SmoothModel(fit, None, said, said, causes.unseen)
-    stored = functions.stored(amounts.of_functions, _LEFT_OUT * _noise_m(fit))
+        return none
+    noise_m = _noise_m(fit)
+    stored, off_m = functions.stored(amounts.of_functions, _LEFT_OUT * noise_m)
+    if off_m > _TOO_FAR_OFF * noise_m:
+        return none
     simulation = Simulation(fit.simulation.robot, fit.simulation.effects, stored)
     beside = fitted(fit.observations, simulation, fit.nuisances, fit.noise)
     later = _Amounts(beside, functions.columns[:, :, :0], _timed(beside, timed), blocks)
     explained = functions.shift(functions.given, amounts.of_functions) + later.in_time
     return SmoothModel(beside, stored, explained, later.in_time, amounts.unseen)
+
+
+def _learnt(
+    fit: Fit, lasting: Sequence[Family], timed: Sequence[Family], blocks: Blocks
+) -> tuple[Fit, _Functions, _Amounts]:
+    """How much of each function, following the arcs of joints that err as long as that predicts rows well."""
+    functions = _Functions(fit, lasting)
+    amounts = _Amounts(fit, functions.columns, _timed(fit, timed), blocks)
+    for _ in range(_ROUNDS if any(family.kind == "joint" for family in lasting) else 0):
+        bent = functions.bent(amounts.of_functions)
+        further = _Amounts(fit, functions.columns, _timed(fit, timed), blocks, bent)
+        if further.lasting_missed > _WORSE * amounts.lasting_missed:
+            break
+        amounts = further
+    return fit, functions, amounts
 
 
 def _noise_m(fit: Fit) -> float:
@@ -108,18 +134,24 @@ class _Functions:
         """At the rows of the fit (n, 3, p)."""
         return self._at(self.given) / self._scales
 
-    def stored(self, amounts: FloatArray, tolerance_m: float) -> Unexplained:
-        """The functions times amounts (p,), and what the simulation has already, as a model."""
-        before = self._simulation.residual
-        shares = amounts / self._scales
-        if before is None and all(family.kind == "place" for family in self._families):
-            return place_map(self._robot, lambda x: self._of_place(x) @ shares, self._x, tolerance_m)
+    def stored(self, amounts: FloatArray, tolerance_m: float) -> tuple[Unexplained, float]:
+        """The functions times amounts (p,), and what the simulation has already, as a model.
 
-        def shift(q: FloatArray) -> FloatArray:
+        Returns:
+            It, and how far it is off them at the rows of the fit (RMS) [m].
+        """
+        before, shares = self._simulation.residual, amounts / self._scales
+
+        def wanted(q: FloatArray) -> FloatArray:
             new = self.shift(q, amounts)
             return new if before is None else new + before.predict(q)
 
-        return smooth_map(self._robot, shift, self.given, tolerance_m)
+        if before is None and all(family.kind == "place" for family in self._families):
+            model = place_map(self._robot, lambda x: self._of_place(x) @ shares, self._x, tolerance_m)
+            return model, 0.0
+        model = smooth_map(self._robot, wanted, self.given, tolerance_m)
+        off = model.predict(self.given) - wanted(self.given)
+        return model, float(np.sqrt(np.square(off).sum(axis=1).mean()))
 
     def shift(self, q: FloatArray, amounts: FloatArray) -> FloatArray:
         """What the functions times amounts (p,) say at readings (n, d), with joints that err turned (n, 3) [m]."""

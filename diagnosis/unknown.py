@@ -83,8 +83,8 @@ class Unknowns:
         left = fit.left.ravel()
         return basis, left - basis @ (basis.T @ left)
 
-    def best(self, fit: Fit, others: Sequence[int] = ()) -> tuple[int, float]:
-        """The family that is worth most beside a fit and other families, and how much [nats]."""
+    def ranked(self, fit: Fit, others: Sequence[int] = ()) -> list[tuple[int, float]]:
+        """The families by what they are worth beside a fit and others, to first order [nats], the best first."""
         basis, left = self.beside(fit, others)
         weights = np.repeat(fit.root_weights[:, 0], 3)[:, None]
         rss, rows = float(left @ left), float(fit.noise.weights.sum())
@@ -99,8 +99,8 @@ class Unknowns:
             explained = float(np.square(vectors[:, told].T @ toward / np.sqrt(values[told])).sum())
             gain = -3.0 * rows * float(np.log1p(-min(explained / rss, 0.999999)))
             worths.append(0.5 * gain - _NUMBER * int(told.sum()))
-        index = int(np.argmax(worths))
-        return index, worths[index] - self._doubt
+        order = np.argsort(worths)[::-1]
+        return [(int(index), worths[index] - self._doubt) for index in order]
 
     def apart(self, fit: Fit, chosen: Sequence[int], start: Apart | None = None) -> Apart:
         """The causes of a fit and families, fitted in turn to what the others leave.
