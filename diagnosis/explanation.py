@@ -25,6 +25,8 @@ _NUMBER = 3.0
 _OF_THE_CAUSES = 0.05
 # Less than this share of all is a rest.
 _REST = 0.25
+# Of the fits on the way to all causes, these are asked whether they are better beside what has no name.
+_FIRST, _LAST = 3, 2
 # What is worth more than this no rounding of readings that stand still brings about [nats].
 _BEYOND_DOUBT = 60.0
 
@@ -74,7 +76,7 @@ def explain(
     is_rest = best.size < _REST * whole
     margin = _MARGIN if is_rest else 0.0
     keys = {frozenset(effect.key for effect in found.causes)}
-    for fit in path:
+    for fit in [*path[:_FIRST], *path[_FIRST:][-_LAST:]]:
         causes = frozenset(effect.key for effect in fit.causes)
         if causes in keys:
             continue

@@ -25,6 +25,8 @@ _NOT_TRIED = 1e-3
 _OF_A_PEAK, _OF_A_MEMORY, _OF_A_TIME = 0.5, 0.1, 0.3
 _LONGEST_MEMORY, _FEWEST_CYCLES = 0.95, 1.5
 _FEWEST_OUTLIERS = 1e-4
+# Of time, whose agreement says how far the numbers are sure.
+_BLOCKS = 60
 _EM_ROUNDS = 6
 # So large a share of so many rows is no outliers.
 _WINDOW, _BURST = 61, 0.45
@@ -150,11 +152,21 @@ class Fit:
 
     @cached_property
     def covariance(self) -> FloatArray:
-        """Of all amounts (p, p), nuisances first, then of periods and time constants."""
-        flat = np.concatenate([self.columns, self.shape_columns], axis=2).reshape(self.left.size, -1)
+        """Of all amounts (p, p), nuisances first, then of periods and time constants.
+
+        Where blocks of time disagree by more than independent rows would, it is larger (Liang and Zeger 1986).
+        """
+        columns = np.concatenate([self.columns, self.shape_columns], axis=2)
+        flat, variance = columns.reshape(self.left.size, -1), self.noise.sigma**2
         precision = np.append(prior_precision(self.simulation, self.nuisances), self._shape_precision)
-        information = flat.T @ flat / self.noise.sigma**2 + np.diag(precision)
-        return np.asarray(np.linalg.pinv(information, rcond=1e-14, hermitian=True), dtype=np.float64)
+        information = flat.T @ flat / variance + np.diag(precision)
+        covariance = np.asarray(np.linalg.pinv(information, rcond=1e-14, hermitian=True), dtype=np.float64)
+        scores = np.einsum("nip,ni->np", columns, self.left) / variance
+        firsts = np.unique(np.linspace(0, len(scores), _BLOCKS, endpoint=False).astype(int))
+        moved = np.add.reduceat(scores, firsts, axis=0) @ covariance
+        ratio = np.square(moved).sum(axis=0) / np.maximum(np.diag(covariance), 1e-300)
+        wider = np.sqrt(np.maximum(ratio, 1.0))
+        return covariance * np.outer(wider, wider)
 
     @property
     def _shape_precision(self) -> FloatArray:

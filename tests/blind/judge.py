@@ -29,6 +29,7 @@ SAME_SHARE = 1e-4  # what is left of a signal, of its chi-square, by an effect t
 SURE = 0.9
 FEWEST_FALSE_FIXES = 3
 SHOWS, HIDDEN_FROM = 0.25, 0.02  # share of the variance from which a joint has to be named, and below which it must not
+FIRST_ORDER = ("settling", "joint_ripple")  # a lag over a smooth move; poles of unequal strength, read by atan2
 TELLS_LITTLE = 10.0  # usual sizes: a wider interval says that the motion does not tell the number
 
 
@@ -282,8 +283,8 @@ def _wrong_reach(truth: Truth, index: int, member: Indistinguishable) -> list[st
 def judged_numbers(truth: Truth, named: Named, index: int) -> tuple[tuple[Number, ...], dict[str, str]]:
     """The numbers of a cause beside the true ones."""
     meaning = truth.meanings[index]
-    # What a lag leaves of a move hangs on how the move went; all else the mechanism has as a number of its own.
-    near = truth.effects[index] if meaning.effect.name == "settling" else meaning.effect
+    # Of these the mechanism has the numbers to first order only: where they come nearest to it is the truth.
+    near = truth.effects[index] if meaning.effect.name in FIRST_ORDER else meaning.effect
     if named.effect.key != meaning.key:
         return (), {"all": "named otherwise"}
     numbers, left_out = [], {}
