@@ -166,7 +166,9 @@ class Diagnosis:
     @cached_property
     def alike(self) -> tuple[Alike, ...]:
         """Effects that share a direction beside the best geometry."""
-        return alike(self.geometry, self.hypotheses.effects)
+        named = {cause.key for cause in self.causes}
+        pairs = alike(self.geometry, self.hypotheses.effects)
+        return tuple(pair for pair in pairs if named & {pair.one.key, pair.other.key})
 
     @cached_property
     def rejected(self) -> list[tuple[Candidate, Added]]:

@@ -105,6 +105,14 @@ class Fit:
         variance = max(float(squares.mean()) / 3.0, 1e-18)
         return float(-1.5 * len(squares) * (np.log(2.0 * np.pi * variance) + 1.0))
 
+    @cached_property
+    def row_log_likelihoods(self) -> FloatArray:
+        """Of each row (n,) [nats]; nothing of rows that are not trusted."""
+        squares, noise = np.einsum("ni,ni->n", self.residuals, self.residuals), self.noise
+        inlier = np.log1p(-noise.share) - 1.5 * np.log(2.0 * np.pi * noise.sigma**2) - 0.5 * squares / noise.sigma**2
+        either = np.logaddexp(inlier, np.log(noise.share) + self.observations.outlier_density)
+        return np.where(self.observations.trusted, either, 0.0)
+
     @property
     def log_likelihood(self) -> float:
         """Of the observations, less what implausibly large effects cost [nats]."""

@@ -15,7 +15,7 @@ from .fit import Fit
 from .held_out import Blocks
 from .scan import Candidate
 from .search import Search, nats
-from .stability import named_again
+from .stability import Instead, named_again
 
 # Signals that differ by less than this, twice the log-likelihood that the right one is expected to gain, are one.
 SAME = 6.0
@@ -90,21 +90,20 @@ def _standing(fit: Fit, cause: Effect, search: Search, blocks: Blocks, seed: int
     gain = 2.0 * (fit.log_likelihood - without.log_likelihood)
     itself = beside.itself or Candidate(cause, gain, 1)
     worth = nats(gain, itself.dof) - search.doubt(itself)
-    tried, compared = [], []
+    nothing = Instead(without, -itself.dof, -search.doubt(itself))
+    tried = []
     for candidate in beside.candidates:
         if candidate.gain < _COMES_NEAR * itself.gain:
             continue
         rival = search.refined(without.with_causes([*without.causes, candidate.effect]), candidate.effect.key)
-        behind = nats(2.0 * (rival.log_likelihood - fit.log_likelihood), candidate.dof - itself.dof)
-        compared.append(candidate)
-        tried.append(
-            (rival, candidate.effect.key, behind - np.log(max(candidate.trials / max(itself.trials, 1), 1e-3)))
-        )
-    odds = np.exp(np.clip([0.0, -worth, *(behind for _, _, behind in tried)], -500.0, 50.0))
+        doubt = float(np.log(max(candidate.trials / max(itself.trials, 1), 1e-3)))
+        tried.append((Instead(rival, candidate.dof - itself.dof, doubt), candidate.effect.key))
+    behind = [nats(2.0 * (one.fit.log_likelihood - fit.log_likelihood), one.dof) - one.doubt for one, _ in tried]
+    odds = np.exp(np.clip([0.0, -worth, *behind], -500.0, 50.0))
     shares = odds / odds.sum()
     rivals = [
-        Rival(rival, _effect(rival, key), float(share), _difference(fit, rival), _anywhere(fit, rival))
-        for (rival, key, _), share in zip(tried, shares[2:], strict=True)
+        Rival(one.fit, _effect(one.fit, key), float(share), _difference(fit, one.fit), _anywhere(fit, one.fit))
+        for (one, key), share in zip(tried, shares[2:], strict=True)
         if share >= PROBABLE
     ]
     same = sum(rival.probability for rival in rivals if rival.is_same_anywhere)
@@ -116,7 +115,7 @@ def _standing(fit: Fit, cause: Effect, search: Search, blocks: Blocks, seed: int
         itself.dof,
         gain,
         ordered,
-        named_again(without, itself, compared, search, blocks, seed),
+        named_again(fit, nothing, [one for one, _ in tried], blocks, seed),
     )
 
 
