@@ -12,7 +12,7 @@ import numpy as np
 from effects import Effect, Simulated
 from interfaces.records import FloatArray
 
-_HARMONICS, _TIMES = 5, 4
+_HARMONICS, _TIMES, _JOINT_TIMES = 5, 4, (8, 32)
 Columns = Callable[[Simulated], FloatArray]
 
 
@@ -65,7 +65,8 @@ def families(run: Simulated) -> list[Family]:
                 found.append(Family(what, "joint", k, None, False, joint, _any_of_both(k, j)))
         if timed:
             what = f"an error of {names[k]} that changes with time"
-            found.append(Family(what, "joint", k, None, True, joint, _any_of_time(2 * _TIMES)))
+            for count in _JOINT_TIMES:
+                found.append(Family(what, "joint", k, None, True, joint, _any_of_time(count)))
             what = f"the link before {names[k]} changes with time"
             found.append(Family(what, "body", k, None, True, link, _any_of_time(_TIMES)))
         if run.simulation.gravity.known:
