@@ -19,7 +19,7 @@ from .config import Ros2Config
 from .link import RETRY_S, Link, OpenLink, Sample, open_zenoh
 from .merging import Merged, Merging
 from .messages import JointState, decode_joint_state
-from .senders import Refusal, Sender
+from .senders import Gates, Refusal, Sender
 from .silence import ADVICE, silence
 
 log = logging.getLogger(__name__)
@@ -122,7 +122,8 @@ class Ros2Joints:
 
     def _forget(self) -> None:
         """Nothing that was heard before tells anything about what comes."""
-        self._senders: dict[tuple[Who, tuple[str, ...]], Sender] = {}
+        self._senders: dict[Who, Sender] = {}
+        self._gates = Gates(self._fastest, self._slack)
         self._owners: list[tuple[Who, float] | None] = [None] * len(self._joints)
         self._sequences: dict[bytes, int] = {}
         self._merging = Merging(len(self._joints))
@@ -155,33 +156,48 @@ class Ros2Joints:
         return JointReading(merged.t, frozen_array(merged.q))
 
     def _believed(self, who: Who, message: JointState, arrived: float) -> Merged | None:
-        sender = self._sender(who, message.names)
-        if not sender.places:
+        columns = {name: column for column, name in enumerate(message.names)}
+        places = [place for place, name in enumerate(self._wanted) if name in columns]
+        if not places:
             return None
-        if any(self._belongs_to_another(place, who, arrived) for place in sender.places):
-            self._refuse(Refusal.RIVAL, "")
-            return None
-        told = sender.offer(message, arrived)
-        if sender.jumped:
-            raise SourceLost("a joint is suddenly somewhere else, or the names were changed", retry_s=RETRY_S)
+        told = self._told(who, message, places, arrived)
         if isinstance(told, Refusal):
-            self._refuse(told, self._wanted[sender.places[0]])
-            if sender.clock_was_set:
-                sender.clock_was_set = False
-                log.warning("the clock of the stamps in %s was set; its time is learnt anew", self._config.topic)
+            self._refuse(told, self._wanted[places[0]])
             return None
-        for place in sender.places:
+        q = [message.positions[columns[self._wanted[place]]] for place in places]
+        if not all(map(math.isfinite, q)):
+            self._refuse(Refusal.NOT_FINITE, self._wanted[places[0]])
+            return None
+        for place in places:
             self._owners[place] = who, arrived
-        return self._merging.put(told.t, message.header.stamp_ns, sender.places, told.q)
+        verdict = self._gates.offer(told, places, q)
+        if self._gates.jumped:
+            raise SourceLost("a joint is suddenly somewhere else, or the names were changed", retry_s=RETRY_S)
+        if verdict is False:
+            self._refuse(Refusal.TOO_FAST, self._wanted[places[0]])
+        return self._merging.put(told, message.header.stamp_ns, places, q) if verdict else None
 
-    def _sender(self, who: Who, names: tuple[str, ...]) -> Sender:
-        sender = self._senders.get((who, names))
+    def _told(self, who: Who, message: JointState, places: Sequence[int], arrived: float) -> float | Refusal:
+        """When the message was true [s], or why it is not to be used."""
+        if any(self._belongs_to_another(place, who, arrived) for place in places):
+            return Refusal.RIVAL
+        if len(set(message.names)) < len(message.names):
+            return Refusal.TWICE
+        if not message.positions:
+            return Refusal.NO_POSITIONS
+        sender = self._sender(who)
+        times_set = sender.times_set
+        t = sender.time_of(message.header.stamp_ns, places, arrived)
+        if sender.times_set != times_set:
+            log.warning("the clock of the stamps in %s was set; its time is learnt anew", self._config.topic)
+        return t
+
+    def _sender(self, who: Who) -> Sender:
+        sender = self._senders.get(who)
         if sender is None:
             if len(self._senders) >= SENDERS:
-                oldest = min(self._senders, key=lambda key: self._senders[key].heard)
-                del self._senders[oldest]
-            sender = Sender(names, self._wanted, self._fastest, self._slack, self._config.max_delay_s)
-            self._senders[who, names] = sender
+                del self._senders[min(self._senders, key=lambda known: self._senders[known].heard)]
+            self._senders[who] = sender = Sender(self._config.max_delay_s)
         return sender
 
     def _belongs_to_another(self, place: int, who: Who, arrived: float) -> bool:

@@ -1,15 +1,13 @@
-"""One node's joint states: whether a message is to be believed, and when it was true."""
+"""Whether a message is to be believed, and when it was true."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from enum import StrEnum
 
 from drivers.turns import SpeedGate
 
-from .messages import JointState
 from .stamps import StampClock
 
 ANEW_AFTER_S = 0.5  # of stamps that all belong to another time: the sender's clock was set
@@ -32,91 +30,82 @@ class Refusal(StrEnum):
     GAP = "gap"  # the joints come in several messages, too far apart in time
 
 
-@dataclass(frozen=True, slots=True)
-class Believed:
-    """What a message tells.
-
-    Attributes:
-        t: when it was true [s].
-        q: positions of the sender's joints.
-    """
-
-    t: float
-    q: tuple[float, ...]
-
-
 class Sender:
-    """One node, and the names that its messages have.
+    """One node: its clock, and how far it has told of each joint.
 
     Attributes:
-        places: which of our joints it tells of.
         heard: when its newest message came [s].
+        times_set: how often its clock was set to another time.
     """
 
-    def __init__(
-        self,
-        names: Sequence[str],
-        wanted: Sequence[str],
-        fastest: Sequence[float],
-        slack: Sequence[float],
-        delay_s: float,
-    ) -> None:
-        """Nothing was heard of it yet.
+    def __init__(self, max_delay_s: float) -> None:
+        """Nothing was heard of it yet; for `max_delay_s` see `StampClock`."""
+        self.heard, self.times_set = -math.inf, 0
+        self._max_delay_s = max_delay_s
+        self._clock = StampClock(max_delay_s)
+        self._newest_ns: dict[int, int] = {}
+        self._astray: list[float] = []
+
+    def time_of(self, stamp_ns: int, places: Sequence[int], arrived: float) -> float | Refusal:
+        """When the message was true [s] that tells of the joints at `places`, or why nothing tells that."""
+        self.heard = arrived
+        if stamp_ns == 0:
+            return Refusal.NO_STAMP
+        told_ns = [self._newest_ns[place] for place in places if place in self._newest_ns]
+        if stamp_ns in told_ns:
+            return Refusal.DUPLICATE
+        if any(stamp_ns < newest_ns for newest_ns in told_ns):
+            return self._astray_at(arrived, Refusal.OUT_OF_ORDER)
+        t = self._clock.time_of(stamp_ns, arrived)
+        if t is None:
+            return self._astray_at(arrived, Refusal.DELAYED)
+        self._newest_ns.update(dict.fromkeys(places, stamp_ns))
+        self._astray.clear()
+        return t
+
+    def _astray_at(self, arrived: float, refusal: Refusal) -> Refusal:
+        """When none but such messages come, the clock that stamps them was set: begin anew with the next."""
+        self._astray = [*self._astray[: ANEW_AFTER - 1], arrived]
+        if len(self._astray) == ANEW_AFTER and arrived - self._astray[0] > ANEW_AFTER_S:
+            self._clock, self._newest_ns, self._astray = StampClock(self._max_delay_s), {}, []
+            self.times_set += 1
+        return refusal
+
+
+class Gates:
+    """Believes of each joint only where it can have come to; of the first two messages, where they agree."""
+
+    def __init__(self, fastest: Sequence[float], slack: Sequence[float]) -> None:
+        """Gates that have seen nothing.
 
         Args:
-            names: of its messages.
-            wanted: what ROS calls our joints.
-            fastest: how fast each of ours is believed to move [rad/s], m/s where it slides.
-            slack: how far its position may be off [rad] or [m].
-            delay_s: see `StampClock`.
+            fastest: how fast each joint is believed to move [rad/s], m/s where it slides.
+            slack: how far its position may be off besides [rad] or [m].
         """
-        self.places = tuple(place for place, name in enumerate(wanted) if name in names)
-        self.heard = -math.inf
-        self.clock_was_set = False
-        self._columns = tuple(names.index(wanted[place]) for place in self.places)
-        self._names_twice = any(names.count(wanted[place]) > 1 for place in self.places)
-        self._gate = SpeedGate([fastest[place] for place in self.places], [slack[place] for place in self.places])
-        self._delay_s = delay_s
-        self._clock = StampClock(delay_s)
-        self._newest_ns: int | None = None
-        self._astray: list[float] = []
+        self._limits = list(zip(fastest, slack, strict=True))
+        self._gates: list[SpeedGate | None] = [None] * len(self._limits)
+        self._confirmed = [False] * len(self._limits)
+
+    def offer(self, t: float, places: Sequence[int], q: Sequence[float]) -> bool | None:
+        """Whether the joints at `places` can be at `q` at the time `t` [s]; None when it is too early to tell."""
+        verdicts = [self._offer(t, place, value) for place, value in zip(places, q, strict=True)]
+        if False in verdicts:
+            return False
+        return None if None in verdicts else True
 
     @property
     def jumped(self) -> bool:
-        """Its joints are somewhere else from one message to the next, and stay there."""
-        return self._gate.jumped
+        """A joint is somewhere else from one message to the next, and stays there."""
+        return any(gate is not None and gate.jumped for gate in self._gates)
 
-    def offer(self, message: JointState, arrived: float) -> Believed | Refusal:
-        """What the message tells, or why it is not to be used."""
-        self.heard = arrived
-        if self._names_twice:
-            return Refusal.TWICE
-        if not message.positions:
-            return Refusal.NO_POSITIONS
-        q = tuple([message.positions[column] for column in self._columns])
-        if not all(map(math.isfinite, q)):
-            return Refusal.NOT_FINITE
-        if message.header.stamp_ns == 0:
-            return Refusal.NO_STAMP
-        t = self._time(message.header.stamp_ns, arrived)
-        if isinstance(t, Refusal):
-            return t
-        if self._gate.offer(t, q) is not None:
-            return Refusal.TOO_FAST
-        return Believed(t, q)
-
-    def _time(self, stamp_ns: int, arrived: float) -> float | Refusal:
-        if stamp_ns == self._newest_ns:
-            return Refusal.DUPLICATE
-        if self._newest_ns is not None and stamp_ns < self._newest_ns:
-            t, refusal = None, Refusal.OUT_OF_ORDER
-        else:
-            t, refusal = self._clock.time_of(stamp_ns, arrived), Refusal.DELAYED
-        if t is None:
-            self._astray = [*self._astray[: ANEW_AFTER - 1], arrived]
-            if len(self._astray) == ANEW_AFTER and arrived - self._astray[0] > ANEW_AFTER_S:
-                self._clock, self._newest_ns, self._astray = StampClock(self._delay_s), None, []
-                self.clock_was_set = True
-            return refusal
-        self._newest_ns, self._astray = stamp_ns, []
-        return t
+    def _offer(self, t: float, place: int, q: float) -> bool | None:
+        gate = self._gates[place]
+        if gate is not None and gate.offer(t, (q,)) is None:
+            self._confirmed[place] = True
+            return True
+        if self._confirmed[place]:
+            return False
+        fastest, slack = self._limits[place]
+        self._gates[place] = gate = SpeedGate([fastest], [slack])
+        gate.offer(t, (q,))
+        return None

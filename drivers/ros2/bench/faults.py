@@ -19,7 +19,7 @@ class Fault(StrEnum):
     GARBAGE = "garbage"  # random bytes
     TRUNCATED = "truncated"
     BIT = "bit"  # one bit of it is another
-    LENGTH = "length"  # it announces more than there is
+    WORD = "word"  # four bytes are a large number, where a length is perhaps
     SWAPPED_NAMES = "swapped_names"
     MISSING_JOINT = "missing_joint"
     NAN = "nan"

@@ -49,6 +49,7 @@ class ZenohRobot:
         for key, value in settings.items():
             config.insert_json5(key, json.dumps(value))
         self._session = session = zenoh.open(config)
+        self._stop.clear()
         token = rmw.publisher_token(self._domain, str(session.info.zid()), "bench", self._topic, JOINT_STATE)
         self._token = session.liveliness().declare_token(token)
         key = rmw.topic_key(self._domain, self._topic, JOINT_STATE)
@@ -81,7 +82,6 @@ class ZenohRobot:
 
     def start(self) -> None:
         """Let all nodes publish, each at its rate, until the end."""
-        self._stop.clear()
         self._threads = [threading.Thread(target=self._run, args=(node,), name="bench") for node in self._nodes]
         for thread in self._threads:
             thread.start()
