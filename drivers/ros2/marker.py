@@ -39,6 +39,16 @@ class MarkerPublisher:
         self._tokens: list[zenoh.LivelinessToken] = []
         self._sequence = 0
 
+    @property
+    def period_s(self) -> float:
+        """No two positions are wanted closer together [s]."""
+        return 1.0 / self._marker.rate_hz
+
+    @property
+    def has_sigma(self) -> bool:
+        """Whether the message tells how sure a position is."""
+        return self._marker.message == "pose"
+
     def __enter__(self) -> Self:
         """SourceLost when the router is not there."""
         self._session = session = open_session(self._config.router)
@@ -73,7 +83,7 @@ class MarkerPublisher:
             raise SourceError("the marker's topic is not open; use it in a with statement")
         self._sequence += 1
         header, at = Header(stamp_ns, self._marker.frame), tuple(x.tolist())
-        if self._marker.message == "point":
+        if not self.has_sigma:
             payload = encode_point(header, at)
         else:
             payload = encode_pose(header, at, NO_TURN, _covariance(sigma))

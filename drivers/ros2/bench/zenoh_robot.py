@@ -71,7 +71,8 @@ class ZenohRobot:
     @property
     def is_heard(self) -> bool:
         """Whether anybody subscribes."""
-        return bool(self._publisher.matching_status.matching)
+        status: Any = self._publisher.matching_status  # zenoh's stub calls it a bool, which it is not
+        return bool(status.matching)
 
     def publish(self, node: Node, t: float) -> None:
         """Let a node publish what is true at `t` [s]."""
