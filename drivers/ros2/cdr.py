@@ -5,6 +5,7 @@ from __future__ import annotations
 import struct
 
 REPRESENTATIONS = {b"\x00\x00": ">", b"\x00\x01": "<"}  # CDR_BE, CDR_LE
+UINT32 = {order: struct.Struct(f"{order}I") for order in "<>"}
 ENCAPSULATION = 4  # bytes; positions are aligned to what follows them
 LARGEST_MESSAGE = 1 << 18
 
@@ -31,6 +32,7 @@ class CdrReader:
         if order is None:
             raise Malformed(f"the representation {data[:2].hex()} is neither CDR_LE nor CDR_BE")
         self._data, self._order, self._at = data, order, ENCAPSULATION
+        self._uint32 = UINT32[order].unpack_from
 
     def int32(self) -> int:
         """A signed number of 4 bytes."""
@@ -38,7 +40,11 @@ class CdrReader:
 
     def uint32(self) -> int:
         """An unsigned number of 4 bytes."""
-        return int(self._numbers("I", 4, 1)[0])
+        begin = (self._at + 3) & ~3  # the encapsulation header has 4 bytes too
+        if begin + 4 > len(self._data):
+            raise Malformed("the message ends too early")
+        self._at = begin + 4
+        return self._uint32(self._data, begin)[0]
 
     def count(self, smallest: int) -> int:
         """The length of a sequence whose elements have `smallest` bytes at least."""

@@ -17,7 +17,7 @@ from interfaces.clock import SystemClock
 from interfaces.errors import ConfigError, SourceLost
 from interfaces.records import JointReading, frozen_array
 
-ROBOT = '[drivers.ros2]\nnames = { waist = "joint_1" }\n'
+ROBOT = '[drivers.ros2]\nrouter = "tcp/robot:7447"\nnames = { waist = "joint_1" }\n'
 MARKER = '[drivers.ros2.marker]\nframe = "eye"\n'
 
 
@@ -144,6 +144,7 @@ def test_the_joints_of_a_ros_2_robot_are_read_by_its_driver(tmp_path) -> None:
         ('[drivers.ros2]\nrouter = "robot"\n', "no endpoint"),
         ("[drivers.ros2]\ndomain = 233\n", "domain"),
         ('[drivers]\nrecording = "walk.csv"\n' + ROBOT, "both a recording and ROS 2"),
+        ("[drivers.ros2]\n", r'same endpoint .* Write in \[zenoh\]: sampler'),
         ('[drivers.ros2.marker]\nframe = "eye"\ntopic = "9"\n', "no name of a topic"),
     ],
 )
