@@ -10,8 +10,10 @@ from drivers.turns import SpeedGate
 
 from .stamps import StampClock
 
-ANEW_AFTER_S = 0.5  # of stamps that all belong to another time: the sender's clock was set
-ANEW_AFTER = 3  # and so many of them
+ANEW_AFTER = 3  # stamps that all belong to another time
+ANEW_AFTER_S = 0.5  # for so long: the sender's clock was set
+STALL_S = 5.0  # unless they are late by no more than this: then rather the network was held up,
+ANEW_AFTER_STALL_S = 10.0  # and catches up within this
 
 
 class Refusal(StrEnum):
@@ -44,7 +46,7 @@ class Sender:
         self._max_delay_s = max_delay_s
         self._clock = StampClock(max_delay_s)
         self._newest_ns: dict[int, int] = {}
-        self._astray: list[float] = []
+        self._astray: list[tuple[float, float]] = []
 
     def time_of(self, stamp_ns: int, places: Sequence[int], arrived: float) -> float | Refusal:
         """When the message was true [s] that tells of the joints at `places`, or why nothing tells that."""
@@ -55,18 +57,22 @@ class Sender:
         if stamp_ns in told_ns:
             return Refusal.DUPLICATE
         if any(stamp_ns < newest_ns for newest_ns in told_ns):
-            return self._astray_at(arrived, Refusal.OUT_OF_ORDER)
+            return self._astray_at(stamp_ns, arrived, Refusal.OUT_OF_ORDER)
         t = self._clock.time_of(stamp_ns, arrived)
         if t is None:
-            return self._astray_at(arrived, Refusal.DELAYED)
+            return self._astray_at(stamp_ns, arrived, Refusal.DELAYED)
         self._newest_ns.update(dict.fromkeys(places, stamp_ns))
         self._astray.clear()
         return t
 
-    def _astray_at(self, arrived: float, refusal: Refusal) -> Refusal:
-        """When none but such messages come, the clock that stamps them was set: begin anew with the next."""
-        self._astray = [*self._astray[: ANEW_AFTER - 1], arrived]
-        if len(self._astray) == ANEW_AFTER and arrived - self._astray[0] > ANEW_AFTER_S:
+    def _astray_at(self, stamp_ns: int, arrived: float, refusal: Refusal) -> Refusal:
+        """When none but such messages come, all off by the same, the clock that stamps them was set: begin anew."""
+        off_s = self._clock.lateness_s(stamp_ns, arrived)
+        if self._astray and abs(off_s - self._astray[0][1]) > self._max_delay_s:
+            self._astray.clear()
+        self._astray = [*self._astray[: ANEW_AFTER - 1], (arrived, off_s)]
+        patience_s = ANEW_AFTER_STALL_S if 0 < off_s < STALL_S else ANEW_AFTER_S
+        if len(self._astray) == ANEW_AFTER and arrived - self._astray[0][0] > patience_s:
             self._clock, self._newest_ns, self._astray = StampClock(self._max_delay_s), {}, []
             self.times_set += 1
         return refusal

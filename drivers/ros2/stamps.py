@@ -11,8 +11,8 @@ TICKS = 1 << 62  # 146 years: stamps do not wrap
 EARLY_S = 2e-3  # by so much a message may be quicker than all before it
 WORST_DRIFT = 5e-3  # and by this share of the time since the last one
 SURE_AFTER = 3  # messages in a row that came too early: the others were late then, or the clock was set
-LATE_S = 5e-3  # when all are later than thought by so much,
-LATE_FOR_S = 1.0  # for so long, then what was thought was wrong
+LATE_S = 5e-3  # when all are later than the first by so much,
+LATE_FOR_S = 1.0  # for so long, then the first's stamp was wrong
 STEADY = 0.5  # times go on at half speed at least while a quicker message shows that all came later than thought
 
 
@@ -32,7 +32,7 @@ class StampClock:
         self._max_delay_s = max_delay_s
         self._last: tuple[int, float] | None = None  # stamp and time
         self._early: list[float] = []
-        self._least_s, self._watched_from = math.inf, math.inf
+        self._least_s = self._began = math.inf
         self._begin(0)
 
     def time_of(self, stamp_ns: int, arrived: float) -> float | None:
@@ -57,23 +57,32 @@ class StampClock:
         self._note_delay(arrived - t, stamp_ns, arrived)
         return t
 
+    def lateness_s(self, stamp_ns: int, arrived: float) -> float:
+        """How much later a message came than the quickest would have; infinite before any."""
+        if self._last is None:
+            return math.inf
+        return arrived - self._last[1] - (stamp_ns - self._last[0]) * TICK_S
+
     def _note_delay(self, delay_s: float, stamp_ns: int, arrived: float) -> None:
-        """Begin anew when a first message, whose stamp was wrong, makes all others late."""
-        self._least_s = min(self._least_s, delay_s)
-        if arrived - self._watched_from < LATE_FOR_S:
+        """Begin anew when, at the start, a first message whose stamp was wrong makes all others late.
+
+        Later on, when all are late, the network is slow.
+        """
+        self._least_s = min(self._least_s, delay_s) if arrived > self._began else math.inf
+        if arrived - self._began < LATE_FOR_S:
             return
+        self._began = math.inf
         if self._least_s > LATE_S:
             self._begin(stamp_ns)
-        self._least_s, self._watched_from = math.inf, arrived
 
     def _is_early(self, stamp_ns: int, arrived: float) -> bool:
         """Whether the message came before it was stamped; one wrong stamp must not make all others late."""
         if self._last is None:
             self._begin(stamp_ns)
-            self._least_s, self._watched_from = math.inf, arrived
+            self._began = arrived
             return False
         passed_s = (stamp_ns - self._last[0]) * TICK_S
-        if self._last[1] + passed_s <= arrived + EARLY_S + WORST_DRIFT * abs(passed_s):
+        if self.lateness_s(stamp_ns, arrived) >= -EARLY_S - WORST_DRIFT * abs(passed_s):
             self._early.clear()
             return False
         offset_s = arrived - (stamp_ns - self._first_ns) * TICK_S

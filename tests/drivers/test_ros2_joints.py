@@ -243,8 +243,8 @@ def test_any_number_of_strangers_costs_bounded_memory() -> None:
 # --- what happens to the robot
 
 
-@pytest.mark.parametrize("seconds", [-3600.0, 3600.0])
-def test_when_its_clock_is_set_the_new_time_is_learnt_within_a_second(seconds) -> None:
+@pytest.mark.parametrize("seconds", [-3600.0, -7.0, 0.5, 3600.0])
+def test_when_its_clock_is_set_the_new_time_is_learnt_within_a_second_or_so(seconds) -> None:
     robot = Robot()
     with robot.joints:
         robot.read(1.0)
@@ -253,6 +253,32 @@ def test_when_its_clock_is_set_the_new_time_is_learnt_within_a_second(seconds) -
         readings = robot.read(1.0)
     assert len(readings) == 100
     assert max(map(robot.error, readings)) < 1e-6
+
+
+def test_a_clock_that_is_set_back_a_little_looks_like_a_slow_network_for_ten_seconds() -> None:
+    robot = Robot()
+    with robot.joints:
+        robot.read(1.0)
+        robot.nodes[0].set_by_s = -0.5
+        assert robot.read(9.0) == []
+        robot.read(2.005)
+        readings = robot.read(1.0)
+    assert len(readings) == 100
+    assert max(map(robot.error, readings)) < 1e-6
+
+
+def test_when_the_network_is_held_up_nothing_is_told_at_a_wrong_time_and_all_is_well_after() -> None:
+    robot, begin = Robot(), 100.0
+    robot.link._delay = lambda: max(0.0, 2.0 - (robot.link._due[0][0] - begin - 3.0)) if stalled(robot, begin) else 0.0
+    with robot.joints:
+        readings = robot.read(10.0)
+    assert max(map(robot.error, readings)) < FASTEST * 0.002
+    assert 780 <= len(readings) <= 860  # of two seconds' messages those that came within 0.1 s of their time
+    assert set(robot.joints.refused) == {Refusal.DELAYED}
+
+
+def stalled(robot: Robot, begin: float) -> bool:
+    return 3.0 <= robot.link._due[0][0] - begin < 5.0
 
 
 def test_a_joint_that_is_suddenly_somewhere_else_ends_the_opening() -> None:
