@@ -58,21 +58,23 @@ def measure(rate_hz: float, seconds: float) -> str:
         with Ros2Joints(config, JOINTS, SystemClock()) as joints:
             off: list[float] = []
             used = begin = 0.0
-            while len(off) < count:
-                reading = joints.read(2.0)
+            while joints.received < count:
+                reading = joints.read(1.0)
                 if reading is None:
-                    break
+                    if off:
+                        break
+                    continue
                 if not off:
                     used, begin = time.process_time(), time.monotonic()
                 off.append(reading.t - _published(joints.stamp_ns))
             share = (time.process_time() - used) / (time.monotonic() - begin)
-            lost, refused = joints.lost, sum(joints.refused.values())
+            received, lost, refused = joints.received, joints.lost, sum(joints.refused.values())
     finally:
         done.set()
         robot.join()
     p50, p99 = np.percentile(np.abs(off[len(off) // 10 :]), (50, 99)) * 1e3
     return (
-        f"{rate_hz:g} Hz: {len(off)} readings of {count} messages, {lost} lost, {refused} refused, "
+        f"{rate_hz:g} Hz: {received} of {count} messages, {lost} lost, {refused} refused, {len(off)} readings, "
         f"{share:.1%} of a core, times off by {p50:.3f} ms (p50), {p99:.3f} ms (p99)"
     )
 

@@ -144,7 +144,7 @@ def test_the_joints_of_a_ros_2_robot_are_read_by_its_driver(tmp_path) -> None:
         ('[drivers.ros2]\nrouter = "robot"\n', "no endpoint"),
         ("[drivers.ros2]\ndomain = 233\n", "domain"),
         ('[drivers]\nrecording = "walk.csv"\n' + ROBOT, "both a recording and ROS 2"),
-        ("[drivers.ros2]\n", r'same endpoint .* Write in \[zenoh\]: sampler'),
+        ("[drivers.ros2]\n", r"same endpoint .* Write in \[zenoh\]: sampler"),
         ('[drivers.ros2.marker]\nframe = "eye"\ntopic = "9"\n', "no name of a topic"),
     ],
 )
