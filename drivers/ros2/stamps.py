@@ -44,10 +44,11 @@ class StampClock:
             stamp_ns: later than all before.
             arrived: when the message came [s].
         """
-        if self._is_early(stamp_ns, arrived):
+        if self._is_early(stamp_ns, arrived) or self._is_late(stamp_ns, arrived):
             return None
         # From the first stamp on, because a float of nanoseconds since 1970 is too coarse.
-        bounds = self._device.narrow(arrived - self._max_delay_s, arrived, stamp_ns - self._first_ns)
+        # Twice the delay: what is not late has to agree with all before, or the clock would begin anew with it.
+        bounds = self._device.narrow(arrived - 2 * self._max_delay_s, arrived, stamp_ns - self._first_ns)
         if bounds is None:
             return None
         t = bounds[1]
@@ -91,6 +92,9 @@ class StampClock:
             return True
         self._begin(stamp_ns)
         return False
+
+    def _is_late(self, stamp_ns: int, arrived: float) -> bool:
+        return self._last is not None and self.lateness_s(stamp_ns, arrived) > self._max_delay_s
 
     def _begin(self, stamp_ns: int) -> None:
         self._device, self._first_ns, self._last = DeviceClock(TICK_S, TICKS), stamp_ns, None

@@ -277,6 +277,15 @@ def test_when_the_network_is_held_up_nothing_is_told_at_a_wrong_time_and_all_is_
     assert set(robot.joints.refused) == {Refusal.DELAYED}
 
 
+def test_a_network_that_stutters_about_the_longest_delay_does_not_shift_the_time() -> None:
+    rng = Random(5)
+    robot = Robot(delay=lambda: rng.choice((0.0,) * 30 + (0.08, 0.0995, 0.1, 0.1005, 0.15)))
+    with robot.joints:
+        readings = robot.read(60.0)
+    assert max(map(robot.error, readings)) < FASTEST * 0.002
+    assert len(readings) > 4000
+
+
 def stalled(robot: Robot, begin: float) -> bool:
     return 3.0 <= robot.link._due[0][0] - begin < 5.0
 
