@@ -1,4 +1,4 @@
-"""The one place that touches zenoh: sessions that are always closed, handlers that always answer.
+"""The one place where the daemon touches zenoh: sessions that are always closed, handlers that always answer.
 
 A Python callback that is never undeclared keeps the process from exiting, so every session here lives in a `with`.
 """

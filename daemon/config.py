@@ -155,6 +155,7 @@ class Config:
             raise ConfigError("min_step_deg is not below max_step_deg", file=file, line=line)
         _check_endpoints(tables.zenoh, file, text)
         tables.drivers.check(robot.joints, file, text)
+        _check_router(tables, file, text)
         if tables.vision.radius_m > LARGEST_BALL_M:
             raise ConfigError(
                 f"vision.radius_m = {tables.vision.radius_m:g}: this looks like millimetres",
@@ -214,6 +215,18 @@ def _check_endpoints(zenoh: ZenohConfig, file: Path, text: str) -> None:
     if zenoh.sampler == zenoh.learner:
         line = line_of(text, ("zenoh", "learner"))
         raise ConfigError("sampler and learner have the same endpoint", file=file, line=line, remedy="Give two")
+
+
+def _check_router(tables: Tables, file: Path, text: str) -> None:
+    """ConfigError when the ROS 2 robot's router, whose port is 7447 too, is where one of ours listens."""
+    ours = (tables.zenoh.sampler, tables.zenoh.learner)
+    if tables.drivers.ros2 is not None and tables.drivers.ros2.router in ours:
+        raise ConfigError(
+            f"the ROS 2 router and a process of ours have the same endpoint {tables.drivers.ros2.router}",
+            file=file,
+            line=line_of(text, ("drivers", "ros2")),
+            remedy='Write in [zenoh]: sampler = "tcp/127.0.0.1:7457" and learner = "tcp/127.0.0.1:7458"',
+        )
 
 
 def _override(raw: dict[str, Any], known: list[str], environment: Mapping[str, str]) -> dict[str, Any]:

@@ -20,6 +20,7 @@ from daemon.answers import Answers
 from daemon.bus import Bus, Request
 from daemon.checkpoint import CheckpointError, read_checkpoint, set_aside, write_checkpoint
 from daemon.config import Config
+from daemon.expected import ExpectedMarker
 from daemon.feed import PairFeed
 from daemon.findings import Findings
 from daemon.keys import Keys
@@ -29,6 +30,7 @@ from daemon.solver_process import SolverLostError, SolverProcess
 from daemon.status import LearnerStatus
 from daemon.tool_changes import ToolChanges
 from daemon.wire import OCTETS, CommandReply, CommandRequest, PairsReply, decode, encode
+from daemon.wiring import open_marker_topic
 from interfaces.protocols import Clock
 from kbmaps import KBMapsError
 
@@ -80,13 +82,20 @@ class Learner:
             thread.start()
         try:
             self._declare()
-            yield
+            with self._publishing():
+                yield
         finally:
             self._stop.set()
             self._feed.wake()
             for thread in threads:
                 thread.join()
             self.checkpoint()
+
+    def _publishing(self) -> contextlib.AbstractContextManager[None]:
+        found = open_marker_topic(self._config, self._clock)
+        if found is None:
+            return contextlib.nullcontext()
+        return ExpectedMarker(*found, lambda: self._learning.snapshot, self._clock).publishing()
 
     def tick(self) -> None:
         """What the main thread does from time to time: a checkpoint when one is due.

@@ -1,11 +1,12 @@
-"""What the sampler is given to read from."""
+"""What sampler and learner are given to read from and to publish on."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import Protocol
 
-from interfaces.protocols import Clock, JointSource, MarkerSource
+from interfaces.protocols import Clock, JointSource, MarkerSource, Source
+from interfaces.records import FloatArray
 from kbmaps import RigidChain
 
 
@@ -29,3 +30,30 @@ class Sources:
     marker: MarkerSource
     clock: Clock
     simulation: Simulation | None = None
+
+
+class StampedJoints(JointSource, Protocol):
+    """Encoders that have a clock of their own."""
+
+    @property
+    def stamp_ns(self) -> int | None:
+        """The newest reading's time on that clock [ns], or None before any."""
+        ...
+
+
+class MarkerTopic(Source, Protocol):
+    """Takes expected positions."""
+
+    @property
+    def period_s(self) -> float:
+        """No two are wanted closer together [s]."""
+        ...
+
+    @property
+    def has_sigma(self) -> bool:
+        """Whether listeners are told how sure a position is."""
+        ...
+
+    def publish(self, stamp_ns: int, x: FloatArray, sigma: FloatArray) -> None:
+        """Tell a position [m] and its 1-sigma per axis [m], shapes (3,), at a time on the encoders' clock [ns]."""
+        ...

@@ -6,14 +6,19 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from interfaces.errors import ConfigError
 from interfaces.protocols import Clock, JointSource
 from kbmaps import RigidChain
 
 from .config import Config
-from .sources import Sources
+from .sources import MarkerTopic, Sources, StampedJoints
 from .store import PairReader
+
+if TYPE_CHECKING:
+    from drivers.ros2.config import Ros2Config
+    from drivers.ros2.joints import Ros2Joints
 
 
 @contextmanager
@@ -44,11 +49,13 @@ def open_joints(config: Config, clock: Clock) -> JointSource:
     """The encoders alone of the arm that robot.toml describes, not opened yet.
 
     Raises:
-        ConfigError: no servos are configured.
+        ConfigError: no servos and no ROS 2 robot are configured.
         StoreError: the store, which tells where they were last, cannot be read.
     """
     from drivers.dynamixel.joints import DynamixelJoints
 
+    if config.tables.drivers.ros2 is not None:
+        return _ros2_joints(config, config.tables.drivers.ros2, clock)
     servos = config.tables.drivers.dynamixel
     if servos is None:
         raise ConfigError(
@@ -56,6 +63,25 @@ def open_joints(config: Config, clock: Clock) -> JointSource:
         )
     limits = list(zip(config.robot.lower.tolist(), config.robot.upper.tolist(), strict=True))
     return DynamixelJoints(servos, config.robot.joints, clock, limits=limits, last_pose=_last_pose(config))
+
+
+def _ros2_joints(config: Config, robot: Ros2Config, clock: Clock) -> Ros2Joints:
+    from drivers.ros2.joints import Ros2Joints
+
+    return Ros2Joints(robot, config.robot.joints, clock, prismatic=config.robot.chain.prismatic.tolist())
+
+
+def open_marker_topic(config: Config, clock: Clock) -> tuple[StampedJoints, MarkerTopic] | None:
+    """The ROS 2 robot's joints, and the topic for where its marker is expected, neither opened yet.
+
+    None where [drivers.ros2.marker] is not configured.
+    """
+    robot = config.tables.drivers.ros2
+    if robot is None or robot.marker is None:
+        return None
+    from drivers.ros2.marker import MarkerPublisher
+
+    return _ros2_joints(config, robot, clock), MarkerPublisher(robot, robot.marker)
 
 
 def _last_pose(config: Config) -> list[float] | None:
@@ -70,9 +96,10 @@ def _last_pose(config: Config) -> list[float] | None:
 def _require_source(config: Config, *, sim: bool) -> None:
     if sim or config.tables.drivers.recording is not None:
         return
-    if config.tables.drivers.dynamixel is not None:
+    if config.tables.drivers.dynamixel is not None or config.tables.drivers.ros2 is not None:
+        joints = "servos" if config.tables.drivers.ros2 is None else "those of a ROS 2 robot"
         raise ConfigError(
-            "the joints are servos, but nothing tells where the marker is: no camera is configured",
+            f"the joints are {joints}, but nothing tells where the marker is: no camera is configured",
             file=config.file,
             remedy="Give --sim for the simulated robot, or name a recording as recording in the table [drivers]",
         )

@@ -22,6 +22,11 @@ from drivers.dynamixel.config import BusConfig, DynamixelConfig, ServoConfig
 from drivers.dynamixel.joints import DynamixelJoints
 from drivers.dynamixel.models import BY_NAME
 from drivers.replay import Replay
+from drivers.ros2.bench.faults import Send, intact
+from drivers.ros2.bench.node import Node
+from drivers.ros2.bench.virtual_link import VirtualLink
+from drivers.ros2.config import Ros2Config
+from drivers.ros2.joints import Ros2Joints
 from interfaces.errors import SourceEnded, SourceError
 from interfaces.protocols import JointSource, MarkerSource, StereoCamera
 from interfaces.recording import Recording
@@ -155,13 +160,25 @@ def servos_that_fall_silent() -> AbstractContextManager[Rig]:
     return servos_on_the_bench(lambda reply: reply if next(said) < 30 else replace(reply, data=b""))
 
 
+@contextmanager
+def ros_2_robot(send: Send = intact) -> Iterator[Rig]:
+    clock = VirtualClock()
+    nodes = [Node({name: swinging(place)}, 50.0, name=name, send=send) for place, name in enumerate("ab")]
+    yield Rig(Ros2Joints(Ros2Config(), ("a", "b"), clock, open_link=lambda *_: VirtualLink(nodes, clock)))
+
+
+def ros_2_robot_that_falls_silent() -> AbstractContextManager[Rig]:
+    said = count()
+    return ros_2_robot(lambda message: intact(message) if next(said) < 30 else None)
+
+
 def swinging(id: int) -> Callable[[float], float]:
     return lambda t: float(np.sin(t + id))
 
 
 SIMULATED = pytest.mark.skipif(find_spec("pybullet") is None, reason="pybullet is not installed")
 ENDING_JOINTS = [replayed_joints, scripted_joints, pytest.param(simulated_joints, marks=SIMULATED)]
-JOINTS = [*ENDING_JOINTS, servos_on_the_bench]
+JOINTS = [*ENDING_JOINTS, servos_on_the_bench, ros_2_robot]
 MARKERS = [replayed_marker, scripted_marker, pytest.param(tracked_camera, marks=SIMULATED)]
 CAMERAS = [pytest.param(simulated_camera, marks=SIMULATED)]
 STANDING_STILL = [*ENDING_JOINTS[2:], *MARKERS[2:], *CAMERAS]
@@ -232,7 +249,16 @@ def test_the_end_is_said_each_time_one_reads(make: Make) -> None:
 
 
 @pytest.mark.parametrize(
-    "make", [replayed_joints, replayed_marker, *ENDING_JOINTS[2:], servos_that_fall_silent, *MARKERS[2:], *CAMERAS]
+    "make",
+    [
+        replayed_joints,
+        replayed_marker,
+        *ENDING_JOINTS[2:],
+        servos_that_fall_silent,
+        ros_2_robot_that_falls_silent,
+        *MARKERS[2:],
+        *CAMERAS,
+    ],
 )
 def test_where_nothing_comes_in_time_none_is_returned(make: Make) -> None:
     with make() as rig, rig.opened():

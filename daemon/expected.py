@@ -1,0 +1,87 @@
+"""Where the marker is expected now, told to whoever listens on a topic."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+
+from daemon.learning.snapshot import NoFrameError, Snapshot
+from daemon.reopen import Reopening
+from daemon.sources import MarkerTopic, StampedJoints
+from interfaces.errors import SourceError
+from interfaces.protocols import Clock
+from interfaces.records import JointReading
+
+log = logging.getLogger(__name__)
+
+READ_TIMEOUT_S = 0.2
+RETRY_S = 1.0
+
+
+class ExpectedMarker:
+    """Follows the encoders, and publishes what the present model says of them.
+
+    Nothing is published while there is no model, nor, where listeners are not told how sure it is, where no data was.
+
+    Attributes:
+        published: positions so far.
+    """
+
+    def __init__(
+        self, joints: StampedJoints, topic: MarkerTopic, snapshot: Callable[[], Snapshot], clock: Clock
+    ) -> None:
+        """Nothing is opened yet.
+
+        Args:
+            snapshot: the model that answers at present.
+        """
+        self._joints, self._topic, self._snapshot, self._clock = joints, topic, snapshot, clock
+        self._stop = threading.Event()
+        self._due = clock.now()
+        self.published = 0
+
+    @contextmanager
+    def publishing(self) -> Iterator[None]:
+        """Publish from here to the end of the with statement; a robot that is not there is waited for."""
+        thread = threading.Thread(target=self._run, name="expected_marker")
+        thread.start()
+        try:
+            yield
+        finally:
+            self._stop.set()
+            thread.join()
+
+    def take(self, reading: JointReading) -> None:
+        """Publish what is expected at this reading, when it is time to."""
+        if self._clock.now() < self._due or self._joints.stamp_ns is None:
+            return
+        try:
+            prediction = self._snapshot().predict(reading.q[None])
+        except NoFrameError:
+            return
+        if not (self._topic.has_sigma or prediction.in_support[0]):
+            return
+        self._due = max(self._due + self._topic.period_s, self._clock.now())
+        self._topic.publish(self._joints.stamp_ns, prediction.x[0], prediction.sigma[0])
+        self.published += 1
+
+    def _run(self) -> None:
+        said = False
+        while not self._stop.is_set():
+            try:
+                with ExitStack() as stack:
+                    stack.enter_context(self._topic)
+                    self._follow(stack.enter_context(Reopening(self._joints, "the robot's joints", self._clock)))
+            except SourceError as error:
+                if not said:
+                    log.warning("the expected marker position is not published: %s; trying again", error)
+                said = True
+                self._stop.wait(RETRY_S)
+
+    def _follow(self, joints: Reopening[JointReading]) -> None:
+        while not self._stop.is_set():
+            reading = joints.read(READ_TIMEOUT_S)
+            if reading is not None:
+                self.take(reading)

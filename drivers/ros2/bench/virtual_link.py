@@ -1,0 +1,83 @@
+"""Nodes at the other end of a link in virtual time: an hour of messages in seconds, and no wait."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from heapq import heappop, heappush, heapreplace
+from typing import Protocol
+
+from drivers.ros2.link import Sample
+from interfaces.protocols import Clock
+
+from .node import Node, Sent
+
+
+class Waiting(Clock, Protocol):
+    """A clock that stands still but when somebody waits."""
+
+    def wait_until(self, t: float) -> None:
+        """Let the time be `t`, if it is not later already."""
+        ...
+
+
+def at_once() -> float:
+    """No delay."""
+    return 0.0
+
+
+class VirtualLink:
+    """What nodes publish from now on.
+
+    Attributes:
+        is_connected: the router is there; when not, nothing arrives.
+        overflowed: never anything.
+        known: liveliness tokens of publishers.
+    """
+
+    def __init__(self, nodes: Sequence[Node], clock: Waiting, *, delay: Callable[[], float] = at_once) -> None:
+        """A link on which nothing was sent yet.
+
+        Args:
+            delay: how long a message is under way [s], drawn anew for each; none overtakes another of its node.
+        """
+        self.is_connected, self.overflowed = True, 0
+        self.known: list[str] = []
+        self._clock, self._delay = clock, delay
+        self._nodes = list(nodes)
+        self._due = [(clock.now() + node.period_s, place) for place, node in enumerate(nodes)]
+        self._arriving: list[tuple[float, int, Sent]] = []
+        self._order = 0
+        self._arrived = [0.0] * len(self._nodes)
+
+    def receive(self, until: float) -> Sample | None:
+        """The message that arrives next; None when none does by `until` [s], or the router is gone."""
+        while self.is_connected:
+            first = self._arriving[0][0] if self._arriving else until
+            if self._due and self._due[0][0] <= min(first, until):
+                self._publish()
+                continue
+            if not self._arriving or first > until:
+                break
+            arrived, _, sent = heappop(self._arriving)
+            self._clock.wait_until(arrived)
+            return Sample(sent.payload, sent.attached, arrived)
+        self._clock.wait_until(until)
+        return None
+
+    def tokens(self) -> Sequence[str]:
+        """The liveliness tokens of publishers."""
+        return self.known
+
+    def close(self) -> None:
+        """Nothing arrives any more."""
+        self._arriving.clear()
+
+    def _publish(self) -> None:
+        t, place = self._due[0]
+        node = self._nodes[place]
+        heapreplace(self._due, (t + node.period_s, place))
+        sent = node.at(t)
+        if sent is not None:
+            self._order += 1
+            self._arrived[place] = max(self._arrived[place], t + self._delay())
+            heappush(self._arriving, (self._arrived[place], self._order, sent))

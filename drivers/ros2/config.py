@@ -1,0 +1,87 @@
+"""The table [drivers.ros2] of robot.toml."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Annotated, Literal
+
+import msgspec
+from msgspec import Meta
+
+from interfaces.errors import ConfigError
+from interfaces.suggest import did_you_mean
+from interfaces.toml_file import line_of
+
+Positive = Annotated[float, Meta(gt=0)]
+
+TABLE = ("drivers", "ros2")
+TOPIC = re.compile(r"/?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")
+ENDPOINT = re.compile(r"(tcp|udp|tls|quic|ws)/.+:[0-9]+|unixsock-stream/.+")
+
+
+class MarkerTopic(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The table [drivers.ros2.marker]: where the learner publishes where it expects the marker.
+
+    Attributes:
+        frame: what ROS calls the measurement frame, into which the positions are.
+        message: `point` is geometry_msgs/PointStamped, `pose` geometry_msgs/PoseWithCovarianceStamped.
+        rate_hz: not more often than this.
+    """
+
+    frame: str
+    topic: str = "/bodyschema/marker"
+    message: Literal["point", "pose"] = "point"
+    rate_hz: Positive = 30.0
+
+
+class Ros2Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The table [drivers.ros2].
+
+    Attributes:
+        router: where rmw_zenohd listens.
+        domain: ROS_DOMAIN_ID of the robot.
+        topic: the joint states.
+        names: what ROS calls a joint, by its name in [robot] joints; those not named have the same name.
+        max_delay_s: a message that came so much later than the quickest is not used.
+        max_gap_s: where several nodes publish the joints, positions between two messages are not used that are
+            farther apart.
+        max_speed_deg_s: no joint turns faster; a position that would need it is not believed.
+        max_speed_m_s: the same for joints that slide.
+        marker: publish predictions.
+    """
+
+    router: str = "tcp/127.0.0.1:7447"
+    domain: Annotated[int, Meta(ge=0, le=232)] = 0
+    topic: str = "/joint_states"
+    names: dict[str, str] = {}
+    max_delay_s: Positive = 0.1
+    max_gap_s: Positive = 0.1
+    max_speed_deg_s: Positive = 600.0
+    max_speed_m_s: Positive = 3.0
+    marker: MarkerTopic | None = None
+
+    def ros_names(self, joints: Sequence[str]) -> tuple[str, ...]:
+        """What ROS calls `joints`."""
+        return tuple(self.names.get(joint, joint) for joint in joints)
+
+    def check(self, joints: Sequence[str], file: Path, text: str) -> None:
+        """ConfigError when a name is none of `joints`, is given twice, or cannot be one."""
+        for keys, what, remedy in self._mistakes(joints):
+            raise ConfigError(what, file=file, line=line_of(text, (*TABLE, *keys)), remedy=remedy)
+
+    def _mistakes(self, joints: Sequence[str]) -> Iterator[tuple[tuple[str, ...], str, str]]:
+        if not ENDPOINT.fullmatch(self.router):
+            yield ("router",), f"drivers.ros2.router: {self.router!r} is no endpoint", "Write tcp/127.0.0.1:7447"
+        if not TOPIC.fullmatch(self.topic):
+            yield ("topic",), f"{self.topic!r} is no name of a topic", "Write one as `ros2 topic list` does"
+        if self.marker is not None and not TOPIC.fullmatch(self.marker.topic):
+            yield ("marker", "topic"), f"{self.marker.topic!r} is no name of a topic", "Write /bodyschema/marker"
+        for joint in self.names:
+            if joint not in joints:
+                yield ("names", joint), f"unknown joint {joint!r}", did_you_mean(joint, joints)
+        given = self.ros_names(joints)
+        for name in given:
+            if given.count(name) > 1:
+                yield ("names",), f"two joints have the name {name!r} in ROS", "Give each its own"

@@ -1,0 +1,229 @@
+"""The joints of a ROS 2 robot as a `JointSource`."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections import Counter
+from collections.abc import Sequence
+from types import TracebackType
+from typing import Self
+
+from interfaces.errors import SourceError, SourceLost
+from interfaces.protocols import Clock
+from interfaces.records import JointReading, frozen_array
+
+from . import rmw
+from .cdr import Malformed
+from .config import Ros2Config
+from .link import RETRY_S, Link, OpenLink, Sample, open_zenoh
+from .merging import Merged, Merging
+from .messages import JointState, decode_joint_state
+from .senders import Gates, Refusal, Sender
+from .silence import ADVICE, silence
+
+log = logging.getLogger(__name__)
+
+SLACK_RAD, SLACK_M = 0.02, 2e-3
+SILENT_AFTER_S = 2.0
+RIVAL_AFTER_S = 1.0  # of silence of the node that told of a joint before, another one is believed
+SENDERS = 64
+NAMES = 256  # kept to tell which there are
+
+Who = bytes | tuple[str, ...]
+
+
+class Ros2Joints:
+    """Reads sensor_msgs/JointState from a robot's router.
+
+    A reading is of one time: that of a message, with the other joints interpolated to it where several nodes publish
+    them. Whatever is doubtful is dropped and counted. When the router goes away, or a joint is suddenly somewhere
+    else, SourceLost is raised; a robot that says nothing is only waited for.
+
+    Attributes:
+        received: messages, since it was made.
+        refused: messages and readings that were not used, by reason.
+        lost: messages that never came, by the senders' own count.
+        stamp_ns: the robot's own stamp of the newest reading [ns], or None before any.
+    """
+
+    def __init__(
+        self,
+        config: Ros2Config,
+        joints: Sequence[str],
+        clock: Clock,
+        *,
+        prismatic: Sequence[bool] | None = None,
+        open_link: OpenLink = open_zenoh,
+    ) -> None:
+        """Nothing is opened yet.
+
+        Args:
+            config: checked; see `Ros2Config.check`.
+            joints: in the order of q.
+            prismatic: which of them slide; by default none does.
+        """
+        self._config, self._joints, self._clock, self._open_link = config, tuple(joints), clock, open_link
+        self._wanted = config.ros_names(joints)
+        slides = [False] * len(joints) if prismatic is None else list(prismatic)
+        turning = math.radians(config.max_speed_deg_s)
+        self._fastest = [config.max_speed_m_s if sliding else turning for sliding in slides]
+        self._slack = [SLACK_M if sliding else SLACK_RAD for sliding in slides]
+        self._link: Link | None = None
+        self._last_t = -math.inf
+        self._forget()
+        self.received = self.lost = 0
+        self.refused: Counter[Refusal] = Counter()
+        self.stamp_ns: int | None = None
+
+    @property
+    def joints(self) -> tuple[str, ...]:
+        """Names of the joints in the order of q."""
+        return self._joints
+
+    @property
+    def health(self) -> tuple[str, ...]:
+        """What is wrong, and what to do."""
+        return () if self._complaint is None else (self._complaint,)
+
+    def __enter__(self) -> Self:
+        self._link = self._open_link(self._config, self._clock)
+        self._forget()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._link is not None:
+            self._link.close()
+            self._link = None
+
+    def read(self, timeout_s: float) -> JointReading | None:
+        """The next reading; see `JointSource.read`.
+
+        Raises:
+            SourceLost: the router is gone, or a joint is suddenly somewhere else.
+        """
+        if self._link is None:
+            raise SourceError("the robot's joint states are not open; use them in a with statement")
+        deadline = self._clock.now() + timeout_s
+        while True:
+            sample = self._link.receive(deadline)
+            reading = None if sample is None else self._take(sample)
+            if reading is not None:
+                self._complaint = None
+                self._read_at = self._clock.now()
+                return reading
+            if sample is None and not self._link.is_connected:
+                raise SourceLost(f"the zenoh router {self._config.router} is gone", retry_s=RETRY_S)
+            self._complain(self._link)
+            if sample is None or self._clock.now() >= deadline:
+                return None
+
+    def _forget(self) -> None:
+        """Nothing that was heard before tells anything about what comes."""
+        self._senders: dict[Who, Sender] = {}
+        self._gates = Gates(self._fastest, self._slack)
+        self._owners: list[tuple[Who, float] | None] = [None] * len(self._joints)
+        self._sequences: dict[bytes, int] = {}
+        self._merging = Merging(len(self._joints))
+        self._names: set[str] = set()
+        self._said: set[Refusal] = set()
+        self._lately: Counter[Refusal] = Counter()
+        self._complaint: str | None = None
+        self._read_at = self._clock.now()
+
+    def _take(self, sample: Sample) -> JointReading | None:
+        self.received += 1
+        try:
+            message = decode_joint_state(sample.payload)
+        except Malformed as error:
+            self._refuse(Refusal.MALFORMED, str(error))
+            return None
+        gid, sequence = rmw.sender_of(sample.attached)
+        self._count_lost(gid, sequence)
+        if len(self._names) < NAMES:
+            self._names.update(message.names)
+        merged = self._believed(gid or message.names, message, sample.arrived)
+        if merged is None:
+            return None
+        if merged.gap_s > self._config.max_gap_s:
+            self._refuse(Refusal.GAP, f"{merged.gap_s:.3f} s")
+            return None
+        if merged.t <= self._last_t:
+            return None
+        self._last_t, self.stamp_ns = merged.t, merged.stamp_ns
+        return JointReading(merged.t, frozen_array(merged.q))
+
+    def _believed(self, who: Who, message: JointState, arrived: float) -> Merged | None:
+        columns = {name: column for column, name in enumerate(message.names)}
+        places = [place for place, name in enumerate(self._wanted) if name in columns]
+        if not places:
+            return None
+        told = self._told(who, message, places, arrived)
+        if isinstance(told, Refusal):
+            self._refuse(told, self._wanted[places[0]])
+            return None
+        q = [message.positions[columns[self._wanted[place]]] for place in places]
+        if not all(map(math.isfinite, q)):
+            self._refuse(Refusal.NOT_FINITE, self._wanted[places[0]])
+            return None
+        for place in places:
+            self._owners[place] = who, arrived
+        verdict = self._gates.offer(told, places, q)
+        if self._gates.jumped:
+            raise SourceLost("a joint is suddenly somewhere else, or the names were changed", retry_s=RETRY_S)
+        if verdict is False:
+            self._refuse(Refusal.TOO_FAST, self._wanted[places[0]])
+        return self._merging.put(told, message.header.stamp_ns, places, q) if verdict else None
+
+    def _told(self, who: Who, message: JointState, places: Sequence[int], arrived: float) -> float | Refusal:
+        """When the message was true [s], or why it is not to be used."""
+        if any(self._belongs_to_another(place, who, arrived) for place in places):
+            return Refusal.RIVAL
+        if len(set(message.names)) < len(message.names):
+            return Refusal.TWICE
+        if not message.positions:
+            return Refusal.NO_POSITIONS
+        sender = self._sender(who)
+        times_set = sender.times_set
+        t = sender.time_of(message.header.stamp_ns, places, arrived)
+        if sender.times_set != times_set:
+            log.warning("the clock of the stamps in %s was set; its time is learnt anew", self._config.topic)
+        return t
+
+    def _sender(self, who: Who) -> Sender:
+        sender = self._senders.get(who)
+        if sender is None:
+            if len(self._senders) >= SENDERS:
+                del self._senders[min(self._senders, key=lambda known: self._senders[known].heard)]
+            self._senders[who] = sender = Sender(self._config.max_delay_s)
+        return sender
+
+    def _belongs_to_another(self, place: int, who: Who, arrived: float) -> bool:
+        owner = self._owners[place]
+        return owner is not None and owner[0] != who and arrived - owner[1] < RIVAL_AFTER_S
+
+    def _count_lost(self, gid: bytes, sequence: int | None) -> None:
+        if sequence is None:
+            return
+        before = self._sequences.get(gid)
+        if before is not None and sequence > before + 1:
+            self.lost += sequence - before - 1
+        if before is not None or len(self._sequences) < SENDERS:
+            self._sequences[gid] = sequence
+
+    def _refuse(self, why: Refusal, detail: str) -> None:
+        self.refused[why] += 1
+        self._lately[why] += 1
+        if why not in self._said:
+            self._said.add(why)
+            log.warning("a message of %s was not used (%s): %s", self._config.topic, detail, ADVICE[why])
+
+    def _complain(self, link: Link) -> None:
+        """Say once why nothing comes."""
+        if self._complaint is not None or self._clock.now() - self._read_at < SILENT_AFTER_S:
+            return
+        missing = [self._wanted[place] for place in self._merging.missing()]
+        self._complaint = silence(self._config, missing, self._names, self._lately, link.tokens)
+        log.warning("%s", self._complaint)

@@ -1,0 +1,95 @@
+"""The expected marker position as a ROS 2 topic."""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from collections.abc import Callable
+from types import TracebackType
+from typing import Self
+
+import zenoh
+
+from interfaces.errors import SourceError
+from interfaces.records import FloatArray
+
+from . import rmw
+from .config import MarkerTopic, Ros2Config
+from .link import open_session
+from .messages import POINT_STAMPED, POSE_WITH_COVARIANCE_STAMPED, Header, encode_point, encode_pose
+
+NODE = "bodyschema"
+# The marker is a ball without an orientation: any turn is as good, up to π about each axis, uniformly.
+UNKNOWN_TURN_RAD2 = 3.289868  # π² / 3
+NO_TURN = (0.0, 0.0, 0.0, 1.0)
+
+
+class MarkerPublisher:
+    """Publishes as a node of rmw_zenoh would, which `ros2 topic list` shows. Goes on when the router comes back."""
+
+    def __init__(self, config: Ros2Config, marker: MarkerTopic, *, wall_ns: Callable[[], int] = time.time_ns) -> None:
+        """Nothing is opened yet.
+
+        Args:
+            wall_ns: time since 1970 [ns], which is told with each message.
+        """
+        self._config, self._marker, self._wall_ns = config, marker, wall_ns
+        self._kind = POINT_STAMPED if marker.message == "point" else POSE_WITH_COVARIANCE_STAMPED
+        self._session: zenoh.Session | None = None
+        self._tokens: list[zenoh.LivelinessToken] = []
+        self._sequence = 0
+
+    @property
+    def period_s(self) -> float:
+        """No two positions are wanted closer together [s]."""
+        return 1.0 / self._marker.rate_hz
+
+    @property
+    def has_sigma(self) -> bool:
+        """Whether the message tells how sure a position is."""
+        return self._marker.message == "pose"
+
+    def __enter__(self) -> Self:
+        """SourceLost when the router is not there."""
+        self._session = session = open_session(self._config.router)
+        domain, topic, name = self._config.domain, self._marker.topic, str(session.info.zid())
+        tokens = (
+            rmw.node_token(domain, name, NODE),
+            rmw.publisher_token(domain, name, NODE, topic, self._kind),
+        )
+        self._tokens = [session.liveliness().declare_token(token) for token in tokens]
+        self._gid = hashlib.blake2b(tokens[1].encode(), digest_size=rmw.GID_BYTES).digest()
+        self._publisher = session.declare_publisher(rmw.topic_key(domain, topic, self._kind))
+        self._sequence = 0
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._session is not None:
+            self._session.close()
+            self._session = None
+            self._tokens.clear()
+
+    def publish(self, stamp_ns: int, x: FloatArray, sigma: FloatArray) -> None:
+        """Say where the marker is.
+
+        Args:
+            stamp_ns: when, on the robot's clock [ns].
+            x: position in the measurement frame [m], shape (3,).
+            sigma: its 1-sigma per axis [m], shape (3,); only a pose carries it.
+        """
+        if self._session is None:
+            raise SourceError("the marker's topic is not open; use it in a with statement")
+        self._sequence += 1
+        header, at = Header(stamp_ns, self._marker.frame), tuple(x.tolist())
+        if not self.has_sigma:
+            payload = encode_point(header, at)
+        else:
+            payload = encode_pose(header, at, NO_TURN, _covariance(sigma))
+        self._publisher.put(payload, attachment=rmw.attachment(self._sequence, self._wall_ns(), self._gid))
+
+
+def _covariance(sigma: FloatArray) -> tuple[float, ...]:
+    diagonal = [*(sigma**2).tolist(), *[UNKNOWN_TURN_RAD2] * 3]
+    return tuple(diagonal[row] if row == column else 0.0 for row in range(6) for column in range(6))

@@ -1,0 +1,131 @@
+"""The ROS 2 messages that are taken and given: sensor_msgs/JointState; geometry_msgs/PointStamped and
+PoseWithCovarianceStamped."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from .cdr import CdrReader, CdrWriter, Malformed
+
+NANO = 1_000_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class MessageType:
+    """A message's type as rmw_zenoh names it.
+
+    Attributes:
+        name: the DDS name.
+        digest: hash of its definition, the same from ROS 2 Iron on (REP-2011).
+    """
+
+    name: str
+    digest: str
+
+
+JOINT_STATE = MessageType(
+    "sensor_msgs::msg::dds_::JointState_",
+    "RIHS01_a13ee3a330e346c9d87b5aa18d24e11690752bd33a0350f11c5882bc9179260e",
+)
+POINT_STAMPED = MessageType(
+    "geometry_msgs::msg::dds_::PointStamped_",
+    "RIHS01_4c0296af86e01e562e9e0405d138a01537247580076c58ea38d7923ac1045897",
+)
+POSE_WITH_COVARIANCE_STAMPED = MessageType(
+    "geometry_msgs::msg::dds_::PoseWithCovarianceStamped_",
+    "RIHS01_26432f9803e43727d3c8f668d1fdb3c630f548af631e2f4e31382371bfea3b6e",
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Header:
+    """std_msgs/Header.
+
+    Attributes:
+        stamp_ns: time since the epoch of the sender's clock [ns].
+        frame: name of the frame.
+    """
+
+    stamp_ns: int
+    frame: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class JointState:
+    """sensor_msgs/JointState.
+
+    Attributes:
+        positions: as many as names [rad], m for a prismatic joint; or none. So are the other two.
+        velocities: [rad/s] or [m/s].
+        efforts: [N m] or [N].
+    """
+
+    header: Header
+    names: tuple[str, ...]
+    positions: tuple[float, ...] = ()
+    velocities: tuple[float, ...] = ()
+    efforts: tuple[float, ...] = ()
+
+
+def decode_joint_state(data: bytes) -> JointState:
+    """The message that `data` are, to the last byte.
+
+    Raises:
+        Malformed: they are none. Nothing is read beyond them, whatever lengths they pretend.
+    """
+    reader = CdrReader(data)
+    message = JointState(_header(reader), reader.strings(), reader.float64s(), reader.float64s(), reader.float64s())
+    reader.end()
+    for values in (message.positions, message.velocities, message.efforts):
+        if len(values) not in (0, len(message.names)):
+            raise Malformed(f"{len(message.names)} names, but {len(values)} values")
+    return message
+
+
+def encode_joint_state(message: JointState, *, big_endian: bool = False) -> bytes:
+    """The message's bytes."""
+    writer = CdrWriter(big_endian=big_endian)
+    _write_header(writer, message.header)
+    writer.strings(message.names)
+    for values in (message.positions, message.velocities, message.efforts):
+        writer.float64s(values)
+    return writer.to_bytes()
+
+
+def encode_point(header: Header, x: tuple[float, ...]) -> bytes:
+    """geometry_msgs/PointStamped at `x` [m], 3 numbers."""
+    writer = CdrWriter()
+    _write_header(writer, header)
+    writer.float64_array(x)
+    return writer.to_bytes()
+
+
+def encode_pose(
+    header: Header, x: tuple[float, ...], quaternion: tuple[float, ...], covariance: tuple[float, ...]
+) -> bytes:
+    """geometry_msgs/PoseWithCovarianceStamped.
+
+    Args:
+        x: position [m], 3 numbers.
+        quaternion: orientation (x, y, z, w).
+        covariance: of position [m²] and turns about the fixed axes [rad²], 6 × 6 by rows.
+    """
+    writer = CdrWriter()
+    _write_header(writer, header)
+    for values in (x, quaternion, covariance):
+        writer.float64_array(values)
+    return writer.to_bytes()
+
+
+def _header(reader: CdrReader) -> Header:
+    seconds, nanoseconds = reader.int32(), reader.uint32()
+    if nanoseconds >= NANO:
+        raise Malformed(f"{nanoseconds} nanoseconds in a stamp")
+    return Header(seconds * NANO + nanoseconds, reader.string())
+
+
+def _write_header(writer: CdrWriter, header: Header) -> None:
+    seconds, nanoseconds = divmod(header.stamp_ns, NANO)
+    writer.int32(seconds)
+    writer.uint32(nanoseconds)
+    writer.string(header.frame)

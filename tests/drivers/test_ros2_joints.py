@@ -1,0 +1,364 @@
+"""The joints of a ROS 2 robot, in virtual time."""
+
+from __future__ import annotations
+
+import logging
+from random import Random
+
+import numpy as np
+import pytest
+from ros2_robot import PATHS, Robot
+
+from drivers.ros2 import rmw
+from drivers.ros2.bench.faults import Fault
+from drivers.ros2.bench.node import Node
+from drivers.ros2.link import Sample
+from drivers.ros2.messages import JOINT_STATE, POINT_STAMPED, Header, JointState, encode_joint_state
+from drivers.ros2.senders import Refusal
+from interfaces.errors import SourceError, SourceLost
+
+FASTEST = 1.2 * 0.7  # [rad/s]
+# There is no checksum in the bytes, TCP's is all: another bit of a position is another position.
+SEEN_BY_THE_GATE = (Fault.BIT, Fault.WORD, Fault.SWAPPED_NAMES)
+
+
+def said(name: str, *joints: str, rate_hz: float = 100.0, **settings) -> Node:
+    """A node that publishes some of the joints."""
+    return Node({joint: PATHS[joint] for joint in joints}, rate_hz, name=name, **settings)
+
+
+# --- what is read
+
+
+def test_joints_come_in_our_order_with_the_time_of_their_stamp() -> None:
+    robot = Robot()
+    with robot.joints:
+        readings = robot.read(1.005)
+    assert len(readings) == 99  # the first message has to be confirmed
+    assert max(map(robot.error, readings)) < 1e-9
+
+
+def test_joints_may_have_other_names_in_ros() -> None:
+    robot = Robot(joints=("pan", "tilt"), names={"tilt": "lift"})
+    robot.paths["tilt"] = robot.paths["lift"]
+    with robot.joints:
+        assert max(map(robot.error, robot.read(0.5))) < 1e-9
+
+
+def test_joints_of_the_robot_that_are_not_ours_are_passed_over() -> None:
+    robot = Robot(joints=("pan",))
+    with robot.joints:
+        assert {len(reading.q) for reading in robot.read(0.5)} == {1}
+
+
+def test_a_sliding_joint_is_read_in_metres_and_may_move_faster_than_its_gate_for_turning() -> None:
+    path = {"lift": lambda t: 20.0 * t}
+    turning, sliding = (Robot(joints=("lift",), paths=path, prismatic=[k], max_speed_m_s=21.0) for k in (False, True))
+    with turning.joints, sliding.joints:
+        assert len(sliding.read(0.055)) == 4
+        assert turning.read(0.055) == []
+
+
+def test_messages_that_take_their_time_are_told_at_the_time_of_their_stamps() -> None:
+    rng = Random(3)
+    robot = Robot(delay=lambda: 0.002 + rng.expovariate(500.0))
+    with robot.joints:
+        robot.read(2.0)
+        worst = max(map(robot.error, robot.read(5.0)))
+    assert worst < FASTEST * 0.003  # the quickest takes 2 ms, which nothing tells
+
+
+@pytest.mark.parametrize("drift", [-1e-4, 1e-4, 2e-3])
+def test_a_clock_of_another_rate_is_followed(drift) -> None:
+    rng = Random(4)
+    robot = Robot([said("a", *PATHS, rate_hz=10.0, drift=drift)], delay=lambda: rng.uniform(0.0, 1e-3))
+    with robot.joints:
+        readings = robot.read(900.0)
+    assert len(readings) >= 8990
+    assert max(map(robot.error, readings)) < FASTEST * 0.003
+
+
+def test_the_robot_s_own_stamp_of_a_reading_is_told() -> None:
+    robot = Robot()
+    with robot.joints:
+        reading = robot.read(0.1)[-1]
+    assert robot.joints.stamp_ns == robot.nodes[0].stamp_ns(reading.t)
+
+
+# --- joints of several nodes
+
+
+def test_joints_of_several_nodes_are_brought_to_one_time() -> None:
+    robot = Robot([said("a", "pan", "lift"), said("b", "elbow", rate_hz=31.0)])
+    with robot.joints:
+        readings = robot.read(5.0)
+    assert len(readings) > 150
+    assert max(map(robot.error, readings)) < 1.2 * 0.7**2 * 0.033**2 / 8 + 1e-9  # of a chord
+
+
+def test_nodes_may_have_clocks_of_their_own() -> None:
+    robot = Robot([said("a", "pan", "lift"), said("b", "elbow", rate_hz=50.0)])
+    robot.nodes[1].set_by_s = -12345.0
+    with robot.joints:
+        assert max(map(robot.error, robot.read(2.0))) < 1e-3
+
+
+def test_positions_too_far_apart_in_time_are_not_brought_together() -> None:
+    robot = Robot([said("a", "pan", "lift"), said("b", "elbow", rate_hz=3.0)])
+    with robot.joints:
+        readings = robot.read(3.0)
+    assert max(map(robot.error, readings)) < 1e-5
+    assert robot.joints.refused[Refusal.GAP] > 0
+
+
+def test_of_two_nodes_with_the_same_joint_the_first_is_believed() -> None:
+    other = Node({"pan": lambda t: 0.0}, 100.0, name="gui")
+    robot = Robot([said("a", *PATHS), other])
+    with robot.joints:
+        assert max(map(robot.error, robot.read(1.0))) < 1e-9
+    assert robot.joints.refused[Refusal.RIVAL] > 90
+
+
+def test_a_node_that_was_restarted_is_believed_again_after_a_second() -> None:
+    robot = Robot([said("a", *PATHS)])
+    with robot.joints:
+        robot.read(1.0)
+        robot.link._nodes[0] = said("restarted", *PATHS)
+        assert 90 <= len(robot.read(2.0)) <= 110
+
+
+# --- what is refused
+
+
+@pytest.mark.parametrize(
+    ("fault", "reasons"),
+    [
+        (Fault.GARBAGE, {Refusal.MALFORMED}),
+        (Fault.TRUNCATED, {Refusal.MALFORMED}),
+        (Fault.SWAPPED_NAMES, {Refusal.TOO_FAST}),
+        (Fault.NAN, {Refusal.NOT_FINITE}),
+        (Fault.REPEATED, {Refusal.DUPLICATE}),
+        (Fault.CLOCK_JUMP, {Refusal.DELAYED, Refusal.OUT_OF_ORDER}),
+    ],
+)
+def test_a_spoilt_message_is_refused_counted_and_costs_no_other(fault, reasons) -> None:
+    robot = Robot()
+    with robot.joints:
+        robot.read(1.005)
+        robot.faults.next = fault
+        readings = robot.read(1.0)
+    assert len(readings) == 99
+    assert max(map(robot.error, readings)) < 1e-9
+    assert sum(robot.joints.refused.values()) == 1
+    assert set(robot.joints.refused) <= reasons
+
+
+def test_a_message_without_a_joint_costs_no_more_than_itself() -> None:
+    robot = Robot()
+    with robot.joints:
+        robot.read(1.005)
+        robot.faults.next = Fault.MISSING_JOINT
+        readings = robot.read(1.0)
+    assert len(readings) >= 99
+    assert max(map(robot.error, readings)) < FASTEST * 0.01
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_no_wrong_reading_is_believed_among_faults_of_many_kinds(seed) -> None:
+    kinds = tuple(fault for fault in Fault if fault not in SEEN_BY_THE_GATE)
+    robot = Robot(share=0.2, kinds=kinds, seed=seed)
+    with robot.joints:
+        robot.read(2.0)  # where the first stamp is wrong, this shows within a second
+        readings = robot.read(60.0)
+    assert max(map(robot.error, readings)) < FASTEST * 0.011  # a stamp may be wrong by a period unseen
+    assert len(readings) > 4300
+    assert len(robot.faults.given) == len(kinds)
+
+
+@pytest.mark.parametrize("kind", SEEN_BY_THE_GATE)
+def test_what_only_the_gate_can_see_is_wrong_by_no_more_than_a_joint_can_move(kind) -> None:
+    robot = Robot(share=0.2, kinds=(kind,), max_speed_deg_s=180.0)
+    with robot.joints:
+        readings = robot.read(60.0)
+    gaps = np.diff([reading.t for reading in readings])
+    assert max(map(robot.error, readings)) < (np.radians(180.0) + FASTEST) * gaps.max() + 0.02
+    assert len(readings) > 4000
+
+
+def test_stamps_that_are_zero_are_refused() -> None:
+    robot = Robot([])
+    robot.link.receive = feed(robot, [JointState(Header(0), ("elbow", "pan", "lift"), (0.0, 0.0, 0.0))])
+    with robot.joints:
+        assert robot.joints.read(0.1) is None
+    assert robot.joints.refused == {Refusal.NO_STAMP: 1}
+
+
+@pytest.mark.parametrize(
+    ("names", "positions", "reason"),
+    [(("pan", "pan"), (0.0, 1.0), Refusal.TWICE), (("pan",), (), Refusal.NO_POSITIONS)],
+)
+def test_messages_that_do_not_tell_where_a_joint_is_are_refused(names, positions, reason) -> None:
+    robot = Robot([], joints=("pan",))
+    robot.link.receive = feed(robot, [JointState(Header(5), names, positions)])
+    with robot.joints:
+        assert robot.joints.read(0.1) is None
+    assert robot.joints.refused == {reason: 1}
+
+
+def feed(robot: Robot, messages: list[JointState]):
+    """Instead of a link's `receive`: these messages, and then nothing."""
+
+    def receive(until: float) -> Sample | None:
+        robot.clock.wait_until(min(until, robot.clock.now() + 0.01) if messages else until)
+        return Sample(encode_joint_state(messages.pop(0)), b"", robot.clock.now()) if messages else None
+
+    return receive
+
+
+def test_each_reason_is_said_once(caplog) -> None:
+    robot = Robot(share=0.5, kinds=(Fault.NAN,))
+    with robot.joints, caplog.at_level(logging.WARNING):
+        robot.read(5.0)
+    assert len([record for record in caplog.records if "not finite" in record.message]) == 1
+
+
+def test_messages_that_never_came_are_counted() -> None:
+    robot = Robot()
+    with robot.joints:
+        robot.read(1.0)
+        for _ in range(7):
+            robot.nodes[0].at(robot.clock.now())
+        robot.read(1.0)
+    assert robot.joints.lost == 7
+
+
+def test_any_number_of_strangers_costs_bounded_memory() -> None:
+    robot = Robot([], joints=("pan",))
+    robot.link.receive = feed(robot, [JointState(Header(5), (f"joint{k}",), (0.0,)) for k in range(500)])
+    with robot.joints:
+        assert robot.joints.read(6.0) is None
+        assert len(robot.joints._senders) <= 64
+
+
+# --- what happens to the robot
+
+
+@pytest.mark.parametrize("seconds", [-3600.0, -7.0, 0.5, 3600.0])
+def test_when_its_clock_is_set_the_new_time_is_learnt_within_a_second_or_so(seconds) -> None:
+    robot = Robot()
+    with robot.joints:
+        robot.read(1.0)
+        robot.nodes[0].set_by_s = seconds
+        robot.read(1.005)
+        readings = robot.read(1.0)
+    assert len(readings) == 100
+    assert max(map(robot.error, readings)) < 1e-6
+
+
+def test_a_clock_that_is_set_back_a_little_looks_like_a_slow_network_for_ten_seconds() -> None:
+    robot = Robot()
+    with robot.joints:
+        robot.read(1.0)
+        robot.nodes[0].set_by_s = -0.5
+        assert robot.read(9.0) == []
+        robot.read(2.005)
+        readings = robot.read(1.0)
+    assert len(readings) == 100
+    assert max(map(robot.error, readings)) < 1e-6
+
+
+def test_when_the_network_is_held_up_nothing_is_told_at_a_wrong_time_and_all_is_well_after() -> None:
+    robot, begin = Robot(), 100.0
+    robot.link._delay = lambda: max(0.0, 2.0 - (robot.link._due[0][0] - begin - 3.0)) if stalled(robot, begin) else 0.0
+    with robot.joints:
+        readings = robot.read(10.0)
+    assert max(map(robot.error, readings)) < FASTEST * 0.002
+    assert 780 <= len(readings) <= 860  # of two seconds' messages those that came within 0.1 s of their time
+    assert set(robot.joints.refused) == {Refusal.DELAYED}
+
+
+def test_a_network_that_stutters_about_the_longest_delay_does_not_shift_the_time() -> None:
+    rng = Random(5)
+    robot = Robot(delay=lambda: rng.choice((0.0,) * 30 + (0.08, 0.0995, 0.1, 0.1005, 0.15)))
+    with robot.joints:
+        readings = robot.read(60.0)
+    assert max(map(robot.error, readings)) < FASTEST * 0.002
+    assert len(readings) > 4000
+
+
+def stalled(robot: Robot, begin: float) -> bool:
+    return 3.0 <= robot.link._due[0][0] - begin < 5.0
+
+
+def test_a_joint_that_is_suddenly_somewhere_else_ends_the_opening() -> None:
+    robot = Robot(paths=PATHS | {"pan": lambda t: 0.0 if t < 101.0 else 2.0})
+    with robot.joints, pytest.raises(SourceLost, match="suddenly somewhere else"):
+        robot.read(2.0)
+    with robot.joints:
+        assert robot.read(1.0)[-1].q[1] == 2.0
+
+
+def test_without_a_router_the_source_is_lost() -> None:
+    robot = Robot()
+    with robot.joints:
+        robot.read(0.5)
+        robot.link.is_connected = False
+        with pytest.raises(SourceLost, match="is gone"):
+            robot.joints.read(0.1)
+
+
+def test_a_robot_that_falls_silent_is_waited_for() -> None:
+    robot = Robot(share=1.0, kinds=(Fault.SILENCE,))
+    with robot.joints:
+        assert robot.read(10.005) == []
+        robot.faults._share = 0.0
+        assert len(robot.read(1.0)) == 99
+    assert robot.joints.health == ()
+
+
+def test_reading_what_is_not_open_is_an_error() -> None:
+    with pytest.raises(SourceError):
+        Robot().joints.read(0.1)
+
+
+# --- why nothing comes
+
+
+def complaint(robot: Robot) -> str:
+    with robot.joints:
+        robot.read(3.0)
+        return "; ".join(robot.joints.health)
+
+
+def test_the_names_that_come_are_told_where_ours_does_not() -> None:
+    said_of_it = complaint(Robot(joints=("pan", "tilt")))
+    assert "nothing about tilt; it tells of elbow, lift, pan" in said_of_it
+
+
+def test_what_is_wrong_with_all_messages_is_told() -> None:
+    assert "not finite" in complaint(Robot(share=1.0, kinds=(Fault.NAN,)))
+
+
+@pytest.mark.parametrize(
+    ("token", "says"),
+    [
+        (rmw.publisher_token(0, "z", "n", "/joint_states", JOINT_STATE), "says nothing"),
+        (rmw.publisher_token(0, "z", "n", "/joint_states", POINT_STAMPED), "no topic of sensor_msgs/JointState"),
+        (rmw.publisher_token(5, "z", "n", "/joint_states", JOINT_STATE), "in the domain 5, not 0"),
+        (rmw.publisher_token(0, "z", "n", "/arm/joint_states", JOINT_STATE), "joint states on /arm/joint_states"),
+        ("", "nobody publishes /joint_states at the router"),
+    ],
+)
+def test_what_the_router_knows_is_told_where_nothing_comes(token, says) -> None:
+    robot = Robot([])
+    robot.link.known = [token]
+    assert says in complaint(robot)
+
+
+def test_times_strictly_increase_whatever_the_delays() -> None:
+    rng = Random(7)
+    robot = Robot(delay=lambda: rng.expovariate(100.0))
+    with robot.joints:
+        readings = robot.read(20.0)
+    assert (np.diff([reading.t for reading in readings]) > 0).all()
+    assert len(readings) >= 1980

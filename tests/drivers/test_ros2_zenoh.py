@@ -1,0 +1,136 @@
+"""The same over zenoh on the loopback interface: router, reader and publisher in one process."""
+
+from __future__ import annotations
+
+import socket
+import time
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+import zenoh
+from ros2_robot import PATHS
+
+from drivers.ros2 import rmw
+from drivers.ros2.bench.node import EPOCH_NS, Node
+from drivers.ros2.bench.zenoh_robot import ZenohRobot
+from drivers.ros2.config import MarkerTopic, Ros2Config
+from drivers.ros2.joints import Ros2Joints
+from drivers.ros2.link import open_session
+from drivers.ros2.marker import MarkerPublisher
+from drivers.ros2.messages import POINT_STAMPED, POSE_WITH_COVARIANCE_STAMPED, Header, encode_point
+from interfaces.clock import SystemClock
+from interfaces.errors import SourceLost
+
+LIMIT_S = 20.0
+NAMES = ("pan", "lift", "elbow")
+
+
+@pytest.fixture
+def endpoint() -> str:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{free.getsockname()[1]}"
+
+
+def robot(endpoint: str, **settings) -> ZenohRobot:
+    return ZenohRobot([Node(PATHS, 200.0)], endpoint, **settings)
+
+
+def joints(endpoint: str, **settings) -> Ros2Joints:
+    return Ros2Joints(Ros2Config(router=endpoint, **settings), NAMES, SystemClock())
+
+
+def first(source: Ros2Joints):
+    """The first reading that comes."""
+    deadline = time.monotonic() + LIMIT_S
+    while time.monotonic() < deadline:
+        reading = source.read(0.5)
+        if reading is not None:
+            return reading
+    raise AssertionError("nothing came")
+
+
+def read_on(source: Ros2Joints) -> None:
+    """Read until an error comes."""
+    deadline = time.monotonic() + LIMIT_S
+    while time.monotonic() < deadline:
+        source.read(0.5)
+
+
+def test_joint_states_are_read_through_the_router(endpoint) -> None:
+    with robot(endpoint) as arm, joints(endpoint) as source:
+        arm.start()
+        reading = first(source)
+    assert reading.q == pytest.approx([PATHS[name](reading.t) for name in NAMES], abs=0.05)
+    assert source.refused == {}
+
+
+def test_namespace_and_domain_are_told_apart(endpoint) -> None:
+    with robot(endpoint, domain=7, topic="/arm/joint_states") as arm, joints(endpoint) as other:
+        arm.start()
+        with joints(endpoint, domain=7, topic="/arm/joint_states") as source:
+            first(source)
+        assert other.read(0.0) is None
+    assert other.received == 0
+
+
+def test_without_a_router_it_is_said_how_to_start_one(endpoint) -> None:
+    with pytest.raises(SourceLost, match="ros2 run rmw_zenoh_cpp rmw_zenohd"), joints(endpoint):
+        pass
+
+
+def test_when_the_router_goes_it_is_said_and_when_it_comes_back_joints_are_read_again(endpoint) -> None:
+    source = joints(endpoint)
+    with robot(endpoint) as arm, source:
+        arm.start()
+        before = first(source)
+        arm.__exit__(None, None, None)
+        with pytest.raises(SourceLost, match=r"router .* is gone"):
+            read_on(source)
+    with robot(endpoint) as arm, source:
+        arm.start()
+        assert first(source).t > before.t
+
+
+# --- the marker's topic
+
+
+@pytest.fixture
+def router(endpoint) -> Iterator[str]:
+    with robot(endpoint):
+        yield endpoint
+
+
+@pytest.mark.parametrize(("message", "kind"), [("point", POINT_STAMPED), ("pose", POSE_WITH_COVARIANCE_STAMPED)])
+def test_the_marker_is_published_as_a_node_of_rmw_zenoh_would(router, message, kind) -> None:
+    marker = MarkerTopic(frame="eye", message=message)
+    x, sigma = np.array([0.1, -0.2, 0.3]), np.array([1e-3, 1e-3, 2e-3])
+    with open_session(router) as session, MarkerPublisher(Ros2Config(router=router, domain=3), marker) as published:
+        heard = session.declare_subscriber(rmw.topic_key(3, "/bodyschema/marker", kind), zenoh.handlers.RingChannel(10))
+        samples = []
+        deadline = time.monotonic() + LIMIT_S
+        while not samples and time.monotonic() < deadline:
+            published.publish(EPOCH_NS, x, sigma)
+            samples = [sample for sample in (heard.try_recv(),) if sample is not None]
+    payload, attached = samples[0].payload.to_bytes(), samples[0].attachment.to_bytes()
+    assert payload.startswith(encode_point(Header(EPOCH_NS, "eye"), (0.1, -0.2, 0.3)))
+    assert len(payload) == len(encode_point(Header(EPOCH_NS, "eye"), (0.1, -0.2, 0.3))) + (
+        0 if message == "point" else 320
+    )
+    gid, sequence = rmw.sender_of(attached)
+    assert len(gid) == 16
+    assert sequence is not None
+    assert sequence >= 1
+
+
+def test_the_marker_s_topic_is_in_the_graph_while_it_is_open(router) -> None:
+    with open_session(router) as session, MarkerPublisher(Ros2Config(router=router), MarkerTopic(frame="eye")):
+        assert rmw.Topic(0, "/bodyschema/marker", POINT_STAMPED.name) in topics(session)
+        nodes = session.liveliness().get("@ros2_lv/0/*/*/*/NN/**", timeout=LIMIT_S)
+        assert any(str(reply.ok.key_expr).endswith("/NN/%/%/bodyschema") for reply in nodes if reply.ok)
+
+
+def topics(session: zenoh.Session) -> list[rmw.Topic]:
+    replies = session.liveliness().get(rmw.publishers_key(), timeout=LIMIT_S)
+    return list(rmw.topics_in([str(reply.ok.key_expr) for reply in replies if reply.ok is not None]))
