@@ -11,10 +11,10 @@ import time
 from collections.abc import Callable
 from random import Random
 
+from drivers.bench.virtual_port import VirtualClock, VirtualPort
 from drivers.dynamixel.bench.chain import Chain
 from drivers.dynamixel.bench.faults import Storm, storm
 from drivers.dynamixel.bench.servo import Servo
-from drivers.dynamixel.bench.virtual_port import VirtualClock, VirtualPort
 from drivers.dynamixel.config import BusConfig, DynamixelConfig, ServoConfig
 from drivers.dynamixel.joints import DynamixelJoints
 from drivers.dynamixel.models import BY_NAME

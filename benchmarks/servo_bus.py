@@ -14,8 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
+from drivers.bench.pty_shell import PtyShell
 from drivers.dynamixel.bench.chain import Chain
-from drivers.dynamixel.bench.pty_shell import PtyShell
 from drivers.dynamixel.bench.servo import Servo
 from drivers.dynamixel.config import BusConfig, DynamixelConfig, ServoConfig
 from drivers.dynamixel.joints import DynamixelJoints
@@ -44,7 +44,7 @@ def measure(seconds: float, return_delay_s: float, *, is_fast: bool) -> str:
             while time.monotonic() < begin + seconds:
                 reading = joints.read(0.1)
                 if reading is not None:
-                    truth = [sampling.t for sampling in shell.chain.samplings.values()]
+                    truth = [sampling.t for sampling in shell.device.samplings.values()]
                     off.append(reading.t - float(np.mean(truth)))
             spent, elapsed = time.thread_time() - used, time.monotonic() - begin
             dropped = joints.dropped

@@ -6,11 +6,11 @@ import math
 from collections.abc import Callable, Sequence
 from random import Random
 
+from drivers.bench.virtual_port import VirtualClock, VirtualPort, at_once
 from drivers.dynamixel.bench.chain import Chain
 from drivers.dynamixel.bench.faults import Planned
 from drivers.dynamixel.bench.frames import Code, instructions_in
 from drivers.dynamixel.bench.servo import Servo
-from drivers.dynamixel.bench.virtual_port import VirtualClock, VirtualPort, at_once
 from drivers.dynamixel.config import BusConfig, DynamixelConfig, ServoConfig
 from drivers.dynamixel.joints import DynamixelJoints
 from drivers.dynamixel.models import BY_NAME
