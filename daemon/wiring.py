@@ -7,6 +7,9 @@ from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
 
+from drivers.dynamixel.config import DynamixelConfig
+from drivers.feetech.config import FeetechConfig
+from drivers.serial_lines.config import SerialLinesConfig
 from interfaces.errors import ConfigError
 from interfaces.protocols import Clock, JointSource
 from kbmaps import RigidChain
@@ -47,15 +50,28 @@ def open_joints(config: Config, clock: Clock) -> JointSource:
         ConfigError: no servos are configured.
         StoreError: the store, which tells where they were last, cannot be read.
     """
-    from drivers.dynamixel.joints import DynamixelJoints
-
-    servos = config.tables.drivers.dynamixel
-    if servos is None:
+    hardware, joints = config.tables.drivers.hardware, config.robot.joints
+    if hardware is None:
         raise ConfigError(
-            "no servos are configured", file=config.file, remedy="Add the table [drivers.dynamixel]: docs/hardware.md"
+            "no servos or encoders are configured",
+            file=config.file,
+            remedy="Add the table [drivers.dynamixel], [drivers.feetech] or [drivers.serial_lines]: docs/hardware.md",
         )
     limits = list(zip(config.robot.lower.tolist(), config.robot.upper.tolist(), strict=True))
-    return DynamixelJoints(servos, config.robot.joints, clock, limits=limits, last_pose=_last_pose(config))
+    last_pose = _last_pose(config)
+    match hardware:
+        case DynamixelConfig():
+            from drivers.dynamixel.joints import DynamixelJoints
+
+            return DynamixelJoints(hardware, joints, clock, limits=limits, last_pose=last_pose)
+        case FeetechConfig():
+            from drivers.feetech.joints import FeetechJoints
+
+            return FeetechJoints(hardware, joints, clock, limits=limits, last_pose=last_pose)
+        case SerialLinesConfig():
+            from drivers.serial_lines.joints import SerialLineJoints
+
+            return SerialLineJoints(hardware, joints, clock, limits=limits, last_pose=last_pose)
 
 
 def _last_pose(config: Config) -> list[float] | None:
@@ -70,9 +86,9 @@ def _last_pose(config: Config) -> list[float] | None:
 def _require_source(config: Config, *, sim: bool) -> None:
     if sim or config.tables.drivers.recording is not None:
         return
-    if config.tables.drivers.dynamixel is not None:
+    if config.tables.drivers.hardware is not None:
         raise ConfigError(
-            "the joints are servos, but nothing tells where the marker is: no camera is configured",
+            "the joints have a driver, but nothing tells where the marker is: no camera is configured",
             file=config.file,
             remedy="Give --sim for the simulated robot, or name a recording as recording in the table [drivers]",
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 from heapq import heappop, heappush
@@ -49,13 +50,13 @@ class VirtualPort:
 
         Args:
             outwards: how long bytes need from the program to the wire [s], drawn anew for each packet.
-            inwards: how long from the wire to the program, drawn anew for each question.
+            inwards: how long from the wire to the program, drawn anew for each question, or what is said unasked.
         """
         self.device = device
         self._clock, self._baud = clock, baud
         self._outwards, self._inwards = outwards, inwards
         self._arriving: list[tuple[float, int, bytes]] = []
-        self._order = 0
+        self._order, self._brought_s = 0, 0.0
 
     @property
     def baud(self) -> int:
@@ -72,8 +73,8 @@ class VirtualPort:
 
     def receive(self, until: float) -> bytes:
         """What has arrived, else what arrives next; nothing when that is not before `until`."""
-        if self.device.speaks_at <= until:
-            self._bring(self.device.speak(until, self._baud))
+        while self.device.speaks_at <= min(until, self._arriving[0][0] if self._arriving else math.inf):
+            self._bring_in_order(self.device.speak(self.device.speaks_at, self._baud))
         if not self._arriving or self._arriving[0][0] > until:
             self._clock.wait_until(until)
             return b""
@@ -82,7 +83,16 @@ class VirtualPort:
 
     def flush(self) -> None:
         """Forget what has arrived."""
+        self._bring_in_order(self.device.speak(self._clock.now(), self._baud))
         self._arrived()
+
+    def _bring_in_order(self, replies: list[Reply]) -> None:
+        """What a device says of itself is not answered, so each is held back by itself, but none overtakes another."""
+        for reply in replies:
+            end = reply.start + len(reply.data) * byte_s(self._baud)
+            self._brought_s = max(self._brought_s, end + self._inwards())
+            self._order += 1
+            heappush(self._arriving, (self._brought_s, self._order, reply.data))
 
     def _bring(self, replies: list[Reply]) -> None:
         inwards_s = self._inwards()

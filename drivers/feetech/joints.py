@@ -39,7 +39,7 @@ def open_serial(config: BusConfig, clock: Clock) -> tuple[Port, float]:
 
 
 def block_requests(bus: ServoBus, servos: Sequence[FittedServo], config: BusConfig) -> list[Request]:
-    """The questions of one reading: one for all of the STS and SMS series that answer it, one for each of the others."""
+    """The questions of one reading: one for all of the STS and SMS series, one for each of the others."""
     together = [servo for servo in servos if servo.model.protocol == STS]
     if len(together) > 1 and config.sync_read == "auto":
         block, ids = together[0].model.layout.block, tuple(servo.id for servo in together)

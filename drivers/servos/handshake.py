@@ -47,6 +47,16 @@ class FittedServo:
     return_delay_s: float
     had_torque: bool = False
 
+    @property
+    def label(self) -> str:
+        """Its number, for messages."""
+        return f"ID {self.id}"
+
+    @property
+    def ticks_per_turn(self) -> int | None:
+        """After so many ticks its sensor tells the same again; None where it does not turn on."""
+        return self.model.ticks_per_turn
+
     def angle(self, ticks: int) -> float:
         """The joint's angle [rad] at a position with its turns [ticks]."""
         return self.direction * (ticks - self.zero_ticks) * self.model.rad_per_tick

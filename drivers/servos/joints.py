@@ -10,7 +10,8 @@ from itertools import zip_longest
 from types import TracebackType
 from typing import Any, Self
 
-from drivers.turns import SpeedGate, nearest_turn
+from drivers.turn_count import TurnCount
+from drivers.turns import SpeedGate
 from interfaces.errors import SourceError, SourceLost
 from interfaces.protocols import Clock
 from interfaces.records import JointReading, frozen_array
@@ -29,7 +30,6 @@ FEW_POLLS = 3  # so many have to fail besides: the program itself may have been 
 DOUBTS = 5  # so many answers in a row that cannot be: the servo was restarted
 LOOK_AFTER_S = 0.1  # one servo's torque and health in turn
 ANCHOR_POLLS = 50
-LOOK_AGAIN_S = 1.0  # whether a joint was turned back
 SLACK_TICKS = 3
 GOLDEN = 0.618034  # multiples of it, modulo 1, are spread most evenly
 
@@ -74,8 +74,8 @@ class ServoJoints:
         self._open_port = open_port
         by_joint = {servo.joint: servo for servo in config.servos}
         self._wanted = [by_joint[joint] for joint in joints]
-        self._limits = [(-math.inf, math.inf)] * len(joints) if limits is None else list(limits)
-        self._last_pose = None if last_pose is None else [float(q) for q in last_pose]
+        unlimited = [(-math.inf, math.inf)] * len(joints)
+        self._turns = TurnCount(limits or unlimited, last_pose, config.max_move_deg, config.table)
         self._buses: dict[str, Bus] = {}
         self._requests: dict[str, list[Request]] = {}
         self._opened = ExitStack()
@@ -83,7 +83,6 @@ class ServoJoints:
         self._had_torque: set[str] = set()
         self._channels: list[Channel] = []
         self._at: dict[tuple[str, int], int] = {}
-        self._counts: list[int] = []
         self._last_t = -math.inf
         self._alerts: dict[str, int] = {}
         self.servos: list[FittedServo] = []
@@ -192,49 +191,17 @@ class ServoJoints:
             samples = self._ask_all()
             if samples is None:
                 continue
+            raw = [sample.ticks for sample in samples]
             if believed == 0:
-                self._counts = [self._nearest(place, sample.ticks) for place, sample in enumerate(samples)]
-            counts = self._continued(samples)
+                self._turns.begin(self.servos, raw)
+            counts = self._turns.continued(raw)
             believed = believed + 1 if self._gate.offer(middle(samples), counts) is None else 0
             if believed == 2:
-                self._counts = counts
-                self._check_turns(samples)
+                self._turns.counts = counts
+                self._turns.check(raw)
                 self._believed_s, self._failures = self._clock.now(), 0
                 return
         raise SourceLost(f"the servos cannot be read: {self._why}", retry_s=RETRY_S)
-
-    def _nearest(self, place: int, ticks: int) -> int:
-        servo, (lower, upper) = self.servos[place], self._limits[place]
-        turn = servo.model.ticks_per_turn
-        if upper - lower < 2 * math.pi:
-            return nearest_turn(ticks, servo.ticks((lower + upper) / 2), turn)
-        if self._last_pose is not None:
-            return nearest_turn(ticks, servo.ticks(self._last_pose[place]), turn)
-        return ticks
-
-    def _check_turns(self, samples: list[Sample]) -> None:
-        """SourceLost when a joint of several turns is not where it was: nothing tells its turn then."""
-        if self._last_pose is None:
-            return
-        for place, (servo, count) in enumerate(zip(self.servos, self._counts, strict=True)):
-            lower, upper = self._limits[place]
-            if upper - lower < 2 * math.pi:
-                continue
-            was, now = self._last_pose[place], servo.angle(count)
-            if abs(now - was) > math.radians(self._config.max_move_deg):
-                raise SourceLost(
-                    f"joint {servo.joint!r} (ID {servo.id}) was at {math.degrees(was):.0f}° and is now at "
-                    f"{math.degrees(now):.0f}°, or whole turns from there: its turn count is lost. "
-                    f"Turn it back to within {self._config.max_move_deg:.0f}° of where it was, or set max_move_deg "
-                    f"in [{self._make.table}] to 179 to take the nearest turn",
-                    retry_s=LOOK_AGAIN_S,
-                )
-            if count != samples[place].ticks:
-                log.info("joint %r: %+d turns are added to what its servo counts", *self._turns(place, count, samples))
-
-    def _turns(self, place: int, count: int, samples: list[Sample]) -> tuple[str, int]:
-        servo = self.servos[place]
-        return servo.joint, round((count - samples[place].ticks) / (servo.model.ticks_per_turn or 1))
 
     def _say_opened(self) -> None:
         switched = [servo.joint for servo in self.servos if servo.had_torque]
@@ -313,7 +280,7 @@ class ServoJoints:
 
     def _judge(self, samples: list[Sample]) -> JointReading | None:
         t = middle(samples)
-        counts = self._continued(samples)
+        counts = self._turns.continued([sample.ticks for sample in samples])
         refused = self._gate.offer(t, counts)
         if refused is not None:
             servo = self.servos[refused]
@@ -323,14 +290,8 @@ class ServoJoints:
             return None
         if t <= self._last_t:
             return None
-        self._counts, self._last_t = counts, t
-        q = [servo.angle(count) for servo, count in zip(self.servos, counts, strict=True)]
-        self._last_pose = q
-        return JointReading(t, frozen_array(q))
-
-    def _continued(self, samples: list[Sample]) -> list[int]:
-        together = zip(self.servos, samples, self._counts, strict=True)
-        return [nearest_turn(sample.ticks, count, servo.model.ticks_per_turn) for servo, sample, count in together]
+        self._last_t = t
+        return JointReading(t, frozen_array(self._turns.keep(counts)))
 
     def _dropped_one(self) -> None:
         self.dropped += 1

@@ -47,7 +47,7 @@ class Chain(ServoChain[Servo]):
             case Code.PING | Code.ACTION | Code.RESET:
                 return True
             case Code.READ:
-                return len(params) == 2 and 0 < params[1] and sum(params) <= servo.model.layout.size
+                return len(params) == 2 and params[1] > 0 and sum(params) <= servo.model.layout.size
             case Code.WRITE | Code.REG_WRITE:
                 return len(params) > 1
             case _:
