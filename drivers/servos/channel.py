@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
+from statistics import median
 
 from .bus import Answer
 from .handshake import FittedServo
 
 SURPRISE_TICKS = 4
+LATELY = 51  # readings that tell what is usual
+HELD_UP_S = 0.3e-3
 SHORTEST_S = 1e-3  # between two samples that make a trend
 VOLTAGE_STEP, TEMPERATURE_STEP = 15, 3  # these change slowly: 0.1 V, K
 
@@ -102,19 +106,35 @@ class Channel(ABC):
         return True
 
 
-def middle(samples: Sequence[Sample]) -> float:
-    """The middle of the time in which the positions were taken [s].
+def middle(samples: Sequence[Sample]) -> tuple[float, float]:
+    """The middle of the time in which the positions were taken [s], and by how much it may be wrong at most [s].
 
     On one bus only the question can have been held up: the servos answer as the wire goes on. So one delay, which is in
     the bounds of all, moves them all.
     """
-    total = 0.0
+    total = unsure = 0.0
     for bus in {sample.bus for sample in samples}:
         there = [sample for sample in samples if sample.bus == bus]
         least = max(sample.earliest - sample.expected for sample in there)
         most = min(sample.latest - sample.expected for sample in there)
         if least <= most:
             total += sum(sample.expected for sample in there) + len(there) * (least + most) / 2
+            unsure += len(there) * (most - least) / 2
         else:
             total += sum(sample.earliest + sample.latest for sample in there) / 2
-    return total / len(samples)
+            unsure += sum(sample.latest - sample.earliest for sample in there) / 2
+    return total / len(samples), unsure / len(samples)
+
+
+class Punctuality:
+    """Tells readings that were held up so long that their time is not known as well as that of most."""
+
+    def __init__(self) -> None:
+        """No reading yet."""
+        self._unsure: deque[float] = deque(maxlen=LATELY)
+
+    def is_usual(self, unsure: float) -> bool:
+        """Whether a reading's time is known about as well as usual, which this one takes part in."""
+        self._unsure.append(unsure)
+        usual = median(self._unsure)
+        return unsure <= max(usual + HELD_UP_S, 2 * usual)

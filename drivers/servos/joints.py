@@ -17,7 +17,7 @@ from interfaces.protocols import Clock
 from interfaces.records import JointReading, frozen_array
 
 from .bus import Bus, Exchange, Request
-from .channel import Channel, Sample, middle
+from .channel import Channel, Punctuality, Sample, middle
 from .config import ServoConfig, ServosConfig
 from .handshake import RETRY_S, Finding, FittedServo, identify, require_all, restore_torque, switch_torque_off
 from .make import Make
@@ -179,6 +179,7 @@ class ServoJoints:
         self._at = {(servo.bus, servo.id): place for place, servo in enumerate(self.servos)}
         speed = math.radians(self._config.max_speed_deg_s)
         self._gate = SpeedGate([speed / s.model.rad_per_tick for s in self.servos], [SLACK_TICKS] * len(self.servos))
+        self._punctuality = Punctuality()
         now = self._clock.now()
         self._believed_s, self._failures, self._next_poll, self._next_look = now, 0, now, now
         self._looked = self._polls = 0
@@ -195,7 +196,7 @@ class ServoJoints:
             if believed == 0:
                 self._turns.begin(self.servos, raw)
             counts = self._turns.continued(raw)
-            believed = believed + 1 if self._gate.offer(middle(samples), counts) is None else 0
+            believed = believed + 1 if self._gate.offer(middle(samples)[0], counts) is None else 0
             if believed == 2:
                 self._turns.counts = counts
                 self._turns.check(raw)
@@ -279,7 +280,10 @@ class ServoJoints:
         return again is not None and channel.agrees(sample, again, math.radians(self._config.max_speed_deg_s))
 
     def _judge(self, samples: list[Sample]) -> JointReading | None:
-        t = middle(samples)
+        t, unsure = middle(samples)
+        if not self._punctuality.is_usual(unsure):
+            self._why = "an answer that was held up"
+            return None
         counts = self._turns.continued([sample.ticks for sample in samples])
         refused = self._gate.offer(t, counts)
         if refused is not None:
