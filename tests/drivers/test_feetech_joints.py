@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import logging
 import math
+from dataclasses import replace
 from random import Random
 
 import numpy as np
 import pytest
 from bench_arm import TICK, swing
 from feetech_arm import FeetechArm
+from hypothesis import given
+from hypothesis import strategies as st
 
 from drivers.bench.faults import corrupt, garbage, half, late, mute, wrong_checksum
 from drivers.feetech.bench.faults import storm, swapped
 from drivers.feetech.bench.servo import Servo
 from drivers.feetech.models import BY_NAME
+from drivers.servos.channel import Punctuality
 from interfaces.errors import SourceError, SourceLost
 from interfaces.records import JointReading
 
@@ -240,6 +244,22 @@ def test_times_are_those_of_the_sampling_to_half_a_millisecond() -> None:
     with (arm := FeetechArm(("STS3215",) * 6, latency_s=1e-3)).joints:
         off = [abs(reading.t - arm.sampled()) for reading in (read(arm)[0] for _ in range(1000))]
     assert np.percentile(off, 99) < 0.5e-3
+
+
+def test_a_reading_that_was_held_up_is_dropped_where_no_clock_tells_its_time() -> None:
+    with (arm := FeetechArm(("STS3215",) * 6)).joints:
+        read(arm, 60)
+        arm.faults.add(1, lambda reply, _: replace(reply, start=reply.start + 2e-3), 1)
+        dropped = arm.joints.dropped
+        read(arm, 5)
+        assert arm.joints.dropped == dropped + 1
+
+
+@given(st.lists(st.floats(0, 8e-3), min_size=60, max_size=200))
+def test_most_readings_of_an_adapter_that_holds_bytes_back_are_kept(unsure) -> None:
+    punctuality = Punctuality()
+    kept = [punctuality.is_usual(width) for width in unsure]
+    assert sum(kept) >= len(kept) // 2 - 1
 
 
 def test_six_servos_are_read_two_hundred_times_a_second() -> None:

@@ -116,8 +116,21 @@ def test_a_header_and_a_reading_are_taken_apart() -> None:
 
 @pytest.mark.parametrize(
     "content",
-    "H,2,7,1,a,4096 H,1,70000,1,a,4096 H,1,7,2,a,4096 H,1,7,2,a,4096,a,4096 H,1,7,1,a,1 H,1,7,1,,4096 "
-    "1,2 65536,1,1 1,4294967296,1 1,1,1.5 1,1, -1,1,1 a,1,1".split(),
+    [
+        "H,2,7,1,a,4096",
+        "H,1,70000,1,a,4096",
+        "H,1,7,2,a,4096",
+        "H,1,7,2,a,4096,a,4096",
+        "H,1,7,1,a,1",
+        "H,1,7,1,,4096",
+        "1,2",
+        "65536,1,1",
+        "1,4294967296,1",
+        "1,1,1.5",
+        "1,1,",
+        "-1,1,1",
+        "a,1,1",
+    ],
 )
 def test_a_line_with_a_right_checksum_and_a_wrong_content_is_refused(content) -> None:
     with pytest.raises(GarbledLine):
