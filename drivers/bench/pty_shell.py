@@ -10,6 +10,7 @@ import threading
 import time
 import tty
 from collections.abc import Callable
+from contextlib import suppress
 from heapq import heappop, heappush
 from pathlib import Path
 from types import TracebackType
@@ -72,6 +73,7 @@ class _Serving:
         self._master, self._slave = os.openpty()
         tty.setraw(self._master)
         tty.setraw(self._slave)
+        os.set_blocking(self._master, False)
         self._wake, self._waker = os.pipe()
         self.name = os.ttyname(self._slave)
         self._due: list[tuple[float, int, bytes]] = []
@@ -96,7 +98,8 @@ class _Serving:
             if self._device.speaks_at <= self._now():
                 self._bring(self._device.speak(self._now(), self._baud), self._baud)
             while self._due and self._due[0][0] <= self._now():
-                os.write(self._master, heappop(self._due)[2])
+                with suppress(BlockingIOError):  # nobody has read for long: what is said now is lost
+                    os.write(self._master, heappop(self._due)[2])
 
     @property
     def _next(self) -> float:

@@ -9,7 +9,7 @@ from drivers.device_clock import StreamClock
 
 from .lines import LONGEST, SEQUENCES, STAMP_S, STAMPS, GarbledLine, Header, Reading, parse
 
-DOUBTS = 5  # so many lines in a row from another time: the board was restarted
+DOUBTS = 5  # so many lines in a row from another time: the board was restarted, or the program stood still
 
 
 @dataclass

@@ -268,7 +268,7 @@ class SerialLineJoints:
         garbled = self.counts.garbled
         self._board.hear(data, self._clock.now())
         if self._board.restarted:
-            raise SourceLost("the board was restarted", retry_s=RETRY_S)
+            raise SourceLost("the board was restarted, or its lines were held up", retry_s=RETRY_S)
         if data:
             self._heard_s = self._clock.now()
         if self.counts.garbled > garbled:

@@ -283,6 +283,7 @@ class ServoJoints:
         t, unsure = middle(samples)
         if not self._punctuality.is_usual(unsure):
             self._why = "an answer that was held up"
+            self._believed_s = self._clock.now()  # they are all there
             return None
         counts = self._turns.continued([sample.ticks for sample in samples])
         refused = self._gate.offer(t, counts)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from random import Random
+from typing import Literal
 
 from drivers.bench.virtual_port import VirtualClock, VirtualPort, at_once
 from drivers.dynamixel.bench.chain import Chain
@@ -53,7 +54,7 @@ class Arm:
         latency_s: float = 0.0,
         delay_s: float = 0.0,
         seed: int = 0,
-        fast: str = "auto",
+        fast: Literal["auto", "never"] = "auto",
         limits: Sequence[tuple[float, float]] | None = None,
         last_pose: Sequence[float] | None = None,
         **settings,

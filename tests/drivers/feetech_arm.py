@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from random import Random
+from typing import Literal
 
 from bench_arm import Path, swing
 
@@ -45,7 +46,7 @@ class FeetechArm:
         latency_s: float = 0.0,
         delay_s: float = 0.0,
         seed: int = 0,
-        sync: str = "auto",
+        sync: Literal["auto", "never"] = "auto",
         limits: Sequence[tuple[float, float]] | None = None,
         last_pose: Sequence[float] | None = None,
         multi_turn: bool = False,

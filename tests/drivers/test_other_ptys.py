@@ -96,3 +96,17 @@ def test_an_unplugged_port_is_told_once_and_is_back_within_a_second_of_the_replu
     assert "is gone" in caplog.messages[0]
     assert (source.losses, joints.epoch) == (1, 2)
     assert after.t > before.t
+
+
+def test_a_board_that_nobody_reads_for_long_can_be_unplugged_and_is_read_again(tmp_path) -> None:
+    angles = {name: (4096, swing(id)) for name, id in zip(NAMES, IDS, strict=True)}
+    board = EncoderBoard(angles, rate_hz=100.0, begun_s=time.monotonic() - 60.0)  # a minute to say at once
+    with PtyShell(board, tmp_path / "bus") as shell:
+        config = SerialLinesConfig(str(shell.link), tuple(EncoderConfig(name) for name in NAMES))
+        deadline = time.monotonic() + LIMIT_S
+        while board.speaks_at < time.monotonic() - 1.0:
+            assert time.monotonic() < deadline
+        shell.unplug()
+        shell.plug_in()
+        with SerialLineJoints(config, NAMES, SystemClock(), limits=LIMITS) as joints:
+            wait_for_reading(joints)

@@ -69,6 +69,7 @@ class BoardArm:
         limits=None,
         last_pose=None,
         seed: int = 0,
+        rate_hz: float = 200.0,
         **settings,
     ) -> None:
         self.clock, rng = VirtualClock(), Random(seed)
@@ -76,7 +77,7 @@ class BoardArm:
         self.names = tuple(f"joint{k}" for k in range(1, len(self.paths) + 1))
         self.faults = Planned(rng)
         angles = {name: (ticks, path) for name, path in zip(self.names, self.paths, strict=True)}
-        self.board = EncoderBoard(angles, begun_s=97.0, drift=drift, faults=self.faults)
+        self.board = EncoderBoard(angles, begun_s=97.0, rate_hz=rate_hz, drift=drift, faults=self.faults)
         jitter = (lambda: rng.uniform(0, latency_s)) if latency_s else at_once
         self.port = VirtualPort(self.board, self.clock, baud, inwards=jitter)
         entries = tuple(EncoderConfig(name, **encoders) for name in self.names)  # pyright: ignore[reportArgumentType]

@@ -101,7 +101,7 @@ def test_a_stream_s_stamp_of_another_time_is_refused_and_does_no_harm(late_s) ->
 
 
 def test_a_stream_that_begins_with_a_backlog_is_soon_right() -> None:
-    clock = StreamClock(1e-6, 2**32)
+    clock, t = StreamClock(1e-6, 2**32), None
     for k in range(400):
         true = 50.0 + k * 5e-3
         t = clock.time(max(true, 50.3), int(true / 1e-6))

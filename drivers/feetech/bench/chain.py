@@ -27,7 +27,7 @@ class Chain(ServoChain[Servo]):
         hearing, params = self._listening(baud), instruction.params
         if instruction.code == Code.SYNC_READ:
             knowing = [servo for servo in hearing if servo.knows_sync_read]
-            asked = [(id, *params[:2]) for id in params[2:]]
+            asked = [(id, params[0], params[1]) for id in params[2:]]
             return self._in_turn(knowing, asked, t, Code.SYNC_READ)
         if instruction.code == Code.SYNC_WRITE:
             self._sync_write(hearing, params, t)

@@ -67,14 +67,12 @@ class EncoderBoard:
         replies: list[Reply] = []
         while self._next_s <= until:
             said = self._said(self._next_s)
-            start = max(self._next_s, self._busy_until)
-            self._busy_until = start + len(said) * byte_s(baud)
-            replies.append(self.faults(Reply(0, start, said)))
-            self._next_s += self._period_s
+            replies.append(self.faults(Reply(0, self._next_s, said)))
+            self._next_s += max(self._period_s, len(said) * byte_s(baud))  # it measures when the last line is out
         return [reply for reply in replies if reply.data]
 
     def _start(self, t: float, boot: int) -> None:
-        self._boot, self._begun_s, self._next_s, self._busy_until = boot, t, t, t
+        self._boot, self._begun_s, self._next_s = boot, t, t
         self._seq, self._header_s = 0, -math.inf
         self._owes_header = True
 
