@@ -1,4 +1,4 @@
-"""How many wrong readings the Dynamixel driver believes when answers are lost, late, corrupt, cut, swapped, in garbage.
+"""How many wrong readings the drivers believe when answers are lost, late, corrupt, cut, swapped, in garbage.
 
 Virtual time, so millions of transactions in minutes. Type: python -m benchmarks.fault_storm --transactions 10_000_000
 """
@@ -9,25 +9,38 @@ import argparse
 import math
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from random import Random
+from typing import Any
 
+from drivers.bench.device import Device
+from drivers.bench.faults import Storm
+from drivers.bench.faults import storm as storm_of_lines
+from drivers.bench.virtual_port import VirtualClock, VirtualPort
 from drivers.dynamixel.bench.chain import Chain
-from drivers.dynamixel.bench.faults import Storm, storm
+from drivers.dynamixel.bench.faults import storm as storm_of_dynamixel
 from drivers.dynamixel.bench.servo import Servo
-from drivers.dynamixel.bench.virtual_port import VirtualClock, VirtualPort
 from drivers.dynamixel.config import BusConfig, DynamixelConfig, ServoConfig
 from drivers.dynamixel.joints import DynamixelJoints
 from drivers.dynamixel.models import BY_NAME
+from drivers.feetech.bench.chain import Chain as FeetechChain
+from drivers.feetech.bench.faults import storm as storm_of_feetech
+from drivers.feetech.bench.servo import Servo as FeetechServo
+from drivers.feetech.config import BusConfig as FeetechBus
+from drivers.feetech.config import FeetechConfig
+from drivers.feetech.joints import FeetechJoints
+from drivers.feetech.models import BY_NAME as FEETECH_MODELS
+from drivers.serial_lines.bench.board import EncoderBoard
+from drivers.serial_lines.config import EncoderConfig, SerialLinesConfig
+from drivers.serial_lines.joints import SerialLineJoints
 from interfaces.errors import SourceLost
 
-ARMS = {
-    "Protocol 2.0, Sync Read": ("XM430-W350", "never"),
-    "Protocol 2.0, Fast Sync Read": ("XM430-W350", "auto"),
-    "Protocol 1.0": ("MX-28", "never"),
-}
 JOINTS = 3
+NAMES = [f"joint{k}" for k in range(1, JOINTS + 1)]
+LIMITS = [(-2.0, 2.0)] * JOINTS
 FASTEST = 1.2 * 0.7  # [rad/s], of the paths below
 TIMING_S = 2e-3  # all joints count as read at one time
+LINE_BAUD = 460_800
 TELL_EVERY_S = 30.0
 
 
@@ -36,46 +49,107 @@ def swing(phase: float) -> Callable[[float], float]:
     return lambda t: 1.2 * math.sin(0.7 * t + phase)
 
 
-def run(model: str, fast: str, transactions: int, intensity: float, seed: int) -> str:
+@dataclass
+class Rig:
+    """A driver with a bench behind it.
+
+    Attributes:
+        device: whose faults are the storm.
+        transactions: how many there were: questions, or lines.
+        rad_per_tick: of its sensors.
+        parts: so many answers make a reading.
+    """
+
+    device: Any
+    joints: Any
+    transactions: Callable[[], int]
+    storm: Callable[[float, Random], Storm]
+    rad_per_tick: float
+    parts: int
+
+
+def _port(device: Device, clock: VirtualClock, rng: Random, baud: int = 1_000_000) -> VirtualPort:
+    return VirtualPort(device, clock, baud, outwards=lambda: rng.uniform(0, 1e-4), inwards=lambda: rng.uniform(0, 3e-4))
+
+
+def dynamixel(clock: VirtualClock, rng: Random, model: str, *, is_fast: bool) -> Rig:
+    """Dynamixel servos."""
+    chain = Chain(
+        Servo(BY_NAME[model], k, swing(k), return_delay_s=0.0, booted_s=0.1 * k) for k in range(1, JOINTS + 1)
+    )
+    port = _port(chain, clock, rng)
+    bus = BusConfig("bench", fast_sync_read="auto" if is_fast else "never")
+    config = DynamixelConfig({"arm": bus}, tuple(ServoConfig(name, k, model) for k, name in enumerate(NAMES, 1)))
+    joints = DynamixelJoints(config, NAMES, clock, limits=LIMITS, open_port=lambda *_: (port, 2e-4))
+    step, parts = BY_NAME[model].rad_per_tick, 1 if is_fast else JOINTS
+    return Rig(chain, joints, lambda: chain.instructions, storm_of_dynamixel, step, parts)
+
+
+def feetech(clock: VirtualClock, rng: Random, model: str) -> Rig:
+    """Feetech servos."""
+    servos = (FeetechServo(FEETECH_MODELS[model], k, swing(k), return_delay_s=0.0) for k in range(1, JOINTS + 1))
+    chain = FeetechChain(servos)
+    port = _port(chain, clock, rng)
+    entries = tuple(ServoConfig(name, k, model) for k, name in enumerate(NAMES, 1))
+    config = FeetechConfig({"arm": FeetechBus("bench")}, entries)
+    joints = FeetechJoints(config, NAMES, clock, limits=LIMITS, open_port=lambda *_: (port, 2e-4))
+    step = FEETECH_MODELS[model].rad_per_tick
+    return Rig(chain, joints, lambda: chain.instructions, storm_of_feetech, step, JOINTS)
+
+
+def lines(clock: VirtualClock, rng: Random) -> Rig:
+    """Own encoders."""
+    encoders = {name: (4096, swing(k)) for k, name in enumerate(NAMES, 1)}
+    board = EncoderBoard(encoders, begun_s=clock.now(), drift=1e-4)
+    port = _port(board, clock, rng, LINE_BAUD)
+    config = SerialLinesConfig("bench", tuple(EncoderConfig(name) for name in NAMES), LINE_BAUD)
+    joints = SerialLineJoints(config, NAMES, clock, limits=LIMITS, open_port=lambda *_: port)
+    return Rig(board, joints, lambda: board.lines, storm_of_lines, 2 * math.pi / 4096, 1)
+
+
+KINDS: dict[str, Callable[[VirtualClock, Random], Rig]] = {
+    "Dynamixel Protocol 2.0, Sync Read": lambda clock, rng: dynamixel(clock, rng, "XM430-W350", is_fast=False),
+    "Dynamixel Protocol 2.0, Fast Sync Read": lambda clock, rng: dynamixel(clock, rng, "XM430-W350", is_fast=True),
+    "Dynamixel Protocol 1.0": lambda clock, rng: dynamixel(clock, rng, "MX-28", is_fast=False),
+    "Feetech STS, Sync Read": lambda clock, rng: feetech(clock, rng, "STS3215"),
+    "Feetech SCS": lambda clock, rng: feetech(clock, rng, "SCS0009"),
+    "serial lines": lines,
+}
+
+
+def run(make: Callable[[VirtualClock, Random], Rig], transactions: int, intensity: float, seed: int) -> str:
     """So many transactions with so many answers struck; a line about them."""
     clock, rng = VirtualClock(), Random(seed)
-    servos = [Servo(BY_NAME[model], k, swing(k), return_delay_s=0.0, booted_s=0.1 * k) for k in range(1, JOINTS + 1)]
-    chain = Chain(servos)
-    port = VirtualPort(chain, clock, outwards=lambda: rng.uniform(0, 1e-4), inwards=lambda: rng.uniform(0, 3e-4))
-    names = [f"joint{k}" for k in range(1, JOINTS + 1)]
-    entries = tuple(ServoConfig(name, k, model) for k, name in enumerate(names, 1))
-    config = DynamixelConfig({"arm": BusConfig("bench", fast_sync_read="auto" if fast == "auto" else "never")}, entries)
-    limits = [(-2.0, 2.0)] * JOINTS
-    joints = DynamixelJoints(config, names, clock, limits=limits, open_port=lambda *_: (port, 2e-4))
-    tolerance = BY_NAME[model].rad_per_tick + FASTEST * TIMING_S
+    rig = make(clock, rng)
+    tolerance = rig.rad_per_tick + FASTEST * TIMING_S
     faults: Storm | None = None
     believed = wrong = losses = 0
     worst = 0.0
     told = time.monotonic()
-    calm = chain.faults
-    while chain.instructions < transactions:
-        chain.faults = calm
-        with joints:
-            chain.faults = faults = storm(intensity, rng) if faults is None else faults
+    calm = rig.device.faults
+    while rig.transactions() < transactions:
+        rig.device.faults = calm
+        with rig.joints:
+            rig.device.faults = faults = rig.storm(intensity, rng) if faults is None else faults
             try:
-                while chain.instructions < transactions:
-                    reading = joints.read(1.0)
+                while rig.transactions() < transactions:
+                    reading = rig.joints.read(1.0)
                     if reading is None:
                         continue
                     off = max(abs(q - swing(k)(reading.t)) for k, q in enumerate(reading.q.tolist(), 1))
                     believed, wrong, worst = believed + 1, wrong + (off > tolerance), max(worst, off)
                     if time.monotonic() - told > TELL_EVERY_S:
                         told = time.monotonic()
-                        print(f"  {chain.instructions:,} transactions, {wrong} wrong", flush=True)
+                        print(f"  {rig.transactions():,} transactions, {wrong} wrong", flush=True)
             except SourceLost:
                 losses += 1
     struck = 0 if faults is None else sum(faults.struck.values())
-    share = believed / (believed + joints.dropped)
-    possible = (1 - intensity) ** (1 if fast == "auto" else JOINTS)
+    asked = rig.transactions() if rig.joints.__class__ is SerialLineJoints else believed + rig.joints.dropped
+    possible = (1 - intensity) ** rig.parts
     return (
-        f"{chain.instructions:,} transactions, {struck:,} faults, {believed:,} readings believed, "
+        f"{rig.transactions():,} transactions, {struck:,} faults, {believed:,} readings believed, "
         f"{wrong} of them wrong (worst {math.degrees(worst):.2f}°), "
-        f"{share:.4f} of the readings where faults leave {possible:.4f}, "
+        f"{believed / asked:.4f} of the readings where faults leave {possible:.4f}, "
         f"opened anew {losses} times"
     )
 
@@ -86,11 +160,13 @@ def main() -> None:
     parser.add_argument("--transactions", type=int, default=100_000, help="shared among the kinds of bus")
     parser.add_argument("--intensity", type=float, default=0.02, help="probability that an answer is struck")
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--only", choices=tuple(KINDS), help="this kind alone")
     given = parser.parse_args()
-    for name, (model, fast) in ARMS.items():
+    kinds = KINDS if given.only is None else {given.only: KINDS[given.only]}
+    for name, make in kinds.items():
         begin = time.monotonic()
-        line = run(model, fast, given.transactions // len(ARMS), given.intensity, given.seed)
-        print(f"{name}: {line}, {time.monotonic() - begin:.0f} s")
+        line = run(make, given.transactions // len(kinds), given.intensity, given.seed)
+        print(f"{name}: {line}, {time.monotonic() - begin:.0f} s", flush=True)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Six servos on a pseudo-terminal with the wire time of 1 Mbit/s: rate, processor time and time stamps of the driver.
+"""Six servos on a pseudo-terminal with the wire time of 1 Mbit/s: rate, processor time and time stamps of the drivers.
 
 Type: python -m benchmarks.servo_bus
 """
@@ -14,15 +14,26 @@ from pathlib import Path
 
 import numpy as np
 
+from drivers.bench.device import Device, Sampling
+from drivers.bench.pty_shell import PtyShell
 from drivers.dynamixel.bench.chain import Chain
-from drivers.dynamixel.bench.pty_shell import PtyShell
 from drivers.dynamixel.bench.servo import Servo
 from drivers.dynamixel.config import BusConfig, DynamixelConfig, ServoConfig
 from drivers.dynamixel.joints import DynamixelJoints
 from drivers.dynamixel.models import BY_NAME
+from drivers.feetech.bench.chain import Chain as FeetechChain
+from drivers.feetech.bench.servo import Servo as FeetechServo
+from drivers.feetech.config import BusConfig as FeetechBus
+from drivers.feetech.config import FeetechConfig
+from drivers.feetech.joints import FeetechJoints
+from drivers.feetech.models import BY_NAME as FEETECH_MODELS
+from drivers.servos.joints import ServoJoints
 from interfaces.clock import SystemClock
 
-MODEL = "XM430-W350"
+IDS = range(1, 7)
+NAMES = [f"joint{k}" for k in IDS]
+MODEL, FEETECH_MODEL = "XM430-W350", "STS3215"
+Open = Callable[[str], ServoJoints]
 
 
 def swing(phase: float) -> Callable[[float], float]:
@@ -30,27 +41,45 @@ def swing(phase: float) -> Callable[[float], float]:
     return lambda t: 1.2 * math.sin(0.7 * t + phase)
 
 
-def measure(seconds: float, return_delay_s: float, *, is_fast: bool) -> str:
+def dynamixel(return_delay_s: float, *, is_fast: bool) -> tuple[Chain, Open]:
+    """A chain of Dynamixel servos, and the driver at a port."""
+    servos = [Servo(BY_NAME[MODEL], k, swing(k), return_delay_s=return_delay_s, booted_s=0.1234 * k) for k in IDS]
+    entries = tuple(ServoConfig(name, k, MODEL) for name, k in zip(NAMES, IDS, strict=True))
+
+    def driver(port: str) -> ServoJoints:
+        bus = BusConfig(port, fast_sync_read="auto" if is_fast else "never")
+        return DynamixelJoints(DynamixelConfig({"arm": bus}, entries), NAMES, SystemClock())
+
+    return Chain(servos), driver
+
+
+def feetech(return_delay_s: float, *, is_sync: bool) -> tuple[FeetechChain, Open]:
+    """A chain of Feetech servos, and the driver at a port."""
+    servos = [FeetechServo(FEETECH_MODELS[FEETECH_MODEL], k, swing(k), return_delay_s=return_delay_s) for k in IDS]
+    entries = tuple(ServoConfig(name, k, FEETECH_MODEL) for name, k in zip(NAMES, IDS, strict=True))
+
+    def driver(port: str) -> ServoJoints:
+        bus = FeetechBus(port, sync_read="auto" if is_sync else "never")
+        return FeetechJoints(FeetechConfig({"arm": bus}, entries), NAMES, SystemClock(), limits=[(-2.0, 2.0)] * 6)
+
+    return FeetechChain(servos), driver
+
+
+def measure(device: Device, samplings: dict[int, Sampling], driver: Open, seconds: float) -> str:
     """A line about reading for so long."""
-    ids = range(1, 7)
-    servos = [Servo(BY_NAME[MODEL], k, swing(k), return_delay_s=return_delay_s, booted_s=0.1234 * k) for k in ids]
-    entries = tuple(ServoConfig(f"joint{k}", k, MODEL) for k in ids)
-    with tempfile.TemporaryDirectory() as folder, PtyShell(Chain(servos), Path(folder) / "bus") as shell:
-        bus = BusConfig(str(shell.link), fast_sync_read="auto" if is_fast else "never")
-        config = DynamixelConfig({"arm": bus}, entries)
-        with DynamixelJoints(config, [entry.joint for entry in entries], SystemClock()) as joints:
-            off: list[float] = []
+    off: list[float] = []
+    with tempfile.TemporaryDirectory() as folder, PtyShell(device, Path(folder) / "bus") as shell:
+        joints = driver(str(shell.link))
+        with joints:
             begin, used = time.monotonic(), time.thread_time()
             while time.monotonic() < begin + seconds:
                 reading = joints.read(0.1)
                 if reading is not None:
-                    truth = [sampling.t for sampling in shell.chain.samplings.values()]
-                    off.append(reading.t - float(np.mean(truth)))
+                    off.append(reading.t - float(np.mean([sampling.t for sampling in samplings.values()])))
             spent, elapsed = time.thread_time() - used, time.monotonic() - begin
-            dropped = joints.dropped
     p50, p99 = np.percentile(np.abs(off), (50, 99)) * 1e3
     return (
-        f"{len(off) / elapsed:.0f} readings/s, {spent / elapsed:.1%} of a core, {dropped} dropped, "
+        f"{len(off) / elapsed:.0f} readings/s, {spent / elapsed:.1%} of a core, {joints.dropped} dropped, "
         f"time stamps off by {p50:.3f} ms (p50), {p99:.3f} ms (p99)"
     )
 
@@ -60,10 +89,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seconds", type=float, default=5.0)
     seconds = parser.parse_args().seconds
-    for is_fast in (True, False):
-        for delay_us in (0, 500):
-            name = f"{'Fast Sync Read' if is_fast else 'Sync Read'}, return delay {delay_us} us"
-            print(f"{name}: {measure(seconds, delay_us * 1e-6, is_fast=is_fast)}", flush=True)
+    for delay_us in (0, 500):
+        for how, (chain, driver) in {
+            "Dynamixel, Fast Sync Read": dynamixel(delay_us * 1e-6, is_fast=True),
+            "Dynamixel, Sync Read": dynamixel(delay_us * 1e-6, is_fast=False),
+            "Feetech, Sync Read": feetech(delay_us * 1e-6, is_sync=True),
+            "Feetech, one by one": feetech(delay_us * 1e-6, is_sync=False),
+        }.items():
+            line = measure(chain, chain.samplings, driver, seconds)
+            print(f"{how}, return delay {delay_us} us: {line}", flush=True)
 
 
 if __name__ == "__main__":

@@ -8,6 +8,10 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from drivers.dynamixel.config import DynamixelConfig
+from drivers.feetech.config import FeetechConfig
+from drivers.ros2.config import Ros2Config
+from drivers.serial_lines.config import SerialLinesConfig
 from interfaces.errors import ConfigError
 from interfaces.protocols import Clock, JointSource
 from kbmaps import RigidChain
@@ -17,7 +21,6 @@ from .sources import MarkerTopic, Sources, StampedJoints
 from .store import PairReader
 
 if TYPE_CHECKING:
-    from drivers.ros2.config import Ros2Config
     from drivers.ros2.joints import Ros2Joints
 
 
@@ -52,17 +55,31 @@ def open_joints(config: Config, clock: Clock) -> JointSource:
         ConfigError: no servos and no ROS 2 robot are configured.
         StoreError: the store, which tells where they were last, cannot be read.
     """
-    from drivers.dynamixel.joints import DynamixelJoints
-
-    if config.tables.drivers.ros2 is not None:
-        return _ros2_joints(config, config.tables.drivers.ros2, clock)
-    servos = config.tables.drivers.dynamixel
-    if servos is None:
+    hardware, joints = config.tables.drivers.hardware, config.robot.joints
+    if hardware is None:
         raise ConfigError(
-            "no servos are configured", file=config.file, remedy="Add the table [drivers.dynamixel]: docs/hardware.md"
+            "no servos, encoders or ROS 2 robot are configured",
+            file=config.file,
+            remedy="Add the table [drivers.dynamixel], [drivers.feetech], [drivers.serial_lines] or [drivers.ros2]: "
+            "docs/hardware.md",
         )
     limits = list(zip(config.robot.lower.tolist(), config.robot.upper.tolist(), strict=True))
-    return DynamixelJoints(servos, config.robot.joints, clock, limits=limits, last_pose=_last_pose(config))
+    last_pose = _last_pose(config)
+    match hardware:
+        case DynamixelConfig():
+            from drivers.dynamixel.joints import DynamixelJoints
+
+            return DynamixelJoints(hardware, joints, clock, limits=limits, last_pose=last_pose)
+        case FeetechConfig():
+            from drivers.feetech.joints import FeetechJoints
+
+            return FeetechJoints(hardware, joints, clock, limits=limits, last_pose=last_pose)
+        case SerialLinesConfig():
+            from drivers.serial_lines.joints import SerialLineJoints
+
+            return SerialLineJoints(hardware, joints, clock, limits=limits, last_pose=last_pose)
+        case Ros2Config():
+            return _ros2_joints(config, hardware, clock)
 
 
 def _ros2_joints(config: Config, robot: Ros2Config, clock: Clock) -> Ros2Joints:
@@ -96,10 +113,9 @@ def _last_pose(config: Config) -> list[float] | None:
 def _require_source(config: Config, *, sim: bool) -> None:
     if sim or config.tables.drivers.recording is not None:
         return
-    if config.tables.drivers.dynamixel is not None or config.tables.drivers.ros2 is not None:
-        joints = "servos" if config.tables.drivers.ros2 is None else "those of a ROS 2 robot"
+    if config.tables.drivers.hardware is not None:
         raise ConfigError(
-            f"the joints are {joints}, but nothing tells where the marker is: no camera is configured",
+            "the joints have a driver, but nothing tells where the marker is: no camera is configured",
             file=config.file,
             remedy="Give --sim for the simulated robot, or name a recording as recording in the table [drivers]",
         )

@@ -13,10 +13,15 @@ from interfaces.errors import ConfigError
 from interfaces.toml_file import line_of
 
 from .dynamixel.config import DynamixelConfig
+from .feetech.config import FeetechConfig
 from .ros2.config import Ros2Config
+from .serial_lines.config import SerialLinesConfig
 
 NonNegative = Annotated[float, Meta(ge=0)]
 Positive = Annotated[float, Meta(gt=0)]
+
+
+HARDWARE = {"dynamixel": "servos", "feetech": "servos", "serial_lines": "encoders", "ros2": "ROS 2"}
 
 
 class DriversConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -28,6 +33,8 @@ class DriversConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         recording_sigma_m: 1-sigma per axis of its marker positions [m] where it has no columns for that. Without
             this key it comes from the stereo camera in [camera], or is 1 mm where there is none.
         dynamixel: the joints are Dynamixel servos.
+        feetech: the joints are Feetech servos.
+        serial_lines: the joints have encoders of their own, on a microcontroller.
         ros2: the joints are those of a ROS 2 robot.
     """
 
@@ -35,23 +42,27 @@ class DriversConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     speed: NonNegative = 1.0
     recording_sigma_m: Positive | None = None
     dynamixel: DynamixelConfig | None = None
+    feetech: FeetechConfig | None = None
+    serial_lines: SerialLinesConfig | None = None
     ros2: Ros2Config | None = None
+
+    @property
+    def hardware(self) -> DynamixelConfig | FeetechConfig | SerialLinesConfig | Ros2Config | None:
+        """What the joints are read from, if there is something."""
+        return self.dynamixel or self.feetech or self.serial_lines or self.ros2
 
     def check(self, joints: Sequence[str], file: Path, text: str) -> None:
         """ConfigError when two things give the joints, or one that does not fit `joints`."""
-        if self.ros2 is not None:
-            self.ros2.check(joints, file, text)
-            if self.recording is not None and self.ros2.marker is None:  # with it the learner reads the joints
-                line = line_of(text, ("drivers", "recording"))
-                raise ConfigError(
-                    "both a recording and ROS 2", file=file, line=line, remedy="Take one out of [drivers]"
-                )
-        if self.dynamixel is None:
+        given = [name for name in HARDWARE if getattr(self, name) is not None]
+        if len(given) > 1:
+            line = line_of(text, ("drivers", given[1]))
+            what = f"the joints cannot come from both {given[0]} and {given[1]}"
+            raise ConfigError(what, file=file, line=line, remedy="Take one out of [drivers]")
+        if self.hardware is None:
             return
-        if self.recording is not None:
+        # For its marker topic the learner reads the joints of a ROS 2 robot whatever the pairs come from.
+        if self.recording is not None and (self.ros2 is None or self.ros2.marker is None):
             line = line_of(text, ("drivers", "recording"))
-            raise ConfigError("both a recording and servos", file=file, line=line, remedy="Take one out of [drivers]")
-        if self.ros2 is not None:
-            line = line_of(text, ("drivers", "ros2"))
-            raise ConfigError("both servos and ROS 2", file=file, line=line, remedy="Take one out of [drivers]")
-        self.dynamixel.check(joints, file, text)
+            what = f"both a recording and {HARDWARE[given[0]]}"
+            raise ConfigError(what, file=file, line=line, remedy="Take one out of [drivers]")
+        self.hardware.check(joints, file, text)

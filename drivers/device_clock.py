@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import deque
+
 RELEARN_AFTER_S = 30.0
 KNOWN_AFTER_S = 1.0
 WORST = 0.02  # difference of rates that is borne until the rate is known
@@ -84,3 +86,92 @@ class DeviceClock:
             self._rate, self._spread = rate, max(self._drift, unsure_s / passed_s)
         if passed_s > RELEARN_AFTER_S:
             self._begin = (earliest, latest, self._device_s)
+
+
+WINDOW_S, BUCKET_S = 20.0, 0.1
+EARLY_S = 1.0  # before so much is seen, nothing is said about the rate
+LONGEST_HELD_S = 0.5
+AHEAD_S = 0.02  # a stamp of the future by less is the fault of news that were all held up before
+
+
+class StreamClock:
+    """Tells when a device did something that it stamped and sent by itself, without being asked.
+
+    The host knows only when the news came: later than it happened, by a delay that is never negative and small again
+    and again. So the clocks' difference runs along the lower edge of arrival minus stamp, and this edge's slope is the
+    difference of their rates. (Moon, Skelly, Towsley 1999: the line below all points that is nearest to them; it
+    contains the edge of their lower convex hull over their mean.)
+
+    Attributes:
+        rate: how many host seconds a device second has.
+    """
+
+    def __init__(self, tick_s: float, ticks: int) -> None:
+        """A clock of which nothing is known; the stamps count from 0 to `ticks`, excluded."""
+        self._tick_s, self._wrap_s = tick_s, tick_s * ticks
+        self._least: deque[tuple[float, float]] = deque()  # by bucket: device time, least arrival minus device time
+        self._device_s = self._origin_s = self._bucket_s = 0.0
+        self._offset_s, self.rate = 0.0, 1.0
+
+    def time(self, latest: float, stamp: int) -> float | None:
+        """When the event was that was heard of at `latest` [s].
+
+        None when the stamp belongs to another time; nothing is learnt from it then.
+        """
+        if not self._least:
+            self._device_s = self._origin_s = stamp * self._tick_s
+            self._offset_s = latest - self._device_s
+        device_s = self._unwrapped(stamp, latest)
+        t = self._mapped(device_s)
+        is_early = device_s - self._least[0][0] < EARLY_S if self._least else True
+        if latest - t > LONGEST_HELD_S or t - latest > (LONGEST_HELD_S if is_early else AHEAD_S):
+            return None
+        self._device_s = max(device_s, self._device_s)
+        self._note(device_s, latest - device_s)
+        return min(self._mapped(device_s), latest)
+
+    def _mapped(self, device_s: float) -> float:
+        return device_s + self._offset_s + (self.rate - 1.0) * (device_s - self._origin_s)
+
+    def _unwrapped(self, stamp: int, latest: float) -> float:
+        device_s = stamp * self._tick_s
+        expected_s = self._device_s + (latest - self._mapped(self._device_s))
+        return device_s + self._wrap_s * round((expected_s - device_s) / self._wrap_s)
+
+    def _note(self, device_s: float, offset_s: float) -> None:
+        least = self._least
+        if not least or device_s - self._bucket_s >= BUCKET_S:
+            self._bucket_s = device_s
+            least.append((device_s, offset_s))
+            while least[-1][0] - least[0][0] > WINDOW_S:
+                least.popleft()
+            self._fit()
+        elif offset_s < least[-1][1]:
+            least[-1] = (device_s, offset_s)
+            if device_s + offset_s < self._mapped(device_s):
+                self._fit()
+
+    def _fit(self) -> None:
+        points = list(self._least)
+        if points[-1][0] - points[0][0] < EARLY_S:
+            self._origin_s, self._offset_s = points[-1][0], min(offset for _, offset in points[-3:])
+            return
+        mean = sum(device_s for device_s, _ in points) / len(points)
+        (x0, y0), (x1, y1) = _edge_below(points, mean)
+        slope = min(max((y1 - y0) / (x1 - x0), -WORST), WORST)
+        self.rate, self._origin_s, self._offset_s = 1.0 + slope, x0, y0
+
+
+def _edge_below(points: list[tuple[float, float]], x: float) -> tuple[tuple[float, float], tuple[float, float]]:
+    """The edge of the lower convex hull of `points`, which are in the order of x, that lies over or under `x`."""
+    hull: list[tuple[float, float]] = []
+    for point in points:
+        while len(hull) > 1 and _turns_down(hull[-2], hull[-1], point):
+            hull.pop()
+        hull.append(point)
+    last = next(k for k, corner in enumerate(hull) if k > 0 and corner[0] >= x)
+    return hull[last - 1], hull[last]
+
+
+def _turns_down(a: tuple[float, float], b: tuple[float, float], c: tuple[float, float]) -> bool:
+    return (b[0] - a[0]) * (c[1] - a[1]) <= (b[1] - a[1]) * (c[0] - a[0])

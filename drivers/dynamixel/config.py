@@ -2,24 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from pathlib import Path
-from typing import Annotated, Literal
+from collections.abc import Mapping
+from typing import ClassVar, Literal
 
 import msgspec
-from msgspec import Meta
 
-from interfaces.errors import ConfigError
-from interfaces.suggest import did_you_mean
-from interfaces.toml_file import line_in_entry, line_of
+from drivers.servos.config import NonNegative, ServoConfig, ServosConfig
+from drivers.servos.model import Model
 
-from .models import BY_NAME, Model
+from .models import BY_NAME
 
-Positive = Annotated[float, Meta(gt=0)]
-NonNegative = Annotated[float, Meta(ge=0)]
+__all__ = ["Baud", "BusConfig", "DynamixelConfig", "ServoConfig"]
+
 Baud = Literal[9600, 57600, 115200, 1_000_000, 2_000_000, 3_000_000, 4_000_000]
-
-TABLE = ("drivers", "dynamixel")
 
 
 class BusConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -38,80 +33,8 @@ class BusConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     fast_sync_read: Literal["auto", "never"] = "auto"
 
 
-class ServoConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """An entry [[drivers.dynamixel.servos]]: the servo of one joint.
+class DynamixelConfig(ServosConfig[BusConfig], frozen=True, forbid_unknown_fields=True):
+    """The table [drivers.dynamixel]. MX-28 speaks Protocol 1.0, MX-28(2.0) speaks 2.0."""
 
-    Attributes:
-        joint: its name in [robot] joints.
-        id: the servo's number on its bus.
-        model: as ROBOTIS writes it; it tells the protocol: MX-28 speaks 1.0, MX-28(2.0) speaks 2.0.
-        bus: needed where there are several.
-        direction: −1 where the joint counts against the servo.
-        zero_ticks: the servo's position where the joint is at 0; by default the middle of its range.
-    """
-
-    joint: str
-    id: Annotated[int, Meta(ge=0, le=252)]
-    model: str
-    bus: str | None = None
-    direction: Literal[1, -1] = 1
-    zero_ticks: int | None = None
-
-
-class DynamixelConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The table [drivers.dynamixel].
-
-    Attributes:
-        rate_hz: readings are not asked for more often than this.
-        max_speed_deg_s: no joint moves faster; a position that would need it is not believed.
-        max_move_deg: how far a joint may have been moved while the bus was away, where only the nearest turn tells.
-        restore_torque: switch torque on again at the end where it was on at the start, holding the pose of the end.
-    """
-
-    buses: dict[str, BusConfig]
-    servos: Annotated[tuple[ServoConfig, ...], Meta(min_length=1)]
-    rate_hz: Positive = 250.0
-    max_speed_deg_s: Positive = 600.0
-    max_move_deg: Annotated[float, Meta(gt=0, lt=180)] = 30.0
-    restore_torque: bool = False
-
-    def bus_of(self, servo: ServoConfig) -> str:
-        """The name of the bus that the servo is on."""
-        return next(iter(self.buses)) if servo.bus is None else servo.bus
-
-    def model_of(self, servo: ServoConfig) -> Model:
-        """What it is said to be."""
-        return BY_NAME[servo.model]
-
-    def check(self, joints: Sequence[str], file: Path, text: str) -> None:
-        """ConfigError when the servos are not one for each of `joints`, each with a bus and an ID of its own."""
-        for place, what, key, remedy in self._mistakes(joints):
-            line = line_in_entry(text, "drivers.dynamixel.servos", place, key)
-            raise ConfigError(what, file=file, line=line, remedy=remedy)
-        missing = [joint for joint in joints if joint not in {servo.joint for servo in self.servos}]
-        if missing:
-            raise ConfigError(
-                f"no servo in [[drivers.dynamixel.servos]] for {', '.join(missing)}",
-                file=file,
-                line=line_of(text, (*TABLE, "servos")),
-                remedy="Every joint of [robot] joints needs one",
-            )
-
-    def _mistakes(self, joints: Sequence[str]) -> Iterator[tuple[int, str, str, str]]:
-        seen_joints, seen_ids = set[str](), set[tuple[str, int]]()
-        for place, servo in enumerate(self.servos):
-            if servo.joint not in joints:
-                yield place, f"unknown joint {servo.joint!r}", "joint", did_you_mean(servo.joint, joints)
-            if servo.joint in seen_joints:
-                yield place, f"a second servo for the joint {servo.joint!r}", "joint", "Give each joint one"
-            if servo.model not in BY_NAME:
-                yield place, f"unknown model {servo.model!r}", "model", did_you_mean(servo.model, BY_NAME)
-            if servo.bus is None and len(self.buses) != 1:
-                yield place, "which bus?", "joint", f"Give bus, one of: {', '.join(self.buses)}"
-            if servo.bus is not None and servo.bus not in self.buses:
-                yield place, f"unknown bus {servo.bus!r}", "bus", did_you_mean(servo.bus, self.buses)
-            key = (self.bus_of(servo), servo.id)
-            if key in seen_ids:
-                yield place, f"the ID {servo.id} is given twice on one bus", "id", "Give each servo an ID of its own"
-            seen_joints.add(servo.joint)
-            seen_ids.add(key)
+    table: ClassVar[str] = "drivers.dynamixel"
+    models: ClassVar[Mapping[str, Model]] = BY_NAME

@@ -2,40 +2,23 @@
 
 from __future__ import annotations
 
-import logging
-import math
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack, suppress
-from itertools import zip_longest
-from types import TracebackType
-from typing import Self
+from collections.abc import Sequence
 
 from drivers.serial_line import adapter_latency_s
-from drivers.turns import SpeedGate, nearest_turn
-from interfaces.errors import SourceError, SourceLost
+from drivers.servos.bus import Bus as ServoBus
+from drivers.servos.bus import Request
+from drivers.servos.handshake import FittedServo
+from drivers.servos.joints import OpenPort, ServoJoints
+from drivers.servos.make import Make
+from drivers.servos.port import Port
 from interfaces.protocols import Clock
-from interfaces.records import JointReading, frozen_array
 
-from .bus import Bus, Request
-from .channel import Channel, Sample, middle
+from .bus import Bus
+from .channel import Channel
 from .config import BusConfig, DynamixelConfig
-from .handshake import RETRY_S, FittedServo, identify, require_all, restore_torque, switch_torque_off
-from .models import HARDWARE_ERRORS, TICK_S
-from .plan import block_requests, state_request, torque_and_error
-from .port import Port, SafePort
-
-log = logging.getLogger(__name__)
-
-LOST_AFTER_S = 0.25  # without a reading; within this no joint turns by half a turn unseen
-FEW_POLLS = 3  # so many have to fail besides: the program itself may have been held up
-DOUBTS = 5  # so many answers in a row that cannot be: the servo was restarted
-LOOK_AFTER_S = 0.1  # one servo's torque and health in turn
-ANCHOR_POLLS = 50
-LOOK_AGAIN_S = 1.0  # whether a joint was turned back
-SLACK_TICKS = 3
-GOLDEN = 0.618034  # multiples of it, modulo 1, are spread most evenly
-
-OpenPort = Callable[[BusConfig, Clock], tuple[Port, float]]
+from .models import BY_NUMBER, HARDWARE_ERRORS, TICK_S
+from .plan import block_requests
+from .port import SafePort
 
 
 def open_serial(config: BusConfig, clock: Clock) -> tuple[Port, float]:
@@ -46,19 +29,15 @@ def open_serial(config: BusConfig, clock: Clock) -> tuple[Port, float]:
     return port, latency_s
 
 
-class DynamixelJoints:
-    """Reads the positions of an arm whose torque is off.
+def _block_requests(bus: ServoBus, servos: Sequence[FittedServo], config: BusConfig) -> list[Request]:
+    return block_requests(bus, servos, try_fast=config.fast_sync_read == "auto")
 
-    A reading is made of intact answers of all servos to the same questions, each from the time at which it was asked,
-    each where the joint can have come to. Whatever is doubtful is dropped, and the line has to fall silent before the
-    next question. When nothing comes for a quarter of a second, or a servo was restarted, or its torque is on,
-    SourceLost is raised: opened again, everything is verified anew, and compared with where the joints were.
 
-    Attributes:
-        servos: as they were found at the last opening, in the order of the joints.
-        epoch: how often it was opened. Positions of different epochs hang together by the comparison only.
-        dropped: readings that were dropped.
-    """
+DYNAMIXEL = Make(DynamixelConfig.table, BY_NUMBER, HARDWARE_ERRORS, Bus, Channel, _block_requests, TICK_S)
+
+
+class DynamixelJoints(ServoJoints):
+    """Reads the positions of an arm of Dynamixel servos whose torque is off; see `ServoJoints`."""
 
     def __init__(
         self,
@@ -70,329 +49,5 @@ class DynamixelJoints:
         last_pose: Sequence[float] | None = None,
         open_port: OpenPort = open_serial,
     ) -> None:
-        """Nothing is opened yet.
-
-        Args:
-            config: checked; see `DynamixelConfig.check`.
-            joints: in the order of q.
-            limits: of each joint [rad]: with less than a turn between them there is no doubt about the turn.
-            last_pose: where the joints were when they were read last [rad], shape (d,), to count turns from.
-        """
-        self._config, self._names, self._clock = config, tuple(joints), clock
-        self._open_port = open_port
-        by_joint = {servo.joint: servo for servo in config.servos}
-        self._wanted = [by_joint[joint] for joint in joints]
-        self._limits = [(-math.inf, math.inf)] * len(joints) if limits is None else list(limits)
-        self._last_pose = None if last_pose is None else [float(q) for q in last_pose]
-        self._buses: dict[str, Bus] = {}
-        self._requests: dict[str, list[Request]] = {}
-        self._opened = ExitStack()
-        self._is_open = self._is_lost = False
-        self._had_torque: set[str] = set()
-        self._channels: list[Channel] = []
-        self._at: dict[tuple[str, int], int] = {}
-        self._counts: list[int] = []
-        self._last_t = -math.inf
-        self._alerts: dict[str, int] = {}
-        self.servos: list[FittedServo] = []
-        self.epoch = self.dropped = 0
-
-    @property
-    def joints(self) -> tuple[str, ...]:
-        """Names of the joints in the order of q."""
-        return self._names
-
-    @property
-    def health(self) -> tuple[str, ...]:
-        """What is wrong with servos, and what to do."""
-        return tuple(_complaint(joint, bits) for joint, bits in self._alerts.items())
-
-    @property
-    def samples(self) -> Mapping[str, Sample | None]:
-        """The newest believed answer for each joint, also of those whose neighbours did not answer."""
-        return {channel.servo.joint: channel.newest for channel in self._channels}
-
-    @property
-    def record(self) -> tuple[Mapping[str, object], ...]:
-        """What is to be kept with the data: each servo's identity and settings."""
-        return tuple(servo.record() for servo in self.servos)
-
-    def __enter__(self) -> Self:
-        with ExitStack() as stack:
-            self._open_buses(stack)
-            names = ", ".join(bus.port for bus in self._config.buses.values())
-            findings = [identify(self._buses[self._config.bus_of(servo)], servo) for servo in self._wanted]
-            servos = require_all(findings, names)
-            self.servos = [switch_torque_off(self._buses[servo.bus], servo) for servo in servos]
-            self._prepare()
-            self._anchor()
-            stack.callback(self._restore)
-            self._opened = stack.pop_all()
-        self._is_open, self._is_lost = True, False
-        self._had_torque.update(servo.joint for servo in self.servos if servo.had_torque)
-        self.epoch += 1
-        self._say_opened()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._is_open = False
-        self._opened.close()
-
-    def read(self, timeout_s: float) -> JointReading | None:
-        """The next reading; see `JointSource.read`.
-
-        Raises:
-            SourceLost: a port is gone, a servo does not answer any more, was restarted, or its torque is on.
-        """
-        if not self._is_open:
-            raise SourceError("the servos are not open; use them in a with statement")
-        try:
-            return self._read_until(self._clock.now() + timeout_s)
-        except SourceLost:
-            self._is_lost = True
-            raise
-
-    def _read_until(self, deadline: float) -> JointReading | None:
-        while True:
-            if self._next_poll > deadline:
-                self._wait_until(deadline)
-                return None
-            if self._wait_until(self._next_poll):
-                self._next_poll = self._following_poll()
-                reading = self._poll()
-                if reading is not None:
-                    return reading
-            if self._clock.now() >= deadline:
-                return None
-
-    # --- opening
-
-    def _open_buses(self, stack: ExitStack) -> None:
-        self._buses.clear()
-        for name, config in self._config.buses.items():
-            port, latency_s = self._open_port(config, self._clock)
-            stack.callback(_close, port)
-            self._buses[name] = Bus(name, port, self._clock, latency_s)
-
-    def _prepare(self) -> None:
-        self._requests = {}
-        for name, bus in self._buses.items():
-            servos = [servo for servo in self.servos if servo.bus == name]
-            fast = self._config.buses[name].fast_sync_read == "auto"
-            self._requests[name] = block_requests(bus, servos, try_fast=fast)
-        self._channels = [Channel(servo) for servo in self.servos]
-        self._at = {(servo.bus, servo.id): place for place, servo in enumerate(self.servos)}
-        speed = math.radians(self._config.max_speed_deg_s)
-        self._gate = SpeedGate([speed / s.model.rad_per_tick for s in self.servos], [SLACK_TICKS] * len(self.servos))
-        now = self._clock.now()
-        self._believed_s, self._failures, self._next_poll, self._next_look = now, 0, now, now
-        self._looked = self._polls = 0
-        self._why = "no answer"
-
-    def _anchor(self) -> None:
-        """Find the turn that each joint is in: two readings that agree."""
-        believed = 0
-        for _ in range(ANCHOR_POLLS):
-            samples = self._ask_all()
-            if samples is None:
-                continue
-            if believed == 0:
-                self._counts = [self._nearest(place, sample.ticks) for place, sample in enumerate(samples)]
-            counts = self._continued(samples)
-            believed = believed + 1 if self._gate.offer(middle(samples), counts) is None else 0
-            if believed == 2:
-                self._counts = counts
-                self._check_turns(samples)
-                self._believed_s, self._failures = self._clock.now(), 0
-                return
-        raise SourceLost(f"the servos cannot be read: {self._why}", retry_s=RETRY_S)
-
-    def _nearest(self, place: int, ticks: int) -> int:
-        servo, (lower, upper) = self.servos[place], self._limits[place]
-        turn = servo.model.ticks_per_turn
-        if upper - lower < 2 * math.pi:
-            return nearest_turn(ticks, servo.ticks((lower + upper) / 2), turn)
-        if self._last_pose is not None:
-            return nearest_turn(ticks, servo.ticks(self._last_pose[place]), turn)
-        return ticks
-
-    def _check_turns(self, samples: list[Sample]) -> None:
-        """SourceLost when a joint of several turns is not where it was: nothing tells its turn then."""
-        if self._last_pose is None:
-            return
-        for place, (servo, count) in enumerate(zip(self.servos, self._counts, strict=True)):
-            lower, upper = self._limits[place]
-            if upper - lower < 2 * math.pi:
-                continue
-            was, now = self._last_pose[place], servo.angle(count)
-            if abs(now - was) > math.radians(self._config.max_move_deg):
-                raise SourceLost(
-                    f"joint {servo.joint!r} (ID {servo.id}) was at {math.degrees(was):.0f}° and is now at "
-                    f"{math.degrees(now):.0f}°, or whole turns from there: its turn count is lost. "
-                    f"Turn it back to within {self._config.max_move_deg:.0f}° of where it was, or set max_move_deg "
-                    "in [drivers.dynamixel] to 179 to take the nearest turn",
-                    retry_s=LOOK_AGAIN_S,
-                )
-            if count != samples[place].ticks:
-                log.info("joint %r: %+d turns are added to what its servo counts", *self._turns(place, count, samples))
-
-    def _turns(self, place: int, count: int, samples: list[Sample]) -> tuple[str, int]:
-        servo = self.servos[place]
-        return servo.joint, round((count - samples[place].ticks) / (servo.model.ticks_per_turn or 1))
-
-    def _say_opened(self) -> None:
-        switched = [servo.joint for servo in self.servos if servo.had_torque]
-        fast = any(request.is_fast for requests in self._requests.values() for request in requests)
-        how = "with Fast Sync Read" if fast else ""
-        log.info("%d servos, torque verified off, are read %s", len(self.servos), how)
-        if switched:
-            log.warning("the torque of %s was on and was switched off", ", ".join(switched))
-
-    def _restore(self) -> None:
-        if not self._config.restore_torque or self._is_lost:  # who was lost is opened again, in somebody's hands
-            return
-        for servo in self.servos:
-            if servo.joint in self._had_torque:
-                with suppress(SourceError):
-                    restore_torque(self._buses[servo.bus], servo)
-
-    # --- reading
-
-    def _poll(self) -> JointReading | None:
-        samples = self._ask_all()
-        reading = None if samples is None else self._judge(samples)
-        if self._clock.now() >= self._next_look:
-            self._look_after_one()
-        if reading is None:
-            self._dropped_one()
-        else:
-            self._believed_s, self._failures = self._clock.now(), 0
-        return reading
-
-    def _following_poll(self) -> float:
-        """When to ask next: not always at the same phase of the servos' ticks, which would tell nothing new of them."""
-        self._polls += 1
-        before, after = (self._polls - 1) * GOLDEN % 1, self._polls * GOLDEN % 1
-        return max(self._next_poll + 1 / self._config.rate_hz + (after - before) * TICK_S, self._clock.now())
-
-    def _ask_all(self) -> list[Sample] | None:
-        """A sample of each joint; None when one is missing or doubtful. All buses are asked at the same time."""
-        samples: dict[int, Sample] = {}
-        for questions in zip_longest(*self._requests.values()):
-            asked = [(bus, q) for bus, q in zip(self._buses.values(), questions, strict=True) if q is not None]
-            for bus, question in asked:
-                bus.send(question)
-            for bus, question in asked:
-                self._take(bus, question, samples)
-        return [samples[place] for place in range(len(self._names))] if len(samples) == len(self._names) else None
-
-    def _take(self, bus: Bus, question: Request, samples: dict[int, Sample]) -> None:
-        exchange = bus.collect(question)
-        stale = False
-        for answer in exchange.answers:
-            place = self._at[bus.name, answer.status.id]
-            sample = self._channels[place].take(answer)
-            if sample is None:
-                stale = True
-                self._why = f"joint {self._names[place]!r}: an answer from another time"
-                self._refuse_restarted(self._channels[place])
-            elif exchange.trouble is None and self._is_confirmed(bus, question, self._channels[place], sample):
-                samples[place] = sample
-        if exchange.trouble is not None and exchange.culprit is not None:
-            servo = self.servos[self._at[bus.name, exchange.culprit]]
-            self._why = f"joint {servo.joint!r} (ID {servo.id}): {exchange.trouble}"
-        elif exchange.trouble is not None:
-            self._why = f"{bus.name}: {exchange.trouble}"
-        elif stale:
-            bus.settle()
-
-    def _is_confirmed(self, bus: Bus, question: Request, channel: Channel, sample: Sample) -> bool:
-        """Ask again for a surprising position of Protocol 1.0, whose checksum lets one in 256 wrong answers through."""
-        if question.protocol != 1 or not channel.surprising:
-            return True
-        exchange = bus.ask(question)
-        again = channel.take(exchange.answers[0]) if exchange.trouble is None else None
-        return again is not None and channel.agrees(sample, again, math.radians(self._config.max_speed_deg_s))
-
-    def _judge(self, samples: list[Sample]) -> JointReading | None:
-        t = middle(samples)
-        counts = self._continued(samples)
-        refused = self._gate.offer(t, counts)
-        if refused is not None:
-            servo = self.servos[refused]
-            self._why = f"joint {servo.joint!r} (ID {servo.id}): a position where it cannot have come to"
-            if self._gate.jumped:
-                raise SourceLost(self._why, retry_s=RETRY_S)
-            return None
-        if t <= self._last_t:
-            return None
-        self._counts, self._last_t = counts, t
-        q = [servo.angle(count) for servo, count in zip(self.servos, counts, strict=True)]
-        self._last_pose = q
-        return JointReading(t, frozen_array(q))
-
-    def _continued(self, samples: list[Sample]) -> list[int]:
-        together = zip(self.servos, samples, self._counts, strict=True)
-        return [nearest_turn(sample.ticks, count, servo.model.ticks_per_turn) for servo, sample, count in together]
-
-    def _dropped_one(self) -> None:
-        self.dropped += 1
-        self._failures += 1
-        if self._failures >= FEW_POLLS and self._clock.now() - self._believed_s > LOST_AFTER_S:
-            raise SourceLost(self._blame(), retry_s=RETRY_S)
-
-    def _blame(self) -> str:
-        """Who does not answer when asked alone, else what went wrong last."""
-        for servo in self.servos:
-            trouble = self._buses[servo.bus].ask(state_request(servo)).trouble
-            if trouble is not None:
-                return f"joint {servo.joint!r} (ID {servo.id}): {trouble}"
-        return self._why
-
-    def _refuse_restarted(self, channel: Channel) -> None:
-        if channel.doubts >= DOUBTS:
-            servo = channel.servo
-            raise SourceLost(f"joint {servo.joint!r} (ID {servo.id}) was restarted", retry_s=RETRY_S)
-
-    def _wait_until(self, t: float) -> bool:
-        """Wait; False when a servo talked though it was not asked."""
-        if t <= self._clock.now():
-            return True
-        bus, *_ = self._buses.values()
-        return bus.listen(t)
-
-    def _look_after_one(self) -> None:
-        """Verify one servo's torque and health; SourceLost when its torque is on."""
-        servo = self.servos[self._looked % len(self.servos)]
-        exchange = self._buses[servo.bus].ask(state_request(servo))
-        if exchange.trouble is not None:
-            return
-        self._looked += 1
-        self._next_look = self._clock.now() + LOOK_AFTER_S
-        status = exchange.answers[0].status
-        has_torque, bits = torque_and_error(servo, status.data, status.error)
-        if has_torque:
-            raise SourceLost(f"the torque of joint {servo.joint!r} was switched on by another program", retry_s=0.0)
-        self._note_alert(servo.joint, bits)
-
-    def _note_alert(self, joint: str, bits: int) -> None:
-        if self._alerts.get(joint, 0) == bits:
-            return
-        if bits:
-            self._alerts[joint] = bits
-            log.warning("%s", _complaint(joint, bits))
-        else:
-            del self._alerts[joint]
-            log.info("joint %r is well again", joint)
-
-
-def _close(port: Port) -> None:
-    with suppress(SourceError):
-        port.close()
-
-
-def _complaint(joint: str, bits: int) -> str:
-    reasons = [text for bit, text in HARDWARE_ERRORS.items() if bits & bit]
-    return f"joint {joint!r}: " + ("; ".join(reasons) or f"hardware error {bits:#04x}")
+        """Nothing is opened yet; arguments as of `ServoJoints`."""
+        super().__init__(DYNAMIXEL, config, joints, clock, open_port=open_port, limits=limits, last_pose=last_pose)

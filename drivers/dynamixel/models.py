@@ -9,60 +9,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Literal
 
+from drivers.servos.model import Layout, Model, Register
+
+__all__ = ["BY_NAME", "BY_NUMBER", "MODELS", "Layout", "Model", "Register"]
+
 Series = Literal["X", "P", "MX", "AX"]
-
-
-@dataclass(frozen=True, slots=True)
-class Register:
-    """Some bytes of a control table, little endian."""
-
-    address: int
-    size: int
-    signed: bool = False
-
-    def value(self, data: bytes) -> int:
-        """The number in the register's bytes."""
-        return int.from_bytes(data, "little", signed=self.signed)
-
-    def bytes(self, value: int) -> bytes:
-        """The register's bytes for a number."""
-        return value.to_bytes(self.size, "little", signed=self.signed)
-
-    @property
-    def end(self) -> int:
-        """The address after the last byte."""
-        return self.address + self.size
-
-
-@dataclass(frozen=True, slots=True)
-class Layout:
-    """Where a series keeps what.
-
-    Attributes:
-        protocol: 1 or 2.
-        registers: by name; the same names in all series.
-        block: what one reading asks for: the position, and what tells whether to believe it.
-        state: torque, status return level and hardware error in one piece (Protocol 1.0: torque alone).
-        ram: address of the first register that is lost with the power and never locked.
-        size: bytes of the control table.
-    """
-
-    protocol: Literal[1, 2]
-    registers: Mapping[str, Register] = field(repr=False)
-    block: Register
-    state: Register
-    ram: int
-    size: int
-
-    def __getitem__(self, name: str) -> Register:
-        return self.registers[name]
-
-    def __contains__(self, name: str) -> bool:
-        return name in self.registers
 
 
 def _layout2(torque: int, size: int) -> Layout:
@@ -119,34 +73,6 @@ LAYOUT_X = _layout2(64, 661)
 LAYOUT_P = _layout2(512, 661)
 LAYOUT_MX1 = _layout1(74)
 LAYOUT_AX = _layout1(50)
-
-
-@dataclass(frozen=True, slots=True)
-class Model:
-    """One kind of servo.
-
-    Attributes:
-        rad_per_tick: exactly a turn, or the sensed part of it, by its number of ticks [rad].
-        ticks_per_turn: None where the sensor does not turn on (AX: 300°).
-        zero_ticks: the position that its manual calls 0°, in the middle of the range.
-        velocity_unit: of the register [rad/s].
-        current_unit: of the register [A]; None where there is no such sensor (the register then shows the load).
-    """
-
-    number: int
-    name: str
-    series: Series
-    layout: Layout
-    rad_per_tick: float
-    ticks_per_turn: int | None
-    zero_ticks: int
-    velocity_unit: float
-    current_unit: float | None
-
-    @property
-    def protocol(self) -> Literal[1, 2]:
-        """The protocol that it speaks."""
-        return self.layout.protocol
 
 
 RPM = 2 * math.pi / 60
@@ -223,7 +149,6 @@ BY_NUMBER: Mapping[int, Model] = MappingProxyType({model.number: model for model
 
 # Register values of the baud rate [bit/s].
 BAUDS2 = (9600, 57600, 115200, 1_000_000, 2_000_000, 3_000_000, 4_000_000, 4_500_000)
-RETURN_DELAY_UNIT_S = 2e-6
 TICK_S, TICKS = 1e-3, 32768  # Realtime Tick
 
 

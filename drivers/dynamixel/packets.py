@@ -7,63 +7,21 @@ answers, and reads past garbage.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 import dynamixel_sdk as sdk
 
+from drivers.servos.packets import Garbled, Packets, Status, take_summed
+
 from .crc16 import crc16
 
-HEADER2, HEADER1 = b"\xff\xff\xfd\x00", b"\xff\xff"
+HEADER2 = b"\xff\xff\xfd\x00"
 STATUS = 0x55
 ALERT = 0x80
 LOOKS_LIKE_HEADER, STUFFED = b"\xff\xff\xfd", b"\xff\xff\xfd\xfd"
 BROADCAST = 0xFE
 Version = Literal[1, 2]
 PING, REBOOT = 1, 8
-
-
-class Garbled(Exception):
-    """These bytes are no intact status packet."""
-
-
-@dataclass(frozen=True, slots=True)
-class Status:
-    """A servo's answer.
-
-    Attributes:
-        id: who says that it is from them.
-        error: the error byte as it came.
-        data: without stuffing.
-        size: bytes on the wire.
-    """
-
-    id: int
-    error: int
-    data: bytes
-    size: int
-
-
-class Packets(Protocol):
-    """One version of the protocol."""
-
-    overhead: int
-
-    def ping(self, id: int) -> bytes:
-        """PING."""
-        ...
-
-    def read(self, id: int, address: int, size: int) -> bytes:
-        """READ."""
-        ...
-
-    def write(self, id: int, address: int, data: bytes) -> bytes:
-        """WRITE."""
-        ...
-
-    def take(self, received: bytes | bytearray, at: int) -> Status | None:
-        """The status packet that begins at `at`; None when it is not complete. Raises Garbled when there is none."""
-        ...
 
 
 class _Caught:
@@ -87,7 +45,8 @@ class _Caught:
 class Packets2:
     """Protocol 2.0."""
 
-    overhead = 11
+    overhead, ping_size = 11, 3
+    refusals, is_weak = 0x7F, False  # e-Manual, status packets
     _sdk: Any = sdk.PacketHandler(2.0)
 
     def ping(self, id: int) -> bytes:
@@ -164,7 +123,8 @@ class Packets2:
 class Packets1:
     """Protocol 1.0."""
 
-    overhead = 6
+    overhead, ping_size = 6, 0
+    refusals, is_weak = 0x58, True
     _sdk: Any = sdk.PacketHandler(1.0)
 
     def ping(self, id: int) -> bytes:
@@ -186,26 +146,13 @@ class Packets1:
 
     def take(self, received: bytes | bytearray, at: int) -> Status | None:
         """The status packet that begins at `at`; see `Packets.take`."""
-        head = bytes(received[at : at + 4])
-        if not HEADER1.startswith(head[:2]) or (len(head) > 2 and head[2] >= BROADCAST):
-            raise Garbled
-        if len(head) < 4:
-            return None
-        if head[3] < 2:
-            raise Garbled
-        size = 4 + head[3]
-        packet = bytes(received[at : at + size])
-        if len(packet) < size:
-            return None
-        if sum(packet[2:]) & 0xFF != 0xFF:
-            raise Garbled
-        return Status(packet[2], packet[4], packet[5:-1], size)
+        return take_summed(received, at)
 
 
 PACKETS2, PACKETS1 = Packets2(), Packets1()
 
 
-def packets_of(protocol: Version) -> Packets2 | Packets1:
+def packets_of(protocol: int) -> Packets:
     """How to speak the protocol."""
     return PACKETS2 if protocol == 2 else PACKETS1
 

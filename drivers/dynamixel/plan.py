@@ -1,12 +1,14 @@
-"""With which questions all positions of a bus are read, and its servos looked after."""
+"""With which questions all positions of a bus are read."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
-from .bus import Bus, Request, read_request, sync_request
-from .handshake import FittedServo
-from .models import Layout
+from drivers.servos.bus import Bus, Request
+from drivers.servos.handshake import FittedServo
+from drivers.servos.model import Layout
+
+from .bus import read_request, sync_request
 
 
 def block_requests(bus: Bus, servos: Sequence[FittedServo], *, try_fast: bool) -> list[Request]:
@@ -35,17 +37,3 @@ def _group_request(bus: Bus, layout: Layout, ids: list[int], try_fast: bool) -> 
         if bus.ask(fast).trouble is None:
             return fast
     return sync_request(ids, block.address, block.size, fast=False)
-
-
-def state_request(servo: FittedServo) -> Request:
-    """Ask for torque and hardware error."""
-    state = servo.model.layout.state
-    return read_request(servo.model.protocol, servo.id, state.address, state.size)
-
-
-def torque_and_error(servo: FittedServo, data: bytes, error: int) -> tuple[bool, int]:
-    """Whether torque is on, and the bits of the hardware error, of an answer to `state_request`."""
-    if servo.model.protocol == 1:
-        return data[0] != 0, error
-    layout = servo.model.layout
-    return data[0] != 0, data[layout["hardware_error"].address - layout.state.address]

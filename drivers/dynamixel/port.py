@@ -4,38 +4,16 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import Literal, Protocol
+from typing import Literal
 
 import dynamixel_sdk as sdk
 
 from drivers.serial_line import SerialLine
+from drivers.servos.port import Port
+
+__all__ = ["Port", "SafePort"]
 
 TIMEOUT_MARGIN_S = 2e-3
-
-
-class Port(Protocol):
-    """What the driver needs of a serial port; `SafePort`, or a bench's."""
-
-    @property
-    def baud(self) -> int:
-        """Bits per second."""
-        ...
-
-    def write(self, data: bytes) -> None:
-        """Send `data`; BusLost when the port is gone."""
-        ...
-
-    def receive(self, until: float) -> bytes:
-        """What has arrived, else what arrives next; nothing when that is not before `until` on the clock."""
-        ...
-
-    def flush(self) -> None:
-        """Forget what has arrived."""
-        ...
-
-    def close(self) -> None:
-        """Give it free."""
-        ...
 
 
 class SafePort(sdk.PortHandler):

@@ -14,19 +14,28 @@ import numpy as np
 import pytest
 from scripted_sources import COV, Scripted
 
+from drivers.bench.virtual_port import VirtualClock, VirtualPort
 from drivers.dynamixel.bench.chain import Chain, no_faults
 from drivers.dynamixel.bench.faults import Faults
 from drivers.dynamixel.bench.servo import Servo
-from drivers.dynamixel.bench.virtual_port import VirtualClock, VirtualPort
 from drivers.dynamixel.config import BusConfig, DynamixelConfig, ServoConfig
 from drivers.dynamixel.joints import DynamixelJoints
 from drivers.dynamixel.models import BY_NAME
+from drivers.feetech.bench.chain import Chain as FeetechChain
+from drivers.feetech.bench.servo import Servo as FeetechServo
+from drivers.feetech.config import BusConfig as FeetechBus
+from drivers.feetech.config import FeetechConfig
+from drivers.feetech.joints import FeetechJoints
+from drivers.feetech.models import BY_NAME as FEETECH_MODELS
 from drivers.replay import Replay
 from drivers.ros2.bench.faults import Send, intact
 from drivers.ros2.bench.node import Node
 from drivers.ros2.bench.virtual_link import VirtualLink
 from drivers.ros2.config import Ros2Config
 from drivers.ros2.joints import Ros2Joints
+from drivers.serial_lines.bench.board import EncoderBoard
+from drivers.serial_lines.config import EncoderConfig, SerialLinesConfig
+from drivers.serial_lines.joints import SerialLineJoints
 from interfaces.errors import SourceEnded, SourceError
 from interfaces.protocols import JointSource, MarkerSource, StereoCamera
 from interfaces.recording import Recording
@@ -155,6 +164,23 @@ def servos_on_the_bench(faults: Faults = no_faults) -> Iterator[Rig]:
     yield Rig(DynamixelJoints(config, ("a", "b"), clock, open_port=lambda *_: (VirtualPort(chain, clock), 0.0)))
 
 
+@contextmanager
+def feetech_servos_on_the_bench(faults: Faults = no_faults) -> Iterator[Rig]:
+    clock = VirtualClock()
+    chain = FeetechChain((FeetechServo(FEETECH_MODELS["STS3215"], id, swinging(id)) for id in (1, 2)), faults)
+    servos = tuple(ServoConfig(name, id, "STS3215") for name, id in (("a", 1), ("b", 2)))
+    config = FeetechConfig({"arm": FeetechBus("bench")}, servos)
+    yield Rig(FeetechJoints(config, ("a", "b"), clock, open_port=lambda *_: (VirtualPort(chain, clock), 0.0)))
+
+
+@contextmanager
+def encoders_on_the_bench(faults: Faults = no_faults) -> Iterator[Rig]:
+    clock = VirtualClock()
+    board = EncoderBoard({"a": (4096, swinging(1)), "b": (1024, swinging(2))}, begun_s=99.0, faults=faults)
+    config = SerialLinesConfig("bench", (EncoderConfig("a"), EncoderConfig("b")))
+    yield Rig(SerialLineJoints(config, ("a", "b"), clock, open_port=lambda *_: VirtualPort(board, clock, 115_200)))
+
+
 def servos_that_fall_silent() -> AbstractContextManager[Rig]:
     said = count()
     return servos_on_the_bench(lambda reply: reply if next(said) < 30 else replace(reply, data=b""))
@@ -172,13 +198,25 @@ def ros_2_robot_that_falls_silent() -> AbstractContextManager[Rig]:
     return ros_2_robot(lambda message: intact(message) if next(said) < 30 else None)
 
 
+def feetech_servos_that_fall_silent() -> AbstractContextManager[Rig]:
+    said = count()
+    return feetech_servos_on_the_bench(lambda reply: reply if next(said) < 30 else replace(reply, data=b""))
+
+
+def encoders_that_fall_silent() -> AbstractContextManager[Rig]:
+    said = count()
+    return encoders_on_the_bench(lambda reply: reply if next(said) < 250 else replace(reply, data=b""))
+
+
 def swinging(id: int) -> Callable[[float], float]:
     return lambda t: float(np.sin(t + id))
 
 
 SIMULATED = pytest.mark.skipif(find_spec("pybullet") is None, reason="pybullet is not installed")
 ENDING_JOINTS = [replayed_joints, scripted_joints, pytest.param(simulated_joints, marks=SIMULATED)]
-JOINTS = [*ENDING_JOINTS, servos_on_the_bench, ros_2_robot]
+JOINTS = [*ENDING_JOINTS, servos_on_the_bench, feetech_servos_on_the_bench, encoders_on_the_bench, ros_2_robot]
+SILENT_SERVOS = [servos_that_fall_silent, feetech_servos_that_fall_silent]
+SILENT = [*SILENT_SERVOS, encoders_that_fall_silent, ros_2_robot_that_falls_silent]
 MARKERS = [replayed_marker, scripted_marker, pytest.param(tracked_camera, marks=SIMULATED)]
 CAMERAS = [pytest.param(simulated_camera, marks=SIMULATED)]
 STANDING_STILL = [*ENDING_JOINTS[2:], *MARKERS[2:], *CAMERAS]
@@ -249,16 +287,7 @@ def test_the_end_is_said_each_time_one_reads(make: Make) -> None:
 
 
 @pytest.mark.parametrize(
-    "make",
-    [
-        replayed_joints,
-        replayed_marker,
-        *ENDING_JOINTS[2:],
-        servos_that_fall_silent,
-        ros_2_robot_that_falls_silent,
-        *MARKERS[2:],
-        *CAMERAS,
-    ],
+    "make", [replayed_joints, replayed_marker, *ENDING_JOINTS[2:], *SILENT, *MARKERS[2:], *CAMERAS]
 )
 def test_where_nothing_comes_in_time_none_is_returned(make: Make) -> None:
     with make() as rig, rig.opened():

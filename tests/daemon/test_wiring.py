@@ -125,3 +125,63 @@ def test_a_joint_without_a_servo_is_named(tmp_path) -> None:
 def test_a_recording_and_servos_exclude_each_other(tmp_path) -> None:
     with pytest.raises(ConfigError, match="both a recording and servos"):
         load(tmp_path, '[drivers]\nrecording = "walk.csv"\n' + SERVOS)
+
+
+FEETECH = SERVOS.replace("dynamixel", "feetech").replace('"XM430-W350"', '"STS3215"').replace('"MX-28"', '"SCS0009"')
+ENCODERS = """
+[drivers.serial_lines]
+port = "/dev/serial/by-id/none"
+
+[[drivers.serial_lines.encoders]]
+joint = "waist"
+
+[[drivers.serial_lines.encoders]]
+joint = "shoulder"
+encoder = "upper"
+"""
+
+
+@pytest.mark.parametrize("tables", [FEETECH, ENCODERS])
+def test_other_hardware_in_robot_toml_is_the_joint_source(tmp_path, tables) -> None:
+    source = open_joints(load(tmp_path, tables), SystemClock())
+    assert source.joints == ("waist", "shoulder")
+    with pytest.raises(SourceLost, match=r"by-id/none is gone: No such file"), source:
+        pass
+
+
+@pytest.mark.parametrize(
+    ("tables", "right", "wrong", "said"),
+    [
+        (FEETECH, '"STS3215"', '"STS3251"', "unknown model 'STS3251'. Did you mean 'STS3250'"),
+        (FEETECH, '"waist"', '"waste"', r"unknown joint 'waste'. Did you mean 'waist'\?"),
+        (FEETECH, "id = 2", "id = 1", "the ID 1 is given twice on one bus"),
+        (ENCODERS, '"shoulder"', '"waist"', "a second encoder for the joint 'waist'"),
+        (ENCODERS, '"upper"', '"waist"', "the encoder 'waist' is given twice"),
+        (ENCODERS, "encoder =", "encode =", "unknown key 'encode' in .*Did you mean 'encoder'"),
+        (ENCODERS, 'joint = "waist"', 'joint = "waist"\ndirection = 2', "direction"),
+        (ENCODERS, "port =", "baud = 5\nport =", "baud"),
+    ],
+)
+def test_a_mistake_about_other_hardware_is_named_with_its_line(tmp_path, tables, right, wrong, said) -> None:
+    with pytest.raises(ConfigError, match=rf"robot.toml, line \d+: .*{said}"):
+        load(tmp_path, tables.replace(right, wrong))
+
+
+def test_a_joint_without_an_encoder_is_named(tmp_path) -> None:
+    with pytest.raises(ConfigError, match=r"no encoder .* for shoulder"):
+        load(tmp_path, ENCODERS[: ENCODERS.rindex("[[")])
+
+
+def test_a_rate_that_no_feetech_servo_has_is_refused(tmp_path) -> None:
+    with pytest.raises(ConfigError, match=r"buses\.baud: 12345 is unknown, known are: 19200, 38400"):
+        load(tmp_path, FEETECH.replace("port =", "baud = 12345\nport ="))
+
+
+def test_joints_come_from_one_kind_of_hardware(tmp_path) -> None:
+    with pytest.raises(ConfigError, match="cannot come from both dynamixel and serial_lines"):
+        load(tmp_path, SERVOS + ENCODERS)
+
+
+def test_a_recording_and_encoders_exclude_each_other(tmp_path) -> None:
+    with pytest.raises(ConfigError, match="both a recording and encoders"):
+        load(tmp_path, '[drivers]\nrecording = "walk.csv"\n' + ENCODERS)

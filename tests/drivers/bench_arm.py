@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from random import Random
+from typing import Literal
 
+from drivers.bench.virtual_port import VirtualClock, VirtualPort, at_once
 from drivers.dynamixel.bench.chain import Chain
 from drivers.dynamixel.bench.faults import Planned
 from drivers.dynamixel.bench.frames import Code, instructions_in
 from drivers.dynamixel.bench.servo import Servo
-from drivers.dynamixel.bench.virtual_port import VirtualClock, VirtualPort, at_once
 from drivers.dynamixel.config import BusConfig, DynamixelConfig, ServoConfig
 from drivers.dynamixel.joints import DynamixelJoints
 from drivers.dynamixel.models import BY_NAME
@@ -53,7 +54,7 @@ class Arm:
         latency_s: float = 0.0,
         delay_s: float = 0.0,
         seed: int = 0,
-        fast: str = "auto",
+        fast: Literal["auto", "never"] = "auto",
         limits: Sequence[tuple[float, float]] | None = None,
         last_pose: Sequence[float] | None = None,
         **settings,

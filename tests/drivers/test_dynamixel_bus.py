@@ -5,8 +5,8 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
+from drivers.bench.virtual_port import VirtualClock
 from drivers.dynamixel.bench.frames import status_packet
-from drivers.dynamixel.bench.virtual_port import VirtualClock
 from drivers.dynamixel.bus import Answer, Bus, Trouble, read_request, sync_request
 from drivers.dynamixel.channel import Channel
 from drivers.dynamixel.handshake import FittedServo

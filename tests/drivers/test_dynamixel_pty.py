@@ -11,8 +11,8 @@ import pytest
 from bench_arm import swing
 
 from daemon.reopen import Reopening
+from drivers.bench.pty_shell import PtyShell
 from drivers.dynamixel.bench.chain import Chain
-from drivers.dynamixel.bench.pty_shell import PtyShell
 from drivers.dynamixel.bench.servo import Servo
 from drivers.dynamixel.config import BusConfig, DynamixelConfig, ServoConfig
 from drivers.dynamixel.joints import DynamixelJoints
@@ -59,7 +59,7 @@ def test_most_times_are_those_of_the_sampling(shell) -> None:
     with driver(shell) as joints:
         for _ in range(200):
             reading = wait_for_reading(joints)
-            off.append(abs(reading.t - np.mean([sampling.t for sampling in shell.chain.samplings.values()])))
+            off.append(abs(reading.t - np.mean([sampling.t for sampling in shell.device.samplings.values()])))
     assert np.median(off) < 0.5e-3
 
 

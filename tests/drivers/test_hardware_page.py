@@ -11,6 +11,8 @@ import pytest
 
 from drivers.config import DriversConfig
 from drivers.dynamixel.models import BY_NAME, Register
+from drivers.feetech.models import LAYOUT_SCS, LAYOUT_STS
+from drivers.serial_lines.lines import Header, Reading, parse
 
 PAGE = (Path(__file__).parents[2] / "docs" / "hardware.md").read_text()
 SHOWN = ("XM430-W350", "PH54-200-S500", "MX-28")
@@ -23,18 +25,53 @@ ROWS = {
 }
 
 
-def block(language: str) -> str:
-    found = re.search(rf"```{language}\n(.*?)```", PAGE, re.DOTALL)
-    assert found is not None
-    return found[1]
+def block(language: str, about: str = "") -> str:
+    for found in re.findall(rf"```{language}\n(.*?)```", PAGE, re.DOTALL):
+        if about in found:
+            return found
+    raise KeyError(about)
 
 
 @pytest.mark.parametrize("uncommented", [False, True])
-def test_the_tables_for_robot_toml_are_accepted_also_with_all_keys(uncommented) -> None:
-    text = re.sub(r"^# (?=[a-z_]+ =)", "", block("toml"), flags=re.MULTILINE) if uncommented else block("toml")
+@pytest.mark.parametrize("driver", ["dynamixel", "feetech", "serial_lines"])
+def test_the_tables_for_robot_toml_are_accepted_also_with_all_keys(driver, uncommented) -> None:
+    shown = block("toml", driver)
+    text = re.sub(r"^# (?=[a-z_]+ =)", "", shown, flags=re.MULTILINE) if uncommented else shown
     config = msgspec.convert(tomllib.loads(text)["drivers"], DriversConfig)
     config.check(["shoulder"], Path("robot.toml"), text)
-    assert config.dynamixel is not None
+    assert getattr(config, driver) is not None
+
+
+@pytest.mark.parametrize("driver", ["feetech", "serial_lines"])
+def test_the_defaults_of_other_drivers_that_are_shown_are_the_defaults(driver) -> None:
+    shown = block("toml", driver)
+    plain = getattr(msgspec.convert(tomllib.loads(shown)["drivers"], DriversConfig), driver)
+    for key, value in re.findall(r"^# (\w+) = (\S+)", shown.partition("\n\n")[0], flags=re.MULTILINE):
+        assert getattr(plain, key) == tomllib.loads(f"value = {value}")["value"]
+
+
+def test_the_lines_that_are_shown_are_lines() -> None:
+    found = re.search(r"For example `(.*)` and `(.*)`", PAGE)
+    assert found is not None
+    assert isinstance(parse(found[1].encode()), Header)
+    assert parse(found[2].encode()) == Reading(12, 3456789, (1023, None))
+
+
+FEETECH_ROWS = {
+    "firmware, model": ("firmware", "model"),
+    "return delay": ("return_delay",),
+    "phase, homing offset, operating mode": ("drive_mode", "homing_offset", "operating_mode"),
+    "torque": ("torque",),
+    "goal position": ("goal",),
+}
+
+
+@pytest.mark.parametrize("row", FEETECH_ROWS)
+def test_the_table_of_feetech_registers_has_their_addresses(row) -> None:
+    line = next(line for line in PAGE.splitlines() if line.startswith(f"| {row} |"))
+    cells = [cell.strip() for cell in line.split("|")][2:4]
+    for cell, layout in zip(cells, (LAYOUT_STS, LAYOUT_SCS), strict=True):
+        assert cell == ", ".join(str(layout[name].address) for name in FEETECH_ROWS[row] if name in layout)
 
 
 def test_the_defaults_that_are_shown_are_the_defaults() -> None:
@@ -71,5 +108,7 @@ def test_the_blocks_are_where_the_table_says() -> None:
     def span(register: Register) -> str:
         return f"{register.address} … {register.end - 1}"
 
+    for layout in (LAYOUT_STS, LAYOUT_SCS):
+        assert f"| {span(layout.block)} |" in PAGE
     for model in SHOWN:
         assert f"| {span(BY_NAME[model].layout.block)} |" in PAGE

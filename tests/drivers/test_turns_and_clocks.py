@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.device_clock import DeviceClock
+from drivers.device_clock import DeviceClock, StreamClock
 from drivers.serial_line import DEFAULT_LATENCY_S, adapter_latency_s
 from drivers.turns import SpeedGate, nearest_turn
 
@@ -72,3 +72,38 @@ def test_the_adapter_s_latency_is_the_system_s_where_it_says(tmp_path) -> None:
     (tmp_path / "ttyUSB7").write_text("16\n")
     assert adapter_latency_s("/dev/ttyUSB7", str(tmp_path / "{}")) == 16e-3
     assert adapter_latency_s("/dev/ttyACM0", str(tmp_path / "{}")) == DEFAULT_LATENCY_S
+
+
+@pytest.mark.parametrize("held_s", [1e-3, 16e-3])
+@pytest.mark.parametrize("drift", [0.0, 50e-6, -0.01, 0.01])
+def test_a_stream_s_clock_is_known_in_offset_and_rate_through_its_wrap(drift, held_s) -> None:
+    rng, clock, off = Random(3), StreamClock(1e-6, 2**32), []
+    for k in range(6000):
+        true = 100.0 + k * 5e-3
+        stamp = int((true * (1 + drift) + 4175) / 1e-6) % 2**32  # wraps on the way
+        t = clock.time(true + rng.uniform(0, held_s), stamp)
+        assert t is not None
+        off.append(abs(t - true))
+    assert max(off[:600]) < held_s + 3e-3
+    assert np.percentile(off[600:], 99) < 0.25e-3
+    assert clock.rate == pytest.approx(1 / (1 + drift), abs=5e-5)
+
+
+@pytest.mark.parametrize("late_s", [0.6, 20.0, -0.05, -20.0])
+def test_a_stream_s_stamp_of_another_time_is_refused_and_does_no_harm(late_s) -> None:
+    clock = StreamClock(1e-6, 2**32)
+    for k in range(600):
+        t = 50.0 + k * 5e-3
+        assert clock.time(t, int(t / 1e-6)) == pytest.approx(t, abs=2e-6)
+    t = 50.0 + 600 * 5e-3
+    assert clock.time(t, int((t - late_s) / 1e-6)) is None
+    assert clock.time(t, int(t / 1e-6)) == pytest.approx(t, abs=2e-6)
+
+
+def test_a_stream_that_begins_with_a_backlog_is_soon_right() -> None:
+    clock, t = StreamClock(1e-6, 2**32), None
+    for k in range(400):
+        true = 50.0 + k * 5e-3
+        t = clock.time(max(true, 50.3), int(true / 1e-6))
+        assert t is not None
+    assert t == pytest.approx(51.995, abs=1e-4)

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
-from functools import reduce
-from operator import and_
+from drivers.bench.chain import ServoChain, mixed
+from drivers.bench.device import Reply, Sampling, no_faults
 
-from .faults import Faults, Reply
 from .frames import (
     ALERT,
     BROADCAST,
@@ -22,90 +19,31 @@ from .frames import (
 )
 from .servo import Servo
 
-BITS_PER_BYTE = 10  # with start and stop bit
-FORGET_AFTER_S = 0.02  # half an instruction is forgotten after so long
+__all__ = ["Chain", "no_faults"]
+
 PING_SLOT_S = 3e-3  # in answer to a broadcast PING each ID has its time
 
 
-Act = Callable[[Servo, float], tuple[Error, bytes]]
+class Chain(ServoChain[Servo]):
+    """Dynamixel servos on one half-duplex wire, of Protocols 2.0 and 1.0; see `ServoChain`."""
 
+    overhead = 11
 
-@dataclass(frozen=True, slots=True)
-class Sampling:
-    """When a servo took the position that it told, and the shaft's angle then [rad]."""
+    def _instructions_in(self, stream: bytearray) -> tuple[list[Instruction], int]:
+        return instructions_in(stream)
 
-    t: float
-    angle: float
+    def _packet(self, servo: Servo, error: Error, params: bytes) -> bytes:
+        return status_packet(servo.model.protocol, servo.id, _error_byte(servo, error), params)
 
-
-def no_faults(reply: Reply) -> Reply:
-    """Everything arrives."""
-    return reply
-
-
-class Chain:
-    """Servos on one half-duplex wire.
-
-    In SYNC_READ and BULK_READ each waits for the end of the answer before its own, or for as long as that would have
-    taken. Each takes its position when its turn comes. Servos with one ID talk at the same time: where their bytes
-    differ, the zeros win.
-
-    Attributes:
-        servos: in the order of the cable.
-        faults: what happens to the answers.
-        samplings: by ID, when each told its position last.
-        instructions: how many were understood.
-    """
-
-    def __init__(self, servos: Iterable[Servo], faults: Faults = no_faults) -> None:
-        """A chain with its power on."""
-        self.servos = list(servos)
-        self.faults = faults
-        self.samplings: dict[int, Sampling] = {}
-        self.instructions = 0
-        self._stream = bytearray()
-        self._last_byte_s = 0.0
-        self._byte_s = 0.0
-
-    def servo(self, id: int) -> Servo:
-        """The first one of this ID; KeyError without one."""
-        for servo in self.servos:
-            if servo.id == id:
-                return servo
-        raise KeyError(id)
-
-    def power_cycle(self, t: float) -> None:
-        """All lose their power and get it back at `t`."""
-        for servo in self.servos:
-            servo.reboot(t)
-
-    def send(self, data: bytes, t: float, baud: int) -> list[Reply]:
-        """The host's `data`, whose first byte is on the wire at `t` [s]; what the servos answer, in its order."""
-        if t - self._last_byte_s > FORGET_AFTER_S:
-            self._stream.clear()
-        before = len(self._stream)
-        self._stream += data
-        self._byte_s = BITS_PER_BYTE / baud
-        self._last_byte_s = t + len(data) * self._byte_s
-        found, done = instructions_in(self._stream)
-        del self._stream[:done]
-        replies: list[Reply] = []
-        for instruction in found:
-            self.instructions += 1
-            heard = t + (instruction.end - before) * self._byte_s
-            replies += self._answers(instruction, heard, baud)
-        arriving = [self.faults(reply) for reply in replies]
-        return sorted((reply for reply in arriving if reply.data), key=lambda reply: reply.start)
-
-    def byte_s(self, baud: int) -> float:
-        """How long a byte takes [s]."""
-        return BITS_PER_BYTE / baud
+    def _will_answer(self, servo: Servo, code: int) -> bool:
+        level = servo["status_return"]
+        return code == Code.PING or level == 2 or (level == 1 and code == Code.READ)
 
     def _answers(self, instruction: Instruction, t: float, baud: int) -> list[Reply]:
-        hearing = [s for s in self.servos if s.model.protocol == instruction.protocol and _agree(s.baud, baud)]
+        hearing = [s for s in self._listening(baud) if s.model.protocol == instruction.protocol]
         if not instruction.intact:
             there = [s for s in hearing if s.id == instruction.id]
-            return self._together(there, t, _complain)
+            return self._together(there, t, _complain, Code.READ)
         many = (
             {
                 Code.SYNC_READ: self._sync_read,
@@ -154,17 +92,6 @@ class Chain:
             self.samplings[servo.id] = Sampling(t, servo.angle(t))
         return servo.read(address, size, t)
 
-    def _together(self, servos: list[Servo], t: float, act: Act, code: int = Code.READ) -> list[Reply]:
-        """The answer of all servos of one ID, usually one; none where the status return level says so."""
-        if not servos:
-            return []
-        start = t + min(servo.return_delay_s for servo in servos)
-        done = [(servo, act(servo, start)) for servo in servos]
-        packets = [_packet(servo, *told) for servo, told in done if _will_answer(servo, code)]
-        if not packets:
-            return []
-        return [Reply(servos[0].id, start, _mixed(packets))]
-
     def _broadcast(self, servos: list[Servo], instruction: Instruction, t: float) -> list[Reply]:
         if instruction.code != Code.PING:
             for servo in servos:
@@ -179,24 +106,15 @@ class Chain:
 
     def _sync_read(self, servos: list[Servo], instruction: Instruction, t: float) -> list[Reply]:
         address, size = _number(instruction.params[:2]), _number(instruction.params[2:4])
-        return self._in_turn(servos, [(id, address, size) for id in instruction.params[4:]], t)
+        return self._in_turn(servos, [(id, address, size) for id in instruction.params[4:]], t, Code.READ)
 
     def _bulk_read(self, servos: list[Servo], instruction: Instruction, t: float) -> list[Reply]:
         params = instruction.params
         if instruction.protocol == 1:  # a zero, then length, ID, address of each
             parts = [params[k : k + 3] for k in range(1, len(params) - 2, 3)]
-            return self._in_turn(servos, [(id, address, size) for size, id, address in parts], t)
+            return self._in_turn(servos, [(id, address, size) for size, id, address in parts], t, Code.READ)
         parts = [params[k : k + 5] for k in range(0, len(params) - 4, 5)]
-        return self._in_turn(servos, [(p[0], _number(p[1:3]), _number(p[3:5])) for p in parts], t)
-
-    def _in_turn(self, servos: list[Servo], asked: list[tuple[int, int, int]], t: float) -> list[Reply]:
-        replies: list[Reply] = []
-        for id, address, size in asked:
-            there = [s for s in servos if s.id == id]
-            reply = self._together(there, t, lambda s, now, a=address, n=size: self._read(s, a, n, now))
-            replies += reply
-            t = reply[0].start + len(reply[0].data) * self._byte_s if reply else t + (size + 11) * self._byte_s
-        return replies
+        return self._in_turn(servos, [(p[0], _number(p[1:3]), _number(p[3:5])) for p in parts], t, Code.READ)
 
     def _fast_sync_read(self, servos: list[Servo], instruction: Instruction, t: float) -> list[Reply]:
         address, size = _number(instruction.params[:2]), _number(instruction.params[2:4])
@@ -211,7 +129,7 @@ class Chain:
                 start = t + there[0].return_delay_s
             now = start + len(packet) * self._byte_s
             told = [(servo, *self._read(servo, address, size, now)) for servo in there]
-            packet += _mixed([fast_block(packet, id, _error_byte(servo, error), data) for servo, error, data in told])
+            packet += mixed([fast_block(packet, id, _error_byte(servo, error), data) for servo, error, data in told])
         return [Reply(ids[0], start, packet)] if ids else []
 
     def _sync_write(self, servos: list[Servo], instruction: Instruction, t: float) -> list[Reply]:
@@ -237,26 +155,11 @@ class Chain:
 
 _CODES = frozenset(Code)
 _ONLY2 = (Code.SYNC_READ, Code.FAST_SYNC_READ, Code.BULK_WRITE)
-BAUD_TOLERANCE = 0.03
-
-
-def _agree(baud: int, other: int) -> bool:
-    return abs(baud - other) <= BAUD_TOLERANCE * baud
 
 
 def _complain(servo: Servo, t: float) -> tuple[Error, bytes]:
     del servo, t
     return Error.CRC, b""
-
-
-def _mixed(packets: list[bytes]) -> bytes:
-    """What is heard when all talk at the same time."""
-    return bytes(reduce(and_, together) for together in zip(*packets, strict=False))
-
-
-def _will_answer(servo: Servo, code: int) -> bool:
-    level = servo["status_return"]
-    return code == Code.PING or level == 2 or (level == 1 and code == Code.READ)
 
 
 def _number(data: bytes) -> int:
@@ -267,7 +170,3 @@ def _error_byte(servo: Servo, error: Error) -> int:
     if servo.model.protocol == 1:
         return servo.hardware_error | (0 if error is Error.NONE else ERRORS1.get(error, 0x08))
     return error | (ALERT if servo.hardware_error else 0)
-
-
-def _packet(servo: Servo, error: Error, params: bytes) -> bytes:
-    return status_packet(servo.model.protocol, servo.id, _error_byte(servo, error), params)

@@ -113,7 +113,7 @@ def _instruction(packet: bytes, end: int) -> Instruction:
     return Instruction(1, packet[2], packet[4], packet[5:-1], intact, end)
 
 
-def status_packet(protocol: Protocol, id: int, error: int, params: bytes) -> bytes:
+def status_packet(protocol: int, id: int, error: int, params: bytes) -> bytes:
     """A servo's answer."""
     if protocol == 1:
         body = bytes((id, len(params) + 2, error)) + params

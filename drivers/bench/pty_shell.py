@@ -1,0 +1,119 @@
+"""A device on a pseudo-terminal, which any program opens like a serial port."""
+
+from __future__ import annotations
+
+import math
+import os
+import select
+import termios
+import threading
+import time
+import tty
+from collections.abc import Callable
+from contextlib import suppress
+from heapq import heappop, heappush
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from .device import Device, Reply, byte_s
+
+_BAUDS = {getattr(termios, name): int(name[1:]) for name in dir(termios) if name[0] == "B" and name[1:].isdigit()}
+DEFAULT_BAUD = 38_400  # of a terminal that nobody has set
+LINE_SPEED = 5  # place of the output speed in termios.tcgetattr
+
+
+class PtyShell:
+    """Serves a device on a pseudo-terminal, under a name that stays the same when it is unplugged and plugged in again.
+
+    Answers take the time that they take on a wire of the rate at which the port was opened.
+    """
+
+    def __init__(self, device: Device, link: Path, now: Callable[[], float] = time.monotonic) -> None:
+        """Nothing is opened yet.
+
+        Args:
+            link: the port's name, a symbolic link.
+            now: the clock of the device; it has to run like the machine's.
+        """
+        self.device, self.link = device, link
+        self._now = now
+        self._serving: _Serving | None = None
+
+    def __enter__(self) -> Self:
+        self.plug_in()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.unplug()
+
+    def plug_in(self) -> None:
+        """The port is there."""
+        if self._serving is None:
+            self._serving = _Serving(self.device, self._now)
+            self.link.unlink(missing_ok=True)
+            self.link.symlink_to(self._serving.name)
+
+    def unplug(self) -> None:
+        """The port is gone, also for who has it open. The servos keep their power."""
+        if self._serving is not None:
+            self.link.unlink(missing_ok=True)
+            self._serving.stop()
+            self._serving = None
+
+
+class _Serving:
+    """One life of the pseudo-terminal and the thread that serves it."""
+
+    def __init__(self, device: Device, now: Callable[[], float]) -> None:
+        self._device, self._now = device, now
+        # The other end is kept open: without anybody there, reading fails.
+        self._master, self._slave = os.openpty()
+        tty.setraw(self._master)
+        tty.setraw(self._slave)
+        os.set_blocking(self._master, False)
+        self._wake, self._waker = os.pipe()
+        self.name = os.ttyname(self._slave)
+        self._due: list[tuple[float, int, bytes]] = []
+        self._order = 0
+        self._thread = threading.Thread(target=self._serve, name="bench")
+        self._thread.start()
+
+    def stop(self) -> None:
+        os.write(self._waker, b"x")
+        self._thread.join()
+        for descriptor in (self._master, self._slave, self._wake, self._waker):
+            os.close(descriptor)
+
+    def _serve(self) -> None:
+        while True:
+            wait_s = max(0.0, self._next - self._now())
+            readable, _, _ = select.select((self._master, self._wake), (), (), None if wait_s == math.inf else wait_s)
+            if self._wake in readable:
+                return
+            if self._master in readable:
+                self._hear(os.read(self._master, 4096))
+            if self._device.speaks_at <= self._now():
+                self._bring(self._device.speak(self._now(), self._baud), self._baud)
+            while self._due and self._due[0][0] <= self._now():
+                with suppress(BlockingIOError):  # nobody has read for long: what is said now is lost
+                    os.write(self._master, heappop(self._due)[2])
+
+    @property
+    def _next(self) -> float:
+        return min(self._due[0][0] if self._due else math.inf, self._device.speaks_at)
+
+    @property
+    def _baud(self) -> int:
+        return _BAUDS.get(termios.tcgetattr(self._slave)[LINE_SPEED], 0) or DEFAULT_BAUD
+
+    def _hear(self, data: bytes) -> None:
+        self._bring(self._device.send(data, self._now(), self._baud), self._baud)
+
+    def _bring(self, replies: list[Reply], baud: int) -> None:
+        for reply in replies:
+            self._order += 1
+            end = reply.start + len(reply.data) * byte_s(baud)
+            heappush(self._due, (end, self._order, reply.data))

@@ -1,0 +1,108 @@
+"""A device behind a port in virtual time: millions of transactions without a wait."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from datetime import UTC, datetime, timedelta
+from heapq import heappop, heappush
+
+from .device import Device, Reply, byte_s
+
+
+class VirtualClock:
+    """A clock that stands still but when somebody waits."""
+
+    def __init__(self, start: float = 100.0) -> None:
+        self._now = start
+
+    def now(self) -> float:
+        """Virtual time [s]."""
+        return self._now
+
+    def utc(self) -> str:
+        """Virtual time since 2026, ISO 8601 in UTC."""
+        return (datetime(2026, 1, 1, tzinfo=UTC) + timedelta(seconds=self._now)).isoformat(timespec="milliseconds")
+
+    def wait_until(self, t: float) -> None:
+        """Let the time be `t`, if it is not later already."""
+        self._now = max(self._now, t)
+
+
+def at_once() -> float:
+    """No delay."""
+    return 0.0
+
+
+class VirtualPort:
+    """What the driver needs of a serial port, with a device at its other end."""
+
+    def __init__(
+        self,
+        device: Device,
+        clock: VirtualClock,
+        baud: int = 1_000_000,
+        *,
+        outwards: Callable[[], float] = at_once,
+        inwards: Callable[[], float] = at_once,
+    ) -> None:
+        """An open port.
+
+        Args:
+            outwards: how long bytes need from the program to the wire [s], drawn anew for each packet.
+            inwards: how long from the wire to the program, drawn anew for each question, or what is said unasked.
+        """
+        self.device = device
+        self._clock, self._baud = clock, baud
+        self._outwards, self._inwards = outwards, inwards
+        self._arriving: list[tuple[float, int, bytes]] = []
+        self._order, self._brought_s = 0, 0.0
+
+    @property
+    def baud(self) -> int:
+        """Bits per second."""
+        return self._baud
+
+    def close(self) -> None:
+        """Nothing arrives any more."""
+        self._arriving.clear()
+
+    def write(self, data: bytes) -> None:
+        """Send `data`."""
+        self._bring(self.device.send(data, self._clock.now() + self._outwards(), self._baud))
+
+    def receive(self, until: float) -> bytes:
+        """What has arrived, else what arrives next; nothing when that is not before `until`."""
+        while self.device.speaks_at <= min(until, self._arriving[0][0] if self._arriving else math.inf):
+            self._bring_in_order(self.device.speak(self.device.speaks_at, self._baud))
+        if not self._arriving or self._arriving[0][0] > until:
+            self._clock.wait_until(until)
+            return b""
+        self._clock.wait_until(self._arriving[0][0])
+        return self._arrived()
+
+    def flush(self) -> None:
+        """Forget what has arrived."""
+        self._bring_in_order(self.device.speak(self._clock.now(), self._baud))
+        self._arrived()
+
+    def _bring_in_order(self, replies: list[Reply]) -> None:
+        """What a device says of itself is not answered, so each is held back by itself, but none overtakes another."""
+        for reply in replies:
+            end = reply.start + len(reply.data) * byte_s(self._baud)
+            self._brought_s = max(self._brought_s, end + self._inwards())
+            self._order += 1
+            heappush(self._arriving, (self._brought_s, self._order, reply.data))
+
+    def _bring(self, replies: list[Reply]) -> None:
+        inwards_s = self._inwards()
+        for reply in replies:
+            self._order += 1
+            arrival = reply.start + len(reply.data) * byte_s(self._baud) + inwards_s
+            heappush(self._arriving, (arrival, self._order, reply.data))
+
+    def _arrived(self) -> bytes:
+        data = b""
+        while self._arriving and self._arriving[0][0] <= self._clock.now():
+            data += heappop(self._arriving)[2]
+        return data

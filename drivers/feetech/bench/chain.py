@@ -1,0 +1,84 @@
+"""Feetech servos on one wire: bytes in, bytes with times out."""
+
+from __future__ import annotations
+
+from drivers.bench.chain import ServoChain
+from drivers.bench.device import Reply, Sampling
+
+from .frames import BROADCAST, Code, Instruction, instructions_in, status_packet
+from .servo import Servo
+
+
+class Chain(ServoChain[Servo]):
+    """Feetech servos on one half-duplex wire; see `ServoChain`. What is not intact is not answered."""
+
+    overhead = 6
+
+    def _instructions_in(self, stream: bytearray) -> tuple[list[Instruction], int]:
+        return instructions_in(stream)
+
+    def _packet(self, servo: Servo, error: int, params: bytes) -> bytes:
+        return status_packet(servo.id, error, params)
+
+    def _will_answer(self, servo: Servo, code: int) -> bool:
+        return servo["status_return"] > 0 or code in (Code.PING, Code.READ, Code.SYNC_READ)
+
+    def _answers(self, instruction: Instruction, t: float, baud: int) -> list[Reply]:
+        hearing, params = self._listening(baud), instruction.params
+        if instruction.code == Code.SYNC_READ:
+            knowing = [servo for servo in hearing if servo.knows_sync_read]
+            asked = [(id, params[0], params[1]) for id in params[2:]]
+            return self._in_turn(knowing, asked, t, Code.SYNC_READ)
+        if instruction.code == Code.SYNC_WRITE:
+            self._sync_write(hearing, params, t)
+            return []
+        is_for_all = instruction.id == BROADCAST
+        there = [servo for servo in hearing if is_for_all or servo.id == instruction.id]
+        there = [servo for servo in there if self._is_understood(servo, instruction)]
+        if is_for_all and instruction.code != Code.PING:
+            for servo in there:
+                self._obey(servo, instruction, t)
+            return []
+        return self._together(there, t, lambda servo, now: self._obey(servo, instruction, now), instruction.code)
+
+    def _is_understood(self, servo: Servo, instruction: Instruction) -> bool:
+        params = instruction.params
+        match instruction.code:
+            case Code.PING | Code.ACTION | Code.RESET:
+                return True
+            case Code.READ:
+                return len(params) == 2 and params[1] > 0 and sum(params) <= servo.model.layout.size
+            case Code.WRITE | Code.REG_WRITE:
+                return len(params) > 1
+            case _:
+                return False
+
+    def _obey(self, servo: Servo, instruction: Instruction, t: float) -> tuple[int, bytes]:
+        params = instruction.params
+        match instruction.code:
+            case Code.READ:
+                return self._read(servo, params[0], params[1], t)
+            case Code.WRITE:
+                servo.write(params[0], params[1:], t)
+            case Code.REG_WRITE:
+                servo.register_write(params[0], params[1:])
+            case Code.ACTION:
+                servo.action(t)
+            case Code.RESET:
+                servo.factory_reset(t)
+        return servo["status"], b""
+
+    def _read(self, servo: Servo, address: int, size: int, t: float) -> tuple[int, bytes]:
+        position = servo.model.layout["position"]
+        if address <= position.address and position.end <= address + size:
+            self.samplings[servo.id] = Sampling(t, servo.angle(t))
+        return servo["status"], servo.read(address, size, t) or b""
+
+    def _sync_write(self, servos: list[Servo], params: bytes, t: float) -> None:
+        if len(params) < 2:
+            return
+        address, size = params[0], params[1]
+        for k in range(2, len(params) - size, size + 1):
+            for servo in servos:
+                if servo.id == params[k]:
+                    servo.write(address, params[k + 1 : k + 1 + size], t)

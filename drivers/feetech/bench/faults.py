@@ -1,0 +1,22 @@
+"""What can go wrong with an answer on its way, of Feetech servos; see `drivers.bench.faults`."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from random import Random
+
+from drivers.bench import faults
+from drivers.bench.device import Reply
+
+
+def swapped(reply: Reply, rng: Random) -> Reply:
+    """It carries another ID, with a checksum that fits."""
+    data = bytearray(reply.data)
+    data[2] = (reply.id + rng.choice((-1, 1))) % 253
+    data[-1] = ~sum(data[2:-1]) & 0xFF
+    return replace(reply, data=bytes(data))
+
+
+def storm(intensity: float, rng: Random, longest_late_s: float = 0.05) -> faults.Storm:
+    """All of them in equal shares; `intensity` is the probability that an answer suffers one."""
+    return faults.storm(intensity, rng, swapped, longest_late_s=longest_late_s)

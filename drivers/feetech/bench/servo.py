@@ -1,0 +1,170 @@
+"""One Feetech servo: its control table, and the rules by which it changes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+from drivers.feetech.models import BAUDS, SCS
+from drivers.servos.model import Model
+
+Angle = Callable[[float], float]
+
+VELOCITY_STEP_S = 0.01
+RETURN_DELAY_UNIT_US = 2
+CALIBRATE = 128  # written to the torque register: where it is, is the middle of its range from now on
+FACTORY = {"firmware": 0x030A, "baud": 0, "id": 1, "return_delay": 250, "status_return": 1, "unloading": 44}
+RAM_OF_FACTORY = {"lock": 1, "voltage": 74, "temperature": 31}
+READ_ONLY = ("firmware", "model", "position", "velocity", "load", "voltage", "temperature", "status", "moving")
+LARGEST_SPEED = 3400  # [ticks/s]
+
+
+class Servo:
+    """A servo on a bench.
+
+    Torque holds nothing here: the shaft is wherever `angle` says.
+
+    Attributes:
+        model: what it is.
+        glitch_ticks: the encoder is wrong by this.
+        knows_sync_read: it answers SYNC_READ.
+    """
+
+    def __init__(
+        self,
+        model: Model,
+        id: int,
+        angle: Angle,
+        *,
+        baud: int = 1_000_000,
+        return_delay_s: float = 500e-6,
+        multi_turn: bool = False,
+    ) -> None:
+        """A servo as it leaves the factory, but for the arguments.
+
+        Args:
+            angle: where its shaft is at a time [s]: [rad], 0 in the middle of its range, any number of turns.
+            multi_turn: it counts its turns, until it loses its power.
+        """
+        self.model, self.knows_sync_read = model, model.protocol != SCS
+        self.glitch_ticks = 0
+        self._angle, self._multi_turn, self._base = angle, multi_turn, 0
+        self._memory = bytearray(model.layout.size)
+        self._registered: tuple[int, bytes] | None = None
+        self["model"] = model.number
+        for name, value in (FACTORY | RAM_OF_FACTORY).items():
+            self[name] = value
+        self["id"], self["baud"] = id, BAUDS.index(baud)
+        self["return_delay"] = round(return_delay_s * 1e6 / RETURN_DELAY_UNIT_US)
+        self._saved = bytes(self._memory[: model.layout.ram])
+
+    def __getitem__(self, name: str) -> int:
+        """The number in a register."""
+        return self.model.layout.value(name, bytes(self._memory))
+
+    def __setitem__(self, name: str, value: int) -> None:
+        """Put a number into a register as the servo itself does, past all locks, for good."""
+        register = self.model.layout[name]
+        self._memory[register.address : register.end] = register.bytes(value)
+        self._saved = bytes(self._memory[: self.model.layout.ram])
+
+    @property
+    def id(self) -> int:
+        """Its number on the bus."""
+        return self["id"]
+
+    @property
+    def baud(self) -> int:
+        """The rate at which it listens [bit/s]."""
+        return BAUDS[min(self["baud"], len(BAUDS) - 1)]
+
+    @property
+    def return_delay_s(self) -> float:
+        """How long it waits before it answers."""
+        return self["return_delay"] * RETURN_DELAY_UNIT_US * 1e-6
+
+    def angle(self, t: float) -> float:
+        """Where its shaft is at `t` [rad]."""
+        return self._angle(t)
+
+    def fail(self, bits: int) -> None:
+        """Something is wrong with it, until it is rebooted; torque goes off where `unloading` says so."""
+        self["status"] |= bits
+        if bits & self["unloading"]:
+            self["torque"] = 0
+
+    def reboot(self, t: float) -> None:
+        """As by a power cycle: RAM, what was written to a locked EEPROM, and the number of turns are lost."""
+        ram = self.model.layout.ram
+        self._memory[:] = self._saved + bytes(len(self._memory) - ram)
+        for name, value in RAM_OF_FACTORY.items():
+            self[name] = value
+        self._registered = None
+        self._base = math.floor(self._count(t) / (self.model.ticks_per_turn or 1))
+
+    def position(self, t: float) -> int:
+        """Present Position at `t` [ticks]."""
+        counted, turn = self._count(t) + self.glitch_ticks, self.model.ticks_per_turn
+        if turn is None:
+            return min(max(counted, 0), 1023)
+        return counted - self._base * turn if self._multi_turn else counted % turn
+
+    def read(self, address: int, size: int, t: float) -> bytes | None:
+        """Bytes of the control table at `t`; None where there are none."""
+        if size == 0 or address + size > len(self._memory):
+            return None
+        self._sense(t)
+        return bytes(self._memory[address : address + size])
+
+    def write(self, address: int, data: bytes, t: float) -> None:
+        """Change bytes of the control table; what is read-only stays as it is."""
+        layout = self.model.layout
+        fixed = {place for name in READ_ONLY for place in range(layout[name].address, layout[name].end)}
+        for place, byte in enumerate(data, address):
+            if place < len(self._memory) and place not in fixed:
+                self._memory[place] = byte
+        if not self["lock"]:
+            self._saved = bytes(self._memory[: layout.ram])
+        if self["torque"] == CALIBRATE:
+            self._calibrate(t)
+
+    def register_write(self, address: int, data: bytes) -> None:
+        """Keep a write for ACTION."""
+        self._registered = (address, data)
+
+    def action(self, t: float) -> None:
+        """Do the write that was kept."""
+        if self._registered is not None:
+            self.write(*self._registered, t)
+        self._registered = None
+
+    def factory_reset(self, t: float) -> None:
+        """All but the ID as it left the factory."""
+        for name, value in FACTORY.items():
+            if name != "id":
+                self[name] = value
+        self.reboot(t)
+
+    def _calibrate(self, t: float) -> None:
+        self["torque"] = 0
+        if "homing_offset" in self.model.layout:
+            offset = self._count(t) + self["homing_offset"] - self.model.zero_ticks
+            self["homing_offset"] = (offset + 2047) % 4096 - 2047
+
+    def _count(self, t: float) -> int:
+        ticks = round(self._angle(t) / self.model.rad_per_tick) + self.model.zero_ticks
+        return ticks - self["homing_offset"]
+
+    def _sense(self, t: float) -> None:
+        """Put what is measured at `t` into the control table."""
+        layout = self.model.layout
+        rad_s = (self._angle(t) - self._angle(t - VELOCITY_STEP_S)) / VELOCITY_STEP_S
+        velocity = round(rad_s / self.model.velocity_unit)
+        measured = {
+            "velocity": min(max(velocity, -LARGEST_SPEED), LARGEST_SPEED),
+            "moving": int(velocity != 0),
+            "position": self.position(t),
+        }
+        for name, value in measured.items():
+            register = layout[name]
+            self._memory[register.address : register.end] = register.bytes(value)

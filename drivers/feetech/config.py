@@ -1,0 +1,40 @@
+"""The table [drivers.feetech] of robot.toml."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import ClassVar, Literal
+
+import msgspec
+
+from drivers.servos.config import NonNegative, ServoConfig, ServosConfig
+from drivers.servos.model import Model
+
+from .models import BY_NAME
+
+__all__ = ["Baud", "BusConfig", "FeetechConfig", "ServoConfig"]
+
+Baud = Literal[19_200, 38_400, 57_600, 115_200, 128_000, 250_000, 500_000, 1_000_000]
+
+
+class BusConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The table [drivers.feetech.buses.<name>]: a port with servos behind it.
+
+    Attributes:
+        port: best one of /dev/serial/by-id, which stays the same when it is plugged in again.
+        baud: as the servos are set [bit/s].
+        latency_ms: how long the adapter keeps bytes back; without this key the system is asked.
+        sync_read: `auto` asks the servos of the STS and SMS series once whether they know it.
+    """
+
+    port: str
+    baud: Baud = 1_000_000
+    latency_ms: NonNegative | None = None
+    sync_read: Literal["auto", "never"] = "auto"
+
+
+class FeetechConfig(ServosConfig[BusConfig], frozen=True, forbid_unknown_fields=True):
+    """The table [drivers.feetech]."""
+
+    table: ClassVar[str] = "drivers.feetech"
+    models: ClassVar[Mapping[str, Model]] = BY_NAME

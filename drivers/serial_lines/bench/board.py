@@ -1,0 +1,102 @@
+"""A microcontroller with encoders, which says a line for each measurement."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+
+from drivers.bench.device import Faults, Reply, byte_s, no_faults
+from drivers.serial_lines.lines import SEQUENCES, STAMP_S, STAMPS, VERSION, with_checksum
+
+HEADER_EVERY_S = 1.0
+Angle = Callable[[float], float]
+
+
+class EncoderBoard:
+    """Encoders on a bench.
+
+    Attributes:
+        faults: what happens to the lines; their id is 0.
+        failing: encoders whose sensor has no value.
+        glitch_ticks: by name, by how much an encoder is wrong.
+        lines: how many were said.
+    """
+
+    def __init__(
+        self,
+        encoders: Mapping[str, tuple[int, Angle]],
+        *,
+        rate_hz: float = 200.0,
+        begun_s: float = 0.0,
+        boot: int = 1,
+        drift: float = 0.0,
+        faults: Faults = no_faults,
+    ) -> None:
+        """A board with its power on.
+
+        Args:
+            encoders: by name, ticks of a turn, and where the shaft is at a time [s]: [rad], 0 at the raw position 0.
+            begun_s: when it got its power.
+            drift: by how much its clock is too fast.
+        """
+        self.encoders, self.faults = dict(encoders), faults
+        self.failing: set[str] = set()
+        self.glitch_ticks: dict[str, int] = {}
+        self.lines = 0
+        self._period_s, self._drift = 1 / rate_hz, drift
+        self._start(begun_s, boot)
+
+    @property
+    def speaks_at(self) -> float:
+        """When the next line is begun [s]."""
+        return self._next_s
+
+    def reboot(self, t: float) -> None:
+        """It loses its power and has it back at `t`."""
+        self._start(t, (self._boot * 25_173 + 13_849) % SEQUENCES)
+
+    def send(self, data: bytes, t: float, baud: int) -> list[Reply]:
+        """The host's `data`; a question mark asks for the header, which comes before the next line."""
+        del t, baud
+        if b"?" in data:
+            self._owes_header = True
+        return []
+
+    def speak(self, until: float, baud: int) -> list[Reply]:
+        """The lines that it begins by `until`."""
+        replies: list[Reply] = []
+        while self._next_s <= until:
+            said = self._said(self._next_s)
+            replies.append(self.faults(Reply(0, self._next_s, said)))
+            self._next_s += max(self._period_s, len(said) * byte_s(baud))  # it measures when the last line is out
+        return [reply for reply in replies if reply.data]
+
+    def _start(self, t: float, boot: int) -> None:
+        self._boot, self._begun_s, self._next_s = boot, t, t
+        self._seq, self._header_s = 0, -math.inf
+        self._owes_header = True
+
+    def _said(self, t: float) -> bytes:
+        line = self._reading(t)
+        if self._owes_header or t - self._header_s >= HEADER_EVERY_S:
+            self._owes_header, self._header_s = False, t
+            return line + self._header()
+        return line
+
+    def _reading(self, t: float) -> bytes:
+        words = [self._ticks(name, t) for name in self.encoders]
+        stamp = int((t - self._begun_s) * (1 + self._drift) / STAMP_S) % STAMPS
+        line = with_checksum(",".join((str(self._seq), str(stamp), *words)))
+        self._seq = (self._seq + 1) % SEQUENCES
+        self.lines += 1
+        return line
+
+    def _ticks(self, name: str, t: float) -> str:
+        if name in self.failing:
+            return "-"
+        per_turn, angle = self.encoders[name]
+        return str((round(angle(t) * per_turn / (2 * math.pi)) + self.glitch_ticks.get(name, 0)) % per_turn)
+
+    def _header(self) -> bytes:
+        words = (f"{name},{per_turn}" for name, (per_turn, _) in self.encoders.items())
+        return with_checksum(",".join(("H", str(VERSION), str(self._boot), str(len(self.encoders)), *words)))

@@ -1,0 +1,87 @@
+"""The table [drivers.serial_lines] of robot.toml."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Annotated, Literal
+
+import msgspec
+from msgspec import Meta
+
+from interfaces.errors import ConfigError
+from interfaces.suggest import did_you_mean
+from interfaces.toml_file import line_in_entry, line_of
+
+Positive = Annotated[float, Meta(gt=0)]
+NonNegative = Annotated[float, Meta(ge=0)]
+TABLE = "drivers.serial_lines"
+
+
+class EncoderConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """An entry [[drivers.serial_lines.encoders]]: the encoder of one joint.
+
+    Attributes:
+        joint: its name in [robot] joints.
+        encoder: its name in the board's header; by default the joint's.
+        direction: −1 where the joint counts against the encoder.
+        zero_ticks: the encoder's position where the joint is at 0.
+        ticks_per_turn: what the header has to say; without this key it is believed.
+    """
+
+    joint: str
+    encoder: str | None = None
+    direction: Literal[1, -1] = 1
+    zero_ticks: int = 0
+    ticks_per_turn: Annotated[int, Meta(gt=1)] | None = None
+
+    @property
+    def name(self) -> str:
+        """The encoder's name in the header."""
+        return self.joint if self.encoder is None else self.encoder
+
+
+class SerialLinesConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The table [drivers.serial_lines].
+
+    Attributes:
+        port: best one of /dev/serial/by-id, which stays the same when it is plugged in again.
+        baud: of the board's UART [bit/s].
+        native_usb: the microcontroller has USB itself, so that lines need no time on a wire.
+        delay_ms: from the middle of a measurement to the first byte of its line on the wire.
+        max_speed_deg_s: no joint moves faster; a position that would need it is not believed.
+        max_move_deg: how far a joint may have been moved while the board was away, where only the nearest turn tells.
+    """
+
+    port: str
+    encoders: Annotated[tuple[EncoderConfig, ...], Meta(min_length=1)]
+    baud: Annotated[int, Meta(ge=9600, le=4_000_000)] = 115_200
+    native_usb: bool = False
+    delay_ms: NonNegative = 0.0
+    max_speed_deg_s: Positive = 600.0
+    max_move_deg: Annotated[float, Meta(gt=0, lt=180)] = 30.0
+
+    def check(self, joints: Sequence[str], file: Path, text: str) -> None:
+        """ConfigError when the encoders are not one for each of `joints`."""
+        for place, what, key, remedy in self._mistakes(joints):
+            raise ConfigError(what, file=file, line=line_in_entry(text, f"{TABLE}.encoders", place, key), remedy=remedy)
+        missing = [joint for joint in joints if joint not in {encoder.joint for encoder in self.encoders}]
+        if missing:
+            raise ConfigError(
+                f"no encoder in [[{TABLE}.encoders]] for {', '.join(missing)}",
+                file=file,
+                line=line_of(text, (*TABLE.split("."), "encoders")),
+                remedy="Every joint of [robot] joints needs one",
+            )
+
+    def _mistakes(self, joints: Sequence[str]) -> Iterator[tuple[int, str, str, str]]:
+        seen_joints, seen_names = set[str](), set[str]()
+        for place, encoder in enumerate(self.encoders):
+            if encoder.joint not in joints:
+                yield place, f"unknown joint {encoder.joint!r}", "joint", did_you_mean(encoder.joint, joints)
+            if encoder.joint in seen_joints:
+                yield place, f"a second encoder for the joint {encoder.joint!r}", "joint", "Give each joint one"
+            if encoder.name in seen_names:
+                yield place, f"the encoder {encoder.name!r} is given twice", "encoder", "Give each joint its own"
+            seen_joints.add(encoder.joint)
+            seen_names.add(encoder.name)

@@ -1,0 +1,325 @@
+"""Own encoders as a `JointSource`."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Self
+
+from drivers.serial_line import RETRY_S, SerialLine
+from drivers.servos.port import Port
+from drivers.turn_count import TurnCount
+from drivers.turns import SpeedGate
+from interfaces.errors import SourceError, SourceLost
+from interfaces.protocols import Clock
+from interfaces.records import JointReading, frozen_array
+
+from .board import Board, Counts, Timed
+from .config import TABLE, EncoderConfig, SerialLinesConfig
+from .lines import ASK_HEADER, Header
+
+log = logging.getLogger(__name__)
+
+BITS_PER_BYTE = 10
+HEADER_S = 4.0  # an Arduino starts anew when its port is opened, and takes two seconds
+ASK_EVERY_S = 0.5
+ANCHOR_S = 1.0
+LOST_AFTER_S = 0.25  # without a reading; within this no joint turns by half a turn unseen
+FEW_ATTEMPTS = 3
+SLACK_TICKS_PART = 1000  # of a turn
+
+OpenPort = Callable[[SerialLinesConfig, Clock], Port]
+
+
+def open_serial(config: SerialLinesConfig, clock: Clock) -> Port:
+    """The open port."""
+    return SerialLine.open(config.port, config.baud, clock.now)
+
+
+@dataclass(frozen=True, slots=True)
+class Encoder:
+    """An encoder as the board announced it.
+
+    Attributes:
+        place: in the board's lines.
+        ticks_per_turn: after so many it tells the same again.
+    """
+
+    config: EncoderConfig
+    place: int
+    ticks_per_turn: int
+
+    @property
+    def joint(self) -> str:
+        """The joint's name."""
+        return self.config.joint
+
+    @property
+    def label(self) -> str:
+        """Its own name, for messages."""
+        return f"encoder {self.config.name!r}"
+
+    @property
+    def rad_per_tick(self) -> float:
+        """Exactly a turn by its ticks [rad]."""
+        return 2 * math.pi / self.ticks_per_turn
+
+    def angle(self, ticks: int) -> float:
+        """The joint's angle [rad] at a position with its turns [ticks]."""
+        return self.config.direction * (ticks - self.config.zero_ticks) * self.rad_per_tick
+
+    def ticks(self, angle: float) -> float:
+        """The position [ticks] at a joint's angle [rad]."""
+        return self.config.zero_ticks + self.config.direction * angle / self.rad_per_tick
+
+
+class SerialLineJoints:
+    """Reads the encoders of a board that sends a line for each measurement.
+
+    A reading is one intact line in its turn, at a time that the board's clock bears out, in which no joint is where it
+    cannot have come to. SourceLost is raised when nothing such comes for a quarter of a second, or when the board was
+    restarted: opened again, everything is compared with where the joints were.
+
+    Attributes:
+        encoders: as they were found at the last opening, in the order of the joints.
+        epoch: how often it was opened.
+        dropped: readings that were dropped though their lines were intact.
+        counts: how the lines went since the last opening.
+    """
+
+    def __init__(
+        self,
+        config: SerialLinesConfig,
+        joints: Sequence[str],
+        clock: Clock,
+        *,
+        limits: Sequence[tuple[float, float]] | None = None,
+        last_pose: Sequence[float] | None = None,
+        open_port: OpenPort = open_serial,
+    ) -> None:
+        """Nothing is opened yet.
+
+        Args:
+            config: checked; see `SerialLinesConfig.check`.
+            joints: in the order of q.
+            limits: of each joint [rad]: with less than a turn between them there is no doubt about the turn.
+            last_pose: where the joints were when they were read last [rad], shape (d,), to count turns from.
+        """
+        self._config, self._names, self._clock, self._open_port = config, tuple(joints), clock, open_port
+        by_joint = {encoder.joint: encoder for encoder in config.encoders}
+        self._wanted = [by_joint[joint] for joint in joints]
+        unlimited = [(-math.inf, math.inf)] * len(joints)
+        self._turns = TurnCount(limits or unlimited, last_pose, config.max_move_deg, TABLE)
+        self._port: Port | None = None
+        self._board = Board(0.0, 0.0)
+        self._last_t = self._believed_s = self._heard_s = -math.inf
+        self._attempts = 0
+        self._why, self._failing = "", set[str]()
+        self.encoders: list[Encoder] = []
+        self.epoch = self.dropped = 0
+
+    @property
+    def joints(self) -> tuple[str, ...]:
+        """Names of the joints in the order of q."""
+        return self._names
+
+    @property
+    def counts(self) -> Counts:
+        """How the lines went since the last opening."""
+        return self._board.counts
+
+    @property
+    def health(self) -> tuple[str, ...]:
+        """Which encoders fail, and what to do."""
+        return tuple(_complaint(joint) for joint in sorted(self._failing))
+
+    @property
+    def record(self) -> tuple[Mapping[str, object], ...]:
+        """What is to be kept with the data: each encoder's identity and settings."""
+        return tuple(
+            {
+                "joint": encoder.joint,
+                "encoder": encoder.config.name,
+                "ticks_per_turn": encoder.ticks_per_turn,
+                "zero_ticks": encoder.config.zero_ticks,
+                "direction": encoder.config.direction,
+                "rad_per_tick": encoder.rad_per_tick,
+            }
+            for encoder in self.encoders
+        )
+
+    def __enter__(self) -> Self:
+        port = self._open_port(self._config, self._clock)
+        try:
+            self._begin(port)
+        except BaseException:
+            _close(port)
+            raise
+        self._port = port
+        self.epoch += 1
+        log.info("%d encoders are read", len(self.encoders))
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._port is not None:
+            _close(self._port)
+            self._port = None
+
+    def read(self, timeout_s: float) -> JointReading | None:
+        """The next reading; see `JointSource.read`.
+
+        Raises:
+            SourceLost: the port is gone, nothing intact comes any more, or the board was restarted.
+        """
+        if self._port is None:
+            raise SourceError("the encoders are not open; use them in a with statement")
+        deadline = self._clock.now() + timeout_s
+        while True:
+            while (timed := self._board.next()) is not None:
+                reading = self._judge(timed)
+                if reading is not None:
+                    self._believed_s, self._attempts = self._clock.now(), 0
+                    return reading
+                self.dropped += 1
+            self._hear(self._port, deadline)
+            if self._clock.now() >= deadline:
+                return None
+
+    # --- opening
+
+    def _begin(self, port: Port) -> None:
+        port.flush()
+        byte_s = 0.0 if self._config.native_usb else BITS_PER_BYTE / port.baud
+        self._board = Board(byte_s, self._config.delay_ms * 1e-3)
+        self.encoders = self._found(self._introduced(port))
+        self._failing.clear()
+        self._gate = SpeedGate(
+            [math.radians(self._config.max_speed_deg_s) / encoder.rad_per_tick for encoder in self.encoders],
+            [2 + encoder.ticks_per_turn / SLACK_TICKS_PART for encoder in self.encoders],
+        )
+        self._anchor(port)
+        self._believed_s = self._heard_s = self._clock.now()
+        self._attempts = 0
+
+    def _introduced(self, port: Port) -> Header:
+        """What the board says of itself, asked until it does."""
+        end, heard = self._clock.now() + HEADER_S, 0
+        while self._clock.now() < end:
+            port.write(ASK_HEADER)
+            ask_again = min(end, self._clock.now() + ASK_EVERY_S)
+            while self._clock.now() < ask_again:
+                data = port.receive(ask_again)
+                heard += len(data)
+                self._board.hear(data, self._clock.now())
+                if self._board.header is not None:
+                    return self._board.header
+        what = "sends nothing: does its program run?" if heard == 0 else "sends no header: compare baud, and the lines"
+        raise SourceLost(f"the board on {self._config.port} {what}", retry_s=RETRY_S)
+
+    def _found(self, header: Header) -> list[Encoder]:
+        """The encoders; SourceError with a table of all when one is not as it should be."""
+        rows, encoders = [("joint", "encoder", "expected", "found")], list[Encoder]()
+        places = list(header.encoders)
+        for config in self._wanted:
+            announced, expected = header.encoders.get(config.name), config.ticks_per_turn
+            rows.append((config.joint, config.name, _ticks(expected, "any"), _ticks(announced, "not announced")))
+            if announced is not None and expected in (None, announced):
+                encoders.append(Encoder(config, places.index(config.name), announced))
+        if len(encoders) == len(self._wanted):
+            return encoders
+        widths = [max(len(row[column]) for row in rows) for column in range(4)]
+        lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+        raise SourceError(
+            "\n  ".join([f"the encoders on {self._config.port} are not those of robot.toml:", *lines])
+            + f"\n  announced are: {', '.join(places)}"
+        )
+
+    def _anchor(self, port: Port) -> None:
+        """Find the turn that each joint is in: two readings that agree."""
+        end, believed = self._clock.now() + ANCHOR_S, 0
+        self._why = "no line"
+        while self._clock.now() < end:
+            while (timed := self._board.next()) is not None:
+                raw = self._raw(timed)
+                if raw is None:
+                    continue
+                if believed == 0:
+                    self._turns.begin(self.encoders, raw)
+                counts = self._turns.continued(raw)
+                believed = believed + 1 if self._gate.offer(timed.t, counts) is None else 0
+                if believed == 2:
+                    self._turns.counts = counts
+                    self._turns.check(raw)
+                    return
+            self._board.hear(port.receive(end), self._clock.now())
+        raise SourceLost(f"the encoders cannot be read: {self._why}", retry_s=RETRY_S)
+
+    # --- reading
+
+    def _hear(self, port: Port, deadline: float) -> None:
+        lost_at = self._believed_s + LOST_AFTER_S
+        data = port.receive(min(deadline, max(lost_at, self._clock.now() + LOST_AFTER_S / FEW_ATTEMPTS)))
+        garbled = self.counts.garbled
+        self._board.hear(data, self._clock.now())
+        if self._board.restarted:
+            raise SourceLost("the board was restarted, or its lines were held up", retry_s=RETRY_S)
+        if data:
+            self._heard_s = self._clock.now()
+        if self.counts.garbled > garbled:
+            self._why = "a garbled line"
+        elif self._clock.now() - self._heard_s > LOST_AFTER_S:
+            self._why = "no line"
+        self._attempts += 1
+        if self._clock.now() > lost_at and self._attempts >= FEW_ATTEMPTS and not self._board.is_waiting:
+            raise SourceLost(f"the encoders cannot be read: {self._why}", retry_s=RETRY_S)
+
+    def _raw(self, timed: Timed) -> list[int] | None:
+        """The positions of the joints; None when an encoder has none."""
+        ticks = [timed.reading.ticks[encoder.place] for encoder in self.encoders]
+        self._note_failing({e.joint for e, tick in zip(self.encoders, ticks, strict=True) if tick is None})
+        raw = [tick for tick in ticks if tick is not None]
+        return raw if len(raw) == len(ticks) else None
+
+    def _judge(self, timed: Timed) -> JointReading | None:
+        raw = self._raw(timed)
+        if raw is None:
+            return None
+        counts = self._turns.continued(raw)
+        refused = self._gate.offer(timed.t, counts)
+        if refused is not None:
+            self._why = f"joint {self._names[refused]!r}: a position where it cannot have come to"
+            if self._gate.jumped:
+                raise SourceLost(self._why, retry_s=RETRY_S)
+            return None
+        if timed.t <= self._last_t:
+            return None
+        self._last_t = timed.t
+        return JointReading(timed.t, frozen_array(self._turns.keep(counts)))
+
+    def _note_failing(self, joints: set[str]) -> None:
+        for joint in sorted(joints - self._failing):
+            log.warning("%s", _complaint(joint))
+        for joint in sorted(self._failing - joints):
+            log.info("the encoder of joint %r is well again", joint)
+        self._failing = joints
+        if joints:
+            self._why = _complaint(min(joints))
+
+
+def _ticks(count: int | None, otherwise: str) -> str:
+    return otherwise if count is None else f"{count} ticks"
+
+
+def _complaint(joint: str) -> str:
+    return f"joint {joint!r}: its encoder has no value: look at its cable, and at the magnet's distance"
+
+
+def _close(port: Port) -> None:
+    with suppress(SourceError):
+        port.close()

@@ -1,0 +1,123 @@
+"""The table of a make of servos in robot.toml: what is the same in all."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, ClassVar, Generic, Literal, Protocol, TypeVar
+
+import msgspec
+from msgspec import Meta
+
+from interfaces.errors import ConfigError
+from interfaces.suggest import did_you_mean
+from interfaces.toml_file import line_in_entry, line_of
+
+from .model import Model
+
+Positive = Annotated[float, Meta(gt=0)]
+NonNegative = Annotated[float, Meta(ge=0)]
+
+
+class AnyBus(Protocol):
+    """What is asked of the table of a bus."""
+
+    @property
+    def port(self) -> str:
+        """The serial port."""
+        ...
+
+    @property
+    def baud(self) -> int:
+        """Bits per second."""
+        ...
+
+    @property
+    def latency_ms(self) -> float | None:
+        """How long the adapter keeps bytes back; None: the system is asked."""
+        ...
+
+
+BusT = TypeVar("BusT", bound=AnyBus)
+
+
+class ServoConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """An entry of servos: the servo of one joint.
+
+    Attributes:
+        joint: its name in [robot] joints.
+        id: the servo's number on its bus.
+        model: as its maker writes it; it tells the protocol.
+        bus: needed where there are several.
+        direction: −1 where the joint counts against the servo.
+        zero_ticks: the servo's position where the joint is at 0; by default the middle of its range.
+    """
+
+    joint: str
+    id: Annotated[int, Meta(ge=0, le=252)]
+    model: str
+    bus: str | None = None
+    direction: Literal[1, -1] = 1
+    zero_ticks: int | None = None
+
+
+class ServosConfig(msgspec.Struct, Generic[BusT], frozen=True, forbid_unknown_fields=True):
+    """The table of a make.
+
+    Attributes:
+        rate_hz: readings are not asked for more often than this.
+        max_speed_deg_s: no joint moves faster; a position that would need it is not believed.
+        max_move_deg: how far a joint may have been moved while the bus was away, where only the nearest turn tells.
+        restore_torque: switch torque on again at the end where it was on at the start, holding the pose of the end.
+    """
+
+    table: ClassVar[str]
+    models: ClassVar[Mapping[str, Model]]
+
+    buses: dict[str, BusT]
+    servos: Annotated[tuple[ServoConfig, ...], Meta(min_length=1)]
+    rate_hz: Positive = 250.0
+    max_speed_deg_s: Positive = 600.0
+    max_move_deg: Annotated[float, Meta(gt=0, lt=180)] = 30.0
+    restore_torque: bool = False
+
+    def bus_of(self, servo: ServoConfig) -> str:
+        """The name of the bus that the servo is on."""
+        return next(iter(self.buses)) if servo.bus is None else servo.bus
+
+    def model_of(self, servo: ServoConfig) -> Model:
+        """What it is said to be."""
+        return self.models[servo.model]
+
+    def check(self, joints: Sequence[str], file: Path, text: str) -> None:
+        """ConfigError when the servos are not one for each of `joints`, each with a bus and an ID of its own."""
+        for place, what, key, remedy in self._mistakes(joints):
+            line = line_in_entry(text, f"{self.table}.servos", place, key)
+            raise ConfigError(what, file=file, line=line, remedy=remedy)
+        missing = [joint for joint in joints if joint not in {servo.joint for servo in self.servos}]
+        if missing:
+            raise ConfigError(
+                f"no servo in [[{self.table}.servos]] for {', '.join(missing)}",
+                file=file,
+                line=line_of(text, (*self.table.split("."), "servos")),
+                remedy="Every joint of [robot] joints needs one",
+            )
+
+    def _mistakes(self, joints: Sequence[str]) -> Iterator[tuple[int, str, str, str]]:
+        seen_joints, seen_ids = set[str](), set[tuple[str, int]]()
+        for place, servo in enumerate(self.servos):
+            if servo.joint not in joints:
+                yield place, f"unknown joint {servo.joint!r}", "joint", did_you_mean(servo.joint, joints)
+            if servo.joint in seen_joints:
+                yield place, f"a second servo for the joint {servo.joint!r}", "joint", "Give each joint one"
+            if servo.model not in self.models:
+                yield place, f"unknown model {servo.model!r}", "model", did_you_mean(servo.model, self.models)
+            if servo.bus is None and len(self.buses) != 1:
+                yield place, "which bus?", "joint", f"Give bus, one of: {', '.join(self.buses)}"
+            if servo.bus is not None and servo.bus not in self.buses:
+                yield place, f"unknown bus {servo.bus!r}", "bus", did_you_mean(servo.bus, self.buses)
+            key = (self.bus_of(servo), servo.id)
+            if key in seen_ids:
+                yield place, f"the ID {servo.id} is given twice on one bus", "id", "Give each servo an ID of its own"
+            seen_joints.add(servo.joint)
+            seen_ids.add(key)

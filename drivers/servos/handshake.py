@@ -1,0 +1,204 @@
+"""Before the first reading: who is there, is it what robot.toml says, and is its torque off."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+
+from interfaces.errors import SourceError, SourceLost
+
+from .bus import Bus, Exchange, Trouble
+from .config import ServoConfig
+from .model import Model, Register
+
+log = logging.getLogger(__name__)
+
+RETURN_DELAY_UNIT_S = 2e-6
+SETTINGS = ("return_delay", "drive_mode", "operating_mode", "homing_offset")
+
+ATTEMPTS = 5
+RETRY_S = 0.2
+
+
+@dataclass(frozen=True, slots=True)
+class FittedServo:
+    """A servo as it was found.
+
+    Attributes:
+        joint: whose angle it tells.
+        bus: the name of its bus.
+        direction, zero_ticks: from its position to the joint's angle.
+        firmware, drive_mode, operating_mode, homing_offset, return_delay_s: as its control table says; a change of
+            them between two recordings is a change of calibration.
+        had_torque: its torque was on.
+    """
+
+    joint: str
+    bus: str
+    id: int
+    model: Model
+    direction: int
+    zero_ticks: int
+    firmware: int
+    drive_mode: int
+    operating_mode: int
+    homing_offset: int
+    return_delay_s: float
+    had_torque: bool = False
+
+    @property
+    def label(self) -> str:
+        """Its number, for messages."""
+        return f"ID {self.id}"
+
+    @property
+    def ticks_per_turn(self) -> int | None:
+        """After so many ticks its sensor tells the same again; None where it does not turn on."""
+        return self.model.ticks_per_turn
+
+    def angle(self, ticks: int) -> float:
+        """The joint's angle [rad] at a position with its turns [ticks]."""
+        return self.direction * (ticks - self.zero_ticks) * self.model.rad_per_tick
+
+    def ticks(self, angle: float) -> float:
+        """The position [ticks] at a joint's angle [rad]."""
+        return self.zero_ticks + self.direction * angle / self.model.rad_per_tick
+
+    def record(self) -> Mapping[str, object]:
+        """Its identity and settings, to be kept with the data."""
+        return {
+            "joint": self.joint,
+            "bus": self.bus,
+            "id": self.id,
+            "model": self.model.name,
+            "firmware": self.firmware,
+            "drive_mode": self.drive_mode,
+            "operating_mode": self.operating_mode,
+            "homing_offset_ticks": self.homing_offset,
+            "zero_ticks": self.zero_ticks,
+            "direction": self.direction,
+            "rad_per_tick": self.model.rad_per_tick,
+            "return_delay_s": self.return_delay_s,
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """What was found in the place of a servo."""
+
+    config: ServoConfig
+    found: str
+    servo: FittedServo | None = None
+    may_come_back: bool = False
+
+
+def identify(bus: Bus, config: ServoConfig, model: Model, known: Mapping[int, Model]) -> Finding:
+    """Ask the servo of `config` whether it is a `model`; `known` are those that can be told by their number."""
+    layout = model.layout
+    head = Register(0, max(layout["model"].end, layout["firmware"].end))
+    data, trouble = _read(bus, model, config.id, head)
+    if data is None:
+        return Finding(config, _absence(bus, model, config.id, trouble), may_come_back=trouble is Trouble.TIMEOUT)
+    number = layout.value("model", data)
+    if number != model.number:
+        other = known.get(number)
+        return Finding(config, f"{other.name if other else f'model number {number}'}: wrong model")
+    last = max(layout[name].end for name in SETTINGS if name in layout)
+    table, trouble = _read(bus, model, config.id, Register(0, last))
+    if table is None:
+        return Finding(config, str(trouble), may_come_back=True)
+    servo = FittedServo(
+        joint=config.joint,
+        bus=bus.name,
+        id=config.id,
+        model=model,
+        direction=config.direction,
+        zero_ticks=model.zero_ticks if config.zero_ticks is None else config.zero_ticks,
+        firmware=layout.value("firmware", table),
+        drive_mode=layout.value("drive_mode", table),
+        operating_mode=layout.value("operating_mode", table),
+        homing_offset=layout.value("homing_offset", table),
+        return_delay_s=layout.value("return_delay", table) * RETURN_DELAY_UNIT_S,
+    )
+    bus.return_delay_s[config.id] = servo.return_delay_s
+    return Finding(config, model.name, servo)
+
+
+def require_all(findings: Iterable[Finding], ports: str) -> list[FittedServo]:
+    """The servos; SourceError with a table of all when one is not as it should be."""
+    findings = list(findings)
+    wrong = [finding for finding in findings if finding.servo is None]
+    if not wrong:
+        return [finding.servo for finding in findings if finding.servo is not None]
+    rows = [("joint", "ID", "expected", "found")]
+    rows += [(f.config.joint, str(f.config.id), f.config.model, f.found) for f in findings]
+    widths = [max(len(row[column]) for row in rows) for column in range(4)]
+    lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+    message = "\n  ".join([f"the servos on {ports} are not those of robot.toml:", *lines])
+    if all(finding.may_come_back for finding in wrong):
+        raise SourceLost(message, retry_s=RETRY_S)
+    raise SourceError(message)
+
+
+def switch_torque_off(bus: Bus, servo: FittedServo) -> FittedServo:
+    """Switch its torque off where it is on, and make sure; the servo with what it was like.
+
+    Raises:
+        SourceLost: it does not answer.
+        SourceError: the torque stays on.
+    """
+    had_torque = torque_is_on(bus, servo)
+    if had_torque:
+        register = servo.model.layout["torque"]
+        for _ in range(ATTEMPTS):
+            bus.write(servo.model, servo.id, register, register.bytes(0))
+            if not torque_is_on(bus, servo):
+                break
+        else:
+            raise SourceError(
+                f"the torque of joint {servo.joint!r} (ID {servo.id}) stays on. "
+                "Look for another program that moves the arm, and end it"
+            )
+    return replace(servo, had_torque=had_torque)
+
+
+def torque_is_on(bus: Bus, servo: FittedServo) -> bool:
+    """Whether it holds its place; SourceLost when it does not answer."""
+    data, trouble = _read(bus, servo.model, servo.id, servo.model.layout["torque"])
+    if data is None:
+        raise SourceLost(f"joint {servo.joint!r} (ID {servo.id}): {trouble}", retry_s=RETRY_S)
+    return data != b"\x00"
+
+
+def restore_torque(bus: Bus, servo: FittedServo) -> None:
+    """Switch its torque on again where it was on, its goal being where it is."""
+    layout = servo.model.layout
+    position, trouble = _read(bus, servo.model, servo.id, layout["position"])
+    if position is None:
+        log.warning("the torque of joint %r stays off: %s", servo.joint, trouble)
+        return
+    for register, data in ((layout["goal"], position), (layout["torque"], b"\x01")):
+        bus.write(servo.model, servo.id, register, data)
+    if not torque_is_on(bus, servo):
+        log.warning("the torque of joint %r could not be switched on again", servo.joint)
+
+
+def _read(bus: Bus, model: Model, id: int, register: Register) -> tuple[bytes | None, Trouble | None]:
+    request = bus.read_request(model, id, register)
+    exchange = Exchange(())
+    for _ in range(ATTEMPTS):
+        exchange = bus.ask(request)
+        if exchange.trouble is None:
+            return exchange.answers[0].status.data, None
+    return None, exchange.trouble
+
+
+def _absence(bus: Bus, model: Model, id: int, trouble: Trouble | None) -> str:
+    if trouble is Trouble.TIMEOUT:
+        if bus.ping(model, id).trouble is None:
+            return "answers PING but no READ: its Status Return Level is 0"
+        return "no answer"
+    if trouble is Trouble.GARBLED:
+        return "garbled answers: two servos with this ID, or a bad cable"
+    return str(trouble)

@@ -1,0 +1,364 @@
+"""An arm of servos as a `JointSource`, whatever their make."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack, suppress
+from itertools import zip_longest
+from types import TracebackType
+from typing import Any, Self
+
+from drivers.turn_count import TurnCount
+from drivers.turns import SpeedGate
+from interfaces.errors import SourceError, SourceLost
+from interfaces.protocols import Clock
+from interfaces.records import JointReading, frozen_array
+
+from .bus import Bus, Exchange, Request
+from .channel import Channel, Punctuality, Sample, middle
+from .config import ServoConfig, ServosConfig
+from .handshake import RETRY_S, Finding, FittedServo, identify, require_all, restore_torque, switch_torque_off
+from .make import Make
+from .port import Port
+
+log = logging.getLogger(__name__)
+
+LOST_AFTER_S = 0.25  # without a reading; within this no joint turns by half a turn unseen
+FEW_POLLS = 3  # so many have to fail besides: the program itself may have been held up
+DOUBTS = 5  # so many answers in a row that cannot be: the servo was restarted
+LOOK_AFTER_S = 0.1  # one servo's torque and health in turn
+ANCHOR_POLLS = 50
+SLACK_TICKS = 3
+GOLDEN = 0.618034  # multiples of it, modulo 1, are spread most evenly
+
+OpenPort = Callable[[Any, Clock], tuple[Port, float]]
+"""Opens the port of a bus; with the latency of its adapter [s]."""
+
+
+class ServoJoints:
+    """Reads the positions of an arm whose torque is off.
+
+    A reading is made of intact answers of all servos to the same questions, each from the time at which it was asked,
+    each where the joint can have come to. Whatever is doubtful is dropped, and the line has to fall silent before the
+    next question. When nothing comes for a quarter of a second, or a servo was restarted, or its torque is on,
+    SourceLost is raised: opened again, everything is verified anew, and compared with where the joints were.
+
+    Attributes:
+        servos: as they were found at the last opening, in the order of the joints.
+        epoch: how often it was opened. Positions of different epochs hang together by the comparison only.
+        dropped: readings that were dropped.
+    """
+
+    def __init__(
+        self,
+        make: Make,
+        config: ServosConfig[Any],
+        joints: Sequence[str],
+        clock: Clock,
+        *,
+        open_port: OpenPort,
+        limits: Sequence[tuple[float, float]] | None = None,
+        last_pose: Sequence[float] | None = None,
+    ) -> None:
+        """Nothing is opened yet.
+
+        Args:
+            config: checked; see `ServosConfig.check`.
+            joints: in the order of q.
+            limits: of each joint [rad]: with less than a turn between them there is no doubt about the turn.
+            last_pose: where the joints were when they were read last [rad], shape (d,), to count turns from.
+        """
+        self._make, self._config, self._names, self._clock = make, config, tuple(joints), clock
+        self._open_port = open_port
+        by_joint = {servo.joint: servo for servo in config.servos}
+        self._wanted = [by_joint[joint] for joint in joints]
+        unlimited = [(-math.inf, math.inf)] * len(joints)
+        self._turns = TurnCount(limits or unlimited, last_pose, config.max_move_deg, config.table)
+        self._buses: dict[str, Bus] = {}
+        self._requests: dict[str, list[Request]] = {}
+        self._opened = ExitStack()
+        self._is_open = self._is_lost = False
+        self._had_torque: set[str] = set()
+        self._channels: list[Channel] = []
+        self._at: dict[tuple[str, int], int] = {}
+        self._last_t = -math.inf
+        self._alerts: dict[str, int] = {}
+        self.servos: list[FittedServo] = []
+        self.epoch = self.dropped = 0
+
+    @property
+    def joints(self) -> tuple[str, ...]:
+        """Names of the joints in the order of q."""
+        return self._names
+
+    @property
+    def health(self) -> tuple[str, ...]:
+        """What is wrong with servos, and what to do."""
+        return tuple(self._complaint(joint, bits) for joint, bits in self._alerts.items())
+
+    @property
+    def samples(self) -> Mapping[str, Sample | None]:
+        """The newest believed answer for each joint, also of those whose neighbours did not answer."""
+        return {channel.servo.joint: channel.newest for channel in self._channels}
+
+    @property
+    def record(self) -> tuple[Mapping[str, object], ...]:
+        """What is to be kept with the data: each servo's identity and settings."""
+        return tuple(servo.record() for servo in self.servos)
+
+    def __enter__(self) -> Self:
+        with ExitStack() as stack:
+            self._open_buses(stack)
+            names = ", ".join(bus.port for bus in self._config.buses.values())
+            findings = [self._identified(servo) for servo in self._wanted]
+            servos = require_all(findings, names)
+            self.servos = [switch_torque_off(self._buses[servo.bus], servo) for servo in servos]
+            self._prepare()
+            self._anchor()
+            stack.callback(self._restore)
+            self._opened = stack.pop_all()
+        self._is_open, self._is_lost = True, False
+        self._had_torque.update(servo.joint for servo in self.servos if servo.had_torque)
+        self.epoch += 1
+        self._say_opened()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._is_open = False
+        self._opened.close()
+
+    def read(self, timeout_s: float) -> JointReading | None:
+        """The next reading; see `JointSource.read`.
+
+        Raises:
+            SourceLost: a port is gone, a servo does not answer any more, was restarted, or its torque is on.
+        """
+        if not self._is_open:
+            raise SourceError("the servos are not open; use them in a with statement")
+        try:
+            return self._read_until(self._clock.now() + timeout_s)
+        except SourceLost:
+            self._is_lost = True
+            raise
+
+    def _read_until(self, deadline: float) -> JointReading | None:
+        while True:
+            if self._next_poll > deadline:
+                self._wait_until(deadline)
+                return None
+            if self._wait_until(self._next_poll):
+                self._next_poll = self._following_poll()
+                reading = self._poll()
+                if reading is not None:
+                    return reading
+            if self._clock.now() >= deadline:
+                return None
+
+    # --- opening
+
+    def _open_buses(self, stack: ExitStack) -> None:
+        self._buses.clear()
+        for name, config in self._config.buses.items():
+            port, latency_s = self._open_port(config, self._clock)
+            stack.callback(_close, port)
+            self._buses[name] = self._make.bus(name, port, self._clock, latency_s)
+
+    def _identified(self, servo: ServoConfig) -> Finding:
+        return identify(self._buses[self._config.bus_of(servo)], servo, self._config.model_of(servo), self._make.models)
+
+    def _prepare(self) -> None:
+        self._requests = {}
+        for name, bus in self._buses.items():
+            servos = [servo for servo in self.servos if servo.bus == name]
+            self._requests[name] = self._make.block_requests(bus, servos, self._config.buses[name])
+        self._channels = [self._make.channel(servo) for servo in self.servos]
+        self._at = {(servo.bus, servo.id): place for place, servo in enumerate(self.servos)}
+        speed = math.radians(self._config.max_speed_deg_s)
+        self._gate = SpeedGate([speed / s.model.rad_per_tick for s in self.servos], [SLACK_TICKS] * len(self.servos))
+        self._punctuality = Punctuality()
+        now = self._clock.now()
+        self._believed_s, self._failures, self._next_poll, self._next_look = now, 0, now, now
+        self._looked = self._polls = 0
+        self._why = "no answer"
+
+    def _anchor(self) -> None:
+        """Find the turn that each joint is in: two readings that agree."""
+        believed = 0
+        for _ in range(ANCHOR_POLLS):
+            samples = self._ask_all()
+            if samples is None:
+                continue
+            raw = [sample.ticks for sample in samples]
+            if believed == 0:
+                self._turns.begin(self.servos, raw)
+            counts = self._turns.continued(raw)
+            believed = believed + 1 if self._gate.offer(middle(samples)[0], counts) is None else 0
+            if believed == 2:
+                self._turns.counts = counts
+                self._turns.check(raw)
+                self._believed_s, self._failures = self._clock.now(), 0
+                return
+        raise SourceLost(f"the servos cannot be read: {self._why}", retry_s=RETRY_S)
+
+    def _say_opened(self) -> None:
+        switched = [servo.joint for servo in self.servos if servo.had_torque]
+        fast = any(request.is_fast for requests in self._requests.values() for request in requests)
+        how = "with Fast Sync Read" if fast else ""
+        log.info("%d servos, torque verified off, are read %s", len(self.servos), how)
+        if switched:
+            log.warning("the torque of %s was on and was switched off", ", ".join(switched))
+
+    def _restore(self) -> None:
+        if not self._config.restore_torque or self._is_lost:  # who was lost is opened again, in somebody's hands
+            return
+        for servo in self.servos:
+            if servo.joint in self._had_torque:
+                with suppress(SourceError):
+                    restore_torque(self._buses[servo.bus], servo)
+
+    # --- reading
+
+    def _poll(self) -> JointReading | None:
+        samples = self._ask_all()
+        reading = None if samples is None else self._judge(samples)
+        if self._clock.now() >= self._next_look:
+            self._look_after_one()
+        if reading is None:
+            self._dropped_one()
+        else:
+            self._believed_s, self._failures = self._clock.now(), 0
+        return reading
+
+    def _following_poll(self) -> float:
+        """When to ask next: not always at the same phase of the servos' ticks, which would tell nothing new of them."""
+        self._polls += 1
+        before, after = (self._polls - 1) * GOLDEN % 1, self._polls * GOLDEN % 1
+        return max(self._next_poll + 1 / self._config.rate_hz + (after - before) * self._make.tick_s, self._clock.now())
+
+    def _ask_all(self) -> list[Sample] | None:
+        """A sample of each joint; None when one is missing or doubtful. All buses are asked at the same time."""
+        samples: dict[int, Sample] = {}
+        for questions in zip_longest(*self._requests.values()):
+            asked = [(bus, q) for bus, q in zip(self._buses.values(), questions, strict=True) if q is not None]
+            for bus, question in asked:
+                bus.send(question)
+            for bus, question in asked:
+                self._take(bus, question, samples)
+        return [samples[place] for place in range(len(self._names))] if len(samples) == len(self._names) else None
+
+    def _take(self, bus: Bus, question: Request, samples: dict[int, Sample]) -> None:
+        exchange = bus.collect(question)
+        stale = False
+        for answer in exchange.answers:
+            place = self._at[bus.name, answer.status.id]
+            sample = self._channels[place].take(answer)
+            if sample is None:
+                stale = True
+                self._why = f"joint {self._names[place]!r}: an answer from another time"
+                self._refuse_restarted(self._channels[place])
+            elif exchange.trouble is None and self._is_confirmed(bus, question, self._channels[place], sample):
+                samples[place] = sample
+        if exchange.trouble is not None and exchange.culprit is not None:
+            servo = self.servos[self._at[bus.name, exchange.culprit]]
+            self._why = f"joint {servo.joint!r} (ID {servo.id}): {exchange.trouble}"
+        elif exchange.trouble is not None:
+            self._why = f"{bus.name}: {exchange.trouble}"
+        elif stale:
+            bus.settle()
+
+    def _is_confirmed(self, bus: Bus, question: Request, channel: Channel, sample: Sample) -> bool:
+        """Ask again for a surprising position where the checksum lets one in 256 wrong answers through."""
+        if not bus.is_weak(question) or not channel.surprising:
+            return True
+        model = channel.servo.model
+        exchange = bus.ask(bus.read_request(model, channel.servo.id, model.layout.block))
+        again = channel.take(exchange.answers[0]) if exchange.trouble is None else None
+        return again is not None and channel.agrees(sample, again, math.radians(self._config.max_speed_deg_s))
+
+    def _judge(self, samples: list[Sample]) -> JointReading | None:
+        t, unsure = middle(samples)
+        if not self._punctuality.is_usual(unsure):
+            self._why = "an answer that was held up"
+            self._believed_s = self._clock.now()  # they are all there
+            return None
+        counts = self._turns.continued([sample.ticks for sample in samples])
+        refused = self._gate.offer(t, counts)
+        if refused is not None:
+            servo = self.servos[refused]
+            self._why = f"joint {servo.joint!r} (ID {servo.id}): a position where it cannot have come to"
+            if self._gate.jumped:
+                raise SourceLost(self._why, retry_s=RETRY_S)
+            return None
+        if t <= self._last_t:
+            return None
+        self._last_t = t
+        return JointReading(t, frozen_array(self._turns.keep(counts)))
+
+    def _dropped_one(self) -> None:
+        self.dropped += 1
+        self._failures += 1
+        if self._failures >= FEW_POLLS and self._clock.now() - self._believed_s > LOST_AFTER_S:
+            raise SourceLost(self._blame(), retry_s=RETRY_S)
+
+    def _blame(self) -> str:
+        """Who does not answer when asked alone, else what went wrong last."""
+        for servo in self.servos:
+            trouble = self._ask_state(servo).trouble
+            if trouble is not None:
+                return f"joint {servo.joint!r} (ID {servo.id}): {trouble}"
+        return self._why
+
+    def _refuse_restarted(self, channel: Channel) -> None:
+        if channel.doubts >= DOUBTS:
+            servo = channel.servo
+            raise SourceLost(f"joint {servo.joint!r} (ID {servo.id}) was restarted", retry_s=RETRY_S)
+
+    def _wait_until(self, t: float) -> bool:
+        """Wait; False when a servo talked though it was not asked."""
+        if t <= self._clock.now():
+            return True
+        bus, *_ = self._buses.values()
+        return bus.listen(t)
+
+    def _look_after_one(self) -> None:
+        """Verify one servo's torque and health; SourceLost when its torque is on."""
+        servo = self.servos[self._looked % len(self.servos)]
+        exchange = self._ask_state(servo)
+        if exchange.trouble is not None:
+            return
+        self._looked += 1
+        self._next_look = self._clock.now() + LOOK_AFTER_S
+        status = exchange.answers[0].status
+        layout = servo.model.layout
+        has_register = "hardware_error" in layout
+        bits = layout.value("hardware_error", status.data, layout.state.address) if has_register else status.error
+        if layout.value("torque", status.data, layout.state.address):
+            raise SourceLost(f"the torque of joint {servo.joint!r} was switched on by another program", retry_s=0.0)
+        self._note_alert(servo.joint, bits)
+
+    def _ask_state(self, servo: FittedServo) -> Exchange:
+        bus = self._buses[servo.bus]
+        return bus.ask(bus.read_request(servo.model, servo.id, servo.model.layout.state))
+
+    def _complaint(self, joint: str, bits: int) -> str:
+        reasons = [text for bit, text in self._make.errors.items() if bits & bit]
+        return f"joint {joint!r}: " + ("; ".join(reasons) or f"hardware error {bits:#04x}")
+
+    def _note_alert(self, joint: str, bits: int) -> None:
+        if self._alerts.get(joint, 0) == bits:
+            return
+        if bits:
+            self._alerts[joint] = bits
+            log.warning("%s", self._complaint(joint, bits))
+        else:
+            del self._alerts[joint]
+            log.info("joint %r is well again", joint)
+
+
+def _close(port: Port) -> None:
+    with suppress(SourceError):
+        port.close()

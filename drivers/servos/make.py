@@ -1,0 +1,35 @@
+"""A make of servos: all that the common driver has to know of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from .bus import Bus, Request
+from .channel import Channel
+from .handshake import FittedServo
+from .model import Model
+
+
+@dataclass(frozen=True, slots=True)
+class Make:
+    """A make of servos.
+
+    Attributes:
+        table: its table in robot.toml.
+        models: by number.
+        errors: what each bit of the hardware error means, and what to do.
+        bus: a bus of its protocols.
+        channel: one servo's answers.
+        block_requests: the questions of one reading of the servos of a bus.
+        tick_s: of the clock with which its servos stamp what they measure [s]; 0 without one.
+    """
+
+    table: str
+    models: Mapping[int, Model] = field(repr=False)
+    errors: Mapping[int, str]
+    bus: type[Bus]
+    channel: Callable[[FittedServo], Channel]
+    block_requests: Callable[[Bus, Sequence[FittedServo], Any], list[Request]]
+    tick_s: float = 0.0

@@ -1,0 +1,120 @@
+"""Which turn each joint is in, from where it was before."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Sequence
+from typing import Protocol
+
+from interfaces.errors import SourceLost
+
+from .turns import nearest_turn
+
+log = logging.getLogger(__name__)
+
+LOOK_AGAIN_S = 1.0  # whether a joint was turned back
+
+
+class Sensor(Protocol):
+    """One joint's sensor."""
+
+    @property
+    def joint(self) -> str:
+        """The joint's name."""
+        ...
+
+    @property
+    def label(self) -> str:
+        """Which of the device's sensors it is."""
+        ...
+
+    @property
+    def ticks_per_turn(self) -> int | None:
+        """After so many ticks it tells the same again; None where it does not turn on."""
+        ...
+
+    def angle(self, ticks: int) -> float:
+        """The joint's angle [rad] at a position with its turns [ticks]."""
+        ...
+
+    def ticks(self, angle: float) -> float:
+        """The position [ticks] at a joint's angle [rad]."""
+        ...
+
+
+class TurnCount:
+    """Positions with their turns [ticks], which go on from one reading to the next.
+
+    Attributes:
+        pose: where the joints were last [rad]; None before anything is known.
+        counts: the same [ticks].
+    """
+
+    def __init__(
+        self,
+        limits: Sequence[tuple[float, float]],
+        last_pose: Sequence[float] | None,
+        max_move_deg: float,
+        table: str,
+    ) -> None:
+        """Nothing is read yet.
+
+        Args:
+            limits: of each joint [rad]: with less than a turn between them there is no doubt about the turn.
+            last_pose: where the joints were when they were read last [rad], shape (d,).
+            max_move_deg: how far a joint may have been moved since, where only the nearest turn tells.
+            table: of robot.toml, for messages.
+        """
+        self._limits, self._max_move_deg, self._table = list(limits), max_move_deg, table
+        self.pose = None if last_pose is None else [float(q) for q in last_pose]
+        self.counts: list[int] = []
+        self._sensors: list[Sensor] = []
+
+    def begin(self, sensors: Sequence[Sensor], raw: Sequence[int]) -> None:
+        """Find the turn of each joint by its limits, else by the last pose."""
+        self._sensors = list(sensors)
+        self.counts = [self._nearest(place, ticks) for place, ticks in enumerate(raw)]
+
+    def continued(self, raw: Sequence[int]) -> list[int]:
+        """What was read, with the turns that bring it nearest to what was kept last."""
+        together = zip(self._sensors, raw, self.counts, strict=True)
+        return [nearest_turn(ticks, count, sensor.ticks_per_turn) for sensor, ticks, count in together]
+
+    def keep(self, counts: list[int]) -> list[float]:
+        """Go on from here; the joints' angles [rad]."""
+        self.counts = counts
+        self.pose = [sensor.angle(count) for sensor, count in zip(self._sensors, counts, strict=True)]
+        return self.pose
+
+    def check(self, raw: Sequence[int]) -> None:
+        """SourceLost when a joint of several turns is not where it was: nothing tells its turn then."""
+        if self.pose is None:
+            return
+        for place, (sensor, count) in enumerate(zip(self._sensors, self.counts, strict=True)):
+            if self._is_within_a_turn(place):
+                continue
+            was, now = self.pose[place], sensor.angle(count)
+            if abs(now - was) > math.radians(self._max_move_deg):
+                raise SourceLost(
+                    f"joint {sensor.joint!r} ({sensor.label}) was at {math.degrees(was):.0f}° and is now at "
+                    f"{math.degrees(now):.0f}°, or whole turns from there: its turn count is lost. "
+                    f"Turn it back to within {self._max_move_deg:.0f}° of where it was, or set max_move_deg "
+                    f"in [{self._table}] to 179 to take the nearest turn",
+                    retry_s=LOOK_AGAIN_S,
+                )
+            if count != raw[place]:
+                turns = round((count - raw[place]) / (sensor.ticks_per_turn or 1))
+                log.info("joint %r: %+d turns are added to what its sensor counts", sensor.joint, turns)
+
+    def _is_within_a_turn(self, place: int) -> bool:
+        lower, upper = self._limits[place]
+        return upper - lower < 2 * math.pi
+
+    def _nearest(self, place: int, ticks: int) -> int:
+        sensor, (lower, upper) = self._sensors[place], self._limits[place]
+        if self._is_within_a_turn(place):
+            return nearest_turn(ticks, sensor.ticks((lower + upper) / 2), sensor.ticks_per_turn)
+        if self.pose is not None:
+            return nearest_turn(ticks, sensor.ticks(self.pose[place]), sensor.ticks_per_turn)
+        return ticks

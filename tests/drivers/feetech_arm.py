@@ -1,0 +1,83 @@
+"""Arms of Feetech servos on the bench in virtual time."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from random import Random
+from typing import Literal
+
+from bench_arm import Path, swing
+
+from drivers.bench.faults import Planned
+from drivers.bench.virtual_port import VirtualClock, VirtualPort, at_once
+from drivers.feetech.bench.chain import Chain
+from drivers.feetech.bench.frames import Code, Instruction, instructions_in
+from drivers.feetech.bench.servo import Servo
+from drivers.feetech.config import BusConfig, FeetechConfig, ServoConfig
+from drivers.feetech.joints import FeetechJoints
+from drivers.feetech.models import BY_NAME
+
+
+class HeardPort(VirtualPort):
+    """Keeps what is sent."""
+
+    def __init__(self, *args, **kwargs) -> None:
+        super().__init__(*args, **kwargs)
+        self.heard: list[Instruction] = []
+
+    def write(self, data: bytes) -> None:
+        self.heard += instructions_in(bytearray(data))[0]
+        super().write(data)
+
+    def writes(self) -> list[tuple[int, bytes]]:
+        """Address and data of all that was written to servos."""
+        told = [i for i in self.heard if i.code in (Code.WRITE, Code.REG_WRITE, Code.SYNC_WRITE, Code.RESET)]
+        return [(i.params[0], i.params[1:]) for i in told]
+
+
+class FeetechArm:
+    """A driver with a bench behind it."""
+
+    def __init__(
+        self,
+        models: Sequence[str] = ("STS3215",) * 3,
+        paths: Sequence[Path] | None = None,
+        *,
+        latency_s: float = 0.0,
+        delay_s: float = 0.0,
+        seed: int = 0,
+        sync: Literal["auto", "never"] = "auto",
+        limits: Sequence[tuple[float, float]] | None = None,
+        last_pose: Sequence[float] | None = None,
+        multi_turn: bool = False,
+        **settings,
+    ) -> None:
+        self.clock, rng = VirtualClock(), Random(seed)
+        self.paths = [swing(k) for k in range(len(models))] if paths is None else list(paths)
+        self.names = tuple(f"joint{k}" for k in range(1, len(models) + 1))
+        self.faults = Planned(rng)
+        servos = [
+            Servo(BY_NAME[model], k, self.paths[k - 1], return_delay_s=delay_s, multi_turn=multi_turn)
+            for k, model in enumerate(models, 1)
+        ]
+        self.chain = Chain(servos, self.faults)
+        jitter = (lambda: rng.uniform(0, latency_s)) if latency_s else at_once
+        self.port = HeardPort(self.chain, self.clock, outwards=at_once, inwards=jitter)
+        fitted = zip(self.names, models, strict=True)
+        entries = tuple(ServoConfig(name, k, model) for k, (name, model) in enumerate(fitted, 1))
+        self.joints = FeetechJoints(
+            FeetechConfig({"arm": BusConfig("bench", sync_read=sync)}, entries, **settings),
+            self.names,
+            self.clock,
+            limits=limits,
+            last_pose=last_pose,
+            open_port=lambda *_: (self.port, latency_s / 2),
+        )
+
+    def error(self, reading) -> float:
+        """Largest error of the reading's angles against the truth at its time [rad]."""
+        return max(abs(q - path(reading.t)) for q, path in zip(reading.q, self.paths, strict=True))
+
+    def sampled(self) -> float:
+        """The middle of the times at which the positions were really taken [s]."""
+        return sum(sampling.t for sampling in self.chain.samplings.values()) / len(self.chain.samplings)

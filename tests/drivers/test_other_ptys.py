@@ -1,0 +1,112 @@
+"""Feetech servos and own encoders on a pseudo-terminal: real time, a real port."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+from bench_arm import swing
+
+from daemon.reopen import Reopening
+from drivers.bench.pty_shell import PtyShell
+from drivers.feetech.bench.chain import Chain
+from drivers.feetech.bench.servo import Servo
+from drivers.feetech.config import BusConfig, FeetechConfig, ServoConfig
+from drivers.feetech.joints import FeetechJoints
+from drivers.feetech.models import BY_NAME
+from drivers.serial_lines.bench.board import EncoderBoard
+from drivers.serial_lines.config import EncoderConfig, SerialLinesConfig
+from drivers.serial_lines.joints import SerialLineJoints
+from interfaces.clock import SystemClock
+from interfaces.errors import SourceError
+from interfaces.records import JointReading
+
+LIMIT_S = 20.0
+IDS = range(1, 7)
+NAMES = [f"joint{id}" for id in IDS]
+LIMITS = [(-2.0, 2.0)] * 6
+Make = Callable[[Path], Any]
+
+
+@contextmanager
+def feetech(folder: Path) -> Iterator[tuple[PtyShell, Callable[[], FeetechJoints]]]:
+    chain = Chain(Servo(BY_NAME["STS3215"], id, swing(id), return_delay_s=0) for id in IDS)
+    entries = tuple(ServoConfig(name, id, "STS3215") for name, id in zip(NAMES, IDS, strict=True))
+    with PtyShell(chain, folder / "bus") as shell:
+        config = FeetechConfig({"arm": BusConfig(str(shell.link))}, entries)
+        yield shell, lambda: FeetechJoints(config, NAMES, SystemClock(), limits=LIMITS)
+
+
+@contextmanager
+def encoders(folder: Path) -> Iterator[tuple[PtyShell, Callable[[], SerialLineJoints]]]:
+    angles = {name: (4096, swing(id)) for name, id in zip(NAMES, IDS, strict=True)}
+    board = EncoderBoard(angles, rate_hz=100.0, begun_s=time.monotonic())
+    with PtyShell(board, folder / "bus") as shell:
+        config = SerialLinesConfig(str(shell.link), tuple(EncoderConfig(name) for name in NAMES))
+        yield shell, lambda: SerialLineJoints(config, NAMES, SystemClock(), limits=LIMITS)
+
+
+BOTH = pytest.mark.parametrize("make", [feetech, encoders])
+
+
+def wait_for_reading(source: Any) -> JointReading:
+    deadline = time.monotonic() + LIMIT_S
+    while time.monotonic() < deadline:
+        if (reading := source.read(0.1)) is not None:
+            return reading
+    raise AssertionError("no reading came")
+
+
+@BOTH
+def test_readings_are_right_with_wire_time(make: Make, tmp_path) -> None:
+    with make(tmp_path) as (_, driver), driver() as joints:
+        for _ in range(50):
+            reading = wait_for_reading(joints)
+            assert reading.q == pytest.approx([swing(id)(reading.t) for id in IDS], abs=0.02)
+
+
+@BOTH
+def test_nobody_else_of_us_opens_the_port(make: Make, tmp_path) -> None:
+    with make(tmp_path) as (_, driver), driver() as joints:
+        wait_for_reading(joints)
+        with pytest.raises(SourceError, match="is in use by another program"):
+            driver().__enter__()
+
+
+@BOTH
+def test_an_unplugged_port_is_told_once_and_is_back_within_a_second_of_the_replug(make: Make, tmp_path, caplog) -> None:
+    with make(tmp_path) as (shell, driver):
+        joints = driver()
+        with caplog.at_level(logging.WARNING), Reopening(joints, "the encoders", SystemClock()) as source:
+            before = wait_for_reading(source)
+            shell.unplug()
+            for _ in range(20):
+                source.read(0.05)
+            assert source.trouble is not None
+            shell.plug_in()
+            begin = time.monotonic()
+            after = wait_for_reading(source)
+            assert time.monotonic() - begin < 1.0
+    assert len(caplog.messages) == 1
+    assert "is gone" in caplog.messages[0]
+    assert (source.losses, joints.epoch) == (1, 2)
+    assert after.t > before.t
+
+
+def test_a_board_that_nobody_reads_for_long_can_be_unplugged_and_is_read_again(tmp_path) -> None:
+    angles = {name: (4096, swing(id)) for name, id in zip(NAMES, IDS, strict=True)}
+    board = EncoderBoard(angles, rate_hz=100.0, begun_s=time.monotonic() - 60.0)  # a minute to say at once
+    with PtyShell(board, tmp_path / "bus") as shell:
+        config = SerialLinesConfig(str(shell.link), tuple(EncoderConfig(name) for name in NAMES))
+        deadline = time.monotonic() + LIMIT_S
+        while board.speaks_at < time.monotonic() - 1.0:
+            assert time.monotonic() < deadline
+        shell.unplug()
+        shell.plug_in()
+        with SerialLineJoints(config, NAMES, SystemClock(), limits=LIMITS) as joints:
+            wait_for_reading(joints)
