@@ -12,6 +12,7 @@ from interfaces.protocols import Clock, JointSource
 from kbmaps import RigidChain
 
 from .config import Config
+from .servo_wiring import require_servos, through_servos
 from .sources import Sources
 from .store import PairReader
 
@@ -68,6 +69,8 @@ def _last_pose(config: Config) -> list[float] | None:
 
 
 def _require_source(config: Config, *, sim: bool) -> None:
+    if sim and config.tables.sim.servo_bench:
+        require_servos(config)
     if sim or config.tables.drivers.recording is not None:
         return
     if config.tables.drivers.dynamixel is not None:
@@ -107,12 +110,16 @@ def demonstration_model() -> Path:
 def _simulated(config: Config) -> Iterator[Sources]:
     require_simulation()
     from sim_backend import SimWorld
+    from sim_backend.guided_path import exact_encoders
     from vision.tracked_camera import TrackedCamera
     from vision.tracker import StereoTracker
 
-    with SimWorld(config.robot, config.tables.sim, config.simulation) as world:
+    on_bench = config.tables.sim.servo_bench
+    settings = exact_encoders(config.tables.sim) if on_bench else config.tables.sim
+    with SimWorld(config.robot, settings, config.simulation) as world:
         marker = TrackedCamera(world.camera, StereoTracker(world.camera.calibration, config.tables.vision))
-        yield Sources(world.joints, marker, world.clock, world)
+        joints = through_servos(config, world.joints) if on_bench else world.joints
+        yield Sources(joints, marker, world.clock, world)
 
 
 @contextmanager
