@@ -15,6 +15,9 @@ from drivers.dynamixel.bench.motion import played, swinging
 from drivers.dynamixel.bench.servo import Angle
 from drivers.dynamixel.bench.through_servos import ThroughServos
 from drivers.dynamixel.config import DynamixelConfig
+from drivers.dynamixel.scan import SCANNERS
+from drivers.scan import ScannedBus, Tell, scan_port, serial_ports
+from drivers.serial_line import adapter_latency_s
 from interfaces.clock import SystemClock
 from interfaces.errors import ConfigError
 from interfaces.protocols import JointSource
@@ -132,3 +135,33 @@ def bench_robot_file(config: Config, bench: DryRun, port: Path) -> Path:
 def through_servos(config: Config, joints: JointSource) -> JointSource:
     """The simulation's joints, read from servos on a bench."""
     return ThroughServos(joints, require_servos(config), SystemClock(), limits_of(config))
+
+
+def scanned_bauds() -> list[int]:
+    """The rates at which somebody may be [bit/s]."""
+    return sorted({baud for scanner in SCANNERS for baud in scanner.bauds})
+
+
+def ports_to_scan(given: Sequence[str], config: Config | None) -> list[str]:
+    """The ports that were given; else those of robot.toml, and all USB serial ports, each once.
+
+    Raises:
+        ConfigError: there are none.
+    """
+    if given:
+        return list(given)
+    servos = None if config is None else config.tables.drivers.dynamixel
+    ports = [] if servos is None else [bus.port for bus in servos.buses.values()]
+    found = {os.path.realpath(port): port for port in [*serial_ports(), *ports]}
+    if not found:
+        raise ConfigError(
+            "there is no USB serial port on this machine",
+            remedy="Plug the adapter in and look at `ls /dev/serial/by-id`, or name another port with --port",
+        )
+    return list(found.values())
+
+
+def scan(ports: Sequence[str], bauds: Sequence[int], tell: Tell) -> list[ScannedBus]:
+    """Who is there, port by port, at all rates or at `bauds`."""
+    clock = SystemClock()
+    return [scan_port(port, SCANNERS, clock, tell, bauds=bauds, latency_s=adapter_latency_s(port)) for port in ports]
