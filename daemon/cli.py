@@ -21,6 +21,7 @@ COMMANDS = {
     "compare": "How far two recordings are apart, row by row.",
     "reproduce": "Run the paper's experiments again, its figures beside ours.",
     "scan": "Which servos are there: all ports, rates and protocols.",
+    "doctor": "Ports, servos, disk, clock, zenoh: what to mend, and how.",
     "bench": "Your servos without the arm: a dry run of robot.toml.",
     "run": "Start sampler and learner, and keep them running.",
     "sampler": "Only the sampler: encoders and cameras in, pairs out.",

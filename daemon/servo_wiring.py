@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 from time import monotonic
 
+from drivers import checks
+from drivers.checks import Check
 from drivers.dynamixel.bench.asked_faults import AskedFault
 from drivers.dynamixel.bench.dry_run import DryRun
 from drivers.dynamixel.bench.motion import played, swinging
 from drivers.dynamixel.bench.servo import Angle
 from drivers.dynamixel.bench.through_servos import ThroughServos
+from drivers.dynamixel.checks import servo_checks as dynamixel_checks
 from drivers.dynamixel.config import DynamixelConfig
 from drivers.dynamixel.scan import SCANNERS
 from drivers.scan import ScannedBus, Tell, scan_port, serial_ports
@@ -165,3 +168,24 @@ def scan(ports: Sequence[str], bauds: Sequence[int], tell: Tell) -> list[Scanned
     """Who is there, port by port, at all rates or at `bauds`."""
     clock = SystemClock()
     return [scan_port(port, SCANNERS, clock, tell, bauds=bauds, latency_s=adapter_latency_s(port)) for port in ports]
+
+
+def port_checks(config: Config) -> Iterator[Check]:
+    """Of each port of robot.toml: is it there, may it be opened, who has it?"""
+    for name, bus in require_servos(config).buses.items():
+        yield from checks.port_checks(name, bus.port)
+
+
+def ports_are_there(config: Config) -> bool:
+    """Whether all ports of robot.toml are."""
+    return all(os.path.exists(bus.port) for bus in require_servos(config).buses.values())
+
+
+def other_holders(config: Config) -> bool:
+    """Whether another process has one of the ports open."""
+    return any(checks.holders(bus.port) for bus in require_servos(config).buses.values())
+
+
+def servo_checks(config: Config) -> Iterator[Check]:
+    """Of the servos of robot.toml: who is there, how they are, how fast they are read. Writes nothing."""
+    yield from dynamixel_checks(require_servos(config), SystemClock())
