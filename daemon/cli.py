@@ -22,6 +22,8 @@ COMMANDS = {
     "reproduce": "Run the paper's experiments again, its figures beside ours.",
     "scan": "Which servos are there: all ports, rates and protocols.",
     "doctor": "Ports, servos, disk, clock, zenoh: what to mend, and how.",
+    "install": "Rules of this machine: install udev, for serial ports.",
+    "joints": "Angles live while you move the arm: signs, ranges, health.",
     "bench": "Your servos without the arm: a dry run of robot.toml.",
     "run": "Start sampler and learner, and keep them running.",
     "sampler": "Only the sampler: encoders and cameras in, pairs out.",

@@ -25,6 +25,7 @@ LITTLE_DISK_BYTES = 2**30
 TIME_ERROR = 5  # adjtimex(2): the clock is not synchronised
 TIMEX_BYTES = 512  # more than struct timex has
 CONNECT_S = 0.3
+OPEN_S = 0.7
 
 Step = tuple[str, Callable[[], Iterator[Check]]]
 
@@ -131,7 +132,7 @@ def zenoh_check(process: str, endpoint: str, token: str) -> Check:
     """Whether the process answers; if not, whether its place is free."""
     if not _is_listening(endpoint):
         return Check("zenoh", "ok", f"the {process} does not run; {endpoint} is free for it")
-    if is_alive(endpoint, token):
+    if is_alive(endpoint, token, open_timeout_s=OPEN_S):
         return Check("zenoh", "ok", f"the {process} answers on {endpoint}")
     port = endpoint.rpartition(":")[2]
     said = f"somebody else listens on {endpoint}, where the {process} should"
