@@ -23,6 +23,7 @@ COMMANDS = {
     "scan": "Which servos are there: all ports, rates and protocols.",
     "doctor": "Ports, servos, disk, clock, zenoh: what to mend, and how.",
     "install": "Rules of this machine: install udev, for serial ports.",
+    "robot": "robot new: a robot.toml for the servos that were found.",
     "joints": "Angles live while you move the arm: signs, ranges, health.",
     "bench": "Your servos without the arm: a dry run of robot.toml.",
     "run": "Start sampler and learner, and keep them running.",

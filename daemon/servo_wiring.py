@@ -18,6 +18,7 @@ from drivers.dynamixel.bench.servo import Angle
 from drivers.dynamixel.bench.through_servos import ThroughServos
 from drivers.dynamixel.checks import servo_checks as dynamixel_checks
 from drivers.dynamixel.config import DynamixelConfig
+from drivers.dynamixel.models import BY_NAME
 from drivers.dynamixel.scan import SCANNERS
 from drivers.scan import ScannedBus, Tell, scan_port, serial_ports
 from drivers.serial_line import adapter_latency_s
@@ -138,6 +139,11 @@ def bench_robot_file(config: Config, bench: DryRun, port: Path) -> Path:
 def through_servos(config: Config, joints: JointSource) -> JointSource:
     """The simulation's joints, read from servos on a bench."""
     return ThroughServos(joints, require_servos(config), SystemClock(), limits_of(config))
+
+
+def known_models() -> list[str]:
+    """The servos that there are drivers for, by name."""
+    return sorted(BY_NAME)
 
 
 def scanned_bauds() -> list[int]:
