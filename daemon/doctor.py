@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import os
+import re
 import shutil
 import socket
 from collections.abc import Callable, Iterator
@@ -27,6 +28,8 @@ TIMEX_BYTES = 512  # more than struct timex has
 CONNECT_S = 0.3
 OPEN_S = 0.7
 
+SAMPLER = re.compile(r"(bodyschema|-m daemon) sampler\b")
+
 Step = tuple[str, Callable[[], Iterator[Check]]]
 
 
@@ -34,7 +37,7 @@ def steps(config: Config) -> Iterator[Step]:
     """What is looked at, with the function that does it."""
     yield "robot.toml", lambda: _description(config)
     if config.tables.drivers.dynamixel is not None:
-        yield "ports", lambda: port_checks(config)
+        yield "ports", lambda: port_checks(config, _samplers(config))
         yield "servos", lambda: _servos(config)
     yield "disk", lambda: disk_checks(config.state_dir)
     yield "clock", clock_checks
@@ -73,9 +76,16 @@ def _servos(config: Config) -> Iterator[Check]:
         yield from servo_checks(config)
 
 
+def _samplers(config: Config) -> list[int]:
+    """Those who have a port open and are the sampler, which answers."""
+    pids = [holder.pid for holder in other_holders(config) if SAMPLER.search(holder.command)]
+    endpoint, token = config.tables.zenoh.sampler, Keys(config.robot.name).alive("sampler")
+    return pids if pids and is_alive(endpoint, token, open_timeout_s=OPEN_S) else []
+
+
 def _of_the_sampler(config: Config) -> Iterator[Check]:
     endpoint, keys = config.tables.zenoh.sampler, Keys(config.robot.name)
-    if not is_alive(endpoint, keys.alive("sampler")):
+    if not is_alive(endpoint, keys.alive("sampler"), open_timeout_s=OPEN_S):
         yield Check("servos", "warning", "not looked at: another program has the port")
         return
     with Bus(connect=endpoint, client=True) as bus:

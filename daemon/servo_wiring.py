@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 from time import monotonic
 
 from drivers import checks
-from drivers.checks import Check
+from drivers.checks import Check, Holder
 from drivers.dynamixel.bench.asked_faults import AskedFault
 from drivers.dynamixel.bench.dry_run import DryRun
 from drivers.dynamixel.bench.motion import played, swinging
@@ -176,10 +176,10 @@ def scan(ports: Sequence[str], bauds: Sequence[int], tell: Tell) -> list[Scanned
     return [scan_port(port, SCANNERS, clock, tell, bauds=bauds, latency_s=adapter_latency_s(port)) for port in ports]
 
 
-def port_checks(config: Config) -> Iterator[Check]:
-    """Of each port of robot.toml: is it there, may it be opened, who has it?"""
+def port_checks(config: Config, ours: Collection[int] = ()) -> Iterator[Check]:
+    """Of each port of robot.toml: is it there, may it be opened, who has it? `ours` are processes that may have it."""
     for name, bus in require_servos(config).buses.items():
-        yield from checks.port_checks(name, bus.port)
+        yield from checks.port_checks(name, bus.port, ours=ours)
 
 
 def ports_are_there(config: Config) -> bool:
@@ -187,9 +187,9 @@ def ports_are_there(config: Config) -> bool:
     return all(os.path.exists(bus.port) for bus in require_servos(config).buses.values())
 
 
-def other_holders(config: Config) -> bool:
-    """Whether another process has one of the ports open."""
-    return any(checks.holders(bus.port) for bus in require_servos(config).buses.values())
+def other_holders(config: Config) -> list[Holder]:
+    """The other processes that have one of the ports open."""
+    return [holder for bus in require_servos(config).buses.values() for holder in checks.holders(bus.port)]
 
 
 def servo_checks(config: Config) -> Iterator[Check]:

@@ -8,10 +8,11 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from interfaces.errors import ConfigError
-from interfaces.protocols import Clock, JointSource
+from interfaces.protocols import Clock
 from kbmaps import RigidChain
 
 from .config import Config
+from .joints_watch import ServoJoints
 from .servo_wiring import require_servos, through_servos
 from .sources import Sources
 from .store import PairReader
@@ -41,7 +42,7 @@ def check_sources(config: Config, *, sim: bool) -> None:
         require_simulation()
 
 
-def open_joints(config: Config, clock: Clock) -> JointSource:
+def open_joints(config: Config, clock: Clock) -> ServoJoints:
     """The encoders alone of the arm that robot.toml describes, not opened yet.
 
     Raises:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import grp
 import os
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -76,22 +76,25 @@ def _command(process: Path) -> str:
     return f"{command[:LONGEST_COMMAND]}…" if len(command) > LONGEST_COMMAND else command or "?"
 
 
-def port_checks(name: str, port: str, root: Path = ROOT) -> Iterator[Check]:
+def port_checks(name: str, port: str, root: Path = ROOT, *, ours: Collection[int] = ()) -> Iterator[Check]:
     """What is to be said of the port of the bus `name`. Opens nothing.
 
     Args:
         root: of the file system, for /dev, /proc and /sys.
+        ours: processes that shall have it open.
     """
     subject = f"port of {name}"
     if not os.path.exists(port):
         yield Check(subject, "wrong", f"{port} is not there", _where(root))
         return
     yield from _permission(subject, port)
-    others = holders(port, root)
+    found = holders(port, root)
+    others = [holder for holder in found if holder.pid not in ours]
     for holder in others:
         yield Check(subject, "wrong", f"{port} is open in process {holder.pid}: {holder.command}", f"kill {holder.pid}")
     if not others:
-        yield Check(subject, "ok", f"{port} is there, and nobody else has it open")
+        who = "the running sampler has it open" if found else "nobody else has it open"
+        yield Check(subject, "ok", f"{port} is there, and {who}")
     yield from _naming(subject, port, root)
     yield from _latency(port, root)
 

@@ -16,12 +16,13 @@ if TYPE_CHECKING:
 
     from daemon.bench_run import BenchRun
 
+PORT = Path("bus")
 GLANCE_S = 0.1
 
 
 def bench(
     *,
-    port: Annotated[Path, Parameter(help="The name of the port to make; PORT-BUS for each of several buses.")],
+    port: Annotated[Path, Parameter(help="The name of the port to make; PORT-BUS for each of several buses.")] = PORT,
     robot: RobotFile = HERE,
     fault: Annotated[
         tuple[str, ...],

@@ -47,6 +47,8 @@ def demo(
     require_simulation()
     console = Console(highlight=False)
     scene = prepare(out, seed, servos=bus is not None)
+    if bus is not None:
+        console.print(f"The joints are servos on a bench; {scene.log_file} tells of them.", soft_wrap=True)
     with shown_on(console) as show:
         outcome = play(scene, first=pairs, second=pairs_after, seed=seed, show=show)
     write_curve(outcome.rows, scene.curve_file)

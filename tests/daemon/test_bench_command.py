@@ -93,5 +93,5 @@ def test_a_robot_without_servos_is_told_what_to_add(folder) -> None:
 
 
 def test_every_fault_is_listed(capsys) -> None:
-    app(["bench", "--port", "bus", "--list-faults"], exit_on_error=False, result_action="return_value")
+    app(["bench", "--list-faults"], exit_on_error=False, result_action="return_value")
     assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == list(FAULTS)

@@ -17,7 +17,12 @@ from daemon.bus import Bus
 from daemon.cli import app
 from daemon.config import Config
 from daemon.doctor_view import show
+from daemon.keys import Keys
 from daemon.servo_wiring import Check
+from daemon.status import SamplerStatus
+from daemon.wire import encode
+from drivers import checks
+from drivers.checks import Holder
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "desk_arm" / "servos.toml"
 LONGEST_S = 5.0
@@ -65,6 +70,30 @@ def test_a_port_that_is_not_there_is_told_once(capsys) -> None:
     assert called("doctor", "--robot", EXAMPLE, "--json") == 1
     checks = json.loads(capsys.readouterr().out)["checks"]
     assert [check["subject"] for check in checks if check["state"] == "wrong"] == ["port of arm"]
+
+
+@pytest.mark.usefixtures("state")
+def test_the_running_sampler_tells_of_the_servos_itself(tmp_path, monkeypatch, capsys) -> None:
+    with BenchRun(Config.load(EXAMPLE), tmp_path / "bus") as run:
+        config = Config.load(run.robot_file)
+        holder = Holder(4711, "/usr/bin/python -m daemon sampler --robot robot.toml")
+        monkeypatch.setattr(checks, "holders", lambda *_: [holder])
+        with Bus(listen=config.tables.zenoh.sampler) as bus:
+            keys = Keys(config.robot.name)
+            bus.token(keys.alive("sampler"))
+            bus.answer(keys.status("sampler"), lambda request: encode(status("joint 'elbow' is hot"), request.encoding))
+            assert called("doctor", "--robot", run.robot_file, "--json") == 0
+    said = {check["said"] for check in json.loads(capsys.readouterr().out)["checks"]}
+    assert {"the running sampler takes 211 readings/s", "joint 'elbow' is hot"} <= said
+    assert any(line.endswith("the running sampler has it open") for line in said)
+
+
+def status(complaint: str) -> SamplerStatus:
+    return SamplerStatus(
+        robot="desk_arm", store="one", state="sampling", pairs=1, segment=1, uptime_s=1.0, frames=1, frames_per_s=1.0,
+        readings_per_s=211.0, pairs_per_s=1.0, rejected={}, coverage={}, disk_free_bytes=1, health=[complaint],
+        version="1",
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize(("known", "state"), [(True, "ok"), (None, "ok"), (False, "warning")])

@@ -71,6 +71,12 @@ def test_who_has_the_port_is_told_with_the_command_that_ends_it(machine) -> None
     assert check.said.endswith("process 4711: wizard --fast")
 
 
+def test_the_running_sampler_may_have_the_port(machine) -> None:
+    machine.process(4711, "bodyschema sampler", machine.port)
+    (check,) = port_checks("arm", str(machine.by_id), machine.root, ours=[4711])
+    assert (check.state, check.said.endswith("the running sampler has it open")) == ("ok", True)
+
+
 def test_who_serves_the_other_end_of_a_pseudo_terminal_does_not_hold_it(machine) -> None:
     machine.process(1, "bench", "/dev/ptmx", "/dev/pts/7")
     machine.process(2, "reader", "/dev/pts/7")
