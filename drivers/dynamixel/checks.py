@@ -18,8 +18,8 @@ from .joints import open_serial
 from .models import HARDWARE_ERRORS
 from .plan import block_requests, state_request, torque_and_error
 
-READ_S = 1.5
-IDENTIFY_S = 1.5  # then who was not asked yet is not asked any more
+READ_S = 1.0
+IDENTIFY_S = 1.0  # then who was not asked yet is not asked any more
 FEW_PER_S = 100.0
 MANY_TROUBLES = 0.01
 LONGEST_DELAY_S = 50e-6

@@ -16,12 +16,12 @@ from interfaces.errors import SourceError, SourceLost
 from interfaces.protocols import Clock
 from interfaces.records import JointReading, frozen_array
 
-from .bus import Bus, Request, read_request
+from .bus import Bus, Request
 from .channel import Channel, Sample, middle
 from .config import BusConfig, DynamixelConfig
 from .handshake import RETRY_S, FittedServo, identify, require_all, restore_torque, switch_torque_off
 from .models import HARDWARE_ERRORS, TICK_S
-from .plan import block_requests, state_request, torque_and_error
+from .plan import block_requests, state_request, temperature_request, torque_and_error
 from .port import Port, SafePort
 
 log = logging.getLogger(__name__)
@@ -157,10 +157,8 @@ class DynamixelJoints:
     def temperature_c(self, joint: str) -> float | None:
         """How hot a joint's servo says it is, asked now; None without an answer. For the thread that reads."""
         servo = self.servos[self._names.index(joint)]
-        register = servo.model.layout["temperature"]
-        request = read_request(servo.model.protocol, servo.id, register.address, register.size)
-        exchange = self._buses[servo.bus].ask(request)
-        return float(register.value(exchange.answers[0].status.data)) if exchange.trouble is None else None
+        exchange = self._buses[servo.bus].ask(temperature_request(servo))
+        return float(exchange.answers[0].status.data[0]) if exchange.trouble is None else None
 
     def _read_until(self, deadline: float) -> JointReading | None:
         while True:

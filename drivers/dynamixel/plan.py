@@ -43,6 +43,12 @@ def state_request(servo: FittedServo) -> Request:
     return read_request(servo.model.protocol, servo.id, state.address, state.size)
 
 
+def temperature_request(servo: FittedServo) -> Request:
+    """Ask for its temperature [°C], one byte."""
+    temperature = servo.model.layout["temperature"]
+    return read_request(servo.model.protocol, servo.id, temperature.address, temperature.size)
+
+
 def torque_and_error(servo: FittedServo, data: bytes, error: int) -> tuple[bool, int]:
     """Whether torque is on, and the bits of the hardware error, of an answer to `state_request`."""
     if servo.model.protocol == 1:
