@@ -26,7 +26,7 @@ log = logging.getLogger(__name__)
 LEASE_MS = 2000
 FIRST_TRY_MS = 100  # how long opening waits for a peer that is not there; trying goes on in the background
 ACCEPT_LIMIT_S = 1.0
-OPEN_TIMEOUT_MS = 5000
+OPEN_TIMEOUT_S = 5.0
 # What clients call a payload when nobody told them: taken for JSON.
 PLAIN = ("zenoh/", "text/")
 RETRY_MS = {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 2}
@@ -60,13 +60,22 @@ class Bus:
     Use as a context manager; leaving it undeclares everything and ends the handler threads.
     """
 
-    def __init__(self, *, listen: str | None = None, connect: str | None = None, client: bool = False) -> None:
+    def __init__(
+        self,
+        *,
+        listen: str | None = None,
+        connect: str | None = None,
+        client: bool = False,
+        open_timeout_s: float = OPEN_TIMEOUT_S,
+    ) -> None:
         """A session that listens on `listen` and, when there is somebody, talks to `connect`.
 
         Args:
             client: connect at once or fail; otherwise go on trying in the background.
+            open_timeout_s: how long who takes the connection may need to speak zenoh.
         """
         self._listen, self._connect, self._client = listen, connect, client
+        self._open_timeout_s = open_timeout_s
         self._session: zenoh.Session | None = None
         self._declared: list[object] = []  # a token that nobody holds is undeclared
 
@@ -182,7 +191,7 @@ class Bus:
             "connect/retry": RETRY_MS,
             "timestamping/enabled": True,
             "transport/link/tx/lease": LEASE_MS,
-            "transport/unicast/open_timeout": OPEN_TIMEOUT_MS,
+            "transport/unicast/open_timeout": round(1e3 * self._open_timeout_s),
         }
         for key, value in settings.items():
             config.insert_json5(key, json.dumps(value))
@@ -230,16 +239,16 @@ class Bus:
 
 
 @contextmanager
-def client(endpoint: str) -> Iterator[Bus]:
+def client(endpoint: str, open_timeout_s: float = OPEN_TIMEOUT_S) -> Iterator[Bus]:
     """A short-lived session to the process that listens on `endpoint`; BusError when there is none."""
-    with Bus(connect=endpoint, client=True) as bus:
+    with Bus(connect=endpoint, client=True, open_timeout_s=open_timeout_s) as bus:
         yield bus
 
 
-def is_alive(endpoint: str, token: str) -> bool:
+def is_alive(endpoint: str, token: str, *, open_timeout_s: float = OPEN_TIMEOUT_S) -> bool:
     """Whether somebody listens on `endpoint` and has declared the liveliness token."""
     try:
-        with client(endpoint) as bus:
+        with client(endpoint, open_timeout_s) as bus:
             return bus.alive(token)
     except BusError:
         return False

@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+if TYPE_CHECKING:
+    from interfaces.urdf import UrdfTree
 
 
 class Guess(NamedTuple):
@@ -89,3 +94,28 @@ def robot_toml(guess: Guess) -> str:
 def _quoted(text: str) -> str:
     escaped = text.replace("\\", "\\\\").replace('"', '\\"')
     return f'"{escaped}"'
+
+
+def guess_from(urdf: Path, robot: Path) -> Guess:
+    """The longest chain of moving joints of `urdf`, from its root to the last link that is fixed to its end.
+
+    Args:
+        robot: the robot.toml to be written; the URDF is named relative to it.
+
+    Raises:
+        RobotError: the URDF cannot be read.
+    """
+    from interfaces.urdf import MOVING, UrdfTree
+
+    tree = UrdfTree.load(urdf)
+    root = _root(tree)
+    paths = {link: [joint for joint, _ in tree.path(root, link)] for link in tree.links}
+    moving = {link: [joint.name for joint in path if joint.kind in MOVING] for link, path in paths.items()}
+    end = max(tree.links, key=lambda link: (len(moving[link]), len(paths[link])))
+    name = "".join(c if c.isascii() and (c.isalnum() or c in "_.-") else "_" for c in tree.name).lstrip(".-") or "robot"
+    return Guess(name, os.path.relpath(urdf, robot.parent), moving[end], end, root)
+
+
+def _root(tree: UrdfTree) -> str:
+    children = {joint.child for joint in tree.joints.values()}
+    return next(link for link in tree.links if link not in children)

@@ -55,7 +55,7 @@ def coverage_table(status: SamplerStatus, slides: Collection[str] = ()) -> Table
     table.add_column(no_wrap=True)
     table.add_column(justify="right", no_wrap=True)
     for name, joint in status.coverage.items():
-        table.add_row(name, _bar(joint), _metres(joint) if name in slides else _degrees(joint))
+        table.add_row(name, bar(joint), _metres(joint) if name in slides else _degrees(joint))
     return table
 
 
@@ -67,7 +67,8 @@ def _metres(joint: JointRange) -> str:
     return f"{joint.low:+.3f} m … {joint.high:+.3f} m"
 
 
-def _bar(joint: JointRange) -> Text:
+def bar(joint: JointRange) -> Text:
+    """Which part of its range a joint has covered."""
     span = (joint.upper_limit - joint.lower_limit) or 1.0
     first = round(BAR_WIDTH * (joint.low - joint.lower_limit) / span)
     last = round(BAR_WIDTH * (joint.high - joint.lower_limit) / span)

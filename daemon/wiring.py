@@ -12,11 +12,14 @@ from drivers.dynamixel.config import DynamixelConfig
 from drivers.feetech.config import FeetechConfig
 from drivers.ros2.config import Ros2Config
 from drivers.serial_lines.config import SerialLinesConfig
+from drivers.servos.joints import ServoJoints as ServoArm
 from interfaces.errors import ConfigError
 from interfaces.protocols import Clock, JointSource
 from kbmaps import RigidChain
 
 from .config import Config
+from .joints_watch import ServoJoints
+from .servo_wiring import require_servos, through_servos
 from .sources import MarkerTopic, Sources, StampedJoints
 from .store import PairReader
 
@@ -82,6 +85,19 @@ def open_joints(config: Config, clock: Clock) -> JointSource:
             return _ros2_joints(config, hardware, clock)
 
 
+def open_servos(config: Config, clock: Clock) -> ServoJoints:
+    """As `open_joints`, of an arm of servos.
+
+    Raises:
+        ConfigError: the joints are not servos.
+    """
+    match open_joints(config, clock):
+        case ServoArm() as joints:
+            return joints
+    remedy = "This is for servos: [drivers.dynamixel] or [drivers.feetech]"
+    raise ConfigError("the joints are no servos", file=config.file, remedy=remedy)
+
+
 def _ros2_joints(config: Config, robot: Ros2Config, clock: Clock) -> Ros2Joints:
     from drivers.ros2.joints import Ros2Joints
 
@@ -111,6 +127,8 @@ def _last_pose(config: Config) -> list[float] | None:
 
 
 def _require_source(config: Config, *, sim: bool) -> None:
+    if sim and config.tables.sim.servo_bench:
+        require_servos(config)
     if sim or config.tables.drivers.recording is not None:
         return
     if config.tables.drivers.hardware is not None:
@@ -150,12 +168,16 @@ def demonstration_model() -> Path:
 def _simulated(config: Config) -> Iterator[Sources]:
     require_simulation()
     from sim_backend import SimWorld
+    from sim_backend.guided_path import exact_encoders
     from vision.tracked_camera import TrackedCamera
     from vision.tracker import StereoTracker
 
-    with SimWorld(config.robot, config.tables.sim, config.simulation) as world:
+    on_bench = config.tables.sim.servo_bench
+    settings = exact_encoders(config.tables.sim) if on_bench else config.tables.sim
+    with SimWorld(config.robot, settings, config.simulation) as world:
         marker = TrackedCamera(world.camera, StereoTracker(world.camera.calibration, config.tables.vision))
-        yield Sources(world.joints, marker, world.clock, world)
+        joints = through_servos(config, world.joints) if on_bench else world.joints
+        yield Sources(joints, marker, world.clock, world)
 
 
 @contextmanager

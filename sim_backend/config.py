@@ -100,6 +100,8 @@ class SimConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
 
     Attributes:
         seed: all that is random is drawn from it.
+        servo_bench: the joints are read from the servos of [drivers], which stand on a bench where the simulated arm
+            is: through their driver, with their resolution.
         tool_changes: tool changes at given simulated times, besides those that `SimWorld.change_tool` asks for.
     """
 
@@ -108,4 +110,5 @@ class SimConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
     camera: CameraConfig = CameraConfig()
     errors: ErrorConfig = ErrorConfig()
     guide: GuideConfig = GuideConfig()
+    servo_bench: bool = False
     tool_changes: tuple[ToolChange, ...] = ()

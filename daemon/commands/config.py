@@ -13,10 +13,8 @@ from cyclopts import Parameter
 from daemon.commands.options import HERE, RobotFile, flag
 
 if TYPE_CHECKING:
-    from daemon.robot_template import Guess
     from effects import Effect
     from interfaces.robot import RobotDescription
-    from interfaces.urdf import UrdfTree
 
 config = cyclopts.App(
     name="config",
@@ -51,9 +49,9 @@ def init(
         if sim:
             _copy_model(robot)
         else:
-            from daemon.robot_template import EXAMPLE, robot_toml
+            from daemon.robot_template import EXAMPLE, guess_from, robot_toml
 
-            _write_new(robot, robot_toml(EXAMPLE if urdf is None else _guess(urdf, robot)))
+            write_new(robot, robot_toml(EXAMPLE if urdf is None else guess_from(urdf, robot)))
     except OSError as error:
         raise ConfigError(f"cannot be written: {error.strerror}", file=robot, remedy="Give another --robot") from error
     say(f"{robot} written. Next: `bodyschema {'run --sim' if sim else 'config check'} --robot {robot}`")
@@ -147,7 +145,8 @@ def say(text: str) -> None:
     Console(highlight=False, soft_wrap=True).print(text, markup=False)
 
 
-def _write_new(file: Path, text: str) -> None:
+def write_new(file: Path, text: str) -> None:
+    """Write a file that is not there yet; ConfigError when it is."""
     from interfaces.errors import ConfigError
 
     try:
@@ -161,27 +160,6 @@ def _copy_model(robot: Path) -> None:
     from daemon.wiring import demonstration_model
 
     model = demonstration_model()
-    _write_new(robot, model.read_text(encoding="utf-8"))
+    write_new(robot, model.read_text(encoding="utf-8"))
     for urdf in model.parent.glob("*.urdf"):
-        _write_new(robot.parent / urdf.name, urdf.read_text(encoding="utf-8"))
-
-
-def _guess(urdf: Path, robot: Path) -> Guess:
-    """The longest chain of moving joints of `urdf`, from its root to the last link that is fixed to its end."""
-    import os
-
-    from daemon.robot_template import Guess
-    from interfaces.urdf import MOVING, UrdfTree
-
-    tree = UrdfTree.load(urdf)
-    root = _root(tree)
-    paths = {link: [joint for joint, _ in tree.path(root, link)] for link in tree.links}
-    moving = {link: [joint.name for joint in path if joint.kind in MOVING] for link, path in paths.items()}
-    end = max(tree.links, key=lambda link: (len(moving[link]), len(paths[link])))
-    name = "".join(c if c.isascii() and (c.isalnum() or c in "_.-") else "_" for c in tree.name).lstrip(".-") or "robot"
-    return Guess(name, os.path.relpath(urdf, robot.parent), moving[end], end, root)
-
-
-def _root(tree: UrdfTree) -> str:
-    children = {joint.child for joint in tree.joints.values()}
-    return next(link for link in tree.links if link not in children)
+        write_new(robot.parent / urdf.name, urdf.read_text(encoding="utf-8"))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from cyclopts import Parameter
 from cyclopts.validators import Number
@@ -17,11 +17,18 @@ def demo(
     pairs: Annotated[int, Parameter(help="Pairs to learn before the tool change.", validator=Number(gte=1))] = 600,
     pairs_after: Annotated[int, Parameter(help="Pairs to learn after it.", validator=Number(gte=1))] = 300,
     seed: Annotated[int, Parameter(help="Another robot, another path, other noise.", validator=Number(gte=0))] = 0,
+    bus: Annotated[
+        Literal["dynamixel"] | None,
+        Parameter(help="The joints are servos on a bench, read through their driver.", show_default=False),
+    ] = None,
 ) -> None:
     """Watch the whole thing learn, in simulation, in about a minute.
 
     A humanoid's arm is guided by a virtual hand, its head cameras see a red ball on the tool. The sampler and the
     learner run as the two real processes; half-way the tool becomes 250 mm longer.
+
+    With --bus dynamixel the joints are read as on a real arm: from servos on a serial port, by the driver and
+    dynamixel-sdk. The servos are a bench at the bytes, and stand where the simulated arm is.
 
     Needs: the extra `sim` (`pip install 'bodyschema[sim]'`), and no hardware.
 
@@ -39,7 +46,9 @@ def demo(
 
     require_simulation()
     console = Console(highlight=False)
-    scene = prepare(out, seed)
+    scene = prepare(out, seed, servos=bus is not None)
+    if bus is not None:
+        console.print(f"The joints are servos on a bench; {scene.log_file} tells of them.", soft_wrap=True)
     with shown_on(console) as show:
         outcome = play(scene, first=pairs, second=pairs_after, seed=seed, show=show)
     write_curve(outcome.rows, scene.curve_file)

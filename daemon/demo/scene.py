@@ -13,6 +13,16 @@ from interfaces.errors import ConfigError
 STATE = "state"
 # A folder with this file is a demo's, and may be emptied by the next one.
 MARK = ".bodyschema-demo"
+# Light ones in the neck, strong ones in the shoulder.
+SERVOS = {
+    "neck_yaw": "XL330-M288",
+    "neck_pitch": "XL330-M288",
+    "shoulder_flexion": "XM540-W270",
+    "shoulder_abduction": "XM540-W270",
+    "upperarm_rotation": "XM430-W350",
+    "elbow_flexion": "XM430-W350",
+    "forearm_rotation": "XM430-W350",
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,8 +67,11 @@ class Scene:
         return self.folder / "learning_curve.png"
 
 
-def prepare(folder: Path, seed: int) -> Scene:
+def prepare(folder: Path, seed: int, *, servos: bool = False) -> Scene:
     """Lay out the demo's folder; what an earlier demo left there is replaced.
+
+    Args:
+        servos: the joints are Dynamixel servos on a bench.
 
     Raises:
         ConfigError: the folder is neither empty nor a demo's, or cannot be written.
@@ -76,7 +89,7 @@ def prepare(folder: Path, seed: int) -> Scene:
             if path.suffix in {".urdf", ".toml"}:
                 shutil.copyfile(path, folder / path.name)
         scene = Scene(folder.resolve())
-        scene.robot_file.write_text(model.read_text(encoding="utf-8") + _own_tables(seed), encoding="utf-8")
+        scene.robot_file.write_text(model.read_text(encoding="utf-8") + _own_tables(seed, servos), encoding="utf-8")
     except OSError as error:
         raise ConfigError(
             f"cannot be written: {error.strerror}", file=folder, remedy="Give another --out or free some space"
@@ -84,8 +97,9 @@ def prepare(folder: Path, seed: int) -> Scene:
     return scene
 
 
-def _own_tables(seed: int) -> str:
+def _own_tables(seed: int, servos: bool) -> str:
     sampler, learner = _free_ports(2)
+    bench = f"servo_bench = true\n{_servos()}" if servos else ""
     return f"""
 [zenoh]
 sampler = "tcp/127.0.0.1:{sampler}"
@@ -96,7 +110,15 @@ state_dir = "{STATE}"
 
 [sim]
 seed = {seed}
-"""
+{bench}"""
+
+
+def _servos() -> str:
+    """The arm as one would build it of servos."""
+    lines = ["", "[drivers.dynamixel.buses.arm]", 'port = "bus"']
+    for id, (joint, model) in enumerate(SERVOS.items(), 1):
+        lines += ["", "[[drivers.dynamixel.servos]]", f'joint = "{joint}"', f"id = {id}", f'model = "{model}"']
+    return "\n".join(lines) + "\n"
 
 
 def _free_ports(count: int) -> list[int]:

@@ -145,6 +145,13 @@ class ServoJoints:
             self._is_lost = True
             raise
 
+    def temperature_c(self, joint: str) -> float | None:
+        """How hot a joint's servo says it is, asked now; None without an answer. For the thread that reads."""
+        servo = self.servos[self._names.index(joint)]
+        bus, register = self._buses[servo.bus], servo.model.layout["temperature"]
+        exchange = bus.ask(bus.read_request(servo.model, servo.id, register))
+        return float(exchange.answers[0].status.data[0]) if exchange.trouble is None else None
+
     def _read_until(self, deadline: float) -> JointReading | None:
         while True:
             if self._next_poll > deadline:

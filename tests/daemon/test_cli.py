@@ -52,7 +52,9 @@ def test_help_names_every_command(tmp_path) -> None:
     assert [name for name in COMMANDS if f" {name} " not in text] == []
 
 
-@pytest.mark.parametrize("command", [*COMMANDS, "config init", "config check", "config show"])
+@pytest.mark.parametrize(
+    "command", [*COMMANDS, "config init", "config check", "config show", "install udev", "robot new"]
+)
 def test_each_command_says_what_it_needs_and_what_is_next(command, capsys) -> None:
     command_line(command.split()[0])([*command.split(), "--help"], exit_on_error=False, result_action="return_value")
     beginnings = [line.split(" ")[0] for line in capsys.readouterr().out.splitlines()]

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from random import Random
 
-from drivers.dynamixel.bench.virtual_port import VirtualClock
+from drivers.bench.virtual_port import VirtualClock
 from drivers.ros2.bench.faults import Fault, Planned
 from drivers.ros2.bench.node import Node
 from drivers.ros2.bench.virtual_link import VirtualLink, at_once

@@ -9,7 +9,10 @@ from pathlib import Path
 import msgspec
 import pytest
 
+from daemon.bench_run import FAULTS
+from daemon.cli import command_line
 from drivers.config import DriversConfig
+from drivers.dynamixel.bench.asked_faults import KINDS
 from drivers.dynamixel.models import BY_NAME, Register
 from drivers.feetech.models import LAYOUT_SCS, LAYOUT_STS
 from drivers.serial_lines.lines import Header, Reading, parse
@@ -112,3 +115,17 @@ def test_the_blocks_are_where_the_table_says() -> None:
         assert f"| {span(layout.block)} |" in PAGE
     for model in SHOWN:
         assert f"| {span(BY_NAME[model].layout.block)} |" in PAGE
+
+
+@pytest.mark.parametrize("command", re.findall(r"^\$ (bodyschema .*)$", PAGE, re.MULTILINE))
+def test_every_command_on_the_page_is_understood(command) -> None:
+    words = command.split()[1:]
+    command_line(words[0]).parse_args(words, exit_on_error=False, print_error=False)
+
+
+def test_the_table_of_faults_is_that_of_the_bench() -> None:
+    body = re.search(r"^\| fault \|.*\n\| ---.*\n((?:\|.*\n)+)", PAGE, re.MULTILINE)
+    assert body is not None
+    rows = re.findall(r"^\| `([a-z-]+)` \| (.*) \|$", body[1], re.MULTILINE)
+    assert dict(rows) == dict(FAULTS)
+    assert set(FAULTS) == set(KINDS)

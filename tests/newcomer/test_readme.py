@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import re
+import shlex
 from pathlib import Path
 
 import pytest
 
-from daemon.cli import COMMANDS
+from daemon.bench_run import BenchRun
+from daemon.cli import COMMANDS, command_line
+from daemon.config import Config
 
 ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -32,6 +35,31 @@ def test_the_readme_s_make_targets_exist(target: str) -> None:
 
 def test_the_readme_lists_every_command_with_its_own_words() -> None:
     assert re.findall(r"^\| `bodyschema (\w+)` \| (.*) \|$", README, re.MULTILINE) == list(COMMANDS.items())
+
+
+@pytest.mark.parametrize("command", re.findall(r"^\.venv/bin/(bodyschema .*)$", README, re.MULTILINE))
+def test_every_command_in_the_readme_is_understood(command: str) -> None:
+    words = shlex.split(command)[1:]
+    command_line(words[0]).parse_args(words, exit_on_error=False, print_error=False)
+
+
+def test_the_commands_for_a_real_arm_go_through_on_a_bench(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """As the README has them, the arm being a bench: its port and one rate are named, and nobody is there to ask."""
+    with BenchRun(Config.load(ROOT / "examples" / "desk_arm" / "servos.toml", {}), tmp_path / "bus") as run:
+        port = ["--port", str(tmp_path / "bus"), "--baud", "1000000"]
+        urdf, robot = str(ROOT / "examples" / "desk_arm" / "desk_arm.urdf"), str(tmp_path / "robot.toml")
+        for words in (
+            ["scan", *port],
+            ["robot", "new", "--urdf", urdf, "--from", "scan", *port, "--robot", robot, "--yes"],
+            ["scan", *port, "--robot", robot],
+            ["doctor", "--robot", str(run.robot_file)],
+            ["joints", "--robot", robot, "--once"],
+        ):
+            command_line(words[0])(words, exit_on_error=False, result_action="return_value")
+    shown = capsys.readouterr().out
+    assert "4 servos found." in shown
+    assert "4 servos: those of robot.toml, all of them." in shown
+    assert "nobody else has it open" in shown
 
 
 PAGES = sorted((ROOT / "docs").rglob("*.md"))

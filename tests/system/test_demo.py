@@ -96,3 +96,14 @@ def test_the_demo_refuses_a_folder_that_is_not_its_own(tmp_path: Path) -> None:
     assert result.returncode == 1
     assert "thesis.tex" in result.stderr
     assert precious.read_text() == "years of work"
+
+
+def test_the_demo_over_servos_learns_as_well(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "daemon", "demo", "--bus", "dynamixel", "--out", str(tmp_path / "out")]
+    command += ["--pairs", str(FIRST), "--pairs-after", "10", "--seed", "3"]
+    done = subprocess.run(command, check=False, capture_output=True, text=True, timeout=LIMIT_S)
+    assert done.returncode == 0, done.stderr
+    assert "7 servos, torque verified off" in (tmp_path / "out" / "daemon.log").read_text()
+    with (tmp_path / "out" / "learning_curve.csv").open(newline="") as stream:
+        rows = [row for row in csv.DictReader(stream) if int(row["pairs"]) <= FIRST + 5]
+    assert float(rows[-1]["held_out_error_mm"]) < 0.7 * float(rows[-1]["nominal_error_mm"])

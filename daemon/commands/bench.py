@@ -1,0 +1,83 @@
+"""`bodyschema bench`."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import Parameter
+from cyclopts.validators import Number
+
+from daemon.commands.options import HERE, RobotFile, flag
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from daemon.bench_run import BenchRun
+
+PORT = Path("bus")
+GLANCE_S = 0.1
+
+
+def bench(
+    *,
+    port: Annotated[Path, Parameter(help="The name of the port to make; PORT-BUS for each of several buses.")] = PORT,
+    robot: RobotFile = HERE,
+    fault: Annotated[
+        tuple[str, ...],
+        Parameter(help="KIND[@JOINT][=SHARE], as in late=0.05 or overload@elbow; more than once for several."),
+    ] = (),
+    list_faults: Annotated[bool, flag("Show the kinds of faults and end.", name="--list-faults")] = False,
+    return_delay_us: Annotated[
+        int, Parameter(help="Return Delay Time of the servos; the factory's is 500.", validator=Number(gte=0, lte=508))
+    ] = 0,
+    seed: Annotated[int, Parameter(help="Of the faults' dice.", validator=Number(gte=0))] = 0,
+) -> None:
+    """A dry run of your robot.toml: its servos on a port that any program opens like a real one. Until Ctrl-C.
+
+    The servos are those of `[drivers.dynamixel]`, with their wire time and their rules; the simulated hand guides them
+    (without pybullet each swings slowly). PORT.toml is written beside PORT, your robot.toml with the bench's port and a
+    state of its own, for the other commands. Both are removed at the end.
+
+    Needs: robot.toml with servos (`bodyschema robot new`), no hardware.
+
+    Next: in another terminal `bodyschema scan`, `doctor` or `joints`, each with --robot PORT.toml.
+    """
+    from rich.console import Console
+
+    from daemon.bench_run import FAULTS, BenchRun
+    from daemon.config import Config
+    from daemon.signals import on_termination
+
+    console = Console(highlight=False, soft_wrap=True)
+    if list_faults:
+        for kind, meaning in FAULTS.items():
+            console.print(f"{kind:12} {meaning}", markup=False)
+        return
+    config = Config.load(robot)
+    run = BenchRun(config, port, faults=fault, return_delay_s=return_delay_us * 1e-6, seed=seed)
+    with on_termination(run.stop), _made(run, console) as opened:
+        for line in opened.introduction():
+            console.print(line, markup=False)
+        _look_on(opened, console)
+
+
+def _made(run: BenchRun, console: Console) -> BenchRun:
+    """The bench with its motion, which takes a moment to make."""
+    if not console.is_terminal:
+        run.prepare(lambda _: None)
+        return run
+    with console.status("guiding the simulated arm") as status:
+        run.prepare(lambda share: status.update(f"guiding the simulated arm: {100 * share:.0f} %"))
+    return run
+
+
+def _look_on(run: BenchRun, console: Console) -> None:
+    with console.status("nobody has spoken to the servos yet") as status:
+        while not run.stopping:
+            for said in run.due():
+                console.print(said, markup=False)
+            if run.instructions:
+                status.update(f"the servos understood {run.instructions:,} packets")
+            time.sleep(GLANCE_S)

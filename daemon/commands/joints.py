@@ -1,0 +1,102 @@
+"""`bodyschema joints`."""
+
+from __future__ import annotations
+
+import sys
+from typing import TYPE_CHECKING, Annotated
+
+from daemon.commands.options import HERE, RobotFile, flag
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from daemon.joints_watch import JointsWatch, Seen
+
+SHOW_EVERY_S = 0.1
+PRINT_EVERY_S = 0.5
+FIRST_READING_S = 5.0
+
+
+def joints(
+    *,
+    robot: RobotFile = HERE,
+    once: Annotated[bool, flag("One table, then end.")] = False,
+    json: Annotated[bool, flag("A line of JSON instead, every half second.")] = False,
+) -> None:
+    """Each joint's angle, speed, current and temperature while you move it by hand, until Ctrl-C.
+
+    Torque is switched off first: hold the arm, it will sink. Below the table stands where the URDF says that the marker
+    went by the joint that you moved last: if it went the other way, the sign is wrong. Angles beyond the URDF's limits
+    are told, too.
+
+    Needs: robot.toml with servos (`bodyschema robot new`), and no sampler that runs.
+
+    Next: mend direction and zero_ticks in robot.toml; then `bodyschema run`.
+    """
+    from rich.console import Console
+    from rich.live import Live
+
+    from daemon.config import Config
+    from daemon.joints_view import as_json, screen
+    from daemon.joints_watch import JointsWatch
+    from daemon.signals import on_termination
+    from daemon.wiring import open_servos
+    from interfaces.clock import SystemClock
+
+    clock = SystemClock()
+    config = Config.load(robot)
+    console = Console(highlight=False)
+    ending = _Ending()
+    with on_termination(ending.end), JointsWatch(config, open_servos(config, clock), clock) as watch:
+        seen = _first(watch)
+        if once:
+            console.file.write(as_json(seen) + "\n") if json else console.print(screen(seen))
+        elif json or not console.is_terminal:
+            _follow(
+                watch, ending, PRINT_EVERY_S, lambda now: _line(as_json(now)) if json else console.print(screen(now))
+            )
+        else:
+            with Live(screen(seen), console=console, auto_refresh=False, screen=True) as live:
+                _follow(watch, ending, SHOW_EVERY_S, lambda now: live.update(screen(now), refresh=True))
+
+
+class _Ending:
+    """Whether it was asked for."""
+
+    def __init__(self) -> None:
+        self.asked = False
+
+    def end(self) -> None:
+        self.asked = True
+
+
+def _line(text: str) -> None:
+    sys.stdout.write(text + "\n")
+    sys.stdout.flush()
+
+
+def _first(watch: JointsWatch) -> Seen:
+    """The first look that has all; SourceError when none comes."""
+    import time
+
+    from interfaces.errors import SourceError
+
+    end = time.monotonic() + FIRST_READING_S
+    while time.monotonic() < end:
+        if watch.look() is not None:
+            watch.know_temperatures()
+            seen = watch.look()
+            if seen is not None:
+                return seen
+    raise SourceError("the joints cannot be read. `bodyschema doctor` tells why")
+
+
+def _follow(watch: JointsWatch, ending: _Ending, every_s: float, show: Callable[[Seen], None]) -> None:
+    import time
+
+    shown_at = 0.0
+    while not ending.asked:
+        seen = watch.look()
+        if seen is not None and time.monotonic() - shown_at >= every_s:
+            shown_at = time.monotonic()
+            show(seen)

@@ -1,0 +1,57 @@
+"""`bodyschema scan`."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+from daemon.commands.options import flag
+
+
+def scan(
+    *,
+    port: Annotated[tuple[str, ...], Parameter(help="Only this port; more than once for several.")] = (),
+    baud: Annotated[tuple[int, ...], Parameter(help="Only at this rate; more than once for several.")] = (),
+    robot: Annotated[
+        Path | None, Parameter(help="Hold what is found against this robot.toml.", show_default=False)
+    ] = None,
+    json: Annotated[bool, flag("As JSON.")] = False,
+) -> None:
+    """Which servos are there: every USB serial port, at every rate, in every protocol. About 12 s for a port.
+
+    A table of ID, model, firmware, supply, temperature, torque, and of what is wrong. With --robot also which servos
+    are missing, of another model, at another rate, double, or not in robot.toml. Nothing is written to any servo, and
+    torque stays as it is. Exit code 1 when not all is as it should be, or nobody answers.
+
+    Needs: servos with their supply on, and the right to open the port (`bodyschema doctor` tells).
+
+    Next: `bodyschema robot new --from scan`; `bodyschema doctor`.
+    """
+    from rich.console import Console
+
+    from daemon import servo_wiring
+    from daemon.config import Config
+    from daemon.reproduce.progress import shown_on
+    from daemon.scan_report import as_json, report_of
+    from daemon.scan_view import show
+    from interfaces.errors import ConfigError
+
+    unknown = [rate for rate in baud if rate not in servo_wiring.scanned_bauds()]
+    if unknown:
+        known = ", ".join(map(str, servo_wiring.scanned_bauds()))
+        raise ConfigError(f"--baud {unknown[0]} is no rate of such servos", remedy=f"Give one of {known}")
+    config = None if robot is None else Config.load(robot)
+    if config is not None:
+        servo_wiring.require_servos(config)
+    ports = servo_wiring.ports_to_scan(port, config)
+    with shown_on(Console(stderr=True, highlight=False), "scan") as tell:
+        report = report_of(servo_wiring.scan(ports, baud, tell), config)
+    if json:
+        sys.stdout.write(as_json(report) + "\n")
+    else:
+        show(Console(highlight=False), report)
+    if not report.is_well:
+        sys.exit(1)

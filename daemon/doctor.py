@@ -1,0 +1,174 @@
+"""Whether this machine and this arm are fit: one check after the other, each with the command that mends it."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import re
+import shutil
+import socket
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import msgspec
+
+from interfaces.errors import BodyschemaError
+
+from .bus import Bus, is_alive
+from .config import Config
+from .keys import Keys
+from .servo_wiring import Check, other_holders, port_checks, ports_are_there, servo_checks
+from .status import SamplerStatus
+from .wire import decode
+
+LOW_DISK_BYTES = 200 * 2**20  # the sampler warns below this
+LITTLE_DISK_BYTES = 2**30
+TIME_ERROR = 5  # adjtimex(2): the clock is not synchronised
+TIMEX_BYTES = 512  # more than struct timex has
+CONNECT_S = 0.3
+OPEN_S = 0.7
+
+SAMPLER = re.compile(r"(bodyschema|-m daemon) sampler\b")
+
+Step = tuple[str, Callable[[], Iterator[Check]]]
+
+
+def steps(config: Config) -> Iterator[Step]:
+    """What is looked at, with the function that does it."""
+    yield "robot.toml", lambda: _description(config)
+    if config.tables.drivers.dynamixel is not None:
+        yield "ports", lambda: port_checks(config, _samplers(config))
+        yield "servos", lambda: _servos(config)
+    yield "disk", lambda: disk_checks(config.state_dir)
+    yield "clock", clock_checks
+    yield "zenoh", lambda: _zenoh(config)
+
+
+def as_json(checks: list[Check]) -> str:
+    """The checks as JSON; `well` when none is wrong."""
+    contents = {"well": all(check.state != "wrong" for check in checks), "checks": checks}
+    return msgspec.json.format(msgspec.json.encode(contents)).decode()
+
+
+def _description(config: Config) -> Iterator[Check]:
+    yield Check(
+        "robot.toml", "ok", f"{config.file} is in order: {config.robot.name}, {len(config.robot.joints)} joints"
+    )
+    if config.tables.drivers.dynamixel is None:
+        said = "no servos are configured, so none were looked at"
+        yield Check("robot.toml", "warning", said, "bodyschema robot new --from scan")
+    if config.robot.calibration is None:
+        said = "[camera] describes no stereo pair: images cannot be used, recordings can"
+        yield Check(
+            "camera", "warning", said, "add focal_px, principal_point_px, baseline_m, image_size_px to [camera]"
+        )
+    else:
+        yield Check("camera", "ok", "[camera] describes a stereo pair")
+
+
+def _servos(config: Config) -> Iterator[Check]:
+    """Of the servos themselves; of the running sampler where that has the port."""
+    if not ports_are_there(config):
+        return
+    if other_holders(config):
+        yield from _of_the_sampler(config)
+    else:
+        yield from servo_checks(config)
+
+
+def _samplers(config: Config) -> list[int]:
+    """Those who have a port open and are the sampler, which answers."""
+    pids = [holder.pid for holder in other_holders(config) if SAMPLER.search(holder.command)]
+    endpoint, token = config.tables.zenoh.sampler, Keys(config.robot.name).alive("sampler")
+    return pids if pids and is_alive(endpoint, token, open_timeout_s=OPEN_S) else []
+
+
+def _of_the_sampler(config: Config) -> Iterator[Check]:
+    endpoint, keys = config.tables.zenoh.sampler, Keys(config.robot.name)
+    if not is_alive(endpoint, keys.alive("sampler"), open_timeout_s=OPEN_S):
+        yield Check("servos", "warning", "not looked at: another program has the port")
+        return
+    with Bus(connect=endpoint, client=True) as bus:
+        status = decode(bus.ask_one(keys.status("sampler")), SamplerStatus)
+    yield Check("rate", "ok", f"the running sampler takes {status.readings_per_s:.0f} readings/s")
+    for complaint in status.health:
+        yield Check("servos", "warning", complaint)
+
+
+def disk_checks(folder: Path) -> Iterator[Check]:
+    """Room and right for the pairs in `folder`."""
+    there = next(path for path in (folder, *folder.parents) if path.exists())
+    if not os.access(there, os.W_OK):
+        said = f"{there} cannot be written, and pairs are to be kept in {folder}"
+        yield Check("disk", "wrong", said, f"sudo chown $USER {there}")
+        return
+    free = shutil.disk_usage(there).free
+    said = f"{free / 2**30:.1f} GiB are free for {folder}"
+    if free < LITTLE_DISK_BYTES:
+        state = "wrong" if free < LOW_DISK_BYTES else "warning"
+        yield Check("disk", state, said, f"du -xh {there} | sort -h | tail    # what could go")
+    else:
+        yield Check("disk", "ok", said)
+
+
+def clock_checks(is_synchronised: Callable[[], bool | None] | None = None) -> Iterator[Check]:
+    """Whether the wall clock is kept right, which dates the pairs. (Time stamps come from the monotonic clock.)"""
+    known = (_is_synchronised if is_synchronised is None else is_synchronised)()
+    if known is None:
+        yield Check("clock", "ok", "the system does not tell whether the clock is kept right")
+    elif known:
+        yield Check("clock", "ok", "kept right by the network")
+    else:
+        yield Check(
+            "clock", "warning", "the wall clock is not kept right by the network", "sudo timedatectl set-ntp true"
+        )
+
+
+def _is_synchronised() -> bool | None:
+    try:
+        state = ctypes.CDLL(None).adjtimex(ctypes.create_string_buffer(TIMEX_BYTES))
+    except (OSError, AttributeError):
+        return None
+    return None if state < 0 else state != TIME_ERROR
+
+
+def _zenoh(config: Config) -> Iterator[Check]:
+    keys = Keys(config.robot.name)
+    for process, endpoint in msgspec.structs.asdict(config.tables.zenoh).items():
+        yield zenoh_check(process, endpoint, keys.alive(process))
+
+
+def zenoh_check(process: str, endpoint: str, token: str) -> Check:
+    """Whether the process answers; if not, whether its place is free."""
+    if not _is_listening(endpoint):
+        return Check("zenoh", "ok", f"the {process} does not run; {endpoint} is free for it")
+    if is_alive(endpoint, token, open_timeout_s=OPEN_S):
+        return Check("zenoh", "ok", f"the {process} answers on {endpoint}")
+    port = endpoint.rpartition(":")[2]
+    said = f"somebody else listens on {endpoint}, where the {process} should"
+    return Check("zenoh", "wrong", said, f"ss -ltnp 'sport = :{port}'    # who it is; or another port in [zenoh]")
+
+
+def _is_listening(endpoint: str) -> bool:
+    """Whether somebody takes connections there; also True where that cannot be tried."""
+    protocol, _, address = endpoint.partition("/")
+    host, _, port = address.rpartition(":")
+    if protocol != "tcp":
+        return True
+    try:
+        with socket.create_connection((host.strip("[]"), int(port)), CONNECT_S):
+            return True
+    except OSError:
+        return False
+
+
+def run(config: Config, tell: Callable[[str], None]) -> list[Check]:
+    """All checks; what fails on the way is one, too."""
+    checks: list[Check] = []
+    for name, look in steps(config):
+        tell(name)
+        try:
+            checks += look()
+        except BodyschemaError as error:
+            checks.append(Check(name, "wrong", str(error)))
+    return checks

@@ -1,0 +1,238 @@
+"""An arm's joints while somebody moves them: where they are, where they were, and what the URDF says of it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Protocol, Self
+
+import msgspec
+import numpy as np
+
+from interfaces.protocols import Clock, JointSource
+from interfaces.records import FloatArray
+from interfaces.robot import RobotDescription
+from interfaces.urdf import chain_between
+from kbmaps import RigidChain
+
+from .config import Config
+from .reopen import Reopening
+from .status import JointRange
+
+READ_S = 0.1
+TEMPERATURE_EVERY_S = 0.5  # one servo in turn
+MOVED_RAD = math.radians(3.0)
+STILL_RAD = math.radians(0.5)
+STILL_S = 1.0
+SEEN_M = 0.01  # a marker that moved less shows no sign
+WORDS = (("forward", "back"), ("left", "right"), ("up", "down"))  # REP 103: x, y, z
+
+
+class Sample(Protocol):
+    """What a servo told; see `drivers.dynamixel.channel.Sample`."""
+
+    @property
+    def velocity(self) -> float: ...
+    @property
+    def current(self) -> float | None: ...
+
+
+class Fitted(Protocol):
+    """A servo as it was found; see `drivers.dynamixel.handshake.FittedServo`."""
+
+    @property
+    def id(self) -> int: ...
+    @property
+    def direction(self) -> int: ...
+
+
+class ServoJoints(JointSource, Protocol):
+    """Encoders that are servos; see `drivers.dynamixel.joints.DynamixelJoints`."""
+
+    @property
+    def servos(self) -> Sequence[Fitted]: ...
+
+    @property
+    def samples(self) -> Mapping[str, Sample | None]: ...
+    @property
+    def health(self) -> tuple[str, ...]: ...
+    def temperature_c(self, joint: str) -> float | None: ...
+
+
+class JointState(msgspec.Struct, frozen=True):
+    """One joint now.
+
+    Attributes:
+        angle: [rad], as q of the pairs would be.
+        velocity: [rad/s]. current: [A], None where it is not measured. temperature_c: None as long as not known.
+        low, high: where it has been since the beginning [rad].
+        lower, upper: the URDF's limits [rad].
+        within_limits: whether it has always been within them; a wrong sign or zero shows here.
+    """
+
+    joint: str
+    id: int
+    angle: float
+    velocity: float
+    current: float | None
+    temperature_c: float | None
+    low: float
+    high: float
+    lower: float
+    upper: float
+    within_limits: bool
+
+    @property
+    def range(self) -> JointRange:
+        """What it has covered of its limits."""
+        return JointRange(self.low, self.high, self.lower, self.upper)
+
+
+class Seen(msgspec.Struct, frozen=True):
+    """The arm now.
+
+    Attributes:
+        moved: which joint was moved last, and where the URDF says the marker went by it; empty before that.
+        health: what is wrong with servos.
+        trouble: why nothing is read at present, or None.
+    """
+
+    joints: tuple[JointState, ...]
+    moved: str
+    health: tuple[str, ...]
+    trouble: str | None
+
+
+class JointsWatch:
+    """Reads an arm, and keeps what it has seen."""
+
+    def __init__(self, config: Config, source: ServoJoints, clock: Clock) -> None:
+        """Nothing is opened yet."""
+        self._robot, self._source, self._clock = config.robot, source, clock
+        self._reading = Reopening(source, "the encoders", clock)
+        self._opened = ExitStack()
+        self._temperatures: dict[str, float | None] = dict.fromkeys(config.robot.joints)
+        self._asked, self._next_s = 0, -math.inf
+        self._q: FloatArray | None = None
+        self._low = self._high = np.zeros(len(config.robot.joints))
+        self._signs = SignCheck(config.robot)
+
+    def __enter__(self) -> Self:
+        self._opened.enter_context(self._reading)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._opened.close()
+
+    def look(self) -> Seen | None:
+        """Read once, and say how things are; None as long as nothing was read."""
+        reading = self._reading.read(READ_S)
+        if reading is not None:
+            self._low = reading.q if self._q is None else np.minimum(self._low, reading.q)
+            self._high = reading.q if self._q is None else np.maximum(self._high, reading.q)
+            self._q = reading.q
+            self._signs.take(reading.t, reading.q)
+            self._feel_one()
+        return None if self._q is None else self._seen(self._q)
+
+    def know_temperatures(self) -> None:
+        """Ask all for their temperatures."""
+        for joint in self._temperatures:
+            self._temperatures[joint] = self._source.temperature_c(joint)
+
+    def _feel_one(self) -> None:
+        if self._clock.now() < self._next_s:
+            return
+        joint = self._robot.joints[self._asked % len(self._robot.joints)]
+        self._temperatures[joint] = self._source.temperature_c(joint)
+        self._asked += 1
+        self._next_s = self._clock.now() + TEMPERATURE_EVERY_S
+
+    def _seen(self, q: FloatArray) -> Seen:
+        joints = tuple(self._joint(place, float(angle)) for place, angle in enumerate(q))
+        return Seen(joints, self._signs.said, self._source.health, self._reading.trouble)
+
+    def _joint(self, place: int, angle: float) -> JointState:
+        name, servo = self._robot.joints[place], self._source.servos[place]
+        sample = self._source.samples.get(name)
+        low, high = float(self._low[place]), float(self._high[place])
+        lower, upper = float(self._robot.lower[place]), float(self._robot.upper[place])
+        return JointState(
+            joint=name,
+            id=servo.id,
+            angle=angle,
+            velocity=0.0 if sample is None else servo.direction * sample.velocity,
+            current=None if sample is None else sample.current,
+            temperature_c=self._temperatures[name],
+            low=low,
+            high=high,
+            lower=lower,
+            upper=upper,
+            within_limits=lower <= low and high <= upper,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class _Rest:
+    t: float
+    q: FloatArray
+
+
+class SignCheck:
+    """Tells where the URDF says that the marker went when one joint was moved, for who moved it to compare.
+
+    Attributes:
+        said: that in words, of the joint that was moved last; empty before.
+    """
+
+    def __init__(self, robot: RobotDescription) -> None:
+        """Nothing has moved yet."""
+        self._robot, self._chain = robot, _from_parent(robot)
+        self._begin: FloatArray | None = None
+        self._rest: _Rest | None = None
+        self.said = ""
+
+    def take(self, t: float, q: FloatArray) -> None:
+        """The joints are at `q` (d,) [rad] at the time `t` [s]."""
+        if self._begin is None:
+            self._begin = q
+        if self._rest is None or np.abs(q - self._rest.q).max() > STILL_RAD:
+            self._rest = _Rest(t, q)
+        moved = q - self._begin
+        place = int(np.abs(moved).argmax())
+        if abs(moved[place]) > MOVED_RAD:
+            self.said = self._sentence(place, self._begin, float(moved[place]))
+        if t - self._rest.t > STILL_S:  # it stands: what comes next is another move
+            self._begin = q
+
+    def _sentence(self, place: int, begin: FloatArray, moved: float) -> str:
+        joint, turn = self._robot.joints[place], f"{math.degrees(moved):+.0f}°"
+        end = begin.copy()
+        end[place] += moved
+        went = self._chain.positions(end[None])[0] - self._chain.positions(begin[None])[0]
+        axis = int(np.abs(went).argmax())
+        if abs(went[axis]) < SEEN_M:
+            way = "counter-clockwise" if moved > 0 else "clockwise"
+            return f"{joint} {turn}: by the URDF it turned {way}, its axis pointing at you"
+        word, sign = WORDS[axis][int(went[axis] < 0)], "+-"[int(went[axis] < 0)]
+        parent = self._robot.camera.parent_link
+        return f"{joint} {turn}: by the URDF the marker went {word} ({sign}{'xyz'[axis]} of {parent})"
+
+
+def _from_parent(robot: RobotDescription) -> RigidChain:
+    """From the link that carries the cameras to the marker."""
+    section = robot.robot
+    return chain_between(
+        robot.tree,
+        section.joints,
+        section.held_at,
+        start=robot.camera.parent_link,
+        end=section.marker_link,
+        T_start_camera=np.eye(4),
+        marker_xyz=np.array(section.marker_xyz),
+    )

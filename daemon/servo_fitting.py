@@ -1,0 +1,147 @@
+"""Which servo moves which joint, and the tables of robot.toml that say so."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import msgspec
+
+from interfaces.errors import ConfigError
+
+from .servo_wiring import known_models
+
+
+class Candidate(msgspec.Struct, frozen=True):
+    """A servo that answered, as `bodyschema scan --json` tells of it."""
+
+    port: str
+    baud: int
+    id: int
+    model: str | None = None
+    is_double: bool = False
+
+    @property
+    def is_usable(self) -> bool:
+        """Whether it is the only one of its ID, and of a model that is known."""
+        return not self.is_double and self.model in known_models()
+
+
+class _Bus(msgspec.Struct, frozen=True):
+    servos: tuple[Candidate, ...]
+
+
+class _Scan(msgspec.Struct, frozen=True):
+    ports: tuple[_Bus, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Fitting:
+    """Servos for joints.
+
+    Attributes:
+        servos: by joint, in the order of the joints.
+        bare: joints without a servo.
+        left: servos without a joint.
+    """
+
+    servos: dict[str, Candidate]
+    bare: tuple[str, ...]
+    left: tuple[Candidate, ...]
+
+
+Choose = Callable[[str, Sequence[Candidate]], Candidate | None]
+
+
+def candidates_in(json: bytes, file: object) -> list[Candidate]:
+    """The servos of a scan that was kept.
+
+    Raises:
+        ConfigError: it is none.
+    """
+    try:
+        scan = msgspec.json.decode(json, type=_Scan)
+    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(
+            f"is no scan: {error}", file=file, remedy="Write one: bodyschema scan --json > FILE.json"
+        ) from error
+    return [servo for bus in scan.ports for servo in bus.servos]
+
+
+def first_of(_joint: str, left: Sequence[Candidate]) -> Candidate | None:
+    """The servo with the lowest ID: arms are numbered from the base."""
+    return left[0] if left else None
+
+
+def fit(joints: Sequence[str], candidates: Sequence[Candidate], choose: Choose) -> Fitting:
+    """Give each joint a servo.
+
+    Raises:
+        ConfigError: none of them can be used, or no joint got one.
+    """
+    left = sorted((c for c in candidates if c.is_usable), key=lambda c: (c.port, c.id))
+    if not left:
+        raise ConfigError(
+            "no servo was found that can be used", remedy="`bodyschema scan` shows who answers, and why not"
+        )
+    servos: dict[str, Candidate] = {}
+    for joint in joints:
+        chosen = choose(joint, left)
+        if chosen is not None:
+            servos[joint] = chosen
+            left.remove(chosen)
+    if not servos:
+        raise ConfigError("no joint got a servo", remedy="Give at least one of them one")
+    return Fitting(servos, tuple(joint for joint in joints if joint not in servos), tuple(left))
+
+
+def servo_tables(fitting: Fitting) -> str:
+    """The tables [drivers.dynamixel...] of robot.toml, commented."""
+    names = _bus_names(list(fitting.servos.values()))
+    lines = ["", "# The servos, as `bodyschema scan` found them. docs/hardware.md has all keys."]
+    for (port, baud), name in names.items():
+        lines += [f"[drivers.dynamixel.buses.{name}]", f"port = {_quoted(port)}", f"baud = {baud:_}", ""]
+    lines.append("# CHECK each with `bodyschema joints`: move the joint, and look where its angle goes.")
+    for joint, servo in fitting.servos.items():
+        lines += ["[[drivers.dynamixel.servos]]", f"joint = {_quoted(joint)}", f"id = {servo.id}"]
+        lines.append(f"model = {_quoted(servo.model or '')}")
+        if len(names) > 1:
+            lines.append(f"bus = {_quoted(names[servo.port, servo.baud])}")
+        lines += [
+            "# direction = -1      # the joint counts against the servo",
+            "# zero_ticks = 2048   # where it is at 0",
+            "",
+        ]
+    return "\n".join(lines)
+
+
+def _bus_names(servos: Sequence[Candidate]) -> dict[tuple[str, int], str]:
+    buses = dict.fromkeys((servo.port, servo.baud) for servo in servos)
+    taken: dict[str, int] = {}
+    for port, baud in buses:
+        if taken.setdefault(os.path.realpath(port), baud) != baud:
+            raise ConfigError(
+                f"the servos on {port} have different rates",
+                remedy="Set all to one, with DYNAMIXEL Wizard for instance",
+            )
+    return {bus: "arm" if len(buses) == 1 else f"bus{place}" for place, bus in enumerate(buses, 1)}
+
+
+def _quoted(text: str) -> str:
+    escaped = text.replace("\\", "\\\\").replace('"', '\\"')
+    return f'"{escaped}"'
+
+
+def read_scan(file: Path) -> list[Candidate]:
+    """The servos in a file that `bodyschema scan --json` wrote.
+
+    Raises:
+        ConfigError: it cannot be read, or is none.
+    """
+    try:
+        return candidates_in(file.read_bytes(), file)
+    except OSError as error:
+        remedy = "Write one: bodyschema scan --json > FILE.json"
+        raise ConfigError(f"cannot be read: {error.strerror}", file=file, remedy=remedy) from error

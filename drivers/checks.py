@@ -1,0 +1,153 @@
+"""Whether a serial port can be used: is it there, may it be opened, who has it, does its adapter keep bytes back?"""
+
+from __future__ import annotations
+
+import grp
+import os
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from .scan import serial_ports
+
+State = Literal["ok", "warning", "wrong"]
+ROOT = Path("/")
+LATENCY_TIMER = "sys/bus/usb-serial/devices/{}/latency_timer"
+LONGEST_LATENCY_MS = 1
+ENUMERATED = ("ttyUSB", "ttyACM")
+PSEUDO_TERMINALS, MASTERS = "/dev/pts/", {"/dev/ptmx", "/dev/pts/ptmx"}
+LONGEST_COMMAND = 60
+
+
+@dataclass(frozen=True, slots=True)
+class Check:
+    """One thing that was looked at.
+
+    Attributes:
+        subject: what.
+        state: "wrong" keeps the arm from being read, "warning" makes it worse than it could be.
+        said: what was found.
+        mend: the command to type, or what to do; empty where nothing is to be done.
+    """
+
+    subject: str
+    state: State
+    said: str
+    mend: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Holder:
+    """A process that has a port open."""
+
+    pid: int
+    command: str
+
+
+def holders(port: str, root: Path = ROOT) -> list[Holder]:
+    """The other processes that have `port` open, as far as this user may see them.
+
+    Of a pseudo-terminal not the one that serves its other end.
+    """
+    device = os.path.realpath(port)
+    found = []
+    for process in sorted((root / "proc").glob("[0-9]*"), key=lambda path: int(path.name)):
+        if int(process.name) != os.getpid() and _has_open(process, device):
+            found.append(Holder(int(process.name), _command(process)))
+    return found
+
+
+def _has_open(process: Path, device: str) -> bool:
+    try:
+        opened = {os.readlink(descriptor) for descriptor in (process / "fd").iterdir()}
+    except OSError:  # it has ended, or is another user's
+        return False
+    serves = device.startswith(PSEUDO_TERMINALS) and bool(opened & MASTERS)
+    return device in opened and not serves
+
+
+def _command(process: Path) -> str:
+    try:
+        words = (process / "cmdline").read_bytes().split(b"\0")
+    except OSError:
+        return "?"
+    command = " ".join(word.decode(errors="replace") for word in words if word)
+    return f"{command[:LONGEST_COMMAND]}…" if len(command) > LONGEST_COMMAND else command or "?"
+
+
+def port_checks(name: str, port: str, root: Path = ROOT, *, ours: Collection[int] = ()) -> Iterator[Check]:
+    """What is to be said of the port of the bus `name`. Opens nothing.
+
+    Args:
+        root: of the file system, for /dev, /proc and /sys.
+        ours: processes that shall have it open.
+    """
+    subject = f"port of {name}"
+    if not os.path.exists(port):
+        yield Check(subject, "wrong", f"{port} is not there", _where(root))
+        return
+    yield from _permission(subject, port)
+    found = holders(port, root)
+    others = [holder for holder in found if holder.pid not in ours]
+    for holder in others:
+        yield Check(subject, "wrong", f"{port} is open in process {holder.pid}: {holder.command}", f"kill {holder.pid}")
+    if not others:
+        who = "the running sampler has it open" if found else "nobody else has it open"
+        yield Check(subject, "ok", f"{port} is there, and {who}")
+    yield from _naming(subject, port, root)
+    yield from _latency(port, root)
+
+
+def _where(root: Path) -> str:
+    ports = serial_ports(root)
+    if len(ports) == 1:
+        return f'plug the adapter in, or set port = "{ports[0]}" in robot.toml'
+    return "plug the adapter in, and compare with: ls -l /dev/serial/by-id"
+
+
+def _permission(subject: str, port: str) -> Iterator[Check]:
+    if os.access(port, os.R_OK | os.W_OK):
+        return
+    number = os.stat(port).st_gid
+    group = _group(number)
+    if number in os.getgroups():
+        yield Check(subject, "wrong", f"{port} may not be opened by its group {group}", "bodyschema install udev")
+        return
+    yield Check(
+        subject,
+        "wrong",
+        f"{port} may not be opened: you are not in the group {group}",
+        f"sudo usermod -aG {group} $USER    # then log in again",
+    )
+
+
+def _group(number: int) -> str:
+    try:
+        return grp.getgrgid(number).gr_name
+    except KeyError:
+        return str(number)
+
+
+def _naming(subject: str, port: str, root: Path) -> Iterator[Check]:
+    """A hint where the port's name may be another one after the next plugging in."""
+    if not Path(port).name.startswith(ENUMERATED):
+        return
+    by_id = [name for name in serial_ports(root) if os.path.realpath(name) == os.path.realpath(port) and name != port]
+    if by_id:
+        said = f"{port} may have another name when it is plugged in again"
+        yield Check(subject, "warning", said, f'set port = "{by_id[0]}" in robot.toml')
+
+
+def _latency(port: str, root: Path) -> Iterator[Check]:
+    device = Path(os.path.realpath(port)).name
+    file = root / LATENCY_TIMER.format(device)
+    try:
+        latency_ms = int(file.read_text())
+    except (OSError, ValueError):
+        return
+    said = f"the adapter keeps bytes back for up to {latency_ms} ms"
+    if latency_ms > LONGEST_LATENCY_MS:
+        yield Check("latency timer", "warning", said, "bodyschema install udev    # then plug the adapter in again")
+    else:
+        yield Check("latency timer", "ok", said)

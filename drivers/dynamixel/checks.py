@@ -1,0 +1,149 @@
+"""How an arm's servos are, and how fast they can be read. Writes nothing: torque stays as it is."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
+from itertools import pairwise, zip_longest
+from statistics import median, quantiles
+
+from drivers.checks import Check
+from interfaces.errors import SourceError
+from interfaces.protocols import Clock
+
+from .bus import Bus, Request
+from .config import DynamixelConfig
+from .handshake import Finding, FittedServo, identify
+from .joints import open_serial
+from .models import HARDWARE_ERRORS
+from .plan import block_requests
+
+READ_S = 1.0
+IDENTIFY_S = 1.0  # then who was not asked yet is not asked any more
+FEW_PER_S = 100.0
+MANY_TROUBLES = 0.01
+LONGEST_DELAY_S = 50e-6
+TYPE = "servos"
+
+
+def servo_checks(config: DynamixelConfig, clock: Clock, *, read_s: float = READ_S) -> Iterator[Check]:
+    """Who is there, how they are, and how fast they are read. The ports are opened for that."""
+    with ExitStack() as stack:
+        buses: dict[str, Bus] = {}
+        try:
+            for name, bus in config.buses.items():
+                port, latency_s = open_serial(bus, clock)
+                stack.callback(port.close)
+                buses[name] = Bus(name, port, clock, latency_s)
+            found = _identified(config, buses, clock)
+            yield from _presence(found)
+            servos = [finding.servo for finding in found if finding.servo is not None]
+            for servo in servos:
+                yield from _health(buses[servo.bus], servo)
+            yield from _delays(servos)
+            if servos:
+                yield from _pace(config, buses, servos, clock, read_s)
+        except SourceError as error:
+            yield Check(TYPE, "wrong", str(error))
+
+
+def _identified(config: DynamixelConfig, buses: dict[str, Bus], clock: Clock) -> list[Finding]:
+    found: list[Finding] = []
+    end = clock.now() + IDENTIFY_S
+    for servo in config.servos:
+        late = clock.now() > end
+        found.append(Finding(servo, "not asked") if late else identify(buses[config.bus_of(servo)], servo))
+    return found
+
+
+def _presence(found: Sequence[Finding]) -> Iterator[Check]:
+    missing = [finding for finding in found if finding.servo is None]
+    for finding in missing:
+        config = finding.config
+        said = f"joint {config.joint} (ID {config.id}, {config.model}): {finding.found}"
+        yield Check(TYPE, "wrong", said, "bodyschema scan --robot robot.toml    # who is there instead")
+    if not missing:
+        yield Check(TYPE, "ok", f"all {len(found)} answer, each of the model that robot.toml names")
+
+
+def _health(bus: Bus, servo: FittedServo) -> Iterator[Check]:
+    layout = servo.model.layout
+    exchange = bus.ask(bus.read_request(servo.model, servo.id, layout.state))
+    if exchange.trouble is not None:
+        return
+    status = exchange.answers[0].status
+    has_torque = layout.value("torque", status.data, layout.state.address)
+    has_register = "hardware_error" in layout
+    bits = layout.value("hardware_error", status.data, layout.state.address) if has_register else status.error
+    for bit, text in HARDWARE_ERRORS.items():
+        if bits & bit:
+            said, _, mend = text.partition(": ")
+            yield Check(TYPE, "wrong", f"joint {servo.joint} (ID {servo.id}): {said}", mend)
+    if has_torque:
+        yield Check(TYPE, "ok", f"joint {servo.joint} holds its place: `bodyschema run` switches its torque off")
+
+
+def _delays(servos: Sequence[FittedServo]) -> Iterator[Check]:
+    slow = [servo for servo in servos if servo.return_delay_s > LONGEST_DELAY_S]
+    if not slow:
+        return
+    worst_us = 1e6 * max(servo.return_delay_s for servo in slow)
+    addresses = sorted({servo.model.layout["return_delay"].address for servo in slow})
+    register = " or ".join(map(str, addresses))
+    names = ", ".join(servo.joint for servo in slow)
+    said = f"{names}: each answer comes {worst_us:.0f} µs late by Return Delay Time"
+    yield Check(TYPE, "warning", said, f"DYNAMIXEL Wizard: set Return Delay Time ({register}) to 0")
+
+
+def _pace(
+    config: DynamixelConfig, buses: dict[str, Bus], servos: Sequence[FittedServo], clock: Clock, read_s: float
+) -> Iterator[Check]:
+    """Read for a while, as fast as it goes."""
+    plans = {
+        name: block_requests(
+            bus, [s for s in servos if s.bus == name], try_fast=config.buses[name].fast_sync_read == "auto"
+        )
+        for name, bus in buses.items()
+    }
+    before = {name: (bus.counts.exchanges, dict(bus.counts.troubles)) for name, bus in buses.items()}
+    end, times = clock.now() + read_s, [clock.now()]
+    while clock.now() < end:
+        if _read_all(buses, plans):
+            times.append(clock.now())
+    yield _rate(times, read_s, config.rate_hz)
+    for name, bus in buses.items():
+        exchanges, troubles = before[name]
+        new = {t.value: n - troubles.get(t, 0) for t, n in bus.counts.troubles.items() if n > troubles.get(t, 0)}
+        yield _troubles(name, bus.counts.exchanges - exchanges, new)
+
+
+def _read_all(buses: dict[str, Bus], plans: dict[str, list[Request]]) -> bool:
+    is_whole = True
+    for questions in zip_longest(*plans.values()):
+        asked = [(bus, question) for bus, question in zip(buses.values(), questions, strict=True) if question]
+        for bus, question in asked:
+            bus.send(question)
+        for bus, question in asked:
+            is_whole &= bus.collect(question).trouble is None
+    return is_whole
+
+
+def _rate(times: Sequence[float], read_s: float, wanted_hz: float) -> Check:
+    rate = (len(times) - 1) / read_s
+    if len(times) < 4:
+        return Check("rate", "wrong", "no reading of all servos came through", "look at cable, supply and baud rates")
+    intervals = [b - a for a, b in pairwise(times)]
+    jitter_ms = 1e3 * (quantiles(intervals, n=20)[-1] - median(intervals))
+    said = f"{rate:.0f} readings/s are possible ({wanted_hz:.0f} wanted), jitter {jitter_ms:.1f} ms (95 %)"
+    if rate < min(FEW_PER_S, wanted_hz):
+        return Check("rate", "warning", said, "a higher baud rate, Return Delay Time 0, latency timer 1 ms")
+    return Check("rate", "ok", said)
+
+
+def _troubles(name: str, exchanges: int, troubles: dict[str, int]) -> Check:
+    count = sum(troubles.values())
+    words = ", ".join(f"{n}× {what}" for what, n in sorted(troubles.items(), key=lambda item: -item[1]))
+    said = f"{count} of {exchanges} questions on {name} went wrong{f': {words}' if words else ''}"
+    if count > MANY_TROUBLES * exchanges:
+        return Check("errors", "warning", said, "look at cable and connectors, the supply's voltage under load, noise")
+    return Check("errors", "ok", said)

@@ -1,0 +1,97 @@
+"""`bodyschema bench` and the wiring behind it."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from daemon.bench_run import FAULTS, BenchRun
+from daemon.cli import app
+from daemon.config import Config
+from daemon.wiring import open_joints
+from interfaces.clock import SystemClock
+from interfaces.errors import ConfigError
+
+EXAMPLE = Path(__file__).parents[2] / "examples" / "desk_arm"
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A folder with an arm of servos in it."""
+    return Path(shutil.copytree(EXAMPLE, tmp_path / "arm"))
+
+
+@pytest.fixture
+def config(folder: Path) -> Config:
+    return Config.load(folder / "servos.toml", {})
+
+
+def test_the_written_file_is_the_users_with_the_port_of_the_bench(config, folder) -> None:
+    with BenchRun(config, folder / "bus") as run:
+        written = Config.load(run.robot_file, {})
+    assert written.tables.drivers.dynamixel is not None
+    assert written.tables.drivers.dynamixel.servos == config.tables.drivers.dynamixel.servos
+    assert written.tables.drivers.dynamixel.buses["arm"].port == str(folder / "bus")
+    assert written.robot.joints == config.robot.joints
+    assert written.state_dir != config.state_dir
+
+
+def test_the_driver_reads_the_bench_by_the_written_file(config, folder) -> None:
+    with BenchRun(config, folder / "bus") as run:
+        with open_joints(Config.load(run.robot_file, {}), SystemClock()) as joints:
+            reading = next(told for _ in range(100) if (told := joints.read(0.1)) is not None)
+        assert run.instructions > 0
+    assert reading.q == pytest.approx(np.zeros(4), abs=0.01)
+
+
+def test_a_bench_leaves_nothing_behind(config, folder) -> None:
+    before = set(folder.iterdir())
+    with BenchRun(config, folder / "bus"):
+        pass
+    assert set(folder.iterdir()) == before
+
+
+def test_the_introduction_says_what_to_type(config, folder) -> None:
+    with BenchRun(config, folder / "bus") as run:
+        said = "\n".join(run.introduction())
+    assert "desk_arm: 4 servos on" in said
+    assert f"bodyschema scan --robot {folder / 'bus.toml'}" in said
+
+
+def test_what_was_asked_for_happens_when_its_time_has_come(config, folder) -> None:
+    time = [0.0]
+    with BenchRun(config, folder / "bus", faults=["unplug"], now=lambda: time[0]) as run:
+        assert list(run.due()) == []
+        time[0] = 10.5
+        assert list(run.due()) == ["unplugged"]
+        assert not (folder / "bus").is_symlink()
+        time[0] = 13.5
+        assert list(run.due()) == ["plugged in again"]
+        assert (folder / "bus").is_symlink()
+
+
+def test_a_file_in_the_place_of_the_port_is_kept(config, folder) -> None:
+    (folder / "bus").write_text("precious")
+    with pytest.raises(ConfigError, match="is there already"):
+        BenchRun(config, folder / "bus")
+    assert (folder / "bus").read_text() == "precious"
+
+
+def test_a_robot_toml_in_the_place_of_its_own_is_kept(config, folder) -> None:
+    (folder / "bus.toml").write_text("precious")
+    with pytest.raises(ConfigError, match="no bench wrote it"), BenchRun(config, folder / "bus"):
+        pass
+    assert (folder / "bus.toml").read_text() == "precious"
+
+
+def test_a_robot_without_servos_is_told_what_to_add(folder) -> None:
+    with pytest.raises(ConfigError, match=r"no servos are configured.*\[drivers\.dynamixel\]"):
+        BenchRun(Config.load(folder / "robot.toml", {}), folder / "bus")
+
+
+def test_every_fault_is_listed(capsys) -> None:
+    app(["bench", "--list-faults"], exit_on_error=False, result_action="return_value")
+    assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == list(FAULTS)

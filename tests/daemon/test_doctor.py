@@ -1,0 +1,146 @@
+"""`bodyschema doctor`."""
+
+from __future__ import annotations
+
+import json
+import socket
+import time
+from io import StringIO
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from daemon import doctor
+from daemon.bench_run import BenchRun
+from daemon.bus import Bus
+from daemon.cli import app
+from daemon.config import Config
+from daemon.doctor_view import show
+from daemon.keys import Keys
+from daemon.servo_wiring import Check
+from daemon.status import SamplerStatus
+from daemon.wire import encode
+from drivers import checks
+from drivers.checks import Holder
+
+EXAMPLE = Path(__file__).parents[2] / "examples" / "desk_arm" / "servos.toml"
+LONGEST_S = 5.0
+
+
+def called(*arguments: object) -> int:
+    try:
+        app(list(map(str, arguments)), exit_on_error=False, result_action="return_value")
+    except SystemExit as ended:
+        return int(ended.code or 0)
+    return 0
+
+
+@pytest.fixture
+def state(tmp_path, monkeypatch, free_endpoint) -> None:
+    """State and endpoints of this test alone."""
+    monkeypatch.setenv("BODYSCHEMA_ZENOH_SAMPLER", free_endpoint())
+    monkeypatch.setenv("BODYSCHEMA_ZENOH_LEARNER", free_endpoint())
+
+
+@pytest.mark.usefixtures("state")
+def test_an_arm_on_the_bench_is_well_within_five_seconds(tmp_path, capsys) -> None:
+    with BenchRun(Config.load(EXAMPLE), tmp_path / "bus") as run:
+        begin = time.monotonic()
+        code = called("doctor", "--robot", run.robot_file, "--json")
+        assert time.monotonic() - begin < LONGEST_S
+    told = json.loads(capsys.readouterr().out)
+    assert (code, told["well"]) == (0, True)
+    assert {check["subject"] for check in told["checks"]} == {
+        "robot.toml", "camera", "port of arm", "servos", "rate", "errors", "disk", "clock", "zenoh",
+    }  # fmt: skip
+
+
+@pytest.mark.usefixtures("state")
+def test_what_is_wrong_is_exit_code_1_and_has_its_remedy(tmp_path, capsys) -> None:
+    with BenchRun(Config.load(EXAMPLE), tmp_path / "bus", faults=["overload@elbow_pitch"]) as run:
+        code = called("doctor", "--robot", run.robot_file, "--json")
+    wrong = [check for check in json.loads(capsys.readouterr().out)["checks"] if check["state"] == "wrong"]
+    assert code == 1
+    assert [check["mend"] for check in wrong] == ["free the joint, then reboot the servo"]
+
+
+@pytest.mark.usefixtures("state")
+def test_a_port_that_is_not_there_is_told_once(capsys) -> None:
+    assert called("doctor", "--robot", EXAMPLE, "--json") == 1
+    checks = json.loads(capsys.readouterr().out)["checks"]
+    assert [check["subject"] for check in checks if check["state"] == "wrong"] == ["port of arm"]
+
+
+@pytest.mark.usefixtures("state")
+def test_the_running_sampler_tells_of_the_servos_itself(tmp_path, monkeypatch, capsys) -> None:
+    with BenchRun(Config.load(EXAMPLE), tmp_path / "bus") as run:
+        config = Config.load(run.robot_file)
+        holder = Holder(4711, "/usr/bin/python -m daemon sampler --robot robot.toml")
+        monkeypatch.setattr(checks, "holders", lambda *_: [holder])
+        with Bus(listen=config.tables.zenoh.sampler) as bus:
+            keys = Keys(config.robot.name)
+            bus.token(keys.alive("sampler"))
+            bus.answer(keys.status("sampler"), lambda request: encode(status("joint 'elbow' is hot"), request.encoding))
+            assert called("doctor", "--robot", run.robot_file, "--json") == 0
+    said = {check["said"] for check in json.loads(capsys.readouterr().out)["checks"]}
+    assert {"the running sampler takes 211 readings/s", "joint 'elbow' is hot"} <= said
+    assert any(line.endswith("the running sampler has it open") for line in said)
+
+
+def status(complaint: str) -> SamplerStatus:
+    return SamplerStatus(
+        robot="desk_arm", store="one", state="sampling", pairs=1, segment=1, uptime_s=1.0, frames=1, frames_per_s=1.0,
+        readings_per_s=211.0, pairs_per_s=1.0, rejected={}, coverage={}, disk_free_bytes=1, health=[complaint],
+        version="1",
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(("known", "state"), [(True, "ok"), (None, "ok"), (False, "warning")])
+def test_a_clock_that_is_not_kept_right_is_a_warning(known, state) -> None:
+    (check,) = doctor.clock_checks(lambda: known)
+    assert check.state == state
+
+
+@pytest.mark.parametrize(("free_mib", "state"), [(100, "wrong"), (500, "warning"), (5000, "ok")])
+def test_a_disk_that_is_nearly_full_is_told(tmp_path, monkeypatch, free_mib, state) -> None:
+    usage = type("Usage", (), {"free": free_mib * 2**20})
+    monkeypatch.setattr(doctor.shutil, "disk_usage", lambda _: usage)
+    (check,) = doctor.disk_checks(tmp_path / "not" / "yet" / "there")
+    assert check.state == state
+
+
+def test_a_free_endpoint_is_ok(endpoint) -> None:
+    assert "is free for it" in doctor.zenoh_check("sampler", endpoint, "x/alive").said
+
+
+def test_a_process_that_answers_is_ok(endpoint) -> None:
+    with Bus(listen=endpoint) as bus:
+        bus.token("x/alive")
+        assert f"answers on {endpoint}" in doctor.zenoh_check("sampler", endpoint, "x/alive").said
+
+
+def test_somebody_else_on_the_endpoint_is_wrong() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+        server.listen()
+        check = doctor.zenoh_check("sampler", f"tcp/127.0.0.1:{port}", "x/alive")
+    assert check.state == "wrong"
+    assert check.mend.startswith(f"ss -ltnp 'sport = :{port}'")
+
+
+def test_a_screen_of_80_columns_keeps_commands_whole() -> None:
+    long = "sudo usermod -aG dialout $USER && " * 4
+    console = Console(file=StringIO(), width=80)
+    show(console, [Check("port of arm", "wrong", "it may not be opened " * 8, long), Check("disk", "ok", "fine")])
+    assert isinstance(console.file, StringIO)
+    shown = console.file.getvalue()
+    assert long.strip() in shown
+    assert "1 wrong: the line below each says what to do." in shown
+
+
+def test_all_well_is_one_sentence() -> None:
+    console = Console(file=StringIO(), width=80)
+    show(console, [Check("disk", "ok", "fine")])
+    assert isinstance(console.file, StringIO)
+    assert console.file.getvalue().endswith("All is well.\n")

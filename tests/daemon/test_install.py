@@ -1,0 +1,83 @@
+"""`bodyschema install udev`."""
+
+from __future__ import annotations
+
+import io
+import re
+
+import pytest
+
+from daemon import udev
+from daemon.cli import command_line
+from daemon.udev import ADAPTERS, FILE, Rules, rules
+from interfaces.errors import ConfigError
+
+# One key, operator and value of a rule; see udev(7).
+TERM = re.compile(r'[A-Z_]+(\{[A-Za-z_]+\})?(==|=|\+=)"[^"]*"')
+
+
+def install(*arguments: object) -> None:
+    command_line("install")(
+        ["install", "udev", *map(str, arguments)], exit_on_error=False, result_action="return_value"
+    )
+
+
+def test_every_line_is_a_comment_or_a_rule() -> None:
+    lines = [line for line in rules().splitlines() if line and not line.startswith("#")]
+    assert len(lines) == 1 + len(ADAPTERS)
+    assert [line for line in lines if not all(TERM.fullmatch(term) for term in line.split(", "))] == []
+
+
+def test_the_latency_timer_becomes_1_ms() -> None:
+    assert 'DRIVER=="ftdi_sio", ATTR{latency_timer}="1"' in rules()
+
+
+def test_yes_writes_the_file(tmp_path, capsys) -> None:
+    install("--yes", "--root", tmp_path)
+    assert (tmp_path / FILE).read_text() == rules()
+    assert rules() in capsys.readouterr().out
+
+
+def test_a_dry_run_shows_it_and_writes_nothing(tmp_path, capsys) -> None:
+    install("--dry-run", "--root", tmp_path)
+    assert list(tmp_path.iterdir()) == []
+    assert rules() in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("answer", "written"), [("y\n", True), ("n\n", False), ("\n", False)])
+def test_without_yes_it_asks(tmp_path, monkeypatch, answer, written) -> None:
+    monkeypatch.setattr("sys.stdin", io.StringIO(answer))
+    install("--root", tmp_path)
+    assert (tmp_path / FILE).exists() == written
+
+
+def test_rules_that_are_there_are_left_as_they_are(tmp_path, capsys) -> None:
+    install("--yes", "--root", tmp_path)
+    install("--root", tmp_path)
+    assert "It is there already" in capsys.readouterr().out
+
+
+def test_uninstall_removes_the_file(tmp_path, capsys) -> None:
+    install("--yes", "--root", tmp_path)
+    install("--uninstall", "--yes", "--root", tmp_path)
+    assert not (tmp_path / FILE).exists()
+    assert "removed." in capsys.readouterr().out
+
+
+def test_a_dry_run_of_uninstall_removes_nothing(tmp_path) -> None:
+    install("--yes", "--root", tmp_path)
+    install("--uninstall", "--dry-run", "--root", tmp_path)
+    assert (tmp_path / FILE).exists()
+
+
+def test_udev_takes_the_rules_in_on_this_machine_alone(tmp_path) -> None:
+    ran: list[object] = []
+    Rules(tmp_path, ran.append).install()
+    assert ran == []
+
+
+def test_a_file_that_cannot_be_written_names_the_command(tmp_path, monkeypatch) -> None:
+    (tmp_path / "etc").write_text("no folder")
+    monkeypatch.setattr(udev.os, "geteuid", lambda: 1000)
+    with pytest.raises(ConfigError, match=r"sudo .* install udev --yes$"):
+        Rules(tmp_path).install()

@@ -1,0 +1,160 @@
+"""`bodyschema joints`: an arm on the bench, moved joint by joint."""
+
+from __future__ import annotations
+
+import json
+from io import StringIO
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from daemon.bench_run import BenchRun
+from daemon.cli import app
+from daemon.config import Config
+from daemon.joints_view import screen
+from daemon.joints_watch import JointState, JointsWatch, Seen, SignCheck
+from daemon.wiring import open_joints
+from drivers.dynamixel.bench.dry_run import DryRun
+from interfaces.clock import SystemClock
+
+EXAMPLE = Path(__file__).parents[2] / "examples" / "desk_arm" / "servos.toml"
+YAW, PITCH, ELBOW, ROLL = range(4)
+
+
+@pytest.fixture(scope="module")
+def config() -> Config:
+    return Config.load(EXAMPLE, {})
+
+
+def signs(config: Config, *path: tuple[int, float], begin=(0.0, 0.0, 0.5, 0.0)) -> str:
+    """What is said after the joints were moved by so much [rad], one after the other, with a rest between."""
+    check, q, t = SignCheck(config.robot), np.array(begin), 0.0
+    for joint, turn in path:
+        for step in np.linspace(0.0, turn, 30):
+            moved = q.copy()
+            moved[joint] += step
+            t += 0.02
+            check.take(t, moved)
+        q = moved
+        for _ in range(30):
+            t += 0.05
+            check.take(t, q)
+    return check.said
+
+
+def test_a_raised_arm_is_said_to_go_where_the_urdf_says(config) -> None:
+    chain, q = config.robot.chain, np.array([0.0, 0.0, 0.5, 0.0])
+    up = q.copy()
+    up[PITCH] += 0.3
+    T = config.robot.camera.pose[:3, :3]
+    went = T @ (chain.positions(up[None])[0] - chain.positions(q[None])[0])
+    axis = int(np.abs(went).argmax())
+    expected = f"({'+-'[int(went[axis] < 0)]}{'xyz'[axis]} of base_link)"
+    said = signs(config, (PITCH, 0.3))
+    assert said.startswith("shoulder_pitch +17°: by the URDF the marker went ")
+    assert said.endswith(expected)
+
+
+def test_turned_back_it_goes_the_other_way(config) -> None:
+    there, back = signs(config, (YAW, 0.3)), signs(config, (YAW, -0.3))
+    assert {there.split("went ")[1].split()[0], back.split("went ")[1].split()[0]} == {"left", "right"}
+
+
+def test_after_a_rest_the_next_joint_is_told(config) -> None:
+    assert signs(config, (YAW, 0.5), (ELBOW, -0.2)).startswith("elbow_pitch -11°")
+
+
+def test_a_joint_that_does_not_move_the_marker_is_told_by_its_turn(config) -> None:
+    assert (
+        signs(config, (ROLL, 0.5))
+        == "wrist_roll +29°: by the URDF it turned counter-clockwise, its axis pointing at you"
+    )
+
+
+def test_noise_is_no_movement(config) -> None:
+    assert signs(config, (YAW, 0.02)) == ""
+
+
+# --- over the bench
+
+
+def test_the_watch_has_angles_speeds_temperatures_and_ranges(config, tmp_path) -> None:
+    shoulder = [0.2]
+    angles = {joint: (lambda _: 0.1) for joint in config.robot.joints} | {"shoulder_pitch": lambda _: shoulder[0]}
+    servos = config.tables.drivers.dynamixel
+    with DryRun(servos, angles, {"arm": tmp_path / "bus"}) as bench:
+        (tmp_path / "desk_arm.urdf").write_bytes(config.robot.tree.file.read_bytes())
+        (tmp_path / "robot.toml").write_text(
+            EXAMPLE.read_text().replace(servos.buses["arm"].port, str(tmp_path / "bus"))
+        )
+        there = Config.load(tmp_path / "robot.toml", {})
+        with JointsWatch(there, open_joints(there, SystemClock()), SystemClock()) as watch:
+            look_until(watch, lambda seen: True)
+            for shoulder[0] in np.linspace(0.2, 0.6, 20):
+                look_until(watch, lambda seen: abs(seen.joints[PITCH].angle - shoulder[0]) < 0.01)
+            watch.know_temperatures()
+            seen = look_until(watch, lambda seen: True)
+        assert bench.instructions > 20
+    pitch = seen.joints[PITCH]
+    assert (pitch.low, pitch.high) == pytest.approx((0.2, 0.6), abs=0.01)
+    assert [joint.temperature_c for joint in seen.joints] == [31.0] * 4
+    assert [joint.current for joint in seen.joints] == [0.0, 0.0, 0.0, None]
+    assert seen.moved.startswith("shoulder_pitch +")
+
+
+def look_until(watch: JointsWatch, done) -> Seen:
+    for _ in range(1000):
+        seen = watch.look()
+        if seen is not None and done(seen):
+            return seen
+    raise AssertionError("it was never seen")
+
+
+def test_once_gives_one_line_of_json(tmp_path, capsys) -> None:
+    with BenchRun(Config.load(EXAMPLE, {}), tmp_path / "bus") as run:
+        app(
+            ["joints", "--robot", str(run.robot_file), "--once", "--json"],
+            exit_on_error=False,
+            result_action="return_value",
+        )
+    (line,) = capsys.readouterr().out.splitlines()
+    assert [joint["joint"] for joint in json.loads(line)["joints"]] == [
+        "base_yaw",
+        "shoulder_pitch",
+        "elbow_pitch",
+        "wrist_roll",
+    ]
+
+
+# --- the screen
+
+
+def shown(**changes) -> str:
+    state = {"joint": "elbow", "id": 3, "angle": 0.5, "velocity": -0.5, "current": 0.12, "temperature_c": 40.0}
+    state |= {"low": 0.0, "high": 0.6, "lower": -1.0, "upper": 1.0, "within_limits": True} | changes
+    console = Console(file=StringIO(), width=80)
+    console.print(screen(Seen((JointState(**state),), "elbow +20°: by the URDF the marker went up", (), None)))
+    assert isinstance(console.file, StringIO)
+    return console.file.getvalue()
+
+
+def test_the_screen_shows_a_joint_in_degrees() -> None:
+    row = next(line for line in shown().splitlines() if line.startswith("elbow "))
+    assert row.split()[1:6] == ["3", "+28.6°", "-29", "+120", "40"]
+    assert len(row.rstrip()) <= 80
+
+
+def test_the_screen_says_what_moved_and_what_to_do() -> None:
+    assert "the marker went up" in shown()
+    assert "direction = -1" in shown()
+
+
+def test_what_is_not_measured_is_a_dash() -> None:
+    row = next(line for line in shown(current=None, temperature_c=None).splitlines() if line.startswith("elbow "))
+    assert row.split()[4:6] == ["-", "-"]
+
+
+def test_an_angle_beyond_the_limits_is_told() -> None:
+    assert "elbow was from +0° to +80°, its limits are -57° to +57°" in shown(high=1.4, within_limits=False)

@@ -1,0 +1,171 @@
+"""Checks of ports and servos: what is found, and the command that mends it."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from drivers import checks
+from drivers.checks import Check, holders, port_checks
+from drivers.dynamixel.bench.asked_faults import AskedFault
+from drivers.dynamixel.bench.dry_run import DryRun
+from drivers.dynamixel.checks import servo_checks
+from drivers.dynamixel.config import BusConfig, DynamixelConfig, ServoConfig
+from interfaces.clock import SystemClock
+
+JOINTS = ("waist", "elbow")
+CONFIG = DynamixelConfig(
+    {"arm": BusConfig("elsewhere", latency_ms=20.0)},
+    (ServoConfig("waist", 1, "XM430-W350"), ServoConfig("elbow", 2, "MX-28")),
+)
+
+
+class Machine:
+    """A file system with what the checks look at."""
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+        self.port = root / "dev" / "ttyUSB0"
+        self.by_id = root / "dev" / "serial" / "by-id" / "usb-FTDI-if00"
+        self.by_id.parent.mkdir(parents=True)
+        self.port.touch()
+        self.by_id.symlink_to(self.port)
+
+    def process(self, pid: int, command: str, *opened: object) -> None:
+        folder = self.root / "proc" / str(pid) / "fd"
+        folder.mkdir(parents=True)
+        (folder.parent / "cmdline").write_bytes(command.replace(" ", "\0").encode())
+        for number, target in enumerate(opened):
+            (folder / str(number)).symlink_to(str(target))
+
+    def latency(self, ms: int) -> None:
+        file = self.root / "sys/bus/usb-serial/devices/ttyUSB0/latency_timer"
+        file.parent.mkdir(parents=True)
+        file.write_text(f"{ms}\n")
+
+    def checks(self, port: Path | None = None) -> list[Check]:
+        return list(port_checks("arm", str(self.by_id if port is None else port), self.root))
+
+
+@pytest.fixture
+def machine(tmp_path: Path) -> Machine:
+    return Machine(tmp_path)
+
+
+def test_a_port_that_is_there_and_free_is_ok(machine) -> None:
+    assert [check.state for check in machine.checks()] == ["ok"]
+
+
+def test_a_missing_port_is_told_with_the_one_that_is_there(machine) -> None:
+    (check,) = machine.checks(machine.root / "dev" / "gone")
+    assert check.state == "wrong"
+    assert f'set port = "{machine.by_id}"' in check.mend
+
+
+def test_who_has_the_port_is_told_with_the_command_that_ends_it(machine) -> None:
+    machine.process(4711, "wizard --fast", "/dev/null", machine.port)
+    (check,) = machine.checks()
+    assert (check.state, check.mend) == ("wrong", "kill 4711")
+    assert check.said.endswith("process 4711: wizard --fast")
+
+
+def test_the_running_sampler_may_have_the_port(machine) -> None:
+    machine.process(4711, "bodyschema sampler", machine.port)
+    (check,) = port_checks("arm", str(machine.by_id), machine.root, ours=[4711])
+    assert (check.state, check.said.endswith("the running sampler has it open")) == ("ok", True)
+
+
+def test_who_serves_the_other_end_of_a_pseudo_terminal_does_not_hold_it(machine) -> None:
+    machine.process(1, "bench", "/dev/ptmx", "/dev/pts/7")
+    machine.process(2, "reader", "/dev/pts/7")
+    assert [holder.pid for holder in holders("/dev/pts/7", machine.root)] == [2]
+
+
+def test_this_process_is_no_other_one(machine) -> None:
+    machine.process(os.getpid(), "python", machine.port)
+    assert holders(str(machine.port), machine.root) == []
+
+
+def test_a_latency_timer_of_16_ms_is_told_with_the_cure(machine) -> None:
+    machine.latency(16)
+    check = machine.checks()[-1]
+    assert (check.subject, check.state) == ("latency timer", "warning")
+    assert "up to 16 ms" in check.said
+    assert check.mend.startswith("bodyschema install udev")
+
+
+def test_a_latency_timer_of_1_ms_is_ok(machine) -> None:
+    machine.latency(1)
+    assert machine.checks()[-1].state == "ok"
+
+
+def test_a_name_that_may_change_is_told_with_the_one_that_stays(machine) -> None:
+    check = machine.checks(machine.port)[-1]
+    assert (check.state, check.mend) == ("warning", f'set port = "{machine.by_id}" in robot.toml')
+
+
+def test_a_port_of_another_group_is_told_with_the_command(machine, monkeypatch) -> None:
+    monkeypatch.setattr(checks.os, "access", lambda *_: False)
+    monkeypatch.setattr(checks.os, "getgroups", list)
+    check = machine.checks()[0]
+    assert check.state == "wrong"
+    assert check.mend.startswith("sudo usermod -aG ")
+
+
+# --- servos on a bench
+
+
+def told(tmp_path: Path, *faults: str, delay_s: float = 0.0, config: DynamixelConfig = CONFIG) -> list[Check]:
+    asked = [AskedFault.parsed(fault, JOINTS) for fault in faults]
+    angles = dict.fromkeys(JOINTS, lambda _: 0.2)
+    with DryRun(config, angles, {"arm": tmp_path / "bus"}, faults=asked, return_delay_s=delay_s) as bench:
+        return list(servo_checks(bench.config, SystemClock(), read_s=0.2))
+
+
+def of(checks: list[Check], subject: str) -> list[Check]:
+    return [check for check in checks if check.subject == subject]
+
+
+def test_servos_that_are_well_are_told_with_their_rate(tmp_path) -> None:
+    found = told(tmp_path)
+    assert of(found, "servos") == [Check("servos", "ok", "all 2 answer, each of the model that robot.toml names")]
+    assert "readings/s are possible (250 wanted)" in of(found, "rate")[0].said
+
+
+def test_a_missing_servo_is_wrong(tmp_path) -> None:
+    check = of(told(tmp_path, "baud@elbow"), "servos")[0]
+    assert (check.state, check.said) == ("wrong", "joint elbow (ID 2, MX-28): no answer")
+
+
+@pytest.mark.parametrize("joint", JOINTS)
+def test_an_alert_is_wrong_and_says_what_to_do(tmp_path, joint) -> None:
+    check = of(told(tmp_path, f"overload@{joint}"), "servos")[1]
+    assert (check.state, check.said) == ("wrong", f"joint {joint} (ID {JOINTS.index(joint) + 1}): it is overloaded")
+    assert check.mend == "free the joint, then reboot the servo"
+
+
+def test_slow_answers_are_told_with_the_register(tmp_path) -> None:
+    check = of(told(tmp_path, delay_s=500e-6), "servos")[1]
+    assert (check.state, check.mend) == ("warning", "DYNAMIXEL Wizard: set Return Delay Time (5 or 9) to 0")
+
+
+def test_errors_are_counted_by_what_went_wrong(tmp_path) -> None:
+    check = of(told(tmp_path, "checksum=0.3"), "errors")[0]
+    assert check.state == "warning"
+    assert "× a garbled answer" in check.said
+
+
+def test_the_doctor_leaves_torque_as_it_is(tmp_path) -> None:
+    asked = [AskedFault.parsed("torque@waist", JOINTS)]
+    angles = dict.fromkeys(JOINTS, lambda _: 0.2)
+    with DryRun(CONFIG, angles, {"arm": tmp_path / "bus"}, faults=asked) as bench:
+        found = list(servo_checks(bench.config, SystemClock(), read_s=0.05))
+        assert bench.servo("waist")["torque"] == 1
+    assert "joint waist holds its place" in of(found, "servos")[1].said
+
+
+def test_a_port_that_cannot_be_opened_is_one_finding() -> None:
+    (check,) = servo_checks(CONFIG, SystemClock())
+    assert (check.state, "elsewhere is gone" in check.said) == ("wrong", True)

@@ -1,0 +1,160 @@
+"""Scanning ports: who is there, at whatever rate, in whatever protocol."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+
+from drivers.bench.pty_shell import PtyShell
+from drivers.bench.virtual_port import VirtualClock, VirtualPort
+from drivers.dynamixel.bench.chain import Chain
+from drivers.dynamixel.bench.frames import Code, instructions_in
+from drivers.dynamixel.bench.servo import Servo
+from drivers.dynamixel.models import BY_NAME
+from drivers.dynamixel.scan import LIKELY_FIRST, SCANNERS
+from drivers.scan import FoundServo, ScannedBus, scan_port, serial_ports
+from interfaces.clock import SystemClock
+from interfaces.errors import SourceError
+
+
+def servo(model: str, id: int, baud: int = 1_000_000, **more) -> Servo:
+    return Servo(BY_NAME[model], id, lambda _: 0.01 * id, baud=baud, booted_s=more.pop("booted_s", 0.1 * id), **more)
+
+
+class Bench:
+    """Servos in virtual time."""
+
+    def __init__(self, servos: Sequence[Servo]) -> None:
+        self.chain, self.clock = Chain(servos), VirtualClock()
+        self.said: list[str] = []
+        self.sent = bytearray()
+
+    def open(self, _port: str, baud: int, _clock: object) -> VirtualPort:
+        bench = self
+
+        class Listened(VirtualPort):
+            def write(self, data: bytes) -> None:
+                bench.sent += data
+                super().write(data)
+
+        return Listened(self.chain, self.clock, baud)
+
+    def scan(self, *bauds: int) -> ScannedBus:
+        return scan_port("bus", SCANNERS, self.clock, self.said.append, bauds=bauds, open_port=self.open)
+
+
+def found(*servos: Servo, bauds: Sequence[int] = ()) -> tuple[FoundServo, ...]:
+    return Bench(servos).scan(*bauds).servos
+
+
+def test_both_protocols_are_found_on_one_bus() -> None:
+    told = found(servo("XM430-W350", 1), servo("MX-28", 4), servo("XL330-M288", 200))
+    assert [(s.id, s.model, s.protocol) for s in told] == [
+        (1, "XM430-W350", "Dynamixel 2.0"), (200, "XL330-M288", "Dynamixel 2.0"), (4, "MX-28", "Dynamixel 1.0"),
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("model", "baud"),
+    [(model, baud) for model in ("XM430-W350", "PH42-020-S300") for baud in LIKELY_FIRST]
+    + [("AX-12A", baud) for baud in LIKELY_FIRST if baud <= 2_000_000],
+)
+def test_a_servo_is_found_at_every_rate(model, baud) -> None:
+    told = found(servo(model, 7, baud), servo(model, 8, baud))
+    assert [(s.id, s.baud, s.model) for s in told] == [(7, baud, model), (8, baud, model)]
+
+
+def test_what_a_servo_tells_of_itself_is_told() -> None:
+    (told,) = found(servo("XM430-W350", 3))
+    assert (told.firmware, told.temperature_c, told.has_torque, told.troubles) == (46, 31.0, False, ())
+    assert told.voltage_v == pytest.approx(12.0)
+
+
+@pytest.mark.parametrize("model", ["XM430-W350", "MX-28"])
+def test_an_overloaded_servo_is_told_with_what_to_do(model) -> None:
+    sick = servo(model, 3)
+    sick.fail(0x20)
+    assert "it is overloaded: free the joint" in found(sick)[0].troubles[0]
+
+
+@pytest.mark.parametrize("model", ["XM430-W350", "MX-28"])
+def test_torque_that_is_on_is_told_and_left_on(model) -> None:
+    holding = servo(model, 3)
+    holding["torque"] = 1
+    assert found(holding)[0].has_torque is True
+    assert holding["torque"] == 1
+
+
+def test_two_servos_of_one_model_with_one_id_are_told() -> None:
+    twins = [Servo(BY_NAME["XM430-W350"], 3, lambda _, q=q: q, booted_s=q) for q in (0.3, 0.7)]
+    (told,) = found(*twins)
+    assert told.is_double
+    assert "two servos have this ID" in told.troubles[0]
+
+
+@pytest.mark.parametrize(("one", "other"), [("XM430-W350", "XL330-M288"), ("MX-28", "AX-12A")])
+def test_two_servos_of_two_models_with_one_id_are_told(one, other) -> None:
+    told = found(servo(one, 3), servo(other, 3), servo(one, 5))
+    assert [(s.id, s.is_double) for s in told] == [(3, True), (5, False)]
+
+
+def test_a_servo_that_answers_no_read_is_told_with_its_register() -> None:
+    silent = servo("XM430-W350", 3)
+    silent["status_return"] = 0
+    assert "Status Return Level (68)" in found(silent)[0].troubles[0]
+
+
+def test_a_scan_writes_to_nobody() -> None:
+    bench = Bench([servo("XM430-W350", 1), servo("MX-28", 4)])
+    bench.scan()
+    told = instructions_in(bench.sent)[0]
+    assert {instruction.code for instruction in told} == {Code.PING, Code.READ}
+
+
+def test_all_rates_take_less_than_15_s() -> None:
+    bench = Bench([servo("XM430-W350", id) for id in range(1, 7)])
+    begin = bench.clock.now()
+    bench.scan()
+    assert bench.clock.now() - begin < 15.0
+
+
+def test_what_is_being_done_is_said_for_each_rate() -> None:
+    bench = Bench([servo("XM430-W350", 1)])
+    bench.scan(1_000_000, 57_600)
+    assert bench.said[-1] == "bus: Dynamixel 1.0 at 57,600 bit/s; 1 servo so far"
+    assert len(bench.said) == 4
+
+
+def test_a_port_that_is_lost_keeps_what_was_found() -> None:
+    bench = Bench([servo("XM430-W350", 1)])
+
+    def opened(port, baud, clock):
+        if baud != 1_000_000:
+            raise SourceError("bus is gone")
+        return bench.open(port, baud, clock)
+
+    told = scan_port("bus", SCANNERS, bench.clock, bench.said.append, open_port=opened)
+    assert ([s.id for s in told.servos], told.trouble) == ([1], "bus is gone")
+
+
+def test_a_scan_of_a_real_port_finds_its_servos(tmp_path: Path) -> None:
+    servos = [servo("XM430-W350", 1, booted_s=0.0), servo("MX-28", 2)]
+    with PtyShell(Chain(servos), tmp_path / "bus"):
+        told = scan_port(str(tmp_path / "bus"), SCANNERS, SystemClock(), lambda _: None, bauds=[1_000_000])
+    assert [(s.id, s.model) for s in told.servos] == [(1, "XM430-W350"), (2, "MX-28")]
+
+
+def test_ports_are_named_by_what_stays_the_same(tmp_path: Path) -> None:
+    for name in ("ttyUSB0", "ttyACM3", "ttyS0"):
+        (tmp_path / "dev").mkdir(exist_ok=True)
+        (tmp_path / "dev" / name).touch()
+    by_id = tmp_path / "dev" / "serial" / "by-id"
+    by_id.mkdir(parents=True)
+    (by_id / "usb-FTDI-if00").symlink_to("../../ttyUSB0")
+    assert serial_ports(tmp_path) == [str(by_id / "usb-FTDI-if00"), str(tmp_path / "dev" / "ttyACM3")]
+
+
+def test_a_machine_without_adapters_has_no_ports(tmp_path: Path) -> None:
+    assert serial_ports(tmp_path) == []
