@@ -25,6 +25,8 @@ _NUMBER = 3.0
 _OF_THE_CAUSES = 0.05
 # Less than this share of all is a rest.
 _REST = 0.25
+# What has no name may predict rows that were not fitted worse by no more than this factor.
+_NO_WORSE = 1.02
 # Of the fits on the way to all causes, these are asked whether they are better beside what has no name.
 _FIRST, _LAST = 3, 2
 # What is worth more than this no rounding of readings that stand still brings about [nats].
@@ -69,7 +71,7 @@ def explain(
     """
     path = list(tried)
     whole = _length(found, found.run.measured - path[0].run.measured)
-    best, alone = _with_unknown(found, unknowns, search), unknowns.missed(found)
+    best, alone = _with_unknown(found, unknowns, search), _NO_WORSE * unknowns.missed(found)
     if best.apart is not None and (best.size < _OF_THE_CAUSES * whole or unknowns.missed(found, best.apart) > alone):
         best = Explanation(found, None, best.worth)
     # Where the causes explain by far the most, they are not given up for what explains the rest.
