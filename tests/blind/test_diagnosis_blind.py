@@ -18,15 +18,16 @@ from pathlib import Path
 import pytest
 from scipy.stats import binom, binomtest
 
+from .judge import TOLD
 from .judgement import Crash, told
 from .sealed import Case, Record, judged
 
 pytestmark = pytest.mark.timeout(600)
 
-CASES = {"one": 8, "two": 4, "three": 3, "outliers": 3, "none": 4, "outside": 8}
+CASES = {"one": 8, "two": 4, "three": 3, "outliers": 3, "none": 4, "outside": 10}
 PAIRS = {name: 1600 if name == "outside" else 600 for name in CASES}
 NAMED, NOTHING, OUTSIDE = ("one", "two", "three", "outliers"), ("none",), ("outside",)
-# Failures and cases in the sealed run.
+# Failures and cases in the sealed run; what no oracle tells from the table's effects is no failure outside of it.
 SEALED: dict[tuple[str, ...], tuple[int, int]] = {NAMED: (5, 160), NOTHING: (0, 40), OUTSIDE: (6, 30)}
 BY_CHANCE = 1e-3
 
@@ -50,7 +51,10 @@ def _judged(names: Sequence[str]) -> list[Record]:
 
 
 def _failed(record: Record) -> bool:
-    return isinstance(record, Crash) or record.outcome in ("wrong", "missed")
+    if isinstance(record, Crash):
+        return True
+    told_apart = record.told_chi2 >= TOLD or not any(truth.outside for truth in record.truth)
+    return record.outcome in ("wrong", "missed") and told_apart
 
 
 def _allowed(rate: float, cases: int) -> int:
