@@ -41,7 +41,7 @@ class Sample(Protocol):
 
 
 class Fitted(Protocol):
-    """A servo as it was found; see `drivers.dynamixel.handshake.FittedServo`."""
+    """A servo as it was found; see `drivers.servos.handshake.FittedServo`."""
 
     @property
     def id(self) -> int: ...

@@ -8,14 +8,14 @@ from itertools import pairwise, zip_longest
 from statistics import median, quantiles
 
 from drivers.checks import Check
+from drivers.servos.handshake import Finding, FittedServo, identify
 from interfaces.errors import SourceError
 from interfaces.protocols import Clock
 
 from .bus import Bus, Request
-from .config import DynamixelConfig
-from .handshake import Finding, FittedServo, identify
+from .config import DynamixelConfig, ServoConfig
 from .joints import open_serial
-from .models import HARDWARE_ERRORS
+from .models import BY_NAME, BY_NUMBER, HARDWARE_ERRORS
 from .plan import block_requests
 
 READ_S = 1.0
@@ -52,8 +52,12 @@ def _identified(config: DynamixelConfig, buses: dict[str, Bus], clock: Clock) ->
     end = clock.now() + IDENTIFY_S
     for servo in config.servos:
         late = clock.now() > end
-        found.append(Finding(servo, "not asked") if late else identify(buses[config.bus_of(servo)], servo))
+        found.append(Finding(servo, "not asked") if late else _asked(buses[config.bus_of(servo)], servo))
     return found
+
+
+def _asked(bus: Bus, servo: ServoConfig) -> Finding:
+    return identify(bus, servo, BY_NAME[servo.model], BY_NUMBER)
 
 
 def _presence(found: Sequence[Finding]) -> Iterator[Check]:

@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 from scripted_sources import COV, Scripted
 
+from drivers.bench.device import Faults
 from drivers.bench.virtual_port import VirtualClock, VirtualPort
 from drivers.dynamixel.bench.chain import Chain, no_faults
-from drivers.dynamixel.bench.faults import Faults
 from drivers.dynamixel.bench.servo import Servo
 from drivers.dynamixel.config import BusConfig, DynamixelConfig, ServoConfig
 from drivers.dynamixel.joints import DynamixelJoints

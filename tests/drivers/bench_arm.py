@@ -7,9 +7,9 @@ from collections.abc import Callable, Sequence
 from random import Random
 from typing import Literal
 
+from drivers.bench.faults import Planned
 from drivers.bench.virtual_port import VirtualClock, VirtualPort, at_once
 from drivers.dynamixel.bench.chain import Chain
-from drivers.dynamixel.bench.faults import Planned
 from drivers.dynamixel.bench.frames import Code, instructions_in
 from drivers.dynamixel.bench.servo import Servo
 from drivers.dynamixel.config import BusConfig, DynamixelConfig, ServoConfig

@@ -11,9 +11,9 @@ from pathlib import Path
 import dynamixel_sdk as sdk
 import pytest
 
+from drivers.bench.faults import Planned, half, mute, wrong_checksum
 from drivers.bench.pty_shell import PtyShell
 from drivers.dynamixel.bench.chain import Chain
-from drivers.dynamixel.bench.faults import Planned, half, mute, wrong_checksum
 from drivers.dynamixel.bench.servo import Servo
 from drivers.dynamixel.models import BY_NAME
 

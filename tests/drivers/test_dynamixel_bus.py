@@ -9,9 +9,9 @@ from drivers.bench.virtual_port import VirtualClock
 from drivers.dynamixel.bench.frames import status_packet
 from drivers.dynamixel.bus import Answer, Bus, Trouble, read_request, sync_request
 from drivers.dynamixel.channel import Channel
-from drivers.dynamixel.handshake import FittedServo
 from drivers.dynamixel.models import BY_NAME
 from drivers.dynamixel.packets import Status
+from drivers.servos.handshake import FittedServo
 
 DATA = bytes(range(16))
 PIECES = st.lists(

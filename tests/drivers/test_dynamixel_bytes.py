@@ -11,8 +11,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from drivers.bench.device import Reply
+from drivers.bench.faults import corrupt
 from drivers.dynamixel.bench.chain import Chain
-from drivers.dynamixel.bench.faults import Reply, corrupt
 from drivers.dynamixel.bench.frames import fast_block, fast_header, instructions_in, status_packet
 from drivers.dynamixel.bench.servo import Servo
 from drivers.dynamixel.crc16 import crc16

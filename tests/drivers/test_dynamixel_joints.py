@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 from bench_arm import TICK, Arm, swing
 
+from drivers.bench.faults import corrupt, garbage, half, late, mute, wrong_checksum
 from drivers.bench.virtual_port import VirtualClock, VirtualPort
 from drivers.dynamixel.bench.chain import Chain
-from drivers.dynamixel.bench.faults import corrupt, garbage, half, late, mute, storm, swapped, wrong_checksum
+from drivers.dynamixel.bench.faults import storm, swapped
 from drivers.dynamixel.bench.servo import Servo
 from drivers.dynamixel.config import BusConfig, DynamixelConfig, ServoConfig
 from drivers.dynamixel.joints import DynamixelJoints

@@ -44,6 +44,15 @@ def test_a_play_rests_until_its_width_is_crossed() -> None:
     np.testing.assert_allclose(output, [-0.02, 0.08, 0.08, 0.07, 0.02], atol=1e-15)
 
 
+def test_a_play_carries_on_from_one_segment_to_the_next(robot) -> None:
+    q = np.zeros((6, len(robot.joints)))
+    q[:, 0] = [0.0, 0.1, 0.2, 0.19, 0.195, 0.185]
+    play = Simulation(robot, (Effect.at(robot, "backlash", robot.joints[0], values=[0.04]),))
+    motion = Motion(q, None, np.array([0, 0, 0, 1, 1, 1]))
+    # It was left leading by half its width and has not crossed it since.
+    np.testing.assert_allclose(play.unloaded(motion)[3:, 0], 0.18, atol=1e-12)
+
+
 def reading_by_reading(simulation, motion):
     live, angles = LiveEncoders(simulation), []
     for q, t, move in zip(motion.q, motion.clock, motion.moves, strict=True):

@@ -7,10 +7,12 @@ from dataclasses import dataclass
 from random import Random
 from types import MappingProxyType
 
+from drivers.bench.device import Fault, Reply
+from drivers.bench.faults import corrupt, garbage, half, late, mute, wrong_checksum
 from interfaces.errors import ConfigError
 from interfaces.suggest import did_you_mean
 
-from .faults import Fault, Reply, corrupt, garbage, half, late, mute, swapped, wrong_checksum
+from .faults import swapped
 
 ON_THE_WIRE: MappingProxyType[str, Fault] = MappingProxyType(
     {

@@ -6,27 +6,11 @@ from dataclasses import replace
 from random import Random
 
 from drivers.bench import faults
-from drivers.bench.device import Fault, Faults, Reply
-from drivers.bench.faults import Planned, Storm, corrupt, garbage, half, late, mute, wrong_checksum
+from drivers.bench.device import Reply
+from drivers.bench.faults import Storm
 from drivers.dynamixel.crc16 import crc16
 
 from .frames import HEADER2
-
-__all__ = [
-    "Fault",
-    "Faults",
-    "Planned",
-    "Reply",
-    "Storm",
-    "corrupt",
-    "garbage",
-    "half",
-    "late",
-    "mute",
-    "storm",
-    "swapped",
-    "wrong_checksum",
-]
 
 
 def swapped(reply: Reply, rng: Random) -> Reply:
