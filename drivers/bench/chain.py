@@ -41,17 +41,7 @@ class AnyServo(Protocol):
         ...
 
 
-class AnyInstruction(Protocol):
-    """What a chain asks of an instruction."""
-
-    @property
-    def end(self) -> int:
-        """Bytes of the stream up to its last."""
-        ...
-
-
 ServoT = TypeVar("ServoT", bound=AnyServo)
-Act = Callable[[ServoT, float], tuple[Any, bytes]]
 
 
 class ServoChain(OnlyAnswers, ABC, Generic[ServoT]):
