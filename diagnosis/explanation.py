@@ -12,21 +12,17 @@ from interfaces.records import FloatArray
 
 from .fit import Fit
 from .search import NAMED, Search
-from .unknown import Apart, Unknowns
+from .unknown import Apart, Unknowns, Way
 
 # What has no name is taken for so much more probability than the named causes alone [nats].
 _MARGIN = 15.0
 _MOST_UNKNOWNS = 3
-# So many families are fitted to see which is the best, if to first order they are worth so large a share of it.
-_NEAREST, _NEAR = 3, 0.9
 # What a number of a named cause costs when sets of causes are compared [nats].
 _NUMBER = 3.0
 # What is left of large causes because their form is not quite theirs is nothing without a name.
 _OF_THE_CAUSES = 0.05
 # Less than this share of all is a rest.
 _REST = 0.25
-# What has no name may predict rows that were not fitted worse by no more than this factor.
-_NO_WORSE = 1.02
 # Of the fits on the way to all causes, these are asked whether they are better beside what has no name.
 _FIRST, _LAST = 3, 2
 # What is worth more than this no rounding of readings that stand still brings about [nats].
@@ -55,8 +51,8 @@ class Explanation:
         return self.fit if self.apart is None else self.apart.fit
 
     @property
-    def unknown(self) -> tuple[int, ...]:
-        """The families that have no name, by their places in `Unknowns.families`."""
+    def unknown(self) -> tuple[Way, ...]:
+        """What has no name."""
         return () if self.apart is None else self.apart.chosen
 
 
@@ -71,8 +67,8 @@ def explain(
     """
     path = list(tried)
     whole = _length(found, found.run.measured - path[0].run.measured)
-    best, alone = _with_unknown(found, unknowns, search), _NO_WORSE * unknowns.missed(found)
-    if best.apart is not None and (best.size < _OF_THE_CAUSES * whole or unknowns.missed(found, best.apart) > alone):
+    best = _with_unknown(found, unknowns, search)
+    if best.apart is not None and (best.size < _OF_THE_CAUSES * whole or not unknowns.predicts(best.apart, found)):
         best = Explanation(found, None, best.worth)
     # Where the causes explain by far the most, they are not given up for what explains the rest.
     is_rest = best.size < _REST * whole
@@ -85,7 +81,7 @@ def explain(
         keys.add(causes)
         other = _with_unknown(fit, unknowns, search)
         better = other.worth > best.worth + (margin if best.fit is found else 0.0)
-        if other.apart is not None and better and unknowns.missed(fit, other.apart) < alone:
+        if other.apart is not None and better and unknowns.predicts(other.apart, found):
             best = other
     if best.unknown:
         tell("something that none of the effects explains")
@@ -103,12 +99,11 @@ def _with_unknown(fit: Fit, unknowns: Unknowns, search: Search) -> Explanation:
     apart: Apart | None = None
     while apart is None or len(apart.chosen) < _MOST_UNKNOWNS:
         here, chosen = (fit, ()) if apart is None else (apart.fit, apart.chosen)
-        ranked = [(index, more) for index, more in unknowns.ranked(here, chosen) if index not in chosen]
-        index, more = ranked[0]
-        if more < NAMED or (more < _BEYOND_DOUBT and unknowns.agreed(here, chosen, index) < 0.0):
+        near = unknowns.nearest(here, chosen)
+        way, more = near[0]
+        if more < NAMED or (more < _BEYOND_DOUBT and unknowns.agreed(here, chosen, way) < 0.0):
             break
-        near = [index for index, other in ranked[:_NEAREST] if other > _NEAR * more]
-        tried = [unknowns.apart(fit, (*chosen, index), apart) for index in near]
+        tried = [unknowns.apart(fit, (*chosen, way), apart) for way, _ in near]
         apart = max(tried, key=lambda one: one.fit.log_likelihood - unknowns.cost(one))
     names = sum(_NUMBER * len(effect.amounts) + search.doubt_of(effect) for effect in fit.causes)
     if apart is None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations_with_replacement
 from typing import Literal
 
@@ -12,7 +12,11 @@ import numpy as np
 from effects import Effect, Simulated
 from interfaces.records import FloatArray
 
-_HARMONICS, _TIMES, _JOINT_TIMES = 5, 4, (8, 32)
+_HARMONICS, _TIMES, _JOINT_TIMES = 5, 4, (8, 32, 96)
+# So many rows there must be for each half wave over time.
+_ROWS_A_WAVE = 10
+# Time constants of what warms up, as shares of the recording's time.
+_WARMING = (0.07, 0.2, 0.6)
 Columns = Callable[[Simulated], FloatArray]
 
 
@@ -24,7 +28,7 @@ class Family:
         what: in a few words.
         kind: what errs: a joint, a body (a link, the tool, the camera), or the place in the image.
         joint: the joint that errs, or before which a link does; None where it is no one joint.
-        driver: the joint on which alone it depends; None for all else.
+        drivers: the joint on which alone it depends, or the two; empty for all else.
         over_time: whether it depends on time.
         moves: what moves, by one unit each (n, 3, a) [m].
         amounts: what it may depend on (n, b); each of the moves is any linear function of it.
@@ -33,7 +37,7 @@ class Family:
     what: str
     kind: Literal["joint", "body", "place"]
     joint: int | None
-    driver: int | None
+    drivers: tuple[int, ...]
     over_time: bool
     moves: Columns
     amounts: Columns
@@ -42,6 +46,10 @@ class Family:
         """Derivatives (n, 3, a b) of what is measured by its numbers [m]."""
         moves, amounts = self.moves(run), self.amounts(run)
         return (moves[:, :, :, None] * amounts[:, None, None, :]).reshape(len(moves), 3, -1)
+
+    def along(self, functions: FloatArray) -> Family:
+        """The part of it whose moves follow some combinations (b, r) of what it may depend on."""
+        return replace(self, amounts=lambda run: self.amounts(run) @ functions)
 
     def moved_by(self, run: Simulated, numbers: FloatArray) -> FloatArray:
         """By how much each of the moves is there (n, a) with these numbers (a b,)."""
@@ -59,26 +67,28 @@ def families(run: Simulated) -> list[Family]:
         joint, link = _joint(k), _link(k)
         for j in joints:
             what = f"an error of {names[k]} that depends on {names[j]}"
-            found.append(Family(what, "joint", k, j, False, joint, _any_of_joint(j)))
+            found.append(Family(what, "joint", k, (j,), False, joint, _any_of_joint(j)))
             if j != k:
                 what = f"an error of {names[k]} that depends on itself and {names[j]} together"
-                found.append(Family(what, "joint", k, None, False, joint, _any_of_both(k, j)))
+                found.append(Family(what, "joint", k, (k, j), False, joint, _any_of_both(k, j)))
         if timed:
             what = f"an error of {names[k]} that changes with time"
-            for count in _JOINT_TIMES:
-                found.append(Family(what, "joint", k, None, True, joint, _any_of_time(count)))
+            for count in (count for count in _JOINT_TIMES if _ROWS_A_WAVE * count < len(motion)):
+                found.append(Family(what, "joint", k, (), True, joint, _any_of_time(count)))
             what = f"the link before {names[k]} changes with time"
-            found.append(Family(what, "body", k, None, True, link, _any_of_time(_TIMES)))
+            found.append(Family(what, "body", k, (), True, link, _warming_or_any_of_time))
         if run.simulation.gravity.known:
             what = f"what carries {names[k]} gives under the arm's weight"
             for loads in (_moments(k), _wrenches(k)):
-                found.append(Family(what, "body", None, None, False, link, loads))
+                found.append(Family(what, "body", None, (), False, link, loads))
     if timed:
         for what, moves in (("the tool changes with time", _tool), ("the camera moves with time", _camera)):
-            found.append(Family(what, "body", None, None, True, moves, _any_of_time(_TIMES)))
-    what = "an error that depends on where the marker is in the image"
+            found.append(Family(what, "body", None, (), True, moves, _warming_or_any_of_time))
     for degree in (2, 3):
-        found.append(Family(what, "place", None, None, False, _anywhere, _places_in_image(degree)))
+        what = "an error of depth that depends on where the marker is in the image"
+        found.append(Family(what, "place", None, (), False, _in_depth, _places_in_image(degree)))
+        what = "an error that depends on where the marker is in the image"
+        found.append(Family(what, "place", None, (), False, _anywhere, _places_in_image(degree)))
     return found
 
 
@@ -102,6 +112,11 @@ def _anywhere(run: Simulated) -> FloatArray:
     return np.broadcast_to(np.eye(3), (len(run.motion), 3, 3))
 
 
+def _in_depth(run: Simulated) -> FloatArray:
+    """Along the ray on which the left eye sees the marker."""
+    return run.measured[:, :, None]
+
+
 def _any_of_joint(j: int) -> Columns:
     return lambda run: _with_one(np.concatenate([_trends(run, j), _harmonics(run, j, _HARMONICS)], axis=1))
 
@@ -110,7 +125,8 @@ def _any_of_both(k: int, j: int) -> Columns:
     def amounts(run: Simulated) -> FloatArray:
         of_one, of_other = _harmonics(run, k, 2), _harmonics(run, j, 2)
         both = of_one[:, :, None] * of_other[:, None, :]
-        return _with_one(np.concatenate([of_one, of_other, both.reshape(len(both), -1)], axis=1))
+        trends = np.concatenate([_trends(run, k), _trends(run, j), run.motion.q[:, [k]] * run.motion.q[:, [j]]], axis=1)
+        return _with_one(np.concatenate([trends, of_one, of_other, both.reshape(len(both), -1)], axis=1))
 
     return amounts
 
@@ -124,6 +140,12 @@ def _any_of_time(count: int) -> Columns:
         return np.cos(np.pi * share[:, None] * np.arange(count + 1))
 
     return amounts
+
+
+def _warming_or_any_of_time(run: Simulated) -> FloatArray:
+    clock = run.motion.clock
+    share = (clock - clock[0]) / max(float(clock[-1] - clock[0]), 1e-9)
+    return np.concatenate([_any_of_time(_TIMES)(run), np.exp(-share[:, None] / np.array(_WARMING))], axis=1)
 
 
 def _moments(k: int) -> Columns:

@@ -21,7 +21,7 @@ from .scan import Candidate
 
 # Blocks of time, and how many folds they are dealt to in turn.
 _MOST_BLOCKS, _FOLDS = 80, 5
-_FEWEST_ROWS_A_BLOCK = 5
+FEWEST_ROWS_A_BLOCK = 5
 _BOOTSTRAPS = 2000
 # A fix that is more probably not the marker counts in no figure.
 _MARKER = 0.5
@@ -40,9 +40,9 @@ class Blocks:
     count: int
 
     @classmethod
-    def cut(cls, rows: int) -> Blocks:
+    def cut(cls, rows: int, most: int = _MOST_BLOCKS) -> Blocks:
         """As many blocks of the same length as make sense for so many rows."""
-        count = int(np.clip(rows // _FEWEST_ROWS_A_BLOCK, _FOLDS, _MOST_BLOCKS))
+        count = int(np.clip(rows // FEWEST_ROWS_A_BLOCK, _FOLDS, most))
         return cls(np.arange(rows) * count // max(rows, 1), count)
 
     @property

@@ -44,9 +44,9 @@ def leftover(explanation: Explanation, unknowns: Unknowns, blocks: Blocks) -> Le
     """What the families of an explanation say of what its causes leave."""
     fit, apart = explanation.fit, explanation.apart
     if apart is None:
-        beside = unknowns.apart(fit, (unknowns.ranked(fit)[0][0],))
-        return Leftover((), (), False, min(1.0, _chance(fit, beside, unknowns) * len(unknowns.families)))
-    families = [unknowns.families[index] for index in apart.chosen]
+        beside = unknowns.apart(fit, (unknowns.nearest(fit)[0][0],))
+        return Leftover((), (), False, min(1.0, _chance(fit, beside, unknowns) * unknowns.count))
+    families = [way.family for way in apart.chosen]
     joints = [joints_of(family, own, fit.run) for family, own in zip(families, apart.numbers, strict=True)]
     return Leftover(
         what=tuple(family.what for family in families),
@@ -61,4 +61,4 @@ def leftover(explanation: Explanation, unknowns: Unknowns, blocks: Blocks) -> Le
 def _chance(fit: Fit, apart: Apart, unknowns: Unknowns) -> float:
     """Of so much structure where there is none."""
     gain = 2.0 * (apart.fit.log_likelihood - fit.log_likelihood)
-    return float(stats.chi2.sf(max(gain, 0.0), max(unknowns.told(apart).shape[2], 1)))
+    return float(stats.chi2.sf(max(gain, 0.0), max(unknowns.told(apart).shape[2] + apart.choice, 1)))

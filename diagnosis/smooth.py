@@ -24,8 +24,10 @@ from .unknown import Apart
 # How far a function may move the marker anywhere, in units of the noise; what predicts rows best is taken.
 _SIZES = (0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0)
 _WIDE = 400
-# Of one joint's angle; rounds in which the arcs of joints that err are followed.
-_HARMONICS, _ROUNDS = 14, 3
+# Of the angle of one joint, and of each of two.
+_HARMONICS = {1: 14, 2: 4}
+# Rounds in which the arcs of joints that err are followed.
+_ROUNDS = 3
 # Arcs that predict rows worse than this, as a multiple of what they did before, are followed no further.
 _WORSE = 1.05
 # What is left out of a stored model, of the noise; what is farther off what it should be is not stored.
@@ -59,6 +61,9 @@ def smooth_model(alone: Fit, apart: Apart, families: Sequence[Family], blocks: B
     """
     said = apart.predicted - alone.run.measured
     lasting = [family for family in families if not family.over_time]
+    # Whatever depends on the place in the image is learnt by the same functions: one family stands for all.
+    places = [family for family in lasting if family.kind == "place"]
+    lasting = [family for family in lasting if family.kind != "place"] + places[:1]
     timed = [family for family in families if family.over_time]
     # What the causes are is found from where they are by themselves, and from where they are beside the families.
     starts = [replace(fit, noise=apart.fit.noise) for fit in (alone, alone.at(apart.fit.simulation))]
@@ -189,12 +194,19 @@ class _Functions:
         return family.columns(run)
 
     def _turns(self, family: Family, run: Simulated) -> FloatArray:
-        """What the error of a joint may depend on (n, p): of one joint, finer than how its family is found."""
-        if family.driver is None:
+        """What the error of a joint may depend on (n, p): periodic, and finer than how its family is found."""
+        if not family.drivers:
             return family.amounts(run)
-        low, high = self.given[:, family.driver].min(), self.given[:, family.driver].max()
-        scale = np.pi / (high - low) if self._robot.chain.prismatic[family.driver] else 1.0
-        angles = scale * run.motion.q[:, [family.driver]] * np.arange(_HARMONICS + 1)
+        first, *others = (self._periodic(run, k, _HARMONICS[len(family.drivers)]) for k in family.drivers)
+        for other in others:
+            first = (first[:, :, None] * other[:, None, :]).reshape(len(first), -1)
+        return first
+
+    def _periodic(self, run: Simulated, joint: int, count: int) -> FloatArray:
+        """Harmonics of a joint's reading (n, 2 count + 1); of a slide, of its path as half a turn."""
+        low, high = self.given[:, joint].min(), self.given[:, joint].max()
+        scale = np.pi / (high - low) if self._robot.chain.prismatic[joint] else 1.0
+        angles = scale * run.motion.q[:, [joint]] * np.arange(count + 1)
         return np.concatenate([np.cos(angles), np.sin(angles[:, 1:])], axis=1)
 
     def _of_place(self, x: FloatArray) -> FloatArray:

@@ -15,7 +15,8 @@ from interfaces.records import FloatArray
 
 from .families import Family, families
 from .fit import Fit, fitted, prior_precision, solved
-from .held_out import Blocks, held_out_square, scores_p_value
+from .held_out import FEWEST_ROWS_A_BLOCK, Blocks, held_out_square, scores_p_value
+from .low_rank import low_rank, numbers_of
 from .observations import Observations
 from .search import nats
 
@@ -31,20 +32,73 @@ _STRONGEST = 4
 _ROUNDS, _ENOUGH = 5, 0.1
 
 
+# Moves of a body may follow so many functions together, and need not follow each its own.
+_RANKS = (1, 2)
+# What has no name may predict rows that were not fitted worse by no more than this factor.
+_NO_WORSE = 1.02
+# So many ways are the nearest to the best, if to first order they are worth so large a share of it.
+_NEAREST, _NEAR = 3, 0.9
+
+
+@dataclass(frozen=True, eq=False)
+class Way:
+    """A family, or a part of one, as it stands beside fits of the same observations.
+
+    Attributes:
+        family: which.
+        columns: what its numbers change (3 n, p), whitened and about as long as one.
+        scales: how long they were (p,): those of the moves times those of what they depend on.
+        amounts: on how many functions each move depends.
+        choice: how many more numbers were spent on choosing the part.
+    """
+
+    family: Family
+    columns: FloatArray
+    scales: FloatArray
+    amounts: int
+    choice: int = 0
+
+    @classmethod
+    def of(cls, family: Family, start: Fit) -> Way:
+        """The whole family."""
+        whitened = start.observations.whitened(family.columns(start.run)).reshape(start.left.size, -1)
+        amounts = family.amounts(start.run).shape[1]
+        lengths = np.linalg.norm(whitened, axis=0).reshape(-1, amounts)
+        of_moves = np.maximum(np.sqrt(np.square(lengths).mean(axis=1, keepdims=True)), 1e-100)
+        of_amounts = np.maximum(np.sqrt(np.square(lengths / of_moves).mean(axis=0)), 1e-100)
+        scales = (of_moves * of_amounts).ravel()
+        return cls(family, whitened / scales, scales, amounts)
+
+    @property
+    def moves(self) -> int:
+        """How many there are."""
+        return len(self.scales) // self.amounts
+
+    def along(self, functions: FloatArray) -> Way:
+        """The part whose moves follow some functions (b, r), in units of the scales."""
+        rank = functions.shape[1]
+        scales = self.scales.reshape(self.moves, self.amounts)
+        mix = functions / (scales[0] / scales[0].max())[:, None]
+        columns = (self.columns.reshape(-1, self.moves, self.amounts) @ functions).reshape(len(self.columns), -1)
+        of_moves = np.repeat(scales[:, scales[0].argmax()], rank)
+        choice = numbers_of(self.moves, self.amounts, rank) - len(of_moves)
+        return Way(self.family.along(mix), columns, of_moves, rank, choice)
+
+
 @dataclass(frozen=True, eq=False)
 class Apart:
-    """A fit to what is left of the observations when families have taken away what they account for.
+    """A fit to what is left of the observations when what has no name has been taken away.
 
     Attributes:
         observations: all that was observed.
-        chosen: which families.
+        chosen: which ways to differ.
         numbers: of each of them (p,).
         fit: of the causes.
-        ridge: on the families' numbers, in units in which their columns are as long as one.
+        ridge: on these numbers, in units in which their columns are as long as one.
     """
 
     observations: Observations
-    chosen: tuple[int, ...]
+    chosen: tuple[Way, ...]
     numbers: tuple[FloatArray, ...]
     fit: Fit
     ridge: float
@@ -54,13 +108,10 @@ class Apart:
         """What is measured (n, 3) [m] by causes and families together."""
         return self.fit.run.measured + (self.observations.x - self.fit.observations.x)
 
-
-def _unit_columns(start: Fit, family: Family) -> tuple[FloatArray, FloatArray]:
-    """A family's columns (3 n, p), whitened and made as long as one, and how long they were (p,)."""
-    columns = start.observations.whitened(family.columns(start.run)).reshape(start.left.size, -1)
-    scales = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
-    columns /= scales
-    return columns, scales
+    @property
+    def choice(self) -> int:
+        """How many more numbers were spent on choosing parts of families."""
+        return sum(way.choice for way in self.chosen)
 
 
 class Unknowns:
@@ -70,48 +121,57 @@ class Unknowns:
     """
 
     def __init__(self, start: Fit) -> None:
-        self.families, self._run = families(start.run), start.run
-        units = [_unit_columns(start, family) for family in self.families]
-        self._columns, self._scales = [columns for columns, _ in units], [scales for _, scales in units]
-        self._doubt = float(np.log(len(self.families))) + _NO_NAME
+        self._run = start.run
+        self._ways = [Way.of(family, start) for family in families(start.run)]
+        self.count = len(self._ways)
+        self._doubt = float(np.log(self.count)) + _NO_NAME
 
-    def beside(self, fit: Fit, others: Sequence[int] = ()) -> tuple[FloatArray, FloatArray]:
-        """An orthonormal basis (3 n, r) of what `fit` and some families can change, and what they leave (3 n,)."""
+    def beside(self, fit: Fit, others: Sequence[Way] = ()) -> tuple[FloatArray, FloatArray]:
+        """An orthonormal basis (3 n, r) of what `fit` and some ways can change, and what they leave (3 n,)."""
         basis = fit.orthogonal.reshape(fit.left.size, -1)
-        for index in others:
-            basis = np.concatenate([basis, self._fresh(fit, basis, index)], axis=1)
+        for way in others:
+            basis = np.concatenate([basis, self._fresh(fit, basis, way)], axis=1)
         left = fit.left.ravel()
         return basis, left - basis @ (basis.T @ left)
 
-    def ranked(self, fit: Fit, others: Sequence[int] = ()) -> list[tuple[int, float]]:
-        """The families by what they are worth beside a fit and others, to first order [nats], the best first."""
+    def nearest(self, fit: Fit, others: Sequence[Way] = ()) -> list[tuple[Way, float]]:
+        """The ways that may be the best beside a fit and others, and their worth to first order [nats]."""
         basis, left = self.beside(fit, others)
         weights = np.repeat(fit.root_weights[:, 0], 3)[:, None]
         rss, rows = float(left @ left), float(fit.noise.weights.sum())
-        worths = []
-        for columns in self._columns:
-            own = columns * weights
+        ranked: list[tuple[float, Way, FloatArray | None]] = []
+        for way in self._ways:
+            if way in others:
+                continue
+            own = way.columns * weights
             onto, toward = basis.T @ own, own.T @ left
             inner = own.T @ own - onto.T @ onto
             values, vectors = np.linalg.eigh(inner)
-            told = values > _TOLD * max(float(values.max()), 1e-12)
-            told &= values > _LEFT
+            told = (values > _TOLD * max(float(values.max()), 1e-12)) & (values > _LEFT)
             explained = float(np.square(vectors[:, told].T @ toward / np.sqrt(values[told])).sum())
-            gain = -3.0 * rows * float(np.log1p(-min(explained / rss, 0.999999)))
-            worths.append(0.5 * gain - _NUMBER * int(told.sum()))
-        order = np.argsort(worths)[::-1]
-        return [(int(index), worths[index] - self._doubt) for index in order]
+            most, numbers = _nats(explained, rss, rows), int(told.sum())
+            ranked.append((most - _NUMBER * numbers, way, None))
+            for rank in _RANKS:
+                fewer = numbers_of(way.moves, way.amounts, rank)
+                best = _NEAR * max(worth for worth, _, _ in ranked)
+                # A part explains no more than the whole.
+                if fewer < numbers and most - _NUMBER * fewer > max(best, self._doubt):
+                    explained, functions = low_rank(inner, toward, way.amounts, rank)
+                    ranked.append((_nats(explained, rss, rows) - _NUMBER * fewer, way, functions))
+        ranked.sort(key=lambda one: -one[0])
+        ranked = [one for one in ranked[:_NEAREST] if one[0] > _NEAR * ranked[0][0] or one is ranked[0]]
+        return [(way if part is None else way.along(part), worth - self._doubt) for worth, way, part in ranked]
 
-    def apart(self, fit: Fit, chosen: Sequence[int], start: Apart | None = None) -> Apart:
-        """The causes of a fit and families, fitted in turn to what the others leave.
+    def apart(self, fit: Fit, chosen: Sequence[Way], start: Apart | None = None) -> Apart:
+        """The causes of a fit and ways to differ, fitted in turn to what the others leave.
 
         A joint that errs is turned in the readings, so that large errors are as exact as small ones.
 
         Args:
-            start: with some of the families.
+            start: with some of the ways.
         """
         known = {} if start is None else dict(zip(start.chosen, start.numbers, strict=True))
-        numbers = tuple(known.get(index, np.zeros(self._columns[index].shape[1])) for index in chosen)
+        numbers = tuple(known.get(way, np.zeros(len(way.scales))) for way in chosen)
         # No function is expected to be larger than twice all that is left.
         ridge = 0.25 * fit.noise.sigma**2 / max(float(np.square(fit.left).sum()), 1e-300)
         here = Apart(fit.observations, tuple(chosen), numbers, fit if start is None else start.fit, ridge)
@@ -127,13 +187,13 @@ class Unknowns:
         return here
 
     def cost(self, apart: Apart) -> float:
-        """What the families and their numbers cost [nats]."""
-        return len(apart.chosen) * self._doubt + _NUMBER * self.told(apart).shape[2]
+        """What the ways and their numbers cost [nats]."""
+        return len(apart.chosen) * self._doubt + _NUMBER * (self.told(apart).shape[2] + apart.choice)
 
     def told(self, apart: Apart) -> FloatArray:
-        """What families can change beside the causes (n, 3, r) [m], in directions that the data tell."""
+        """What ways can change beside the causes (n, 3, r) [m], in directions that the data tell."""
         fit = apart.fit
-        columns = np.concatenate([self._columns[index] for index in apart.chosen], axis=1)
+        columns = np.concatenate([way.columns for way in apart.chosen], axis=1)
         basis = fit.orthogonal.reshape(fit.left.size, -1)
         weighted = columns * np.repeat(fit.root_weights[:, 0], 3)[:, None]
         _, values, mix = np.linalg.svd(weighted - basis @ (basis.T @ weighted), full_matrices=False)
@@ -141,15 +201,22 @@ class Unknowns:
         directions = (columns @ (mix[there].T / values[there])).reshape(*fit.left.shape, -1)
         return np.asarray(np.linalg.solve(fit.observations.whitening, directions), dtype=np.float64)
 
-    def missed(self, fit: Fit, apart: Apart | None = None) -> float:
-        """Mean square of what causes, and families, leave of rows that they were not fitted to, whitened."""
-        fit = fit if apart is None else apart.fit
+    def predicts(self, apart: Apart, alone: Fit) -> bool:
+        """Whether ways to differ predict rows that they were not fitted to as well as a fit without them does."""
+        rows = len(alone.observations)
+        # What changes with time says nothing of a longer time that nobody has seen.
+        timed = any(way.family.over_time for way in apart.chosen)
+        blocks = Blocks.cut(rows, rows // FEWEST_ROWS_A_BLOCK) if timed else Blocks.cut(rows)
+        return self._missed(apart.fit, blocks, apart) <= _NO_WORSE * self._missed(alone, blocks)
+
+    def _missed(self, fit: Fit, blocks: Blocks, apart: Apart | None = None) -> float:
+        """Mean square of what causes, and ways, leave of rows that they were not fitted to, whitened."""
         columns, precision = fit.columns, prior_precision(fit.simulation, fit.nuisances)
         if apart is not None:
             more = fit.weighted(self.told(apart))
             columns = np.concatenate([columns, more], axis=2)
             precision = np.append(precision, np.full(more.shape[2], apart.ridge / fit.noise.sigma**2))
-        square = held_out_square(fit, columns, precision, Blocks.cut(len(fit.observations)))
+        square = held_out_square(fit, columns, precision, blocks)
         return square / max(float(fit.noise.weights.sum()), 1.0)
 
     def _step(self, here: Apart) -> tuple[FloatArray, ...]:
@@ -157,41 +224,46 @@ class Unknowns:
         fit, counts = here.fit, [len(number) for number in here.numbers]
         basis = fit.orthogonal.reshape(fit.left.size, -1)
         weights = np.repeat(fit.root_weights[:, 0], 3)[:, None]
-        columns = np.concatenate([self._columns[index] for index in here.chosen], axis=1) * weights
+        columns = np.concatenate([way.columns for way in here.chosen], axis=1) * weights
         columns = columns - basis @ (basis.T @ columns)
-        scales = np.concatenate([self._scales[index] for index in here.chosen])
+        scales = np.concatenate([way.scales for way in here.chosen])
         before = np.concatenate(here.numbers) * scales
         normal = columns.T @ columns + here.ridge * np.eye(len(before))
         step = solved(normal, columns.T @ fit.left.ravel() - here.ridge * before)
         return tuple(np.split((before + step) / scales, np.cumsum(counts)[:-1]))
 
     def _without(
-        self, observations: Observations, chosen: Sequence[int], numbers: Sequence[FloatArray]
+        self, observations: Observations, chosen: Sequence[Way], numbers: Sequence[FloatArray]
     ) -> Observations:
         """Without what families account for: a joint's error in the readings, all else in the positions."""
         q, x = observations.motion.q.copy(), observations.x.copy()
-        for index, own in zip(chosen, numbers, strict=True):
-            family = self.families[index]
+        for family, own in ((way.family, own) for way, own in zip(chosen, numbers, strict=True)):
             if family.kind == "joint":
                 q[:, family.joint] += family.moved_by(self._run, own)[:, 0]
             else:
                 x -= family.columns(self._run) @ own
         return replace(observations, motion=replace(observations.motion, q=q), x=x)
 
-    def agreed(self, fit: Fit, others: Sequence[int], index: int) -> float:
-        """What a family is worth by the agreement of blocks of time [nats]."""
+    def agreed(self, fit: Fit, others: Sequence[Way], way: Way) -> float:
+        """What a way is worth by the agreement of blocks of time [nats]."""
         basis, left = self.beside(fit, others)
-        fresh = self._fresh(fit, basis, index)
+        fresh = self._fresh(fit, basis, way)
         strongest = np.argsort(-np.abs(fresh.T @ left))[:_STRONGEST]
         columns = fresh[:, strongest].reshape(*fit.left.shape, -1)
         chance = scores_p_value(columns, left.reshape(fit.left.shape), Blocks.cut(len(fit.left)))
         # The strongest of so many were chosen: each costs as one among all.
         gain = float(stats.chi2.isf(max(chance, 1e-290), len(strongest)))
-        return nats(gain, len(strongest)) - len(strongest) * float(np.log(fresh.shape[1])) - self._doubt
+        choice = len(strongest) * float(np.log(fresh.shape[1])) + _NUMBER * way.choice
+        return nats(gain, len(strongest)) - choice - self._doubt
 
-    def _fresh(self, fit: Fit, basis: FloatArray, index: int) -> FloatArray:
-        """An orthonormal basis (3 n, r) of what a family changes beside a basis."""
-        columns = self._columns[index] * np.repeat(fit.root_weights[:, 0], 3)[:, None]
+    def _fresh(self, fit: Fit, basis: FloatArray, way: Way) -> FloatArray:
+        """An orthonormal basis (3 n, r) of what a way changes beside a basis."""
+        columns = way.columns * np.repeat(fit.root_weights[:, 0], 3)[:, None]
         columns = columns - basis @ (basis.T @ columns)
         left, values, _ = np.linalg.svd(columns, full_matrices=False)
         return left[:, values > np.sqrt(_LEFT)]
+
+
+def _nats(explained: float, rss: float, rows: float) -> float:
+    """By how much the log-likelihood rises when so much of a sum of squares is explained."""
+    return -1.5 * rows * float(np.log1p(-min(explained / rss, 0.999999)))
