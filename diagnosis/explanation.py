@@ -15,7 +15,7 @@ from .search import NAMED, Search
 from .unknown import Apart, Unknowns, Way
 
 # What has no name is taken for so much more probability than the named causes alone [nats].
-_MARGIN = 15.0
+_MARGIN = 8.0
 _MOST_UNKNOWNS = 3
 # What a number of a named cause costs when sets of causes are compared [nats].
 _NUMBER = 3.0

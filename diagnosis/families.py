@@ -11,6 +11,7 @@ import numpy as np
 
 from effects import Effect, Simulated
 from interfaces.records import FloatArray
+from kbmaps.rotations import cross_matrix
 
 _HARMONICS, _TIMES, _JOINT_TIMES = 5, 4, (8, 32, 96)
 # So many rows there must be for each half wave over time.
@@ -32,6 +33,7 @@ class Family:
         over_time: whether it depends on time.
         moves: what moves, by one unit each (n, 3, a) [m].
         amounts: what it may depend on (n, b); each of the moves is any linear function of it.
+        paired: each of the moves is proportional to its own amount instead (b = a).
     """
 
     what: str
@@ -41,10 +43,13 @@ class Family:
     over_time: bool
     moves: Columns
     amounts: Columns
+    paired: bool = False
 
     def columns(self, run: Simulated) -> FloatArray:
-        """Derivatives (n, 3, a b) of what is measured by its numbers [m]."""
+        """Derivatives (n, 3, p) of what is measured by its numbers [m], a b or where paired a."""
         moves, amounts = self.moves(run), self.amounts(run)
+        if self.paired:
+            return moves * amounts[:, None, :]
         return (moves[:, :, :, None] * amounts[:, None, None, :]).reshape(len(moves), 3, -1)
 
     def along(self, functions: FloatArray) -> Family:
@@ -52,8 +57,10 @@ class Family:
         return replace(self, amounts=lambda run: self.amounts(run) @ functions)
 
     def moved_by(self, run: Simulated, numbers: FloatArray) -> FloatArray:
-        """By how much each of the moves is there (n, a) with these numbers (a b,)."""
+        """By how much each of the moves is there (n, a) with these numbers (p,)."""
         amounts = self.amounts(run)
+        if self.paired:
+            return amounts * numbers
         return amounts @ numbers.reshape(-1, amounts.shape[1]).T
 
 
@@ -81,6 +88,8 @@ def families(run: Simulated) -> list[Family]:
             what = f"what carries {names[k]} gives under the arm's weight"
             for loads in (_moments(k), _wrenches(k)):
                 found.append(Family(what, "body", None, (), False, link, loads))
+            for T in (np.eye(4), run.simulation.gravity.in_carrier(k)):
+                found.append(Family(what, "body", None, (), False, _link_about(k, T), _own_loads(k, T), paired=True))
     if timed:
         for what, moves in (("the tool changes with time", _tool), ("the camera moves with time", _camera)):
             found.append(Family(what, "body", None, (), True, moves, _warming_or_any_of_time))
@@ -154,6 +163,26 @@ def _moments(k: int) -> Columns:
 
 def _wrenches(k: int) -> Columns:
     return lambda run: _with_one(run.wrenches[:, k])
+
+
+def _link_about(k: int, T: FloatArray) -> Columns:
+    """The link before a joint moved along and turned about the axes of a frame, in which the joint's is at T (4, 4)."""
+
+    def moves(run: Simulated) -> FloatArray:
+        along, about = np.split(_link(k)(run) @ np.kron(np.eye(2), T[:3, :3].T), 2, axis=2)
+        return np.concatenate([along, about + along @ -cross_matrix(T[:3, 3])], axis=2)
+
+    return moves
+
+
+def _own_loads(k: int, T: FloatArray) -> Columns:
+    """Force along and moment about each axis of a frame (n, 6), in which the joint's is at T (4, 4)."""
+
+    def loads(run: Simulated) -> FloatArray:
+        moments, forces = (part @ T[:3, :3].T for part in np.split(run.wrenches[:, k], 2, axis=1))
+        return np.concatenate([forces, moments + np.cross(T[:3, 3], forces)], axis=1)
+
+    return loads
 
 
 def _places_in_image(degree: int) -> Columns:

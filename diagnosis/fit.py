@@ -24,6 +24,8 @@ _NOT_TRIED = 1e-3
 # share of it.
 _OF_A_PEAK, _OF_A_MEMORY, _OF_A_TIME = 0.5, 0.1, 0.3
 _LONGEST_MEMORY, _FEWEST_CYCLES = 0.95, 1.5
+# A drift that is over after a smaller share of the recording is none: what is measured is off from the beginning.
+SHORTEST_DRIFT = 0.03
 _FEWEST_OUTLIERS = 1e-4
 # Of time, whose agreement says how far the numbers are sure.
 _BLOCKS = 60
@@ -218,7 +220,7 @@ class Fit:
             first += len(effect.amounts)
             if index >= self.nuisances:
                 for k in effect.shapes:
-                    values[k] = _bounded(effect, k, values[k] + step[shape])
+                    values[k] = _bounded(effect, k, values[k] + step[shape], self.observations.motion.clock)
                     shape += 1
             effects.append(effect.with_values(values))
         return self.simulation.with_effects(effects)
@@ -284,13 +286,15 @@ def _reach(run: Simulated, effect: Effect, k: int) -> float:
     return _OF_A_MEMORY if effect.name == "settling" else _OF_A_TIME * float(effect.values[k])
 
 
-def _bounded(effect: Effect, k: int, value: float) -> float:
+def _bounded(effect: Effect, k: int, value: float, clock: FloatArray) -> float:
     """A period or a time constant that can be."""
     if effect.name == "settling":
         return float(np.clip(value, 0.0, _LONGEST_MEMORY))
     if effect.parameters[k].name == "cycles_per_turn":
         # Once a turn it would be an eccentricity.
         value = max(value, _FEWEST_CYCLES)
+    if effect.name == "thermal_drift":
+        value = max(value, SHORTEST_DRIFT * float(clock[-1] - clock[0]))
     return float(np.clip(value, 0.5 * effect.values[k], 2.0 * effect.values[k]))
 
 

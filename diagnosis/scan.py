@@ -14,13 +14,13 @@ from effects import Effect
 from effects.simulation import settled
 from interfaces.records import FloatArray
 
-from .fit import LARGEST, Fit
+from .fit import LARGEST, SHORTEST_DRIFT, Fit
 
 # The finest ripple that is looked for.
 _MOST_CYCLES = 100
 # Widths of a play that are tried [rad, m], and time constants as shares of the recording's time.
 _WIDTHS = np.geomspace(2e-4, 0.15, 14)
-_TIME_CONSTANTS = np.geomspace(0.02, 4.0, 24)
+_TIME_CONSTANTS = np.geomspace(SHORTEST_DRIFT, 4.0, 24)
 # How much of what was missing is still missing at the next reading.
 _MEMORIES = np.linspace(0.0, 0.9, 19)
 # As so many independent shapes those of a smooth family count.

@@ -26,6 +26,8 @@ Key = tuple[str, str | None, str | None]
 _CHEAPEST = 1.5
 # What explains a smaller share of what a cause explains is no rival of it; within so much two are as probable [nats].
 _COMES_NEAR, _EQUAL = 0.8, 0.3
+# A moment or a period that seems to explain so much more than that of the fit is tried in its place.
+_ELSEWHERE = 1.0
 # The camera's pose and the marker's place are simpler than the link next to them.
 _OF_A_LINK = 1
 
@@ -174,7 +176,12 @@ class Search:
             beside = self.beside(fit, cause)
             without, others = beside.without, beside.without.causes
             itself = beside.itself or Candidate(cause, 0.0, 1)
-            lost = nats(2.0 * (fit.log_likelihood - without.log_likelihood), itself.dof)
+            gain = 2.0 * (fit.log_likelihood - without.log_likelihood)
+            if itself.gain > gain + _ELSEWHERE:
+                tried = fit.with_causes([*others, itself.effect])
+                if tried.log_likelihood > fit.log_likelihood + _ELSEWHERE:
+                    return self._second_thoughts(tried)
+            lost = nats(gain, itself.dof)
             if lost < NAMED + self.doubt(itself):
                 self._tell(f"dropped {describe(cause)}")
                 return without, True

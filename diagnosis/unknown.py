@@ -62,7 +62,7 @@ class Way:
     def of(cls, family: Family, start: Fit) -> Way:
         """The whole family."""
         whitened = start.observations.whitened(family.columns(start.run)).reshape(start.left.size, -1)
-        amounts = family.amounts(start.run).shape[1]
+        amounts = 1 if family.paired else family.amounts(start.run).shape[1]
         lengths = np.linalg.norm(whitened, axis=0).reshape(-1, amounts)
         of_moves = np.maximum(np.sqrt(np.square(lengths).mean(axis=1, keepdims=True)), 1e-100)
         of_amounts = np.maximum(np.sqrt(np.square(lengths / of_moves).mean(axis=0)), 1e-100)

@@ -48,6 +48,10 @@ class GravityLoad:
         """Whether the URDF states any mass that a joint bears."""
         return any(body.mass_kg > 0.0 for k, body in self._bodies.items() if k is not None)
 
+    def in_carrier(self, k: int) -> FloatArray:
+        """Pose (4, 4) of a joint's frame in the link of the joint that carries it, or in the root link."""
+        return self._bodies[k].T_carrier_joint
+
     def torques(self, q: FloatArray) -> FloatArray:
         """Torque of gravity about each joint, in the direction in which it counts [N·m, or N] (n, d), at q (n, d)."""
         moments, forces = self.loads(q)
