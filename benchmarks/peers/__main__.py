@@ -87,7 +87,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--models", nargs="*", default=[], help=f"all by default: {' '.join(BY_KEY)}")
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--budget-s", type=float, default=float("inf"), help="stop after so many seconds")
-    parser.add_argument("--fit-limit-s", type=float, default=30.0, help="give up a fit that takes longer")
+    parser.add_argument("--fit-limit-s", type=float, default=30.0, help="give up a fit that takes the processor longer")
     parser.add_argument("--most-pairs", type=int, default=3000)
     parser.add_argument("--again", nargs="*", default=[], metavar="MODEL", help="forget what was measured of these")
     parser.add_argument("--growth", action=argparse.BooleanOptionalAction, default=True, help="time against size")

@@ -23,7 +23,7 @@ class Outcome:
 
     Attributes:
         errors: mean error [m] of each test; empty unless the status is "ok".
-        learn_s, predict_us: time to learn all pairs [s], and to predict one row of a batch [µs].
+        learn_s, predict_us: of the processor, to learn all pairs [s], and to predict one row of a batch [µs].
         reason: why there are no errors.
     """
 

@@ -30,7 +30,7 @@ class Plan:
     Attributes:
         seeds: how many, from 0.
         deadline_s: when to stop, on the clock; the fit under way is finished.
-        fit_limit_s: a fit that takes longer is given up.
+        fit_limit_s: a fit that takes the processor longer is given up.
         clock: seconds.
     """
 
@@ -115,9 +115,9 @@ def _slower_size(results: Results, blank: Outcome) -> str | None:
 
 def _measured(blank: Outcome, competitor: Competitor, trial: Trial) -> Outcome:
     earlier = None if trial.before is None else competitor.learn(_own(trial.before, blank.seed), None)
-    begin = time.perf_counter()
+    begin = time.process_time()
     fitted = competitor.learn(_own(trial.problem, blank.seed), earlier)
-    learn_s = time.perf_counter() - begin
+    learn_s = time.process_time() - begin
     errors, predict_us = _tested(fitted, trial)
     worst = max(errors.values())
     if not worst < DIVERGED_M:
@@ -130,31 +130,34 @@ def _own(problem: Problem, seed: int) -> Problem:
 
 
 def _tested(fitted: Fitted, trial: Trial) -> tuple[dict[str, float], float]:
-    """Mean error of each test [m], and the best time a row [µs], once warm."""
+    """Mean error of each test [m], and the processor's best time a row [µs], once warm."""
     errors: dict[str, float] = {}
     rates: list[float] = []
     for name, (q, x) in trial.tests.items():
         fitted.predict(q)
-        begin = time.perf_counter()
+        begin = time.process_time()
         shown = fitted.predict(q)
-        rates.append((time.perf_counter() - begin) / len(q))
+        rates.append((time.process_time() - begin) / len(q))
         errors[name] = float(np.linalg.norm(shown - x, axis=1).mean())
     return errors, 1e6 * min(rates)
 
 
 @contextmanager
 def _time_limit(seconds: float) -> Iterator[None]:
-    """Raises TooSlow in this thread after so long; a single call into compiled code is finished first."""
+    """Raises TooSlow in this thread after so long on the processor; a call into compiled code is finished first.
+
+    What else runs on the machine does not count.
+    """
     if threading.current_thread() is not threading.main_thread():
         raise RuntimeError("fits are limited by a signal, which only the main thread receives")
 
     def give_up(_signal: int, _frame: object) -> None:
         raise TooSlow
 
-    before = signal.signal(signal.SIGALRM, give_up)
-    signal.setitimer(signal.ITIMER_REAL, seconds)
+    before = signal.signal(signal.SIGPROF, give_up)
+    signal.setitimer(signal.ITIMER_PROF, seconds)
     try:
         yield
     finally:
-        signal.setitimer(signal.ITIMER_REAL, 0.0)
-        signal.signal(signal.SIGALRM, before)
+        signal.setitimer(signal.ITIMER_PROF, 0.0)
+        signal.signal(signal.SIGPROF, before)
