@@ -89,6 +89,16 @@ class Motion:
         firsts = np.flatnonzero(self.begins)
         return list(zip(firsts.tolist(), [*firsts[1:].tolist(), len(self.q)], strict=True))
 
+    @cached_property
+    def cubics(self) -> FloatArray:
+        """The path from each row to the next of its run (4, n, d), by powers of the time since, the highest first."""
+        cubics = np.zeros((4, *self.q.shape))
+        cubics[3] = self.q
+        for first, end in self.runs:
+            if end - first > 1:
+                cubics[:, first : end - 1] = PchipInterpolator(self.clock[first:end], self.q[first:end], axis=0).c
+        return frozen_array(cubics)
+
     def earlier(self, lag_s: float) -> Motion:
         """The readings that the encoders gave `lag_s` before each row, interpolated without overshoot.
 
@@ -104,13 +114,14 @@ class Motion:
 def _earlier(motion: Motion, lag_s: float) -> Motion:
     """A search asks for the same lags of the same motion again and again."""
     assert motion.t is not None
-    q = motion.q.copy()
-    for first, end in motion.runs:
-        if end - first < 2:
-            continue
-        t = motion.t[first:end]
-        path = PchipInterpolator(t, motion.q[first:end], axis=0)
-        asked = t - lag_s
-        inside = np.clip(asked, t[0], t[-1])
-        q[first:end] = path(inside) + (asked - inside)[:, None] * path(inside, 1)
+    t, cubics = motion.t, motion.cubics
+    lengths = [end - first for first, end in motion.runs]
+    first, end = (np.repeat(rows, lengths) for rows in zip(*motion.runs, strict=True))
+    asked = t - lag_s
+    inside = np.clip(asked, t[first], t[end - 1])
+    interval = np.clip(np.searchsorted(t, inside, side="right") - 1, first, np.maximum(end - 2, first))
+    since = (inside - t[interval])[:, None]
+    a, b, c, d = cubics[:, interval]
+    rate = (3.0 * a * since + 2.0 * b) * since + c
+    q = ((a * since + b) * since + c) * since + d + (asked - inside)[:, None] * rate
     return Motion(frozen_array(q), motion.t, motion.segment, motion.begun_at)
