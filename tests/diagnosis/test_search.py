@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from planted_cases import BASE, ELBOW, SHOULDER, at_rest, desk_arm, start_of, surveyed_arm, walk
+from planted_cases import BASE, ELBOW, INTERVAL_S, SHOULDER, at_rest, desk_arm, start_of, surveyed_arm, walk
 
 from diagnosis.fit import Fit
 from diagnosis.search import NAMED, Search, nats, simplicity
@@ -128,3 +128,14 @@ def test_a_search_that_would_exchange_two_causes_for_ever_ends_with_each_set_tri
     search.run(start_of(robot, walk(robot, 2), (truth,), 2))
     # There, and back to a set that was seen.
     assert search.asked <= 4
+
+
+def test_a_moment_is_sought_again_beside_causes_that_came_later(robot) -> None:
+    slip = Effect.at(robot, "tool_slip", values=[2e-3, 0.0, 0.0, 30.0])
+    turned = Effect.at(robot, "joint_eccentricity", SHOULDER, values=[0.03, 0.0])
+    start = start_of(robot, walk(robot, 3), (slip, turned), 3)
+    early = Effect.at(robot, "tool_slip", values=[0.0, 0.0, 0.0, 24.0])
+    search = Search([early, at_rest(turned)], lambda _: None)
+    found = search.run(start.with_causes([early, at_rest(turned)]))
+    (moment,) = [effect.value("t0") for effect in found.causes if effect.name == "tool_slip"]
+    assert abs(moment - 30.0) <= INTERVAL_S

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from planted_cases import ELBOW, SHOULDER, SIGMA_M, desk_arm, measured, motion_of, seen, walk
+from planted_cases import ELBOW, SHOULDER, SIGMA_M, desk_arm, measured, motion_of, seen, surveyed_arm, walk
 
 from diagnosis.conclusion import conclusion
 from diagnosis.diagnosis import Diagnosis, diagnose
@@ -106,6 +106,28 @@ def test_what_wanders_with_time_is_not_in_the_model_and_that_is_told(robot) -> N
     assert diagnosis.extended.simulation.residual is None
     assert (left.model_joints, left.not_in_model) == ((), left.what)
     assert "What changes with time is in no such model" in modelled(left)
+
+
+def test_a_link_that_grows_as_it_warms_up_is_unexplained_and_no_cause_is_named(robot) -> None:
+    motion = walk(robot, 1)
+    columns = Simulation(robot).run(motion).columns(Effect.at(robot, "link_geometry", ELBOW))
+    grown = 1.0 - np.exp(-motion.clock / (0.15 * motion.clock[-1]))
+    x = Simulation(robot).positions(motion) + grown[:, None] * (columns @ np.array([1e-3, 2e-3, -1e-3, 0.0, 0.0, 0.0]))
+    noise = SIGMA_M * np.random.default_rng([1, 1]).normal(size=x.shape)
+    found = conclusion(diagnose(measured(robot, motion, x + noise), Simulation(robot)))
+    assert (found.verdict, found.causes) == ("unexplained", ())
+    assert {ELBOW, "time"} <= set(found.unexplained.depends_on)
+
+
+def test_depth_that_errs_with_the_place_in_the_image_is_unexplained_and_learnt() -> None:
+    robot, motion = surveyed_arm(), walk(surveyed_arm(), 1)
+    right = Simulation(robot).positions(motion)
+    x = right * (1.0 + 0.04 * np.square(right[:, :1] / right[:, 2:]))
+    noise = SIGMA_M * np.random.default_rng([1, 1]).normal(size=x.shape)
+    diagnosis = diagnose(measured(robot, motion, x + noise), Simulation(robot))
+    found = conclusion(diagnosis)
+    assert (found.verdict, found.causes) == ("unexplained", ())
+    assert found.rms_mm.extended < 1.3 * found.rms_mm.noise_floor
 
 
 def test_where_nothing_is_hidden_nothing_is_found(robot) -> None:

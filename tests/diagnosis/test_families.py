@@ -1,0 +1,57 @@
+"""What the families of errors without a name move, and by how much."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from planted_cases import desk_arm, start_of, walk
+
+from diagnosis.families import Family, families
+from diagnosis.fit import Fit
+from diagnosis.unknown import Way
+from interfaces.robot import RobotDescription
+from sim_backend import model_file
+
+
+@pytest.fixture(scope="module")
+def start() -> Fit:
+    robot = desk_arm()
+    return start_of(robot, walk(robot, 1), (), 1)
+
+
+@pytest.fixture(scope="module")
+def found(start) -> list[Family]:
+    return families(start.run)
+
+
+def test_columns_times_numbers_are_the_moves_by_what_they_are_moved(start, found) -> None:
+    rng = np.random.default_rng(0)
+    for family in found:
+        columns = family.columns(start.run)
+        numbers = rng.normal(size=columns.shape[2])
+        by = family.moved_by(start.run, numbers)
+        np.testing.assert_allclose(columns @ numbers, np.einsum("nia,na->ni", family.moves(start.run), by), atol=1e-9)
+
+
+def test_a_part_of_a_family_moves_as_the_family_with_the_same_numbers_does(start, found) -> None:
+    rng = np.random.default_rng(0)
+    for family in (family for family in found if family.kind == "body" and not family.paired):
+        way = Way.of(family, start)
+        part = way.along(np.linalg.qr(rng.normal(size=(way.amounts, 2)))[0])
+        numbers = rng.normal(size=len(part.scales)) / part.scales
+        whitened = start.observations.whitened((part.family.columns(start.run) @ numbers)[:, :, None]).ravel()
+        np.testing.assert_allclose(part.columns @ (part.scales * numbers), whitened, rtol=1e-6, atol=1e-6)
+
+
+def test_a_link_that_gives_at_its_near_end_turns_about_what_carries_it() -> None:
+    robot = RobotDescription.load(model_file("upper_body"))
+    run = start_of(robot, walk(robot, 1, rows=50), (), 1).run
+    found, gravity = families(run), run.simulation.gravity
+    for k in np.flatnonzero(~np.array(run.simulation.upward)):
+        what = f"what carries {run.simulation.robot.joints[k]} gives under the arm's weight"
+        family = [family for family in found if family.paired and family.what == what][1]
+        T_camera_carrier = run.frames[:, k] @ np.linalg.inv(gravity.in_carrier(k))
+        axes, lever = T_camera_carrier[:, :3, :3], run.measured - T_camera_carrier[:, :3, 3]
+        turned = np.cross(np.swapaxes(axes, 1, 2), lever[:, None, :]).swapaxes(1, 2)
+        np.testing.assert_allclose(family.moves(run)[:, :, 3:], turned, atol=1e-9)
+        np.testing.assert_allclose(family.moves(run)[:, :, :3], axes, atol=1e-9)
