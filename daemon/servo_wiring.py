@@ -13,7 +13,7 @@ from drivers import checks
 from drivers.checks import Check, Holder
 from drivers.dynamixel.bench.asked_faults import AskedFault
 from drivers.dynamixel.bench.dry_run import DryRun
-from drivers.dynamixel.bench.motion import played, swinging
+from drivers.bench.motion import played, swinging
 from drivers.dynamixel.bench.servo import Angle
 from drivers.dynamixel.bench.through_servos import ThroughServos
 from drivers.dynamixel.checks import servo_checks as dynamixel_checks

@@ -12,7 +12,7 @@ import pytest
 from drivers.bench.device import Reply
 from drivers.dynamixel.bench.asked_faults import KINDS, ON_THE_WIRE, AskedFault, WireFaults
 from drivers.dynamixel.bench.dry_run import DryRun
-from drivers.dynamixel.bench.motion import played, swinging
+from drivers.bench.motion import played, swinging
 from drivers.dynamixel.bench.through_servos import ThroughServos
 from drivers.dynamixel.config import BusConfig, DynamixelConfig, ServoConfig
 from drivers.dynamixel.joints import DynamixelJoints
