@@ -17,7 +17,15 @@ from interfaces.errors import BodyschemaError
 from .bus import Bus, is_alive
 from .config import Config
 from .keys import Keys
-from .servo_wiring import Check, other_holders, port_checks, ports_are_there, servo_checks
+from .servo_wiring import (
+    Check,
+    configured_ports,
+    other_holders,
+    port_checks,
+    ports_are_there,
+    servo_checks,
+    servos_of,
+)
 from .status import SamplerStatus
 from .wire import decode
 
@@ -36,8 +44,9 @@ Step = tuple[str, Callable[[], Iterator[Check]]]
 def steps(config: Config) -> Iterator[Step]:
     """What is looked at, with the function that does it."""
     yield "robot.toml", lambda: _description(config)
-    if config.tables.drivers.dynamixel is not None:
+    if configured_ports(config):
         yield "ports", lambda: port_checks(config, _samplers(config))
+    if servos_of(config) is not None:
         yield "servos", lambda: _servos(config)
     yield "disk", lambda: disk_checks(config.state_dir)
     yield "clock", clock_checks
@@ -54,7 +63,7 @@ def _description(config: Config) -> Iterator[Check]:
     yield Check(
         "robot.toml", "ok", f"{config.file} is in order: {config.robot.name}, {len(config.robot.joints)} joints"
     )
-    if config.tables.drivers.dynamixel is None:
+    if config.tables.drivers.hardware is None:
         said = "no servos are configured, so none were looked at"
         yield Check("robot.toml", "warning", said, "bodyschema robot new --from scan")
     if config.robot.calibration is None:

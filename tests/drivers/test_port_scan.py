@@ -13,8 +13,9 @@ from drivers.dynamixel.bench.chain import Chain
 from drivers.dynamixel.bench.frames import Code, instructions_in
 from drivers.dynamixel.bench.servo import Servo
 from drivers.dynamixel.models import BY_NAME
-from drivers.dynamixel.scan import LIKELY_FIRST, SCANNERS
+from drivers.dynamixel.scan import LIKELY_FIRST
 from drivers.scan import FoundServo, ScannedBus, scan_port, serial_ports
+from drivers.scanners import SCANNERS
 from interfaces.clock import SystemClock
 from interfaces.errors import SourceError
 
@@ -68,7 +69,7 @@ def test_a_servo_is_found_at_every_rate(model, baud) -> None:
 
 def test_what_a_servo_tells_of_itself_is_told() -> None:
     (told,) = found(servo("XM430-W350", 3))
-    assert (told.firmware, told.temperature_c, told.has_torque, told.troubles) == (46, 31.0, False, ())
+    assert (told.firmware, told.temperature_c, told.has_torque, told.troubles) == ("46", 31.0, False, ())
     assert told.voltage_v == pytest.approx(12.0)
 
 
@@ -123,7 +124,7 @@ def test_all_rates_take_less_than_15_s() -> None:
 def test_what_is_being_done_is_said_for_each_rate() -> None:
     bench = Bench([servo("XM430-W350", 1)])
     bench.scan(1_000_000, 57_600)
-    assert bench.said[-1] == "bus: Dynamixel 1.0 at 57,600 bit/s; 1 servo so far"
+    assert bench.said[-1] == "bus: Dynamixel 1.0 and Feetech at 57,600 bit/s; 1 servo so far"
     assert len(bench.said) == 4
 
 
