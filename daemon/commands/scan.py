@@ -20,11 +20,12 @@ def scan(
     ] = None,
     json: Annotated[bool, flag("As JSON.")] = False,
 ) -> None:
-    """Which servos are there: every USB serial port, at every rate, in every protocol. About 12 s for a port.
+    """Which servos are there: every USB serial port, at every rate, in every protocol. Up to 15 s for a port.
 
-    A table of ID, model, firmware, supply, temperature, torque, and of what is wrong. With --robot also which servos
-    are missing, of another model, at another rate, double, or not in robot.toml. Nothing is written to any servo, and
-    torque stays as it is. Exit code 1 when not all is as it should be, or nobody answers.
+    Dynamixel servos of both protocols, and Feetech servos: a table of ID, model, firmware, supply, temperature, torque,
+    and of what is wrong. With --robot also which servos are missing, of another model, at another rate, double, or not
+    in robot.toml. Nothing is written to any servo, and torque stays as it is. Exit code 1 when not all is as it should
+    be, or nobody answers.
 
     Needs: servos with their supply on, and the right to open the port (`bodyschema doctor` tells).
 
