@@ -9,7 +9,7 @@ from pathlib import Path
 from types import MappingProxyType, TracebackType
 from typing import Self
 
-from .bench_wiring import Motion, bench_motion, bench_ports, bench_robot_file, open_bench
+from .bench_wiring import Motion, bench_commands, bench_motion, bench_ports, bench_robot_file, open_bench
 from .config import Config
 
 FAULTS: Mapping[str, str] = MappingProxyType(
@@ -116,7 +116,7 @@ class BenchRun:
             yield f"{config.robot.name}: {words}"
         yield self._motion.words
         yield "In another terminal:"
-        for command in ("scan", "doctor", "joints"):
+        for command in bench_commands(self._bench):
             yield f"  bodyschema {command} --robot {file}"
         yield f"{file} is {config.file} with the bench's port. Ctrl-C ends the bench."
 

@@ -152,6 +152,11 @@ def bench_ports(bench: DryRun) -> list[str]:
             ]
 
 
+def bench_commands(bench: DryRun) -> tuple[str, ...]:
+    """The commands that speak to what is on the ports."""
+    return ("doctor", "joints") if isinstance(bench.config, SerialLinesConfig) else ("scan", "doctor", "joints")
+
+
 def _counted(count: int, what: str) -> str:
     return f"{count} {what}{'' if count == 1 else 's'}"
 

@@ -20,6 +20,7 @@ from .keys import Keys
 from .servo_wiring import (
     Check,
     configured_ports,
+    encoder_checks,
     other_holders,
     port_checks,
     ports_are_there,
@@ -47,7 +48,9 @@ def steps(config: Config) -> Iterator[Step]:
     if configured_ports(config):
         yield "ports", lambda: port_checks(config, _samplers(config))
     if servos_of(config) is not None:
-        yield "servos", lambda: _servos(config)
+        yield "servos", lambda: _on_the_ports(config, servo_checks)
+    elif configured_ports(config):
+        yield "encoders", lambda: _on_the_ports(config, encoder_checks)
     yield "disk", lambda: disk_checks(config.state_dir)
     yield "clock", clock_checks
     yield "zenoh", lambda: _zenoh(config)
@@ -75,14 +78,14 @@ def _description(config: Config) -> Iterator[Check]:
         yield Check("camera", "ok", "[camera] describes a stereo pair")
 
 
-def _servos(config: Config) -> Iterator[Check]:
-    """Of the servos themselves; of the running sampler where that has the port."""
+def _on_the_ports(config: Config, look: Callable[[Config], Iterator[Check]]) -> Iterator[Check]:
+    """What `look` finds there; what the running sampler tells where that has the port."""
     if not ports_are_there(config):
         return
     if other_holders(config):
         yield from _of_the_sampler(config)
     else:
-        yield from servo_checks(config)
+        yield from look(config)
 
 
 def _samplers(config: Config) -> list[int]:

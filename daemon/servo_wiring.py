@@ -22,6 +22,7 @@ from drivers.feetech.models import BY_NAME as FEETECH_MODELS
 from drivers.scan import ScannedBus, Tell, scan_port, serial_ports
 from drivers.scanners import SCANNERS
 from drivers.serial_line import adapter_latency_s
+from drivers.serial_lines.checks import encoder_checks as checks_of_encoders
 from drivers.servos.checks import servo_checks as checks_of_servos
 from interfaces.clock import SystemClock
 from interfaces.errors import ConfigError
@@ -137,3 +138,10 @@ def servo_checks(config: Config) -> Iterator[Check]:
             yield from checks_of_servos(DYNAMIXEL, servos, clock, open_dynamixel)
         case FeetechConfig() as servos:
             yield from checks_of_servos(FEETECH, servos, clock, open_feetech)
+
+
+def encoder_checks(config: Config) -> Iterator[Check]:
+    """Of the encoders of robot.toml on a board, if it has some."""
+    board = config.tables.drivers.serial_lines
+    if board is not None:
+        yield from checks_of_encoders(board, config.robot.joints, SystemClock())

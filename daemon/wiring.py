@@ -12,6 +12,7 @@ from drivers.dynamixel.config import DynamixelConfig
 from drivers.feetech.config import FeetechConfig
 from drivers.ros2.config import Ros2Config
 from drivers.serial_lines.config import SerialLinesConfig
+from drivers.serial_lines.joints import SerialLineJoints
 from drivers.servos.joints import ServoJoints as ServoArm
 from interfaces.clock import SystemClock
 from interfaces.errors import ConfigError
@@ -20,7 +21,7 @@ from kbmaps import RigidChain
 
 from .bench_wiring import require_bench, through_bench
 from .config import Config
-from .joints_watch import ServoJoints
+from .joints_watch import EncoderJoints
 from .sources import MarkerTopic, Sources, StampedJoints
 from .store import PairReader
 
@@ -90,24 +91,22 @@ def driver_of(hardware: Hardware, config: Config, clock: Clock, *, last_pose: li
 
             return FeetechJoints(hardware, joints, clock, limits=limits, last_pose=last_pose)
         case SerialLinesConfig():
-            from drivers.serial_lines.joints import SerialLineJoints
-
             return SerialLineJoints(hardware, joints, clock, limits=limits, last_pose=last_pose)
         case Ros2Config():
             return _ros2_joints(config, hardware, clock)
 
 
-def open_servos(config: Config, clock: Clock) -> ServoJoints:
-    """As `open_joints`, of an arm of servos.
+def open_encoders(config: Config, clock: Clock) -> EncoderJoints:
+    """As `open_joints`, of an arm whose servos or encoders are on a serial port.
 
     Raises:
-        ConfigError: the joints are not servos.
+        ConfigError: they are not.
     """
     match open_joints(config, clock):
-        case ServoArm() as joints:
+        case ServoArm() | SerialLineJoints() as joints:
             return joints
-    remedy = "This is for servos: [drivers.dynamixel] or [drivers.feetech]"
-    raise ConfigError("the joints are no servos", file=config.file, remedy=remedy)
+    remedy = "This is for [drivers.dynamixel], [drivers.feetech] and [drivers.serial_lines]"
+    raise ConfigError("the joints are neither servos nor encoders on a port", file=config.file, remedy=remedy)
 
 
 def _ros2_joints(config: Config, robot: Ros2Config, clock: Clock) -> Ros2Joints:
