@@ -237,18 +237,13 @@ def _looking_at_lines(
     hardware: SerialLinesConfig, angles: Mapping[str, Angle], open_driver: OpenDriver
 ) -> Iterator[Look]:
     """Each look is at a line whose measurement began after it."""
+    from drivers.serial_lines.bench.listener import Listener
+
     clock = SystemClock()
     quick = msgspec.structs.replace(hardware, baud=BOARD_BAUD, delay_ms=0.0, native_usb=False)
     arm = _arm(quick, angles, rate_hz=BOARD_RATE_HZ)
-    with _on_a_bench(arm) as bench, open_driver(bench.config) as encoders:
-
-        def look() -> JointReading | None:
-            begin = clock.now()
-            while (told := encoders.read(READ_S)) is not None and told.t < begin + SETTLED_S:
-                continue
-            return told
-
-        yield look
+    with _on_a_bench(arm) as bench, open_driver(bench.config) as encoders, Listener(encoders) as listener:
+        yield lambda: listener.after(clock.now() + SETTLED_S, READ_S)
 
 
 @contextmanager
