@@ -93,9 +93,14 @@ class BenchRun:
         self._opened.close()
 
     @property
-    def instructions(self) -> int:
-        """How many packets the servos understood, or lines the board said."""
-        return self._bench.arm.heard
+    def count(self) -> int:
+        """How many packets were understood, or lines were said."""
+        return self._bench.arm.count
+
+    @property
+    def unit(self) -> str:
+        """Of what is counted."""
+        return self._bench.arm.unit
 
     def stop(self) -> None:
         """Come to an end. Only sets a flag: a signal handler may call it."""

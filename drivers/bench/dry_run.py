@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 from .asked_faults import NOW_AND_THEN, AskedFault
 from .device import Device
@@ -27,14 +27,16 @@ class BenchArm(ABC):
 
     Attributes:
         devices: by name of the bus.
+        unit: of what is counted.
     """
 
     devices: Mapping[str, Device]
+    unit: ClassVar[str]
 
     @property
     @abstractmethod
-    def heard(self) -> int:
-        """How many packets or lines went over the wire so far."""
+    def count(self) -> int:
+        """How many packets were understood, or lines were said, so far."""
 
     @abstractmethod
     def at_ports(self, ports: Mapping[str, str]) -> Any:

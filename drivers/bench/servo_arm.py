@@ -43,6 +43,7 @@ ConfigT = TypeVar("ConfigT", bound=ServosConfig[Any])
 class ServoArm(BenchArm, Generic[ServoT, ConfigT]):
     """Servos as they are configured, on one chain for each bus."""
 
+    unit: ClassVar[str] = "packets understood"
     kinds: ClassVar[FaultKinds]
     errors: ClassVar[Mapping[str, int]]
     """Bits of what is wrong with a servo, by the names of the faults."""
@@ -92,7 +93,7 @@ class ServoArm(BenchArm, Generic[ServoT, ConfigT]):
         """Let the servo listen at another rate."""
 
     @property
-    def heard(self) -> int:
+    def count(self) -> int:
         """How many packets the servos understood."""
         return sum(chain.instructions for chain in self.devices.values())
 

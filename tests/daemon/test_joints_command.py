@@ -97,7 +97,7 @@ def test_the_watch_has_angles_speeds_temperatures_and_ranges(config, tmp_path) -
                 look_until(watch, lambda seen: abs(seen.joints[PITCH].angle - shoulder[0]) < 0.01)
             watch.know_temperatures()
             seen = look_until(watch, lambda seen: True)
-        assert bench.arm.heard > 20
+        assert bench.arm.count > 20
     pitch = seen.joints[PITCH]
     assert (pitch.low, pitch.high) == pytest.approx((0.2, 0.6), abs=0.01)
     assert [joint.temperature_c for joint in seen.joints] == [31.0] * 4

@@ -101,7 +101,7 @@ def reading(bench: DryRun, make: str) -> JointReading:
 def test_the_driver_reads_the_angles_that_the_bench_was_given(make, tmp_path) -> None:
     with standing(tmp_path, make) as bench:
         assert reading(bench, make).q == pytest.approx(POSE, abs=TICK)
-        assert bench.arm.heard > 0
+        assert bench.arm.count > 0
 
 
 def test_each_bus_has_a_port_of_its_own(tmp_path) -> None:

@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from random import Random
+from typing import ClassVar
 
 import msgspec
 
@@ -24,6 +25,8 @@ RATE_HZ = 200.0
 
 class EncoderArm(BenchArm):
     """Encoders as they are configured, on one board."""
+
+    unit: ClassVar[str] = "lines said"
 
     def __init__(
         self,
@@ -53,7 +56,7 @@ class EncoderArm(BenchArm):
         self.devices = {BUS: self._board}
 
     @property
-    def heard(self) -> int:
+    def count(self) -> int:
         """How many lines were said."""
         return self._board.lines
 
