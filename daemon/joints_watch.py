@@ -140,7 +140,7 @@ class JointsWatch:
         self._opened.close()
 
     def look(self) -> Seen | None:
-        """Read once, and say how things are; None as long as nothing was read."""
+        """Read once, and say how things are; None as long as not all is known."""
         reading = self._reading.read(READ_S)
         if reading is not None:
             self._low = reading.q if self._q is None else np.minimum(self._low, reading.q)
@@ -149,7 +149,8 @@ class JointsWatch:
             self._speeds.take(reading.t, reading.q)
             self._signs.take(reading.t, reading.q)
             self._feel_one()
-        return None if self._q is None else self._seen(self._q)
+        has_all = self._servos is not None or self._speeds.are_known
+        return self._seen(self._q) if self._q is not None and has_all else None
 
     def know_temperatures(self) -> None:
         """Ask all for their temperatures."""
@@ -196,11 +197,13 @@ class Speeds:
 
     Attributes:
         v: over the last tenth of a second or more [rad/s], shape (d,).
+        are_known: the joints were looked at for so long.
     """
 
     def __init__(self, d: int) -> None:
         """Nothing has moved yet."""
         self.v: FloatArray = np.zeros(d)
+        self.are_known = False
         self._t, self._q = -math.inf, self.v
 
     def take(self, t: float, q: FloatArray) -> None:
@@ -209,7 +212,7 @@ class Speeds:
         if passed < SPEED_OVER_S:
             return
         if math.isfinite(passed):
-            self.v = (q - self._q) / passed
+            self.v, self.are_known = (q - self._q) / passed, True
         self._t, self._q = t, q
 
 

@@ -110,7 +110,7 @@ def configured_ports(config: Config) -> dict[str, str]:
     """The serial ports of robot.toml, by what they are called."""
     servos, lines = servos_of(config), config.tables.drivers.serial_lines
     if lines is not None:
-        return {"the encoders": lines.port}
+        return {"board": lines.port}
     return {} if servos is None else {name: bus.port for name, bus in servos.buses.items()}
 
 

@@ -26,12 +26,15 @@ class BenchArm(ABC):
     """What is behind the ports of an arm, whatever it is made of.
 
     Attributes:
-        devices: by name of the bus.
         unit: of what is counted.
     """
 
-    devices: Mapping[str, Device]
     unit: ClassVar[str]
+
+    @property
+    @abstractmethod
+    def devices(self) -> Mapping[str, Device]:
+        """What is behind each port, by name of the bus."""
 
     @property
     @abstractmethod

@@ -41,7 +41,11 @@ ConfigT = TypeVar("ConfigT", bound=ServosConfig[Any])
 
 
 class ServoArm(BenchArm, Generic[ServoT, ConfigT]):
-    """Servos as they are configured, on one chain for each bus."""
+    """Servos as they are configured, on one chain for each bus.
+
+    Attributes:
+        chains: by name of the bus.
+    """
 
     unit: ClassVar[str] = "packets understood"
     kinds: ClassVar[FaultKinds]
@@ -68,14 +72,14 @@ class ServoArm(BenchArm, Generic[ServoT, ConfigT]):
         """
         self._config, self._return_delay_s, self._rng, self._now = config, return_delay_s, Random(seed), now
         self._servos: dict[str, ServoT] = {}
-        self.devices: dict[str, ServoChain[ServoT]] = {}
+        self.chains: dict[str, ServoChain[ServoT]] = {}
         for name in config.buses:
             fitted = [entry for entry in config.servos if config.bus_of(entry) == name]
             for entry in fitted:
                 self._servos[entry.joint] = self._servo(entry, shaft(config, entry, angles[entry.joint]))
             ids = {entry.joint: entry.id for entry in fitted}
             wire = WireFaults.asked(faults, self.kinds, ids, self._rng)
-            self.devices[name] = self._chain([self._servos[joint] for joint in ids], wire)
+            self.chains[name] = self._chain([self._servos[joint] for joint in ids], wire)
         for fault in faults:
             if fault.joint in self._servos:
                 self._begin(fault.kind, fault.joint)
@@ -93,9 +97,14 @@ class ServoArm(BenchArm, Generic[ServoT, ConfigT]):
         """Let the servo listen at another rate."""
 
     @property
+    def devices(self) -> Mapping[str, ServoChain[ServoT]]:
+        """What is behind each port, by name of the bus."""
+        return self.chains
+
+    @property
     def count(self) -> int:
         """How many packets the servos understood."""
-        return sum(chain.instructions for chain in self.devices.values())
+        return sum(chain.instructions for chain in self.chains.values())
 
     def servo(self, joint: str) -> ServoT:
         """The servo of a joint."""
@@ -112,7 +121,7 @@ class ServoArm(BenchArm, Generic[ServoT, ConfigT]):
 
     def power_cycle(self, t: float) -> None:
         """All lose their power and get it back at `t`."""
-        for chain in self.devices.values():
+        for chain in self.chains.values():
             chain.power_cycle(t)
 
     def _begin(self, kind: str, joint: str) -> None:
@@ -124,7 +133,7 @@ class ServoArm(BenchArm, Generic[ServoT, ConfigT]):
             self._change_rate(servo)
         elif kind == "double":
             entry = next(entry for entry in self._config.servos if entry.joint == joint)
-            self.devices[self._config.bus_of(entry)].servos.append(self._servo(entry, lambda _: TWIN_RAD))
+            self.chains[self._config.bus_of(entry)].servos.append(self._servo(entry, lambda _: TWIN_RAD))
         elif kind == "torque":
             servo["torque"] = 1
 

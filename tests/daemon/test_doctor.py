@@ -54,7 +54,7 @@ def test_an_arm_on_the_bench_is_well_within_five_seconds(file, what, tmp_path, c
         assert time.monotonic() - begin < LONGEST_S
     told = json.loads(capsys.readouterr().out)
     assert (code, told["well"]) == (0, True)
-    port = "port of arm" if what == "servos" else "port of the encoders"
+    port = "port of arm" if what == "servos" else "port of board"
     assert {check["subject"] for check in told["checks"]} == {
         "robot.toml", "camera", port, what, "rate", "errors", "disk", "clock", "zenoh",
     }  # fmt: skip

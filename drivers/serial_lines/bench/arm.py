@@ -53,7 +53,11 @@ class EncoderArm(BenchArm):
         }
         self._board = EncoderBoard(encoders, rate_hz=rate_hz, begun_s=now(), boot=rng.randrange(2**16), faults=wire)
         self._board.failing.update(self._names[f.joint] for f in faults if f.kind == "sensor" and f.joint)
-        self.devices = {BUS: self._board}
+
+    @property
+    def devices(self) -> Mapping[str, EncoderBoard]:
+        """What is behind the port."""
+        return {BUS: self._board}
 
     @property
     def count(self) -> int:
