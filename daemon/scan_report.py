@@ -5,12 +5,14 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import msgspec
 
-from .config import Config
 from .servo_wiring import require_servos
+
+if TYPE_CHECKING:
+    from .config import Config
 
 
 class Servo(Protocol):

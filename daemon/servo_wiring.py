@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
-from typing import get_args
+from typing import TYPE_CHECKING, get_args
 
 from drivers import checks
 from drivers.checks import Check, Holder
@@ -27,7 +27,8 @@ from drivers.servos.checks import servo_checks as checks_of_servos
 from interfaces.clock import SystemClock
 from interfaces.errors import ConfigError
 
-from .config import Config
+if TYPE_CHECKING:
+    from .config import Config  # takes the better part of a second, and a scan may need none
 
 Servos = DynamixelConfig | FeetechConfig
 

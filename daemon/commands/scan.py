@@ -34,8 +34,7 @@ def scan(
     from rich.console import Console
 
     from daemon import servo_wiring
-    from daemon.config import Config
-    from daemon.reproduce.progress import shown_on
+    from daemon.progress import shown_on
     from daemon.scan_report import as_json, report_of
     from daemon.scan_view import show
     from interfaces.errors import ConfigError
@@ -44,8 +43,11 @@ def scan(
     if unknown:
         known = ", ".join(map(str, servo_wiring.scanned_bauds()))
         raise ConfigError(f"--baud {unknown[0]} is no rate of such servos", remedy=f"Give one of {known}")
-    config = None if robot is None else Config.load(robot)
-    if config is not None:
+    config = None
+    if robot is not None:
+        from daemon.config import Config
+
+        config = Config.load(robot)
         servo_wiring.require_servos(config)
     ports = servo_wiring.ports_to_scan(port, config)
     with shown_on(Console(stderr=True, highlight=False), "scan") as tell:
