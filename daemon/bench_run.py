@@ -9,8 +9,8 @@ from pathlib import Path
 from types import MappingProxyType, TracebackType
 from typing import Self
 
+from .bench_wiring import Motion, bench_commands, bench_motion, bench_ports, bench_robot_file, open_bench
 from .config import Config
-from .servo_wiring import Motion, bench_motion, bench_robot_file, open_bench, require_servos
 
 FAULTS: Mapping[str, str] = MappingProxyType(
     {
@@ -24,13 +24,15 @@ FAULTS: Mapping[str, str] = MappingProxyType(
         "voltage": "@JOINT: the supply is out of range, and the servo says so",
         "hot": "@JOINT: it is too hot",
         "encoder": "@JOINT: its motor's encoder fails",
-        "shock": "@JOINT: its circuit is damaged",
+        "shock": "@JOINT: its circuit is damaged (Dynamixel)",
+        "current": "@JOINT: its motor draws too much current (Feetech)",
         "overload": "@JOINT: it is overloaded",
         "baud": "@JOINT: it listens at another rate",
+        "sensor": "@JOINT: its sensor has no value (own encoders)",
         "double": "@JOINT: a second servo has the same ID",
         "torque": "@JOINT: its torque is on",
         "glitch": "@JOINT: every 10 s its encoder is wrong for a moment",
-        "power-cycle": "every 10 s all lose their power and get it back",
+        "power-cycle": "every 10 s the power is lost and comes back",
         "unplug": "every 10 s the port is gone for 3 s",
     }
 )
@@ -91,9 +93,14 @@ class BenchRun:
         self._opened.close()
 
     @property
-    def instructions(self) -> int:
-        """How many packets the servos understood."""
-        return self._bench.instructions
+    def count(self) -> int:
+        """How many packets were understood, or lines were said."""
+        return self._bench.arm.count
+
+    @property
+    def unit(self) -> str:
+        """Of what is counted."""
+        return self._bench.arm.unit
 
     def stop(self) -> None:
         """Come to an end. Only sets a flag: a signal handler may call it."""
@@ -110,13 +117,11 @@ class BenchRun:
     def introduction(self) -> Iterator[str]:
         """What is there, and what to type in another terminal."""
         config, file = self._config, self.robot_file
-        for name, bus in self._bench.config.buses.items():
-            fitted = [servo for servo in require_servos(config).servos if require_servos(config).bus_of(servo) == name]
-            servos = f"{len(fitted)} servo{'s' if len(fitted) > 1 else ''}"
-            yield f"{config.robot.name}: {servos} on {bus.port} at {bus.baud:,} bit/s"
+        for words in bench_ports(self._bench):
+            yield f"{config.robot.name}: {words}"
         yield self._motion.words
         yield "In another terminal:"
-        for command in ("scan", "doctor", "joints"):
+        for command in bench_commands(self._bench):
             yield f"  bodyschema {command} --robot {file}"
         yield f"{file} is {config.file} with the bench's port. Ctrl-C ends the bench."
 

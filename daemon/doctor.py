@@ -17,7 +17,16 @@ from interfaces.errors import BodyschemaError
 from .bus import Bus, is_alive
 from .config import Config
 from .keys import Keys
-from .servo_wiring import Check, other_holders, port_checks, ports_are_there, servo_checks
+from .servo_wiring import (
+    Check,
+    configured_ports,
+    encoder_checks,
+    other_holders,
+    port_checks,
+    ports_are_there,
+    servo_checks,
+    servos_of,
+)
 from .status import SamplerStatus
 from .wire import decode
 
@@ -36,9 +45,12 @@ Step = tuple[str, Callable[[], Iterator[Check]]]
 def steps(config: Config) -> Iterator[Step]:
     """What is looked at, with the function that does it."""
     yield "robot.toml", lambda: _description(config)
-    if config.tables.drivers.dynamixel is not None:
+    if configured_ports(config):
         yield "ports", lambda: port_checks(config, _samplers(config))
-        yield "servos", lambda: _servos(config)
+    if servos_of(config) is not None:
+        yield "servos", lambda: _on_the_ports(config, servo_checks)
+    elif configured_ports(config):
+        yield "encoders", lambda: _on_the_ports(config, encoder_checks)
     yield "disk", lambda: disk_checks(config.state_dir)
     yield "clock", clock_checks
     yield "zenoh", lambda: _zenoh(config)
@@ -54,7 +66,7 @@ def _description(config: Config) -> Iterator[Check]:
     yield Check(
         "robot.toml", "ok", f"{config.file} is in order: {config.robot.name}, {len(config.robot.joints)} joints"
     )
-    if config.tables.drivers.dynamixel is None:
+    if config.tables.drivers.hardware is None:
         said = "no servos are configured, so none were looked at"
         yield Check("robot.toml", "warning", said, "bodyschema robot new --from scan")
     if config.robot.calibration is None:
@@ -66,14 +78,14 @@ def _description(config: Config) -> Iterator[Check]:
         yield Check("camera", "ok", "[camera] describes a stereo pair")
 
 
-def _servos(config: Config) -> Iterator[Check]:
-    """Of the servos themselves; of the running sampler where that has the port."""
+def _on_the_ports(config: Config, look: Callable[[Config], Iterator[Check]]) -> Iterator[Check]:
+    """What `look` finds there; what the running sampler tells where that has the port."""
     if not ports_are_there(config):
         return
     if other_holders(config):
         yield from _of_the_sampler(config)
     else:
-        yield from servo_checks(config)
+        yield from look(config)
 
 
 def _samplers(config: Config) -> list[int]:

@@ -40,7 +40,7 @@ def as_json(seen: Seen) -> str:
 def _row(joint: JointState) -> tuple[str | Text, ...]:
     return (
         joint.joint,
-        str(joint.id),
+        "-" if joint.id is None else str(joint.id),
         f"{math.degrees(joint.angle):+.1f}°",
         f"{math.degrees(joint.velocity) + 0.0:+.0f}",
         "-" if joint.current is None else f"{1e3 * joint.current:+.0f}",

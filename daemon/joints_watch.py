@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from types import TracebackType
-from typing import Protocol, Self
+from typing import Protocol, Self, runtime_checkable
 
 import msgspec
 import numpy as np
@@ -23,6 +23,7 @@ from .reopen import Reopening
 from .status import JointRange
 
 READ_S = 0.1
+SPEED_OVER_S = 0.1
 TEMPERATURE_EVERY_S = 0.5  # one servo in turn
 MOVED_RAD = math.radians(3.0)
 STILL_RAD = math.radians(0.5)
@@ -49,16 +50,22 @@ class Fitted(Protocol):
     def direction(self) -> int: ...
 
 
-class ServoJoints(JointSource, Protocol):
-    """Encoders that are servos; see `drivers.dynamixel.joints.DynamixelJoints`."""
+class EncoderJoints(JointSource, Protocol):
+    """Encoders that know how they are; see `drivers.serial_lines.joints.SerialLineJoints`."""
+
+    @property
+    def health(self) -> tuple[str, ...]: ...
+
+
+@runtime_checkable
+class ServoJoints(EncoderJoints, Protocol):
+    """Encoders that are servos; see `drivers.servos.joints.ServoJoints`."""
 
     @property
     def servos(self) -> Sequence[Fitted]: ...
 
     @property
     def samples(self) -> Mapping[str, Sample | None]: ...
-    @property
-    def health(self) -> tuple[str, ...]: ...
     def temperature_c(self, joint: str) -> float | None: ...
 
 
@@ -66,6 +73,7 @@ class JointState(msgspec.Struct, frozen=True):
     """One joint now.
 
     Attributes:
+        id: of its servo; None where there is none.
         angle: [rad], as q of the pairs would be.
         velocity: [rad/s]. current: [A], None where it is not measured. temperature_c: None as long as not known.
         low, high: where it has been since the beginning [rad].
@@ -74,7 +82,7 @@ class JointState(msgspec.Struct, frozen=True):
     """
 
     joint: str
-    id: int
+    id: int | None
     angle: float
     velocity: float
     current: float | None
@@ -109,15 +117,17 @@ class Seen(msgspec.Struct, frozen=True):
 class JointsWatch:
     """Reads an arm, and keeps what it has seen."""
 
-    def __init__(self, config: Config, source: ServoJoints, clock: Clock) -> None:
+    def __init__(self, config: Config, source: EncoderJoints, clock: Clock) -> None:
         """Nothing is opened yet."""
         self._robot, self._source, self._clock = config.robot, source, clock
+        self._servos = source if isinstance(source, ServoJoints) else None
         self._reading = Reopening(source, "the encoders", clock)
         self._opened = ExitStack()
         self._temperatures: dict[str, float | None] = dict.fromkeys(config.robot.joints)
         self._asked, self._next_s = 0, -math.inf
         self._q: FloatArray | None = None
         self._low = self._high = np.zeros(len(config.robot.joints))
+        self._speeds = Speeds(len(config.robot.joints))
         self._signs = SignCheck(config.robot)
 
     def __enter__(self) -> Self:
@@ -130,26 +140,29 @@ class JointsWatch:
         self._opened.close()
 
     def look(self) -> Seen | None:
-        """Read once, and say how things are; None as long as nothing was read."""
+        """Read once, and say how things are; None as long as not all is known."""
         reading = self._reading.read(READ_S)
         if reading is not None:
             self._low = reading.q if self._q is None else np.minimum(self._low, reading.q)
             self._high = reading.q if self._q is None else np.maximum(self._high, reading.q)
             self._q = reading.q
+            self._speeds.take(reading.t, reading.q)
             self._signs.take(reading.t, reading.q)
             self._feel_one()
-        return None if self._q is None else self._seen(self._q)
+        has_all = self._servos is not None or self._speeds.are_known
+        return self._seen(self._q) if self._q is not None and has_all else None
 
     def know_temperatures(self) -> None:
         """Ask all for their temperatures."""
-        for joint in self._temperatures:
-            self._temperatures[joint] = self._source.temperature_c(joint)
+        if self._servos is not None:
+            for joint in self._temperatures:
+                self._temperatures[joint] = self._servos.temperature_c(joint)
 
     def _feel_one(self) -> None:
-        if self._clock.now() < self._next_s:
+        if self._servos is None or self._clock.now() < self._next_s:
             return
         joint = self._robot.joints[self._asked % len(self._robot.joints)]
-        self._temperatures[joint] = self._source.temperature_c(joint)
+        self._temperatures[joint] = self._servos.temperature_c(joint)
         self._asked += 1
         self._next_s = self._clock.now() + TEMPERATURE_EVERY_S
 
@@ -158,15 +171,17 @@ class JointsWatch:
         return Seen(joints, self._signs.said, self._source.health, self._reading.trouble)
 
     def _joint(self, place: int, angle: float) -> JointState:
-        name, servo = self._robot.joints[place], self._source.servos[place]
-        sample = self._source.samples.get(name)
+        name = self._robot.joints[place]
+        servo = None if self._servos is None else self._servos.servos[place]
+        sample = None if self._servos is None else self._servos.samples.get(name)
+        told = None if servo is None or sample is None else servo.direction * sample.velocity
         low, high = float(self._low[place]), float(self._high[place])
         lower, upper = float(self._robot.lower[place]), float(self._robot.upper[place])
         return JointState(
             joint=name,
-            id=servo.id,
+            id=None if servo is None else servo.id,
             angle=angle,
-            velocity=0.0 if sample is None else servo.direction * sample.velocity,
+            velocity=float(self._speeds.v[place]) if told is None else told,
             current=None if sample is None else sample.current,
             temperature_c=self._temperatures[name],
             low=low,
@@ -175,6 +190,30 @@ class JointsWatch:
             upper=upper,
             within_limits=lower <= low and high <= upper,
         )
+
+
+class Speeds:
+    """How fast joints move whose encoders do not tell.
+
+    Attributes:
+        v: over the last tenth of a second or more [rad/s], shape (d,).
+        are_known: the joints were looked at for so long.
+    """
+
+    def __init__(self, d: int) -> None:
+        """Nothing has moved yet."""
+        self.v: FloatArray = np.zeros(d)
+        self.are_known = False
+        self._t, self._q = -math.inf, self.v
+
+    def take(self, t: float, q: FloatArray) -> None:
+        """The joints are at `q` (d,) [rad] at `t` [s]."""
+        passed = t - self._t
+        if passed < SPEED_OVER_S:
+            return
+        if math.isfinite(passed):
+            self.v, self.are_known = (q - self._q) / passed, True
+        self._t, self._q = t, q
 
 
 @dataclass(frozen=True, slots=True)

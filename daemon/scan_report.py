@@ -5,12 +5,14 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import msgspec
 
-from .config import Config
 from .servo_wiring import require_servos
+
+if TYPE_CHECKING:
+    from .config import Config
 
 
 class Servo(Protocol):
@@ -27,7 +29,7 @@ class Servo(Protocol):
     @property
     def model(self) -> str | None: ...
     @property
-    def firmware(self) -> int | None: ...
+    def firmware(self) -> str | None: ...
     @property
     def voltage_v(self) -> float | None: ...
     @property

@@ -39,7 +39,7 @@ def _table(servos: Sequence[Servo], joints: dict[int, str], *, named: bool) -> T
         cells = [
             str(servo.id),
             servo.model or "?",
-            _or_dash(servo.firmware, "{}"),
+            servo.firmware or "-",
             servo.protocol,
             _rate(servo.baud),
             _or_dash(servo.voltage_v, "{:.1f} V"),

@@ -11,7 +11,7 @@ import msgspec
 
 from interfaces.errors import ConfigError
 
-from .servo_wiring import known_models
+from .servo_wiring import KnownModel, known_models
 
 
 class Candidate(msgspec.Struct, frozen=True):
@@ -25,8 +25,9 @@ class Candidate(msgspec.Struct, frozen=True):
 
     @property
     def is_usable(self) -> bool:
-        """Whether it is the only one of its ID, and of a model that is known."""
-        return not self.is_double and self.model in known_models()
+        """Whether it is the only one of its ID, of a model that is known, at a rate that robot.toml can name."""
+        known = known_models().get(self.model or "")
+        return not self.is_double and known is not None and self.baud in known.bauds
 
 
 class _Bus(msgspec.Struct, frozen=True):
@@ -98,33 +99,52 @@ def fit(joints: Sequence[str], candidates: Sequence[Candidate], choose: Choose) 
 
 
 def servo_tables(fitting: Fitting) -> str:
-    """The tables [drivers.dynamixel...] of robot.toml, commented."""
-    names = _bus_names(list(fitting.servos.values()))
+    """The tables [drivers.dynamixel...] or [drivers.feetech...] of robot.toml, commented.
+
+    Raises:
+        ConfigError: the servos are of two makes, or those on one port have different rates.
+    """
+    servos, known = list(fitting.servos.values()), known_models()
+    make = _make(servos)
+    names = _bus_names(servos, make.software)
     lines = ["", "# The servos, as `bodyschema scan` found them. docs/hardware.md has all keys."]
     for (port, baud), name in names.items():
-        lines += [f"[drivers.dynamixel.buses.{name}]", f"port = {_quoted(port)}", f"baud = {baud:_}", ""]
+        lines += [f"[{make.table}.buses.{name}]", f"port = {_quoted(port)}", f"baud = {baud:_}", ""]
     lines.append("# CHECK each with `bodyschema joints`: move the joint, and look where its angle goes.")
     for joint, servo in fitting.servos.items():
-        lines += ["[[drivers.dynamixel.servos]]", f"joint = {_quoted(joint)}", f"id = {servo.id}"]
+        lines += [f"[[{make.table}.servos]]", f"joint = {_quoted(joint)}", f"id = {servo.id}"]
         lines.append(f"model = {_quoted(servo.model or '')}")
         if len(names) > 1:
             lines.append(f"bus = {_quoted(names[servo.port, servo.baud])}")
+        zero_ticks = f"# zero_ticks = {known[servo.model or ''].zero_ticks}"
         lines += [
             "# direction = -1      # the joint counts against the servo",
-            "# zero_ticks = 2048   # where it is at 0",
+            f"{zero_ticks:22}# where it is at 0",
             "",
         ]
     return "\n".join(lines)
 
 
-def _bus_names(servos: Sequence[Candidate]) -> dict[tuple[str, int], str]:
+def _make(servos: Sequence[Candidate]) -> KnownModel:
+    """What the models of all `servos` have in common."""
+    known = known_models()
+    makes = {known[servo.model or ""].table: known[servo.model or ""] for servo in servos}
+    if len(makes) > 1:
+        raise ConfigError(
+            f"the servos are of two makes, {' and '.join(makes)}, and an arm is of one",
+            remedy="Give --port with the port of one of them, or - for the other's joints",
+        )
+    return next(iter(makes.values()))
+
+
+def _bus_names(servos: Sequence[Candidate], software: str) -> dict[tuple[str, int], str]:
     buses = dict.fromkeys((servo.port, servo.baud) for servo in servos)
     taken: dict[str, int] = {}
     for port, baud in buses:
         if taken.setdefault(os.path.realpath(port), baud) != baud:
             raise ConfigError(
                 f"the servos on {port} have different rates",
-                remedy="Set all to one, with DYNAMIXEL Wizard for instance",
+                remedy=f"Set all to one, with {software} for instance",
             )
     return {bus: "arm" if len(buses) == 1 else f"bus{place}" for place, bus in enumerate(buses, 1)}
 

@@ -12,19 +12,23 @@ from drivers.dynamixel.config import DynamixelConfig
 from drivers.feetech.config import FeetechConfig
 from drivers.ros2.config import Ros2Config
 from drivers.serial_lines.config import SerialLinesConfig
+from drivers.serial_lines.joints import SerialLineJoints
 from drivers.servos.joints import ServoJoints as ServoArm
+from interfaces.clock import SystemClock
 from interfaces.errors import ConfigError
 from interfaces.protocols import Clock, JointSource
 from kbmaps import RigidChain
 
+from .bench_wiring import require_bench, through_bench
 from .config import Config
-from .joints_watch import ServoJoints
-from .servo_wiring import require_servos, through_servos
+from .joints_watch import EncoderJoints
 from .sources import MarkerTopic, Sources, StampedJoints
 from .store import PairReader
 
 if TYPE_CHECKING:
     from drivers.ros2.joints import Ros2Joints
+
+Hardware = DynamixelConfig | FeetechConfig | SerialLinesConfig | Ros2Config
 
 
 @contextmanager
@@ -58,7 +62,7 @@ def open_joints(config: Config, clock: Clock) -> JointSource:
         ConfigError: no servos and no ROS 2 robot are configured.
         StoreError: the store, which tells where they were last, cannot be read.
     """
-    hardware, joints = config.tables.drivers.hardware, config.robot.joints
+    hardware = config.tables.drivers.hardware
     if hardware is None:
         raise ConfigError(
             "no servos, encoders or ROS 2 robot are configured",
@@ -66,8 +70,17 @@ def open_joints(config: Config, clock: Clock) -> JointSource:
             remedy="Add the table [drivers.dynamixel], [drivers.feetech], [drivers.serial_lines] or [drivers.ros2]: "
             "docs/hardware.md",
         )
+    return driver_of(hardware, config, clock, last_pose=_last_pose(config))
+
+
+def driver_of(hardware: Hardware, config: Config, clock: Clock, *, last_pose: list[float] | None) -> JointSource:
+    """The driver of the joints of robot.toml on `hardware`, not opened yet.
+
+    Args:
+        last_pose: where the joints were at the newest pair [rad]; None: nobody knows.
+    """
+    joints = config.robot.joints
     limits = list(zip(config.robot.lower.tolist(), config.robot.upper.tolist(), strict=True))
-    last_pose = _last_pose(config)
     match hardware:
         case DynamixelConfig():
             from drivers.dynamixel.joints import DynamixelJoints
@@ -78,24 +91,22 @@ def open_joints(config: Config, clock: Clock) -> JointSource:
 
             return FeetechJoints(hardware, joints, clock, limits=limits, last_pose=last_pose)
         case SerialLinesConfig():
-            from drivers.serial_lines.joints import SerialLineJoints
-
             return SerialLineJoints(hardware, joints, clock, limits=limits, last_pose=last_pose)
         case Ros2Config():
             return _ros2_joints(config, hardware, clock)
 
 
-def open_servos(config: Config, clock: Clock) -> ServoJoints:
-    """As `open_joints`, of an arm of servos.
+def open_encoders(config: Config, clock: Clock) -> EncoderJoints:
+    """As `open_joints`, of an arm whose servos or encoders are on a serial port.
 
     Raises:
-        ConfigError: the joints are not servos.
+        ConfigError: they are not.
     """
     match open_joints(config, clock):
-        case ServoArm() as joints:
+        case ServoArm() | SerialLineJoints() as joints:
             return joints
-    remedy = "This is for servos: [drivers.dynamixel] or [drivers.feetech]"
-    raise ConfigError("the joints are no servos", file=config.file, remedy=remedy)
+    remedy = "This is for [drivers.dynamixel], [drivers.feetech] and [drivers.serial_lines]"
+    raise ConfigError("the joints are neither servos nor encoders on a port", file=config.file, remedy=remedy)
 
 
 def _ros2_joints(config: Config, robot: Ros2Config, clock: Clock) -> Ros2Joints:
@@ -128,7 +139,7 @@ def _last_pose(config: Config) -> list[float] | None:
 
 def _require_source(config: Config, *, sim: bool) -> None:
     if sim and config.tables.sim.servo_bench:
-        require_servos(config)
+        require_bench(config)
     if sim or config.tables.drivers.recording is not None:
         return
     if config.tables.drivers.hardware is not None:
@@ -176,8 +187,13 @@ def _simulated(config: Config) -> Iterator[Sources]:
     settings = exact_encoders(config.tables.sim) if on_bench else config.tables.sim
     with SimWorld(config.robot, settings, config.simulation) as world:
         marker = TrackedCamera(world.camera, StereoTracker(world.camera.calibration, config.tables.vision))
-        joints = through_servos(config, world.joints) if on_bench else world.joints
+        joints = _through_bench(config, world.joints) if on_bench else world.joints
         yield Sources(joints, marker, world.clock, world)
+
+
+def _through_bench(config: Config, joints: JointSource) -> JointSource:
+    """The joints of the simulation, read by the driver that robot.toml configures."""
+    return through_bench(config, joints, lambda hardware: driver_of(hardware, config, SystemClock(), last_pose=None))
 
 
 @contextmanager

@@ -48,6 +48,7 @@ class FoundServo:
 
     Attributes:
         protocol: in words, as "Dynamixel 2.0".
+        firmware: its version, as its maker writes it.
         model: by name, or its number where it is not known; None when it does not tell.
         voltage_v, temperature_c: as it says itself; None when it does not tell.
         has_torque: its motor holds its place; None when it does not tell.
@@ -60,7 +61,7 @@ class FoundServo:
     protocol: str
     id: int
     model: str | None = None
-    firmware: int | None = None
+    firmware: str | None = None
     voltage_v: float | None = None
     temperature_c: float | None = None
     has_torque: bool | None = None

@@ -100,8 +100,8 @@ class SimConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
 
     Attributes:
         seed: all that is random is drawn from it.
-        servo_bench: the joints are read from the servos of [drivers], which stand on a bench where the simulated arm
-            is: through their driver, with their resolution.
+        servo_bench: the joints are read from the servos, encoders or ROS 2 robot of [drivers], which stand on a bench
+            where the simulated arm is: through their driver, with their resolution.
         tool_changes: tool changes at given simulated times, besides those that `SimWorld.change_tool` asks for.
     """
 

@@ -36,11 +36,12 @@ def bench(
 ) -> None:
     """A dry run of your robot.toml: its servos on a port that any program opens like a real one. Until Ctrl-C.
 
-    The servos are those of `[drivers.dynamixel]`, with their wire time and their rules; the simulated hand guides them
-    (without pybullet each swings slowly). PORT.toml is written beside PORT, your robot.toml with the bench's port and a
-    state of its own, for the other commands. Both are removed at the end.
+    The servos are those of `[drivers.dynamixel]` or `[drivers.feetech]`, the encoders those of
+    `[drivers.serial_lines]`, with their wire time and their rules; the simulated hand guides them (without pybullet
+    each swings slowly). PORT.toml is written beside PORT, your robot.toml with the bench's port and a state of its own,
+    for the other commands. Both are removed at the end.
 
-    Needs: robot.toml with servos (`bodyschema robot new`), no hardware.
+    Needs: robot.toml with servos (`bodyschema robot new`) or encoders, no hardware.
 
     Next: in another terminal `bodyschema scan`, `doctor` or `joints`, each with --robot PORT.toml.
     """
@@ -74,10 +75,10 @@ def _made(run: BenchRun, console: Console) -> BenchRun:
 
 
 def _look_on(run: BenchRun, console: Console) -> None:
-    with console.status("nobody has spoken to the servos yet") as status:
+    with console.status("nothing has gone over the wire yet") as status:
         while not run.stopping:
             for said in run.due():
                 console.print(said, markup=False)
-            if run.instructions:
-                status.update(f"the servos understood {run.instructions:,} packets")
+            if run.count:
+                status.update(f"{run.count:,} {run.unit}")
             time.sleep(GLANCE_S)

@@ -9,6 +9,12 @@ from cyclopts import Parameter
 from cyclopts.validators import Number
 
 OUT = Path("bodyschema-demo")
+WHAT = {
+    "dynamixel": "Dynamixel servos",
+    "feetech": "Feetech servos",
+    "serial": "encoders of a board",
+    "ros2": "a robot's",
+}
 
 
 def demo(
@@ -18,8 +24,8 @@ def demo(
     pairs_after: Annotated[int, Parameter(help="Pairs to learn after it.", validator=Number(gte=1))] = 300,
     seed: Annotated[int, Parameter(help="Another robot, another path, other noise.", validator=Number(gte=0))] = 0,
     bus: Annotated[
-        Literal["dynamixel"] | None,
-        Parameter(help="The joints are servos on a bench, read through their driver.", show_default=False),
+        Literal["dynamixel", "feetech", "serial", "ros2"] | None,
+        Parameter(help="The joints stand on a bench and are read by this driver.", show_default=False),
     ] = None,
 ) -> None:
     """Watch the whole thing learn, in simulation, in about a minute.
@@ -27,8 +33,9 @@ def demo(
     A humanoid's arm is guided by a virtual hand, its head cameras see a red ball on the tool. The sampler and the
     learner run as the two real processes; half-way the tool becomes 250 mm longer.
 
-    With --bus dynamixel the joints are read as on a real arm: from servos on a serial port, by the driver and
-    dynamixel-sdk. The servos are a bench at the bytes, and stand where the simulated arm is.
+    With --bus the joints are read as on a real arm, by the driver: from Dynamixel or Feetech servos or a board of
+    encoders (serial) on a serial port, or from a ROS 2 robot behind a zenoh router. All of these are a bench at the
+    bytes, and stand where the simulated arm is.
 
     Needs: the extra `sim` (`pip install 'bodyschema[sim]'`), and no hardware.
 
@@ -46,9 +53,9 @@ def demo(
 
     require_simulation()
     console = Console(highlight=False)
-    scene = prepare(out, seed, servos=bus is not None)
+    scene = prepare(out, seed, bus=bus)
     if bus is not None:
-        console.print(f"The joints are servos on a bench; {scene.log_file} tells of them.", soft_wrap=True)
+        console.print(f"The joints are {WHAT[bus]} on a bench; {scene.log_file} tells of them.", soft_wrap=True)
     with shown_on(console) as show:
         outcome = play(scene, first=pairs, second=pairs_after, seed=seed, show=show)
     write_curve(outcome.rows, scene.curve_file)

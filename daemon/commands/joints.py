@@ -25,11 +25,11 @@ def joints(
 ) -> None:
     """Each joint's angle, speed, current and temperature while you move it by hand, until Ctrl-C.
 
-    Torque is switched off first: hold the arm, it will sink. Below the table stands where the URDF says that the marker
-    went by the joint that you moved last: if it went the other way, the sign is wrong. Angles beyond the URDF's limits
-    are told, too.
+    Torque of servos is switched off first: hold the arm, it will sink. Below the table stands where the URDF says that
+    the marker went by the joint that you moved last: if it went the other way, the sign is wrong. Angles beyond the
+    URDF's limits are told, too.
 
-    Needs: robot.toml with servos (`bodyschema robot new`), and no sampler that runs.
+    Needs: robot.toml with servos (`bodyschema robot new`) or encoders, and no sampler that runs.
 
     Next: mend direction and zero_ticks in robot.toml; then `bodyschema run`.
     """
@@ -40,14 +40,14 @@ def joints(
     from daemon.joints_view import as_json, screen
     from daemon.joints_watch import JointsWatch
     from daemon.signals import on_termination
-    from daemon.wiring import open_servos
+    from daemon.wiring import open_encoders
     from interfaces.clock import SystemClock
 
     clock = SystemClock()
     config = Config.load(robot)
     console = Console(highlight=False)
     ending = _Ending()
-    with on_termination(ending.end), JointsWatch(config, open_servos(config, clock), clock) as watch:
+    with on_termination(ending.end), JointsWatch(config, open_encoders(config, clock), clock) as watch:
         seen = _first(watch)
         if once:
             console.file.write(as_json(seen) + "\n") if json else console.print(screen(seen))

@@ -50,9 +50,9 @@ def reproduce(
     import numpy as np
     from rich.console import Console
 
+    from daemon.progress import shown_on
     from daemon.reproduce import EXPERIMENTS, Run
     from daemon.reproduce.plot import plot
-    from daemon.reproduce.progress import shown_on
     from daemon.reproduce.show import show
     from interfaces.errors import ConfigError
 

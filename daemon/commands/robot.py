@@ -77,7 +77,7 @@ def _candidates(source: str, ports: Sequence[str], bauds: Sequence[int]) -> list
     from rich.console import Console
 
     from daemon import servo_wiring
-    from daemon.reproduce.progress import shown_on
+    from daemon.progress import shown_on
     from daemon.scan_report import as_json, report_of
     from daemon.servo_fitting import candidates_in, read_scan
 

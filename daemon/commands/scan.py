@@ -20,11 +20,12 @@ def scan(
     ] = None,
     json: Annotated[bool, flag("As JSON.")] = False,
 ) -> None:
-    """Which servos are there: every USB serial port, at every rate, in every protocol. About 12 s for a port.
+    """Which servos are there: every USB serial port, at every rate, in every protocol. Up to 15 s for a port.
 
-    A table of ID, model, firmware, supply, temperature, torque, and of what is wrong. With --robot also which servos
-    are missing, of another model, at another rate, double, or not in robot.toml. Nothing is written to any servo, and
-    torque stays as it is. Exit code 1 when not all is as it should be, or nobody answers.
+    Dynamixel servos of both protocols, and Feetech servos: a table of ID, model, firmware, supply, temperature, torque,
+    and of what is wrong. With --robot also which servos are missing, of another model, at another rate, double, or not
+    in robot.toml. Nothing is written to any servo, and torque stays as it is. Exit code 1 when not all is as it should
+    be, or nobody answers.
 
     Needs: servos with their supply on, and the right to open the port (`bodyschema doctor` tells).
 
@@ -33,8 +34,7 @@ def scan(
     from rich.console import Console
 
     from daemon import servo_wiring
-    from daemon.config import Config
-    from daemon.reproduce.progress import shown_on
+    from daemon.progress import shown_on
     from daemon.scan_report import as_json, report_of
     from daemon.scan_view import show
     from interfaces.errors import ConfigError
@@ -43,8 +43,11 @@ def scan(
     if unknown:
         known = ", ".join(map(str, servo_wiring.scanned_bauds()))
         raise ConfigError(f"--baud {unknown[0]} is no rate of such servos", remedy=f"Give one of {known}")
-    config = None if robot is None else Config.load(robot)
-    if config is not None:
+    config = None
+    if robot is not None:
+        from daemon.config import Config
+
+        config = Config.load(robot)
         servo_wiring.require_servos(config)
     ports = servo_wiring.ports_to_scan(port, config)
     with shown_on(Console(stderr=True, highlight=False), "scan") as tell:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import shutil
 import socket
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from daemon.wiring import demonstration_model
 from interfaces.errors import ConfigError
@@ -13,8 +15,9 @@ from interfaces.errors import ConfigError
 STATE = "state"
 # A folder with this file is a demo's, and may be emptied by the next one.
 MARK = ".bodyschema-demo"
+Bus = Literal["dynamixel", "feetech", "serial", "ros2"]
 # Light ones in the neck, strong ones in the shoulder.
-SERVOS = {
+DYNAMIXEL = {
     "neck_yaw": "XL330-M288",
     "neck_pitch": "XL330-M288",
     "shoulder_flexion": "XM540-W270",
@@ -23,6 +26,7 @@ SERVOS = {
     "elbow_flexion": "XM430-W350",
     "forearm_rotation": "XM430-W350",
 }
+FEETECH = {joint: "STS3250" if joint.startswith("shoulder") else "STS3215" for joint in DYNAMIXEL}
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,11 +71,11 @@ class Scene:
         return self.folder / "learning_curve.png"
 
 
-def prepare(folder: Path, seed: int, *, servos: bool = False) -> Scene:
+def prepare(folder: Path, seed: int, *, bus: Bus | None = None) -> Scene:
     """Lay out the demo's folder; what an earlier demo left there is replaced.
 
     Args:
-        servos: the joints are Dynamixel servos on a bench.
+        bus: what the joints are read through, from a bench.
 
     Raises:
         ConfigError: the folder is neither empty nor a demo's, or cannot be written.
@@ -89,7 +93,7 @@ def prepare(folder: Path, seed: int, *, servos: bool = False) -> Scene:
             if path.suffix in {".urdf", ".toml"}:
                 shutil.copyfile(path, folder / path.name)
         scene = Scene(folder.resolve())
-        scene.robot_file.write_text(model.read_text(encoding="utf-8") + _own_tables(seed, servos), encoding="utf-8")
+        scene.robot_file.write_text(model.read_text(encoding="utf-8") + _own_tables(seed, bus), encoding="utf-8")
     except OSError as error:
         raise ConfigError(
             f"cannot be written: {error.strerror}", file=folder, remedy="Give another --out or free some space"
@@ -97,9 +101,9 @@ def prepare(folder: Path, seed: int, *, servos: bool = False) -> Scene:
     return scene
 
 
-def _own_tables(seed: int, servos: bool) -> str:
+def _own_tables(seed: int, bus: Bus | None) -> str:
     sampler, learner = _free_ports(2)
-    bench = f"servo_bench = true\n{_servos()}" if servos else ""
+    bench = "" if bus is None else f"servo_bench = true\n{_joints(bus)}"
     return f"""
 [zenoh]
 sampler = "tcp/127.0.0.1:{sampler}"
@@ -113,11 +117,24 @@ seed = {seed}
 {bench}"""
 
 
-def _servos() -> str:
-    """The arm as one would build it of servos."""
-    lines = ["", "[drivers.dynamixel.buses.arm]", 'port = "bus"']
-    for id, (joint, model) in enumerate(SERVOS.items(), 1):
-        lines += ["", "[[drivers.dynamixel.servos]]", f'joint = "{joint}"', f"id = {id}", f'model = "{model}"']
+def _joints(bus: Bus) -> str:
+    """The arm's joints as one would build them."""
+    match bus:
+        case "dynamixel":
+            return _servos("dynamixel", DYNAMIXEL)
+        case "feetech":
+            return _servos("feetech", FEETECH)
+        case "serial":
+            encoders = (f'[[drivers.serial_lines.encoders]]\njoint = "{joint}"\n' for joint in DYNAMIXEL)
+            return "\n".join(["", "[drivers.serial_lines]", 'port = "bus"', "", *encoders])
+        case "ros2":
+            return "\n[drivers.ros2]\n"
+
+
+def _servos(make: str, models: Mapping[str, str]) -> str:
+    lines = ["", f"[drivers.{make}.buses.arm]", 'port = "bus"']
+    for id, (joint, model) in enumerate(models.items(), 1):
+        lines += ["", f"[[drivers.{make}.servos]]", f'joint = "{joint}"', f"id = {id}", f'model = "{model}"']
     return "\n".join(lines) + "\n"
 
 

@@ -7,11 +7,12 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
+from daemon.progress import counted
+
 from .arm import CRUDE, JOINTS, OTHER_SIX, arm, crude_estimate, uniform
 from .experiment import MEAN_NOISE, Column, Comparison, Curve, Experiment, Pairs, Panel, Reading, Run, Tests
 from .least_squares import REGULARISED, blank_map, plain, regularised
 from .models import FROM_NOTHING, SEARCHED, WITH_DRAWING, Knowledge, learn_all
-from .progress import counted
 
 SIGMA_M = 0.010
 HALF_DEG, FAR_DEG = 80.0, 120.0

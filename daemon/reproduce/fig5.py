@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from daemon.progress import counted
 from interfaces.records import FloatArray
 from kbmaps import RigidChain
 
@@ -15,7 +16,6 @@ from .experiment import MEAN_NOISE, Column, Comparison, Curve, Experiment, Pairs
 from .least_squares import REGULARISED, blank_map, plain, regularised
 from .measured import Measured, postures
 from .models import FROM_NOTHING, SEARCHED, WITH_DRAWING, Knowledge, learn_all
-from .progress import counted
 from .walk import walk
 
 SIGMA_M = 0.020

@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 
 from daemon.config import DaemonConfig
+from daemon.progress import Say
 from daemon.wiring import open_postures, open_sources, simulated_truth
 from interfaces.records import FloatArray
 from kbmaps import RigidChain
 
 from .arm import JOINTS
 from .arm import configuration as configured
-from .progress import Say
 from .sampling import sampled
 
 # The tracker may miss the ball in some of the postures.

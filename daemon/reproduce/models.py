@@ -8,6 +8,7 @@ from math import inf
 
 import numpy as np
 
+from daemon.progress import Say, counted, quiet
 from interfaces.records import FloatArray
 from kbmaps import (
     ChainTolerances,
@@ -22,7 +23,6 @@ from kbmaps import (
 from kbmaps.model import Model
 
 from .experiment import Curve, Pairs, Tests, distances
-from .progress import Say, counted, quiet
 
 # Pairs from which a chain is searched where nothing is known of the arm.
 SEARCHED = 100

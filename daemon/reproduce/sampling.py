@@ -11,6 +11,7 @@ import numpy as np
 
 from daemon.bus import Bus
 from daemon.config import Config
+from daemon.progress import TELL_EVERY_S, Say
 from daemon.sampler import Sampler
 from daemon.session import session_of
 from daemon.sources import Sources
@@ -19,8 +20,6 @@ from interfaces.clock import SystemClock
 from interfaces.errors import SourceEnded, SourceError
 from interfaces.protocols import MarkerSource
 from interfaces.records import FloatArray, MarkerFix, MarkerMiss
-
-from .progress import TELL_EVERY_S, Say
 
 
 class _Enough:

@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 
 from daemon.config import LearnerConfig
 from daemon.learning import DirectSolver, Learning, NominalModel
+from daemon.progress import Say, counted
 from interfaces.records import FloatArray, Pair, frozen_array
 from kbmaps import NLMS, JointBasis, KBMap, RigidChain
 
 from .experiment import Curve, Tests, distances
 from .models import WITH_DRAWING, Knowledge, learn_all, spread_counts
-from .progress import Say, counted
 
 ALPHA = np.radians(60.0)
 EVERY = 10

@@ -12,13 +12,13 @@ from typing import Self
 import numpy as np
 
 from daemon.config import DaemonConfig
+from daemon.progress import Say, quiet
 from daemon.sources import Sources
 from interfaces.clock import SystemClock
 from interfaces.records import FloatArray, JointReading, MarkerFix, frozen_array
 from kbmaps import RigidChain
 
 from .arm import configuration
-from .progress import Say, quiet
 from .sampling import sampled
 
 # Normally distributed about zero with this standard deviation [rad].

@@ -114,8 +114,8 @@ class ServoChain(OnlyAnswers, ABC, Generic[ServoT]):
         """Error and data of part of a control table at `t`."""
 
     @abstractmethod
-    def _packet(self, servo: ServoT, error: Any, params: bytes) -> bytes:
-        """A status packet."""
+    def _packet(self, servo: ServoT, id: int, error: Any, params: bytes) -> bytes:
+        """A status packet of a servo that was asked by this ID."""
 
     @abstractmethod
     def _will_answer(self, servo: ServoT, code: int) -> bool:
@@ -131,11 +131,10 @@ class ServoChain(OnlyAnswers, ABC, Generic[ServoT]):
         if not servos:
             return []
         start = t + min(servo.return_delay_s for servo in servos)
+        id = servos[0].id  # whoever is given another one answers with that by which it was asked
         done = [(servo, act(servo, start)) for servo in servos]
-        packets = [self._packet(servo, *told) for servo, told in done if self._will_answer(servo, code)]
-        if not packets:
-            return []
-        return [Reply(servos[0].id, start, mixed(packets))]
+        packets = [self._packet(servo, id, *told) for servo, told in done if self._will_answer(servo, code)]
+        return [Reply(id, start, mixed(packets))] if packets else []
 
     def _in_turn(self, servos: list[ServoT], asked: list[tuple[int, int, int]], t: float, code: int) -> list[Reply]:
         replies: list[Reply] = []

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import fcntl
 import math
 import os
 import select
+import struct
 import termios
 import threading
 import time
@@ -21,6 +23,9 @@ from .device import Device, Reply, byte_s
 _BAUDS = {getattr(termios, name): int(name[1:]) for name in dir(termios) if name[0] == "B" and name[1:].isdigit()}
 DEFAULT_BAUD = 38_400  # of a terminal that nobody has set
 LINE_SPEED = 5  # place of the output speed in termios.tcgetattr
+# <asm-generic/termbits.h>: the only call that tells any rate. A program may set its rate so that tcgetattr, which knows
+# the rates that have a name, tells none.
+TCGETS2, TERMIOS2 = 0x802C542A, struct.Struct("=4I20s2I")
 
 
 class PtyShell:
@@ -107,7 +112,7 @@ class _Serving:
 
     @property
     def _baud(self) -> int:
-        return _BAUDS.get(termios.tcgetattr(self._slave)[LINE_SPEED], 0) or DEFAULT_BAUD
+        return _line_speed(self._slave) or DEFAULT_BAUD
 
     def _hear(self, data: bytes) -> None:
         self._bring(self._device.send(data, self._now(), self._baud), self._baud)
@@ -117,3 +122,12 @@ class _Serving:
             self._order += 1
             end = reply.start + len(reply.data) * byte_s(baud)
             heappush(self._due, (end, self._order, reply.data))
+
+
+def _line_speed(descriptor: int) -> int:
+    """The rate [bit/s] to which a terminal was set; 0 when nobody has."""
+    try:
+        *_, speed = TERMIOS2.unpack(fcntl.ioctl(descriptor, TCGETS2, bytes(TERMIOS2.size)))
+    except OSError:  # a system that has no such call
+        return _BAUDS.get(termios.tcgetattr(descriptor)[LINE_SPEED], 0)
+    return speed

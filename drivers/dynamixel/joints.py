@@ -33,7 +33,9 @@ def _block_requests(bus: ServoBus, servos: Sequence[FittedServo], config: BusCon
     return block_requests(bus, servos, try_fast=config.fast_sync_read == "auto")
 
 
-DYNAMIXEL = Make(DynamixelConfig.table, BY_NUMBER, HARDWARE_ERRORS, Bus, Channel, _block_requests, TICK_S)
+DYNAMIXEL = Make(
+    DynamixelConfig.table, BY_NUMBER, HARDWARE_ERRORS, Bus, Channel, "DYNAMIXEL Wizard", _block_requests, TICK_S
+)
 
 
 class DynamixelJoints(ServoJoints):

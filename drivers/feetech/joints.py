@@ -54,7 +54,7 @@ def _block_request(bus: ServoBus, servo: FittedServo) -> Request:
     return bus.read_request(servo.model, servo.id, servo.model.layout.block)
 
 
-FEETECH = Make(FeetechConfig.table, BY_NUMBER, HARDWARE_ERRORS, Bus, Channel, block_requests)
+FEETECH = Make(FeetechConfig.table, BY_NUMBER, HARDWARE_ERRORS, Bus, Channel, "Feetech's FD", block_requests)
 
 
 class FeetechJoints(ServoJoints):

@@ -22,6 +22,7 @@ class Make:
         errors: what each bit of the hardware error means, and what to do.
         bus: a bus of its protocols.
         channel: one servo's answers.
+        software: its maker's program with which its servos are set up.
         block_requests: the questions of one reading of the servos of a bus.
         tick_s: of the clock with which its servos stamp what they measure [s]; 0 without one.
     """
@@ -31,5 +32,6 @@ class Make:
     errors: Mapping[int, str]
     bus: type[Bus]
     channel: Callable[[FittedServo], Channel]
+    software: str
     block_requests: Callable[[Bus, Sequence[FittedServo], Any], list[Request]]
     tick_s: float = 0.0

@@ -37,6 +37,10 @@ class Register:
             value = abs(value) | (1 << self.sign_bit if value < 0 else 0)
         return value.to_bytes(self.size, self.order, signed=self.signed)
 
+    def words(self, table: bytes) -> str:
+        """The register's bytes in a control table from its beginning, each as a number, as versions are written."""
+        return ".".join(map(str, table[self.address : self.end]))
+
     @property
     def end(self) -> int:
         """The address after the last byte."""

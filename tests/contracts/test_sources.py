@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+import shutil
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from itertools import count
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 import pytest
 from scripted_sources import COV, Scripted
 
+from daemon.bench_wiring import through_bench
+from daemon.config import Config
+from daemon.wiring import driver_of
 from drivers.bench.device import Faults
 from drivers.bench.virtual_port import VirtualClock, VirtualPort
 from drivers.dynamixel.bench.chain import Chain, no_faults
@@ -36,6 +42,7 @@ from drivers.ros2.joints import Ros2Joints
 from drivers.serial_lines.bench.board import EncoderBoard
 from drivers.serial_lines.config import EncoderConfig, SerialLinesConfig
 from drivers.serial_lines.joints import SerialLineJoints
+from interfaces.clock import SystemClock
 from interfaces.errors import SourceEnded, SourceError
 from interfaces.protocols import JointSource, MarkerSource, StereoCamera
 from interfaces.recording import Recording
@@ -181,6 +188,39 @@ def encoders_on_the_bench(faults: Faults = no_faults) -> Iterator[Rig]:
     yield Rig(SerialLineJoints(config, ("a", "b"), clock, open_port=lambda *_: VirtualPort(board, clock, 115_200)))
 
 
+ARM = Path(__file__).parents[2] / "examples" / "desk_arm"
+
+
+@contextmanager
+def through_a_bench(file: str, tables: str = "") -> Iterator[Rig]:
+    """Joints of another source, read from a bench by the driver that a robot.toml configures."""
+    with TemporaryDirectory() as folder:
+        arm = shutil.copytree(ARM, Path(folder) / "arm")
+        with (arm / file).open("a", encoding="utf-8") as toml:
+            toml.write(tables)
+        config = Config.load(arm / file, {})
+        poses = [JointReading(t, frozen_array([0.01 * k, 0.1, -0.01 * k, 0.2])) for k, t in enumerate(TIMES.tolist())]
+        scripted = Scripted(poses, config.robot.joints)
+        clock = SystemClock()
+        yield Rig(through_bench(config, scripted, lambda there: driver_of(there, config, clock, last_pose=None)))
+
+
+def through_dynamixel_servos() -> AbstractContextManager[Rig]:
+    return through_a_bench("servos.toml")
+
+
+def through_feetech_servos() -> AbstractContextManager[Rig]:
+    return through_a_bench("feetech.toml")
+
+
+def through_encoders() -> AbstractContextManager[Rig]:
+    return through_a_bench("encoders.toml")
+
+
+def through_ros_2() -> AbstractContextManager[Rig]:
+    return through_a_bench("robot.toml", '\n[drivers.ros2]\nrouter = "tcp/127.0.0.1:17447"\n')
+
+
 def servos_that_fall_silent() -> AbstractContextManager[Rig]:
     said = count()
     return servos_on_the_bench(lambda reply: reply if next(said) < 30 else replace(reply, data=b""))
@@ -212,14 +252,15 @@ def swinging(id: int) -> Callable[[float], float]:
     return lambda t: float(np.sin(t + id))
 
 
+THROUGH = [through_dynamixel_servos, through_feetech_servos, through_encoders, through_ros_2]
 SIMULATED = pytest.mark.skipif(find_spec("pybullet") is None, reason="pybullet is not installed")
-ENDING_JOINTS = [replayed_joints, scripted_joints, pytest.param(simulated_joints, marks=SIMULATED)]
+ENDING_JOINTS = [replayed_joints, scripted_joints, pytest.param(simulated_joints, marks=SIMULATED), *THROUGH]
 JOINTS = [*ENDING_JOINTS, servos_on_the_bench, feetech_servos_on_the_bench, encoders_on_the_bench, ros_2_robot]
 SILENT_SERVOS = [servos_that_fall_silent, feetech_servos_that_fall_silent]
 SILENT = [*SILENT_SERVOS, encoders_that_fall_silent, ros_2_robot_that_falls_silent]
 MARKERS = [replayed_marker, scripted_marker, pytest.param(tracked_camera, marks=SIMULATED)]
 CAMERAS = [pytest.param(simulated_camera, marks=SIMULATED)]
-STANDING_STILL = [*ENDING_JOINTS[2:], *MARKERS[2:], *CAMERAS]
+STANDING_STILL = [ENDING_JOINTS[2], *MARKERS[2:], *CAMERAS]
 Make = Callable[[], AbstractContextManager[Rig]]
 
 
@@ -286,9 +327,7 @@ def test_the_end_is_said_each_time_one_reads(make: Make) -> None:
 # --- waiting
 
 
-@pytest.mark.parametrize(
-    "make", [replayed_joints, replayed_marker, *ENDING_JOINTS[2:], *SILENT, *MARKERS[2:], *CAMERAS]
-)
+@pytest.mark.parametrize("make", [replayed_joints, replayed_marker, ENDING_JOINTS[2], *SILENT, *MARKERS[2:], *CAMERAS])
 def test_where_nothing_comes_in_time_none_is_returned(make: Make) -> None:
     with make() as rig, rig.opened():
         while rig.source.read(0.01) is not None:  # time stands still until the other side is read too
@@ -353,3 +392,12 @@ def test_a_camera_gives_two_colour_images_of_its_calibration_s_size(frames) -> N
         assert type(frame) is StereoFrame
         for image in (frame.left, frame.right):
             assert (image.shape, image.dtype) == ((height, width, 3), np.uint8)
+
+
+@pytest.mark.parametrize("make", THROUGH)
+def test_joints_through_a_bench_are_those_of_the_source_at_its_times(make: Make) -> None:
+    with make() as rig, rig.opened():
+        told = rig.read(ROWS)
+    assert [reading.t for reading in told] == TIMES.tolist()
+    expected = [[0.01 * k, 0.1, -0.01 * k, 0.2] for k in range(ROWS)]
+    assert np.abs(np.array([reading.q for reading in told]) - expected).max() <= np.pi / 4096 + 1e-9

@@ -29,6 +29,9 @@ def config(folder: Path) -> Config:
     return Config.load(folder / "servos.toml", {})
 
 
+EACH = pytest.mark.parametrize("file", ["servos.toml", "feetech.toml", "encoders.toml"])
+
+
 def test_the_written_file_is_the_users_with_the_port_of_the_bench(config, folder) -> None:
     with BenchRun(config, folder / "bus") as run:
         written = Config.load(run.robot_file, {})
@@ -39,26 +42,38 @@ def test_the_written_file_is_the_users_with_the_port_of_the_bench(config, folder
     assert written.state_dir != config.state_dir
 
 
-def test_the_driver_reads_the_bench_by_the_written_file(config, folder) -> None:
+@EACH
+def test_the_driver_reads_the_bench_by_the_written_file(file, folder) -> None:
+    config = Config.load(folder / file, {})
     with BenchRun(config, folder / "bus") as run:
         with open_joints(Config.load(run.robot_file, {}), SystemClock()) as joints:
             reading = next(told for _ in range(100) if (told := joints.read(0.1)) is not None)
-        assert run.instructions > 0
+        assert run.count > 0
     assert reading.q == pytest.approx(np.zeros(4), abs=0.01)
 
 
-def test_a_bench_leaves_nothing_behind(config, folder) -> None:
+@EACH
+def test_a_bench_leaves_nothing_behind(file, folder) -> None:
+    config = Config.load(folder / file, {})
     before = set(folder.iterdir())
     with BenchRun(config, folder / "bus"):
         pass
     assert set(folder.iterdir()) == before
 
 
-def test_the_introduction_says_what_to_type(config, folder) -> None:
-    with BenchRun(config, folder / "bus") as run:
+@pytest.mark.parametrize(
+    ("file", "what", "command"),
+    [
+        ("servos.toml", "4 servos", "scan"),
+        ("feetech.toml", "4 servos", "joints"),
+        ("encoders.toml", "4 encoders", "doctor"),
+    ],
+)
+def test_the_introduction_says_what_to_type(file, what, command, folder) -> None:
+    with BenchRun(Config.load(folder / file, {}), folder / "bus") as run:
         said = "\n".join(run.introduction())
-    assert "desk_arm: 4 servos on" in said
-    assert f"bodyschema scan --robot {folder / 'bus.toml'}" in said
+    assert f"desk_arm: {what} on {folder / 'bus'} at " in said
+    assert f"bodyschema {command} --robot {folder / 'bus.toml'}" in said
 
 
 def test_what_was_asked_for_happens_when_its_time_has_come(config, folder) -> None:

@@ -44,25 +44,45 @@ def state(tmp_path, monkeypatch, free_endpoint) -> None:
 
 
 @pytest.mark.usefixtures("state")
-def test_an_arm_on_the_bench_is_well_within_five_seconds(tmp_path, capsys) -> None:
-    with BenchRun(Config.load(EXAMPLE), tmp_path / "bus") as run:
+@pytest.mark.parametrize(
+    ("file", "what"), [("servos.toml", "servos"), ("feetech.toml", "servos"), ("encoders.toml", "encoders")]
+)
+def test_an_arm_on_the_bench_is_well_within_five_seconds(file, what, tmp_path, capsys) -> None:
+    with BenchRun(Config.load(EXAMPLE.with_name(file)), tmp_path / "bus") as run:
         begin = time.monotonic()
         code = called("doctor", "--robot", run.robot_file, "--json")
         assert time.monotonic() - begin < LONGEST_S
     told = json.loads(capsys.readouterr().out)
     assert (code, told["well"]) == (0, True)
+    port = "port of arm" if what == "servos" else "port of board"
     assert {check["subject"] for check in told["checks"]} == {
-        "robot.toml", "camera", "port of arm", "servos", "rate", "errors", "disk", "clock", "zenoh",
+        "robot.toml", "camera", port, what, "rate", "errors", "disk", "clock", "zenoh",
     }  # fmt: skip
 
 
 @pytest.mark.usefixtures("state")
-def test_what_is_wrong_is_exit_code_1_and_has_its_remedy(tmp_path, capsys) -> None:
-    with BenchRun(Config.load(EXAMPLE), tmp_path / "bus", faults=["overload@elbow_pitch"]) as run:
+@pytest.mark.parametrize(
+    ("file", "fault", "mend"),
+    [
+        ("servos.toml", "overload@elbow_pitch", "free the joint, then reboot the servo"),
+        ("feetech.toml", "overload@elbow_pitch", "free the joint, then switch its supply off and on"),
+    ],
+)
+def test_what_is_wrong_is_exit_code_1_and_has_its_remedy(file, fault, mend, tmp_path, capsys) -> None:
+    with BenchRun(Config.load(EXAMPLE.with_name(file)), tmp_path / "bus", faults=[fault]) as run:
         code = called("doctor", "--robot", run.robot_file, "--json")
     wrong = [check for check in json.loads(capsys.readouterr().out)["checks"] if check["state"] == "wrong"]
     assert code == 1
-    assert [check["mend"] for check in wrong] == ["free the joint, then reboot the servo"]
+    assert [check["mend"] for check in wrong] == [mend]
+
+
+@pytest.mark.usefixtures("state")
+def test_a_sensor_without_a_value_is_wrong(tmp_path, capsys) -> None:
+    arm = Config.load(EXAMPLE.with_name("encoders.toml"))
+    with BenchRun(arm, tmp_path / "bus", faults=["sensor@elbow_pitch"]) as run:
+        assert called("doctor", "--robot", run.robot_file, "--json") == 1
+    wrong = [check for check in json.loads(capsys.readouterr().out)["checks"] if check["state"] == "wrong"]
+    assert ["elbow_pitch" in check["said"] for check in wrong] == [True]
 
 
 @pytest.mark.usefixtures("state")

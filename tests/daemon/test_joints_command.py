@@ -14,9 +14,10 @@ from daemon.bench_run import BenchRun
 from daemon.cli import app
 from daemon.config import Config
 from daemon.joints_view import screen
-from daemon.joints_watch import JointState, JointsWatch, Seen, SignCheck
+from daemon.joints_watch import JointState, JointsWatch, Seen, SignCheck, Speeds
 from daemon.wiring import open_joints
-from drivers.dynamixel.bench.dry_run import DryRun
+from drivers.bench.dry_run import DryRun
+from drivers.dynamixel.bench.arm import DynamixelArm
 from interfaces.clock import SystemClock
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "desk_arm" / "servos.toml"
@@ -84,7 +85,7 @@ def test_the_watch_has_angles_speeds_temperatures_and_ranges(config, tmp_path) -
     shoulder = [0.2]
     angles = {joint: (lambda _: 0.1) for joint in config.robot.joints} | {"shoulder_pitch": lambda _: shoulder[0]}
     servos = config.tables.drivers.dynamixel
-    with DryRun(servos, angles, {"arm": tmp_path / "bus"}) as bench:
+    with DryRun(DynamixelArm(servos, angles), {"arm": tmp_path / "bus"}) as bench:
         (tmp_path / "desk_arm.urdf").write_bytes(config.robot.tree.file.read_bytes())
         (tmp_path / "robot.toml").write_text(
             EXAMPLE.read_text().replace(servos.buses["arm"].port, str(tmp_path / "bus"))
@@ -96,7 +97,7 @@ def test_the_watch_has_angles_speeds_temperatures_and_ranges(config, tmp_path) -
                 look_until(watch, lambda seen: abs(seen.joints[PITCH].angle - shoulder[0]) < 0.01)
             watch.know_temperatures()
             seen = look_until(watch, lambda seen: True)
-        assert bench.instructions > 20
+        assert bench.arm.count > 20
     pitch = seen.joints[PITCH]
     assert (pitch.low, pitch.high) == pytest.approx((0.2, 0.6), abs=0.01)
     assert [joint.temperature_c for joint in seen.joints] == [31.0] * 4
@@ -112,20 +113,31 @@ def look_until(watch: JointsWatch, done) -> Seen:
     raise AssertionError("it was never seen")
 
 
-def test_once_gives_one_line_of_json(tmp_path, capsys) -> None:
-    with BenchRun(Config.load(EXAMPLE, {}), tmp_path / "bus") as run:
+@pytest.mark.parametrize(
+    ("file", "ids"), [("servos.toml", [1, 2, 3, 4]), ("feetech.toml", [1, 2, 3, 4]), ("encoders.toml", [None] * 4)]
+)
+def test_once_gives_one_line_of_json(file, ids, tmp_path, capsys) -> None:
+    with BenchRun(Config.load(EXAMPLE.with_name(file), {}), tmp_path / "bus") as run:
         app(
             ["joints", "--robot", str(run.robot_file), "--once", "--json"],
             exit_on_error=False,
             result_action="return_value",
         )
     (line,) = capsys.readouterr().out.splitlines()
+    assert [joint["id"] for joint in json.loads(line)["joints"]] == ids
     assert [joint["joint"] for joint in json.loads(line)["joints"]] == [
         "base_yaw",
         "shoulder_pitch",
         "elbow_pitch",
         "wrist_roll",
     ]
+
+
+def test_the_speed_of_encoders_that_do_not_tell_it_is_that_of_their_angles() -> None:
+    speeds = Speeds(1)
+    for k in range(100):
+        speeds.take(0.01 * k, np.array([0.3 * 0.01 * k]))
+    assert speeds.v == pytest.approx([0.3])
 
 
 # --- the screen

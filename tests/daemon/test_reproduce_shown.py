@@ -13,7 +13,8 @@ pytest.importorskip("matplotlib")
 
 from matplotlib.figure import Figure
 
-from daemon.reproduce import Column, Comparison, Curve, Experiment, Panel, Reading, plot, progress
+from daemon import progress
+from daemon.reproduce import Column, Comparison, Curve, Experiment, Panel, Reading, plot
 from daemon.reproduce.show import show
 
 LONG = "without noise; steps of 1° to 3° a joint; near the walk"

@@ -11,6 +11,7 @@ import pytest
 from daemon.bench_run import BenchRun
 from daemon.cli import command_line
 from daemon.config import Config
+from daemon.servo_wiring import servos_of
 from interfaces.errors import ConfigError
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "desk_arm"
@@ -35,7 +36,7 @@ def four(tmp_path: Path) -> Path:
 
 
 def servos(file: Path) -> dict[str, tuple[int, str]]:
-    table = Config.load(file, {}).tables.drivers.dynamixel
+    table = servos_of(Config.load(file, {}))
     assert table is not None
     return {servo.joint: (servo.id, servo.model) for servo in table.servos}
 
@@ -114,9 +115,32 @@ def test_two_ports_are_two_buses(tmp_path) -> None:
     ]
 
 
-def test_the_servos_of_a_bench_are_found_and_written(tmp_path) -> None:
-    with BenchRun(Config.load(EXAMPLE / "servos.toml", {}), tmp_path / "bus"):
+def test_servos_of_two_makes_make_no_arm(tmp_path) -> None:
+    mixed = scan(tmp_path / "found.json", (1, "STS3215"), (2, "MX-28"))
+    with pytest.raises(ConfigError, match=r"of two makes, drivers\.feetech and drivers\.dynamixel"):
+        new("--from", mixed, "--robot", tmp_path / "robot.toml", "--yes")
+    assert not (tmp_path / "robot.toml").exists()
+
+
+def test_a_servo_at_a_rate_that_robot_toml_cannot_name_is_not_used(tmp_path) -> None:
+    found = scan(tmp_path / "found.json", (1, "MX-28"), baud=500_000)
+    with pytest.raises(ConfigError, match="no servo was found that can be used"):
+        new("--from", found, "--robot", tmp_path / "robot.toml", "--yes")
+
+
+def test_the_zero_of_a_model_is_told(tmp_path) -> None:
+    new("--from", scan(tmp_path / "found.json", (1, "SCS0009")), "--robot", tmp_path / "robot.toml", "--yes")
+    assert "# zero_ticks = 512 " in (tmp_path / "robot.toml").read_text()
+
+
+@pytest.mark.parametrize(
+    ("file", "models"),
+    [
+        ("servos.toml", ["XM430-W350", "XM540-W270", "XM430-W350", "MX-28"]),
+        ("feetech.toml", ["STS3215", "STS3250", "STS3215", "STS3215"]),
+    ],
+)
+def test_the_servos_of_a_bench_are_found_and_written(file, models, tmp_path) -> None:
+    with BenchRun(Config.load(EXAMPLE / file, {}), tmp_path / "bus"):
         new("--port", tmp_path / "bus", "--baud", 1000000, "--robot", tmp_path / "robot.toml", "--yes")
-    assert [model for _, model in servos(tmp_path / "robot.toml").values()] == [
-        "XM430-W350", "XM540-W270", "XM430-W350", "MX-28",
-    ]  # fmt: skip
+    assert [model for _, model in servos(tmp_path / "robot.toml").values()] == models

@@ -3,46 +3,90 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from random import Random
+from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 import pytest
 
+from drivers.bench.asked_faults import AskedFault, FaultKinds, WireFaults
 from drivers.bench.device import Reply
-from drivers.dynamixel.bench.asked_faults import KINDS, ON_THE_WIRE, AskedFault, WireFaults
-from drivers.dynamixel.bench.dry_run import DryRun
-from drivers.dynamixel.bench.motion import played, swinging
-from drivers.dynamixel.bench.through_servos import ThroughServos
+from drivers.bench.dry_run import DryRun
+from drivers.bench.motion import played, swinging
+from drivers.bench.through_driver import Look, ThroughDriver
+from drivers.dynamixel.bench.arm import KINDS, DynamixelArm
 from drivers.dynamixel.config import BusConfig, DynamixelConfig, ServoConfig
 from drivers.dynamixel.joints import DynamixelJoints
+from drivers.feetech.bench.arm import KINDS as FEETECH_KINDS
+from drivers.feetech.bench.arm import FeetechArm
+from drivers.feetech.config import BusConfig as FeetechBus
+from drivers.feetech.config import FeetechConfig
+from drivers.feetech.joints import FeetechJoints
+from drivers.serial_lines.bench.arm import KINDS as LINE_KINDS
+from drivers.serial_lines.bench.arm import EncoderArm
+from drivers.serial_lines.config import EncoderConfig, SerialLinesConfig
+from drivers.serial_lines.joints import SerialLineJoints
 from interfaces.clock import SystemClock
 from interfaces.errors import ConfigError, SourceError
 from interfaces.records import JointReading
 
 JOINTS = ("waist", "shoulder", "elbow")
 LIMITS = [(-3.0, 3.0)] * 3
-CONFIG = DynamixelConfig(
-    {"arm": BusConfig("elsewhere", latency_ms=20.0)},
+ENTRIES = ((1, "XM430-W350"), (2, "XM430-W350"), (5, "MX-28(2.0)"))
+TURNED = ({}, {"direction": -1}, {"zero_ticks": 1000})
+
+
+def dynamixel(ports: tuple[str, ...] = ("arm",), buses: tuple[str, ...] = ("arm",) * 3) -> DynamixelConfig:
+    servos = (
+        ServoConfig(joint, id, model, bus=bus, **how)
+        for joint, (id, model), bus, how in zip(JOINTS, ENTRIES, buses, TURNED, strict=True)
+    )
+    return DynamixelConfig({port: BusConfig("elsewhere", latency_ms=20.0) for port in ports}, tuple(servos))
+
+
+CONFIG = dynamixel()
+FEETECH_CONFIG = FeetechConfig(
+    {"arm": FeetechBus("elsewhere", latency_ms=20.0)},
     (
-        ServoConfig("waist", 1, "XM430-W350"),
-        ServoConfig("shoulder", 2, "XM430-W350", direction=-1),
-        ServoConfig("elbow", 5, "MX-28(2.0)", zero_ticks=1000),
+        ServoConfig("waist", 1, "STS3215"),
+        ServoConfig("shoulder", 2, "STS3250", direction=-1),
+        ServoConfig("elbow", 5, "STS3215", zero_ticks=1000),
     ),
 )
+LINES_CONFIG = SerialLinesConfig(
+    "elsewhere",
+    (
+        EncoderConfig("waist"),
+        EncoderConfig("shoulder", encoder="a2", direction=-1),
+        EncoderConfig("elbow", zero_ticks=1000, ticks_per_turn=16384),
+    ),
+)
+# Of each make: its bench, the configured arm, the kinds of faults, and the driver.
+MAKES: dict[str, tuple[Any, Any, FaultKinds, Any]] = {
+    "Dynamixel": (DynamixelArm, CONFIG, KINDS, DynamixelJoints),
+    "Feetech": (FeetechArm, FEETECH_CONFIG, FEETECH_KINDS, FeetechJoints),
+    "serial lines": (EncoderArm, LINES_CONFIG, LINE_KINDS, SerialLineJoints),
+}
+EACH = pytest.mark.parametrize("make", MAKES)
+SERVOS = pytest.mark.parametrize("make", ["Dynamixel", "Feetech"])
 TICK = 2 * math.pi / 4096
 POSE = (0.5, -0.25, 1.0)
 
 
-def standing(tmp_path: Path, *faults: str, config: DynamixelConfig = CONFIG, seed: int = 0) -> DryRun:
-    asked = [AskedFault.parsed(fault, JOINTS) for fault in faults]
+def standing(tmp_path: Path, make: str, *faults: str, config: Any = None, seed: int = 0) -> DryRun:
+    arm_of, usual, kinds, _ = MAKES[make]
+    asked = [AskedFault.parsed(fault, JOINTS, kinds) for fault in faults]
     angles = {joint: lambda _, q=q: q for joint, q in zip(JOINTS, POSE, strict=True)}
-    links = {name: tmp_path / name for name in config.buses}
-    return DryRun(config, angles, links, faults=asked, seed=seed)
+    arm = arm_of(config or usual, angles, faults=asked, seed=seed)
+    return DryRun(arm, {name: tmp_path / name for name in arm.devices}, faults=asked)
 
 
-def reading(bench: DryRun) -> JointReading:
-    with DynamixelJoints(bench.config, JOINTS, SystemClock(), limits=LIMITS) as joints:
+def reading(bench: DryRun, make: str) -> JointReading:
+    with MAKES[make][3](bench.config, JOINTS, SystemClock(), limits=LIMITS) as joints:
         for _ in range(100):
             told = joints.read(0.1)
             if told is not None:
@@ -53,78 +97,101 @@ def reading(bench: DryRun) -> JointReading:
 # --- the configured servos
 
 
-def test_the_driver_reads_the_angles_that_the_bench_was_given(tmp_path) -> None:
-    with standing(tmp_path) as bench:
-        assert reading(bench).q == pytest.approx(POSE, abs=TICK)
+@EACH
+def test_the_driver_reads_the_angles_that_the_bench_was_given(make, tmp_path) -> None:
+    with standing(tmp_path, make) as bench:
+        assert reading(bench, make).q == pytest.approx(POSE, abs=TICK)
+        assert bench.arm.count > 0
 
 
 def test_each_bus_has_a_port_of_its_own(tmp_path) -> None:
-    servos = (*CONFIG.servos[:2], ServoConfig("elbow", 1, "XL330-M288", bus="hand"))
-    servos = tuple(ServoConfig(s.joint, s.id, s.model, bus=s.bus or "arm", direction=s.direction) for s in servos)
-    two = DynamixelConfig({"arm": BusConfig("a", latency_ms=20.0), "hand": BusConfig("b", latency_ms=20.0)}, servos)
-    with standing(tmp_path, config=two) as bench:
-        assert reading(bench).q == pytest.approx(POSE, abs=TICK)
+    two = dynamixel(("arm", "hand"), ("arm", "arm", "hand"))
+    with standing(tmp_path, "Dynamixel", config=two) as bench:
+        assert reading(bench, "Dynamixel").q == pytest.approx(POSE, abs=TICK)
         assert {path.name for path in tmp_path.iterdir()} == {"arm", "hand"}
 
 
-def test_nothing_is_left_of_a_bench_that_has_ended(tmp_path) -> None:
-    with standing(tmp_path):
+@EACH
+def test_nothing_is_left_of_a_bench_that_has_ended(make, tmp_path) -> None:
+    with standing(tmp_path, make):
         pass
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_servo_at_another_rate_is_missing(tmp_path) -> None:
-    with standing(tmp_path, "baud@elbow") as bench, pytest.raises(SourceError, match=r"elbow +5 .* no answer"):
-        reading(bench)
+@SERVOS
+def test_a_servo_at_another_rate_is_missing(make, tmp_path) -> None:
+    with standing(tmp_path, make, "baud@elbow") as bench, pytest.raises(SourceError, match=r"elbow +5 .* no answer"):
+        reading(bench, make)
 
 
-def test_two_servos_of_one_id_are_refused(tmp_path) -> None:
-    with standing(tmp_path, "double@waist") as bench, pytest.raises(SourceError, match=r"waist +1 .* garbled"):
-        reading(bench)
+@SERVOS
+def test_two_servos_of_one_id_are_refused(make, tmp_path) -> None:
+    with standing(tmp_path, make, "double@waist") as bench, pytest.raises(SourceError, match="waist"):
+        reading(bench, make)
 
 
-def test_an_overload_is_in_the_servo(tmp_path) -> None:
-    assert standing(tmp_path, "overload@elbow").servo("elbow").hardware_error == 0x20
+def test_a_sensor_without_a_value_is_refused(tmp_path) -> None:
+    with standing(tmp_path, "serial lines", "sensor@elbow") as bench, pytest.raises(SourceError, match="'elbow'"):
+        reading(bench, "serial lines")
 
 
-def test_an_unplugged_port_is_gone_and_comes_back(tmp_path) -> None:
-    with standing(tmp_path, "unplug") as bench:
+@pytest.mark.parametrize(("make", "register"), [("Dynamixel", "hardware_error"), ("Feetech", "status")])
+def test_an_overload_is_in_the_servo(make, register, tmp_path) -> None:
+    assert standing(tmp_path, make, "overload@elbow").arm.servo("elbow")[register] == 0x20
+
+
+@EACH
+def test_an_unplugged_port_is_gone_and_comes_back(make, tmp_path) -> None:
+    with standing(tmp_path, make, "unplug") as bench:
         events = bench.events()
         _, _, unplug = next(events)
         _, _, plug_in = next(events)
+        (link,) = tmp_path.iterdir()
         unplug()
-        assert not (tmp_path / "arm").is_symlink()
+        assert not link.is_symlink()
         plug_in()
-        assert reading(bench).q == pytest.approx(POSE, abs=TICK)
+        assert reading(bench, make).q == pytest.approx(POSE, abs=TICK)
 
 
-def test_a_glitch_is_over_with_the_next_event(tmp_path) -> None:
-    bench = standing(tmp_path, "glitch@elbow")
+@SERVOS
+def test_a_glitch_is_over_with_the_next_event(make, tmp_path) -> None:
+    bench = standing(tmp_path, make, "glitch@elbow")
     events = bench.events()
     next(events)[2]()
-    assert bench.servo("elbow").glitch_ticks != 0
+    assert bench.arm.servo("elbow").glitch_ticks != 0
     next(events)[2]()
-    assert bench.servo("elbow").glitch_ticks == 0
+    assert bench.arm.servo("elbow").glitch_ticks == 0
 
 
-def test_a_power_cycle_loses_what_stands_in_ram(tmp_path) -> None:
-    bench = standing(tmp_path, "power-cycle", "torque@waist")
-    assert bench.servo("waist")["torque"] == 1
+@SERVOS
+def test_a_power_cycle_loses_what_stands_in_ram(make, tmp_path) -> None:
+    bench = standing(tmp_path, make, "power-cycle", "torque@waist")
+    assert bench.arm.servo("waist")["torque"] == 1
     next(bench.events())[2]()
-    assert bench.servo("waist")["torque"] == 0
+    assert bench.arm.servo("waist")["torque"] == 0
+
+
+def test_a_board_that_lost_its_power_says_so(tmp_path) -> None:
+    bench = standing(tmp_path, "serial lines", "power-cycle")
+    board = bench.arm.devices["board"]
+    before = board.speak(board.speaks_at, 115_200)[0].data
+    next(bench.events())[2]()
+    after = board.speak(board.speaks_at, 115_200)[0].data
+    assert before.split(b"H,1,")[1].split(b",")[0] != after.split(b"H,1,")[1].split(b",")[0]
 
 
 def test_a_bench_without_faults_has_no_events(tmp_path) -> None:
-    assert list(standing(tmp_path).events()) == []
+    assert list(standing(tmp_path, "Dynamixel").events()) == []
 
 
 # --- what is asked for
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_each_kind_can_be_asked_for(kind) -> None:
-    alone = kind in (*ON_THE_WIRE, "unplug", "power-cycle")
-    assert AskedFault.parsed(kind if alone else f"{kind}@elbow", JOINTS).kind == kind
+@pytest.mark.parametrize(("make", "kind"), [(make, kind) for make in MAKES for kind in MAKES[make][2].names])
+def test_each_kind_can_be_asked_for(make, kind) -> None:
+    kinds = MAKES[make][2]
+    text = f"{kind}@elbow" if kind in kinds.of_one_joint else kind
+    assert AskedFault.parsed(text, JOINTS, kinds).kind == kind
 
 
 @pytest.mark.parametrize(
@@ -141,18 +208,18 @@ def test_each_kind_can_be_asked_for(kind) -> None:
 )
 def test_what_is_no_fault_is_said_to_be_none(text, said) -> None:
     with pytest.raises(ConfigError) as caught:
-        AskedFault.parsed(text, JOINTS)
+        AskedFault.parsed(text, JOINTS, KINDS)
     assert f"--fault {text}: " in str(caught.value)
     assert said in str(caught.value)
 
 
 def test_a_fault_of_a_joint_strikes_each_of_its_answers_and_no_other() -> None:
-    faults = WireFaults([(5, 1.0, ON_THE_WIRE["mute"])], Random(1))
+    faults = WireFaults([(5, 1.0, KINDS.on_the_wire["mute"])], Random(1))
     assert [bool(faults(Reply(id, 0.0, b"12")).data) for id in (5, 1, 5, 2)] == [False, True, False, True]
 
 
 def test_a_share_is_that_of_the_answers_that_suffer() -> None:
-    faults = WireFaults([(None, 0.1, ON_THE_WIRE["mute"])], Random(1))
+    faults = WireFaults([(None, 0.1, KINDS.on_the_wire["mute"])], Random(1))
     struck = sum(not faults(Reply(1, 0.0, b"12")).data for _ in range(5000))
     assert 0.08 < struck / 5000 < 0.12
 
@@ -193,9 +260,26 @@ class Scripted:
         return self._readings.pop(0) if self._readings else None
 
 
-def test_readings_through_servos_keep_their_times_and_have_the_servos_resolution() -> None:
+def through(source: Any, make: str) -> ThroughDriver:
+    arm_of, config, _, driver = MAKES[make]
+
+    @contextmanager
+    def opened(angles: Any) -> Iterator[Look]:
+        arm = arm_of(config, angles)
+        with (
+            TemporaryDirectory() as folder,
+            DryRun(arm, {name: Path(folder) / name for name in arm.devices}) as bench,
+            driver(bench.config, JOINTS, SystemClock(), limits=LIMITS) as joints,
+        ):
+            yield lambda: joints.read(1.0)
+
+    return ThroughDriver(source, opened)
+
+
+@SERVOS
+def test_readings_through_servos_keep_their_times_and_have_the_servos_resolution(make) -> None:
     poses = [(0.5 + 1e-3 * k, 0.1, -0.2 - 2e-3 * k) for k in range(20)]
-    with ThroughServos(Scripted(poses), CONFIG, SystemClock(), LIMITS) as source:
+    with through(Scripted(poses), make) as source:
         seen = [source.read(1.0) for _ in poses]
         assert source.read(1.0) is None
     assert [told.t for told in seen if told] == [k / 10 for k in range(20)]
@@ -204,8 +288,9 @@ def test_readings_through_servos_keep_their_times_and_have_the_servos_resolution
     assert q / TICK == pytest.approx(np.round(q / TICK), abs=1e-9)
 
 
-def test_readings_through_servos_can_be_opened_again() -> None:
-    source = ThroughServos(Scripted([POSE] * 2), CONFIG, SystemClock(), LIMITS)
+@EACH
+def test_readings_through_a_bench_can_be_opened_again(make) -> None:
+    source = through(Scripted([POSE] * 2), make)
     for _ in range(2):
         with source:
             told = source.read(1.0)

@@ -8,11 +8,19 @@ from pathlib import Path
 import pytest
 
 from drivers import checks
+from drivers.bench.asked_faults import AskedFault
+from drivers.bench.dry_run import DryRun
 from drivers.checks import Check, holders, port_checks
-from drivers.dynamixel.bench.asked_faults import AskedFault
-from drivers.dynamixel.bench.dry_run import DryRun
-from drivers.dynamixel.checks import servo_checks
+from drivers.dynamixel.bench.arm import DynamixelArm
 from drivers.dynamixel.config import BusConfig, DynamixelConfig, ServoConfig
+from drivers.dynamixel.joints import DYNAMIXEL
+from drivers.dynamixel.joints import open_serial as open_dynamixel
+from drivers.feetech.bench.arm import FeetechArm
+from drivers.feetech.config import BusConfig as FeetechBus
+from drivers.feetech.config import FeetechConfig
+from drivers.feetech.joints import FEETECH
+from drivers.feetech.joints import open_serial as open_feetech
+from drivers.servos.checks import servo_checks
 from interfaces.clock import SystemClock
 
 JOINTS = ("waist", "elbow")
@@ -20,6 +28,23 @@ CONFIG = DynamixelConfig(
     {"arm": BusConfig("elsewhere", latency_ms=20.0)},
     (ServoConfig("waist", 1, "XM430-W350"), ServoConfig("elbow", 2, "MX-28")),
 )
+FEETECH_CONFIG = FeetechConfig(
+    {"arm": FeetechBus("elsewhere", latency_ms=20.0)},
+    (ServoConfig("waist", 1, "STS3215"), ServoConfig("elbow", 2, "SCS0009")),
+)
+# Of each make: how to build its bench, how to open it, the model at the elbow, how a return delay is set to 0, and how
+# an overloaded servo is mended.
+MAKES = {
+    "Dynamixel": (
+        DynamixelArm, CONFIG, DYNAMIXEL, open_dynamixel, "MX-28",
+        "DYNAMIXEL Wizard: set Return Delay Time (5 or 9) to 0", "free the joint, then reboot the servo",
+    ),
+    "Feetech": (
+        FeetechArm, FEETECH_CONFIG, FEETECH, open_feetech, "SCS0009",
+        "Feetech's FD: set Return Delay Time (7) to 0", "free the joint, then switch its supply off and on",
+    ),
+}  # fmt: skip
+EACH = pytest.mark.parametrize("make", MAKES)
 
 
 class Machine:
@@ -117,55 +142,63 @@ def test_a_port_of_another_group_is_told_with_the_command(machine, monkeypatch) 
 # --- servos on a bench
 
 
-def told(tmp_path: Path, *faults: str, delay_s: float = 0.0, config: DynamixelConfig = CONFIG) -> list[Check]:
-    asked = [AskedFault.parsed(fault, JOINTS) for fault in faults]
-    angles = dict.fromkeys(JOINTS, lambda _: 0.2)
-    with DryRun(config, angles, {"arm": tmp_path / "bus"}, faults=asked, return_delay_s=delay_s) as bench:
-        return list(servo_checks(bench.config, SystemClock(), read_s=0.2))
+class Told:
+    """What the doctor says of servos on a bench."""
+
+    def __init__(self, make: str, tmp_path: Path, *faults: str, delay_s: float = 0.0) -> None:
+        arm_of, config, the_make, open_port, *_ = MAKES[make]
+        asked = [AskedFault.parsed(fault, JOINTS, arm_of.kinds) for fault in faults]
+        self.arm = arm_of(config, dict.fromkeys(JOINTS, lambda _: 0.2), faults=asked, return_delay_s=delay_s)
+        with DryRun(self.arm, {"arm": tmp_path / "bus"}) as bench:
+            self.checks = list(servo_checks(the_make, bench.config, SystemClock(), open_port, read_s=0.2))
+
+    def of(self, subject: str) -> list[Check]:
+        return [check for check in self.checks if check.subject == subject]
 
 
-def of(checks: list[Check], subject: str) -> list[Check]:
-    return [check for check in checks if check.subject == subject]
+@EACH
+def test_servos_that_are_well_are_told_with_their_rate(make, tmp_path) -> None:
+    told = Told(make, tmp_path)
+    assert told.of("servos") == [Check("servos", "ok", "all 2 answer, each of the model that robot.toml names")]
+    assert "readings/s are possible (250 wanted)" in told.of("rate")[0].said
 
 
-def test_servos_that_are_well_are_told_with_their_rate(tmp_path) -> None:
-    found = told(tmp_path)
-    assert of(found, "servos") == [Check("servos", "ok", "all 2 answer, each of the model that robot.toml names")]
-    assert "readings/s are possible (250 wanted)" in of(found, "rate")[0].said
+@EACH
+def test_a_missing_servo_is_wrong(make, tmp_path) -> None:
+    check = Told(make, tmp_path, "baud@elbow").of("servos")[0]
+    assert (check.state, check.said) == ("wrong", f"joint elbow (ID 2, {MAKES[make][4]}): no answer")
 
 
-def test_a_missing_servo_is_wrong(tmp_path) -> None:
-    check = of(told(tmp_path, "baud@elbow"), "servos")[0]
-    assert (check.state, check.said) == ("wrong", "joint elbow (ID 2, MX-28): no answer")
-
-
+@EACH
 @pytest.mark.parametrize("joint", JOINTS)
-def test_an_alert_is_wrong_and_says_what_to_do(tmp_path, joint) -> None:
-    check = of(told(tmp_path, f"overload@{joint}"), "servos")[1]
+def test_an_alert_is_wrong_and_says_what_to_do(make, tmp_path, joint) -> None:
+    check = Told(make, tmp_path, f"overload@{joint}").of("servos")[1]
     assert (check.state, check.said) == ("wrong", f"joint {joint} (ID {JOINTS.index(joint) + 1}): it is overloaded")
-    assert check.mend == "free the joint, then reboot the servo"
+    assert check.mend == MAKES[make][6]
 
 
-def test_slow_answers_are_told_with_the_register(tmp_path) -> None:
-    check = of(told(tmp_path, delay_s=500e-6), "servos")[1]
-    assert (check.state, check.mend) == ("warning", "DYNAMIXEL Wizard: set Return Delay Time (5 or 9) to 0")
+@EACH
+def test_slow_answers_are_told_with_the_register(make, tmp_path) -> None:
+    check = Told(make, tmp_path, delay_s=500e-6).of("servos")[1]
+    assert (check.state, check.mend) == ("warning", MAKES[make][5])
 
 
-def test_errors_are_counted_by_what_went_wrong(tmp_path) -> None:
-    check = of(told(tmp_path, "checksum=0.3"), "errors")[0]
+@EACH
+def test_errors_are_counted_by_what_went_wrong(make, tmp_path) -> None:
+    check = Told(make, tmp_path, "checksum=0.3").of("errors")[0]
     assert check.state == "warning"
     assert "× a garbled answer" in check.said
 
 
-def test_the_doctor_leaves_torque_as_it_is(tmp_path) -> None:
-    asked = [AskedFault.parsed("torque@waist", JOINTS)]
-    angles = dict.fromkeys(JOINTS, lambda _: 0.2)
-    with DryRun(CONFIG, angles, {"arm": tmp_path / "bus"}, faults=asked) as bench:
-        found = list(servo_checks(bench.config, SystemClock(), read_s=0.05))
-        assert bench.servo("waist")["torque"] == 1
-    assert "joint waist holds its place" in of(found, "servos")[1].said
+@EACH
+def test_the_doctor_leaves_torque_as_it_is(make, tmp_path) -> None:
+    told = Told(make, tmp_path, "torque@waist")
+    assert told.arm.servo("waist")["torque"] == 1
+    assert "joint waist holds its place" in told.of("servos")[1].said
 
 
-def test_a_port_that_cannot_be_opened_is_one_finding() -> None:
-    (check,) = servo_checks(CONFIG, SystemClock())
+@EACH
+def test_a_port_that_cannot_be_opened_is_one_finding(make) -> None:
+    _, config, the_make, open_port, *_ = MAKES[make]
+    (check,) = servo_checks(the_make, config, SystemClock(), open_port)
     assert (check.state, "elsewhere is gone" in check.said) == ("wrong", True)

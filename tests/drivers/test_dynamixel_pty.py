@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import time
 from pathlib import Path
 
@@ -10,7 +9,6 @@ import numpy as np
 import pytest
 from bench_arm import swing
 
-from daemon.reopen import Reopening
 from drivers.bench.pty_shell import PtyShell
 from drivers.dynamixel.bench.chain import Chain
 from drivers.dynamixel.bench.servo import Servo
@@ -18,7 +16,6 @@ from drivers.dynamixel.config import BusConfig, DynamixelConfig, ServoConfig
 from drivers.dynamixel.joints import DynamixelJoints
 from drivers.dynamixel.models import BY_NAME
 from interfaces.clock import SystemClock
-from interfaces.errors import SourceError
 from interfaces.records import JointReading
 
 SIX = range(1, 7)
@@ -63,13 +60,6 @@ def test_most_times_are_those_of_the_sampling(shell) -> None:
     assert np.median(off) < 0.5e-3
 
 
-def test_nobody_else_of_us_opens_the_port(shell) -> None:
-    with driver(shell) as joints:
-        wait_for_reading(joints)
-        with pytest.raises(SourceError, match="is in use by another program"):
-            driver(shell).__enter__()
-
-
 def test_waiting_costs_little_of_the_processor(shell) -> None:
     with driver(shell) as joints:
         wait_for_reading(joints)
@@ -77,22 +67,3 @@ def test_waiting_costs_little_of_the_processor(shell) -> None:
         for _ in range(200):
             wait_for_reading(joints)
         assert time.thread_time() - used < 0.3 * (time.monotonic() - begin)
-
-
-def test_an_unplugged_bus_is_told_once_and_is_back_within_a_second_of_the_replug(shell, caplog) -> None:
-    joints = driver(shell)
-    source = Reopening(joints, "the encoders", SystemClock())
-    with caplog.at_level(logging.WARNING), source:
-        before = wait_for_reading(source)
-        shell.unplug()
-        for _ in range(20):
-            source.read(0.05)
-        assert source.trouble is not None
-        shell.plug_in()
-        begin = time.monotonic()
-        after = wait_for_reading(source)
-        assert time.monotonic() - begin < 1.0
-    assert len(caplog.messages) == 1
-    assert "is gone" in caplog.messages[0]
-    assert (source.losses, joints.epoch) == (1, 2)
-    assert after.t > before.t

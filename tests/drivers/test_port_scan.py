@@ -7,14 +7,20 @@ from pathlib import Path
 
 import pytest
 
+from drivers.bench.device import OnlyAnswers, Reply
 from drivers.bench.pty_shell import PtyShell
 from drivers.bench.virtual_port import VirtualClock, VirtualPort
 from drivers.dynamixel.bench.chain import Chain
 from drivers.dynamixel.bench.frames import Code, instructions_in
 from drivers.dynamixel.bench.servo import Servo
 from drivers.dynamixel.models import BY_NAME
-from drivers.dynamixel.scan import LIKELY_FIRST, SCANNERS
+from drivers.dynamixel.scan import LIKELY_FIRST
+from drivers.feetech.bench.chain import Chain as FeetechChain
+from drivers.feetech.bench.servo import Servo as FeetechServo
+from drivers.feetech.models import BAUDS as FEETECH_BAUDS
+from drivers.feetech.models import BY_NAME as FEETECH
 from drivers.scan import FoundServo, ScannedBus, scan_port, serial_ports
+from drivers.scanners import SCANNERS
 from interfaces.clock import SystemClock
 from interfaces.errors import SourceError
 
@@ -23,11 +29,28 @@ def servo(model: str, id: int, baud: int = 1_000_000, **more) -> Servo:
     return Servo(BY_NAME[model], id, lambda _: 0.01 * id, baud=baud, booted_s=more.pop("booted_s", 0.1 * id), **more)
 
 
+def feetech(model: str, id: int, baud: int = 1_000_000, rad: float = 0.1) -> FeetechServo:
+    return FeetechServo(FEETECH[model], id, lambda _: rad, baud=baud)
+
+
+class Cable(OnlyAnswers):
+    """Servos of both makes on one wire."""
+
+    def __init__(self, servos: Sequence[Servo | FeetechServo]) -> None:
+        self._chains = (
+            Chain(servo for servo in servos if isinstance(servo, Servo)),
+            FeetechChain(servo for servo in servos if isinstance(servo, FeetechServo)),
+        )
+
+    def send(self, data: bytes, t: float, baud: int) -> list[Reply]:
+        return [reply for chain in self._chains for reply in chain.send(data, t, baud)]
+
+
 class Bench:
     """Servos in virtual time."""
 
-    def __init__(self, servos: Sequence[Servo]) -> None:
-        self.chain, self.clock = Chain(servos), VirtualClock()
+    def __init__(self, servos: Sequence[Servo | FeetechServo]) -> None:
+        self.chain, self.clock = Cable(servos), VirtualClock()
         self.said: list[str] = []
         self.sent = bytearray()
 
@@ -45,7 +68,7 @@ class Bench:
         return scan_port("bus", SCANNERS, self.clock, self.said.append, bauds=bauds, open_port=self.open)
 
 
-def found(*servos: Servo, bauds: Sequence[int] = ()) -> tuple[FoundServo, ...]:
+def found(*servos: Servo | FeetechServo, bauds: Sequence[int] = ()) -> tuple[FoundServo, ...]:
     return Bench(servos).scan(*bauds).servos
 
 
@@ -66,9 +89,58 @@ def test_a_servo_is_found_at_every_rate(model, baud) -> None:
     assert [(s.id, s.baud, s.model) for s in told] == [(7, baud, model), (8, baud, model)]
 
 
+@pytest.mark.parametrize("model", FEETECH)
+@pytest.mark.parametrize("baud", FEETECH_BAUDS)
+def test_a_feetech_servo_is_found_at_every_rate(model, baud) -> None:
+    told = found(feetech(model, 9, baud), feetech(model, 10, baud))  # 9 is a byte of an STS3215's number, too
+    assert [(s.id, s.baud, s.model, s.protocol) for s in told] == [(id, baud, model, "Feetech") for id in (9, 10)]
+
+
+def test_both_makes_are_told_apart_on_one_bus() -> None:
+    told = found(feetech("STS3215", 3), servo("MX-28", 4), feetech("SCS0009", 5), servo("AX-12A", 9))
+    assert [(s.id, s.model, s.protocol) for s in told] == [
+        (3, "STS3215", "Feetech"), (4, "MX-28", "Dynamixel 1.0"), (5, "SCS0009", "Feetech"),
+        (9, "AX-12A", "Dynamixel 1.0"),
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("number", [1, 12, 300, 65535])
+def test_a_feetech_servo_of_an_unknown_model_is_told_with_its_number(number) -> None:
+    strange = feetech("STS3215", 3)
+    strange["model"] = number
+    (told,) = found(strange, bauds=[1_000_000])
+    assert (told.protocol, told.model, told.troubles) == (
+        "Feetech", f"model {number}", ("a model that no driver knows",),
+    )  # fmt: skip
+
+
+def test_two_feetech_servos_with_one_id_are_told() -> None:
+    told = found(feetech("STS3215", 3, rad=0.3), feetech("STS3215", 3, rad=0.7), feetech("STS3215", 5))
+    assert [(s.id, s.is_double) for s in told] == [(3, True), (5, False)]
+
+
+def test_what_a_feetech_servo_tells_of_itself_is_told() -> None:
+    holding = feetech("STS3215", 3)
+    holding["torque"] = 1
+    holding.fail(0x04)
+    (told,) = found(holding, bauds=[1_000_000])
+    assert (told.firmware, told.voltage_v, told.temperature_c, told.has_torque) == (
+        "3.10",
+        pytest.approx(7.4),
+        31.0,
+        False,
+    )
+    assert told.troubles == ("it is too hot: let it cool down",)
+
+
+def test_a_servo_at_a_rate_that_robot_toml_cannot_name_is_told() -> None:
+    (told,) = found(servo("MX-28", 3, 500_000))
+    assert told.troubles == ("robot.toml has no such rate: give it 1,000,000 bit/s",)
+
+
 def test_what_a_servo_tells_of_itself_is_told() -> None:
     (told,) = found(servo("XM430-W350", 3))
-    assert (told.firmware, told.temperature_c, told.has_torque, told.troubles) == (46, 31.0, False, ())
+    assert (told.firmware, told.temperature_c, told.has_torque, told.troubles) == ("46", 31.0, False, ())
     assert told.voltage_v == pytest.approx(12.0)
 
 
@@ -107,14 +179,14 @@ def test_a_servo_that_answers_no_read_is_told_with_its_register() -> None:
 
 
 def test_a_scan_writes_to_nobody() -> None:
-    bench = Bench([servo("XM430-W350", 1), servo("MX-28", 4)])
+    bench = Bench([servo("XM430-W350", 1), servo("MX-28", 4), feetech("STS3215", 5)])
     bench.scan()
     told = instructions_in(bench.sent)[0]
     assert {instruction.code for instruction in told} == {Code.PING, Code.READ}
 
 
 def test_all_rates_take_less_than_15_s() -> None:
-    bench = Bench([servo("XM430-W350", id) for id in range(1, 7)])
+    bench = Bench([servo("XM430-W350", id) for id in range(1, 7)] + [feetech("STS3215", id) for id in range(11, 17)])
     begin = bench.clock.now()
     bench.scan()
     assert bench.clock.now() - begin < 15.0
@@ -123,7 +195,7 @@ def test_all_rates_take_less_than_15_s() -> None:
 def test_what_is_being_done_is_said_for_each_rate() -> None:
     bench = Bench([servo("XM430-W350", 1)])
     bench.scan(1_000_000, 57_600)
-    assert bench.said[-1] == "bus: Dynamixel 1.0 at 57,600 bit/s; 1 servo so far"
+    assert bench.said[-1] == "bus: Dynamixel 1.0 and Feetech at 57,600 bit/s; 1 servo so far"
     assert len(bench.said) == 4
 
 

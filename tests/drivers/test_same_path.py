@@ -1,9 +1,15 @@
-"""The same hand-guided path through every driver gives the same learnt model, to within the encoders' resolution."""
+"""One hand-guided path of the simulated arm through every driver: the same model is learnt, to within the encoders'
+resolution."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable
+import socket
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cache
+from importlib.util import find_spec
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,53 +17,146 @@ from bench_arm import TICK, Arm
 from feetech_arm import FeetechArm
 from test_serial_lines import BoardArm
 
-from interfaces.records import JointReading
-from kbmaps import ExactLearner, JointBasis, KBMap, RigidChain
+from drivers.bench.motion import Angle, played
+from drivers.bench.virtual_port import VirtualClock
+from drivers.ros2.bench.node import Node
+from drivers.ros2.bench.zenoh_robot import ZenohRobot
+from drivers.ros2.config import Ros2Config
+from drivers.ros2.joints import Ros2Joints
+from drivers.ros2.link import Link, Sample, open_zenoh
+from interfaces.protocols import JointSource
+from interfaces.records import FloatArray, JointReading
+from interfaces.robot import RobotDescription
+from kbmaps import ExactLearner, JointBasis, KBMap
+from sim_backend import SimConfig, SimWorld
+from sim_backend.guided_path import guided_path
 
-LIMITS = [(-2.0, 2.0)] * 3
-FREQUENCIES = (0.71, 0.53, 0.37)  # in no simple ratio: the path goes everywhere
-PATHS = [lambda t, k=k, w=w: 1.0 * math.sin(w * t + k) for k, w in enumerate(FREQUENCIES)]
-REACH_M = 1.0  # of the arm below, at most
-COUNT, RATE_HZ = 2000, 60.0
+pytestmark = pytest.mark.skipif(find_spec("pybullet") is None, reason="pybullet is not installed")
 
-
-def chain() -> RigidChain:
-    fixed = np.tile(np.eye(4), (4, 1, 1))
-    fixed[1:, :3, 3] = [[0.3, 0.0, 0.1], [0.0, 0.25, 0.0], [0.2, 0.0, 0.05]]
-    axes = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
-    return RigidChain(fixed, axes, np.zeros(3, dtype=bool))
-
-
-def true_angles(readings: list[JointReading]) -> np.ndarray:
-    return np.array([[path(reading.t) for path in PATHS] for reading in readings])
-
-
-def readings_of(joints) -> list[JointReading]:
-    with joints:
-        readings = [joints.read(1.0) for _ in range(COUNT)]
-    return [reading for reading in readings if reading is not None]
+ROBOT = Path(__file__).parents[2] / "examples" / "desk_arm" / "robot.toml"
+CONFIG = SimConfig()
+SECONDS, RATE_HZ = 60.0, 60.0
+BEGIN_S = 100.0  # of the path on the benches' clocks, which stand there at first
+LATENCY_S = 1e-3
 
 
-def learnt(q: np.ndarray, x: np.ndarray) -> KBMap:
-    bases = (JointBasis.orthonormal(-1.0, 1.0),) * 3
-    learner = ExactLearner(KBMap(bases, np.zeros((3, 3, 3, 3))))
-    learner.learn(q, x)
-    return learner.solve().map
+@dataclass(frozen=True)
+class Guided:
+    """An arm, and where the virtual hand guided it."""
+
+    robot: RobotDescription
+    path: FloatArray  # (n, d) [rad]
+
+    def angles(self, begin_s: float) -> list[Angle]:
+        """Of each joint its angle at a time, the path beginning at `begin_s`."""
+        return played(self.path, CONFIG.encoders.rate_hz, begin_s)
+
+    @property
+    def limits(self) -> list[tuple[float, float]]:
+        return list(zip(self.robot.lower.tolist(), self.robot.upper.tolist(), strict=True))
+
+    @property
+    def reach_m(self) -> float:
+        """The marker is nowhere farther from a joint than this."""
+        return sum(float(np.linalg.norm(T[:3, 3])) for T in self.robot.chain.fixed[1:])
+
+    def learnt(self, q: FloatArray, true_q: FloatArray) -> KBMap:
+        """What is learnt of readings `q` and a camera without errors, (n, d) [rad] both."""
+        bases = (JointBasis.orthonormal(-1.0, 1.0),) * len(self.robot.joints)
+        learner = ExactLearner(KBMap(bases, np.zeros((3,) * (len(bases) + 1))))
+        learner.learn(q, self.robot.chain.positions(true_q))
+        return learner.solve().map
 
 
-SOURCES: dict[str, Callable[[], object]] = {
-    "Dynamixel": lambda: Arm(paths=PATHS, limits=LIMITS, latency_s=1e-3, rate_hz=RATE_HZ).joints,
-    "Feetech": lambda: FeetechArm(paths=PATHS, limits=LIMITS, latency_s=1e-3, rate_hz=RATE_HZ).joints,
-    "serial lines": lambda: BoardArm(PATHS, limits=LIMITS, latency_s=1e-3, rate_hz=RATE_HZ).joints,
+@cache
+def guided() -> Guided:
+    robot = RobotDescription.load(ROBOT)
+    return Guided(robot, guided_path(robot, CONFIG, SECONDS))
+
+
+class PacedLink:
+    """A robot's messages over zenoh, each sent when virtual time has come to it: no wait but zenoh's own."""
+
+    def __init__(self, inner: Link, robot: ZenohRobot, node: Node, clock: VirtualClock) -> None:
+        self._inner, self._robot, self._node, self._clock = inner, robot, node, clock
+        self._due = clock.now()
+
+    def __getattr__(self, name: str) -> object:
+        return getattr(self._inner, name)
+
+    def receive(self, until: float) -> Sample | None:
+        if self._due > until:
+            self._clock.wait_until(until)
+            return None
+        while not self._robot.is_heard:
+            continue
+        self._clock.wait_until(self._due)
+        self._robot.publish(self._node, self._due)
+        self._due += self._node.period_s
+        return self._inner.receive(self._clock.now() + 1.0)
+
+
+@contextmanager
+def ros2(arm: Guided) -> Iterator[tuple[JointSource, float]]:
+    clock = VirtualClock()
+    node = Node(dict(zip(arm.robot.joints, arm.angles(BEGIN_S), strict=True)), RATE_HZ)
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        endpoint = f"tcp/127.0.0.1:{free.getsockname()[1]}"
+    with ZenohRobot([node], endpoint) as robot:
+        yield (
+            Ros2Joints(
+                Ros2Config(router=endpoint),
+                arm.robot.joints,
+                clock,
+                open_link=lambda *settings: PacedLink(open_zenoh(*settings), robot, node, clock),  # pyright: ignore
+            ),
+            BEGIN_S,
+        )
+
+
+@contextmanager
+def simulated(arm: Guided) -> Iterator[tuple[JointSource, float]]:
+    with SimWorld(arm.robot, CONFIG) as world:
+        yield world.joints, 1 / CONFIG.encoders.rate_hz
+
+
+def on_bench(make: Callable[..., Arm | FeetechArm | BoardArm], **more: object):
+    @contextmanager
+    def opened(arm: Guided) -> Iterator[tuple[JointSource, float]]:
+        settings = {"paths": arm.angles(BEGIN_S), "limits": arm.limits, "latency_s": LATENCY_S, "rate_hz": RATE_HZ}
+        yield make(**settings, **more).joints, BEGIN_S
+
+    return opened
+
+
+SOURCES = {
+    "simulated source": simulated,
+    "Dynamixel 2.0": on_bench(Arm, models=("XM430-W350",) * 4),
+    "Dynamixel 1.0": on_bench(Arm, models=("MX-28",) * 4),
+    "Feetech": on_bench(FeetechArm, models=("STS3215",) * 4),
+    "serial lines": on_bench(BoardArm),
+    "ROS 2": ros2,
 }
 
 
+def readings_of(joints: JointSource, until: float) -> list[JointReading]:
+    readings: list[JointReading] = []
+    with joints:
+        while not readings or readings[-1].t < until:
+            reading = joints.read(1.0)
+            if reading is not None:
+                readings.append(reading)
+    return readings
+
+
 @pytest.mark.parametrize("source", SOURCES)
-def test_the_same_path_gives_the_same_model_whatever_reads_the_joints(source) -> None:
-    readings = readings_of(SOURCES[source]())
-    q, arm = true_angles(readings), chain()
-    x = arm.positions(q)  # a camera without errors, at the readings' times
-    through_driver, simulated = learnt(np.array([reading.q for reading in readings]), x), learnt(q, x)
-    poses = q[::50]
-    apart = np.linalg.norm(through_driver.predict(poses) - simulated.predict(poses), axis=1)
-    assert apart.max() < TICK * REACH_M
+def test_one_hand_guided_path_gives_the_same_model_whatever_reads_the_joints(source) -> None:
+    arm = guided()
+    with SOURCES[source](arm) as (joints, begin_s):
+        readings, angles = readings_of(joints, begin_s + SECONDS - 0.1), arm.angles(begin_s)
+    q = np.array([reading.q for reading in readings])
+    true_q = np.array([[angle(reading.t) for angle in angles] for reading in readings])
+    through_driver, exact = arm.learnt(q, true_q), arm.learnt(arm.path, arm.path)
+    poses = arm.path[::50]
+    apart_m = np.linalg.norm(through_driver.predict(poses) - exact.predict(poses), axis=1)
+    assert apart_m.max() < TICK * arm.reach_m

@@ -32,8 +32,8 @@ class Chain(ServoChain[Servo]):
     def _instructions_in(self, stream: bytearray) -> tuple[list[Instruction], int]:
         return instructions_in(stream)
 
-    def _packet(self, servo: Servo, error: Error, params: bytes) -> bytes:
-        return status_packet(servo.model.protocol, servo.id, _error_byte(servo, error), params)
+    def _packet(self, servo: Servo, id: int, error: Error, params: bytes) -> bytes:
+        return status_packet(servo.model.protocol, id, _error_byte(servo, error), params)
 
     def _will_answer(self, servo: Servo, code: int) -> bool:
         level = servo["status_return"]

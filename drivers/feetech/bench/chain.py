@@ -17,8 +17,9 @@ class Chain(ServoChain[Servo]):
     def _instructions_in(self, stream: bytearray) -> tuple[list[Instruction], int]:
         return instructions_in(stream)
 
-    def _packet(self, servo: Servo, error: int, params: bytes) -> bytes:
-        return status_packet(servo.id, error, params)
+    def _packet(self, servo: Servo, id: int, error: int, params: bytes) -> bytes:
+        del servo
+        return status_packet(id, error, params)
 
     def _will_answer(self, servo: Servo, code: int) -> bool:
         return servo["status_return"] > 0 or code in (Code.PING, Code.READ, Code.SYNC_READ)

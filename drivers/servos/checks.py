@@ -6,17 +6,17 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from itertools import pairwise, zip_longest
 from statistics import median, quantiles
+from typing import Any
 
 from drivers.checks import Check
-from drivers.servos.handshake import Finding, FittedServo, identify
 from interfaces.errors import SourceError
 from interfaces.protocols import Clock
 
 from .bus import Bus, Request
-from .config import DynamixelConfig, ServoConfig
-from .joints import open_serial
-from .models import BY_NAME, BY_NUMBER, HARDWARE_ERRORS
-from .plan import block_requests
+from .config import ServosConfig
+from .handshake import Finding, FittedServo, identify
+from .joints import OpenPort
+from .make import Make
 
 READ_S = 1.0
 IDENTIFY_S = 1.0  # then who was not asked yet is not asked any more
@@ -26,38 +26,38 @@ LONGEST_DELAY_S = 50e-6
 TYPE = "servos"
 
 
-def servo_checks(config: DynamixelConfig, clock: Clock, *, read_s: float = READ_S) -> Iterator[Check]:
+def servo_checks(
+    make: Make, config: ServosConfig[Any], clock: Clock, open_port: OpenPort, *, read_s: float = READ_S
+) -> Iterator[Check]:
     """Who is there, how they are, and how fast they are read. The ports are opened for that."""
     with ExitStack() as stack:
         buses: dict[str, Bus] = {}
         try:
             for name, bus in config.buses.items():
-                port, latency_s = open_serial(bus, clock)
+                port, latency_s = open_port(bus, clock)
                 stack.callback(port.close)
-                buses[name] = Bus(name, port, clock, latency_s)
-            found = _identified(config, buses, clock)
+                buses[name] = make.bus(name, port, clock, latency_s)
+            found = _identified(make, config, buses, clock)
             yield from _presence(found)
             servos = [finding.servo for finding in found if finding.servo is not None]
             for servo in servos:
-                yield from _health(buses[servo.bus], servo)
-            yield from _delays(servos)
+                yield from _health(make, buses[servo.bus], servo)
+            yield from _delays(make, servos)
             if servos:
-                yield from _pace(config, buses, servos, clock, read_s)
+                yield from _pace(make, config, buses, servos, clock, read_s)
         except SourceError as error:
             yield Check(TYPE, "wrong", str(error))
 
 
-def _identified(config: DynamixelConfig, buses: dict[str, Bus], clock: Clock) -> list[Finding]:
+def _identified(make: Make, config: ServosConfig[Any], buses: dict[str, Bus], clock: Clock) -> list[Finding]:
     found: list[Finding] = []
     end = clock.now() + IDENTIFY_S
     for servo in config.servos:
-        late = clock.now() > end
-        found.append(Finding(servo, "not asked") if late else _asked(buses[config.bus_of(servo)], servo))
+        if clock.now() > end:
+            found.append(Finding(servo, "not asked"))
+        else:
+            found.append(identify(buses[config.bus_of(servo)], servo, config.model_of(servo), make.models))
     return found
-
-
-def _asked(bus: Bus, servo: ServoConfig) -> Finding:
-    return identify(bus, servo, BY_NAME[servo.model], BY_NUMBER)
 
 
 def _presence(found: Sequence[Finding]) -> Iterator[Check]:
@@ -70,7 +70,7 @@ def _presence(found: Sequence[Finding]) -> Iterator[Check]:
         yield Check(TYPE, "ok", f"all {len(found)} answer, each of the model that robot.toml names")
 
 
-def _health(bus: Bus, servo: FittedServo) -> Iterator[Check]:
+def _health(make: Make, bus: Bus, servo: FittedServo) -> Iterator[Check]:
     layout = servo.model.layout
     exchange = bus.ask(bus.read_request(servo.model, servo.id, layout.state))
     if exchange.trouble is not None:
@@ -79,7 +79,7 @@ def _health(bus: Bus, servo: FittedServo) -> Iterator[Check]:
     has_torque = layout.value("torque", status.data, layout.state.address)
     has_register = "hardware_error" in layout
     bits = layout.value("hardware_error", status.data, layout.state.address) if has_register else status.error
-    for bit, text in HARDWARE_ERRORS.items():
+    for bit, text in make.errors.items():
         if bits & bit:
             said, _, mend = text.partition(": ")
             yield Check(TYPE, "wrong", f"joint {servo.joint} (ID {servo.id}): {said}", mend)
@@ -87,7 +87,7 @@ def _health(bus: Bus, servo: FittedServo) -> Iterator[Check]:
         yield Check(TYPE, "ok", f"joint {servo.joint} holds its place: `bodyschema run` switches its torque off")
 
 
-def _delays(servos: Sequence[FittedServo]) -> Iterator[Check]:
+def _delays(make: Make, servos: Sequence[FittedServo]) -> Iterator[Check]:
     slow = [servo for servo in servos if servo.return_delay_s > LONGEST_DELAY_S]
     if not slow:
         return
@@ -96,17 +96,20 @@ def _delays(servos: Sequence[FittedServo]) -> Iterator[Check]:
     register = " or ".join(map(str, addresses))
     names = ", ".join(servo.joint for servo in slow)
     said = f"{names}: each answer comes {worst_us:.0f} µs late by Return Delay Time"
-    yield Check(TYPE, "warning", said, f"DYNAMIXEL Wizard: set Return Delay Time ({register}) to 0")
+    yield Check(TYPE, "warning", said, f"{make.software}: set Return Delay Time ({register}) to 0")
 
 
 def _pace(
-    config: DynamixelConfig, buses: dict[str, Bus], servos: Sequence[FittedServo], clock: Clock, read_s: float
+    make: Make,
+    config: ServosConfig[Any],
+    buses: dict[str, Bus],
+    servos: Sequence[FittedServo],
+    clock: Clock,
+    read_s: float,
 ) -> Iterator[Check]:
     """Read for a while, as fast as it goes."""
     plans = {
-        name: block_requests(
-            bus, [s for s in servos if s.bus == name], try_fast=config.buses[name].fast_sync_read == "auto"
-        )
+        name: make.block_requests(bus, [s for s in servos if s.bus == name], config.buses[name])
         for name, bus in buses.items()
     }
     before = {name: (bus.counts.exchanges, dict(bus.counts.troubles)) for name, bus in buses.items()}

@@ -1,4 +1,4 @@
-"""Feetech servos and own encoders on a pseudo-terminal: real time, a real port."""
+"""Servos of each make and own encoders on a pseudo-terminal: real time, a real port."""
 
 from __future__ import annotations
 
@@ -14,6 +14,12 @@ from bench_arm import swing
 
 from daemon.reopen import Reopening
 from drivers.bench.pty_shell import PtyShell
+from drivers.dynamixel.bench.chain import Chain as DynamixelChain
+from drivers.dynamixel.bench.servo import Servo as DynamixelServo
+from drivers.dynamixel.config import BusConfig as DynamixelBus
+from drivers.dynamixel.config import DynamixelConfig
+from drivers.dynamixel.joints import DynamixelJoints
+from drivers.dynamixel.models import BY_NAME as DYNAMIXEL
 from drivers.feetech.bench.chain import Chain
 from drivers.feetech.bench.servo import Servo
 from drivers.feetech.config import BusConfig, FeetechConfig, ServoConfig
@@ -34,6 +40,16 @@ Make = Callable[[Path], Any]
 
 
 @contextmanager
+def dynamixel(folder: Path) -> Iterator[tuple[PtyShell, Callable[[], DynamixelJoints]]]:
+    model = DYNAMIXEL["XM430-W350"]
+    chain = DynamixelChain(DynamixelServo(model, id, swing(id), return_delay_s=0, booted_s=id * 0.1234) for id in IDS)
+    entries = tuple(ServoConfig(name, id, "XM430-W350") for name, id in zip(NAMES, IDS, strict=True))
+    with PtyShell(chain, folder / "bus") as shell:
+        config = DynamixelConfig({"arm": DynamixelBus(str(shell.link))}, entries)
+        yield shell, lambda: DynamixelJoints(config, NAMES, SystemClock(), limits=LIMITS)
+
+
+@contextmanager
 def feetech(folder: Path) -> Iterator[tuple[PtyShell, Callable[[], FeetechJoints]]]:
     chain = Chain(Servo(BY_NAME["STS3215"], id, swing(id), return_delay_s=0) for id in IDS)
     entries = tuple(ServoConfig(name, id, "STS3215") for name, id in zip(NAMES, IDS, strict=True))
@@ -51,7 +67,7 @@ def encoders(folder: Path) -> Iterator[tuple[PtyShell, Callable[[], SerialLineJo
         yield shell, lambda: SerialLineJoints(config, NAMES, SystemClock(), limits=LIMITS)
 
 
-BOTH = pytest.mark.parametrize("make", [feetech, encoders])
+EACH = pytest.mark.parametrize("make", [dynamixel, feetech, encoders])
 
 
 def wait_for_reading(source: Any) -> JointReading:
@@ -62,7 +78,7 @@ def wait_for_reading(source: Any) -> JointReading:
     raise AssertionError("no reading came")
 
 
-@BOTH
+@EACH
 def test_readings_are_right_with_wire_time(make: Make, tmp_path) -> None:
     with make(tmp_path) as (_, driver), driver() as joints:
         for _ in range(50):
@@ -70,7 +86,7 @@ def test_readings_are_right_with_wire_time(make: Make, tmp_path) -> None:
             assert reading.q == pytest.approx([swing(id)(reading.t) for id in IDS], abs=0.02)
 
 
-@BOTH
+@EACH
 def test_nobody_else_of_us_opens_the_port(make: Make, tmp_path) -> None:
     with make(tmp_path) as (_, driver), driver() as joints:
         wait_for_reading(joints)
@@ -78,7 +94,7 @@ def test_nobody_else_of_us_opens_the_port(make: Make, tmp_path) -> None:
             driver().__enter__()
 
 
-@BOTH
+@EACH
 def test_an_unplugged_port_is_told_once_and_is_back_within_a_second_of_the_replug(make: Make, tmp_path, caplog) -> None:
     with make(tmp_path) as (shell, driver):
         joints = driver()

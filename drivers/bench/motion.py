@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from interfaces.records import FloatArray, frozen_array
 
-from .servo import Angle
+Angle = Callable[[float], float]
 
 SLOWEST_S = 20.0  # a swing and back
 PHASE_RAD = 2.4  # between neighbours: the golden angle, so that no two joints move together

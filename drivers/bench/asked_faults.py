@@ -2,41 +2,46 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from random import Random
-from types import MappingProxyType
 
-from drivers.bench.device import Fault, Reply
-from drivers.bench.faults import corrupt, garbage, half, late, mute, wrong_checksum
 from interfaces.errors import ConfigError
 from interfaces.suggest import did_you_mean
 
-from .faults import swapped
+from .device import Fault, Reply
+from .faults import corrupt, garbage, half, late, mute, wrong_checksum
 
-ON_THE_WIRE: MappingProxyType[str, Fault] = MappingProxyType(
-    {
-        "mute": mute,
-        "late": late(0.05),
-        "checksum": wrong_checksum,
-        "corrupt": corrupt(),
-        "half": half,
-        "garbage": garbage(),
-        "swapped": swapped,
-    }
-)
-# Bits of Hardware Error Status.
-OF_A_SERVO: MappingProxyType[str, int] = MappingProxyType(
-    {"voltage": 0x01, "hot": 0x04, "encoder": 0x08, "shock": 0x10, "overload": 0x20}
-)
-# What is another way from the beginning.
-AT_THE_START = ("baud", "double", "torque")
-# What happens again and again.
-NOW_AND_THEN = ("glitch", "power-cycle", "unplug")
-KINDS = (*ON_THE_WIRE, *OF_A_SERVO, *AT_THE_START, *NOW_AND_THEN)
-OF_ONE_JOINT = (*OF_A_SERVO, *AT_THE_START, "glitch")
+ON_THE_WIRE: Mapping[str, Fault] = {
+    "mute": mute,
+    "late": late(0.05),
+    "checksum": wrong_checksum,
+    "corrupt": corrupt(),
+    "half": half,
+    "garbage": garbage(),
+}
+OF_ALL = ("power-cycle", "unplug")
+NOW_AND_THEN = ("glitch", *OF_ALL)
 SHARE = 0.02
 OPTION = "--fault"
+
+
+@dataclass(frozen=True, slots=True)
+class FaultKinds:
+    """What can go wrong with a make of servos or encoders.
+
+    Attributes:
+        on_the_wire: with what it says.
+        of_one_joint: with one servo or encoder, `glitch` now and then, the others from the beginning.
+    """
+
+    on_the_wire: Mapping[str, Fault]
+    of_one_joint: tuple[str, ...]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """All of them."""
+        return (*self.on_the_wire, *self.of_one_joint, *OF_ALL)
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,8 +49,8 @@ class AskedFault:
     """One fault.
 
     Attributes:
-        kind: one of KINDS.
-        joint: whose servo; None: all.
+        kind: its name.
+        joint: whose servo or encoder; None: all.
         share: the probability that an answer suffers it, for those on the wire.
     """
 
@@ -54,7 +59,7 @@ class AskedFault:
     share: float
 
     @classmethod
-    def parsed(cls, text: str, joints: Collection[str]) -> AskedFault:
+    def parsed(cls, text: str, joints: Collection[str], kinds: FaultKinds) -> AskedFault:
         """The fault that `KIND[@JOINT][=SHARE]` names.
 
         With a joint every answer of its servo suffers a fault on the wire, without one 2 % of all answers do.
@@ -64,16 +69,16 @@ class AskedFault:
         """
         named, _, share = text.partition("=")
         kind, _, joint = named.partition("@")
-        if kind not in KINDS:
-            raise ConfigError(f"{OPTION} {text}: unknown fault {kind!r}", remedy=did_you_mean(kind, KINDS))
+        if kind not in kinds.names:
+            raise ConfigError(f"{OPTION} {text}: unknown fault {kind!r}", remedy=did_you_mean(kind, kinds.names))
         if joint and joint not in joints:
             raise ConfigError(f"{OPTION} {text}: unknown joint {joint!r}", remedy=did_you_mean(joint, joints))
-        if not joint and kind in OF_ONE_JOINT:
+        if not joint and kind in kinds.of_one_joint:
             first = next(iter(joints))
             raise ConfigError(f"{OPTION} {text}: it is of one joint", remedy=f"Name it, as in {kind}@{first}")
-        if joint and kind in ("unplug", "power-cycle"):
+        if joint and kind in OF_ALL:
             raise ConfigError(f"{OPTION} {text}: it strikes all servos", remedy=f"Give {kind} alone")
-        if share and kind not in ON_THE_WIRE:
+        if share and kind not in kinds.on_the_wire:
             raise ConfigError(f"{OPTION} {text}: it has no share", remedy=f"Give {named} alone")
         return cls(kind, joint or None, _probability(text, share) if share else 1.0 if joint else SHARE)
 
@@ -89,11 +94,18 @@ def _probability(text: str, share: str) -> float:
 
 
 class WireFaults:
-    """What happens to the answers on one bus."""
+    """What happens to what is said on one bus."""
 
     def __init__(self, faults: Sequence[tuple[int | None, float, Fault]], rng: Random) -> None:
         """Faults with the ID that each strikes (None: all) and its probability."""
         self._faults, self._rng = tuple(faults), rng
+
+    @classmethod
+    def asked(cls, faults: Sequence[AskedFault], kinds: FaultKinds, ids: Mapping[str, int], rng: Random) -> WireFaults:
+        """Those of `faults` that strike a bus; `ids` are by the joints that are on it."""
+        here = [f for f in faults if f.kind in kinds.on_the_wire and (f.joint is None or f.joint in ids)]
+        strike = [(None if f.joint is None else ids[f.joint], f.share, kinds.on_the_wire[f.kind]) for f in here]
+        return cls(strike, Random(rng.random()))
 
     def __call__(self, reply: Reply) -> Reply:
         """The answer as it arrives."""

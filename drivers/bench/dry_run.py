@@ -1,0 +1,117 @@
+"""The arm that a robot.toml describes, on pseudo-terminals."""
+
+from __future__ import annotations
+
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from types import TracebackType
+from typing import Any, ClassVar, Self
+
+from .asked_faults import NOW_AND_THEN, AskedFault
+from .device import Device
+from .pty_shell import PtyShell
+
+EVERY_S = 10.0  # what happens now and then
+UNPLUGGED_S = 3.0
+GLITCH_S = 0.1
+
+Angle = Callable[[float], float]
+Event = tuple[float, str, Callable[[], None]]
+
+
+class BenchArm(ABC):
+    """What is behind the ports of an arm, whatever it is made of.
+
+    Attributes:
+        unit: of what is counted.
+    """
+
+    unit: ClassVar[str]
+
+    @property
+    @abstractmethod
+    def devices(self) -> Mapping[str, Device]:
+        """What is behind each port, by name of the bus."""
+
+    @property
+    @abstractmethod
+    def count(self) -> int:
+        """How many packets were understood, or lines were said, so far."""
+
+    @abstractmethod
+    def at_ports(self, ports: Mapping[str, str]) -> Any:
+        """The configuration with other ports, by name of the bus."""
+
+    @abstractmethod
+    def glitch(self, joint: str, is_wrong: bool) -> None:
+        """A joint's encoder begins or ends to be wrong."""
+
+    @abstractmethod
+    def power_cycle(self, t: float) -> None:
+        """All lose their power and get it back at `t`."""
+
+
+class DryRun:
+    """An arm as it is configured, each bus behind a port of its own. Ended with its with statement.
+
+    Attributes:
+        arm: what is behind the ports.
+        config: the configuration with the bench's ports in the place of those that it names.
+        shells: by name of the bus.
+    """
+
+    def __init__(
+        self,
+        arm: BenchArm,
+        links: Mapping[str, Path],
+        *,
+        faults: Sequence[AskedFault] = (),
+        now: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """Nothing is there yet.
+
+        Args:
+            links: by bus, the name of its port.
+            faults: those that happen now and then; the others are the arm's.
+        """
+        self.arm, self._faults, self._now = arm, tuple(faults), now
+        self._opened = ExitStack()
+        self.shells = {name: PtyShell(device, links[name], now) for name, device in arm.devices.items()}
+        self.config = arm.at_ports({name: str(link) for name, link in links.items()})
+
+    def __enter__(self) -> Self:
+        with ExitStack() as stack:
+            for shell in self.shells.values():
+                stack.enter_context(shell)
+            self._opened = stack.pop_all()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._opened.close()
+
+    def events(self) -> Iterator[Event]:
+        """What happens from now on because it was asked for: after how many seconds, what, and how to do it."""
+        asked = [fault for fault in self._faults if fault.kind in NOW_AND_THEN]
+        while asked:
+            for fault in asked:
+                yield from self._happening(fault)
+
+    def _happening(self, fault: AskedFault) -> Iterator[Event]:
+        joint = fault.joint or ""
+        if fault.kind == "unplug":
+            yield EVERY_S, "unplugged", lambda: self._each(PtyShell.unplug)
+            yield UNPLUGGED_S, "plugged in again", lambda: self._each(PtyShell.plug_in)
+        elif fault.kind == "power-cycle":
+            yield EVERY_S, "the power is lost and comes back", lambda: self.arm.power_cycle(self._now())
+        else:
+            yield EVERY_S, f"the encoder of {joint} is wrong for a moment", lambda: self.arm.glitch(joint, True)
+            yield GLITCH_S, f"the encoder of {joint} is right again", lambda: self.arm.glitch(joint, False)
+
+    def _each(self, act: Callable[[PtyShell], None]) -> None:
+        for shell in self.shells.values():
+            act(shell)

@@ -1,0 +1,18 @@
+"""What a scan has to know of Feetech servos."""
+
+from __future__ import annotations
+
+from drivers.servos.scan import Kind
+
+from .joints import Bus
+from .models import BAUDS, BY_NUMBER, HARDWARE_ERRORS, STS
+
+FEETECH_SERVOS = Kind(
+    name="Feetech",
+    bauds=BAUDS,
+    version=STS,
+    models=BY_NUMBER,
+    errors=HARDWARE_ERRORS,
+    bus=Bus,
+    mute="answers PING but no READ: look at its cable and supply",
+)

@@ -1,0 +1,50 @@
+"""How a board's encoders are, and how its lines come. Writes nothing to it but the question for its header."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+from drivers.checks import Check
+from interfaces.errors import SourceError
+from interfaces.protocols import Clock
+
+from .config import SerialLinesConfig
+from .joints import SerialLineJoints
+
+READ_S = 1.0
+FEW_PER_S = 50.0
+MANY_TROUBLES = 0.01
+
+
+def encoder_checks(
+    config: SerialLinesConfig, joints: Sequence[str], clock: Clock, *, read_s: float = READ_S
+) -> Iterator[Check]:
+    """Whether the configured encoders are there, and how often they are read. The port is opened for that."""
+    try:
+        with SerialLineJoints(config, joints, clock) as encoders:
+            yield Check("encoders", "ok", f"all {len(joints)} of robot.toml are in the board's header")
+            end, readings = clock.now() + read_s, 0
+            while clock.now() < end:
+                readings += encoders.read(end - clock.now()) is not None
+            yield _rate(readings / read_s)
+            counts = encoders.counts
+            yield _troubles(counts.lines, counts.garbled + counts.missing)
+            for complaint in encoders.health:
+                said, _, mend = complaint.rpartition(": ")
+                yield Check("encoders", "wrong", said, mend)
+    except SourceError as error:
+        yield Check("encoders", "wrong", str(error))
+
+
+def _rate(rate_hz: float) -> Check:
+    said = f"{rate_hz:.0f} readings/s come"
+    if rate_hz < FEW_PER_S:
+        return Check("rate", "warning", said, "a higher rate of the UART, fewer other things that the board does")
+    return Check("rate", "ok", said)
+
+
+def _troubles(lines: int, lost: int) -> Check:
+    said = f"{lost} of {lines + lost} lines were garbled or missing"
+    if lost > MANY_TROUBLES * (lines + lost):
+        return Check("errors", "warning", said, "look at the cable, and whether the board keeps the rate exactly")
+    return Check("errors", "ok", said)

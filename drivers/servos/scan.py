@@ -1,0 +1,215 @@
+"""Finds servos at whatever rate: asks each ID, and who answers what it is and how it is. Writes to no register."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+from drivers.scan import FoundServo, ScannedPort
+from interfaces.protocols import Clock
+
+from .bus import BITS_PER_BYTE, SLOWEST_DELAY_S, Bus, Exchange, Request, Trouble
+from .model import Model, Register
+from .packets import Garbled, Packets, Status
+
+IDS = range(253)
+HOST_S = 5e-3  # the operating system's part of an answer's delay
+APART_S = 1e-3  # between two questions at least
+ATTEMPTS = 3
+VOLT_PER_UNIT = 0.1
+OVERHEAD_OF_PING = 6  # bytes of the question in the older protocols
+
+
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """A make of servos, or those of its servos that speak one version of its protocol.
+
+    Attributes:
+        name: in words.
+        bauds: rates that robot.toml can name [bit/s].
+        version: of its make's protocol.
+        models: by number.
+        errors: what each bit of the hardware error means, and what to do.
+        bus: a bus of its protocols.
+        mute: what is wrong with a servo that answers PING but no READ.
+    """
+
+    name: str
+    bauds: tuple[int, ...]
+    version: int
+    models: Mapping[int, Model] = field(repr=False)
+    errors: Mapping[int, str] = field(repr=False)
+    bus: type[Bus]
+    mute: str
+
+    @property
+    def packets(self) -> Packets:
+        """How to speak to it."""
+        return self.bus.packets_of(self.version)
+
+    def told(self, head: bytes, id: int) -> Identity | None:
+        """Who the servo of this ID is by the beginning of its control table; None when it is none of this kind."""
+        layouts = {model.layout.protocol: model.layout for model in self.models.values()}
+        of_id = [layout for layout in layouts.values() if layout.value("id", head) == id]
+        for layout in of_id:
+            model = self.models.get(layout.value("model", head))
+            if model is not None and model.layout.protocol == layout.protocol:
+                return Identity(self, model, model.number, layout["firmware"].words(head))
+        if not of_id:
+            return None
+        return Identity(self, None, of_id[0].value("model", head), of_id[0]["firmware"].words(head))
+
+
+@dataclass(frozen=True, slots=True)
+class Identity:
+    """Who a servo says that it is; `model` is None when it is not known."""
+
+    kind: Kind
+    model: Model | None
+    number: int
+    firmware: str
+
+
+class PingScanner:
+    """Finds servos of kinds whose PING is the same, to the bytes (a `Scanner`).
+
+    Each ID is asked. The questions do not wait for the answers, which carry an ID; where something comes that cannot be
+    understood, each is asked by itself. What kind it is, the beginning of its control table tells.
+    """
+
+    def __init__(self, *kinds: Kind, question: int = OVERHEAD_OF_PING) -> None:
+        """For `kinds`, whose PING has `question` bytes."""
+        self._kinds, self._packets = kinds, kinds[0].packets
+        self._ping_sizes = (question, self._packets.overhead + self._packets.ping_size)
+
+    @property
+    def protocol(self) -> str:
+        """Its name."""
+        return " and ".join(kind.name for kind in self._kinds)
+
+    @property
+    def bauds(self) -> Sequence[int]:
+        """Rates that robot.toml can name for one of them, the likely ones first [bit/s]."""
+        return tuple(dict.fromkeys(baud for kind in self._kinds for baud in kind.bauds))
+
+    def scan(self, name: str, port: ScannedPort, clock: Clock, latency_s: float) -> Iterator[FoundServo]:
+        """The servos on the port; see `Scanner.scan`."""
+        for id in self._ids(port, clock, latency_s):
+            yield self._found(name, port, clock, latency_s, id)
+
+    def _ids(self, port: ScannedPort, clock: Clock, latency_s: float) -> list[int]:
+        """Who answers when each is asked. An ID whose answers are not understood counts when it is asked again."""
+        port.flush()
+        spacing = max(sum(self._ping_sizes) * BITS_PER_BYTE / port.baud + SLOWEST_DELAY_S, APART_S)
+        received = b""
+        for id in IDS:
+            begin = clock.now()
+            port.write(self._packets.ping(id))
+            received += heard(port, clock, begin + spacing)
+        received += heard(port, clock, clock.now() + 2 * latency_s + HOST_S)
+        statuses, is_clean = self._statuses(received)
+        ids = {status.id for status in statuses}
+        return sorted(ids if is_clean else ids | self._unclear(port, clock, latency_s, ids))
+
+    def _unclear(self, port: ScannedPort, clock: Clock, latency_s: float, known: set[int]) -> set[int]:
+        """Who answers something, asked one after the other."""
+        wait_s = sum(self._ping_sizes) * BITS_PER_BYTE / port.baud + SLOWEST_DELAY_S + 2 * latency_s + HOST_S
+        found = set[int]()
+        for id in IDS:
+            if id in known:
+                continue
+            port.flush()
+            port.write(self._packets.ping(id))
+            if heard(port, clock, clock.now() + wait_s, self._ping_sizes[1]):
+                found.add(id)
+        return found
+
+    def _statuses(self, received: bytes) -> tuple[list[Status], bool]:
+        """The answers in what was heard, and whether there was nothing else."""
+        statuses: list[Status] = []
+        at, is_clean = 0, True
+        while at < len(received):
+            try:
+                status = self._packets.take(received, at)
+            except Garbled:
+                status = None
+            if status is None:
+                is_clean, at = False, at + 1
+                continue
+            statuses.append(status)
+            at += status.size
+        return statuses, is_clean
+
+    def _found(self, name: str, port: ScannedPort, clock: Clock, latency_s: float, id: int) -> FoundServo:
+        """The servo with what it tells of itself."""
+        kind = self._kinds[0]
+        servo, bus = FoundServo(name, port.baud, self.protocol, id), kind.bus(name, port, clock, latency_s)
+        head = _asked(bus, kind, id, self._head)
+        if head.trouble is Trouble.TIMEOUT:
+            return replace(servo, troubles=tuple(dict.fromkeys(kind.mute for kind in self._kinds)))
+        if head.trouble is not None:
+            return replace(servo, is_double=True, troubles=(DOUBLE,))
+        identity = self._identity(head.answers[0].status.data, id)
+        if identity is None:
+            return replace(servo, troubles=(UNKNOWN,))
+        kind, model = identity.kind, identity.model
+        servo = replace(servo, protocol=kind.name, firmware=identity.firmware)
+        if model is None:
+            return replace(servo, model=f"model {identity.number}", troubles=(UNKNOWN,))
+        bus = kind.bus(name, port, clock, latency_s)
+        return _with_state(bus, replace(servo, model=model.name), kind, model)
+
+    @property
+    def _head(self) -> Register:
+        """The part of the control table that tells who it is."""
+        layouts = [model.layout for kind in self._kinds for model in kind.models.values()]
+        return Register(0, max(layout[name].end for layout in layouts for name in ("model", "firmware", "id")))
+
+    def _identity(self, head: bytes, id: int) -> Identity | None:
+        """Of several kinds that it may be, the one that has such a model."""
+        told = [identity for kind in self._kinds if (identity := kind.told(head, id)) is not None]
+        known = [identity for identity in told if identity.model is not None]
+        return next(iter([*known, *told]), None)
+
+
+def _with_state(bus: Bus, servo: FoundServo, kind: Kind, model: Model) -> FoundServo:
+    layout = model.layout
+    first, last = layout["torque"].address, layout["temperature"].end
+    told = _asked(bus, kind, servo.id, Register(first, last - first))
+    if told.trouble is not None:  # two of one model say the same until they are asked for what differs
+        return replace(servo, is_double=True, troubles=(DOUBLE,))
+    status = told.answers[0].status
+    has_register = "hardware_error" in layout
+    bits = layout.value("hardware_error", status.data, first) if has_register else status.error
+    troubles = [text for bit, text in kind.errors.items() if bits & bit]
+    if servo.baud not in kind.bauds:
+        troubles.append(f"robot.toml has no such rate: give it {kind.bauds[0]:,} bit/s")
+    return replace(
+        servo,
+        voltage_v=VOLT_PER_UNIT * layout.value("voltage", status.data, first),
+        temperature_c=float(layout.value("temperature", status.data, first)),
+        has_torque=bool(layout.value("torque", status.data, first)),
+        troubles=tuple(troubles),
+    )
+
+
+def _asked(bus: Bus, kind: Kind, id: int, register: Register) -> Exchange:
+    packet = kind.packets.read(id, register.address, register.size)
+    exchange = Exchange(())
+    for _ in range(ATTEMPTS):
+        exchange = bus.ask(Request(packet, (id,), register.size, kind.version))
+        if exchange.trouble is None:
+            break
+    return exchange
+
+
+DOUBLE = "two servos have this ID, or the cable is bad: take one off, give the other another ID"
+UNKNOWN = "a model that no driver knows"
+
+
+def heard(port: ScannedPort, clock: Clock, end: float, enough: int | None = None) -> bytes:
+    """What comes until `end`; with `enough` only until there are so many bytes."""
+    received = b""
+    while clock.now() < end and (enough is None or len(received) < enough):
+        received += port.receive(end)
+    return received

@@ -1,0 +1,224 @@
+"""The benches on a pseudo-terminal, spoken to by rustypot as it is: a client that shares no code with ours."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from drivers.bench.pty_shell import PtyShell
+from drivers.dynamixel.bench.chain import Chain as DynamixelChain
+from drivers.dynamixel.bench.servo import Servo as DynamixelServo
+from drivers.dynamixel.models import BY_NAME as DYNAMIXEL
+from drivers.feetech.bench.chain import Chain as FeetechChain
+from drivers.feetech.bench.servo import Servo as FeetechServo
+from drivers.feetech.models import BY_NAME as FEETECH
+
+rustypot = pytest.importorskip("rustypot")
+
+IDS = (1, 2, 7)
+ANGLES = (0.5, -1.0, 0.3)
+TIMEOUT_S = 0.2
+
+
+def dynamixel(model: str) -> DynamixelChain:
+    kind = DYNAMIXEL[model]
+    told = zip(IDS, ANGLES, strict=True)
+    return DynamixelChain(DynamixelServo(kind, id, lambda _, a=a: a, return_delay_s=0) for id, a in told)
+
+
+def feetech(model: str) -> FeetechChain:
+    kind = FEETECH[model]
+    told = zip(IDS, ANGLES, strict=True)
+    return FeetechChain(FeetechServo(kind, id, lambda _, a=a: a, return_delay_s=0) for id, a in told)
+
+
+CHAINS: dict[str, Callable[[], Any]] = {
+    "XL330-M288": lambda: dynamixel("XL330-M288"),
+    "XL430-W250": lambda: dynamixel("XL430-W250"),
+    "MX-28": lambda: dynamixel("MX-28"),
+    "AX-12A": lambda: dynamixel("AX-12A"),
+    "STS3215": lambda: feetech("STS3215"),
+    "SCS0009": lambda: feetech("SCS0009"),
+}
+CONTROLLERS = {
+    "XL330-M288": "Xl330PyController", "XL430-W250": "Xl430PyController", "MX-28": "MxPyController",
+    "AX-12A": "AxPyController", "STS3215": "Sts3215PyController", "SCS0009": "Scs0009PyController",
+}  # fmt: skip
+MODELS = DYNAMIXEL | FEETECH
+# Who answers SYNC_READ by the manuals: neither Protocol 1.0 of Dynamixel nor the SCS series of Feetech.
+TOGETHER = ["XL330-M288", "XL430-W250", "STS3215"]
+EACH = pytest.mark.parametrize("model", CONTROLLERS)
+
+
+class Bench:
+    """Servos of one model, and the client that is connected to them."""
+
+    def __init__(self, model: str, folder: Path) -> None:
+        self.model, self.chain = MODELS[model], CHAINS[model]()
+        self.shell = PtyShell(self.chain, folder / "bus")
+        self._controller = getattr(rustypot, CONTROLLERS[model])
+
+    def __enter__(self) -> Bench:
+        self.shell.plug_in()
+        self.client = self._controller(str(self.shell.link), 1_000_000, TIMEOUT_S)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.client.close()
+        self.shell.unplug()
+
+    def ticks(self, id: int) -> int:
+        """Where the servo stands."""
+        return self.model.zero_ticks + round(ANGLES[IDS.index(id)] / self.model.rad_per_tick)
+
+
+@pytest.fixture
+def bench(model: str, tmp_path: Path) -> Iterator[Bench]:
+    with Bench(model, tmp_path) as opened:
+        yield opened
+
+
+@EACH
+def test_ping_finds_who_is_there_and_nobody_else(bench: Bench) -> None:
+    assert [bench.client.ping(id) for id in (*IDS, 9)] == [True, True, True, False]
+
+
+@EACH
+def test_a_scan_tells_the_model_s_number(bench: Bench) -> None:
+    assert bench.client.scan([1, 3, 7]) == {1: bench.model.number, 7: bench.model.number}
+
+
+@EACH
+def test_a_position_is_read(bench: Bench) -> None:
+    assert [bench.client.read_register(id, "present_position") for id in IDS] == [bench.ticks(id) for id in IDS]
+
+
+@EACH
+def test_what_is_written_is_read_again(bench: Bench) -> None:
+    bench.client.write_register(2, "goal_position", 700)
+    assert bench.client.read_register(2, "goal_position") == 700
+    assert bench.chain.servo(2)["goal"] == 700
+
+
+@EACH
+def test_a_write_is_answered_without_an_error(bench: Bench) -> None:
+    assert bench.client.write_register_with_error(1, "torque_enable", 1) == 0
+    assert bench.chain.servo(1)["torque"] == 1
+
+
+@EACH
+def test_sync_write_writes_each_its_own(bench: Bench) -> None:
+    bench.client.sync_write_register([1, 7], "goal_position", [100, 900])
+    assert bench.client.read_register(7, "goal_position") == 900  # the line is silent after that
+    assert [bench.chain.servo(id)["goal"] for id in IDS] == [100, 0, 900]
+
+
+@pytest.mark.parametrize("model", TOGETHER)
+def test_sync_read_gives_each_servo_s_position_in_the_order_asked(bench: Bench) -> None:
+    told = bench.client.sync_read_register([7, 1, 2], "present_position")
+    assert told == [bench.ticks(7), bench.ticks(1), bench.ticks(2)]
+
+
+@pytest.mark.parametrize("model", TOGETHER)
+def test_after_a_sync_read_with_one_missing_the_next_is_right(bench: Bench) -> None:
+    with pytest.raises(RuntimeError):
+        bench.client.sync_read_register([1, 9], "present_position")
+    assert bench.client.sync_read_register([1, 7], "present_position") == [bench.ticks(1), bench.ticks(7)]
+
+
+@pytest.mark.parametrize("model", ["MX-28", "AX-12A", "SCS0009"])
+def test_who_has_no_sync_read_is_silent(bench: Bench) -> None:
+    with pytest.raises(RuntimeError, match="timed out"):
+        bench.client.sync_read_raw_data([1, 2], 36, 2)
+
+
+@pytest.mark.parametrize("model", ["XL330-M288", "XL430-W250"])
+def test_fast_sync_read_gives_the_same(bench: Bench) -> None:
+    bench.client.set_fast_sync_read(True)
+    assert bench.client.sync_read_register(list(IDS), "present_position") == [bench.ticks(id) for id in IDS]
+
+
+@pytest.mark.parametrize("model", ["XL330-M288", "XL430-W250"])
+def test_a_broadcast_ping_finds_all_of_protocol_2(bench: Bench) -> None:
+    assert bench.client.broadcast_scan() == dict.fromkeys(IDS, bench.model.number)
+
+
+@pytest.mark.parametrize("model", ["STS3215"])
+def test_a_broadcast_ping_finds_a_feetech_servo_that_is_alone(bench: Bench) -> None:
+    del bench.chain.servos[1:]  # "only applicable when there is only one servo on the bus": several answer at once
+    assert bench.client.broadcast_scan() == {1: 777}
+
+
+@pytest.mark.parametrize("model", ["XL330-M288", "XL430-W250"])
+def test_a_reboot_is_answered_and_loses_what_stands_in_ram(bench: Bench) -> None:
+    bench.client.write_register(1, "torque_enable", 1)
+    assert bench.client.reboot(1)
+    assert bench.client.read_register(1, "torque_enable") == 0
+
+
+@pytest.mark.parametrize("model", ["XL330-M288", "XL430-W250"])
+def test_eeprom_is_locked_while_torque_is_on(bench: Bench) -> None:
+    bench.client.write_register(1, "torque_enable", 1)
+    assert bench.client.write_register_with_error(1, "return_delay_time", 3) == 7
+
+
+@EACH
+def test_a_new_id_is_answered_by_the_old_one(bench: Bench) -> None:
+    definition = type(bench.client).definition()
+    bench.client.close()
+    with rustypot.Bus(str(bench.shell.link), 1_000_000, TIMEOUT_S, {}) as opened:
+        opened.change_id(definition, 2, 42)
+    assert [servo.id for servo in bench.chain.servos] == [1, 42, 7]
+
+
+@pytest.mark.parametrize("model", [*TOGETHER, "SCS0009"])  # of the others rustypot knows no rates
+def test_a_new_rate_holds_from_the_next_question_on(bench: Bench) -> None:
+    definition = type(bench.client).definition()
+    bench.client.close()
+    with rustypot.Bus(str(bench.shell.link), 1_000_000, TIMEOUT_S, {}) as opened:
+        opened.change_baudrate(definition, 1, 57_600)
+        assert opened.scan(definition, [1, 7]) == {7: bench.model.number}
+        opened.set_baudrate(57_600)
+        assert opened.scan(definition, [1, 7]) == {1: bench.model.number}
+
+
+@pytest.mark.parametrize("model", ["STS3215"])
+def test_an_id_written_to_a_locked_eeprom_is_lost_with_the_power(bench: Bench) -> None:
+    bench.client.write_register(1, "id", 42)
+    assert bench.client.ping(42)
+    bench.chain.power_cycle(0.0)
+    assert bench.client.ping(1)
+
+
+@pytest.mark.parametrize("model", ["XL330-M288", "MX-28", "STS3215"])
+def test_what_is_wrong_with_a_servo_is_in_the_error_of_its_answers(bench: Bench) -> None:
+    bench.chain.servo(1).fail(0x20)
+    _, error = bench.client.read_register_with_error(1, "present_position")
+    assert error == (0x80 if bench.model.protocol == 2 else 0x20)
+
+
+def test_servos_of_several_models_and_protocols_share_a_bus(tmp_path: Path) -> None:
+    there = {1: "XL330-M288", 2: "XL430-W250", 3: "MX-28"}
+    chain = DynamixelChain(DynamixelServo(DYNAMIXEL[model], id, lambda _: 0.5) for id, model in there.items())
+    definitions = {id: getattr(rustypot, CONTROLLERS[model]).definition() for id, model in there.items()}
+    with (
+        PtyShell(chain, tmp_path / "bus"),
+        rustypot.Bus(str(tmp_path / "bus"), 1_000_000, TIMEOUT_S, definitions) as bus,
+    ):
+        expected = 2048 + round(0.5 / DYNAMIXEL["MX-28"].rad_per_tick)
+        assert bus.sync_read_register([1, 2], "present_position") == [expected] * 2
+        assert bus.read_register(3, "present_position") == expected
+        assert bus.set_torque([1, 2, 3], True) == {}
+    assert [servo["torque"] for servo in chain.servos] == [1, 1, 1]
+
+
+@pytest.mark.parametrize("rate", [1_000_000, 57_600, 128_000])
+def test_a_rate_without_a_name_is_known_too(rate, tmp_path: Path) -> None:
+    chain = FeetechChain([FeetechServo(FEETECH["STS3215"], 1, lambda _: 0.0, baud=rate)])
+    with PtyShell(chain, tmp_path / "bus"):
+        client = rustypot.Sts3215PyController(str(tmp_path / "bus"), rate, TIMEOUT_S)
+        assert client.ping(1)
+        client.close()
