@@ -19,6 +19,7 @@ from .config import BusConfig, DynamixelConfig
 from .models import BY_NUMBER, HARDWARE_ERRORS, TICK_S
 from .plan import block_requests
 from .port import SafePort
+from .settings import settings_of
 
 
 def open_serial(config: BusConfig, clock: Clock) -> tuple[Port, float]:
@@ -33,7 +34,9 @@ def _block_requests(bus: ServoBus, servos: Sequence[FittedServo], config: BusCon
     return block_requests(bus, servos, try_fast=config.fast_sync_read == "auto")
 
 
-DYNAMIXEL = Make(DynamixelConfig.table, BY_NUMBER, HARDWARE_ERRORS, Bus, Channel, _block_requests, TICK_S)
+DYNAMIXEL = Make(
+    DynamixelConfig.table, BY_NUMBER, HARDWARE_ERRORS, Bus, Channel, _block_requests, settings_of, 1, TICK_S
+)
 
 
 class DynamixelJoints(ServoJoints):

@@ -97,7 +97,7 @@ def identify(bus: Bus, config: ServoConfig, model: Model, known: Mapping[int, Mo
     """Ask the servo of `config` whether it is a `model`; `known` are those that can be told by their number."""
     layout = model.layout
     head = Register(0, max(layout["model"].end, layout["firmware"].end))
-    data, trouble = _read(bus, model, config.id, head)
+    data, trouble = read_register(bus, model, config.id, head)
     if data is None:
         return Finding(config, _absence(bus, model, config.id, trouble), may_come_back=trouble is Trouble.TIMEOUT)
     number = layout.value("model", data)
@@ -105,7 +105,7 @@ def identify(bus: Bus, config: ServoConfig, model: Model, known: Mapping[int, Mo
         other = known.get(number)
         return Finding(config, f"{other.name if other else f'model number {number}'}: wrong model")
     last = max(layout[name].end for name in SETTINGS if name in layout)
-    table, trouble = _read(bus, model, config.id, Register(0, last))
+    table, trouble = read_register(bus, model, config.id, Register(0, last))
     if table is None:
         return Finding(config, str(trouble), may_come_back=True)
     servo = FittedServo(
@@ -165,7 +165,7 @@ def switch_torque_off(bus: Bus, servo: FittedServo) -> FittedServo:
 
 def torque_is_on(bus: Bus, servo: FittedServo) -> bool:
     """Whether it holds its place; SourceLost when it does not answer."""
-    data, trouble = _read(bus, servo.model, servo.id, servo.model.layout["torque"])
+    data, trouble = read_register(bus, servo.model, servo.id, servo.model.layout["torque"])
     if data is None:
         raise SourceLost(f"joint {servo.joint!r} (ID {servo.id}): {trouble}", retry_s=RETRY_S)
     return data != b"\x00"
@@ -174,7 +174,7 @@ def torque_is_on(bus: Bus, servo: FittedServo) -> bool:
 def restore_torque(bus: Bus, servo: FittedServo) -> None:
     """Switch its torque on again where it was on, its goal being where it is."""
     layout = servo.model.layout
-    position, trouble = _read(bus, servo.model, servo.id, layout["position"])
+    position, trouble = read_register(bus, servo.model, servo.id, layout["position"])
     if position is None:
         log.warning("the torque of joint %r stays off: %s", servo.joint, trouble)
         return
@@ -184,7 +184,8 @@ def restore_torque(bus: Bus, servo: FittedServo) -> None:
         log.warning("the torque of joint %r could not be switched on again", servo.joint)
 
 
-def _read(bus: Bus, model: Model, id: int, register: Register) -> tuple[bytes | None, Trouble | None]:
+def read_register(bus: Bus, model: Model, id: int, register: Register) -> tuple[bytes | None, Trouble | None]:
+    """Its bytes; without them what was wrong the last time of several."""
     request = bus.read_request(model, id, register)
     exchange = Exchange(())
     for _ in range(ATTEMPTS):
