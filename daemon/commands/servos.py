@@ -94,8 +94,9 @@ def set_(
     """Write settings to servos' EEPROM: shows them first, asks, switches torque off, writes, reads back.
 
     `bodyschema servos show` lists the names. `id` and `baud` are set alone; an ID that is taken is refused, and after
-    another rate each servo is looked for there. Values are those of the register, but for words (operating_mode=current)
-    and the rate in bit/s. Exit code 1 when something was not written. Torque is switched off: hold the arm, it will sink.
+    another rate each servo is looked for there. Values are those of the register, but for the rate in bit/s and
+    words (operating_mode=current). Torque is switched off: hold the arm, it will sink. Exit code 1 when something was
+    not written.
 
     Needs: robot.toml with servos, or --port and --id; and no sampler that runs.
 

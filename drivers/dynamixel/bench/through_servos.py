@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -13,6 +13,7 @@ import msgspec
 
 from drivers.dynamixel.config import DynamixelConfig
 from drivers.dynamixel.joints import DynamixelJoints
+from drivers.servos.health import BusHealth, ServoHealth
 from interfaces.protocols import Clock, JointSource
 from interfaces.records import JointReading, frozen_array
 
@@ -52,6 +53,26 @@ class ThroughServos:
     def joints(self) -> tuple[str, ...]:
         """Names of the joints in the order of q."""
         return self._source.joints
+
+    @property
+    def health(self) -> tuple[str, ...]:
+        """As of the driver; nothing before it is opened, which the first reading does."""
+        return () if self._servos is None else self._servos.health
+
+    @property
+    def servo_health(self) -> tuple[ServoHealth, ...]:
+        """As of the driver."""
+        return () if self._servos is None else self._servos.servo_health
+
+    @property
+    def bus_health(self) -> Mapping[str, BusHealth]:
+        """As of the driver."""
+        return {} if self._servos is None else self._servos.bus_health
+
+    @property
+    def record(self) -> tuple[Mapping[str, object], ...]:
+        """As of the driver."""
+        return () if self._servos is None else self._servos.record
 
     def __enter__(self) -> Self:
         self._opened.enter_context(self._source)
