@@ -24,6 +24,10 @@ class ServoHealth(Protocol):
     @property
     def firmware(self) -> int: ...
     @property
+    def homing_offset(self) -> int: ...
+    @property
+    def drive_mode(self) -> int: ...
+    @property
     def voltage_v(self) -> float | None: ...
     @property
     def temperature_c(self) -> float | None: ...
@@ -98,6 +102,8 @@ def _status(servo: ServoHealth) -> ServoStatus:
         id=servo.id,
         model=servo.model,
         firmware=servo.firmware,
+        homing_offset=servo.homing_offset,
+        drive_mode=servo.drive_mode,
         voltage_v=None if servo.voltage_v is None else round(servo.voltage_v, 1),
         temperature_c=servo.temperature_c,
         current_a=None if servo.current_a is None else round(servo.current_a, 3),

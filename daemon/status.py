@@ -21,6 +21,7 @@ class ServoStatus(msgspec.Struct, frozen=True):
 
     Attributes:
         firmware: its version, as it tells it.
+        homing_offset: [ticks]; drive_mode: bits; both as its EEPROM has them, 0 where there are none.
         voltage_v, temperature_c: as it told last; null before it did.
         current_a: null where it is not measured.
         troubles: what is wrong with it, and what to do; empty when it is well.
@@ -30,6 +31,8 @@ class ServoStatus(msgspec.Struct, frozen=True):
     id: int
     model: str
     firmware: int
+    homing_offset: int
+    drive_mode: int
     voltage_v: float | None
     temperature_c: float | None
     current_a: float | None

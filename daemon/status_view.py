@@ -126,7 +126,7 @@ def _sampler(status: SamplerStatus) -> list[RenderableType]:
 
 
 def _bus(bus: BusStatus) -> str:
-    wrong = ", ".join(f"{count} {name}" for name, count in sorted(bus.troubles.items(), key=lambda item: -item[1]))
+    wrong = ", ".join(f"{count} × {name}" for name, count in sorted(bus.troubles.items(), key=lambda item: -item[1]))
     return f"{bus.answered:.2%} of {bus.exchanges} questions answered{f': {wrong}' if wrong else ''}"
 
 

@@ -49,6 +49,7 @@ class TurnCount:
     Attributes:
         pose: where the joints were last [rad]; None before anything is known.
         counts: the same [ticks].
+        lost: a joint that is not where it was, so that somebody has to say in which turn it is.
     """
 
     def __init__(
@@ -70,16 +71,12 @@ class TurnCount:
         self.pose = None if last_pose is None else [float(q) for q in last_pose]
         self.counts: list[int] = []
         self._sensors: list[Sensor] = []
-        self._is_asking = self._is_accepted = False
-
-    @property
-    def is_asking(self) -> bool:
-        """Whether a joint is not where it was, so that somebody has to say in which turn it is."""
-        return self._is_asking
+        self._is_accepted = False
+        self.lost: str | None = None
 
     def accept(self) -> None:
         """Somebody says that the turns nearest to where the joints were are right. From any thread."""
-        self._is_accepted = self._is_asking
+        self._is_accepted = self.lost is not None
 
     def begin(self, sensors: Sequence[Sensor], raw: Sequence[int]) -> None:
         """Find the turn of each joint by its limits, else by the last pose."""
@@ -108,7 +105,7 @@ class TurnCount:
             if abs(now - was) > math.radians(self._max_move_deg) and self._is_accepted:
                 log.warning("joint %r: at %.0f°, as somebody said", sensor.joint, math.degrees(now))
             elif abs(now - was) > math.radians(self._max_move_deg):
-                self._is_asking = True
+                self.lost = sensor.joint
                 raise SourceLost(
                     f"joint {sensor.joint!r} ({sensor.label}) was at {math.degrees(was):.0f}° and is now at "
                     f"{math.degrees(now):.0f}°, or whole turns from there: its turn count is lost. "
@@ -120,7 +117,7 @@ class TurnCount:
             if count != raw[place]:
                 turns = round((count - raw[place]) / (sensor.ticks_per_turn or 1))
                 log.info("joint %r: %+d turns are added to what its sensor counts", sensor.joint, turns)
-        self._is_asking = self._is_accepted = False
+        self.lost, self._is_accepted = None, False
 
     def _is_within_a_turn(self, place: int) -> bool:
         lower, upper = self._limits[place]

@@ -20,9 +20,7 @@ def command(
     *,
     to: Annotated[
         Process | None,
-        Parameter(
-            help="Who is to do it; else who knows the command, and for pause and resume the sampler."
-        ),
+        Parameter(help="Who is to do it; else who knows the command, and for pause and resume the sampler."),
     ] = None,
     robot: RobotFile = HERE,
 ) -> None:

@@ -15,7 +15,7 @@ from drivers.servos.settings import BAUD, HOMING_OFFSET, ID, Setting
 from .models import LAYOUT_MX1, baud_value
 
 BAUDS2 = (9600, 57_600, 115_200, 1_000_000, 2_000_000, 3_000_000, 4_000_000)
-BAUDS1 = (9600, 57_600, 115_200, 1_000_000)
+BAUDS1 = (9600, 57_600, 115_200, 1_000_000)  # the register knows others, which robot.toml does not
 MODES = {"velocity": 1, "position": 3, "extended": 4, "pwm": 16}
 CURRENT_MODES = {"current": 0, "current_position": 5}
 FARTHEST_OFFSET = 1_044_479  # 255 turns

@@ -155,7 +155,7 @@ class SerialLineJoints:
     @property
     def asks_for_turns(self) -> bool:
         """Whether it cannot be opened because a joint lost its turn count."""
-        return self._turns.is_asking
+        return self._turns.lost is not None
 
     def accept_turns(self) -> None:
         """Take the turns nearest to where the joints were, at the next opening. From any thread."""

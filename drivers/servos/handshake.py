@@ -19,6 +19,9 @@ SETTINGS = ("return_delay", "drive_mode", "operating_mode", "homing_offset")
 
 ATTEMPTS = 5
 RETRY_S = 0.2
+LOOKS = 5  # at what a servo measures
+GARBLED = "garbled answers: two servos with this ID, or a bad cable"
+SCAN = "`bodyschema scan --robot robot.toml` looks for them at all rates and IDs, and says what to do"
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,7 +110,9 @@ def identify(bus: Bus, config: ServoConfig, model: Model, known: Mapping[int, Mo
     last = max(layout[name].end for name in SETTINGS if name in layout)
     table, trouble = read_register(bus, model, config.id, Register(0, last))
     if table is None:
-        return Finding(config, str(trouble), may_come_back=True)
+        return Finding(config, _absence(bus, model, config.id, trouble), may_come_back=True)
+    if _is_garbled(bus, model, config.id):
+        return Finding(config, GARBLED, may_come_back=True)
     servo = FittedServo(
         joint=config.joint,
         bus=bus.name,
@@ -135,7 +140,7 @@ def require_all(findings: Iterable[Finding], ports: str) -> list[FittedServo]:
     rows += [(f.config.joint, str(f.config.id), f.config.model, f.found) for f in findings]
     widths = [max(len(row[column]) for row in rows) for column in range(4)]
     lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
-    message = "\n  ".join([f"the servos on {ports} are not those of robot.toml:", *lines])
+    message = "\n  ".join([f"the servos on {ports} are not those of robot.toml:", *lines, SCAN])
     if all(finding.may_come_back for finding in wrong):
         raise SourceLost(message, retry_s=RETRY_S)
     raise SourceError(message)
@@ -201,5 +206,12 @@ def _absence(bus: Bus, model: Model, id: int, trouble: Trouble | None) -> str:
             return "answers PING but no READ: its Status Return Level is 0"
         return "no answer"
     if trouble is Trouble.GARBLED:
-        return "garbled answers: two servos with this ID, or a bad cable"
+        return GARBLED
     return str(trouble)
+
+
+def _is_garbled(bus: Bus, model: Model, id: int) -> bool:
+    """Whether most of what it measures comes garbled: two of one model say the same of themselves, but not of that."""
+    request = bus.read_request(model, id, model.layout.block)
+    garbled = sum(bus.ask(request).trouble is Trouble.GARBLED for _ in range(LOOKS))
+    return garbled > LOOKS // 2

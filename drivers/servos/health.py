@@ -20,6 +20,7 @@ class ServoHealth:
     """One servo.
 
     Attributes:
+        homing_offset, drive_mode: as it keeps them.
         voltage_v, temperature_c: as it told last; None before it did.
         current_a: None where it is not measured.
         troubles: what is wrong with it, and what to do.
@@ -30,6 +31,8 @@ class ServoHealth:
     id: int
     model: str
     firmware: int
+    homing_offset: int
+    drive_mode: int
     voltage_v: float | None
     temperature_c: float | None
     current_a: float | None
@@ -50,7 +53,11 @@ class BusHealth:
 
 
 class Health:
-    """What the servos of an arm told of themselves."""
+    """What the servos of an arm told of themselves.
+
+    Attributes:
+        away: names of the buses whose ports cannot be opened.
+    """
 
     def __init__(self, errors: Mapping[int, str]) -> None:
         """Nothing was told yet.
@@ -62,6 +69,7 @@ class Health:
         self._alerts: dict[str, int] = {}
         self._supplies: dict[str, tuple[float, float]] = {}
         self._absent: dict[str, str] = {}
+        self.away: set[str] = set()
 
     @property
     def complaints(self) -> tuple[str, ...]:
@@ -97,15 +105,19 @@ class Health:
         """A servo does not answer when it is asked alone."""
         self._absent[joint] = trouble
 
-    def of(self, servo: FittedServo, sample: Sample | None) -> ServoHealth:
-        """How a servo is."""
+    def of(self, servo: FittedServo, sample: Sample | None, lost: str | None) -> ServoHealth:
+        """How a servo is; `lost` is the joint that lost its turn count."""
         joint = servo.joint
         voltage, temperature = self._supplies.get(joint, (None, None))
         troubles = self._reasons(self._alerts.get(joint, 0))
+        if joint == lost:
+            troubles.append("its turn count is lost: turn it back, or say that it is right")
         if joint in self._absent:
             troubles = [f"{self._absent[joint]}: look at its supply and cable, and those of the one before it"]
+        if servo.bus in self.away:
+            troubles = ["its bus is away: look at the adapter's cable"]
         current = None if sample is None else sample.current
-        about = (joint, servo.bus, servo.id, servo.model.name, servo.firmware)
+        about = (joint, servo.bus, servo.id, servo.model.name, servo.firmware, servo.homing_offset, servo.drive_mode)
         return ServoHealth(*about, voltage, temperature, current, tuple(troubles))
 
     def _reasons(self, bits: int) -> list[str]:

@@ -105,7 +105,8 @@ class ServoJoints:
     def servo_health(self) -> tuple[ServoHealth, ...]:
         """How each servo is; empty before the first opening. From any thread."""
         samples = self.samples
-        return tuple(self._health.of(servo, samples.get(servo.joint)) for servo in list(self.servos))
+        lost = self._turns.lost
+        return tuple(self._health.of(servo, samples.get(servo.joint), lost) for servo in list(self.servos))
 
     @property
     def bus_health(self) -> Mapping[str, BusHealth]:
@@ -120,7 +121,7 @@ class ServoJoints:
     @property
     def asks_for_turns(self) -> bool:
         """Whether it cannot be opened because a joint lost its turn count."""
-        return self._turns.is_asking
+        return self._turns.lost is not None
 
     def accept_turns(self) -> None:
         """Take the turns nearest to where the joints were, at the next opening. From any thread."""
@@ -194,10 +195,12 @@ class ServoJoints:
     def _open_buses(self, stack: ExitStack) -> None:
         self._buses.clear()
         for name, config in self._config.buses.items():
+            self._health.away.add(name)
             port, latency_s = self._open_port(config, self._clock)
             stack.callback(_close, port)
             self._buses[name] = self._make.bus(name, port, self._clock, latency_s)
             self._buses[name].counts = self._counts[name]
+            self._health.away.discard(name)
 
     def _identified(self, servo: ServoConfig) -> Finding:
         return identify(self._buses[self._config.bus_of(servo)], servo, self._config.model_of(servo), self._make.models)

@@ -62,7 +62,7 @@ def test_what_is_wrong_is_exit_code_1_and_has_its_remedy(tmp_path, capsys) -> No
         code = called("doctor", "--robot", run.robot_file, "--json")
     wrong = [check for check in json.loads(capsys.readouterr().out)["checks"] if check["state"] == "wrong"]
     assert code == 1
-    assert [check["mend"] for check in wrong] == ["free the joint, then reboot the servo"]
+    assert [check["mend"] for check in wrong] == ["free the joint, then switch its supply off and on"]
 
 
 @pytest.mark.usefixtures("state")

@@ -143,7 +143,7 @@ def test_a_missing_servo_is_wrong(tmp_path) -> None:
 def test_an_alert_is_wrong_and_says_what_to_do(tmp_path, joint) -> None:
     check = of(told(tmp_path, f"overload@{joint}"), "servos")[1]
     assert (check.state, check.said) == ("wrong", f"joint {joint} (ID {JOINTS.index(joint) + 1}): it is overloaded")
-    assert check.mend == "free the joint, then reboot the servo"
+    assert check.mend == "free the joint, then switch its supply off and on"
 
 
 def test_slow_answers_are_told_with_the_register(tmp_path) -> None:

@@ -231,7 +231,9 @@ def test_an_answer_with_an_alert_is_as_good_and_the_remedy_is_told(caplog) -> No
     with caplog.at_level(logging.WARNING), (arm := Arm()).joints:
         arm.chain.servo(2).fail(0x20)
         assert max(arm.error(reading) for reading in read(arm, 200)) < 2 * TICK
-        assert arm.joints.health == ("joint 'joint2': it is overloaded: free the joint, then reboot the servo",)
+        assert arm.joints.health == (
+            "joint 'joint2': it is overloaded: free the joint, then switch its supply off and on",
+        )
         assert len(caplog.messages) == 1
         arm.chain.servo(2)["hardware_error"] = 0
         read(arm, 200)
