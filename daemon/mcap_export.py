@@ -47,7 +47,10 @@ _POSE_IN_FRAME = {
 
 
 def write_mcap(recording: Recording, file: Path, devices: Sequence[Devices] = ()) -> None:
-    """Write `recording` to `file`, with what its joints were read with as metadata; message times are `Recording.play_times`, moved to begin at 0 if negative.
+    """Write `recording` to `file`; message times are `Recording.play_times`, moved to begin at 0 if negative.
+
+    Args:
+        devices: what its joints were read with, which becomes metadata.
 
     Raises:
         RecordingError: the extra `export` is not installed, or a time cannot be told in nanoseconds.

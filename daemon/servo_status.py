@@ -114,4 +114,4 @@ def _status(servo: ServoHealth) -> ServoStatus:
 def _bus(bus: BusHealth) -> BusStatus:
     failed = sum(bus.troubles.values())
     answered = 1.0 - failed / bus.exchanges if bus.exchanges else 0.0
-    return BusStatus(bus.exchanges, round(answered, 5), {str(name): count for name, count in bus.troubles.items()})
+    return BusStatus(bus.exchanges, round(answered, 5), dict(bus.troubles))

@@ -150,7 +150,7 @@ class PairReader:
         if not self._rows("SELECT 1 FROM sqlite_schema WHERE name = 'devices'", ()):
             return []
         rows = self._rows("SELECT session, from_seq, utc, record FROM devices ORDER BY id", ())
-        return [Devices(*row[:3], tuple(msgspec.json.decode(row[3]))) for row in rows]
+        return [Devices(session, seq, utc, tuple(msgspec.json.decode(record))) for session, seq, utc, record in rows]
 
     def _rows(self, statement: str, values: tuple[Any, ...]) -> list[Any]:
         with self._lock, explained(self.file):

@@ -111,7 +111,10 @@ class ServoJoints:
     @property
     def bus_health(self) -> Mapping[str, BusHealth]:
         """By name how each bus went since the start. From any thread."""
-        return {name: BusHealth(counts.exchanges, dict(counts.troubles)) for name, counts in self._counts.items()}
+        return {
+            name: BusHealth(counts.exchanges, {str(name): n for name, n in list(counts.troubles.items())})
+            for name, counts in self._counts.items()
+        }
 
     @property
     def samples(self) -> Mapping[str, Sample | None]:
