@@ -142,7 +142,8 @@ def require_all(findings: Iterable[Finding], ports: str) -> list[FittedServo]:
     lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
     message = "\n  ".join([f"the servos on {ports} are not those of robot.toml:", *lines, SCAN])
     if all(finding.may_come_back for finding in wrong):
-        raise SourceLost(message, retry_s=RETRY_S)
+        brief = "; ".join(f"joint {f.config.joint!r} (ID {f.config.id}): {f.found}" for f in wrong)
+        raise SourceLost(message, retry_s=RETRY_S, brief=brief)
     raise SourceError(message)
 
 
