@@ -86,14 +86,14 @@ def test_servos_of_a_port_that_is_away_are_marked() -> None:
 def test_two_dynamixel_servos_of_one_model_and_id_are_refused_at_the_start(model) -> None:
     arm = Arm((model,) * 3)
     arm.chain.servos.append(Servo(arm.chain.servo(2).model, 2, lambda t: swing(0)(t) + 0.4, return_delay_s=0))
-    with pytest.raises(SourceError, match="joint2 +2 .* garbled answers: two servos with this ID"), arm.joints:
+    with pytest.raises(SourceError, match=r"joint2 +2 .* garbled answers: two servos with this ID"), arm.joints:
         pytest.fail("it was opened")
 
 
 def test_two_feetech_servos_of_one_model_and_id_are_refused_at_the_start() -> None:
     arm = FeetechArm()
     arm.chain.servos.append(FeetechServo(arm.chain.servo(2).model, 2, lambda t: swing(0)(t) + 0.4, return_delay_s=0))
-    with pytest.raises(SourceError, match="joint2 +2 .* garbled answers: two servos with this ID"), arm.joints:
+    with pytest.raises(SourceError, match=r"joint2 +2 .* garbled answers: two servos with this ID"), arm.joints:
         pytest.fail("it was opened")
 
 
