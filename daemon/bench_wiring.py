@@ -18,7 +18,7 @@ import msgspec
 from drivers.bench.asked_faults import AskedFault, FaultKinds
 from drivers.bench.dry_run import Angle, BenchArm, DryRun
 from drivers.bench.motion import played, swinging
-from drivers.bench.through_driver import LATENCY_MS, READ_S, Look, ThroughDriver
+from drivers.bench.through_driver import LATENCY_MS, READ_S, Behind, ThroughDriver
 from drivers.dynamixel.config import DynamixelConfig
 from drivers.feetech.config import FeetechConfig
 from drivers.ros2.config import Ros2Config
@@ -225,17 +225,17 @@ def through_bench(config: Config, joints: JointSource, open_driver: OpenDriver) 
 @contextmanager
 def _looking_at_servos(
     hardware: DynamixelConfig | FeetechConfig, angles: Mapping[str, Angle], open_driver: OpenDriver
-) -> Iterator[Look]:
+) -> Iterator[Behind]:
     buses = {name: msgspec.structs.replace(bus, latency_ms=LATENCY_MS) for name, bus in hardware.buses.items()}
     patient = msgspec.structs.replace(hardware, buses=buses)
     with _on_a_bench(_arm(patient, angles)) as bench, open_driver(bench.config) as servos:
-        yield lambda: servos.read(READ_S)
+        yield Behind(servos, lambda: servos.read(READ_S))
 
 
 @contextmanager
 def _looking_at_lines(
     hardware: SerialLinesConfig, angles: Mapping[str, Angle], open_driver: OpenDriver
-) -> Iterator[Look]:
+) -> Iterator[Behind]:
     """Each look is at a line whose measurement began after it."""
     from drivers.serial_lines.bench.listener import Listener
 
@@ -243,11 +243,13 @@ def _looking_at_lines(
     quick = msgspec.structs.replace(hardware, baud=BOARD_BAUD, delay_ms=0.0, native_usb=False)
     arm = _arm(quick, angles, rate_hz=BOARD_RATE_HZ)
     with _on_a_bench(arm) as bench, open_driver(bench.config) as encoders, Listener(encoders) as listener:
-        yield lambda: listener.after(clock.now() + SETTLED_S, READ_S)
+        yield Behind(encoders, lambda: listener.after(clock.now() + SETTLED_S, READ_S))
 
 
 @contextmanager
-def _looking_at_messages(hardware: Ros2Config, angles: Mapping[str, Angle], open_driver: OpenDriver) -> Iterator[Look]:
+def _looking_at_messages(
+    hardware: Ros2Config, angles: Mapping[str, Angle], open_driver: OpenDriver
+) -> Iterator[Behind]:
     """A node that publishes when it is looked at, and a router, in this process."""
     from drivers.ros2.bench.node import Node
     from drivers.ros2.bench.zenoh_robot import ZenohRobot
@@ -263,7 +265,7 @@ def _looking_at_messages(hardware: Ros2Config, angles: Mapping[str, Angle], open
             robot.publish(node, clock.now())
             return joints.read(READ_S)
 
-        yield look
+        yield Behind(joints, look)
 
 
 @contextmanager

@@ -193,8 +193,7 @@ class Config:
         """Where store and checkpoint live."""
         if self.tables.daemon.state_dir is not None:
             return (self.file.parent / self.tables.daemon.state_dir).resolve()
-        home = os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state"
-        return Path(home) / "bodyschema" / self.robot.name
+        return state_home() / self.robot.name
 
     @property
     def store_file(self) -> Path:
@@ -205,6 +204,11 @@ class Config:
     def checkpoint_file(self) -> Path:
         """The learner's state."""
         return self.state_dir / "learner.ckpt"
+
+
+def state_home() -> Path:
+    """The folder of all robots' states."""
+    return Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state") / "bodyschema"
 
 
 def _check_endpoints(zenoh: ZenohConfig, file: Path, text: str) -> None:

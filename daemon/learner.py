@@ -31,6 +31,7 @@ from daemon.status import LearnerStatus
 from daemon.tool_changes import ToolChanges
 from daemon.wire import OCTETS, CommandReply, CommandRequest, PairsReply, decode, encode
 from daemon.wiring import open_marker_topic
+from interfaces.errors import RequestError
 from interfaces.protocols import Clock
 from kbmaps import KBMapsError
 
@@ -224,6 +225,9 @@ class Learner:
             "tool_changed": self._tool_changed,
             "checkpoint": self._checkpoint_now,
         }
+        if command not in carried_out:
+            known = ", ".join(carried_out)
+            raise RequestError(f"the learner knows {known}, not {command}. Send it to {self._keys.command('sampler')}")
         message = carried_out[command]()
         log.info("command %s: %s", command, message)
         return encode(CommandReply(command, message), request.encoding)

@@ -4,10 +4,14 @@
 | --- | --- | --- |
 | /pair | bodyschema.Row | every column of the row under its own name, exactly |
 | /marker | foxglove.PoseInFrame | the marker, for the 3-D panel; unturned where no orientation was recorded |
+
+Metadata `bodyschema` has the joints and the number of rows; `devices/1`, `devices/500` … of each joint what it was read
+with from that pair on: servo, firmware, homing offset and so on, as JSON.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +21,8 @@ import numpy as np
 from interfaces.errors import RecordingError
 from interfaces.recording import Recording
 from interfaces.records import FloatArray
+
+from .store import Devices
 
 FRAME_ID = "measurement_frame"
 UNTURNED = (0.0, 0.0, 0.0, 1.0)
@@ -40,8 +46,11 @@ _POSE_IN_FRAME = {
 }
 
 
-def write_mcap(recording: Recording, file: Path) -> None:
+def write_mcap(recording: Recording, file: Path, devices: Sequence[Devices] = ()) -> None:
     """Write `recording` to `file`; message times are `Recording.play_times`, moved to begin at 0 if negative.
+
+    Args:
+        devices: what its joints were read with, which becomes metadata.
 
     Raises:
         RecordingError: the extra `export` is not installed, or a time cannot be told in nanoseconds.
@@ -53,6 +62,10 @@ def write_mcap(recording: Recording, file: Path) -> None:
         writer = writer_type(stream)
         writer.start(profile="", library="bodyschema")
         writer.add_metadata("bodyschema", {"joints": _json(recording.joints).decode(), "rows": str(len(recording))})
+        for part in devices:
+            joints = {str(device["joint"]): _json(device).decode() for device in part.record}
+            about = {"from_seq": str(part.from_seq), "utc": part.utc}
+            writer.add_metadata(f"devices/{part.from_seq}", about | joints)
         _write_rows(writer, recording, times_ns)
         _write_markers(writer, recording, times_ns)
         writer.finish()

@@ -14,14 +14,14 @@ from interfaces.recording import CSV, PARQUET, Recording, joints_in
 from interfaces.records import Pair
 
 from .mcap_export import write_mcap
-from .store import PairReader
+from .store import Devices, PairReader
 
 MCAP, URDF = ".mcap", ".urdf"
 STORE_ENDINGS = (".sqlite", ".sqlite3", ".db")
 
-_WRITERS: dict[str, Callable[[Recording, Path], None]] = {
-    CSV: Recording.write_csv,
-    PARQUET: Recording.write_parquet,
+_WRITERS: dict[str, Callable[[Recording, Path, Sequence[Devices]], None]] = {
+    CSV: lambda recording, file, _: recording.write_csv(file),
+    PARQUET: lambda recording, file, _: recording.write_parquet(file),
     MCAP: write_mcap,
 }
 
@@ -70,6 +70,12 @@ def stored_pairs(file: Path) -> StoredPairs:
         if not pairs:
             raise RecordingError("the store has no pairs yet", file=file, remedy="Move the arm in front of the camera")
         return StoredPairs(pairs[0].store, from_pairs(pairs, reader.joints))
+
+
+def devices_of(store: Path) -> list[Devices]:
+    """What the joints of a store's pairs were read with; StoreError when it cannot be read."""
+    with PairReader(store) as reader:
+        return reader.devices()
 
 
 def opened(source: Path, joints: tuple[str, ...] | None = None) -> Recording:
@@ -124,15 +130,18 @@ def check_target(out: Path, *, force: bool) -> None:
         raise RecordingError("the file is there already", file=out, remedy="Give another name, or --force")
 
 
-def write(recording: Recording, out: Path) -> None:
+def write(recording: Recording, out: Path, devices: Sequence[Devices] = ()) -> None:
     """Write `recording` in the format of the ending of `out`. The file appears when it is whole.
+
+    Args:
+        devices: what the joints were read with, which only MCAP has a place for.
 
     Raises:
         RecordingError: it cannot be written, or the extra `export` is not installed.
     """
     part = out.with_name(f".{out.stem}.part{out.suffix}")
     try:
-        _WRITERS[out.suffix.lower()](recording, part)
+        _WRITERS[out.suffix.lower()](recording, part, devices)
         os.replace(part, out)
     except RecordingError as error:
         raise RecordingError(error.what, file=out, remedy=error.remedy) from error

@@ -100,6 +100,7 @@ class Reopening(Generic[R_co]):
         else:
             self._wait_s = min(2 * self._wait_s, LONGEST_WAIT_S)
         self._is_open = False
-        self.trouble = f"{self._name} are lost ({error}); trying to open them again"
+        said = error.brief if isinstance(error, SourceLost) else error
+        self.trouble = f"{self._name} are lost ({said}); trying to open them again"
         soon_s = error.retry_s if isinstance(error, SourceLost) else None
         self._next_try = self._wall.now() + (self._wait_s if soon_s is None else soon_s)

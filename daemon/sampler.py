@@ -20,10 +20,12 @@ from interfaces.records import FloatArray, JointReading, MarkerFix, MarkerMiss, 
 from .align import JointBuffer
 from .bus import Bus, Request
 from .config import Config
+from .devices import DeviceWatch
 from .gate import Accepted, Gate
 from .history import answer_pairs
 from .keys import Keys
 from .reopen import Reopening
+from .servo_status import AsksForTurns, buses_of, complaints_of, servos_of
 from .simulation import answer_simulation
 from .sources import Sources
 from .status import SamplerStatus
@@ -78,6 +80,7 @@ class Sampler:
         self._keys = Keys(config.robot.name)
         self._simulation, self._source_clock = sources.simulation, sources.clock
         self._joints = Reopening(sources.joints, "the encoders", self._wall)
+        self._encoders, self._devices = sources.joints, DeviceWatch(sources.joints, store, self._wall)
         self._marker = Reopening(sources.marker, "the cameras", self._wall)
         rules, prismatic = config.tables.daemon, config.robot.chain.prismatic
         self._buffer = JointBuffer(prismatic, rules.max_reading_gap_s)
@@ -111,6 +114,7 @@ class Sampler:
         with ExitStack() as stack:
             stack.enter_context(self._joints)
             stack.enter_context(self._marker)
+            self._devices.look()
             reader = threading.Thread(target=self._read_encoders, name="encoders")
             reader.start()
             stack.callback(reader.join)
@@ -145,6 +149,8 @@ class Sampler:
             coverage=tally.coverage,
             disk_free_bytes=self._disk_free(),
             health=self._health(),
+            servos=servos_of(self._encoders),
+            buses=buses_of(self._encoders),
             version=version("bodyschema"),
         )
 
@@ -201,6 +207,8 @@ class Sampler:
             if self._paused:
                 self._gate.break_segment()
                 return Reason.PAUSED
+            if self._devices.look():
+                self._gate.break_segment()
             verdict = self._gate.offer(seen.t, q, seen.x)
             if isinstance(verdict, Reason):
                 return verdict
@@ -249,9 +257,12 @@ class Sampler:
 
     def _obey(self, request: Request) -> bytes:
         command = decode(request.payload, CommandRequest, request.encoding).command
+        if command == "accept_turns":
+            return encode(CommandReply(command, self._accept_turns()), request.encoding)
         if command not in ("pause", "resume"):
             raise RequestError(
-                f"the sampler knows pause and resume, not {command}. Send it to {self._keys.command('learner')}"
+                f"the sampler knows pause, resume and accept_turns, not {command}. "
+                f"Send it to {self._keys.command('learner')}"
             )
         if command == "resume" and self._paused:
             # A frame that is still under way shows the arm as it was during the pause.
@@ -261,6 +272,14 @@ class Sampler:
         message = "no pairs are accepted until resume" if self._paused else "pairs are accepted, in a new segment"
         log.info("%s: %s", command, message)
         return encode(CommandReply(command, message), request.encoding)
+
+    def _accept_turns(self) -> str:
+        encoders = self._encoders
+        if not isinstance(encoders, AsksForTurns) or not encoders.asks_for_turns:
+            raise RequestError("no joint has lost its turn count: there is nothing to accept")
+        encoders.accept_turns()
+        log.info("accept_turns: the turns nearest to where the joints were are taken")
+        return "the turns nearest to where the joints were are taken; pairs go on in a new segment"
 
     def _tell_when_due(self) -> None:
         self._tally.tick()
@@ -280,6 +299,7 @@ class Sampler:
 
     def _health(self) -> list[str]:
         said: list[str] = [trouble for trouble in (self._joints.trouble, self._marker.trouble) if trouble]
+        said += complaints_of(self._encoders) + self._devices.changes
         if self._failure is not None:
             said.append(str(self._failure))
         elif not self._ended:

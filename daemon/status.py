@@ -16,6 +16,43 @@ class JointRange(msgspec.Struct, frozen=True):
     upper_limit: float
 
 
+class ServoStatus(msgspec.Struct, frozen=True):
+    """One joint's servo.
+
+    Attributes:
+        firmware: its version, as it tells it.
+        homing_offset: [ticks]; drive_mode: bits; both as its EEPROM has them, 0 where there are none.
+        voltage_v, temperature_c: as it told last; null before it did.
+        current_a: null where it is not measured.
+        troubles: what is wrong with it, and what to do; empty when it is well.
+    """
+
+    bus: str
+    id: int
+    model: str
+    firmware: int
+    homing_offset: int
+    drive_mode: int
+    voltage_v: float | None
+    temperature_c: float | None
+    current_a: float | None
+    troubles: list[str]
+
+
+class BusStatus(msgspec.Struct, frozen=True):
+    """One bus of servos since the start.
+
+    Attributes:
+        exchanges: questions that were asked.
+        answered: the share of them that was answered as it should be.
+        troubles: the others, by what was wrong.
+    """
+
+    exchanges: int
+    answered: float
+    troubles: dict[str, int]
+
+
 class SamplerStatus(msgspec.Struct, frozen=True, kw_only=True):
     """State of the sampler.
 
@@ -28,6 +65,8 @@ class SamplerStatus(msgspec.Struct, frozen=True, kw_only=True):
         rejected: frames that did not become pairs, by reason.
         coverage: by joint.
         health: sentences about what is wrong; empty when all is well.
+        servos: by joint; empty where the joints are no servos.
+        buses: by name; the same.
     """
 
     robot: str
@@ -45,6 +84,8 @@ class SamplerStatus(msgspec.Struct, frozen=True, kw_only=True):
     disk_free_bytes: int
     health: list[str]
     version: str
+    servos: dict[str, ServoStatus] = {}
+    buses: dict[str, BusStatus] = {}
     schema: int = SCHEMA
 
 

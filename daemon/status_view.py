@@ -20,7 +20,8 @@ from .config import Config
 from .findings_view import calibration_table, outlook_lines
 from .keys import Keys
 from .screen import coverage_table, mm, rejected
-from .status import LearnerStatus, SamplerStatus
+from .servos_view import servos_table
+from .status import BusStatus, LearnerStatus, SamplerStatus
 from .wire import decode
 
 ANSWER_LIMIT_S = 2.0
@@ -117,8 +118,16 @@ def _sampler(status: SamplerStatus) -> list[RenderableType]:
     facts.add_row("pairs", f"{status.pairs} in {status.segment} segments, {status.pairs_per_s:.1f}/s")
     facts.add_row("frames", f"{status.frames}, {status.frames_per_s:.1f}/s; readings {status.readings_per_s:.0f}/s")
     facts.add_row("rejected", reasons)
+    for name, bus in status.buses.items():
+        facts.add_row(f"bus {name}", _bus(bus))
     facts.add_row("store", f"{status.store}, {status.disk_free_bytes / 1e9:.1f} GB free")
-    return [_head("sampler", status), facts, *_health(status.health)]
+    servos = [Text(), servos_table(status.servos)] if status.servos else []
+    return [_head("sampler", status), facts, *_health(status.health), *servos]
+
+
+def _bus(bus: BusStatus) -> str:
+    wrong = ", ".join(f"{count} × {name}" for name, count in sorted(bus.troubles.items(), key=lambda item: -item[1]))
+    return f"{bus.answered:.2%} of {bus.exchanges} questions answered{f': {wrong}' if wrong else ''}"
 
 
 def _learner(status: LearnerStatus) -> list[RenderableType]:

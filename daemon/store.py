@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import contextlib
-import errno
-import fcntl
 import os
-import shutil
 import sqlite3
 import uuid
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,9 +20,10 @@ import numpy as np
 from interfaces.errors import StoreError
 from interfaces.records import FloatArray, MarkerFix, Pair, frozen_array
 
-SCHEMA_VERSION = 1
+from .store_file import NOTHING_CHANGED, damaged, explained, lock
+
+SCHEMA_VERSION = 2
 APPLICATION_ID = 0x42534348  # "BSCH": how `file` and we tell a pair store from another SQLite file
-NOTHING_CHANGED = "Nothing was changed"
 
 _TABLES = """
 CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID;
@@ -36,6 +34,13 @@ CREATE TABLE sessions (
 CREATE TABLE pairs (
     seq INTEGER PRIMARY KEY, session INTEGER NOT NULL REFERENCES sessions, segment INTEGER NOT NULL,
     t REAL NOT NULL, utc TEXT NOT NULL, q TEXT NOT NULL, x TEXT NOT NULL, cov TEXT NOT NULL, centres_px TEXT
+);
+"""
+# Since schema 2. What the joints were read with from pair `from_seq` on.
+_DEVICES = """
+CREATE TABLE devices (
+    id INTEGER PRIMARY KEY, session INTEGER NOT NULL REFERENCES sessions, from_seq INTEGER NOT NULL, utc TEXT NOT NULL,
+    record TEXT NOT NULL
 );
 """
 _COLUMNS = "seq, segment, t, utc, q, x, cov, centres_px"
@@ -61,6 +66,22 @@ class Session:
     host: str
 
 
+@dataclass(frozen=True, slots=True)
+class Devices:
+    """What the joints were read with.
+
+    Attributes:
+        session: number of the run of the sampler.
+        from_seq: from this pair on, until the next ones.
+        record: of each joint: names and settings, as its driver tells them.
+    """
+
+    session: int
+    from_seq: int
+    utc: str
+    record: tuple[dict[str, Any], ...]
+
+
 class PairReader:
     """Reads a pair store, also while a sampler writes it. Use as a context manager; any thread may read.
 
@@ -79,7 +100,7 @@ class PairReader:
     def __enter__(self) -> Self:
         if not self.file.exists():
             raise StoreError(f"there is no store {self.file}. The sampler makes it: start it with `bodyschema sampler`")
-        with _explained(self.file):
+        with explained(self.file):
             self._connection = _connect(self.file, readonly=True)
             try:
                 _check_kind(self._connection, self.file)
@@ -124,8 +145,15 @@ class PairReader:
         ranges = self._rows(f"SELECT {columns} FROM pairs", ())[0]
         return None if ranges[0] is None else (frozen_array(ranges[0::2]), frozen_array(ranges[1::2]))
 
+    def devices(self) -> list[Devices]:
+        """What the joints were read with, in the order of the pairs; empty in a store that an older version wrote."""
+        if not self._rows("SELECT 1 FROM sqlite_schema WHERE name = 'devices'", ()):
+            return []
+        rows = self._rows("SELECT session, from_seq, utc, record FROM devices ORDER BY id", ())
+        return [Devices(session, seq, utc, tuple(msgspec.json.decode(record))) for session, seq, utc, record in rows]
+
     def _rows(self, statement: str, values: tuple[Any, ...]) -> list[Any]:
-        with self._lock, _explained(self.file):
+        with self._lock, explained(self.file):
             if self._connection is None:
                 raise StoreError(f"the store {self.file} is closed; use it in a with statement")
             return self._connection.execute(statement, values).fetchall()
@@ -181,13 +209,29 @@ class PairStore:
         if self._connection is None:
             raise StoreError(f"the store {self.file} is closed; use it in a with statement")
         pair = Pair(self.identity, self._seq + 1, segment, fix.t, utc, q, fix.x, fix.cov, fix.centres_px)
-        with _explained(self.file), _transaction(self._connection):
+        with explained(self.file), _transaction(self._connection):
             self._connection.execute(
                 f"INSERT INTO pairs (session, {_COLUMNS}) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)",
                 (self._session_id, *_row(pair)),
             )
         self._seq = pair.seq
         return pair
+
+    def note_devices(self, utc: str, record: Sequence[Mapping[str, object]]) -> None:
+        """Keep what the joints are read with from the next pair on.
+
+        Raises:
+            StoreError: the disk is full or broken.
+        """
+        if self._connection is None:
+            raise StoreError(f"the store {self.file} is closed; use it in a with statement")
+        with explained(self.file), _transaction(self._connection):
+            # What no pair was measured with tells nothing of the pairs.
+            self._connection.execute("DELETE FROM devices WHERE from_seq > ?", (self._seq,))
+            self._connection.execute(
+                "INSERT INTO devices (session, from_seq, utc, record) VALUES (?, ?, ?, ?)",
+                (self._session_id, self._seq + 1, utc, _json(record)),
+            )
 
     def read(self, from_seq: int = 1, to_seq: int | None = None, limit: int | None = None) -> list[Pair]:
         """As `PairReader.read`; from any thread."""
@@ -199,13 +243,14 @@ class PairStore:
 
     def _open(self) -> None:
         self._make_directory()
-        self._lock_file = _lock(self.file)
-        with _explained(self.file):
+        self._lock_file = lock(self.file)
+        with explained(self.file):
             self._connection = _connect(self.file)
             if not self._connection.execute("SELECT count(*) FROM sqlite_schema").fetchone()[0]:
                 self._create(self._connection)
             _check_kind(self._connection, self.file)
             _check_health(self._connection, self.file)
+            _migrate(self._connection)
             self._check_joints(tuple(msgspec.json.decode(_meta(self._connection)["joints"])))
             self._connection.execute("PRAGMA journal_mode = WAL")
             self._connection.execute("PRAGMA synchronous = FULL")
@@ -226,7 +271,7 @@ class PairStore:
         meta = {"store": str(uuid.uuid4()), "created_utc": self._session.started_utc}
         meta["joints"] = msgspec.json.encode(self._session.joints).decode()
         with _transaction(connection):
-            for statement in _TABLES.split(";"):
+            for statement in (_TABLES + _DEVICES).split(";"):
                 connection.execute(statement)
             connection.executemany("INSERT INTO meta VALUES (?, ?)", meta.items())
             connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
@@ -235,6 +280,8 @@ class PairStore:
     def _begin_session(self, connection: sqlite3.Connection) -> int:
         session = self._session
         with _transaction(connection):
+            newest = connection.execute("SELECT coalesce(max(seq), 0) FROM pairs").fetchone()[0]
+            connection.execute("DELETE FROM devices WHERE from_seq > ?", (newest,))
             # A sampler that is started again and again without seeing a pair must not fill the disk.
             connection.execute(
                 "DELETE FROM sessions WHERE id > coalesce((SELECT session FROM pairs ORDER BY seq DESC LIMIT 1), 0)"
@@ -280,24 +327,6 @@ def _transaction(connection: sqlite3.Connection) -> Iterator[None]:
         raise
 
 
-def _lock(file: Path) -> int:
-    """A lock on a file beside the store, which the process's end frees and which its children do not inherit."""
-    lock_file = file.with_name(file.name + ".lock")
-    try:
-        descriptor = os.open(lock_file, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
-    except OSError as error:
-        raise StoreError(_unwritable(file, error.errno, error.strerror)) from error
-    try:
-        fcntl.lockf(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError as error:
-        os.close(descriptor)
-        raise StoreError(
-            f"another sampler is writing {file}. Stop it (`bodyschema status` shows it), "
-            "or give this one a --state-dir of its own"
-        ) from error
-    return descriptor
-
-
 def _check_kind(connection: sqlite3.Connection, file: Path) -> None:
     if connection.execute("PRAGMA application_id").fetchone()[0] != APPLICATION_ID:
         raise StoreError(
@@ -312,56 +341,24 @@ def _check_kind(connection: sqlite3.Connection, file: Path) -> None:
         )
 
 
+def _migrate(connection: sqlite3.Connection) -> None:
+    """Bring a store of an older version to this one; its pairs stay as they are."""
+    if connection.execute("PRAGMA user_version").fetchone()[0] < SCHEMA_VERSION:
+        with _transaction(connection):
+            connection.execute(_DEVICES)
+            connection.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
+
+
 def _check_health(connection: sqlite3.Connection, file: Path) -> None:
     found = connection.execute("PRAGMA quick_check(1)").fetchone()[0]
     count, newest = connection.execute("SELECT count(*), coalesce(max(seq), 0) FROM pairs").fetchone()
     if found != "ok" or count != newest:
         what = found if found != "ok" else f"{newest - count} pairs are missing"
-        raise StoreError(_damaged(file, what))
+        raise StoreError(damaged(file, what))
 
 
 def _meta(connection: sqlite3.Connection) -> dict[str, str]:
     return dict(connection.execute("SELECT key, value FROM meta").fetchall())
-
-
-@contextmanager
-def _explained(file: Path) -> Iterator[None]:
-    """Errors of SQLite as StoreErrors that name the file and the remedy."""
-    try:
-        yield
-    except sqlite3.Error as error:
-        raise StoreError(_explanation(file, error)) from error
-
-
-def _explanation(file: Path, error: sqlite3.Error) -> str:
-    name = getattr(error, "sqlite_errorname", "")
-    if name == "SQLITE_FULL" or (name.startswith("SQLITE_IOERR") and _free_bytes(file) < 2**16):
-        return _unwritable(file, errno.ENOSPC, "")
-    if name.startswith(("SQLITE_READONLY", "SQLITE_CANTOPEN")):
-        return _unwritable(file, errno.EROFS, str(error))
-    if name.startswith("SQLITE_NOTADB"):
-        return f"{file} is not a pair store. Move it away, or give another --state-dir. {NOTHING_CHANGED}"
-    if name.startswith("SQLITE_CORRUPT") or isinstance(error, sqlite3.DataError):
-        return _damaged(file, str(error))
-    return f"{file}: {error} ({name or type(error).__name__}). Check the disk"
-
-
-def _unwritable(file: Path, number: int | None, what: str | None) -> str:
-    if number == errno.ENOSPC:
-        return f"the disk of {file} is full. Free some space, or give a --state-dir on another disk. {NOTHING_CHANGED}"
-    why = "the disk is read-only" if number == errno.EROFS else what
-    return f"cannot write {file}: {why}. Give a --state-dir that can be written"
-
-
-def _damaged(file: Path, what: str) -> str:
-    return (
-        f"{file} is damaged ({what}). Keep it, save what can be read with `sqlite3 {file.name} .recover`, "
-        f"and give another --state-dir. {NOTHING_CHANGED}"
-    )
-
-
-def _free_bytes(file: Path) -> int:
-    return shutil.disk_usage(file.parent).free
 
 
 def _row(pair: Pair) -> tuple[Any, ...]:

@@ -133,7 +133,7 @@ class IkReply(msgspec.Struct, frozen=True):
 class CommandRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A command to one of the processes; which it knows is in its documentation."""
 
-    command: Literal["pause", "resume", "reset_to_prior", "tool_changed", "checkpoint"]
+    command: Literal["pause", "resume", "reset_to_prior", "tool_changed", "checkpoint", "accept_turns"]
 
 
 class CommandReply(msgspec.Struct, frozen=True):

@@ -49,6 +49,7 @@ class TurnCount:
     Attributes:
         pose: where the joints were last [rad]; None before anything is known.
         counts: the same [ticks].
+        lost: a joint that is not where it was, so that somebody has to say in which turn it is.
     """
 
     def __init__(
@@ -70,6 +71,12 @@ class TurnCount:
         self.pose = None if last_pose is None else [float(q) for q in last_pose]
         self.counts: list[int] = []
         self._sensors: list[Sensor] = []
+        self._is_accepted = False
+        self.lost: str | None = None
+
+    def accept(self) -> None:
+        """Somebody says that the turns nearest to where the joints were are right. From any thread."""
+        self._is_accepted = self.lost is not None
 
     def begin(self, sensors: Sequence[Sensor], raw: Sequence[int]) -> None:
         """Find the turn of each joint by its limits, else by the last pose."""
@@ -95,17 +102,22 @@ class TurnCount:
             if self._is_within_a_turn(place):
                 continue
             was, now = self.pose[place], sensor.angle(count)
-            if abs(now - was) > math.radians(self._max_move_deg):
+            if abs(now - was) > math.radians(self._max_move_deg) and self._is_accepted:
+                log.warning("joint %r: at %.0f°, as somebody said", sensor.joint, math.degrees(now))
+            elif abs(now - was) > math.radians(self._max_move_deg):
+                self.lost = sensor.joint
                 raise SourceLost(
                     f"joint {sensor.joint!r} ({sensor.label}) was at {math.degrees(was):.0f}° and is now at "
                     f"{math.degrees(now):.0f}°, or whole turns from there: its turn count is lost. "
-                    f"Turn it back to within {self._max_move_deg:.0f}° of where it was, or set max_move_deg "
-                    f"in [{self._table}] to 179 to take the nearest turn",
+                    f"Turn it back to within {self._max_move_deg:.0f}° of where it was. If it really is at "
+                    f"{math.degrees(now):.0f}°: `bodyschema command accept_turns` while the sampler runs, "
+                    f"else max_move_deg = 179 in [{self._table}]",
                     retry_s=LOOK_AGAIN_S,
                 )
             if count != raw[place]:
                 turns = round((count - raw[place]) / (sensor.ticks_per_turn or 1))
                 log.info("joint %r: %+d turns are added to what its sensor counts", sensor.joint, turns)
+        self.lost, self._is_accepted = None, False
 
     def _is_within_a_turn(self, place: int) -> bool:
         lower, upper = self._limits[place]

@@ -56,10 +56,13 @@ class SourceEnded(SourceError):
 
 
 class SourceLost(SourceError):
-    """The device went away; opening it again may help, from `retry_s` on where the source knows that it is cheap."""
+    """The device went away; opening it again may help, from `retry_s` on where the source knows that it is cheap.
 
-    def __init__(self, message: str = "", *, retry_s: float | None = None) -> None:
-        self.retry_s = retry_s
+    `brief` is the message in a sentence, where that has a table.
+    """
+
+    def __init__(self, message: str = "", *, retry_s: float | None = None, brief: str = "") -> None:
+        self.retry_s, self.brief = retry_s, brief or message
         super().__init__(message)
 
 

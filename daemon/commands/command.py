@@ -8,10 +8,10 @@ from cyclopts import Parameter
 
 from daemon.commands.options import HERE, RobotFile
 
-Name = Literal["pause", "resume", "reset_to_prior", "tool_changed", "checkpoint"]
+Name = Literal["pause", "resume", "reset_to_prior", "tool_changed", "checkpoint", "accept_turns"]
 Process = Literal["sampler", "learner"]
 
-SAMPLERS = ("pause", "resume")
+SAMPLERS = ("pause", "resume", "accept_turns")
 
 
 def command(
@@ -20,7 +20,7 @@ def command(
     *,
     to: Annotated[
         Process | None,
-        Parameter(help="Who is to do it; else pause and resume go to the sampler, others to the learner."),
+        Parameter(help="Who is to do it; else who knows the command, and for pause and resume the sampler."),
     ] = None,
     robot: RobotFile = HERE,
 ) -> None:
@@ -28,7 +28,8 @@ def command(
 
     `pause` and `resume` accepting pairs (or, with --to learner, learning); `tool_changed` when another tool is in
     the hand; `reset_to_prior` forgets what was learnt, not the stored pairs; `checkpoint` writes the learner's state
-    now.
+    now; `accept_turns` when a joint lost its turn count while its bus was away, and stands where the message says: the
+    turn nearest to where it was is taken.
 
     Needs: that process running (`bodyschema run`).
 
@@ -44,7 +45,9 @@ def command(
 
     process: Process = to or ("sampler" if name in SAMPLERS else "learner")
     if process == "sampler" and name not in SAMPLERS:
-        raise RequestError(f"the sampler knows {' and '.join(SAMPLERS)} alone; {name} is the learner's: drop --to")
+        raise RequestError(f"the sampler knows {', '.join(SAMPLERS)} alone; {name} is the learner's: drop --to")
+    if process == "learner" and name == "accept_turns":
+        raise RequestError("accept_turns is the sampler's: drop --to")
     config = Config.load(robot)
     with client(getattr(config.tables.zenoh, process)) as bus:
         reply = bus.ask_one(Keys(config.robot.name).command(process), encode(CommandRequest(name)))

@@ -21,7 +21,7 @@ def export(
     """Turn a store or a recording into CSV, Parquet or MCAP.
 
     A store may be in use by a running sampler. MCAP opens in Foxglove: joints and positions under `/pair`, the marker
-    under `/marker`.
+    under `/marker`, and as metadata what the joints were read with (servos, firmware, homing offsets).
 
     Needs: for a recording robot.toml, which names its joints; for Parquet and MCAP the extra `export`
     (`pip install 'bodyschema[export]'`).
@@ -36,8 +36,8 @@ def export(
 
     recordings.check_target(out, force=force)
     if source.suffix.lower() in recordings.STORE_ENDINGS:
-        recording = recordings.from_store(source)
+        recording, devices = recordings.from_store(source), recordings.devices_of(source)
     else:
-        recording = Recording.read(source, RobotDescription.load(robot).joints)
-    recordings.write(recording, out)
+        recording, devices = Recording.read(source, RobotDescription.load(robot).joints), []
+    recordings.write(recording, out, devices)
     Console(highlight=False, soft_wrap=True).print(f"{len(recording)} pairs written to {out}", markup=False)

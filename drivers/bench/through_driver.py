@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack
+from dataclasses import dataclass
 from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
+from drivers.servos.health import BusHealth, ServoHealth
 from interfaces.protocols import JointSource
 from interfaces.records import JointReading, frozen_array
 
@@ -17,9 +19,21 @@ READ_S = 0.5
 # Bench and driver share a process, and perhaps the processor, with the simulation: answers may be as late as this.
 LATENCY_MS = 40.0
 
-Look = Callable[[], JointReading | None]
-"""Reads the joints of a bench as they are now; None when that did not work out."""
-OpenBench = Callable[[Mapping[str, Angle]], AbstractContextManager[Look]]
+
+@dataclass(frozen=True)
+class Behind:
+    """A driver with its bench.
+
+    Attributes:
+        driver: is open.
+        look: reads the joints of the bench as they are now; None when that did not work out.
+    """
+
+    driver: JointSource
+    look: Callable[[], JointReading | None]
+
+
+OpenBench = Callable[[Mapping[str, Angle]], AbstractContextManager[Behind]]
 """Puts joints, by name, on a bench, and opens the driver that reads them."""
 
 
@@ -38,13 +52,36 @@ class ThroughDriver:
         """
         self._source, self._open_bench = source, open_bench
         self._opened = ExitStack()
-        self._look: Look | None = None
+        self._behind: Behind | None = None
         self._q = [0.0] * len(source.joints)
 
     @property
     def joints(self) -> tuple[str, ...]:
         """Names of the joints in the order of q."""
         return self._source.joints
+
+    @property
+    def health(self) -> Sequence[str]:
+        """As of the driver; nothing before it is opened, which the first reading does."""
+        return self._of_driver("health", ())
+
+    @property
+    def servo_health(self) -> Sequence[ServoHealth]:
+        """As of the driver, where it reads servos."""
+        return self._of_driver("servo_health", ())
+
+    @property
+    def bus_health(self) -> Mapping[str, BusHealth]:
+        """As of the driver, where it reads servos."""
+        return self._of_driver("bus_health", {})
+
+    @property
+    def record(self) -> Sequence[Mapping[str, object]]:
+        """As of the driver, where it keeps one."""
+        return self._of_driver("record", ())
+
+    def _of_driver(self, name: str, default: Any) -> Any:
+        return default if self._behind is None else getattr(self._behind.driver, name, default)
 
     def __enter__(self) -> Self:
         self._opened.enter_context(self._source)
@@ -53,7 +90,7 @@ class ThroughDriver:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._look = None
+        self._behind = None
         self._opened.close()
 
     def read(self, timeout_s: float) -> JointReading | None:
@@ -62,11 +99,11 @@ class ThroughDriver:
         if wanted is None:
             return None
         self._q = wanted.q.tolist()
-        if self._look is None:  # not before the first angles are known, or the arm would jump there
+        if self._behind is None:  # not before the first angles are known, or the arm would jump there
             angles = {name: self._angle(place) for place, name in enumerate(self.joints)}
-            self._look = self._opened.enter_context(self._open_bench(angles))
+            self._behind = self._opened.enter_context(self._open_bench(angles))
         for _ in range(ATTEMPTS):
-            told = self._look()
+            told = self._behind.look()
             if told is not None:
                 return JointReading(wanted.t, frozen_array(told.q))
         return None

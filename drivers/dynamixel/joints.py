@@ -19,6 +19,7 @@ from .config import BusConfig, DynamixelConfig
 from .models import BY_NUMBER, HARDWARE_ERRORS, TICK_S
 from .plan import block_requests
 from .port import SafePort
+from .settings import settings_of
 
 
 def open_serial(config: BusConfig, clock: Clock) -> tuple[Port, float]:
@@ -34,7 +35,16 @@ def _block_requests(bus: ServoBus, servos: Sequence[FittedServo], config: BusCon
 
 
 DYNAMIXEL = Make(
-    DynamixelConfig.table, BY_NUMBER, HARDWARE_ERRORS, Bus, Channel, "DYNAMIXEL Wizard", _block_requests, TICK_S
+    DynamixelConfig.table,
+    BY_NUMBER,
+    HARDWARE_ERRORS,
+    Bus,
+    Channel,
+    "DYNAMIXEL Wizard",
+    _block_requests,
+    settings_of,
+    1,
+    TICK_S,
 )
 
 

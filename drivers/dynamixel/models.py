@@ -173,6 +173,6 @@ HARDWARE_ERRORS: Mapping[int, str] = MappingProxyType(
         0x04: "it is too hot: let it cool down",
         0x08: "its motor's encoder fails: the servo has to be repaired",
         0x10: "its circuit is damaged or its motor gets too little power: check supply and cable, else repair it",
-        0x20: "it is overloaded: free the joint, then reboot the servo",
+        0x20: "it is overloaded: free the joint, then switch its supply off and on",
     }
 )

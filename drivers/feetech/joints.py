@@ -18,6 +18,7 @@ from .channel import Channel
 from .config import BusConfig, FeetechConfig
 from .models import BY_NUMBER, HARDWARE_ERRORS, STS
 from .packets import FeetechPackets
+from .settings import settings_of
 
 PACKETS = FeetechPackets()
 
@@ -54,7 +55,9 @@ def _block_request(bus: ServoBus, servo: FittedServo) -> Request:
     return bus.read_request(servo.model, servo.id, servo.model.layout.block)
 
 
-FEETECH = Make(FeetechConfig.table, BY_NUMBER, HARDWARE_ERRORS, Bus, Channel, "Feetech's FD", block_requests)
+FEETECH = Make(
+    FeetechConfig.table, BY_NUMBER, HARDWARE_ERRORS, Bus, Channel, "Feetech's FD", block_requests, settings_of, -1
+)
 
 
 class FeetechJoints(ServoJoints):

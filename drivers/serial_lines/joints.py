@@ -152,6 +152,15 @@ class SerialLineJoints:
             for encoder in self.encoders
         )
 
+    @property
+    def asks_for_turns(self) -> bool:
+        """Whether it cannot be opened because a joint lost its turn count."""
+        return self._turns.lost is not None
+
+    def accept_turns(self) -> None:
+        """Take the turns nearest to where the joints were, at the next opening. From any thread."""
+        self._turns.accept()
+
     def __enter__(self) -> Self:
         port = self._open_port(self._config, self._clock)
         try:

@@ -19,6 +19,9 @@ SETTINGS = ("return_delay", "drive_mode", "operating_mode", "homing_offset")
 
 ATTEMPTS = 5
 RETRY_S = 0.2
+LOOKS = 5  # at what a servo measures
+GARBLED = "garbled answers: two servos with this ID, or a bad cable"
+SCAN = "`bodyschema scan --robot robot.toml` looks for them at all rates and IDs, and says what to do"
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,7 +100,7 @@ def identify(bus: Bus, config: ServoConfig, model: Model, known: Mapping[int, Mo
     """Ask the servo of `config` whether it is a `model`; `known` are those that can be told by their number."""
     layout = model.layout
     head = Register(0, max(layout["model"].end, layout["firmware"].end))
-    data, trouble = _read(bus, model, config.id, head)
+    data, trouble = read_register(bus, model, config.id, head)
     if data is None:
         return Finding(config, _absence(bus, model, config.id, trouble), may_come_back=trouble is Trouble.TIMEOUT)
     number = layout.value("model", data)
@@ -105,9 +108,11 @@ def identify(bus: Bus, config: ServoConfig, model: Model, known: Mapping[int, Mo
         other = known.get(number)
         return Finding(config, f"{other.name if other else f'model number {number}'}: wrong model")
     last = max(layout[name].end for name in SETTINGS if name in layout)
-    table, trouble = _read(bus, model, config.id, Register(0, last))
+    table, trouble = read_register(bus, model, config.id, Register(0, last))
     if table is None:
-        return Finding(config, str(trouble), may_come_back=True)
+        return Finding(config, _absence(bus, model, config.id, trouble), may_come_back=True)
+    if _is_garbled(bus, model, config.id):
+        return Finding(config, GARBLED, may_come_back=True)
     servo = FittedServo(
         joint=config.joint,
         bus=bus.name,
@@ -135,9 +140,10 @@ def require_all(findings: Iterable[Finding], ports: str) -> list[FittedServo]:
     rows += [(f.config.joint, str(f.config.id), f.config.model, f.found) for f in findings]
     widths = [max(len(row[column]) for row in rows) for column in range(4)]
     lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
-    message = "\n  ".join([f"the servos on {ports} are not those of robot.toml:", *lines])
+    message = "\n  ".join([f"the servos on {ports} are not those of robot.toml:", *lines, SCAN])
     if all(finding.may_come_back for finding in wrong):
-        raise SourceLost(message, retry_s=RETRY_S)
+        brief = "; ".join(f"joint {f.config.joint!r} (ID {f.config.id}): {f.found}" for f in wrong)
+        raise SourceLost(message, retry_s=RETRY_S, brief=brief)
     raise SourceError(message)
 
 
@@ -165,7 +171,7 @@ def switch_torque_off(bus: Bus, servo: FittedServo) -> FittedServo:
 
 def torque_is_on(bus: Bus, servo: FittedServo) -> bool:
     """Whether it holds its place; SourceLost when it does not answer."""
-    data, trouble = _read(bus, servo.model, servo.id, servo.model.layout["torque"])
+    data, trouble = read_register(bus, servo.model, servo.id, servo.model.layout["torque"])
     if data is None:
         raise SourceLost(f"joint {servo.joint!r} (ID {servo.id}): {trouble}", retry_s=RETRY_S)
     return data != b"\x00"
@@ -174,7 +180,7 @@ def torque_is_on(bus: Bus, servo: FittedServo) -> bool:
 def restore_torque(bus: Bus, servo: FittedServo) -> None:
     """Switch its torque on again where it was on, its goal being where it is."""
     layout = servo.model.layout
-    position, trouble = _read(bus, servo.model, servo.id, layout["position"])
+    position, trouble = read_register(bus, servo.model, servo.id, layout["position"])
     if position is None:
         log.warning("the torque of joint %r stays off: %s", servo.joint, trouble)
         return
@@ -184,7 +190,8 @@ def restore_torque(bus: Bus, servo: FittedServo) -> None:
         log.warning("the torque of joint %r could not be switched on again", servo.joint)
 
 
-def _read(bus: Bus, model: Model, id: int, register: Register) -> tuple[bytes | None, Trouble | None]:
+def read_register(bus: Bus, model: Model, id: int, register: Register) -> tuple[bytes | None, Trouble | None]:
+    """Its bytes; without them what was wrong the last time of several."""
     request = bus.read_request(model, id, register)
     exchange = Exchange(())
     for _ in range(ATTEMPTS):
@@ -200,5 +207,12 @@ def _absence(bus: Bus, model: Model, id: int, trouble: Trouble | None) -> str:
             return "answers PING but no READ: its Status Return Level is 0"
         return "no answer"
     if trouble is Trouble.GARBLED:
-        return "garbled answers: two servos with this ID, or a bad cable"
+        return GARBLED
     return str(trouble)
+
+
+def _is_garbled(bus: Bus, model: Model, id: int) -> bool:
+    """Whether most of what it measures comes garbled: two of one model say the same of themselves, but not of that."""
+    request = bus.read_request(model, id, model.layout.block)
+    garbled = sum(bus.ask(request).trouble is Trouble.GARBLED for _ in range(LOOKS))
+    return garbled > LOOKS // 2

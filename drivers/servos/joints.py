@@ -16,10 +16,11 @@ from interfaces.errors import SourceError, SourceLost
 from interfaces.protocols import Clock
 from interfaces.records import JointReading, frozen_array
 
-from .bus import Bus, Exchange, Request
+from .bus import Bus, Counts, Exchange, Request
 from .channel import Channel, Punctuality, Sample, middle
 from .config import ServoConfig, ServosConfig
 from .handshake import RETRY_S, Finding, FittedServo, identify, require_all, restore_torque, switch_torque_off
+from .health import BusHealth, Health, ServoHealth, supply_of
 from .make import Make
 from .port import Port
 
@@ -29,6 +30,7 @@ LOST_AFTER_S = 0.25  # without a reading; within this no joint turns by half a t
 FEW_POLLS = 3  # so many have to fail besides: the program itself may have been held up
 DOUBTS = 5  # so many answers in a row that cannot be: the servo was restarted
 LOOK_AFTER_S = 0.1  # one servo's torque and health in turn
+SUPPLY_EVERY = 11  # so many looks: voltage and temperature of that one too
 ANCHOR_POLLS = 50
 SLACK_TICKS = 3
 GOLDEN = 0.618034  # multiples of it, modulo 1, are spread most evenly
@@ -84,7 +86,8 @@ class ServoJoints:
         self._channels: list[Channel] = []
         self._at: dict[tuple[str, int], int] = {}
         self._last_t = -math.inf
-        self._alerts: dict[str, int] = {}
+        self._health = Health(make.errors)
+        self._counts = {name: Counts() for name in config.buses}
         self.servos: list[FittedServo] = []
         self.epoch = self.dropped = 0
 
@@ -96,12 +99,36 @@ class ServoJoints:
     @property
     def health(self) -> tuple[str, ...]:
         """What is wrong with servos, and what to do."""
-        return tuple(self._complaint(joint, bits) for joint, bits in self._alerts.items())
+        return self._health.complaints
+
+    @property
+    def servo_health(self) -> tuple[ServoHealth, ...]:
+        """How each servo is; empty before the first opening. From any thread."""
+        samples = self.samples
+        lost = self._turns.lost
+        return tuple(self._health.of(servo, samples.get(servo.joint), lost) for servo in list(self.servos))
+
+    @property
+    def bus_health(self) -> Mapping[str, BusHealth]:
+        """By name how each bus went since the start. From any thread."""
+        return {
+            name: BusHealth(counts.exchanges, {str(name): n for name, n in list(counts.troubles.items())})
+            for name, counts in self._counts.items()
+        }
 
     @property
     def samples(self) -> Mapping[str, Sample | None]:
         """The newest believed answer for each joint, also of those whose neighbours did not answer."""
-        return {channel.servo.joint: channel.newest for channel in self._channels}
+        return {channel.servo.joint: channel.newest for channel in list(self._channels)}
+
+    @property
+    def asks_for_turns(self) -> bool:
+        """Whether it cannot be opened because a joint lost its turn count."""
+        return self._turns.lost is not None
+
+    def accept_turns(self) -> None:
+        """Take the turns nearest to where the joints were, at the next opening. From any thread."""
+        self._turns.accept()
 
     @property
     def record(self) -> tuple[Mapping[str, object], ...]:
@@ -113,6 +140,7 @@ class ServoJoints:
             self._open_buses(stack)
             names = ", ".join(bus.port for bus in self._config.buses.values())
             findings = [self._identified(servo) for servo in self._wanted]
+            self._health.note_found(findings)
             servos = require_all(findings, names)
             self.servos = [switch_torque_off(self._buses[servo.bus], servo) for servo in servos]
             self._prepare()
@@ -170,9 +198,12 @@ class ServoJoints:
     def _open_buses(self, stack: ExitStack) -> None:
         self._buses.clear()
         for name, config in self._config.buses.items():
+            self._health.away.add(name)
             port, latency_s = self._open_port(config, self._clock)
             stack.callback(_close, port)
             self._buses[name] = self._make.bus(name, port, self._clock, latency_s)
+            self._buses[name].counts = self._counts[name]
+            self._health.away.discard(name)
 
     def _identified(self, servo: ServoConfig) -> Finding:
         return identify(self._buses[self._config.bus_of(servo)], servo, self._config.model_of(servo), self._make.models)
@@ -316,6 +347,7 @@ class ServoJoints:
         for servo in self.servos:
             trouble = self._ask_state(servo).trouble
             if trouble is not None:
+                self._health.note_silent(servo.joint, trouble)
                 return f"joint {servo.joint!r} (ID {servo.id}): {trouble}"
         return self._why
 
@@ -345,25 +377,19 @@ class ServoJoints:
         bits = layout.value("hardware_error", status.data, layout.state.address) if has_register else status.error
         if layout.value("torque", status.data, layout.state.address):
             raise SourceLost(f"the torque of joint {servo.joint!r} was switched on by another program", retry_s=0.0)
-        self._note_alert(servo.joint, bits)
+        self._health.note_alert(servo.joint, bits)
+        if self._looked % SUPPLY_EVERY == 0 or not self._health.knows_supply(servo.joint):
+            self._ask_supply(servo)
+
+    def _ask_supply(self, servo: FittedServo) -> None:
+        bus = self._buses[servo.bus]
+        exchange = bus.ask(bus.read_request(servo.model, servo.id, supply_of(servo.model)))
+        if exchange.trouble is None:
+            self._health.note_supply(servo.joint, servo.model, exchange.answers[0].status.data)
 
     def _ask_state(self, servo: FittedServo) -> Exchange:
         bus = self._buses[servo.bus]
         return bus.ask(bus.read_request(servo.model, servo.id, servo.model.layout.state))
-
-    def _complaint(self, joint: str, bits: int) -> str:
-        reasons = [text for bit, text in self._make.errors.items() if bits & bit]
-        return f"joint {joint!r}: " + ("; ".join(reasons) or f"hardware error {bits:#04x}")
-
-    def _note_alert(self, joint: str, bits: int) -> None:
-        if self._alerts.get(joint, 0) == bits:
-            return
-        if bits:
-            self._alerts[joint] = bits
-            log.warning("%s", self._complaint(joint, bits))
-        else:
-            del self._alerts[joint]
-            log.info("joint %r is well again", joint)
 
 
 def _close(port: Port) -> None:

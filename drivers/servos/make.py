@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 from .bus import Bus, Request
 from .channel import Channel
 from .handshake import FittedServo
 from .model import Model
+from .settings import Setting
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,6 +25,8 @@ class Make:
         channel: one servo's answers.
         software: its maker's program with which its servos are set up.
         block_requests: the questions of one reading of the servos of a bus.
+        settings: what a command may change in a model's EEPROM.
+        homing_sign: 1 where the homing offset is added to what the sensor tells, −1 where it is taken off.
         tick_s: of the clock with which its servos stamp what they measure [s]; 0 without one.
     """
 
@@ -34,4 +37,6 @@ class Make:
     channel: Callable[[FittedServo], Channel]
     software: str
     block_requests: Callable[[Bus, Sequence[FittedServo], Any], list[Request]]
+    settings: Callable[[Model], Sequence[Setting]]
+    homing_sign: Literal[1, -1]
     tick_s: float = 0.0

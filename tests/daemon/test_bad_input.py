@@ -342,7 +342,7 @@ def test_the_status_of_a_learner_alone_names_the_command_that_starts_a_sampler(l
 
 def test_a_command_that_the_sampler_does_not_know_is_the_learner_s(lonely_learner) -> None:
     said = refused("command", "tool_changed", "--to", "sampler", cwd=lonely_learner.file.parent)
-    assert said == "the sampler knows pause and resume alone; tool_changed is the learner's: drop --to"
+    assert said == "the sampler knows pause, resume, accept_turns alone; tool_changed is the learner's: drop --to"
 
 
 def test_a_target_that_is_no_position_is_refused_in_words(lonely_learner) -> None:

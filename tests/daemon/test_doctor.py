@@ -64,7 +64,7 @@ def test_an_arm_on_the_bench_is_well_within_five_seconds(file, what, tmp_path, c
 @pytest.mark.parametrize(
     ("file", "fault", "mend"),
     [
-        ("servos.toml", "overload@elbow_pitch", "free the joint, then reboot the servo"),
+        ("servos.toml", "overload@elbow_pitch", "free the joint, then switch its supply off and on"),
         ("feetech.toml", "overload@elbow_pitch", "free the joint, then switch its supply off and on"),
     ],
 )

@@ -343,8 +343,13 @@ def test_a_frame_that_was_under_way_when_the_sampler_resumed_gives_no_pair(confi
     assert (ended.pairs, ended.rejected) == (8, {"paused": 4})
 
 
+def test_turns_are_not_accepted_where_nobody_asks_for_them(ended) -> None:
+    with pytest.raises(RequestError, match="no joint has lost its turn count"):
+        command(ended, "accept_turns")
+
+
 def test_a_command_for_the_learner_is_refused_with_its_address(ended) -> None:
-    with pytest.raises(RequestError, match=r"the sampler knows pause and resume, not checkpoint.*/command/learner"):
+    with pytest.raises(RequestError, match=r"knows pause, resume and accept_turns, not checkpoint.*/command/learner"):
         command(ended, "checkpoint")
 
 

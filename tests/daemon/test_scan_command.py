@@ -117,7 +117,7 @@ def test_the_table_fits_80_columns_and_shows_everything(config, arm, port) -> No
 
 
 def test_the_troubles_of_a_servo_are_under_the_table(arm, port) -> None:
-    arm[0] = replace(arm[0], troubles=("it is overloaded: free the joint, then reboot the servo",))
+    arm[0] = replace(arm[0], troubles=("it is overloaded: free the joint, then switch its supply off and on",))
     assert "ID 1: it is overloaded" in screen(report(None, arm, port))
 
 

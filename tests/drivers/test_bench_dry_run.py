@@ -17,7 +17,7 @@ from drivers.bench.asked_faults import AskedFault, FaultKinds, WireFaults
 from drivers.bench.device import Reply
 from drivers.bench.dry_run import DryRun
 from drivers.bench.motion import played, swinging
-from drivers.bench.through_driver import Look, ThroughDriver
+from drivers.bench.through_driver import Behind, ThroughDriver
 from drivers.dynamixel.bench.arm import KINDS, DynamixelArm
 from drivers.dynamixel.config import BusConfig, DynamixelConfig, ServoConfig
 from drivers.dynamixel.joints import DynamixelJoints
@@ -264,14 +264,14 @@ def through(source: Any, make: str) -> ThroughDriver:
     arm_of, config, _, driver = MAKES[make]
 
     @contextmanager
-    def opened(angles: Any) -> Iterator[Look]:
+    def opened(angles: Any) -> Iterator[Behind]:
         arm = arm_of(config, angles)
         with (
             TemporaryDirectory() as folder,
             DryRun(arm, {name: Path(folder) / name for name in arm.devices}) as bench,
             driver(bench.config, JOINTS, SystemClock(), limits=LIMITS) as joints,
         ):
-            yield lambda: joints.read(1.0)
+            yield Behind(joints, lambda: joints.read(1.0))
 
     return ThroughDriver(source, opened)
 

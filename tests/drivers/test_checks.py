@@ -37,7 +37,7 @@ FEETECH_CONFIG = FeetechConfig(
 MAKES = {
     "Dynamixel": (
         DynamixelArm, CONFIG, DYNAMIXEL, open_dynamixel, "MX-28",
-        "DYNAMIXEL Wizard: set Return Delay Time (5 or 9) to 0", "free the joint, then reboot the servo",
+        "DYNAMIXEL Wizard: set Return Delay Time (5 or 9) to 0", "free the joint, then switch its supply off and on",
     ),
     "Feetech": (
         FeetechArm, FEETECH_CONFIG, FEETECH, open_feetech, "SCS0009",

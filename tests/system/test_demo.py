@@ -107,3 +107,16 @@ def test_the_demo_over_servos_learns_as_well(tmp_path: Path) -> None:
     with (tmp_path / "out" / "learning_curve.csv").open(newline="") as stream:
         rows = [row for row in csv.DictReader(stream) if int(row["pairs"]) <= FIRST + 5]
     assert float(rows[-1]["held_out_error_mm"]) < 0.7 * float(rows[-1]["nominal_error_mm"])
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("seed", range(5))
+def test_the_demo_over_servos_reaches_the_figures_of_the_demo(tmp_path: Path, seed: int) -> None:
+    command = [sys.executable, "-m", "daemon", "demo", "--bus", "dynamixel", "--out", str(tmp_path / "out")]
+    done = subprocess.run([*command, "--seed", str(seed)], check=True, capture_output=True, text=True, timeout=LIMIT_S)
+    first, second = re.findall(r"│ +([\d.]+) mm │ +([\d.]+) mm │ +\d+ % │", done.stdout)
+    print(f"seed {seed}: {first}, {second}")
+    assert float(first[0]) <= 20.0
+    assert float(second[0]) <= 30.0
+    assert all(0.5 < float(claimed) / float(error) < 2.0 for error, claimed in (first, second))
+    assert " 0 went unanswered" in done.stdout

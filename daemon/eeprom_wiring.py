@@ -1,0 +1,151 @@
+"""The wiring of `bodyschema servos`: which servos are meant, and the bench at which their EEPROM is changed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import get_args
+
+import msgspec
+
+from drivers.dynamixel.config import Baud as DynamixelBaud
+from drivers.dynamixel.config import BusConfig as DynamixelBus
+from drivers.dynamixel.config import DynamixelConfig
+from drivers.dynamixel.joints import DYNAMIXEL
+from drivers.dynamixel.joints import open_serial as open_dynamixel
+from drivers.feetech.config import Baud as FeetechBaud
+from drivers.feetech.config import BusConfig as FeetechBus
+from drivers.feetech.config import FeetechConfig
+from drivers.feetech.joints import FEETECH
+from drivers.feetech.joints import open_serial as open_feetech
+from drivers.servos.config import ServoConfig
+from drivers.servos.handshake import FittedServo
+from drivers.servos.model import Model
+from drivers.servos.port import Port
+from drivers.servos.settings import BAUD, HOMING_OFFSET, ID, Setting, setting_called
+from drivers.servos.workbench import Change, Done, Outcome, Workbench
+from interfaces.clock import SystemClock
+from interfaces.errors import ConfigError, SourceError
+from interfaces.suggest import did_you_mean
+
+from .config import Config
+
+__all__ = [
+    "BAUD",
+    "HOMING_OFFSET",
+    "ID",
+    "Change",
+    "Done",
+    "FittedServo",
+    "Outcome",
+    "Setting",
+    "Wanted",
+    "Workbench",
+    "configured",
+    "entry_of",
+    "model_called",
+    "setting_called",
+    "settings_by_name",
+    "stranger",
+    "workbench_of",
+]
+
+STRANGER = "-"  # in the place of a joint's name
+TABLES = {"dynamixel": (DYNAMIXEL, DynamixelConfig), "feetech": (FEETECH, FeetechConfig)}
+
+
+@dataclass(frozen=True, slots=True)
+class Wanted:
+    """A servo that is meant, before it was asked anything.
+
+    Attributes:
+        table: its make's table in [drivers].
+    """
+
+    table: str
+    port: str
+    baud: int
+    entry: ServoConfig
+    model: Model
+
+
+def configured(config: Config, joints: Sequence[str], bus: str | None) -> list[Wanted]:
+    """The servos of robot.toml that move `joints`, or all of a bus; with neither all.
+
+    Raises:
+        ConfigError: there are none, or no such joint or bus.
+    """
+    tables = config.tables.drivers
+    table = "dynamixel" if tables.dynamixel is not None else "feetech"
+    servos = tables.dynamixel or tables.feetech
+    if servos is None:
+        remedy = "Add [drivers.dynamixel] or [drivers.feetech] (docs/hardware.md), or give --port and --id"
+        raise ConfigError("no servos are configured", file=config.file, remedy=remedy)
+    _require_known("joint", joints, config.robot.joints)
+    _require_known("bus", [] if bus is None else [bus], servos.buses)
+    found = []
+    for entry in servos.servos:
+        name = servos.bus_of(entry)
+        if (not joints or entry.joint in joints) and bus in (None, name):
+            place = servos.buses[name]
+            found.append(Wanted(table, place.port, place.baud, entry, servos.model_of(entry)))
+    if not found:
+        raise ConfigError(f"none of these joints is on the bus {bus!r}", file=config.file, remedy="Drop --bus")
+    return found
+
+
+def bauds_of(table: str) -> Sequence[int]:
+    """The rates that robot.toml can name for a make [bit/s]."""
+    return get_args(DynamixelBaud if table == "dynamixel" else FeetechBaud)
+
+
+def stranger(port: str, baud: int, id: int) -> Wanted:
+    """The servo of that ID, which no robot.toml knows, of whatever make; SourceError when none answers."""
+    for table in [table for table in TABLES if baud in bauds_of(table)]:
+        with workbench_of(table) as workbench:
+            model = workbench.model_at(workbench.bus(port, baud), id)
+        if model is not None:
+            return Wanted(table, port, baud, entry_of(STRANGER, id, model), model)
+    raise SourceError(
+        f"no servo that we know answers to ID {id} on {port} at {baud:,} bit/s. "
+        f"`bodyschema scan --port {port}` looks at all rates"
+    )
+
+
+def workbench_of(table: str) -> Workbench:
+    """The bench for servos of a make."""
+    clock = SystemClock()
+    openers = {"dynamixel": _open_dynamixel, "feetech": _open_feetech}
+    return Workbench(TABLES[table][0], clock, lambda port, baud: openers[table](port, baud, clock))
+
+
+def entry_of(joint: str, id: int, model: Model) -> ServoConfig:
+    """A servo as robot.toml would have it."""
+    return ServoConfig(joint, id, model.name)
+
+
+def _open_dynamixel(port: str, baud: int, clock: SystemClock) -> tuple[Port, float]:
+    return open_dynamixel(msgspec.convert({"port": port, "baud": baud}, DynamixelBus), clock)
+
+
+def _open_feetech(port: str, baud: int, clock: SystemClock) -> tuple[Port, float]:
+    return open_feetech(msgspec.convert({"port": port, "baud": baud}, FeetechBus), clock)
+
+
+def settings_by_name(workbench: Workbench, model: Model) -> Mapping[str, Setting]:
+    """What may be written to a model."""
+    return {setting.name: setting for setting in workbench.make.settings(model)}
+
+
+def model_called(table: str, name: str) -> Model:
+    """The model of a make; ConfigError when this version does not know it."""
+    models = TABLES[table][1].models if table in TABLES else {}
+    if name not in models:
+        raise ConfigError(f"unknown model {name!r} of {table}", remedy=did_you_mean(name, models))
+    return models[name]
+
+
+def _require_known(what: str, names: Iterable[str], known: Iterable[str]) -> None:
+    for name in names:
+        if name not in list(known):
+            raise ConfigError(f"unknown {what} {name!r}", remedy=did_you_mean(name, known))

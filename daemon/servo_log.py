@@ -1,0 +1,105 @@
+"""What was written to servos' EEPROM, one line of JSON each, so that it can be taken back."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from itertools import groupby
+from pathlib import Path
+from typing import Literal
+
+import msgspec
+
+from interfaces.errors import BodyschemaError, ConfigError
+
+FILE = "servo_writes.jsonl"
+State = Literal["begun", "written", "not written", "something else stands there", "not known"]
+
+
+class LoggedWrite(msgspec.Struct, frozen=True, kw_only=True):
+    """One number that was written.
+
+    Attributes:
+        batch: what one command wrote has one number.
+        table: the servo's make.
+        baud, id: of the servo before it was written.
+        name, address: of the register.
+        old, new: its contents before, and what was to be written.
+        state: "begun" stands there before the servo is told, so that nothing is written that the log does not know.
+        undoes: the batch that was taken back.
+    """
+
+    utc: str
+    batch: int
+    table: str
+    port: str
+    baud: int
+    id: int
+    model: str
+    joint: str
+    name: str
+    address: int
+    old: int
+    new: int
+    state: State = "begun"
+    undoes: int | None = None
+
+
+class ServoLog:
+    """The log in a state directory; an absent one is empty."""
+
+    def __init__(self, folder: Path) -> None:
+        """Nothing is opened."""
+        self.file = folder / FILE
+
+    def append(self, entries: Sequence[LoggedWrite]) -> None:
+        """Add lines, on the disk before this returns.
+
+        Raises:
+            ConfigError: the file cannot be written.
+        """
+        try:
+            self.file.parent.mkdir(parents=True, exist_ok=True)
+            with self.file.open("ab") as stream:
+                stream.write(b"".join(msgspec.json.encode(entry) + b"\n" for entry in entries))
+                stream.flush()
+                os.fsync(stream.fileno())
+        except OSError as error:
+            what = f"what is written to servos cannot be logged: {error.strerror}"
+            raise ConfigError(what, file=self.file, remedy="Make room, or set state_dir in [daemon]") from error
+
+    def batches(self) -> dict[int, list[LoggedWrite]]:
+        """By number what each command wrote, every write in its last state.
+
+        Raises:
+            BodyschemaError: a line that is no entry, other than a last one that a crash cut short.
+        """
+        if not self.file.exists():
+            return {}
+        last: dict[tuple[int, str, int, int], LoggedWrite] = {}
+        lines = self.file.read_bytes().split(b"\n")
+        for number, line in enumerate(lines, 1):
+            try:
+                entry = msgspec.json.decode(line, type=LoggedWrite) if line else None
+            except msgspec.DecodeError as error:
+                if number == len(lines):
+                    break
+                raise BodyschemaError(f"{self.file}, line {number}: {error}. Move the file away") from error
+            if entry is not None:
+                last[entry.batch, entry.port, entry.id, entry.address] = entry
+        ordered = sorted(last.values(), key=lambda entry: entry.batch)
+        return {batch: list(entries) for batch, entries in groupby(ordered, key=lambda entry: entry.batch)}
+
+    def next_batch(self) -> int:
+        """A number that no batch has."""
+        return max(self.batches(), default=0) + 1
+
+    def to_undo(self) -> list[LoggedWrite]:
+        """The newest batch that changed something and was not taken back; empty when there is none."""
+        batches = self.batches()
+        undone = {entries[0].undoes for entries in batches.values() if any(e.state == "written" for e in entries)}
+        for number in sorted(batches, reverse=True):
+            entries = [entry for entry in batches[number] if entry.state != "not written"]
+            if entries and number not in undone and entries[0].undoes is None:
+                return entries
+        return []

@@ -1,0 +1,74 @@
+"""The file of a pair store: one writer, and errors that say what to do."""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import os
+import shutil
+import sqlite3
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from interfaces.errors import StoreError
+
+NOTHING_CHANGED = "Nothing was changed"
+
+
+@contextmanager
+def explained(file: Path) -> Iterator[None]:
+    """Errors of SQLite as StoreErrors that name the file and the remedy."""
+    try:
+        yield
+    except sqlite3.Error as error:
+        raise StoreError(explanation(file, error)) from error
+
+
+def explanation(file: Path, error: sqlite3.Error) -> str:
+    name = getattr(error, "sqlite_errorname", "")
+    if name == "SQLITE_FULL" or (name.startswith("SQLITE_IOERR") and free_bytes(file) < 2**16):
+        return unwritable(file, errno.ENOSPC, "")
+    if name.startswith(("SQLITE_READONLY", "SQLITE_CANTOPEN")):
+        return unwritable(file, errno.EROFS, str(error))
+    if name.startswith("SQLITE_NOTADB"):
+        return f"{file} is not a pair store. Move it away, or give another --state-dir. {NOTHING_CHANGED}"
+    if name.startswith("SQLITE_CORRUPT") or isinstance(error, sqlite3.DataError):
+        return damaged(file, str(error))
+    return f"{file}: {error} ({name or type(error).__name__}). Check the disk"
+
+
+def unwritable(file: Path, number: int | None, what: str | None) -> str:
+    if number == errno.ENOSPC:
+        return f"the disk of {file} is full. Free some space, or give a --state-dir on another disk. {NOTHING_CHANGED}"
+    why = "the disk is read-only" if number == errno.EROFS else what
+    return f"cannot write {file}: {why}. Give a --state-dir that can be written"
+
+
+def damaged(file: Path, what: str) -> str:
+    return (
+        f"{file} is damaged ({what}). Keep it, save what can be read with `sqlite3 {file.name} .recover`, "
+        f"and give another --state-dir. {NOTHING_CHANGED}"
+    )
+
+
+def free_bytes(file: Path) -> int:
+    return shutil.disk_usage(file.parent).free
+
+
+def lock(file: Path) -> int:
+    """A lock on a file beside the store, which the process's end frees and which its children do not inherit."""
+    lock_file = file.with_name(file.name + ".lock")
+    try:
+        descriptor = os.open(lock_file, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+    except OSError as error:
+        raise StoreError(unwritable(file, error.errno, error.strerror)) from error
+    try:
+        fcntl.lockf(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        os.close(descriptor)
+        raise StoreError(
+            f"another sampler is writing {file}. Stop it (`bodyschema status` shows it), "
+            "or give this one a --state-dir of its own"
+        ) from error
+    return descriptor

@@ -1,0 +1,79 @@
+"""What a command may change in a servo's EEPROM."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from interfaces.errors import ConfigError
+from interfaces.suggest import did_you_mean
+
+from .model import Register
+
+ID, BAUD, HOMING_OFFSET = "id", "baud", "homing_offset"
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """A number that a servo keeps without power.
+
+    Attributes:
+        lowest, highest: what it may be.
+        words: names of values. Where there are some, no other value is one.
+        per_unit, unit: what one of it means, for people; no unit: it is a mere number.
+        follows: what a change of it means for an arm that is calibrated.
+    """
+
+    name: str
+    register: Register
+    lowest: int
+    highest: int
+    words: Mapping[str, int] = field(default_factory=dict, repr=False)
+    per_unit: float = 1.0
+    unit: str = ""
+    follows: str = ""
+
+    def value(self, text: str) -> int:
+        """What the user wrote, as a number.
+
+        Raises:
+            ConfigError: it is none, or out of range.
+        """
+        if text in self.words:
+            return self.words[text]
+        try:
+            value = int(text, 0)
+        except ValueError:
+            remedy = did_you_mean(text, self.words) if self.words else self.range
+            raise ConfigError(f"{self.name}={text}: {text!r} is no value of it", remedy=remedy) from None
+        if self.words and (self.name == BAUD or value not in self.words.values()):
+            raise ConfigError(f"{self.name}={text}: there is no such value", remedy=self.range)
+        if not self.lowest <= value <= self.highest:
+            raise ConfigError(f"{self.name}={text} is out of range", remedy=self.range)
+        return value
+
+    def shown(self, value: int) -> str:
+        """A value for people, as "250 (500 µs)"."""
+        word = next((word for word, known in self.words.items() if known == value), "")
+        if self.name == BAUD:
+            return f"{int(word):,} bit/s" if word else f"{value} (unknown rate)"
+        if word:
+            return f"{value} ({word})"
+        return f"{value} ({value * self.per_unit:.4g} {self.unit})" if self.unit else str(value)
+
+    @property
+    def range(self) -> str:
+        """What may be given, in words."""
+        if self.name == BAUD:
+            return f"Give one of {', '.join(self.words)}"
+        if self.words:
+            return f"Give one of {', '.join(f'{word} ({value})' for word, value in self.words.items())}"
+        return f"Give a number from {self.lowest} to {self.highest}"
+
+
+def setting_called(name: str, settings: Mapping[str, Setting], model: str) -> Setting:
+    """The one of that name; ConfigError when the model's EEPROM has none that may be written."""
+    if name not in settings:
+        what = f"{model} has no setting {name!r} that may be written"
+        raise ConfigError(what, remedy=did_you_mean(name, settings))
+    return settings[name]

@@ -1,0 +1,235 @@
+"""Changes what servos keep in their EEPROM: torque verified off, written, read back."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from types import TracebackType
+from typing import Self
+
+from interfaces.errors import SourceError
+from interfaces.protocols import Clock
+
+from .bus import Bus, Trouble
+from .config import ServoConfig
+from .handshake import ATTEMPTS, FittedServo, identify, read_register, switch_torque_off
+from .make import Make
+from .model import Model, Register
+from .port import Port
+from .settings import ID, Setting
+
+EEPROM_S = 0.02  # a servo may be deaf so long while it writes
+LOCK = "lock"
+
+OpenAt = Callable[[str, int], tuple[Port, float]]
+"""Opens a port at a rate; with the latency of its adapter [s]."""
+
+
+class Outcome(StrEnum):
+    """What came of a change."""
+
+    WRITTEN = "written"
+    KEPT = "not written"
+    OTHER = "something else stands there"
+    UNKNOWN = "not known"
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """A number that is to be written: `then` in the place of `now`."""
+
+    servo: FittedServo
+    setting: Setting
+    now: int
+    then: int
+
+
+@dataclass(frozen=True, slots=True)
+class Done:
+    """What came of a change.
+
+    Attributes:
+        found: what stands there now; None when nobody could be asked.
+        said: what to know of it besides; empty when it was written and read back.
+    """
+
+    change: Change
+    outcome: Outcome
+    found: int | None = None
+    said: str = ""
+
+
+class Workbench:
+    """Servos whose EEPROM is looked at and changed. Use as a context manager; it opens ports when they are needed.
+
+    The bus of a servo is its port.
+    """
+
+    def __init__(self, make: Make, clock: Clock, open_at: OpenAt) -> None:
+        """Nothing is opened yet."""
+        self.make, self._clock, self._open_at = make, clock, open_at
+        self._buses: dict[str, tuple[int, Bus]] = {}
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        with ExitStack() as stack:
+            for _, bus in self._buses.values():
+                stack.callback(bus.close)
+            self._buses.clear()
+
+    def bus(self, port: str, baud: int) -> Bus:
+        """The bus at `port`, opened at this rate; SourceError when it cannot be."""
+        if port in self._buses:
+            rate, bus = self._buses[port]
+            if rate == baud:
+                return bus
+            del self._buses[port]
+            bus.close()
+        opened, latency_s = self._open_at(port, baud)
+        self._buses[port] = (baud, self.make.bus(port, opened, self._clock, latency_s))
+        return self._buses[port][1]
+
+    def fitted(self, bus: Bus, config: ServoConfig, model: Model) -> FittedServo:
+        """The servo, as it is; SourceError when it is another, or does not answer."""
+        finding = identify(bus, config, model, self.make.models)
+        if finding.servo is None:
+            raise SourceError(
+                f"{_named(config)} on {bus.name}: {finding.found}. "
+                "Look with `bodyschema scan` who is there; nothing was written"
+            )
+        return finding.servo
+
+    def model_at(self, bus: Bus, id: int) -> Model | None:
+        """What the servo of an ID is, asked in every protocol of the make; None when none understands it."""
+        by_protocol = {model.protocol: model for model in self.make.models.values()}
+        for protocol, any_of_it in by_protocol.items():
+            register = any_of_it.layout["model"]
+            data, _ = read_register(bus, any_of_it, id, register)
+            model = None if data is None else self.make.models.get(register.value(data))
+            if model is not None and model.protocol == protocol:
+                return model
+        return None
+
+    def is_taken(self, bus: Bus, id: int) -> bool:
+        """Whether somebody answers to an ID, in whatever protocol."""
+        by_protocol = {model.protocol: model for model in self.make.models.values()}
+        return any(bus.ping(model, id).trouble is not Trouble.TIMEOUT for model in by_protocol.values())
+
+    def value(self, bus: Bus, servo: FittedServo, setting: Setting) -> int:
+        """What stands in its EEPROM; SourceError when it does not answer."""
+        data, trouble = read_register(bus, servo.model, servo.id, setting.register)
+        if data is None:
+            raise SourceError(f"joint {servo.joint!r} (ID {servo.id}) on {bus.name}: {trouble}. Nothing was written")
+        return setting.register.value(data)
+
+    def position(self, bus: Bus, servo: FittedServo) -> int:
+        """Where it is [ticks]; SourceError when it does not answer."""
+        position = servo.model.layout["position"]
+        data, trouble = read_register(bus, servo.model, servo.id, position)
+        if data is None:
+            raise SourceError(f"joint {servo.joint!r} (ID {servo.id}) on {bus.name}: {trouble}")
+        return position.value(data)
+
+    def homing_offset(self, bus: Bus, servo: FittedServo) -> int:
+        """The homing offset with which the servo's position here and now would be its `zero_ticks`, or a turn off."""
+        moved = servo.zero_ticks - self.position(bus, servo)
+        turn = servo.ticks_per_turn
+        wanted = servo.homing_offset + self.make.homing_sign * moved
+        return wanted if turn is None else (wanted + turn // 2) % turn - turn // 2
+
+    def torque_off(self, bus: Bus, servos: Iterable[FittedServo]) -> None:
+        """Switch the torque of all off, and verify it; SourceError when one's stays on."""
+        for servo in servos:
+            switch_torque_off(bus, servo)
+
+    def write(self, bus: Bus, change: Change) -> Done:
+        """Write it, and read it back. Not for rates, see `write_bauds`. Torque has to be off."""
+        self._unlock(bus, change.servo)
+        done = self._tried(bus, change)
+        for _ in range(ATTEMPTS - 1):
+            if done.outcome is Outcome.KEPT:
+                done = self._tried(bus, change)
+        return self._locked(bus, done)
+
+    def write_bauds(self, port: str, baud: int, then: int, changes: Sequence[Change]) -> list[Done]:
+        """Give servos of one port another rate [bit/s], and look for each there, else where it was."""
+        bus = self.bus(port, baud)
+        for change in changes:
+            self._unlock(bus, change.servo)
+            self._tell(bus, change.servo, change.setting.register, change.then)
+        return [self._met(port, baud, then, change) for change in changes]
+
+    def _tried(self, bus: Bus, change: Change) -> Done:
+        servo, register = change.servo, change.setting.register
+        self._tell(bus, servo, register, change.then)
+        id = change.then if change.setting.name == ID else servo.id
+        data, trouble = read_register(bus, servo.model, id, register)
+        if data is None and change.setting.name == ID:
+            return self._still_there(bus, change, trouble)
+        if data is None:
+            return _lost(change, trouble)
+        found = register.value(data)
+        if found == change.then:
+            return Done(change, Outcome.WRITTEN, found)
+        if found == change.now:
+            return Done(change, Outcome.KEPT, found, "the servo refuses it: out of range for this model, or locked")
+        return Done(change, Outcome.OTHER, found, f"{change.setting.shown(found)} was read back")
+
+    def _still_there(self, bus: Bus, change: Change, trouble: Trouble | None) -> Done:
+        """Nobody answers to the new ID."""
+        data, _ = read_register(bus, change.servo.model, change.servo.id, change.setting.register)
+        if data is None:
+            return _lost(change, trouble)
+        return Done(change, Outcome.KEPT, change.servo.id, "the servo refuses it, and answers to its old ID")
+
+    def _met(self, port: str, baud: int, then: int, change: Change) -> Done:
+        servo, register = change.servo, change.setting.register
+        data, trouble = read_register(self.bus(port, then), servo.model, servo.id, register)
+        if data is not None:
+            return self._locked(self.bus(port, then), Done(change, Outcome.WRITTEN, register.value(data)))
+        data, _ = read_register(self.bus(port, baud), servo.model, servo.id, register)
+        if data is not None:
+            said = f"it still answers at {baud:,} bit/s"
+            return self._locked(self.bus(port, baud), Done(change, Outcome.KEPT, register.value(data), said))
+        return _lost(change, trouble)
+
+    def _tell(self, bus: Bus, servo: FittedServo, register: Register, value: int) -> None:
+        """Write, whatever is answered: under which ID and at which rate it is answered depends on the firmware."""
+        bus.write(servo.model, servo.id, register, register.bytes(value))
+        bus.settle()
+        bus.listen(self._clock.now() + EEPROM_S)
+
+    def _unlock(self, bus: Bus, servo: FittedServo) -> None:
+        """What is written while its EEPROM is locked would be lost with the power."""
+        if LOCK in servo.model.layout:
+            self._tell(bus, servo, servo.model.layout[LOCK], 0)
+
+    def _locked(self, bus: Bus, done: Done) -> Done:
+        """Lock the EEPROM again, where there is a lock."""
+        servo = done.change.servo
+        if LOCK not in servo.model.layout or done.outcome is Outcome.UNKNOWN:
+            return done
+        if done.change.setting.name == ID and done.outcome is Outcome.WRITTEN:
+            servo = replace(servo, id=done.change.then)
+        register = servo.model.layout[LOCK]
+        self._tell(bus, servo, register, 1)
+        data, _ = read_register(bus, servo.model, servo.id, register)
+        if data == register.bytes(1):
+            return done
+        said = "its EEPROM may still be unlocked: switch its supply off and on"
+        return replace(done, said="; ".join(filter(None, (done.said, said))))
+
+
+def _lost(change: Change, trouble: Trouble | None) -> Done:
+    said = f"{trouble} after it was written: look at the cable, then ask again with `bodyschema servos show`"
+    return Done(change, Outcome.UNKNOWN, None, said)
+
+
+def _named(config: ServoConfig) -> str:
+    return f"joint {config.joint!r} (ID {config.id}, {config.model})"

@@ -1,0 +1,174 @@
+"""What the joints were read with, kept with the pairs; the status of servos."""
+
+from __future__ import annotations
+
+import re
+import sqlite3
+from io import StringIO
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+from rich.console import Console
+
+from daemon.devices import DeviceWatch, differences
+from daemon.mcap_export import write_mcap
+from daemon.servos_view import servos_table
+from daemon.status import ServoStatus
+from daemon.store import PairReader, PairStore, Session
+from interfaces.clock import SystemClock
+from interfaces.recording import Recording
+from interfaces.records import MarkerFix, frozen_array
+
+SESSION = Session(("elbow",), "2026-01-01T00:00:00+00:00", "[robot]", "<robot/>", "{}", "0", "host")
+ELBOW = {
+    "joint": "elbow",
+    "model": "XM430-W350",
+    "firmware": 46,
+    "drive_mode": 0,
+    "homing_offset_ticks": 0,
+    "zero_ticks": 2048,
+    "direction": 1,
+    "return_delay_s": 5e-4,
+}
+
+
+class Joints:
+    """Encoders of which only the record is looked at."""
+
+    joints = ("elbow",)
+
+    def __init__(self, **changes) -> None:
+        self.record = (ELBOW | changes,)
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_) -> None:
+        """Nothing was opened."""
+
+    def read(self, timeout_s: float) -> None:
+        """Never anything."""
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    return tmp_path / "pairs.sqlite"
+
+
+def fill(store: PairStore, count: int) -> None:
+    for _ in range(count):
+        fix = MarkerFix(1.0, frozen_array([0.0, 0.0, 1.0]), frozen_array(np.eye(3)))
+        store.append(1, "utc", frozen_array([0.1]), fix)
+
+
+def test_each_session_keeps_what_its_pairs_were_measured_with(file) -> None:
+    for _ in range(2):
+        with PairStore(file, SESSION) as store:
+            assert not DeviceWatch(Joints(), store, SystemClock()).look()
+            fill(store, 3)
+    with PairReader(file) as reader:
+        kept = reader.devices()
+    assert [(one.session, one.from_seq, one.record) for one in kept] == [(1, 1, (ELBOW,)), (2, 4, (ELBOW,))]
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"homing_offset_ticks": 100}, "homing_offset was 0, is 100.*servos set homing_offset=0 --joint elbow"),
+        ({"drive_mode": 1}, "drive_mode was 0, is 1"),
+        ({"firmware": 47}, "the firmware of 'elbow' was 46, is 47"),
+        ({"model": "XM540-W270"}, "another servo than the pairs before: XM430-W350 then, XM540-W270 now"),
+        ({"zero_ticks": 1000}, "zero_ticks in robot.toml was 2048, is 1000"),
+    ],
+)
+def test_a_change_against_the_last_session_is_told_once_with_what_to_do(file, caplog, changes, said) -> None:
+    with PairStore(file, SESSION) as store:
+        DeviceWatch(Joints(), store, SystemClock()).look()
+        fill(store, 1)
+    with PairStore(file, SESSION) as store:
+        watch = DeviceWatch(Joints(**changes), store, SystemClock())
+        assert (watch.look(), watch.look()) == (True, False)
+    (message,) = caplog.messages
+    assert watch.changes == [message]
+    assert re.search(said, message)
+
+
+def test_a_change_while_the_sampler_runs_is_kept_from_the_next_pair_on(file) -> None:
+    with PairStore(file, SESSION) as store:
+        joints = Joints()
+        watch = DeviceWatch(joints, store, SystemClock())
+        watch.look()
+        fill(store, 3)
+        joints.record = (ELBOW | {"homing_offset_ticks": 100},)
+        assert watch.look()
+        fill(store, 1)
+        assert [one.from_seq for one in store.reader.devices()] == [1, 4]
+
+
+def test_what_no_pair_was_measured_with_is_forgotten(file) -> None:
+    with PairStore(file, SESSION) as store:
+        DeviceWatch(Joints(), store, SystemClock()).look()
+        fill(store, 1)
+    for offset in (100, 0):
+        with PairStore(file, SESSION) as store:
+            watch = DeviceWatch(Joints(homing_offset_ticks=offset), store, SystemClock())
+            assert watch.look() == bool(offset)
+
+
+def test_how_fast_a_servo_answers_is_no_other_calibration() -> None:
+    assert differences([ELBOW], [ELBOW | {"return_delay_s": 0.0}]) == []
+
+
+def as_schema_1(file: Path) -> None:
+    """The store as the version before wrote it."""
+    connection = sqlite3.connect(file)
+    connection.executescript("DROP TABLE devices; PRAGMA user_version = 1;")
+    connection.close()
+
+
+def test_a_store_of_schema_1_is_read_as_it_is(file) -> None:
+    with PairStore(file, SESSION) as store:
+        fill(store, 2)
+    as_schema_1(file)
+    before = file.read_bytes()
+    with PairReader(file) as reader:
+        assert (reader.last_seq(), reader.devices()) == (2, [])
+    assert file.read_bytes() == before
+
+
+def test_a_store_of_schema_1_is_brought_to_this_one_with_its_pairs(file) -> None:
+    with PairStore(file, SESSION) as store:
+        fill(store, 2)
+        identity = store.identity
+    as_schema_1(file)
+    with PairStore(file, SESSION) as store:
+        DeviceWatch(Joints(), store, SystemClock()).look()
+        fill(store, 1)
+        assert (store.identity, store.reader.last_seq()) == (identity, 3)
+        assert [one.from_seq for one in store.reader.devices()] == [3]
+
+
+def test_mcap_files_carry_what_the_joints_were_read_with(file, tmp_path) -> None:
+    reader = pytest.importorskip("mcap.reader")
+    with PairStore(file, SESSION) as store:
+        DeviceWatch(Joints(), store, SystemClock()).look()
+        fill(store, 1)
+        devices = store.reader.devices()
+    recording = Recording(("elbow",), np.zeros((1, 1)), np.zeros((1, 3)), t=np.zeros(1))
+    write_mcap(recording, tmp_path / "a.mcap", devices)
+    with (tmp_path / "a.mcap").open("rb") as stream:
+        found = {part.name: part.metadata for part in reader.make_reader(stream).iter_metadata()}
+    assert msgspec.json.decode(found["devices/1"]["elbow"]) == ELBOW
+
+
+def test_a_servo_that_is_not_well_shows_in_the_table_within_80_columns() -> None:
+    hot = ServoStatus("arm", 3, "PH54-200-S500", 46, 0, 0, 24.0, 81.0, 0.12, ["it is too hot: let it cool down"])
+    well = ServoStatus("arm", 4, "MX-28", 24, 0, 0, None, None, None, [])
+    console = Console(file=StringIO(), width=80)
+    console.print(servos_table({"shoulder_pitch": hot, "elbow": well}))
+    assert isinstance(console.file, StringIO)
+    lines = console.file.getvalue().splitlines()
+    assert " ".join(lines[1].split()) == "shoulder_pitch 3 PH54-200-S500 46 24.0 V 81 °C 0.12 A it is too hot"
+    assert " ".join(lines[2].split()) == "elbow 4 MX-28 24 - - - well"

@@ -1,0 +1,195 @@
+"""What is written to EEPROMs, on the bench in virtual time."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from importlib.resources import files
+
+import pytest
+
+from drivers.bench.device import Reply
+from drivers.bench.faults import mute
+from drivers.bench.virtual_port import VirtualClock, VirtualPort, at_once
+from drivers.dynamixel.bench.chain import Chain as DynamixelChain
+from drivers.dynamixel.bench.servo import Servo as DynamixelServo
+from drivers.dynamixel.joints import DYNAMIXEL
+from drivers.dynamixel.models import BY_NAME as DYNAMIXELS
+from drivers.dynamixel.models import MODELS
+from drivers.dynamixel.settings import settings_of
+from drivers.feetech.bench.chain import Chain as FeetechChain
+from drivers.feetech.bench.servo import Servo as FeetechServo
+from drivers.feetech.joints import FEETECH
+from drivers.feetech.models import BY_NAME as FEETECHS
+from drivers.servos.config import ServoConfig
+from drivers.servos.workbench import Change, Outcome, Workbench
+from interfaces.errors import ConfigError, SourceError
+
+RATE = 1_000_000
+ARMS = [("XM430-W350", "XM430-W350"), ("MX-28", "MX-28"), ("STS3215", "STS3215"), ("SCS0009", "SCS0009")]
+
+
+class Arm:
+    """Two servos, IDs 1 and 2, and a workbench."""
+
+    def __init__(self, models: tuple[str, ...] = ("XM430-W350", "XM430-W350"), angle: float = 0.3) -> None:
+        self.clock = VirtualClock()
+        is_dynamixel = models[0] in DYNAMIXELS
+        known = DYNAMIXELS if is_dynamixel else FEETECHS
+        self.models = [known[name] for name in models]
+        kinds = (DynamixelChain, DynamixelServo) if is_dynamixel else (FeetechChain, FeetechServo)
+        self.chain = kinds[0]([kinds[1](model, id, lambda _: angle) for id, model in enumerate(self.models, 1)])
+        self.bench = Workbench(DYNAMIXEL if is_dynamixel else FEETECH, self.clock, self.open)
+
+    def open(self, port: str, baud: int):
+        return VirtualPort(self.chain, self.clock, outwards=at_once, inwards=at_once, baud=baud), 0.0
+
+    @property
+    def bus(self):
+        return self.bench.bus("bench", RATE)
+
+    def fitted(self, id: int = 1):
+        return self.bench.fitted(self.bus, ServoConfig(f"joint{id}", id, self.models[id - 1].name), self.models[id - 1])
+
+    def change(self, name: str, then: int, id: int = 1) -> Change:
+        servo = self.fitted(id)
+        setting = {setting.name: setting for setting in self.bench.make.settings(servo.model)}[name]
+        return Change(servo, setting, self.bench.value(self.bus, servo, setting), then)
+
+
+@pytest.mark.parametrize("models", ARMS)
+def test_a_number_is_written_and_read_back(models) -> None:
+    arm = Arm(models)
+    done = arm.bench.write(arm.bus, arm.change("return_delay", 0))
+    assert (done.outcome, done.found, done.said) == (Outcome.WRITTEN, 0, "")
+    assert (arm.chain.servo(1)["return_delay"], arm.chain.servo(2)["return_delay"]) == (0, 250)
+
+
+@pytest.mark.parametrize("models", ARMS)
+def test_what_was_written_outlasts_a_power_cycle(models) -> None:
+    arm = Arm(models)
+    arm.bench.write(arm.bus, arm.change("return_delay", 0))
+    arm.chain.power_cycle(arm.clock.now())
+    assert arm.chain.servo(1)["return_delay"] == 0
+
+
+@pytest.mark.parametrize("models", ARMS[2:])
+def test_the_eeprom_is_locked_again(models) -> None:
+    arm = Arm(models)
+    for name, then in (("return_delay", 0), ("id", 9)):
+        assert arm.bench.write(arm.bus, arm.change(name, then)).said == ""
+    assert arm.chain.servo(9)["lock"] == 1
+
+
+@pytest.mark.parametrize("models", ARMS)
+def test_a_servo_with_a_new_id_is_found_there(models) -> None:
+    arm = Arm(models)
+    assert arm.bench.write(arm.bus, arm.change("id", 7)).outcome is Outcome.WRITTEN
+    assert (arm.bench.is_taken(arm.bus, 7), arm.bench.is_taken(arm.bus, 1)) == (True, False)
+
+
+@pytest.mark.parametrize("models", ARMS)
+def test_all_servos_of_a_bus_are_found_at_the_new_rate(models) -> None:
+    arm = Arm(models)
+    changes = [arm.change("baud", 0, id) for id in (1, 2)]
+    then = changes[0].setting.words["57600"]
+    changes = [replace(change, then=then) for change in changes]
+    done = arm.bench.write_bauds("bench", RATE, 57_600, changes)
+    assert [one.outcome for one in done] == [Outcome.WRITTEN] * 2
+    assert [servo.baud // 100 for servo in arm.chain.servos] in ([576, 576], [571, 571])
+
+
+def test_a_servo_that_refuses_its_new_rate_is_found_at_the_old_one() -> None:
+    arm = Arm()
+    arm.chain.servo(1)["torque"] = 1
+    change = arm.change("baud", 1)
+    (done,) = arm.bench.write_bauds("bench", RATE, 57_600, [change])
+    assert (done.outcome, done.said) == (Outcome.KEPT, "it still answers at 1,000,000 bit/s")
+
+
+def test_what_a_servo_refuses_is_told_and_not_believed_to_be_written() -> None:
+    arm = Arm()
+    arm.chain.servo(1)["torque"] = 1  # locks the EEPROM
+    done = arm.bench.write(arm.bus, arm.change("return_delay", 0))
+    assert (done.outcome, done.found) == (Outcome.KEPT, 250)
+
+
+@pytest.mark.parametrize("models", ARMS)
+def test_a_cable_that_fails_after_the_write_leaves_it_open_what_stands_there(models) -> None:
+    arm = Arm(models)
+    change = arm.change("return_delay", 0)
+
+    def cut(reply: Reply) -> Reply:
+        return mute(reply, None) if arm.chain.servo(1)["return_delay"] == 0 else reply
+
+    arm.chain.faults = cut
+    done = arm.bench.write(arm.bus, change)
+    assert (done.outcome, done.found) == (Outcome.UNKNOWN, None)
+    assert "no answer after it was written" in done.said
+
+
+@pytest.mark.parametrize("models", ARMS)
+def test_torque_is_off_before_anything_is_written(models) -> None:
+    arm = Arm(models)
+    arm.chain.servo(1)["torque"] = 1
+    arm.bench.torque_off(arm.bus, [arm.fitted()])
+    assert arm.chain.servo(1)["torque"] == 0
+
+
+@pytest.mark.parametrize("models", [ARMS[0], ARMS[2]])
+@pytest.mark.parametrize("angle", [0.3, -0.9, 1.4])
+def test_with_the_offset_of_here_the_position_here_is_the_zero(models, angle) -> None:
+    arm = Arm(models, angle)
+    servo = arm.fitted()
+    arm.bench.write(arm.bus, arm.change("homing_offset", arm.bench.homing_offset(arm.bus, servo)))
+    assert arm.bench.position(arm.bus, servo) == servo.zero_ticks
+
+
+def test_a_servo_of_another_model_is_not_written_to() -> None:
+    arm = Arm()
+    wrong = DYNAMIXELS["XM540-W270"]
+    with pytest.raises(SourceError, match=r"XM430-W350: wrong model.*nothing was written"):
+        arm.bench.fitted(arm.bus, ServoConfig("joint1", 1, wrong.name), wrong)
+
+
+@pytest.mark.parametrize("models", ARMS)
+def test_a_servo_that_no_file_names_says_what_it_is(models) -> None:
+    arm = Arm(models)
+    assert arm.bench.model_at(arm.bus, 2) == arm.models[1]
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [("255", "from 0 to 254"), ("-1", "from 0 to 254"), ("much", "from 0 to 254")],
+)
+def test_what_is_out_of_range_is_refused_with_the_range(text, said) -> None:
+    (delay,) = [setting for setting in settings_of(DYNAMIXELS["XM430-W350"]) if setting.name == "return_delay"]
+    with pytest.raises(ConfigError, match=said):
+        delay.value(text)
+
+
+def test_a_model_without_current_sensor_has_no_current_mode() -> None:
+    (mode,) = [setting for setting in settings_of(DYNAMIXELS["XL430-W250"]) if setting.name == "operating_mode"]
+    with pytest.raises(ConfigError, match="there is no such value"):
+        mode.value("0")
+
+
+@pytest.mark.parametrize("model", [model for model in MODELS if model.protocol == 2], ids=lambda model: model.name)
+def test_settings_stand_where_the_control_tables_of_the_sdk_have_them(model) -> None:
+    tables = files("dynamixel_easy_sdk") / "control_table"
+    names = dict(line.split("\t")[:2] for line in (tables / "dynamixel.model").read_text().splitlines()[1:])
+    rows = [line.split("\t") for line in (tables / names[str(model.number)].strip()).read_text().splitlines()]
+    places = {(int(row[0]), int(row[1])): row[2] for row in rows if len(row) == 3 and row[0].isdigit()}
+    for setting in settings_of(model):
+        theirs = places[setting.register.address, setting.register.size].lower().replace(" ", "_")
+        assert theirs.replace("(shadow)", "").replace("_rate", "").replace("_time", "") == setting.name
+
+
+@pytest.mark.parametrize("make", [DYNAMIXEL, FEETECH], ids=lambda make: make.table)
+def test_every_setting_lies_in_the_eeprom_apart_from_the_others(make) -> None:
+    for model in make.models.values():
+        ends = 0
+        for setting in make.settings(model):
+            assert ends <= setting.register.address
+            assert setting.register.bytes(setting.lowest) != setting.register.bytes(setting.highest)
+            ends = setting.register.end
+        assert ends <= model.layout.ram
