@@ -19,6 +19,7 @@ from interfaces.records import JointReading, frozen_array
 from .bus import Bus, Exchange, Request
 from .channel import Channel, Punctuality, Sample, middle
 from .config import ServoConfig, ServosConfig
+from .drive import Drive
 from .handshake import RETRY_S, Finding, FittedServo, identify, require_all, restore_torque, switch_torque_off
 from .make import Make
 from .port import Port
@@ -61,6 +62,7 @@ class ServoJoints:
         open_port: OpenPort,
         limits: Sequence[tuple[float, float]] | None = None,
         last_pose: Sequence[float] | None = None,
+        drives: Sequence[Drive] = (),
     ) -> None:
         """Nothing is opened yet.
 
@@ -69,7 +71,9 @@ class ServoJoints:
             joints: in the order of q.
             limits: of each joint [rad]: with less than a turn between them there is no doubt about the turn.
             last_pose: where the joints were when they were read last [rad], shape (d,), to count turns from.
+            drives: what may move joints once it is asked to; without any, torque stays off.
         """
+        self._drives = tuple(drives)
         self._make, self._config, self._names, self._clock = make, config, tuple(joints), clock
         self._open_port = open_port
         by_joint = {servo.joint: servo for servo in config.servos}
@@ -96,7 +100,8 @@ class ServoJoints:
     @property
     def health(self) -> tuple[str, ...]:
         """What is wrong with servos, and what to do."""
-        return tuple(self._complaint(joint, bits) for joint, bits in self._alerts.items())
+        said = [self._complaint(joint, bits) for joint, bits in self._alerts.items()]
+        return (*said, *(text for drive in self._drives for text in drive.complaints))
 
     @property
     def samples(self) -> Mapping[str, Sample | None]:
@@ -118,6 +123,9 @@ class ServoJoints:
             self._prepare()
             self._anchor()
             stack.callback(self._restore)
+            for drive in self._drives:
+                drive.open(self._buses, self.servos)
+            stack.callback(self._release, "the servos were closed")
             self._opened = stack.pop_all()
         self._is_open, self._is_lost = True, False
         self._had_torque.update(servo.joint for servo in self.servos if servo.had_torque)
@@ -141,8 +149,9 @@ class ServoJoints:
             raise SourceError("the servos are not open; use them in a with statement")
         try:
             return self._read_until(self._clock.now() + timeout_s)
-        except SourceLost:
-            self._is_lost = True
+        except BaseException as error:  # whatever ends the reading, nobody would look after the torque
+            self._is_lost = isinstance(error, SourceLost)
+            self._release(f"the servos cannot be read any more: {error}")
             raise
 
     def temperature_c(self, joint: str) -> float | None:
@@ -227,6 +236,11 @@ class ServoJoints:
                 with suppress(SourceError):
                     restore_torque(self._buses[servo.bus], servo)
 
+    def _release(self, why: str) -> None:
+        with ExitStack() as stack:  # each, though one should fail
+            for drive in self._drives:
+                stack.callback(drive.release, why)
+
     # --- reading
 
     def _poll(self) -> JointReading | None:
@@ -234,6 +248,8 @@ class ServoJoints:
         reading = None if samples is None else self._judge(samples)
         if self._clock.now() >= self._next_look:
             self._look_after_one()
+        for drive in self._drives:
+            drive.step(reading, self.samples)
         if reading is None:
             self._dropped_one()
         else:
@@ -343,7 +359,8 @@ class ServoJoints:
         layout = servo.model.layout
         has_register = "hardware_error" in layout
         bits = layout.value("hardware_error", status.data, layout.state.address) if has_register else status.error
-        if layout.value("torque", status.data, layout.state.address):
+        has_torque = layout.value("torque", status.data, layout.state.address)
+        if has_torque and not any(servo.joint in drive.holding for drive in self._drives):
             raise SourceLost(f"the torque of joint {servo.joint!r} was switched on by another program", retry_s=0.0)
         self._note_alert(servo.joint, bits)
 
