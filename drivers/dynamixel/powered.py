@@ -123,7 +123,7 @@ class PoweredJoints(ABC):
             self._drop(str(error) or type(error).__name__)
             raise
 
-    def release(self, why: str) -> None:
+    def release(self, why: str | None) -> None:
         """See `Drive.release`."""
         while True:
             try:
@@ -131,9 +131,13 @@ class PoweredJoints(ABC):
             except Empty:
                 break
             if answer.set_running_or_notify_cancel():
-                answer.set_exception(RequestError(f"{self.name}: {why}"))
-        if self.state == "on":
+                answer.set_exception(RequestError(f"{self.name}: {why or 'the servos were closed'}"))
+        if self.state != "on":
+            return
+        if why is not None:
             self._drop(why)
+        elif self._end():
+            log.error("%s", "; ".join(self.complaints))
 
     # --- what differs
 
@@ -172,12 +176,18 @@ class PoweredJoints(ABC):
                 raise
 
     def _switch_off(self) -> str:
+        unsure = self._end()
+        if unsure:
+            raise RequestError("; ".join(self.complaints))
+        return f"{self.name} is off, the torque of {', '.join(self._joints)} verified off"
+
+    def _end(self) -> tuple[str, ...]:
+        """Torque off, as it was asked for; whose could not be verified."""
         unsure = self._let_go()
         self.state, self._why = "off", ""
-        if unsure:
-            raise RequestError(f"the torque of {', '.join(unsure)} could not be verified off: switch the supply off")
-        log.info("%s was ended; torque is verified off", self.name)
-        return f"{self.name} is off, the torque of {', '.join(self._joints)} verified off"
+        if not unsure:
+            log.info("%s was ended; torque is verified off", self.name)
+        return unsure
 
     def _switch_on(self) -> str:
         if self.state == "on":

@@ -36,6 +36,6 @@ class Drive(Protocol):
         """Once each cycle, after the question: the reading, None when it was doubtful, and the newest samples."""
         ...
 
-    def release(self, why: str) -> None:
-        """Torque off, verified on every joint as far as the bus allows."""
+    def release(self, why: str | None) -> None:
+        """Torque off, verified on every joint as far as the bus allows; None when that is the orderly end."""
         ...

@@ -125,7 +125,7 @@ class ServoJoints:
             stack.callback(self._restore)
             for drive in self._drives:
                 drive.open(self._buses, self.servos)
-            stack.callback(self._release, "the servos were closed")
+            stack.callback(self._release, None)
             self._opened = stack.pop_all()
         self._is_open, self._is_lost = True, False
         self._had_torque.update(servo.joint for servo in self.servos if servo.had_torque)
@@ -236,7 +236,7 @@ class ServoJoints:
                 with suppress(SourceError):
                     restore_torque(self._buses[servo.bus], servo)
 
-    def _release(self, why: str) -> None:
+    def _release(self, why: str | None) -> None:
         with ExitStack() as stack:  # each, though one should fail
             for drive in self._drives:
                 stack.callback(drive.release, why)

@@ -68,6 +68,7 @@ class Servo:
     Attributes:
         model: what it is.
         glitch_ticks: the encoder is wrong by this.
+        excess_a: it draws so much more than it regulates [A].
         fast: it knows FAST_SYNC_READ.
     """
 
@@ -89,7 +90,7 @@ class Servo:
             booted_s: when it got its power.
         """
         self.model, self.fast = model, fast
-        self.glitch_ticks = 0
+        self.glitch_ticks, self.excess_a = 0, 0.0
         self._angle = angle
         self._memory = bytearray(model.layout.size)
         self._reset_memory()
@@ -314,7 +315,7 @@ class Servo:
 
     def _told_current(self, t: float) -> int:
         unit = self.model.current_unit
-        return 0 if unit is None else round((-1 if self._is_reversed else 1) * self.motor_current(t) / unit)
+        return 0 if unit is None else round((-1 if self._is_reversed else 1) * (self.motor_current(t) + self.excess_a) / unit)
 
     def _refusal(self, address: int, data: bytes) -> Error:
         layout, end = self.model.layout, address + len(data)
