@@ -19,6 +19,7 @@ from kbmaps import RigidChain
 
 from .config import Config
 from .joints_watch import ServoJoints
+from .powered_wiring import open_drives
 from .servo_wiring import require_servos, through_servos
 from .sources import MarkerTopic, Sources, StampedJoints
 from .store import PairReader
@@ -55,7 +56,7 @@ def open_joints(config: Config, clock: Clock) -> JointSource:
     """The encoders alone of the arm that robot.toml describes, not opened yet.
 
     Raises:
-        ConfigError: no servos and no ROS 2 robot are configured.
+        ConfigError: no servos and no ROS 2 robot are configured, or zero-force or gaze do not fit the robot.
         StoreError: the store, which tells where they were last, cannot be read.
     """
     hardware, joints = config.tables.drivers.hardware, config.robot.joints
@@ -72,7 +73,8 @@ def open_joints(config: Config, clock: Clock) -> JointSource:
         case DynamixelConfig():
             from drivers.dynamixel.joints import DynamixelJoints
 
-            return DynamixelJoints(hardware, joints, clock, limits=limits, last_pose=last_pose)
+            drives = open_drives(config, hardware, clock)
+            return DynamixelJoints(hardware, joints, clock, limits=limits, last_pose=last_pose, drives=drives)
         case FeetechConfig():
             from drivers.feetech.joints import FeetechJoints
 

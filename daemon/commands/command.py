@@ -8,10 +8,20 @@ from cyclopts import Parameter
 
 from daemon.commands.options import HERE, RobotFile
 
-Name = Literal["pause", "resume", "reset_to_prior", "tool_changed", "checkpoint"]
+Name = Literal[
+    "pause",
+    "resume",
+    "zero_force_on",
+    "zero_force_off",
+    "gaze_on",
+    "gaze_off",
+    "reset_to_prior",
+    "tool_changed",
+    "checkpoint",
+]
 Process = Literal["sampler", "learner"]
 
-SAMPLERS = ("pause", "resume")
+SAMPLERS = ("pause", "resume", "zero_force_on", "zero_force_off", "gaze_on", "gaze_off")
 
 
 def command(
@@ -20,14 +30,17 @@ def command(
     *,
     to: Annotated[
         Process | None,
-        Parameter(help="Who is to do it; else pause and resume go to the sampler, others to the learner."),
+        Parameter(
+            help="Who is to do it; else pause, resume, zero-force and gaze go to the sampler, others to the learner."
+        ),
     ] = None,
     robot: RobotFile = HERE,
 ) -> None:
     """Tell a running process to do something.
 
-    `pause` and `resume` accepting pairs (or, with --to learner, learning); `tool_changed` when another tool is in
-    the hand; `reset_to_prior` forgets what was learnt, not the stored pairs; `checkpoint` writes the learner's state
+    `pause` and `resume` accepting pairs (or, with --to learner, learning); `zero_force_on` lets the servos bear the
+    arm, `gaze_on` turns the head to the hand, `..._off` switches their torque off; `tool_changed` when another tool is
+    in the hand; `reset_to_prior` forgets what was learnt, not the stored pairs; `checkpoint` writes the learner's state
     now.
 
     Needs: that process running (`bodyschema run`).
@@ -44,7 +57,7 @@ def command(
 
     process: Process = to or ("sampler" if name in SAMPLERS else "learner")
     if process == "sampler" and name not in SAMPLERS:
-        raise RequestError(f"the sampler knows {' and '.join(SAMPLERS)} alone; {name} is the learner's: drop --to")
+        raise RequestError(f"the sampler knows {', '.join(SAMPLERS)} alone; {name} is the learner's: drop --to")
     config = Config.load(robot)
     with client(getattr(config.tables.zenoh, process)) as bus:
         reply = bus.ask_one(Keys(config.robot.name).command(process), encode(CommandRequest(name)))

@@ -66,9 +66,13 @@ class DynamixelConfig(ServosConfig[BusConfig], frozen=True, forbid_unknown_field
                 continue
             for keys, what, remedy in table.mistakes(self.servos, self.models):
                 yield name, keys, what, remedy
-            if table.heartbeat_s < CYCLES_PER_HEARTBEAT / self.rate_hz:
-                yield name, ("heartbeat_ms",), f"rate_hz = {self.rate_hz:g} is too slow for its heartbeat", (
-                    f"Give a heartbeat_ms of at least {1e3 * CYCLES_PER_HEARTBEAT / self.rate_hz:.0f}, or a higher rate_hz"
+            shortest_s = CYCLES_PER_HEARTBEAT / self.rate_hz
+            if table.heartbeat_s < shortest_s:
+                yield (
+                    name,
+                    ("heartbeat_ms",),
+                    f"rate_hz = {self.rate_hz:g} is too slow for its heartbeat",
+                    f"Give a heartbeat_ms of at least {1e3 * shortest_s:.0f}, or a higher rate_hz",
                 )
             if self.restore_torque:
                 yield name, (), "restore_torque switches torque on again at the end", "Take one of the two out"

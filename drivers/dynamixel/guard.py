@@ -11,7 +11,7 @@ import numpy as np
 
 from interfaces.records import FloatArray, frozen_array
 
-SHORTEST_BASE_S, LONGEST_BASE_S = 0.02, 0.06  # over which a speed is taken from positions: one tick is 4°/s at most
+SHORTEST_BASE_S = 0.02  # over which a speed is taken from positions: one tick is 4°/s at most
 CURRENT_SLACK, CURRENT_SLACK_A = 0.15, 0.05  # what a current may be over its limit: the servo's own regulation
 REFUSALS = 3  # so many goals in a row that a servo did not take
 
@@ -121,7 +121,7 @@ class Guard:
         late_s, self._checked_s = now - self._checked_s, now
         if not 0 <= late_s <= self._limits.heartbeat_s:
             raise Drop(
-                f"the program was held up for {1e3 * late_s:.0f} ms (heartbeat {1e3 * self._limits.heartbeat_s:.0f} ms). "
+                f"the program was held up for {1e3 * late_s:.0f} ms ({1e3 * self._limits.heartbeat_s:.0f} are allowed). "
                 "Run less beside it, or give a longer heartbeat_ms"
             )
         if motion is None:
@@ -144,7 +144,7 @@ class Guard:
             raise Drop("a reading is not finite. Report this: it should have been refused before")
         self._check_speed("by its servo", np.abs(motion.velocity))
         self._track.append((motion.t, frozen_array(motion.q)))
-        while motion.t - self._track[0][0] > LONGEST_BASE_S:
+        while len(self._track) > 1 and motion.t - self._track[1][0] >= SHORTEST_BASE_S:
             self._track.popleft()
         base_s = motion.t - self._track[0][0]
         if base_s >= SHORTEST_BASE_S:

@@ -106,9 +106,10 @@ class PoweredJoints(ABC):
 
     def step(self, reading: JointReading | None, samples: Mapping[str, Sample | None]) -> None:
         """See `Drive.step`."""
+        was_on = self.state == "on"
         self._answer_requests()
-        if self.state != "on":
-            return
+        if not was_on or self.state != "on":
+            return  # who has just been switched on is not where the samples say: a position may lose its turns by that
         try:
             now = self._clock.now()
             motion = self._motion(reading, samples)
@@ -225,7 +226,7 @@ class PoweredJoints(ABC):
 
     def _wrong_mode(self, servo: FittedServo, found: int) -> str:
         return (
-            f"joint {servo.joint!r} (ID {servo.id}) is in operating mode {found}, not in {self.mode_name} ({self.mode}). "
+            f"joint {servo.joint!r} (ID {servo.id}) is in operating mode {found}, not {self.mode_name} ({self.mode}). "
             f"It is kept in the servo's EEPROM; type: bodyschema servos set {servo.joint} operating_mode {self.mode}"
         )
 

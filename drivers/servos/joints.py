@@ -98,6 +98,11 @@ class ServoJoints:
         return self._names
 
     @property
+    def drives(self) -> tuple[Drive, ...]:
+        """What may move its joints."""
+        return self._drives
+
+    @property
     def health(self) -> tuple[str, ...]:
         """What is wrong with servos, and what to do."""
         said = [self._complaint(joint, bits) for joint, bits in self._alerts.items()]

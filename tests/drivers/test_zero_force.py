@@ -198,9 +198,14 @@ def test_torque_is_off_after_the_end() -> None:
 
 def test_torque_is_off_after_any_exception() -> None:
     arm = FloatingArm()
-    with pytest.raises(ZeroDivisionError), arm.joints:
-        arm.float()
-        raise ZeroDivisionError
+
+    def fail() -> None:
+        with arm.joints:
+            arm.float()
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        fail()
     assert arm.torque == [0, 0]
 
 

@@ -62,8 +62,8 @@ RAM_OF_FACTORY = ("status_return", "voltage", "temperature")
 class Servo:
     """A servo on a bench.
 
-    The shaft is wherever `angle` says. What the servo does about it, `motor_current` and `held_at` tell: an `angle` that
-    follows these moves as a real arm would.
+    The shaft is wherever `angle` says. What the servo does about it, `motor_current` and `held_at` tell: an `angle`
+    that follows these moves as a real arm would.
 
     Attributes:
         model: what it is.
@@ -315,7 +315,11 @@ class Servo:
 
     def _told_current(self, t: float) -> int:
         unit = self.model.current_unit
-        return 0 if unit is None else round((-1 if self._is_reversed else 1) * (self.motor_current(t) + self.excess_a) / unit)
+        return (
+            0
+            if unit is None
+            else round((-1 if self._is_reversed else 1) * (self.motor_current(t) + self.excess_a) / unit)
+        )
 
     def _refusal(self, address: int, data: bytes) -> Error:
         layout, end = self.model.layout, address + len(data)
