@@ -121,7 +121,7 @@ class Guard:
         late_s, self._checked_s = now - self._checked_s, now
         if not 0 <= late_s <= self._limits.heartbeat_s:
             raise Drop(
-                f"the program was held up for {1e3 * late_s:.0f} ms ({1e3 * self._limits.heartbeat_s:.0f} are allowed). "
+                f"this was held up for {1e3 * late_s:.0f} ms (heartbeat {1e3 * self._limits.heartbeat_s:.0f} ms). "
                 "Run less beside it, or give a longer heartbeat_ms"
             )
         if motion is None:

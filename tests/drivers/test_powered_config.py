@@ -55,7 +55,7 @@ def test_nothing_has_torque_by_default() -> None:
 
 @pytest.mark.parametrize("model", ["XL430-W250", "AX-12A", "MX-28", "MX-106", "MX-28(2.0)", "XC430-W240"])
 def test_a_servo_without_current_control_is_refused_by_its_joint(model) -> None:
-    with pytest.raises(ConfigError, match="joint 'shoulder': a .* has no current control") as refused:
+    with pytest.raises(ConfigError, match=r"joint 'shoulder': a .* has no current control") as refused:
         check(floating(), model=model)
     assert model in str(refused.value)
 

@@ -56,6 +56,7 @@ READ_ONLY = (
     "current",
 )
 LARGEST = {"id": 252, "torque": 1, "status_return": 2, "return_delay": 254}
+JUDGED = (*LARGEST, *GOALS, "operating_mode")
 RAM_OF_FACTORY = ("status_return", "voltage", "temperature")
 
 
@@ -331,9 +332,9 @@ class Servo:
             if name in layout and layout[name].address < end and layout[name].end > address:
                 return Error.ACCESS
         written = {
-            name: register.value(data[register.address - address : register.end - address])
-            for name, register in layout.registers.items()
-            if address <= register.address and register.end <= end
+            name: layout.value(name, data, address)
+            for name in JUDGED
+            if name in layout and address <= layout[name].address and layout[name].end <= end
         }
         if any(written.get(name, 0) > largest for name, largest in LARGEST.items()):
             return Error.LIMIT
