@@ -104,12 +104,12 @@ class PoweredJoints(ABC):
             if servo.operating_mode != self.mode:
                 log.warning("%s is not possible as yet: %s", self.name, self._wrong_mode(servo, servo.operating_mode))
 
-    def step(self, reading: JointReading | None, samples: Mapping[str, Sample | None]) -> None:
+    def step(self, reading: JointReading | None, samples: Mapping[str, Sample | None]) -> str | None:
         """See `Drive.step`."""
         was_on = self.state == "on"
         self._answer_requests()
         if not was_on or self.state != "on":
-            return  # who has just been switched on is not where the samples say: a position may lose its turns by that
+            return None  # who has just been switched on is not where the samples say: a position may lose its turns by that
         try:
             now = self._clock.now()
             motion = self._motion(reading, samples)
@@ -120,9 +120,11 @@ class PoweredJoints(ABC):
                 self._look_at_one(now)
         except Drop as drop:
             self._drop(str(drop))
+            return str(drop)
         except BaseException as error:
             self._drop(str(error) or type(error).__name__)
             raise
+        return None
 
     def release(self, why: str | None) -> None:
         """See `Drive.release`."""

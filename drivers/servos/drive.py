@@ -32,8 +32,11 @@ class Drive(Protocol):
         """The servos were found, with their torque verified off; in the order of the joints."""
         ...
 
-    def step(self, reading: JointReading | None, samples: Mapping[str, Sample | None]) -> None:
-        """Once each cycle, after the question: the reading, None when it was doubtful, and the newest samples."""
+    def step(self, reading: JointReading | None, samples: Mapping[str, Sample | None]) -> str | None:
+        """Once each cycle, after the question: the reading, None when it was doubtful, and the newest samples.
+
+        Why it had to let go in this cycle, which is reason for the other drives to let go too; else None.
+        """
         ...
 
     def release(self, why: str | None) -> None:

@@ -253,8 +253,9 @@ class ServoJoints:
         reading = None if samples is None else self._judge(samples)
         if self._clock.now() >= self._next_look:
             self._look_after_one()
-        for drive in self._drives:
-            drive.step(reading, self.samples)
+        for why in [drive.step(reading, self.samples) for drive in self._drives]:
+            if why is not None:
+                self._release(why)
         if reading is None:
             self._dropped_one()
         else:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import math
 
+import msgspec
 import numpy as np
 import pytest
 from floating_arm import CONSTANT, INERTIA, WEIGHT_N_M, FloatingArm, holding
@@ -12,6 +13,8 @@ from floating_arm import CONSTANT, INERTIA, WEIGHT_N_M, FloatingArm, holding
 from drivers.bench.faults import mute
 from drivers.dynamixel.bench.frames import Code
 from drivers.dynamixel.bench.servo import POSITION_MODE
+from drivers.dynamixel.joints import DynamixelJoints
+from drivers.dynamixel.zero_force import ZeroForce
 from interfaces.errors import RequestError, SourceError, SourceLost
 
 DRIFT_RAD = math.radians(0.5)  # what the arm may drift in ten seconds after it is let go
@@ -327,6 +330,21 @@ def test_a_mute_servo_s_torque_is_off_though_it_cannot_be_verified() -> None:
             arm.run(3.0)
         assert arm.torque == [0, 0]
         assert "joint1 could not be verified off" in arm.force.complaints[0]
+
+
+def test_where_one_drive_lets_go_the_other_lets_go_too() -> None:
+    arm = FloatingArm()
+    tables = [msgspec.structs.replace(arm.table, joints={name: arm.table.joints[name]}) for name in arm.names]
+    drives = [ZeroForce(arm.config, table, arm.names, holding, arm.clock) for table in tables]
+    arm.joints = DynamixelJoints(arm.config, arm.names, arm.clock, open_port=lambda *_: (arm.port, 0.0), drives=drives)
+    with arm.joints:
+        answers = [drive.ask(True) for drive in drives]
+        while not all(answer.done() for answer in answers):
+            arm.joints.read(0.02)
+        assert arm.torque == [1, 1]
+        arm.chain.servo(2)["temperature"] = 70
+        arm.run(1.0)
+        assert (arm.torque, [drive.state for drive in drives]) == ([0, 0], ["dropped"] * 2)
 
 
 def test_it_ends_once_is_told_once_and_begins_again_only_when_asked(caplog) -> None:
