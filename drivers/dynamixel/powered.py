@@ -109,7 +109,7 @@ class PoweredJoints(ABC):
         was_on = self.state == "on"
         self._answer_requests()
         if not was_on or self.state != "on":
-            return None  # who has just been switched on is not where the samples say: a position may lose its turns by that
+            return None  # the samples are older than the torque, with which a position may lose its turns
         try:
             now = self._clock.now()
             motion = self._motion(reading, samples)
