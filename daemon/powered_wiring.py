@@ -40,8 +40,7 @@ def open_drives(config: Config, servos: DynamixelConfig, clock: Clock) -> tuple[
     """What may move the joints: nothing, unless robot.toml names it; and then nothing, until a person asks.
 
     Raises:
-        ConfigError: the URDF states no masses, robot.toml says that somebody else bears the arm, or [camera] describes
-            no stereo pair to look with.
+        ConfigError: the URDF states no masses, or robot.toml says that somebody else bears the arm.
     """
     joints, drives = config.robot.joints, []
     _check_hold(config, servos)

@@ -39,7 +39,7 @@ OpenPort = Callable[[Any, Clock], tuple[Port, float]]
 
 
 class ServoJoints:
-    """Reads the positions of an arm whose torque is off.
+    """Reads the positions of an arm whose torque is off, but for what `drives` hold.
 
     A reading is made of intact answers of all servos to the same questions, each from the time at which it was asked,
     each where the joint can have come to. Whatever is doubtful is dropped, and the line has to fall silent before the

@@ -76,8 +76,6 @@ class GazingRobot:
             Servo(BY_NAME[MODEL], id, shaft, return_delay_s=0.0, booted_s=id * 0.1234)
             for id, shaft in enumerate([*self.heads, *arm], 1)
         ]
-        for servo in servos:
-            servo["max_position"] = 4095
         self.faults = Planned()
         self.chain = Chain(servos, self.faults)
         for head, servo in zip(self.heads, servos, strict=False):

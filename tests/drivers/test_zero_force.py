@@ -11,9 +11,14 @@ import pytest
 from floating_arm import CONSTANT, INERTIA, WEIGHT_N_M, FloatingArm, holding
 
 from drivers.bench.faults import mute
+from drivers.bench.virtual_port import VirtualClock, VirtualPort
+from drivers.dynamixel.bench.chain import Chain
 from drivers.dynamixel.bench.frames import Code
-from drivers.dynamixel.bench.servo import POSITION_MODE
+from drivers.dynamixel.bench.servo import CURRENT_MODE, POSITION_MODE, Servo
+from drivers.dynamixel.config import BusConfig, DynamixelConfig, ServoConfig
 from drivers.dynamixel.joints import DynamixelJoints
+from drivers.dynamixel.models import BY_NAME
+from drivers.dynamixel.powered_config import FloatingJoint, ZeroForceConfig
 from drivers.dynamixel.zero_force import ZeroForce
 from interfaces.errors import RequestError, SourceError, SourceLost
 
@@ -85,6 +90,32 @@ def test_a_servo_that_is_reversed_by_its_drive_mode_floats_too() -> None:
         arm.run(3.0)
         assert arm.force.state == "on"
         assert np.abs(np.subtract(arm.q, before)).max() < DRIFT_RAD
+
+
+def test_servos_of_two_series_on_two_buses_get_their_currents() -> None:
+    models, clock = {"left": "XM430-W350", "right": "PH54-200-S500"}, VirtualClock()
+    servos = {name: Servo(BY_NAME[model], 1, lambda t: 0.5, return_delay_s=0.0) for name, model in models.items()}
+    for servo in servos.values():
+        servo["operating_mode"] = CURRENT_MODE
+    table = ZeroForceConfig(joints={name: FloatingJoint(current_limit_a=1.0) for name in models})
+    config = DynamixelConfig(
+        {name: BusConfig(name) for name in models},
+        tuple(ServoConfig(name, 1, model, bus=name) for name, model in models.items()),
+        zero_force=table,
+    )
+    force = ZeroForce(config, table, tuple(models), lambda q: np.array([0.5, -2.0]), clock)
+    ports = {name: VirtualPort(Chain([servo]), clock) for name, servo in servos.items()}
+    answer = force.ask(True)
+    with DynamixelJoints(
+        config, tuple(models), clock, open_port=lambda bus, _: (ports[bus.port], 0.0), drives=[force]
+    ) as joints:
+        end = clock.now() + 1.3
+        while clock.now() < end:
+            joints.read(0.02)
+        assert answer.done()
+        currents = [servo.motor_current(clock.now()) for servo in servos.values()]
+    assert currents == pytest.approx([0.5 / (4.1 / 2.3), -2.0 / (44.7 / 9.3)], abs=3e-3)
+    assert [servo["torque"] for servo in servos.values()] == [0, 0]
 
 
 def test_the_currents_grow_within_a_second() -> None:

@@ -292,6 +292,10 @@ class Servo:
         self["model"] = self.model.number
         for name, value in self._factory.items():
             self[name] = value
+        if self.model.protocol == 2:
+            turn = self.model.ticks_per_turn or 0
+            self["min_position"] = self.model.zero_ticks - turn // 2
+            self["max_position"] = self["min_position"] + turn - 1
 
     def _fold(self, t: float) -> None:
         turn = self.model.ticks_per_turn
@@ -349,4 +353,5 @@ class Servo:
             return Error.RANGE
         if abs(written.get("goal_current", 0)) > self["current_limit"]:
             return Error.LIMIT
-        return Error.NONE
+        within = self["min_position"] <= written.get("goal", self["min_position"]) <= self["max_position"]
+        return Error.NONE if within or self._mode != POSITION_MODE else Error.LIMIT
