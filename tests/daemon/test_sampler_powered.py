@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import threading
+import time
 from concurrent.futures import Future
+from queue import Queue
 
+import numpy as np
 import pytest
 from scripted_sources import Scripted
 from small_arm import write_small_arm
@@ -13,8 +16,12 @@ from test_sampler import command, running, status_when
 from daemon import powered
 from daemon.config import Config
 from daemon.sources import Sources
+from daemon.wiring import demonstration_model
 from interfaces.clock import SystemClock
-from interfaces.errors import RequestError
+from interfaces.errors import ConfigError, RequestError
+from interfaces.records import frozen_array
+
+LIMIT_S = 30.0
 
 
 class Powered:
@@ -85,3 +92,47 @@ def test_its_complaints_are_in_the_status(config) -> None:
     with running(config, sources(config, drive)) as bus:
         status = status_when(bus, lambda status: bool(status.health))
     assert drive.complaints[0] in status.health
+
+
+class Head(Powered):
+    """A head that stands still and keeps what it is told."""
+
+    name, head = "gaze", ("neck_yaw", "neck_pitch")
+    lower, upper = frozen_array([-1.0, -1.0]), frozen_array([1.0, 1.0])
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.told: Queue = Queue()
+
+    @property
+    def pose(self):
+        return time.monotonic(), np.radians([10.0, 20.0, 35.0, 15.0, 0.0, 80.0, 0.0])
+
+    def aim(self, t, angles) -> None:
+        self.told.put((t, angles))
+
+
+def test_the_head_is_told_where_to_look_while_the_sampler_runs(tmp_path, endpoint) -> None:
+    environment = {
+        "BODYSCHEMA_ROBOT_NAME": "arm",
+        "BODYSCHEMA_ZENOH_SAMPLER": endpoint,
+        "BODYSCHEMA_DAEMON_STATE_DIR": str(tmp_path),
+    }
+    config, head, held = Config.load(demonstration_model(), environment), Head(), threading.Event()
+    joints, marker = Scripted([held], config.robot.joints), Scripted([held])
+    with running(config, Sources(joints, marker, SystemClock(), powered=(head,), head=head)):
+        first, _ = head.told.get(timeout=LIMIT_S)
+        second, angles = head.told.get(timeout=LIMIT_S)
+    assert second > first
+    assert angles.shape == (2,)
+    assert np.abs(angles).max() <= 1.0
+
+
+def test_gaze_without_a_stereo_pair_is_refused(config) -> None:
+    head, held = Head(), threading.Event()
+    joints, marker = Scripted([held], config.robot.joints), Scripted([held])
+    with (
+        pytest.raises(ConfigError, match="how the cameras see"),
+        running(config, Sources(joints, marker, SystemClock(), head=head)),
+    ):
+        pass
