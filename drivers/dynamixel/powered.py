@@ -17,7 +17,7 @@ from drivers.servos.bus import Bus as ServoBus
 from drivers.servos.channel import Sample
 from drivers.servos.handshake import FittedServo, switch_torque_off
 from drivers.servos.model import Register
-from interfaces.errors import RequestError, SourceError
+from interfaces.errors import RequestError
 from interfaces.protocols import Clock
 from interfaces.records import FloatArray, JointReading
 
@@ -62,7 +62,7 @@ class PoweredJoints(ABC):
         self._looked, self._next_look = 0, -math.inf
         self._missed: dict[str, int] = {}
         self._unsure: tuple[str, ...] = ()
-        self._why = ""
+        self._why, self._has_just_begun = "", False
         self.state: State = "off"
 
     def ask(self, on: bool) -> Future[str]:
@@ -106,9 +106,9 @@ class PoweredJoints(ABC):
 
     def step(self, reading: JointReading | None, samples: Mapping[str, Sample | None]) -> str | None:
         """See `Drive.step`."""
-        was_on = self.state == "on"
+        self._has_just_begun = False
         self._answer_requests()
-        if not was_on or self.state != "on":
+        if self.state != "on" or self._has_just_begun:
             return None  # the samples are older than the torque, with which a position may lose its turns
         try:
             now = self._clock.now()
@@ -208,7 +208,7 @@ class PoweredJoints(ABC):
             raise
         now = self._clock.now()
         self._guard.begin(now)
-        self._missed, self._next_look, self._why = {}, now, ""
+        self._missed, self._next_look, self._why, self._has_just_begun = {}, now, "", True
         self._begin(now)
         log.warning("%s is on: %s have torque", self.name, ", ".join(self._joints))
         return self._said_on()
@@ -241,17 +241,19 @@ class PoweredJoints(ABC):
 
     def _let_go(self) -> tuple[str, ...]:
         """Torque off: told to all at once, then verified one by one. Whose could not be verified."""
-        with suppress(SourceError):
+        # Whatever fails with one servo, the others have to be told all the same.
+        with suppress(Exception):
             self._write_all("torque", dict.fromkeys(self._joints, 0))
         unsure = []
         for servo in self._servos:
             bus = self._buses[servo.bus]
             try:
                 switch_torque_off(bus, servo)
-            except SourceError:
+            except Exception as error:
+                log.debug("the torque of %s is not verified: %r", servo.joint, error)
                 unsure.append(servo.joint)
                 continue
-            with suppress(SourceError, RequestError):
+            with suppress(Exception):
                 self._write(servo, "watchdog", 0)
         self._unsure = tuple(unsure)
         return self._unsure

@@ -167,6 +167,18 @@ def test_a_head_that_was_turned_round_stays_where_it_is() -> None:
         assert robot.heads[0](robot.clock.now()) == pytest.approx(before, abs=0.01)
 
 
+def test_asked_off_and_on_at_once_the_head_stays_where_it_is() -> None:
+    robot = GazingRobot()
+    robot.heads[0]._q += 2 * math.pi
+    with robot.joints:
+        robot.switch_on()
+        before = robot.heads[0](robot.clock.now())
+        robot.gaze.ask(False)
+        assert "gaze is on" in robot.switch_on()
+        robot.run(0.5, looking=False)
+        assert robot.heads[0](robot.clock.now()) == pytest.approx(before, abs=0.01)
+
+
 def test_a_head_that_is_held_fast_ends_it() -> None:
     with (robot := GazingRobot(blocked_deg=8.0)).joints:
         robot.switch_on()
