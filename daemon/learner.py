@@ -224,6 +224,10 @@ class Learner:
             "tool_changed": self._tool_changed,
             "checkpoint": self._checkpoint_now,
         }
+        if command not in carried_out:
+            raise RequestError(
+                f"the learner has nothing to do with {command}. Send it to {self._keys.command('sampler')}"
+            )
         message = carried_out[command]()
         log.info("command %s: %s", command, message)
         return encode(CommandReply(command, message), request.encoding)

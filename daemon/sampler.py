@@ -261,7 +261,7 @@ class Sampler:
             return encode(CommandReply(command, self._power(name, on=way == "on")), request.encoding)
         if command not in ("pause", "resume"):
             raise RequestError(
-                f"the sampler knows pause and resume, not {command}. Send it to {self._keys.command('learner')}"
+                f"the sampler has nothing to do with {command}. Send it to {self._keys.command('learner')}"
             )
         if command == "resume" and self._paused:
             # A frame that is still under way shows the arm as it was during the pause.

@@ -57,7 +57,7 @@ def command(
 
     process: Process = to or ("sampler" if name in SAMPLERS else "learner")
     if process == "sampler" and name not in SAMPLERS:
-        raise RequestError(f"the sampler knows {', '.join(SAMPLERS)} alone; {name} is the learner's: drop --to")
+        raise RequestError(f"{name} is a command of the learner: drop --to")
     config = Config.load(robot)
     with client(getattr(config.tables.zenoh, process)) as bus:
         reply = bus.ask_one(Keys(config.robot.name).command(process), encode(CommandRequest(name)))

@@ -344,7 +344,7 @@ def test_a_frame_that_was_under_way_when_the_sampler_resumed_gives_no_pair(confi
 
 
 def test_a_command_for_the_learner_is_refused_with_its_address(ended) -> None:
-    with pytest.raises(RequestError, match=r"the sampler knows pause and resume, not checkpoint.*/command/learner"):
+    with pytest.raises(RequestError, match=r"the sampler has nothing to do with checkpoint.*/command/learner"):
         command(ended, "checkpoint")
 
 
