@@ -31,6 +31,7 @@ from daemon.status import LearnerStatus
 from daemon.tool_changes import ToolChanges
 from daemon.wire import OCTETS, CommandReply, CommandRequest, PairsReply, decode, encode
 from daemon.wiring import open_marker_topic
+from interfaces.errors import RequestError
 from interfaces.protocols import Clock
 from kbmaps import KBMapsError
 
