@@ -17,10 +17,12 @@ import numpy as np
 from drivers.bench.device import Device, Sampling
 from drivers.bench.pty_shell import PtyShell
 from drivers.dynamixel.bench.chain import Chain
-from drivers.dynamixel.bench.servo import Servo
+from drivers.dynamixel.bench.servo import CURRENT_MODE, Servo
 from drivers.dynamixel.config import BusConfig, DynamixelConfig, ServoConfig
 from drivers.dynamixel.joints import DynamixelJoints
 from drivers.dynamixel.models import BY_NAME
+from drivers.dynamixel.powered_config import FloatingJoint, ZeroForceConfig
+from drivers.dynamixel.zero_force import ZeroForce
 from drivers.feetech.bench.chain import Chain as FeetechChain
 from drivers.feetech.bench.servo import Servo as FeetechServo
 from drivers.feetech.config import BusConfig as FeetechBus
@@ -53,6 +55,23 @@ def dynamixel(return_delay_s: float, *, is_fast: bool) -> tuple[Chain, Open]:
     return Chain(servos), driver
 
 
+def floating(return_delay_s: float) -> tuple[Chain, Open]:
+    """Dynamixel servos that bear their part of an arm while they are read."""
+    chain, _ = dynamixel(return_delay_s, is_fast=True)
+    for servo in chain.servos:
+        servo["operating_mode"] = CURRENT_MODE
+    table = ZeroForceConfig(joints={name: FloatingJoint(current_limit_a=1.0) for name in NAMES}, heartbeat_ms=500)
+    entries = tuple(ServoConfig(name, k, MODEL) for name, k in zip(NAMES, IDS, strict=True))
+
+    def driver(port: str) -> ServoJoints:
+        config, clock = DynamixelConfig({"arm": BusConfig(port)}, entries, zero_force=table), SystemClock()
+        force = ZeroForce(config, table, NAMES, np.cos, clock)
+        force.ask(True)
+        return DynamixelJoints(config, NAMES, clock, drives=[force])
+
+    return chain, driver
+
+
 def feetech(return_delay_s: float, *, is_sync: bool) -> tuple[FeetechChain, Open]:
     """A chain of Feetech servos, and the driver at a port."""
     servos = [FeetechServo(FEETECH_MODELS[FEETECH_MODEL], k, swing(k), return_delay_s=return_delay_s) for k in IDS]
@@ -76,11 +95,12 @@ def measure(device: Device, samplings: dict[int, Sampling], driver: Open, second
                 reading = joints.read(0.1)
                 if reading is not None:
                     off.append(reading.t - float(np.mean([sampling.t for sampling in samplings.values()])))
+            held = ", torque to the end" if any(drive.holding for drive in joints.drives) else ""
             spent, elapsed = time.thread_time() - used, time.monotonic() - begin
     p50, p99 = np.percentile(np.abs(off), (50, 99)) * 1e3
     return (
         f"{len(off) / elapsed:.0f} readings/s, {spent / elapsed:.1%} of a core, {joints.dropped} dropped, "
-        f"time stamps off by {p50:.3f} ms (p50), {p99:.3f} ms (p99)"
+        f"time stamps off by {p50:.3f} ms (p50), {p99:.3f} ms (p99){held}"
     )
 
 
@@ -92,6 +112,7 @@ def main() -> None:
     for delay_us in (0, 500):
         for how, (chain, driver) in {
             "Dynamixel, Fast Sync Read": dynamixel(delay_us * 1e-6, is_fast=True),
+            "Dynamixel, zero-force": floating(delay_us * 1e-6),
             "Dynamixel, Sync Read": dynamixel(delay_us * 1e-6, is_fast=False),
             "Feetech, Sync Read": feetech(delay_us * 1e-6, is_sync=True),
             "Feetech, one by one": feetech(delay_us * 1e-6, is_sync=False),

@@ -226,8 +226,9 @@ class Learner:
             "checkpoint": self._checkpoint_now,
         }
         if command not in carried_out:
-            known = ", ".join(carried_out)
-            raise RequestError(f"the learner knows {known}, not {command}. Send it to {self._keys.command('sampler')}")
+            raise RequestError(
+                f"the learner has nothing to do with {command}. Send it to {self._keys.command('sampler')}"
+            )
         message = carried_out[command]()
         log.info("command %s: %s", command, message)
         return encode(CommandReply(command, message), request.encoding)

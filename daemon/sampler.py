@@ -22,12 +22,14 @@ from .bus import Bus, Request
 from .config import Config
 from .devices import DeviceWatch
 from .gate import Accepted, Gate
+from .gaze_loop import GazeLoop, HandModel
 from .history import answer_pairs
 from .keys import Keys
+from .powered import asked
 from .reopen import Reopening
 from .servo_status import AsksForTurns, buses_of, complaints_of, servos_of
 from .simulation import answer_simulation
-from .sources import Sources
+from .sources import Head, Sources
 from .status import SamplerStatus
 from .store import PairStore
 from .tally import Tally
@@ -37,6 +39,7 @@ log = logging.getLogger(__name__)
 
 READ_TIMEOUT_S = 0.2
 JOINTS_TIMEOUT_S = 1.0  # how long a frame waits for the encoders to reach its time
+PREDICT_S = 0.2  # what the gaze waits for the learner
 STATUS_EVERY_S = 1.0
 SILENT_AFTER_S = 2.0  # a source that has said nothing for so long is reported
 PAIR_CACHE = 1000
@@ -78,6 +81,8 @@ class Sampler:
         self._config, self._bus, self._store, self._exit_at_end = config, bus, store, exit_at_end
         self._wall = SystemClock() if wall is None else wall
         self._keys = Keys(config.robot.name)
+        self._powered = {drive.name: drive for drive in sources.powered}
+        self._gaze = None if sources.head is None else self._gaze_loop(sources.head)
         self._simulation, self._source_clock = sources.simulation, sources.clock
         self._joints = Reopening(sources.joints, "the encoders", self._wall)
         self._encoders, self._devices = sources.joints, DeviceWatch(sources.joints, store, self._wall)
@@ -120,6 +125,8 @@ class Sampler:
             stack.callback(reader.join)
             stack.callback(self._buffer.close)
             stack.callback(self.stop)
+            if self._gaze is not None:
+                stack.enter_context(self._gaze)
             self._serve()
             name, endpoint = self._config.robot.name, self._config.tables.zenoh.sampler
             log.info("the sampler of %s answers on %s; %d pairs are in %s", name, endpoint, self._seq, self._store.file)
@@ -259,10 +266,12 @@ class Sampler:
         command = decode(request.payload, CommandRequest, request.encoding).command
         if command == "accept_turns":
             return encode(CommandReply(command, self._accept_turns()), request.encoding)
+        name, _, way = command.rpartition("_")
+        if way in ("on", "off"):
+            return encode(CommandReply(command, self._power(name, on=way == "on")), request.encoding)
         if command not in ("pause", "resume"):
             raise RequestError(
-                f"the sampler knows pause, resume and accept_turns, not {command}. "
-                f"Send it to {self._keys.command('learner')}"
+                f"the sampler has nothing to do with {command}. Send it to {self._keys.command('learner')}"
             )
         if command == "resume" and self._paused:
             # A frame that is still under way shows the arm as it was during the pause.
@@ -280,6 +289,19 @@ class Sampler:
         encoders.accept_turns()
         log.info("accept_turns: the turns nearest to where the joints were are taken")
         return "the turns nearest to where the joints were are taken; pairs go on in a new segment"
+
+    def _gaze_loop(self, head: Head) -> GazeLoop:
+        def predict(payload: bytes) -> bytes:
+            return self._bus.ask_one(self._keys.predict, payload, timeout_s=PREDICT_S)
+
+        return GazeLoop(self._config.robot, head, HandModel(self._config.robot, predict, self._wall))
+
+    def _power(self, name: str, *, on: bool) -> str:
+        if name not in self._powered:
+            raise RequestError(f"{name} is not configured: docs/hardware.md shows its table [drivers.dynamixel.{name}]")
+        said = asked(self._powered[name], on=on)
+        log.info("%s", said)
+        return said
 
     def _tell_when_due(self) -> None:
         self._tally.tick()
@@ -304,6 +326,7 @@ class Sampler:
             said.append(str(self._failure))
         elif not self._ended:
             said += self._silences()
+        said += [text for drive in self._powered.values() for text in drive.complaints]
         if self._bad_readings:
             said.append(f"{self._bad_readings} encoder readings were not finite and were not used")
         if self._disk_free() < LOW_DISK_BYTES:

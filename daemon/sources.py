@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from concurrent.futures import Future
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from interfaces.protocols import Clock, JointSource, MarkerSource, Source
 from interfaces.records import FloatArray
@@ -22,14 +23,73 @@ class Simulation(Protocol):
         ...
 
 
+@runtime_checkable
+class Powered(Protocol):
+    """Joints that have torque from when a person asks for it until anything is not as it must be."""
+
+    @property
+    def name(self) -> str:
+        """In commands: `<name>_on`, `<name>_off`."""
+        ...
+
+    @property
+    def state(self) -> str:
+        """off, on, or dropped: off by itself, until somebody asks again."""
+        ...
+
+    @property
+    def complaints(self) -> tuple[str, ...]:
+        """What is wrong, and what to do."""
+        ...
+
+    def ask(self, on: bool) -> Future[str]:
+        """Ask for torque or its end; the answer comes from the thread that reads, unless it is cancelled before."""
+        ...
+
+
+class Head(Powered, Protocol):
+    """A head that turns to where it is told to look."""
+
+    @property
+    def head(self) -> tuple[str, ...]:
+        """Names of its joints."""
+        ...
+
+    @property
+    def lower(self) -> FloatArray:
+        """Their lower limits [rad] (g,)."""
+        ...
+
+    @property
+    def upper(self) -> FloatArray:
+        """Their upper limits [rad] (g,)."""
+        ...
+
+    @property
+    def pose(self) -> tuple[float, FloatArray] | None:
+        """Time [s] and angles of all joints [rad] (d,) of the newest reading; None while it has no torque."""
+        ...
+
+    def aim(self, t: float, angles: FloatArray) -> None:
+        """At `t` [s] its joints should stand at `angles` (g,) [rad]."""
+        ...
+
+
 @dataclass(frozen=True, slots=True)
 class Sources:
-    """Encoders and marker, not opened yet, on one clock; and the simulated world when there is one."""
+    """Encoders and marker, not opened yet, on one clock; and the simulated world when there is one.
+
+    Attributes:
+        powered: what may move the arm or the head, once a person asks for it.
+        head: the one of them that turns the cameras.
+    """
 
     joints: JointSource
     marker: MarkerSource
     clock: Clock
     simulation: Simulation | None = None
+    powered: tuple[Powered, ...] = ()
+    head: Head | None = None
 
 
 class StampedJoints(JointSource, Protocol):

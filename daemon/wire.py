@@ -133,7 +133,18 @@ class IkReply(msgspec.Struct, frozen=True):
 class CommandRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A command to one of the processes; which it knows is in its documentation."""
 
-    command: Literal["pause", "resume", "reset_to_prior", "tool_changed", "checkpoint", "accept_turns"]
+    command: Literal[
+        "pause",
+        "resume",
+        "accept_turns",
+        "zero_force_on",
+        "zero_force_off",
+        "gaze_on",
+        "gaze_off",
+        "reset_to_prior",
+        "tool_changed",
+        "checkpoint",
+    ]
 
 
 class CommandReply(msgspec.Struct, frozen=True):

@@ -22,6 +22,7 @@ from kbmaps import RigidChain
 from .bench_wiring import require_bench, through_bench
 from .config import Config
 from .joints_watch import EncoderJoints
+from .powered_wiring import open_drives
 from .sources import MarkerTopic, Sources, StampedJoints
 from .store import PairReader
 
@@ -59,7 +60,7 @@ def open_joints(config: Config, clock: Clock) -> JointSource:
     """The encoders alone of the arm that robot.toml describes, not opened yet.
 
     Raises:
-        ConfigError: no servos and no ROS 2 robot are configured.
+        ConfigError: no servos and no ROS 2 robot are configured, or zero-force or gaze do not fit the robot.
         StoreError: the store, which tells where they were last, cannot be read.
     """
     hardware = config.tables.drivers.hardware
@@ -85,7 +86,8 @@ def driver_of(hardware: Hardware, config: Config, clock: Clock, *, last_pose: li
         case DynamixelConfig():
             from drivers.dynamixel.joints import DynamixelJoints
 
-            return DynamixelJoints(hardware, joints, clock, limits=limits, last_pose=last_pose)
+            drives = open_drives(config, hardware, clock)
+            return DynamixelJoints(hardware, joints, clock, limits=limits, last_pose=last_pose, drives=drives)
         case FeetechConfig():
             from drivers.feetech.joints import FeetechJoints
 

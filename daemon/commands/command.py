@@ -8,10 +8,22 @@ from cyclopts import Parameter
 
 from daemon.commands.options import HERE, RobotFile
 
-Name = Literal["pause", "resume", "reset_to_prior", "tool_changed", "checkpoint", "accept_turns"]
+Name = Literal[
+    "pause",
+    "resume",
+    "accept_turns",
+    "zero_force_on",
+    "zero_force_off",
+    "gaze_on",
+    "gaze_off",
+    "reset_to_prior",
+    "tool_changed",
+    "checkpoint",
+]
 Process = Literal["sampler", "learner"]
 
-SAMPLERS = ("pause", "resume", "accept_turns")
+BOTHS = ("pause", "resume")
+SAMPLERS = (*BOTHS, "accept_turns", "zero_force_on", "zero_force_off", "gaze_on", "gaze_off")
 
 
 def command(
@@ -26,10 +38,11 @@ def command(
 ) -> None:
     """Tell a running process to do something.
 
-    `pause` and `resume` accepting pairs (or, with --to learner, learning); `tool_changed` when another tool is in
-    the hand; `reset_to_prior` forgets what was learnt, not the stored pairs; `checkpoint` writes the learner's state
-    now; `accept_turns` when a joint lost its turn count while its bus was away, and stands where the message says: the
-    turn nearest to where it was is taken.
+    `pause` and `resume` accepting pairs (or, with --to learner, learning); `zero_force_on` lets the servos bear the
+    arm, `gaze_on` turns the head to the hand, `..._off` switches their torque off; `accept_turns` when a joint lost its
+    turn count while its bus was away, and stands where the message says: the turn nearest to where it was is taken;
+    `tool_changed` when another tool is in the hand; `reset_to_prior` forgets what was learnt, not the stored pairs;
+    `checkpoint` writes the learner's state now.
 
     Needs: that process running (`bodyschema run`).
 
@@ -45,9 +58,9 @@ def command(
 
     process: Process = to or ("sampler" if name in SAMPLERS else "learner")
     if process == "sampler" and name not in SAMPLERS:
-        raise RequestError(f"the sampler knows {', '.join(SAMPLERS)} alone; {name} is the learner's: drop --to")
-    if process == "learner" and name == "accept_turns":
-        raise RequestError("accept_turns is the sampler's: drop --to")
+        raise RequestError(f"{name} is a command of the learner: drop --to")
+    if process == "learner" and name in SAMPLERS and name not in BOTHS:
+        raise RequestError(f"{name} is a command of the sampler: drop --to")
     config = Config.load(robot)
     with client(getattr(config.tables.zenoh, process)) as bus:
         reply = bus.ask_one(Keys(config.robot.name).command(process), encode(CommandRequest(name)))

@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from daemon.joints_watch import JointsWatch, Seen
+    from daemon.sources import Powered
 
 SHOW_EVERY_S = 0.1
 PRINT_EVERY_S = 0.5
@@ -22,12 +23,14 @@ def joints(
     robot: RobotFile = HERE,
     once: Annotated[bool, flag("One table, then end.")] = False,
     json: Annotated[bool, flag("A line of JSON instead, every half second.")] = False,
+    zero_force: Annotated[bool, flag("The servos bear the arm meanwhile: [drivers.dynamixel.zero_force].")] = False,
 ) -> None:
     """Each joint's angle, speed, current and temperature while you move it by hand, until Ctrl-C.
 
-    Torque of servos is switched off first: hold the arm, it will sink. Below the table stands where the URDF says that
-    the marker went by the joint that you moved last: if it went the other way, the sign is wrong. Angles beyond the
-    URDF's limits are told, too.
+    Torque of servos is switched off first: hold the arm, it will sink. With --zero-force the servos then bear it, until
+    Ctrl-C or until anything is in doubt: stay ready to hold it. Below the table stands where the URDF says that the
+    marker went by the joint that you moved last: if it went the other way, the sign is wrong. Angles beyond the URDF's
+    limits are told, too.
 
     Needs: robot.toml with servos (`bodyschema robot new`) or encoders, and no sampler that runs.
 
@@ -39,6 +42,7 @@ def joints(
     from daemon.config import Config
     from daemon.joints_view import as_json, screen
     from daemon.joints_watch import JointsWatch
+    from daemon.powered import find_powered
     from daemon.signals import on_termination
     from daemon.wiring import open_encoders
     from interfaces.clock import SystemClock
@@ -47,8 +51,12 @@ def joints(
     config = Config.load(robot)
     console = Console(highlight=False)
     ending = _Ending()
-    with on_termination(ending.end), JointsWatch(config, open_encoders(config, clock), clock) as watch:
+    source = open_encoders(config, clock)
+    force = find_powered(getattr(source, "drives", ()), "zero_force", config.file) if zero_force else None
+    with on_termination(ending.end), JointsWatch(config, source, clock) as watch:
         seen = _first(watch)
+        if force is not None:
+            _begin(watch, force)
         if once:
             console.file.write(as_json(seen) + "\n") if json else console.print(screen(seen))
         elif json or not console.is_terminal:
@@ -89,6 +97,14 @@ def _first(watch: JointsWatch) -> Seen:
             if seen is not None:
                 return seen
     raise SourceError("the joints cannot be read. `bodyschema doctor` tells why")
+
+
+def _begin(watch: JointsWatch, force: Powered) -> None:
+    """Zero-force on, and what is to be known of that; RequestError when it is refused."""
+    answer = force.ask(True)
+    while not answer.done():
+        watch.look()
+    sys.stderr.write(answer.result() + "\n")
 
 
 def _follow(watch: JointsWatch, ending: _Ending, every_s: float, show: Callable[[Seen], None]) -> None:

@@ -84,7 +84,8 @@ class ServoChain(OnlyAnswers, ABC, Generic[ServoT]):
             servo.reboot(t)
 
     def send(self, data: bytes, t: float, baud: int) -> list[Reply]:
-        """The host's `data`, whose first byte is on the wire at `t` [s]; what the servos answer, in its order."""
+        """The host's `data`, whose first byte is on the wire at `t` [s] or when the wire is free; what is answered."""
+        t = max(t, self._last_byte_s)
         if t - self._last_byte_s > FORGET_AFTER_S:
             self._stream.clear()
         before = len(self._stream)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from drivers.servos.bus import Answer, Exchange, Request, Trouble
 from drivers.servos.bus import Bus as ServoBus
+from drivers.servos.model import Register
 from drivers.servos.packets import Packets
 
 from .packets import PACKETS2, Garbled, packets_of
@@ -32,6 +33,11 @@ class Bus(ServoBus):
     def packets_of(protocol: int) -> Packets:
         """How to speak the protocol."""
         return packets_of(protocol)
+
+    def sync_write(self, register: Register, values: Mapping[int, int]) -> None:
+        """Write a register of servos of Protocol 2.0, by ID. Nobody answers: whoever needs to know has to ask."""
+        data = {id: register.bytes(value) for id, value in values.items()}
+        self.announce(PACKETS2.sync_write(register.address, register.size, data))
 
     def _collect(self, request: Request) -> Exchange:
         return self._collect_fast(request) if request.is_fast else super()._collect(request)

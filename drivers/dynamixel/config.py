@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import ClassVar, Literal
 
 import msgspec
 
 from drivers.servos.config import NonNegative, ServoConfig, ServosConfig
 from drivers.servos.model import Model
+from interfaces.errors import ConfigError
+from interfaces.toml_file import line_of
 
 from .models import BY_NAME
+from .powered_config import GazeConfig, ZeroForceConfig
 
 __all__ = ["Baud", "BusConfig", "DynamixelConfig", "ServoConfig"]
+
+CYCLES_PER_HEARTBEAT = 4
 
 Baud = Literal[9600, 57600, 115200, 1_000_000, 2_000_000, 3_000_000, 4_000_000]
 
@@ -34,7 +40,43 @@ class BusConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class DynamixelConfig(ServosConfig[BusConfig], frozen=True, forbid_unknown_fields=True):
-    """The table [drivers.dynamixel]. MX-28 speaks Protocol 1.0, MX-28(2.0) speaks 2.0."""
+    """The table [drivers.dynamixel]. MX-28 speaks Protocol 1.0, MX-28(2.0) speaks 2.0.
+
+    Attributes:
+        zero_force: which joints bear the arm, once a person asks for it. Without this table none ever does.
+        gaze: which joints turn the cameras to the hand, once a person asks for it.
+    """
 
     table: ClassVar[str] = "drivers.dynamixel"
     models: ClassVar[Mapping[str, Model]] = BY_NAME
+
+    zero_force: ZeroForceConfig | None = None
+    gaze: GazeConfig | None = None
+
+    def check(self, joints: Sequence[str], file: Path, text: str) -> None:
+        """ConfigError when servos, zero-force or gaze do not fit `joints` or each other; see `ServosConfig.check`."""
+        super().check(joints, file, text)
+        for name, keys, what, remedy in self._powered_mistakes():
+            line = line_of(text, (*self.table.split("."), name, *keys)) or line_of(text, (*self.table.split("."), name))
+            raise ConfigError(f"[{self.table}.{name}] {what}", file=file, line=line, remedy=remedy)
+
+    def _powered_mistakes(self) -> Iterator[tuple[str, tuple[str, ...], str, str]]:
+        for name, table in (("zero_force", self.zero_force), ("gaze", self.gaze)):
+            if table is None:
+                continue
+            for keys, what, remedy in table.mistakes(self.servos, self.models):
+                yield name, keys, what, remedy
+            shortest_s = CYCLES_PER_HEARTBEAT / self.rate_hz
+            if table.heartbeat_s < shortest_s:
+                yield (
+                    name,
+                    ("heartbeat_ms",),
+                    f"rate_hz = {self.rate_hz:g} is too slow for its heartbeat",
+                    f"Give a heartbeat_ms of at least {1e3 * shortest_s:.0f}, or a higher rate_hz",
+                )
+            if self.restore_torque:
+                yield name, (), "restore_torque switches torque on again at the end", "Take one of the two out"
+        if self.zero_force is not None and self.gaze is not None:
+            for joint in self.gaze.joints:
+                if joint in self.zero_force.joints:
+                    yield "gaze", ("joints",), f"joint {joint!r} is in zero_force too", "Take it out of one"

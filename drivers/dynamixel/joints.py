@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from drivers.serial_line import adapter_latency_s
 from drivers.servos.bus import Bus as ServoBus
 from drivers.servos.bus import Request
+from drivers.servos.drive import Drive
 from drivers.servos.handshake import FittedServo
 from drivers.servos.joints import OpenPort, ServoJoints
 from drivers.servos.make import Make
@@ -49,7 +50,7 @@ DYNAMIXEL = Make(
 
 
 class DynamixelJoints(ServoJoints):
-    """Reads the positions of an arm of Dynamixel servos whose torque is off; see `ServoJoints`."""
+    """Reads the positions of an arm of Dynamixel servos; see `ServoJoints`."""
 
     def __init__(
         self,
@@ -60,6 +61,9 @@ class DynamixelJoints(ServoJoints):
         limits: Sequence[tuple[float, float]] | None = None,
         last_pose: Sequence[float] | None = None,
         open_port: OpenPort = open_serial,
+        drives: Sequence[Drive] = (),
     ) -> None:
         """Nothing is opened yet; arguments as of `ServoJoints`."""
-        super().__init__(DYNAMIXEL, config, joints, clock, open_port=open_port, limits=limits, last_pose=last_pose)
+        super().__init__(
+            DYNAMIXEL, config, joints, clock, open_port=open_port, limits=limits, last_pose=last_pose, drives=drives
+        )

@@ -6,7 +6,7 @@ answers, and reads past garbage.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 import dynamixel_sdk as sdk
@@ -69,6 +69,12 @@ class Packets2:
     def sync_read(self, ids: Sequence[int], address: int, size: int, *, fast: bool) -> bytes:
         """SYNC_READ, or FAST_SYNC_READ."""
         return self._of(lambda port: self._sdk.syncReadTx(port, address, size, list(ids), len(ids), fast))
+
+    def sync_write(self, address: int, size: int, data: Mapping[int, bytes]) -> bytes:
+        """SYNC_WRITE of `size` bytes to each ID. Nobody answers."""
+        params = [byte for id, bytes_ in data.items() for byte in (id, *bytes_)]
+        packet = self._of(lambda port: self._sdk.syncWriteTxOnly(port, address, size, params, len(params)))
+        return _stuffed(packet) if len(packet) == len(params) + 14 else packet
 
     def _of(self, send: Any) -> bytes:
         port = _Caught()

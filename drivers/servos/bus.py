@@ -104,7 +104,7 @@ class Bus(ABC):
         self.name, self.return_delay_s, self.counts = name, dict[int, float](), Counts()
         self._port, self._clock, self._latency_s = port, clock, latency_s
         self._byte_s = BITS_PER_BYTE / port.baud
-        self._sent = 0.0
+        self._sent = self._free_s = 0.0
 
     @staticmethod
     @abstractmethod
@@ -141,7 +141,7 @@ class Bus(ABC):
     def send(self, request: Request) -> None:
         """Send it."""
         self._port.flush()
-        self._sent = self._clock.now()
+        self._sent = max(self._clock.now(), self._free_s)
         self._port.write(request.packet)
 
     def collect(self, request: Request) -> Exchange:
@@ -158,6 +158,11 @@ class Bus(ABC):
     def tell(self, protocol: int, packet: bytes, id: int) -> Exchange:
         """Send an instruction that is answered without data, or, as its status return level says, not at all."""
         return self.ask(Request(packet, (id,), 0, protocol))
+
+    def announce(self, packet: bytes) -> None:
+        """Send an instruction that nobody answers. The next question comes after it on the wire."""
+        self._free_s = max(self._clock.now(), self._free_s) + len(packet) * self._byte_s
+        self._port.write(packet)
 
     def listen(self, until: float) -> bool:
         """Wait; False when something came though nobody was asked: what came before is not to be trusted."""

@@ -19,6 +19,7 @@ from interfaces.records import JointReading, frozen_array
 from .bus import Bus, Counts, Exchange, Request
 from .channel import Channel, Punctuality, Sample, middle
 from .config import ServoConfig, ServosConfig
+from .drive import Drive
 from .handshake import RETRY_S, Finding, FittedServo, identify, require_all, restore_torque, switch_torque_off
 from .health import BusHealth, Health, ServoHealth, supply_of
 from .make import Make
@@ -40,7 +41,7 @@ OpenPort = Callable[[Any, Clock], tuple[Port, float]]
 
 
 class ServoJoints:
-    """Reads the positions of an arm whose torque is off.
+    """Reads the positions of an arm whose torque is off, but for what `drives` hold.
 
     A reading is made of intact answers of all servos to the same questions, each from the time at which it was asked,
     each where the joint can have come to. Whatever is doubtful is dropped, and the line has to fall silent before the
@@ -63,6 +64,7 @@ class ServoJoints:
         open_port: OpenPort,
         limits: Sequence[tuple[float, float]] | None = None,
         last_pose: Sequence[float] | None = None,
+        drives: Sequence[Drive] = (),
     ) -> None:
         """Nothing is opened yet.
 
@@ -71,7 +73,9 @@ class ServoJoints:
             joints: in the order of q.
             limits: of each joint [rad]: with less than a turn between them there is no doubt about the turn.
             last_pose: where the joints were when they were read last [rad], shape (d,), to count turns from.
+            drives: what may move joints once it is asked to; without any, torque stays off.
         """
+        self._drives = tuple(drives)
         self._make, self._config, self._names, self._clock = make, config, tuple(joints), clock
         self._open_port = open_port
         by_joint = {servo.joint: servo for servo in config.servos}
@@ -97,9 +101,14 @@ class ServoJoints:
         return self._names
 
     @property
+    def drives(self) -> tuple[Drive, ...]:
+        """What may move its joints."""
+        return self._drives
+
+    @property
     def health(self) -> tuple[str, ...]:
         """What is wrong with servos, and what to do."""
-        return self._health.complaints
+        return (*self._health.complaints, *(text for drive in self._drives for text in drive.complaints))
 
     @property
     def servo_health(self) -> tuple[ServoHealth, ...]:
@@ -146,6 +155,9 @@ class ServoJoints:
             self._prepare()
             self._anchor()
             stack.callback(self._restore)
+            for drive in self._drives:
+                drive.open(self._buses, self.servos)
+            stack.callback(self._release, None)
             self._opened = stack.pop_all()
         self._is_open, self._is_lost = True, False
         self._had_torque.update(servo.joint for servo in self.servos if servo.had_torque)
@@ -169,8 +181,9 @@ class ServoJoints:
             raise SourceError("the servos are not open; use them in a with statement")
         try:
             return self._read_until(self._clock.now() + timeout_s)
-        except SourceLost:
-            self._is_lost = True
+        except BaseException as error:  # whatever ends the reading, nobody would look after the torque
+            self._is_lost = isinstance(error, SourceLost)
+            self._release(f"the servos cannot be read any more: {error}")
             raise
 
     def temperature_c(self, joint: str) -> float | None:
@@ -258,6 +271,11 @@ class ServoJoints:
                 with suppress(SourceError):
                     restore_torque(self._buses[servo.bus], servo)
 
+    def _release(self, why: str | None) -> None:
+        with ExitStack() as stack:  # each, though one should fail
+            for drive in self._drives:
+                stack.callback(drive.release, why)
+
     # --- reading
 
     def _poll(self) -> JointReading | None:
@@ -265,6 +283,9 @@ class ServoJoints:
         reading = None if samples is None else self._judge(samples)
         if self._clock.now() >= self._next_look:
             self._look_after_one()
+        for why in [drive.step(reading, self.samples) for drive in self._drives]:
+            if why is not None:
+                self._release(why)
         if reading is None:
             self._dropped_one()
         else:
@@ -375,7 +396,8 @@ class ServoJoints:
         layout = servo.model.layout
         has_register = "hardware_error" in layout
         bits = layout.value("hardware_error", status.data, layout.state.address) if has_register else status.error
-        if layout.value("torque", status.data, layout.state.address):
+        has_torque = layout.value("torque", status.data, layout.state.address)
+        if has_torque and not any(servo.joint in drive.holding for drive in self._drives):
             raise SourceLost(f"the torque of joint {servo.joint!r} was switched on by another program", retry_s=0.0)
         self._health.note_alert(servo.joint, bits)
         if self._looked % SUPPLY_EVERY == 0 or not self._health.knows_supply(servo.joint):

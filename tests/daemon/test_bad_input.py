@@ -340,9 +340,14 @@ def test_the_status_of_a_learner_alone_names_the_command_that_starts_a_sampler(l
     assert f"sampler does not answer on {lonely_learner.tables.zenoh.sampler}. Start it with `bodyschema s" in text
 
 
+def test_a_command_of_the_sampler_is_refused_by_the_learner(lonely_learner) -> None:
+    said = refused("command", "zero_force_on", "--to", "learner", cwd=lonely_learner.file.parent)
+    assert "the learner has nothing to do with zero_force_on" in said
+
+
 def test_a_command_that_the_sampler_does_not_know_is_the_learner_s(lonely_learner) -> None:
     said = refused("command", "tool_changed", "--to", "sampler", cwd=lonely_learner.file.parent)
-    assert said == "the sampler knows pause, resume, accept_turns alone; tool_changed is the learner's: drop --to"
+    assert said == "tool_changed is a command of the learner: drop --to"
 
 
 def test_a_target_that_is_no_position_is_refused_in_words(lonely_learner) -> None:

@@ -349,7 +349,7 @@ def test_turns_are_not_accepted_where_nobody_asks_for_them(ended) -> None:
 
 
 def test_a_command_for_the_learner_is_refused_with_its_address(ended) -> None:
-    with pytest.raises(RequestError, match=r"knows pause, resume and accept_turns, not checkpoint.*/command/learner"):
+    with pytest.raises(RequestError, match=r"the sampler has nothing to do with checkpoint.*/command/learner"):
         command(ended, "checkpoint")
 
 

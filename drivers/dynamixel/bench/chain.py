@@ -44,6 +44,9 @@ class Chain(ServoChain[Servo]):
         if not instruction.intact:
             there = [s for s in hearing if s.id == instruction.id]
             return self._together(there, t, _complain, Code.READ)
+        for servo in hearing:
+            if _is_for(instruction, servo.id):
+                servo.hear(t)
         many = (
             {
                 Code.SYNC_READ: self._sync_read,
@@ -154,7 +157,18 @@ class Chain(ServoChain[Servo]):
 
 
 _CODES = frozenset(Code)
+_LISTS = (Code.SYNC_READ, Code.FAST_SYNC_READ, Code.SYNC_WRITE)
 _ONLY2 = (Code.SYNC_READ, Code.FAST_SYNC_READ, Code.BULK_WRITE)
+
+
+def _is_for(instruction: Instruction, id: int) -> bool:
+    """Whether it is for this servo: to its ID, to all, or to a list that it is in."""
+    if instruction.id != BROADCAST or instruction.code not in _LISTS:
+        return instruction.id in (id, BROADCAST)
+    wide, params = instruction.protocol, instruction.params
+    if instruction.code in (Code.SYNC_READ, Code.FAST_SYNC_READ):
+        return id in params[4:]
+    return id in params[2 * wide :: 1 + _number(params[wide : 2 * wide])]
 
 
 def _complain(servo: Servo, t: float) -> tuple[Error, bytes]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 from drivers.dynamixel.models import TICK_S, TICKS, Model, baud_of, baud_value
 
@@ -11,7 +11,12 @@ from .frames import Error
 
 Angle = Callable[[float], float]
 
-POSITION_MODE = 3  # Operating Mode
+CURRENT_MODE, POSITION_MODE = 0, 3  # Operating Mode
+MODES_WITH_CURRENT, MODES_WITHOUT = (0, 1, 3, 4, 5, 16), (1, 3, 4, 16)
+GOALS = ("goal_current", "goal")
+WATCHDOG_UNIT_S = 0.02
+FIRED = -1  # Bus Watchdog
+FACTORY_CURRENT_LIMIT = 1193  # of the X430; the others have others
 REVERSE = 0x01  # Drive Mode
 VELOCITY_STEP_S = 0.01
 TICKS_PER_REPLY_DELAY_US = 2
@@ -27,6 +32,7 @@ FACTORY2 = {
     "status_return": 2,
     "voltage": 120,
     "temperature": 31,
+    "current_limit": FACTORY_CURRENT_LIMIT,
 }
 FACTORY1 = {
     "firmware": 24,
@@ -50,17 +56,20 @@ READ_ONLY = (
     "current",
 )
 LARGEST = {"id": 252, "torque": 1, "status_return": 2, "return_delay": 254}
+JUDGED = (*LARGEST, *GOALS, "operating_mode")
 RAM_OF_FACTORY = ("status_return", "voltage", "temperature")
 
 
 class Servo:
     """A servo on a bench.
 
-    Torque holds nothing here: the shaft is wherever `angle` says.
+    The shaft is wherever `angle` says. What the servo does about it, `motor_current` and `held_at` tell: an `angle`
+    that follows these moves as a real arm would.
 
     Attributes:
         model: what it is.
         glitch_ticks: the encoder is wrong by this.
+        excess_a: it draws so much more than it regulates [A].
         fast: it knows FAST_SYNC_READ.
     """
 
@@ -82,7 +91,7 @@ class Servo:
             booted_s: when it got its power.
         """
         self.model, self.fast = model, fast
-        self.glitch_ticks = 0
+        self.glitch_ticks, self.excess_a = 0, 0.0
         self._angle = angle
         self._memory = bytearray(model.layout.size)
         self._reset_memory()
@@ -91,6 +100,8 @@ class Servo:
         self._registered: tuple[int, bytes] | None = None
         self._booted_s = booted_s
         self._base = 0
+        self._heard_s = booted_s
+        self._held_at: float | None = None
         self._fold(booted_s)
 
     def __getitem__(self, name: str) -> int:
@@ -136,6 +147,42 @@ class Servo:
         """Where its shaft is at `t` [rad]."""
         return self._angle(t)
 
+    def hear(self, t: float) -> None:
+        """An instruction for it was on the wire at `t`."""
+        self._look_at_watchdog(t)
+        self._heard_s = t
+
+    def motor_current(self, t: float) -> float:
+        """The current that it regulates at `t` [A], positive where it turns the shaft forward; 0 in other modes."""
+        self._look_at_watchdog(t)
+        unit = self.model.current_unit
+        if unit is None or not self["torque"] or self["watchdog"] == FIRED:
+            return 0.0
+        if self["operating_mode"] != CURRENT_MODE:
+            return 0.0
+        return (-1 if self._is_reversed else 1) * self["goal_current"] * unit
+
+    def held_at(self, t: float) -> float | None:
+        """The shaft's angle to which it turns and where it stays [rad]; None where it holds nothing."""
+        self._look_at_watchdog(t)
+        if not self["torque"] or not self._is_in_position_mode:
+            return None
+        if self["watchdog"] == FIRED:
+            return self._held_at
+        ticks = self["goal"] + self._base - self["homing_offset"]
+        return ((-ticks if self._is_reversed else ticks) - self.model.zero_ticks) * self.model.rad_per_tick
+
+    def _look_at_watchdog(self, t: float) -> None:
+        """Without an instruction for long enough it stops, and takes no goal any more (e-Manual, Bus Watchdog).
+
+        In current control it is free then, in position control it stays where it is.
+        """
+        if self.model.protocol == 1 or not self["torque"] or self["watchdog"] <= 0:
+            return
+        if t - self._heard_s > self["watchdog"] * WATCHDOG_UNIT_S:
+            self._held_at = self._angle(t)
+            self["watchdog"] = FIRED
+
     def count(self, t: float) -> int:
         """What its encoder counts at `t`, turns included, since ever."""
         model = self.model
@@ -166,8 +213,11 @@ class Servo:
         error = self._refusal(address, data)
         if error is not Error.NONE:
             return error
-        had_torque = self["torque"]
+        had_torque, mode = self["torque"], self._mode
+        self._angle(t)  # up to now the shaft has moved by what was there
         self._memory[address : address + len(data)] = data
+        if self._mode != mode and "current_limit" in self.model.layout:
+            self["goal_current"] = self["current_limit"]  # e-Manual, Operating Mode
         if self["torque"] and not had_torque and self._is_in_position_mode:
             self._fold(t)  # e-Manual, Present Position: within one turn as soon as torque is on
         return Error.NONE
@@ -196,7 +246,9 @@ class Servo:
             if self.model.layout[name].address >= self.model.layout.ram:
                 self[name] = self._factory[name]
         self._registered, self._error1 = None, 0
-        self._booted_s = t
+        self._booted_s = self._heard_s = t
+        if "current_limit" in self.model.layout:
+            self["goal_current"] = self["current_limit"]
         self._fold(t)
 
     def factory_reset(self, option: int, t: float) -> Error:
@@ -227,6 +279,10 @@ class Servo:
         return self.model.protocol == 2 and bool(self["drive_mode"] & REVERSE)
 
     @property
+    def _mode(self) -> int:
+        return self["operating_mode"] if self.model.protocol == 2 else POSITION_MODE
+
+    @property
     def _is_in_position_mode(self) -> bool:
         return self.model.protocol == 2 and self["operating_mode"] == POSITION_MODE
 
@@ -236,6 +292,10 @@ class Servo:
         self["model"] = self.model.number
         for name, value in self._factory.items():
             self[name] = value
+        if self.model.protocol == 2:
+            turn = self.model.ticks_per_turn or 0
+            self["min_position"] = self.model.zero_ticks - turn // 2
+            self["max_position"] = self["min_position"] + turn - 1
 
     def _fold(self, t: float) -> None:
         turn = self.model.ticks_per_turn
@@ -254,8 +314,17 @@ class Servo:
         else:
             self["velocity"] = -velocity if self._is_reversed else velocity
             self["moving"] = int(abs(velocity) > self["moving_threshold"])
+            self["current"] = self._told_current(t)
             self["tick"] = int((t - self._booted_s) / TICK_S) % TICKS
         self["position"] = self.position(t)
+
+    def _told_current(self, t: float) -> int:
+        unit = self.model.current_unit
+        return (
+            0
+            if unit is None
+            else round((-1 if self._is_reversed else 1) * (self.motor_current(t) + self.excess_a) / unit)
+        )
 
     def _refusal(self, address: int, data: bytes) -> Error:
         layout, end = self.model.layout, address + len(data)
@@ -266,10 +335,23 @@ class Servo:
         for name in READ_ONLY:
             if name in layout and layout[name].address < end and layout[name].end > address:
                 return Error.ACCESS
-        for name, largest in LARGEST.items():
-            register = layout[name]
-            if address <= register.address and register.end <= end:
-                value = register.value(data[register.address - address : register.end - address])
-                if value > largest:
-                    return Error.LIMIT
-        return Error.NONE
+        written = {
+            name: layout.value(name, data, address)
+            for name in JUDGED
+            if name in layout and address <= layout[name].address and layout[name].end <= end
+        }
+        if any(written.get(name, 0) > largest for name, largest in LARGEST.items()):
+            return Error.LIMIT
+        return self._refusal2(written) if self.model.protocol == 2 else Error.NONE
+
+    def _refusal2(self, written: Mapping[str, int]) -> Error:
+        """What Protocol 2.0's servos do not take."""
+        if self["watchdog"] == FIRED and any(name in written for name in GOALS):
+            return Error.RANGE
+        modes = MODES_WITHOUT if self.model.current_unit is None else MODES_WITH_CURRENT
+        if written.get("operating_mode", POSITION_MODE) not in modes:
+            return Error.RANGE
+        if abs(written.get("goal_current", 0)) > self["current_limit"]:
+            return Error.LIMIT
+        within = self["min_position"] <= written.get("goal", self["min_position"]) <= self["max_position"]
+        return Error.NONE if within or self._mode != POSITION_MODE else Error.LIMIT

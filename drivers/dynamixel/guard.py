@@ -1,0 +1,229 @@
+"""When torque has to go off, and which currents are never exceeded. Knows no bus: numbers in, numbers or `Drop` out."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from interfaces.records import FloatArray, frozen_array
+
+SHORTEST_BASE_S = 0.02  # over which a speed is taken from positions: one tick is 4°/s at most
+CURRENT_SLACK, CURRENT_SLACK_A = 0.15, 0.05  # what a current may be over its limit: the servo's own regulation
+REFUSALS = 3  # so many goals in a row that a servo did not take
+
+
+class Drop(Exception):
+    """Torque has to go off at once; the text says why and what to do."""
+
+
+@dataclass(frozen=True, slots=True)
+class GuardLimits:
+    """What is allowed.
+
+    Attributes:
+        joints: names, in the order of all arrays (n,).
+        heartbeat_s: longest time between two checks.
+        doubtful_cycles: so many checks in a row without a motion are too many.
+        max_speed: of each joint [rad/s].
+        current_limit: of each joint [A]; infinite where it is not looked at.
+        overcurrent_s: a current over its limit for longer is too long.
+        max_temperature_c: a servo at this or above is too hot.
+    """
+
+    joints: tuple[str, ...]
+    heartbeat_s: float
+    doubtful_cycles: int
+    max_speed: FloatArray
+    current_limit: FloatArray
+    overcurrent_s: float
+    max_temperature_c: float
+
+
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """What one reading says of the joints that have torque, arrays (n,).
+
+    Attributes:
+        t: of the reading [s].
+        q: angles [rad]. velocity: as the servos tell it [rad/s]. current: measured [A], 0 where it is not.
+        alert: whether the servo says that something is wrong with it.
+    """
+
+    t: float
+    q: FloatArray
+    velocity: FloatArray
+    current: FloatArray
+    alert: Sequence[bool]
+
+
+@dataclass(frozen=True, slots=True)
+class ServoState:
+    """What one servo's control table says while it has torque.
+
+    Attributes:
+        has_torque: its torque is on.
+        trouble: what its hardware error says, in words; empty when all is well.
+        watchdog: Bus Watchdog: below 0 it has fired, 0 it is not armed.
+        took_goal: its goal is the one that was sent last.
+    """
+
+    has_torque: bool
+    trouble: str
+    watchdog: int
+    took_goal: bool
+    temperature_c: float
+
+
+class Guard:
+    """Watches joints with torque. Until `begin`, and after anything that must not be, every check raises `Drop`.
+
+    Nothing is forgiven by what comes later: only a new `begin` does that.
+    """
+
+    def __init__(self, limits: GuardLimits) -> None:
+        """Everything is refused as yet."""
+        self._limits = limits
+        self._why: str | None = "it was not begun"
+        self._checked_s = -math.inf
+        self._doubts = 0
+        self._refusals: dict[str, int] = {}
+        self._track: deque[tuple[float, FloatArray]] = deque()
+        self._over_since = [math.inf] * len(limits.joints)
+
+    def begin(self, now: float) -> None:
+        """A person asked for it at `now` [s]."""
+        self.__init__(self._limits)
+        self._why, self._checked_s = None, now
+
+    def check(self, now: float, motion: Motion | None) -> None:
+        """Once a cycle, at `now` [s]; None when the reading was doubtful. Raises Drop."""
+        try:
+            self._check(now, motion)
+        except Drop as drop:
+            self._why = str(drop)
+            raise
+
+    def check_servo(self, joint: str, state: ServoState) -> None:
+        """What a servo says of itself, now and then. Raises Drop."""
+        try:
+            self._check_servo(joint, state)
+        except Drop as drop:
+            self._why = str(drop)
+            raise
+
+    def _check(self, now: float, motion: Motion | None) -> None:
+        if self._why is not None:
+            raise Drop(self._why)
+        late_s, self._checked_s = now - self._checked_s, now
+        if not 0 <= late_s <= self._limits.heartbeat_s:
+            raise Drop(
+                f"this was held up for {1e3 * late_s:.0f} ms (heartbeat {1e3 * self._limits.heartbeat_s:.0f} ms). "
+                "Run less beside it, or give a longer heartbeat_ms"
+            )
+        if motion is None:
+            self._doubts += 1
+            if self._doubts >= self._limits.doubtful_cycles:
+                raise Drop(
+                    f"{self._doubts} readings in a row could not be believed. "
+                    "Look at cable and supply: `bodyschema doctor`"
+                )
+            return
+        self._doubts = 0
+        self._check_motion(motion)
+
+    def _check_motion(self, motion: Motion) -> None:
+        for joint, alert in zip(self._limits.joints, motion.alert, strict=True):
+            if alert:
+                raise Drop(f"the servo of joint {joint!r} reports a fault. `bodyschema doctor` says which")
+        numbers = np.stack([motion.q, motion.velocity, motion.current])
+        if not (np.isfinite(numbers).all() and math.isfinite(motion.t)):
+            raise Drop("a reading is not finite. Report this: it should have been refused before")
+        self._check_speed("by its servo", np.abs(motion.velocity))
+        self._track.append((motion.t, frozen_array(motion.q)))
+        while len(self._track) > 1 and motion.t - self._track[1][0] >= SHORTEST_BASE_S:
+            self._track.popleft()
+        base_s = motion.t - self._track[0][0]
+        if base_s >= SHORTEST_BASE_S:
+            self._check_speed("by its positions", np.abs(motion.q - self._track[0][1]) / base_s)
+        self._check_currents(motion.t, np.abs(motion.current))
+
+    def _check_speed(self, how: str, speed: FloatArray) -> None:
+        worst = int(np.argmax(speed / self._limits.max_speed))
+        if speed[worst] > self._limits.max_speed[worst]:
+            fast, most = math.degrees(speed[worst]), math.degrees(self._limits.max_speed[worst])
+            raise Drop(
+                f"joint {self._limits.joints[worst]!r} turned at {fast:.0f}°/s ({how}; {most:.0f}°/s are allowed). "
+                "If nobody moved it so fast: look at direction, torque_constant and the URDF's masses"
+            )
+
+    def _check_currents(self, t: float, current: FloatArray) -> None:
+        allowed = (1 + CURRENT_SLACK) * self._limits.current_limit + CURRENT_SLACK_A
+        for place, joint in enumerate(self._limits.joints):
+            if current[place] <= allowed[place]:
+                self._over_since[place] = math.inf
+                continue
+            self._over_since[place] = min(self._over_since[place], t)
+            if t - self._over_since[place] >= self._limits.overcurrent_s:
+                raise Drop(
+                    f"joint {joint!r} drew {current[place]:.2f} A for {t - self._over_since[place]:.1f} s "
+                    f"({self._limits.current_limit[place]:.2f} A are allowed). Free the joint"
+                )
+
+    def _check_servo(self, joint: str, state: ServoState) -> None:
+        if self._why is not None:
+            raise Drop(self._why)
+        if state.trouble:
+            raise Drop(f"joint {joint!r}: {state.trouble}")
+        if state.watchdog < 0:
+            raise Drop(f"joint {joint!r}: its servo heard nothing for too long and stopped. Look at the cable")
+        if not state.has_torque or state.watchdog == 0:
+            raise Drop(f"joint {joint!r}: its servo lost torque or its watchdog. Look at supply and cable")
+        # Written so that a temperature that is no number counts as too hot.
+        if not state.temperature_c < self._limits.max_temperature_c:
+            raise Drop(f"joint {joint!r}: its servo is at {state.temperature_c:.0f} °C. Let it cool down")
+        self._refusals[joint] = 0 if state.took_goal else self._refusals.get(joint, 0) + 1
+        if self._refusals[joint] >= REFUSALS:
+            raise Drop(f"joint {joint!r}: its servo does not take its goal. Look at the cable: `bodyschema doctor`")
+
+
+class Currents:
+    """Currents that bear the arm: within their limits, and growing from nothing."""
+
+    def __init__(
+        self, joints: Sequence[str], torque_constant: FloatArray, current_limit: FloatArray, ramp_s: float, share: float
+    ) -> None:
+        """Arrays (n,).
+
+        Args:
+            torque_constant: of each joint [N·m/A].
+            current_limit: of each joint [A].
+            ramp_s: the currents grow for so long.
+            share: of the torque that is given, up to 1.
+        """
+        self._joints = tuple(joints)
+        self._constant, self._limit = torque_constant, current_limit
+        self._ramp_s, self._share = ramp_s, share
+        self._begin_s = math.inf
+        self.saturated: tuple[str, ...] = ()
+
+    def begin(self, now: float) -> None:
+        """They grow from `now` on [s]."""
+        self._begin_s, self.saturated = now, ()
+
+    def share(self, now: float) -> float:
+        """The part of the torque that is given at `now` [s]."""
+        return self._share * min(max((now - self._begin_s) / self._ramp_s, 0.0), 1.0)
+
+    def at(self, now: float, torques: FloatArray) -> FloatArray:
+        """Currents [A] (n,) for the torques that hold the arm [N·m] (n,). Raises Drop when these are no numbers."""
+        if torques.shape != self._limit.shape or not np.isfinite(torques).all():
+            raise Drop("the model gives no torque for where the arm is. Look at the URDF's masses and joint limits")
+        wanted = self.share(now) * torques / self._constant
+        self.saturated = tuple(
+            joint for joint, over in zip(self._joints, np.abs(wanted) > self._limit, strict=True) if over
+        )
+        return np.clip(wanted, -self._limit, self._limit)

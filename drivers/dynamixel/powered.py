@@ -1,0 +1,336 @@
+"""Joints that may have torque while they are read: asked for, watched, and let go of whenever in doubt."""
+
+from __future__ import annotations
+
+import logging
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from concurrent.futures import Future
+from contextlib import suppress
+from queue import Empty, SimpleQueue
+from typing import Literal
+
+import numpy as np
+
+from drivers.servos.bus import Bus as ServoBus
+from drivers.servos.channel import Sample
+from drivers.servos.handshake import FittedServo, switch_torque_off
+from drivers.servos.model import Register
+from interfaces.errors import RequestError
+from interfaces.protocols import Clock
+from interfaces.records import FloatArray, JointReading
+
+from .bus import Bus
+from .guard import Drop, Guard, Motion, ServoState
+from .models import HARDWARE_ERRORS
+from .powered_config import PoweredConfig
+
+log = logging.getLogger(__name__)
+
+LOOK_EVERY_S = 0.05  # at one servo's torque, health, watchdog and goal
+MISSED_LOOKS = 5
+ATTEMPTS = 3
+
+State = Literal["off", "on", "dropped"]
+
+
+class PoweredJoints(ABC):
+    """Some joints of an arm that have torque from when a person asks for it until anything is not as it must be.
+
+    A `Drive`. Nothing but a new request switches torque on again. `ask` may be called from any thread, and so may the
+    properties; the rest belongs to the thread that reads.
+    """
+
+    name: str
+    """What messages call it, and the commands: `<name>_on`, `<name>_off`."""
+    mode: int
+    """Operating Mode that its servos have to be in."""
+    mode_name: str
+    goal: str
+    """The register that it writes."""
+
+    def __init__(self, config: PoweredConfig, joints: Sequence[str], guard: Guard, clock: Clock) -> None:
+        """Torque is off, and nothing was asked for."""
+        self._config, self._guard, self._clock = config, guard, clock
+        self._joints = tuple(joints)
+        self._requests: SimpleQueue[tuple[bool, Future[str]]] = SimpleQueue()
+        self._buses: dict[str, Bus] = {}
+        self._servos: list[FittedServo] = []
+        self._places: list[int] = []
+        self._sent: dict[str, int] = {}
+        self._looked, self._next_look = 0, -math.inf
+        self._missed: dict[str, int] = {}
+        self._unsure: tuple[str, ...] = ()
+        self._why, self._has_just_begun = "", False
+        self.state: State = "off"
+
+    def ask(self, on: bool) -> Future[str]:
+        """Ask for torque, or for its end. The reading thread does it and says what it did, or why not (RequestError).
+
+        Whoever does not wait for the answer any longer has to cancel it, so that nothing begins unexpectedly.
+        """
+        answer: Future[str] = Future()
+        self._requests.put((on, answer))
+        return answer
+
+    @property
+    def holding(self) -> frozenset[str]:
+        """Joints whose torque may be on now."""
+        return frozenset(self._joints) if self.state == "on" else frozenset()
+
+    @property
+    def complaints(self) -> tuple[str, ...]:
+        """What is wrong, and what to do."""
+        said = []
+        if self._unsure:
+            said.append(f"the torque of {', '.join(self._unsure)} could not be verified off: switch the supply off")
+        if self.state == "dropped":
+            said.append(
+                f"{self.name} ended, torque off: {self._why}. Then ask again: `bodyschema command {self.name}_on`"
+            )
+        return tuple(said)
+
+    # --- `Drive`, by the thread that reads
+
+    def open(self, buses: Mapping[str, ServoBus], servos: Sequence[FittedServo]) -> None:
+        """See `Drive.open`."""
+        self._buses = {name: bus for name, bus in buses.items() if isinstance(bus, Bus)}
+        by_joint = {servo.joint: place for place, servo in enumerate(servos)}
+        self._places = [by_joint[joint] for joint in self._joints]
+        self._servos = [servos[place] for place in self._places]
+        self._unsure = ()  # all were verified off
+        for servo in self._servos:
+            if servo.operating_mode != self.mode:
+                log.warning("%s is not possible as yet: %s", self.name, self._wrong_mode(servo, servo.operating_mode))
+
+    def step(self, reading: JointReading | None, samples: Mapping[str, Sample | None]) -> str | None:
+        """See `Drive.step`."""
+        self._has_just_begun = False
+        self._answer_requests()
+        if self.state != "on" or self._has_just_begun:
+            return None  # the samples are older than the torque, with which a position may lose its turns
+        try:
+            now = self._clock.now()
+            motion = self._motion(reading, samples)
+            self._guard.check(now, motion)
+            if motion is not None and reading is not None:
+                self._send(self._goals(now, reading.q, samples))
+            if now >= self._next_look:
+                self._look_at_one(now)
+        except Drop as drop:
+            self._drop(str(drop))
+            return str(drop)
+        except BaseException as error:
+            self._drop(str(error) or type(error).__name__)
+            raise
+        return None
+
+    def release(self, why: str | None) -> None:
+        """See `Drive.release`."""
+        while True:
+            try:
+                _, answer = self._requests.get_nowait()
+            except Empty:
+                break
+            if answer.set_running_or_notify_cancel():
+                answer.set_exception(RequestError(f"{self.name}: {why or 'the servos were closed'}"))
+        if self.state != "on":
+            return
+        if why is not None:
+            self._drop(why)
+        elif self._end():
+            log.error("%s", "; ".join(self.complaints))
+
+    # --- what differs
+
+    @abstractmethod
+    def _prepare(self, servo: FittedServo) -> int:
+        """Verify the servo's own limits; the goal with which its torque is safe to be switched on. RequestError."""
+
+    @abstractmethod
+    def _begin(self, now: float) -> None:
+        """Torque is on since now."""
+
+    @abstractmethod
+    def _goals(self, now: float, q: FloatArray, samples: Mapping[str, Sample | None]) -> list[int]:
+        """The goals' registers, joint by joint; q (d,) are the angles of the whole arm [rad]. Raises Drop."""
+
+    @abstractmethod
+    def _said_on(self) -> str:
+        """For whoever asked for it."""
+
+    # --- torque on
+
+    def _answer_requests(self) -> None:
+        while True:
+            try:
+                on, answer = self._requests.get_nowait()
+            except Empty:
+                return
+            if not answer.set_running_or_notify_cancel():
+                continue
+            try:
+                answer.set_result(self._switch_on() if on else self._switch_off())
+            except RequestError as error:
+                answer.set_exception(error)
+            except BaseException as error:
+                answer.set_exception(error)
+                raise
+
+    def _switch_off(self) -> str:
+        unsure = self._end()
+        if unsure:
+            raise RequestError("; ".join(self.complaints))
+        return f"{self.name} is off, the torque of {', '.join(self._joints)} verified off"
+
+    def _end(self) -> tuple[str, ...]:
+        """Torque off, as it was asked for; whose could not be verified."""
+        unsure = self._let_go()
+        self.state, self._why = "off", ""
+        if not unsure:
+            log.info("%s was ended; torque is verified off", self.name)
+        return unsure
+
+    def _switch_on(self) -> str:
+        if self.state == "on":
+            return f"{self.name} is on already"
+        try:
+            self._sent = {servo.joint: self._prepared(servo) for servo in self._servos}
+            self.state = "on"
+            self._write_all("torque", dict.fromkeys(self._joints, 1))
+            for servo in self._servos:
+                if self._read(servo, "torque") != 1:
+                    raise RequestError(f"joint {servo.joint!r}: its torque does not go on. `bodyschema doctor`")
+        except BaseException:
+            self._let_go()
+            self.state = "off"
+            raise
+        now = self._clock.now()
+        self._guard.begin(now)
+        self._missed, self._next_look, self._why, self._has_just_begun = {}, now, "", True
+        self._begin(now)
+        log.warning("%s is on: %s have torque", self.name, ", ".join(self._joints))
+        return self._said_on()
+
+    def _prepared(self, servo: FittedServo) -> int:
+        """Its torque is off, its mode right, its goal harmless, its watchdog armed; the goal."""
+        if self._read(servo, "torque") != 0:
+            raise RequestError(f"joint {servo.joint!r} has torque already: another program moves it")
+        mode = self._read(servo, "operating_mode")
+        if mode != self.mode:
+            raise RequestError(self._wrong_mode(servo, mode))
+        goal = self._prepare(servo)
+        # After a change of mode the goal current is the largest there is (e-Manual, Operating Mode).
+        for name, value in (("watchdog", 0), (self.goal, goal), ("watchdog", self._config.watchdog)):
+            self._write(servo, name, value)
+        return goal
+
+    def _wrong_mode(self, servo: FittedServo, found: int) -> str:
+        return (
+            f"joint {servo.joint!r} (ID {servo.id}) is in operating mode {found}, not {self.mode_name} ({self.mode}). "
+            f"It is kept in the servo's EEPROM; type: "
+            f"bodyschema servos set operating_mode={self.mode} --joint {servo.joint}"
+        )
+
+    # --- torque off
+
+    def _drop(self, why: str) -> None:
+        self._let_go()
+        self.state, self._why = "dropped", why
+        log.error("%s", "; ".join(self.complaints))
+
+    def _let_go(self) -> tuple[str, ...]:
+        """Torque off: told to all at once, then verified one by one. Whose could not be verified."""
+        # Whatever fails with one servo, the others have to be told all the same.
+        with suppress(Exception):
+            self._write_all("torque", dict.fromkeys(self._joints, 0))
+        unsure = []
+        for servo in self._servos:
+            bus = self._buses[servo.bus]
+            try:
+                switch_torque_off(bus, servo)
+            except Exception as error:
+                log.debug("the torque of %s is not verified: %r", servo.joint, error)
+                unsure.append(servo.joint)
+                continue
+            with suppress(Exception):
+                self._write(servo, "watchdog", 0)
+        self._unsure = tuple(unsure)
+        return self._unsure
+
+    # --- each cycle
+
+    def _motion(self, reading: JointReading | None, samples: Mapping[str, Sample | None]) -> Motion | None:
+        newest = [samples[joint] for joint in self._joints]
+        believed = [sample for sample in newest if sample is not None]
+        if reading is None or len(believed) < len(newest):
+            return None
+        return Motion(
+            reading.t,
+            reading.q[self._places],
+            np.array([sample.velocity for sample in believed]),
+            np.array([sample.current or 0.0 for sample in believed]),
+            [sample.alert for sample in believed],
+        )
+
+    def _send(self, goals: Sequence[int]) -> None:
+        self._sent = dict(zip(self._joints, goals, strict=True))
+        self._write_all(self.goal, self._sent)
+
+    def _look_at_one(self, now: float) -> None:
+        servo = self._servos[self._looked % len(self._servos)]
+        self._looked, self._next_look = self._looked + 1, now + LOOK_EVERY_S
+        layout = servo.model.layout
+        begin = layout["torque"].address
+        span = Register(begin, layout["temperature"].end - begin)
+        bus = self._buses[servo.bus]
+        exchange = bus.ask(bus.read_request(servo.model, servo.id, span))
+        if exchange.trouble is not None:
+            self._missed[servo.joint] = self._missed.get(servo.joint, 0) + 1
+            if self._missed[servo.joint] >= MISSED_LOOKS:
+                raise Drop(f"joint {servo.joint!r}: its servo does not tell its state: {exchange.trouble}")
+            return
+        self._missed[servo.joint] = 0
+        data = exchange.answers[0].status.data
+        told = {name: layout.value(name, data, begin) for name in ("torque", "hardware_error", "watchdog", self.goal)}
+        state = ServoState(
+            has_torque=told["torque"] == 1,
+            trouble="; ".join(text for bit, text in HARDWARE_ERRORS.items() if told["hardware_error"] & bit),
+            watchdog=told["watchdog"],
+            took_goal=told[self.goal] == self._sent[servo.joint],
+            temperature_c=float(layout.value("temperature", data, begin)),
+        )
+        self._guard.check_servo(servo.joint, state)
+
+    # --- registers
+
+    def _write_all(self, name: str, values: Mapping[str, int]) -> None:
+        """By Sync Write: of each bus the servos of one series at the same time."""
+        groups: dict[tuple[str, Register], dict[int, int]] = {}
+        for servo in self._servos:
+            key = (servo.bus, servo.model.layout[name])
+            groups.setdefault(key, {})[servo.id] = values[servo.joint]
+        for (bus, register), by_id in groups.items():
+            self._buses[bus].sync_write(register, by_id)
+
+    def _write(self, servo: FittedServo, name: str, value: int) -> None:
+        """Write a register and read it back; RequestError when it does not have the value then."""
+        register = servo.model.layout[name]
+        found = None
+        for _ in range(ATTEMPTS):
+            self._buses[servo.bus].write(servo.model, servo.id, register, register.bytes(value))
+            found = self._read(servo, name)
+            if found == value:
+                return
+        raise RequestError(f"joint {servo.joint!r} (ID {servo.id}): {name} was set to {value} and is {found}")
+
+    def _read(self, servo: FittedServo, name: str) -> int:
+        """A register's number; RequestError without an answer."""
+        bus, register = self._buses[servo.bus], servo.model.layout[name]
+        exchange = None
+        for _ in range(ATTEMPTS):
+            exchange = bus.ask(bus.read_request(servo.model, servo.id, register))
+            if exchange.trouble is None:
+                return register.value(exchange.answers[0].status.data)
+        raise RequestError(f"joint {servo.joint!r} (ID {servo.id}): {exchange.trouble if exchange else 'no answer'}")

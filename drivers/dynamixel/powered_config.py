@@ -1,0 +1,146 @@
+"""The tables of robot.toml for joints whose torque may be on: zero-force and gaze."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Annotated
+
+import msgspec
+from msgspec import Meta
+
+from drivers.servos.config import Positive, ServoConfig
+from drivers.servos.model import Model
+from interfaces.suggest import did_you_mean
+
+from .torque_constants import torque_constant
+
+WATCHDOG_UNIT_S, LARGEST_WATCHDOG = 0.02, 127  # e-Manual, Bus Watchdog
+Heartbeat = Annotated[float, Meta(ge=20, le=1e3 * WATCHDOG_UNIT_S * LARGEST_WATCHDOG)]
+
+Mistake = tuple[tuple[str, ...], str, str]
+"""Keys below the table, what is wrong, and what to do."""
+
+
+class FloatingJoint(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The table [drivers.dynamixel.zero_force.joints.<joint>]: a joint that bears its part of the arm.
+
+    Attributes:
+        current_limit_a: never more than this [A].
+        torque_constant: torque per current of its servo and what is between it and the joint [N·m/A]; without this
+            key the model's, where the manual's figures are known.
+    """
+
+    current_limit_a: Positive
+    torque_constant: Positive | None = None
+
+
+class PoweredConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """What is common to both.
+
+    Attributes:
+        heartbeat_ms: a loop that comes round later than this drops to torque-off, and a servo that hears nothing
+            for so long stops by itself (Bus Watchdog, steps of 20 ms).
+        max_temperature_c: a hotter servo: torque off.
+        doubtful_cycles: so many readings in a row that cannot be believed: torque off.
+    """
+
+    heartbeat_ms: Heartbeat = 100.0
+    max_temperature_c: Annotated[float, Meta(gt=0, le=80)] = 65.0
+    doubtful_cycles: Annotated[int, Meta(ge=1, le=100)] = 10
+
+    @property
+    def heartbeat_s(self) -> float:
+        """In seconds."""
+        return self.heartbeat_ms * 1e-3
+
+    @property
+    def watchdog(self) -> int:
+        """The register's value."""
+        return math.ceil(self.heartbeat_s / WATCHDOG_UNIT_S - 1e-9)
+
+
+class ZeroForceConfig(PoweredConfig, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The table [drivers.dynamixel.zero_force]: the servos bear the arm, so that a hand guides it without its weight.
+
+    Attributes:
+        joints: those that bear; the torque of the others stays off.
+        max_speed_deg_s: a joint that turns faster: torque off.
+        ramp_s: the currents grow for so long.
+        overcurrent_s: a current that is over the limit for so long: torque off.
+        share: of the arm's weight that is borne.
+    """
+
+    joints: Annotated[dict[str, FloatingJoint], Meta(min_length=1)]
+    max_speed_deg_s: Annotated[float, Meta(gt=0, le=360)] = 90.0
+    ramp_s: Annotated[float, Meta(ge=0.2, le=10)] = 1.0
+    overcurrent_s: Annotated[float, Meta(gt=0, le=5)] = 0.5
+    share: Annotated[float, Meta(gt=0, le=1)] = 1.0
+
+    def torque_constant_of(self, servo: ServoConfig) -> float:
+        """Of a joint's servo [N·m/A]; checked to be known."""
+        given = self.joints[servo.joint].torque_constant
+        return given or torque_constant(servo.model) or math.nan
+
+    def mistakes(self, servos: Sequence[ServoConfig], models: Mapping[str, Model]) -> Iterator[Mistake]:
+        """What is wrong with it for these servos, whose models are known."""
+        by_joint = {servo.joint: servo for servo in servos}
+        for joint, table in self.joints.items():
+            keys = ("joints", joint)
+            if joint not in by_joint:
+                yield keys, f"there is no joint {joint!r} with a servo", did_you_mean(joint, by_joint)
+                continue
+            model = models[by_joint[joint].model]
+            if model.protocol == 1 or model.current_unit is None:
+                yield (
+                    keys,
+                    f"joint {joint!r}: a {model.name} has no current control, so it cannot bear the arm",
+                    "Take the joint out (its torque stays off), or fit a servo with current control (docs/hardware.md)",
+                )
+            elif table.torque_constant is None and torque_constant(model.name) is None:
+                yield (
+                    keys,
+                    f"joint {joint!r}: the torque constant of a {model.name} is not known here",
+                    "Give torque_constant [N·m/A]: stall torque by stall current in its manual",
+                )
+
+
+class GazeConfig(PoweredConfig, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The table [drivers.dynamixel.gaze]: joints that turn the cameras to the hand.
+
+    Attributes:
+        joints: those of the head; each is also one of [robot] joints.
+        limits_deg: by joint, narrower limits than the URDF's [°].
+        max_speed_deg_s: of the head's joints.
+        stale_s: without a newer aim for so long, the head stands still.
+        blocked_s, blocked_deg: a head that is so far from where it should be for so long: torque off.
+    """
+
+    joints: Annotated[tuple[str, ...], Meta(min_length=1)]
+    limits_deg: dict[str, tuple[float, float]] = {}
+    max_speed_deg_s: Annotated[float, Meta(gt=0, le=180)] = 30.0
+    stale_s: Annotated[float, Meta(gt=0, le=5)] = 0.5
+    blocked_s: Positive = 1.0
+    blocked_deg: Positive = 15.0
+
+    def mistakes(self, servos: Sequence[ServoConfig], models: Mapping[str, Model]) -> Iterator[Mistake]:
+        """What is wrong with it for these servos, whose models are known."""
+        by_joint = {servo.joint: servo for servo in servos}
+        for joint in self.joints:
+            if joint not in by_joint:
+                yield ("joints",), f"there is no joint {joint!r} with a servo", did_you_mean(joint, by_joint)
+            elif models[by_joint[joint].model].protocol == 1:
+                yield (
+                    ("joints",),
+                    f"joint {joint!r}: a {by_joint[joint].model} has no watchdog that stops it when this program dies",
+                    "Take a servo of Protocol 2.0 for the head",
+                )
+        for joint, (lower, upper) in self.limits_deg.items():
+            if joint not in self.joints:
+                yield (
+                    ("limits_deg",),
+                    f"{joint!r} is not one of its joints",
+                    did_you_mean(joint, self.joints),
+                )
+            elif lower >= upper:
+                yield ("limits_deg",), f"joint {joint!r}: the lower limit is not below the upper one", "Swap them"

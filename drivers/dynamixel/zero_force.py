@@ -1,0 +1,117 @@
+"""Zero-force: the servos' currents bear the arm, so that a hand guides it without its weight."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+
+from drivers.servos.channel import Sample
+from drivers.servos.handshake import FittedServo
+from interfaces.errors import RequestError
+from interfaces.protocols import Clock
+from interfaces.records import FloatArray, frozen_array
+
+from .config import DynamixelConfig
+from .guard import Currents, Drop, Guard, GuardLimits
+from .powered import PoweredJoints
+from .powered_config import ZeroForceConfig
+
+CURRENT_MODE = 0
+SATURATED_S = 1.0
+
+HoldingTorques = Callable[[FloatArray], FloatArray]
+"""From the angles of all joints [rad] (d,) the torques about them that hold the arm where it is [N·m] (d,)."""
+
+
+class ZeroForce(PoweredJoints):
+    """Bears the arm by current; see `PoweredJoints`. The torque of joints that are not configured stays off."""
+
+    name, goal = "zero_force", "goal_current"
+    mode, mode_name = CURRENT_MODE, "current control"
+
+    def __init__(
+        self,
+        config: DynamixelConfig,
+        zero_force: ZeroForceConfig,
+        joints: Sequence[str],
+        torques: HoldingTorques,
+        clock: Clock,
+    ) -> None:
+        """Torque is off.
+
+        Args:
+            config: the servos; checked.
+            zero_force: its table.
+            joints: all, in the order of q.
+        """
+        floating = [joint for joint in joints if joint in zero_force.joints]
+        servos = {servo.joint: servo for servo in config.servos}
+        limit = frozen_array([zero_force.joints[joint].current_limit_a for joint in floating])
+        limits = GuardLimits(
+            joints=tuple(floating),
+            heartbeat_s=zero_force.heartbeat_s,
+            doubtful_cycles=zero_force.doubtful_cycles,
+            max_speed=np.full(len(floating), math.radians(zero_force.max_speed_deg_s)),
+            current_limit=limit,
+            overcurrent_s=zero_force.overcurrent_s,
+            max_temperature_c=zero_force.max_temperature_c,
+        )
+        super().__init__(zero_force, floating, Guard(limits), clock)
+        constants = frozen_array([zero_force.torque_constant_of(servos[joint]) for joint in floating])
+        self._limit, self._torques = limit, torques
+        self._currents = Currents(floating, constants, limit, zero_force.ramp_s, zero_force.share)
+        self._ramp_s = zero_force.ramp_s
+        self._saturated_s = math.inf
+        self._sinking: tuple[str, ...] = ()
+
+    @property
+    def complaints(self) -> tuple[str, ...]:
+        """What is wrong, and what to do."""
+        said = super().complaints
+        if self.state == "on" and self._sinking:
+            names = ", ".join(self._sinking)
+            said += (f"zero_force: the current limit of {names} does not bear the arm here: it sinks. Hold it",)
+        return said
+
+    def _prepare(self, servo: FittedServo) -> int:
+        wanted = self._ticks(servo, self._limit[self._joints.index(servo.joint)])
+        allowed = self._read(servo, "current_limit")
+        if abs(wanted) > allowed:
+            unit = servo.model.current_unit or math.nan
+            raise RequestError(
+                f"joint {servo.joint!r} (ID {servo.id}): its own Current Limit is {allowed * unit:.2f} A. Give at most "
+                "that as current_limit_a, or type: "
+                f"bodyschema servos set current_limit={abs(wanted)} --joint {servo.joint}"
+            )
+        return 0
+
+    def _begin(self, now: float) -> None:
+        self._currents.begin(now)
+        self._saturated_s, self._sinking = math.inf, ()
+
+    def _goals(self, now: float, q: FloatArray, samples: Mapping[str, Sample | None]) -> list[int]:
+        del samples
+        currents = self._currents.at(now, self._torques_at(q))
+        saturated = self._currents.saturated
+        self._saturated_s = min(self._saturated_s, now) if saturated else math.inf
+        self._sinking = saturated if now - self._saturated_s > SATURATED_S else ()
+        return [self._ticks(servo, current) for servo, current in zip(self._servos, currents, strict=True)]
+
+    def _torques_at(self, q: FloatArray) -> FloatArray:
+        try:
+            return np.asarray(self._torques(q), dtype=np.float64)[self._places]
+        except Exception as error:  # whatever it raises, nobody knows what bears the arm
+            raise Drop(f"the model of the arm's weight failed: {error!r}") from error
+
+    def _said_on(self) -> str:
+        return (
+            f"zero_force is on: within {self._ramp_s:.1f} s {', '.join(self._joints)} bear the arm. Hold it until "
+            "then, and stay ready to hold it: whatever is in doubt switches torque off"
+        )
+
+    @staticmethod
+    def _ticks(servo: FittedServo, current: float) -> int:
+        """The register for a current [A] that turns the joint forward."""
+        return round(servo.direction * current / (servo.model.current_unit or math.nan))

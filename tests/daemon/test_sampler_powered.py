@@ -1,0 +1,138 @@
+"""Zero-force and gaze by command to the sampler, over zenoh."""
+
+from __future__ import annotations
+
+import threading
+import time
+from concurrent.futures import Future
+from queue import Queue
+
+import numpy as np
+import pytest
+from scripted_sources import Scripted
+from small_arm import write_small_arm
+from test_sampler import command, running, status_when
+
+from daemon import powered
+from daemon.config import Config
+from daemon.sources import Sources
+from daemon.wiring import demonstration_model
+from interfaces.clock import SystemClock
+from interfaces.errors import ConfigError, RequestError
+from interfaces.records import frozen_array
+
+LIMIT_S = 30.0
+
+
+class Powered:
+    """Joints that answer as told."""
+
+    name, state = "zero_force", "off"
+
+    def __init__(self, answers=None) -> None:
+        self.asked, self.complaints = [], ()
+        self._answers = answers or {}
+
+    def ask(self, on: bool) -> Future[str]:
+        answer = Future()
+        self.asked.append((on, answer))
+        if on in self._answers:
+            said = self._answers[on]
+            answer.set_running_or_notify_cancel()
+            answer.set_exception(said) if isinstance(said, Exception) else answer.set_result(said)
+        return answer
+
+
+@pytest.fixture
+def config(tmp_path, endpoint: str) -> Config:
+    return Config.load(
+        write_small_arm(tmp_path, f'[zenoh]\nsampler = "{endpoint}"\n[daemon]\nstate_dir = "state"\n'), {}
+    )
+
+
+def sources(config: Config, drive: Powered) -> Sources:
+    held = threading.Event()
+    joints, marker = Scripted([held], config.robot.joints), Scripted([held])
+    return Sources(joints, marker, SystemClock(), powered=(drive,))
+
+
+def test_what_the_arm_says_is_the_answer(config) -> None:
+    drive = Powered({True: "it floats", False: "it is off"})
+    with running(config, sources(config, drive)) as bus:
+        assert command(bus, "zero_force_on") == "it floats"
+        assert command(bus, "zero_force_off") == "it is off"
+    assert [on for on, _ in drive.asked] == [True, False]
+
+
+def test_a_refusal_is_the_answer(config) -> None:
+    drive = Powered({True: RequestError("joint 'elbow' is in operating mode 3")})
+    with running(config, sources(config, drive)) as bus, pytest.raises(RequestError, match="in operating mode 3"):
+        command(bus, "zero_force_on")
+
+
+def test_what_nobody_does_in_time_is_not_done_later(config, monkeypatch) -> None:
+    monkeypatch.setattr(powered, "ANSWER_S", 0.05)
+    drive = Powered()
+    with running(config, sources(config, drive)) as bus, pytest.raises(RequestError, match="not read at present"):
+        command(bus, "zero_force_on")
+    assert drive.asked[0][1].cancelled()
+
+
+def test_what_is_not_configured_is_refused(config) -> None:
+    with (
+        running(config, sources(config, Powered())) as bus,
+        pytest.raises(RequestError, match="gaze is not configured"),
+    ):
+        command(bus, "gaze_on")
+
+
+def test_its_complaints_are_in_the_status(config) -> None:
+    drive = Powered()
+    drive.complaints = ("zero_force ended, torque off: it is too hot",)
+    with running(config, sources(config, drive)) as bus:
+        status = status_when(bus, lambda status: bool(status.health))
+    assert drive.complaints[0] in status.health
+
+
+class Head(Powered):
+    """A head that stands still and keeps what it is told."""
+
+    name, head = "gaze", ("neck_yaw", "neck_pitch")
+    lower, upper = frozen_array([-1.0, -1.0]), frozen_array([1.0, 1.0])
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.told: Queue = Queue()
+
+    @property
+    def pose(self):
+        return time.monotonic(), np.radians([10.0, 20.0, 35.0, 15.0, 0.0, 80.0, 0.0])
+
+    def aim(self, t, angles) -> None:
+        self.told.put((t, angles))
+
+
+def test_the_head_is_told_where_to_look_while_the_sampler_runs(tmp_path, endpoint) -> None:
+    environment = {
+        "BODYSCHEMA_ROBOT_NAME": "arm",
+        "BODYSCHEMA_ZENOH_SAMPLER": endpoint,
+        "BODYSCHEMA_DAEMON_STATE_DIR": str(tmp_path),
+    }
+    config, head, held = Config.load(demonstration_model(), environment), Head(), threading.Event()
+    joints, marker = Scripted([held], config.robot.joints), Scripted([held])
+    with running(config, Sources(joints, marker, SystemClock(), powered=(head,), head=head)):
+        first, _ = head.told.get(timeout=LIMIT_S)
+        second, angles = head.told.get(timeout=LIMIT_S)
+    assert second > first
+    assert angles.shape == (2,)
+    assert np.abs(angles).max() <= 1.0
+
+
+def test_gaze_without_a_stereo_pair_is_refused(config) -> None:
+    head, held = Head(), threading.Event()
+    joints, marker = Scripted([held], config.robot.joints), Scripted([held])
+    with (
+        pytest.raises(ConfigError, match="how the cameras see"),
+        running(config, Sources(joints, marker, SystemClock(), head=head)),
+    ):
+        pass

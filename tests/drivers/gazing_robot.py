@@ -1,0 +1,136 @@
+"""The demonstration's upper body on the bench: its arm moves along a path, its head as its servos turn it."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from bench_arm import HeardPort
+
+from daemon.gaze_loop import GazeLoop, HandModel
+from daemon.wiring import demonstration_model
+from drivers.bench.faults import Planned
+from drivers.bench.virtual_port import VirtualClock
+from drivers.dynamixel.bench.chain import Chain
+from drivers.dynamixel.bench.servo import Servo
+from drivers.dynamixel.config import BusConfig, DynamixelConfig, ServoConfig
+from drivers.dynamixel.gaze import Gaze
+from drivers.dynamixel.joints import DynamixelJoints
+from drivers.dynamixel.models import BY_NAME
+from drivers.dynamixel.powered_config import GazeConfig
+from interfaces.errors import BusError
+from interfaces.pointing import Pointing
+from interfaces.robot import RobotDescription
+from kbmaps import RigidChain
+
+MODEL = "XM430-W350"
+HEAD = ("neck_yaw", "neck_pitch")
+MIDDLE = np.radians([0.0, 20.0, 35.0, -15.0, 0.0, 80.0, 0.0])
+SWING = np.radians([0.0, 0.0, 30.0, 20.0, 30.0, 30.0, 20.0])
+PACE = np.array([0.0, 0.0, 0.5, 0.7, 0.4, 0.6, 0.9])
+HEAD_SPEED = math.radians(80)
+LOOK_S = 0.04
+
+
+def nobody(payload: bytes) -> bytes:
+    """No learner answers."""
+    raise BusError("nobody answers")
+
+
+class HeadShaft:
+    """A joint of the head: its servo turns it where it holds it, else it stays."""
+
+    def __init__(self, q: float) -> None:
+        self.servo: Servo | None = None
+        self.jammed = False
+        self._q, self._t = q, 0.0
+
+    def __call__(self, t: float) -> float:
+        if self.servo is not None and t > self._t:
+            t0, self._t = self._t, t
+            goal = self.servo.held_at(t)
+            if goal is not None and not self.jammed:
+                most = HEAD_SPEED * (t - t0)
+                self._q += min(max(goal - self._q, -most), most)
+        return self._q
+
+
+class GazingRobot:
+    """A driver with gaze over the bench, in virtual time; `truth` is the arm as it really is."""
+
+    def __init__(self, predict=nobody, truth: RigidChain | None = None, **settings) -> None:
+        self.clock = VirtualClock()
+        self.robot = robot = RobotDescription.load(demonstration_model())
+        assert robot.calibration is not None
+        self.truth = robot.chain if truth is None else truth
+        pointing = Pointing(robot.calibration, (0, 1), robot.lower[:2], robot.upper[:2])
+        start = MIDDLE[None].copy()
+        for _ in range(20):
+            start[:, :2] = pointing.clipped(start[:, :2] + pointing.step(start, robot.chain.positions))
+        self.heads = [HeadShaft(float(q)) for q in start[0, :2]]
+        begin = self.clock.now()
+        arm = [
+            lambda t, k=k: float(MIDDLE[k] + SWING[k] * math.sin(PACE[k] * max(t - begin, 0.0))) for k in range(2, 7)
+        ]
+        servos = [
+            Servo(BY_NAME[MODEL], id, shaft, return_delay_s=0.0, booted_s=id * 0.1234)
+            for id, shaft in enumerate([*self.heads, *arm], 1)
+        ]
+        self.faults = Planned()
+        self.chain = Chain(servos, self.faults)
+        for head, servo in zip(self.heads, servos, strict=False):
+            head.servo = servo
+        self.port = HeardPort(self.chain, self.clock)
+        self.table = GazeConfig(joints=HEAD, **{"max_speed_deg_s": 60.0, **settings})
+        entries = tuple(ServoConfig(joint, id, MODEL) for id, joint in enumerate(robot.joints, 1))
+        self.config = DynamixelConfig({"arm": BusConfig("bench")}, entries, gaze=self.table)
+        limits = list(zip(robot.lower.tolist(), robot.upper.tolist(), strict=True))
+        self.gaze = Gaze(self.table, robot.joints, limits, self.clock)
+        self.model = HandModel(robot, predict, self.clock)
+        self.loop = GazeLoop(robot, self.gaze, self.model)
+        self.joints = DynamixelJoints(
+            self.config,
+            robot.joints,
+            self.clock,
+            limits=limits,
+            open_port=lambda *_: (self.port, 0.0),
+            drives=[self.gaze],
+        )
+
+    def switch_on(self) -> str:
+        """Ask for gaze, and read until it answers."""
+        answer = self.gaze.ask(True)
+        while not answer.done():
+            self.joints.read(0.02)
+        return answer.result()
+
+    def run(self, seconds: float, *, looking: bool = True) -> np.ndarray:
+        """Read for so long; where the hand was in the left image at each reading [px] (n, 2)."""
+        end, next_look, seen = self.clock.now() + seconds, 0.0, []
+        while self.clock.now() < end:
+            reading = self.joints.read(0.02)
+            if reading is None:
+                continue
+            seen.append(self.pixel())
+            if looking and self.clock.now() >= next_look:
+                next_look = self.clock.now() + LOOK_S
+                self.loop.look()
+        return np.array(seen)
+
+    def q(self) -> np.ndarray:
+        """Where all joints are [rad] (d,)."""
+        return np.array([servo.angle(self.clock.now()) for servo in self.chain.servos])
+
+    def pixel(self) -> np.ndarray:
+        """Where the hand is in the left image [px] (2,)."""
+        calibration = self.robot.calibration
+        assert calibration is not None
+        x, y, z = self.truth.positions(self.q()[None])[0]
+        return np.array([x, y]) / z * calibration.focal_px + calibration.principal_point_px
+
+    def in_view(self, pixels: np.ndarray) -> np.ndarray:
+        """Which are in the image (n,)."""
+        calibration = self.robot.calibration
+        assert calibration is not None
+        size = np.array(calibration.image_size_px)
+        return ((pixels >= 0) & (pixels < size)).all(axis=1)

@@ -1,0 +1,64 @@
+"""What docs/hardware.md says of zero-force and gaze is true of the code."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from drivers.dynamixel.models import LAYOUT_P, LAYOUT_X
+from drivers.dynamixel.powered_config import GazeConfig, ZeroForceConfig
+
+FILES = ("powered.py", "zero_force.py", "gaze.py", "guard.py")
+ROOT = Path(__file__).parents[2]
+PAGE = (ROOT / "docs" / "hardware.md").read_text()
+CODE = "".join((ROOT / "drivers" / "dynamixel" / name).read_text() for name in FILES)
+TABLES = {"zero_force": ZeroForceConfig, "gaze": GazeConfig}
+
+
+def block(name: str) -> str:
+    found = re.search(rf"```toml\n([^`]*\[drivers\.dynamixel\.{name}\].*?)```", PAGE, re.DOTALL)
+    assert found is not None
+    return found[1]
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_all_keys_that_are_shown_are_known_and_no_key_is_missing(name) -> None:
+    shown = re.sub(r"^# (?=[a-z_]+ =)", "", block(name), flags=re.MULTILINE)
+    table = tomllib.loads(shown)["drivers"]["dynamixel"][name]
+    msgspec.convert(table, TABLES[name])
+    assert set(table) == {field.name for field in msgspec.structs.fields(TABLES[name])}
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_the_defaults_that_are_shown_are_the_defaults(name) -> None:
+    defaults = {field.name: field.default for field in msgspec.structs.fields(TABLES[name])}
+    shown = re.findall(r"^# (\w+) = ([\d.]+)\b", block(name), flags=re.MULTILINE)
+    for key, value in shown:
+        if key in defaults:
+            assert float(value) == defaults[key]
+    assert len(shown) >= 7
+
+
+def test_the_registers_that_are_shown_are_those() -> None:
+    addresses = [
+        ", ".join(str(layout[name].address) for name in ("watchdog", "goal_current")) for layout in (LAYOUT_X, LAYOUT_P)
+    ]
+    assert f"| Bus Watchdog, Goal Current | {addresses[0]} | {addresses[1]} |" in PAGE
+
+
+def test_the_messages_that_are_shown_are_those_of_the_code() -> None:
+    body = PAGE.partition("### Messages of zero-force and gaze")[2].partition("\n## ")[0]
+    shown = [
+        text
+        for row in re.findall(r"^\| (`.*?`(?:, `.*?`)*)", body, re.MULTILINE)
+        for text in re.findall("`(.*?)`", row)
+    ]
+    parts = [part.strip(" °/s") for text in shown for part in re.split(r"\.\.\.|3, not current control \(0\)", text)]
+    said = re.sub(r'"\s*\n\s*f?"', "", CODE)
+    for part in parts:
+        assert part in said, part
+    assert len(shown) >= 10

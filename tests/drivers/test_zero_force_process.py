@@ -1,0 +1,213 @@
+"""Zero-force of a real process, with dynamixel-sdk and a pseudo-terminal, and how it ends."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from daemon.config import Config
+from daemon.wiring import open_joints
+from drivers.dynamixel.bench.dry_run import DryRun
+from drivers.dynamixel.bench.servo import CURRENT_MODE, POSITION_MODE
+from interfaces.clock import SystemClock
+from interfaces.errors import ConfigError
+
+REPOSITORY = Path(__file__).parents[2]
+LIMIT_S = 40.0
+HEARTBEAT_S = 0.5  # generous: bench, driver and test share the machine with others
+ANGLES = {"shoulder": 0.3, "elbow": -0.5}
+LINK = '<link name="{name}">{inertial}</link>'
+INERTIAL = (
+    '<inertial><origin xyz="0.15 0 0"/><mass value="0.5"/>'
+    '<inertia ixx="0.001" ixy="0" ixz="0" iyy="0.001" iyz="0" izz="0.001"/></inertial>'
+)
+JOINT = """<joint name="{name}" type="revolute"><parent link="{parent}"/><child link="{child}"/>
+<origin xyz="{xyz}"/><axis xyz="0 1 0"/><limit lower="-2" upper="2" effort="5" velocity="3"/></joint>"""
+ROBOT = """[robot]
+name = "arm"
+urdf = "arm.urdf"
+joints = ["shoulder", "elbow"]
+marker_link = "forearm"
+hold = "{hold}"
+[camera]
+parent_link = "base"
+[drivers.dynamixel.buses.arm]
+port = "{port}"
+latency_ms = 20
+[[drivers.dynamixel.servos]]
+joint = "shoulder"
+id = 1
+model = "XM430-W350"
+[[drivers.dynamixel.servos]]
+joint = "elbow"
+id = 2
+model = "XM430-W350"
+"""
+ZERO_FORCE = f"""[drivers.dynamixel.zero_force]
+heartbeat_ms = {1e3 * HEARTBEAT_S}
+ramp_s = 0.2
+joints.shoulder = {{ current_limit_a = 2.0 }}
+joints.elbow = {{ current_limit_a = 2.0 }}
+"""
+
+
+def write_robot(folder: Path, *, hold: str = "zero_force", tables: str = ZERO_FORCE, inertial: str = INERTIAL) -> Path:
+    links = "".join(LINK.format(name=name, inertial=inertial) for name in ("base", "arm", "forearm"))
+    joints = JOINT.format(name="shoulder", parent="base", child="arm", xyz="0 0 0.3")
+    joints += JOINT.format(name="elbow", parent="arm", child="forearm", xyz="0.3 0 0")
+    (folder / "arm.urdf").write_text(f'<robot name="arm">{links}{joints}</robot>')
+    file = folder / "robot.toml"
+    file.write_text(ROBOT.format(hold=hold, port=folder / "bus") + tables)
+    return file
+
+
+@contextmanager
+def bench_of(file: Path, mode: int = CURRENT_MODE) -> Iterator[DryRun]:
+    config = Config.load(file).tables.drivers.dynamixel
+    assert config is not None
+    angles = {joint: lambda _, q=q: q for joint, q in ANGLES.items()}
+    with DryRun(config, angles, {"arm": file.parent / "bus"}) as bench:
+        for joint in ANGLES:
+            servo = bench.servo(joint)
+            servo["operating_mode"], servo["goal_current"] = mode, servo["current_limit"]
+        yield bench
+
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Iterator[DryRun]:
+    with bench_of(write_robot(tmp_path)) as bench:
+        yield bench
+
+
+class Floating:
+    """`bodyschema joints --zero-force`, begun."""
+
+    def __init__(self, folder: Path) -> None:
+        command = [sys.executable, "-m", "daemon", "joints", "--json", "--zero-force", "--robot", "robot.toml"]
+        self.process = subprocess.Popen(
+            command,
+            cwd=folder,
+            env={**os.environ, "PYTHONPATH": str(REPOSITORY)},
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+
+    def until(self, true) -> dict:
+        """Read what it says until that is true of it."""
+        assert self.process.stdout is not None
+        end = time.monotonic() + LIMIT_S
+        for line in self.process.stdout:
+            said = json.loads(line)
+            if true(said):
+                return said
+            if time.monotonic() > end:
+                break
+        self.process.kill()
+        raise AssertionError(self.process.communicate()[1])
+
+    def ended(self) -> int:
+        """Its exit code."""
+        self.process.communicate(timeout=LIMIT_S)
+        return self.process.returncode
+
+
+@pytest.fixture
+def floating(bench: DryRun, tmp_path: Path) -> Iterator[Floating]:
+    floating = Floating(tmp_path)
+    try:
+        floating.until(lambda _: min(map(abs, currents(bench, 0.0))) > 0.1)
+        yield floating
+    finally:
+        floating.process.kill()
+        floating.process.communicate(timeout=LIMIT_S)
+
+
+def torque(bench: DryRun) -> list[int]:
+    return [bench.servo(joint)["torque"] for joint in ANGLES]
+
+
+def currents(bench: DryRun, after_s: float) -> list[float]:
+    return [bench.servo(joint).motor_current(time.monotonic() + after_s) for joint in ANGLES]
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_ends_it_with_torque_off(bench, floating, number) -> None:
+    floating.process.send_signal(number)
+    assert floating.ended() == 0
+    assert torque(bench) == [0, 0]
+
+
+def test_a_killed_process_leaves_no_current_after_its_heartbeat(bench, floating) -> None:
+    floating.process.kill()
+    floating.ended()
+    assert not any(currents(bench, HEARTBEAT_S + 0.02))
+    assert [bench.servo(joint)["watchdog"] for joint in ANGLES] == [-1, -1]
+
+
+def test_an_unplugged_bus_leaves_no_current_and_torque_is_off_when_it_is_back(bench, floating) -> None:
+    bench.shells["arm"].unplug()
+    assert not any(currents(bench, HEARTBEAT_S + 0.02))
+    bench.shells["arm"].plug_in()
+    said = floating.until(lambda said: said["trouble"] is None and torque(bench) == [0, 0] and said["health"])
+    assert "zero_force ended, torque off" in said["health"][0]
+    assert "bodyschema command zero_force_on" in said["health"][0]
+
+
+def test_a_fault_of_a_servo_ends_it(bench, floating) -> None:
+    bench.servo("elbow").fail(0x20)
+    said = floating.until(lambda said: any("zero_force ended" in text for text in said["health"]))
+    assert torque(bench) == [0, 0]
+    assert floating.process.poll() is None
+    assert any("'elbow'" in text for text in said["health"])
+
+
+def test_another_mode_is_refused_with_the_command(tmp_path) -> None:
+    with bench_of(write_robot(tmp_path), POSITION_MODE) as bench:
+        process = Floating(tmp_path).process
+        said = process.communicate(timeout=LIMIT_S)[1]
+        assert process.returncode == 1
+        assert "bodyschema servos set operating_mode=0 --joint shoulder" in " ".join(said.split())
+        assert torque(bench) == [0, 0]
+
+
+# --- what robot.toml has to say
+
+
+@pytest.mark.parametrize("hold", ["torque_free", "held"])
+def test_hold_has_to_agree(tmp_path, hold) -> None:
+    config = Config.load(write_robot(tmp_path, hold=hold))
+    with pytest.raises(ConfigError, match=f'hold = "{hold}" in .robot. says otherwise to the diagnosis') as refused:
+        open_joints(config, SystemClock())
+    assert refused.value.line is not None
+
+
+def test_hold_by_nobody_is_refused(tmp_path) -> None:
+    with pytest.raises(ConfigError, match="but nothing bears the arm"):
+        open_joints(Config.load(write_robot(tmp_path, tables="")), SystemClock())
+
+
+def test_a_urdf_without_masses_is_refused(tmp_path) -> None:
+    with pytest.raises(ConfigError, match="states no masses"):
+        open_joints(Config.load(write_robot(tmp_path, inertial="")), SystemClock())
+
+
+def test_the_currents_bear_the_weight_that_the_urdf_states(bench, floating) -> None:
+    floating.until(lambda _: True)
+    g, mass, lever, length = 9.80665, 0.5, 0.15, 0.3
+    q1, q2 = ANGLES.values()
+    elbow = mass * g * lever * math.cos(q1 + q2)
+    shoulder = elbow + mass * g * (lever + length) * math.cos(q1)
+    # A turn about y lowers what lies in front, so the torque that holds it is negative.
+    expected = [-torque / (4.1 / 2.3) for torque in (shoulder, elbow)]
+    assert currents(bench, 0.0) == pytest.approx(expected, abs=0.01)
