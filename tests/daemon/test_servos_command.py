@@ -11,11 +11,11 @@ import dynamixel_sdk as sdk
 import msgspec
 import pytest
 
+from daemon.bench_wiring import Motion, bench_robot_file, open_bench
 from daemon.cli import command_line
 from daemon.config import Config
 from daemon.servo_log import FILE, LoggedWrite, ServoLog
-from daemon.servo_wiring import Motion, bench_robot_file, open_bench
-from drivers.dynamixel.bench.dry_run import DryRun
+from drivers.bench.dry_run import DryRun
 from interfaces.errors import BodyschemaError, ConfigError, SourceError
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "desk_arm" / "servos.toml"
@@ -40,7 +40,7 @@ class Bench:
 
     def elbow(self, name: str) -> int:
         """What stands in a register of the elbow's servo."""
-        return self.dry_run.servo("elbow_pitch")[name]
+        return self.dry_run.arm.servo("elbow_pitch")[name]
 
     @property
     def log(self) -> list[LoggedWrite]:
@@ -92,7 +92,7 @@ def test_undo_takes_back_one_command_after_the_other(bench) -> None:
 
 def test_undo_leaves_alone_what_somebody_else_changed(bench, capsys) -> None:
     bench("set", "return_delay=0", *ELBOW, "--yes")
-    bench.dry_run.servo("elbow_pitch")["return_delay"] = 7
+    bench.dry_run.arm.servo("elbow_pitch")["return_delay"] = 7
     assert bench("undo", "--yes") == 0
     assert bench.elbow("return_delay") == 7
     assert "left alone: elbow_pitch (ID 3): return_delay is 7" in capsys.readouterr().out
@@ -100,10 +100,10 @@ def test_undo_leaves_alone_what_somebody_else_changed(bench, capsys) -> None:
 
 def test_a_rate_is_changed_and_taken_back(bench) -> None:
     assert bench("set", "baud=57600", "--joint", "base_yaw", "--yes") == 0
-    assert bench.dry_run.servo("base_yaw").baud == 57_600
+    assert bench.dry_run.arm.servo("base_yaw").baud == 57_600
     assert bench("show", "--port", str(bench.robot.with_name("bus")), "--id", "1", "--baud", "57600") == 0
     assert bench("undo", "--yes") == 0
-    assert bench.dry_run.servo("base_yaw").baud == 1_000_000
+    assert bench.dry_run.arm.servo("base_yaw").baud == 1_000_000
 
 
 def test_zero_tells_the_ticks_of_here_and_writes_nothing(bench, capsys) -> None:
@@ -115,7 +115,7 @@ def test_zero_tells_the_ticks_of_here_and_writes_nothing(bench, capsys) -> None:
 
 def test_zero_in_the_servo_makes_here_the_zero(bench) -> None:
     assert bench("zero", "--in-servo", *ELBOW, "--yes") == 0
-    assert bench.dry_run.servo("elbow_pitch").position(0.0) == 2048
+    assert bench.dry_run.arm.servo("elbow_pitch").position(0.0) == 2048
 
 
 @pytest.mark.parametrize(
@@ -141,7 +141,7 @@ def test_what_cannot_be_is_refused_and_nothing_is_written(bench, words, said) ->
 
 
 def test_a_servo_that_does_not_answer_is_named(bench) -> None:
-    bench.dry_run.chains["arm"].servos.pop(2)
+    bench.dry_run.arm.chains["arm"].servos.pop(2)
     with pytest.raises(SourceError, match=r"'elbow_pitch' \(ID 3, XM430-W350\).*no answer"):
         bench("set", "return_delay=0", *ELBOW, "--yes")
 

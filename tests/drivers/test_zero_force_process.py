@@ -17,7 +17,8 @@ import pytest
 
 from daemon.config import Config
 from daemon.wiring import open_joints
-from drivers.dynamixel.bench.dry_run import DryRun
+from drivers.bench.dry_run import DryRun
+from drivers.dynamixel.bench.arm import DynamixelArm
 from drivers.dynamixel.bench.servo import CURRENT_MODE, POSITION_MODE
 from interfaces.clock import SystemClock
 from interfaces.errors import ConfigError
@@ -76,9 +77,9 @@ def bench_of(file: Path, mode: int = CURRENT_MODE) -> Iterator[DryRun]:
     config = Config.load(file).tables.drivers.dynamixel
     assert config is not None
     angles = {joint: lambda _, q=q: q for joint, q in ANGLES.items()}
-    with DryRun(config, angles, {"arm": file.parent / "bus"}) as bench:
+    with DryRun(DynamixelArm(config, angles), {"arm": file.parent / "bus"}) as bench:
         for joint in ANGLES:
-            servo = bench.servo(joint)
+            servo = bench.arm.servo(joint)
             servo["operating_mode"], servo["goal_current"] = mode, servo["current_limit"]
         yield bench
 
@@ -134,11 +135,11 @@ def floating(bench: DryRun, tmp_path: Path) -> Iterator[Floating]:
 
 
 def torque(bench: DryRun) -> list[int]:
-    return [bench.servo(joint)["torque"] for joint in ANGLES]
+    return [bench.arm.servo(joint)["torque"] for joint in ANGLES]
 
 
 def currents(bench: DryRun, after_s: float) -> list[float]:
-    return [bench.servo(joint).motor_current(time.monotonic() + after_s) for joint in ANGLES]
+    return [bench.arm.servo(joint).motor_current(time.monotonic() + after_s) for joint in ANGLES]
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
@@ -152,7 +153,7 @@ def test_a_killed_process_leaves_no_current_after_its_heartbeat(bench, floating)
     floating.process.kill()
     floating.ended()
     assert not any(currents(bench, HEARTBEAT_S + 0.02))
-    assert [bench.servo(joint)["watchdog"] for joint in ANGLES] == [-1, -1]
+    assert [bench.arm.servo(joint)["watchdog"] for joint in ANGLES] == [-1, -1]
 
 
 def test_an_unplugged_bus_leaves_no_current_and_torque_is_off_when_it_is_back(bench, floating) -> None:
@@ -165,7 +166,7 @@ def test_an_unplugged_bus_leaves_no_current_and_torque_is_off_when_it_is_back(be
 
 
 def test_a_fault_of_a_servo_ends_it(bench, floating) -> None:
-    bench.servo("elbow").fail(0x20)
+    bench.arm.servo("elbow").fail(0x20)
     said = floating.until(lambda said: any("zero_force ended" in text for text in said["health"]))
     assert torque(bench) == [0, 0]
     assert floating.process.poll() is None
