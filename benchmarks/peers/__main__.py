@@ -24,6 +24,7 @@ from benchmarks.peers.recordings import recorded_tasks
 from benchmarks.peers.registry import BY_KEY, COMPETITORS
 from benchmarks.peers.results import Outcome, Results, machine
 from benchmarks.peers.runner import Job, Plan, run
+from benchmarks.peers.summary import summary
 from benchmarks.peers.tasks import simulated_tasks
 
 DATA_VARIABLE = "BODYSCHEMA_DATA"
@@ -76,6 +77,8 @@ def main() -> None:
     )
     results.save(arguments.json)
     write_page(arguments.out, results, tasks, COMPETITORS)
+    if arguments.markdown is not None:
+        arguments.markdown.write_text(summary(results, tasks, plan.competitors))
     print(f"{'all done' if done else 'the time was up, run again to go on'}: {arguments.out}, {arguments.json}")
 
 
@@ -93,6 +96,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--growth", action=argparse.BooleanOptionalAction, default=True, help="time against size")
     parser.add_argument("--data", type=Path, help=f"folder with recordings; else {DATA_VARIABLE}")
     parser.add_argument("--out", type=Path, default=Path("peers.html"))
+    parser.add_argument("--markdown", type=Path, help="write the means of the --models as tables, too")
     parser.add_argument("--json", type=Path, default=Path("peers.json"))
     return parser
 

@@ -15,6 +15,7 @@ from benchmarks.peers.problem import Competitor, Fitted, Problem, drawn
 from benchmarks.peers.registry import BY_KEY, COMPETITORS
 from benchmarks.peers.results import Growth, Outcome, Results, cell, machine
 from benchmarks.peers.runner import Plan, run
+from benchmarks.peers.summary import summary
 from benchmarks.peers.tasks import Setting, Task, simulated_tasks
 
 TASK = Task("tiny", "A tiny task", Setting(joints=4), counts=(30,))
@@ -153,3 +154,15 @@ def test_names_at_lines_ends_are_kept_apart_within_the_chart():
     placed = apart([10.0, 11.0, 279.0, 280.0, 280.0])
     assert min(np.diff(placed)) >= 14.0
     assert max(placed) <= 280.0
+
+
+def test_the_tables_say_each_task_s_means_with_the_best_in_bold():
+    drawing, psom = BY_KEY["drawing"], BY_KEY["psom"]
+    results = Results()
+    for key, error_m in (("drawing", 4e-3), ("psom", 0.12)):
+        for seed in range(2):
+            outcome = Outcome("tiny", key, 30, seed, "ok", {"drawn alike": error_m})
+            results.outcomes[outcome.key] = outcome
+    said = summary(results, [TASK], [drawing, psom])
+    assert "## 30 pairs, 2 seeds" in said
+    assert "| A tiny task |  | **4.0** | 120 |" in said
