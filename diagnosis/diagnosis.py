@@ -16,7 +16,7 @@ from interfaces.records import FloatArray
 from .alignment import aligned
 from .alike import Alike, alike
 from .contact import before_contact
-from .explanation import explain, without_one
+from .explanation import changed_by_the_way, explain, without_one
 from .fit import Fit, fitted
 from .held_out import Added, Blocks, added, gain_percent, held_out_errors, is_marker
 from .hypotheses import Hypotheses
@@ -35,9 +35,8 @@ _FEWEST_OUTLIERS = 3
 _OUTLIERS_NAMED = 15.0
 # Where they are off so often where the arm is faster, motion has to do with it.
 _MOSTLY = 0.8
-# What depends on the way to a reading, not only on the reading; and how far off, in units of its size, is farther than
-# the way between two readings can explain.
-_BY_THE_WAY, _BY_SO_MUCH = ("backlash", "settling", "camera_latency"), 4.0
+# How far off, in units of what depends on the way between two readings, is farther than that way can explain.
+_BY_SO_MUCH = 4.0
 # Where more rows than this are doubtful, leaving them out costs more than they do harm.
 _MOST_DOUBTFUL = 0.25
 # Beside what has no name a cause stays named only if it is more probable than not.
@@ -122,12 +121,9 @@ class Diagnosis:
         That is the way between two readings, which nobody has seen, and what has no name.
         """
         fit = self.extended
-        moving = [cause for cause in fit.causes if cause.name in _BY_THE_WAY]
-        changes = [fit.run.columns(cause)[:, :, cause.amounts] @ cause.values[cause.amounts] for cause in moving]
+        changes = [changed_by_the_way(fit)]
         if self.left.model is not None:
             changes.append(self.left.model.explained)
-        if not changes:
-            return False
         squares = np.square(fit.observations.whitened(np.stack(changes, axis=2))).sum(axis=1).mean(axis=0)
         off = np.square(fit.residuals[self._off]).sum(axis=1)
         return bool(np.median(off) < _BY_SO_MUCH**2 * squares.sum())

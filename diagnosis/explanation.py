@@ -19,8 +19,10 @@ _MARGIN = 8.0
 _MOST_UNKNOWNS = 3
 # What a number of a named cause costs when sets of causes are compared [nats].
 _NUMBER = 3.0
-# What is left of large causes because their form is not quite theirs is nothing without a name.
-_OF_THE_CAUSES = 0.05
+# What is left of large causes because their form is not quite theirs is nothing without a name: a share of them all,
+# and a larger one of those that depend on the way between two readings, which nobody has seen.
+_OF_THE_CAUSES, _OF_THE_WAY = 0.05, 0.12
+_BY_THE_WAY = ("backlash", "settling", "camera_latency")
 # Less than this share of all is a rest.
 _REST = 0.25
 # Of the fits on the way to all causes, these are asked whether they are better beside what has no name.
@@ -68,7 +70,8 @@ def explain(
     path = list(tried)
     whole = _length(found, found.run.measured - path[0].run.measured)
     best = _with_unknown(found, unknowns, search)
-    if best.apart is not None and (best.size < _OF_THE_CAUSES * whole or not unknowns.predicts(best.apart, found)):
+    inexact = max(_OF_THE_CAUSES * whole, _OF_THE_WAY * _length(found, changed_by_the_way(found)))
+    if best.apart is not None and (best.size < inexact or not unknowns.predicts(best.apart, found)):
         best = Explanation(found, None, best.worth)
     # Where the causes explain by far the most, they are not given up for what explains the rest.
     is_rest = best.size < _REST * whole
@@ -88,6 +91,15 @@ def explain(
         if not (is_rest and best.fit is found):
             best = _pruned(best, unknowns, search)
     return best
+
+
+def changed_by_the_way(fit: Fit) -> FloatArray:
+    """What causes that depend on the way between two readings change (n, 3) [m]."""
+    change = np.zeros_like(fit.residuals)
+    for cause in fit.causes:
+        if cause.name in _BY_THE_WAY:
+            change += fit.run.columns(cause)[:, :, cause.amounts] @ cause.values[cause.amounts]
+    return change
 
 
 def _length(fit: Fit, change: FloatArray) -> float:
