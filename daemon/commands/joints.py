@@ -41,7 +41,7 @@ def joints(
 
     from daemon.config import Config
     from daemon.joints_view import as_json, screen
-    from daemon.joints_watch import JointsWatch
+    from daemon.joints_watch import JointsWatch, ServoJoints
     from daemon.powered import find_powered
     from daemon.signals import on_termination
     from daemon.wiring import open_encoders
@@ -52,7 +52,8 @@ def joints(
     console = Console(highlight=False)
     ending = _Ending()
     source = open_encoders(config, clock)
-    force = find_powered(getattr(source, "drives", ()), "zero_force", config.file) if zero_force else None
+    drives = source.drives if isinstance(source, ServoJoints) else ()
+    force = find_powered(drives, "zero_force", config.file) if zero_force else None
     with on_termination(ending.end), JointsWatch(config, source, clock) as watch:
         seen = _first(watch)
         if force is not None:
