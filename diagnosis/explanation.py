@@ -25,6 +25,8 @@ _OF_THE_CAUSES, _OF_THE_WAY = 0.05, 0.12
 _BY_THE_WAY = ("backlash", "settling", "camera_latency")
 # Less than this share of all is a rest.
 _REST = 0.25
+# Causes that the same ways without a name can be, as probably to within this, are no causes [nats].
+_AS_GOOD = 8.0
 # Of the fits on the way to all causes, these are asked whether they are better beside what has no name.
 _FIRST, _LAST = 3, 2
 # What is worth more than this no rounding of readings that stand still brings about [nats].
@@ -83,14 +85,19 @@ def explain(
             continue
         keys.add(causes)
         other = _with_unknown(fit, unknowns, search)
-        better = other.worth > best.worth + (margin if best.fit is found else 0.0)
+        better = other.worth > best.worth + (margin if best.fit is found else 0.0) or _is_as_good(other, best)
         if other.apart is not None and better and unknowns.predicts(other.apart, found):
             best = other
     if best.unknown:
         tell("something that none of the effects explains")
-        if not (is_rest and best.fit is found):
-            best = _pruned(best, unknowns, search)
+        best = _pruned(best, unknowns, search, rest=is_rest and best.fit is found)
     return best
+
+
+def _is_as_good(fewer: Explanation, explanation: Explanation) -> bool:
+    """Whether fewer causes do as well beside ways without a name that are no others."""
+    ways, needed = ({way.family.what for way in one.unknown} for one in (explanation, fewer))
+    return bool(needed) and needed <= ways and fewer.worth > explanation.worth - _AS_GOOD
 
 
 def changed_by_the_way(fit: Fit) -> FloatArray:
@@ -124,12 +131,13 @@ def _with_unknown(fit: Fit, unknowns: Unknowns, search: Search) -> Explanation:
     return Explanation(fit, apart, worth, _length(fit, apart.predicted - fit.run.measured))
 
 
-def _pruned(explanation: Explanation, unknowns: Unknowns, search: Search) -> Explanation:
-    """Without causes that are not worth it beside what has no name."""
+def _pruned(explanation: Explanation, unknowns: Unknowns, search: Search, *, rest: bool) -> Explanation:
+    """Without causes that are not worth it beside what has no name; with a rest, without those that it can be."""
     for cause in explanation.fit.causes:
         fewer = without_one(explanation, cause, unknowns, search)
-        if fewer.unknown and fewer.worth > explanation.worth - NAMED:
-            return _pruned(fewer, unknowns, search)
+        redundant = _is_as_good(fewer, explanation) if rest else fewer.worth > explanation.worth - NAMED
+        if fewer.unknown and redundant:
+            return _pruned(fewer, unknowns, search, rest=rest)
     return explanation
 
 
