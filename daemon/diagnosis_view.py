@@ -33,7 +33,7 @@ _ERRORS = (
     ("nominal", "simulation as it is"),
     ("aligned", "placed as well as it can be"),
     ("geometry", "best geometry"),
-    ("extended", "with the causes"),
+    ("extended", "with what was found"),
     ("noise_floor", "noise alone"),
 )
 # What says nothing new where it is the same as another.

@@ -16,7 +16,7 @@ _ERRORS = (
     ("nominal", "The simulation as it is"),
     ("aligned", "Placed as well as it can be"),
     ("geometry", "The best geometry"),
-    ("extended", "With the causes"),
+    ("extended", "With what was found"),
     ("noise_floor", "Noise alone"),
 )
 
