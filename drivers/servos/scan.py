@@ -100,7 +100,7 @@ class PingScanner:
     def _ids(self, port: ScannedPort, clock: Clock, latency_s: float) -> list[int]:
         """Who answers when each is asked. An ID whose answers are not understood counts when it is asked again."""
         port.flush()
-        spacing = max(sum(self._ping_sizes) * BITS_PER_BYTE / port.baud + SLOWEST_DELAY_S, APART_S)
+        spacing = self._spacing_s(port.baud)
         received = b""
         for id in IDS:
             begin = clock.now()
@@ -110,6 +110,10 @@ class PingScanner:
         statuses, is_clean = self._statuses(received)
         ids = {status.id for status in statuses}
         return sorted(ids if is_clean else ids | self._unclear(port, clock, latency_s, ids))
+
+    def _spacing_s(self, baud: int) -> float:
+        """Time between two questions, so that the answer to the first is over."""
+        return max(sum(self._ping_sizes) * BITS_PER_BYTE / baud + SLOWEST_DELAY_S, APART_S)
 
     def _unclear(self, port: ScannedPort, clock: Clock, latency_s: float, known: set[int]) -> set[int]:
         """Who answers something, asked one after the other."""
