@@ -21,6 +21,7 @@ from .servo_wiring import (
     Check,
     configured_ports,
     encoder_checks,
+    joint_state_checks,
     other_holders,
     port_checks,
     ports_are_there,
@@ -51,6 +52,8 @@ def steps(config: Config) -> Iterator[Step]:
         yield "servos", lambda: _on_the_ports(config, servo_checks)
     elif configured_ports(config):
         yield "encoders", lambda: _on_the_ports(config, encoder_checks)
+    if config.tables.drivers.ros2 is not None:
+        yield "router", lambda: joint_state_checks(config)
     yield "disk", lambda: disk_checks(config.state_dir)
     yield "clock", clock_checks
     yield "zenoh", lambda: _zenoh(config)

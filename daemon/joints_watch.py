@@ -51,7 +51,7 @@ class Fitted(Protocol):
 
 
 class EncoderJoints(JointSource, Protocol):
-    """Encoders that know how they are; see `drivers.serial_lines.joints.SerialLineJoints`."""
+    """A real arm's joints, which know how they are; see `drivers.serial_lines.joints.SerialLineJoints`."""
 
     @property
     def health(self) -> tuple[str, ...]: ...
