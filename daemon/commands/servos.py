@@ -10,7 +10,7 @@ import cyclopts
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
-from daemon.commands.options import HERE, RobotFile, flag
+from daemon.commands.options import HERE, RobotFile, flag, several
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -34,7 +34,7 @@ servos = cyclopts.App(
     """,
 )
 
-Joints = Annotated[tuple[str, ...], Parameter(help="The servo of this joint; more than once for several.")]
+Joints = Annotated[tuple[str, ...], several("The servo of this joint")]
 OneBus = Annotated[str | None, Parameter(help="All servos of this bus of robot.toml.", show_default=False)]
 Port = Annotated[str | None, Parameter(help="With --id: a servo that robot.toml does not know.", show_default=False)]
 Id = Annotated[
