@@ -8,6 +8,7 @@ import re
 import shutil
 import socket
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import msgspec
@@ -177,13 +178,18 @@ def _is_listening(endpoint: str) -> bool:
         return False
 
 
+def _named(check: Check, file: Path) -> Check:
+    """With the description's own name in what there is to type."""
+    return replace(check, mend=check.mend.replace("robot.toml", str(file)))
+
+
 def run(config: Config, tell: Callable[[str], None]) -> list[Check]:
     """All checks; what fails on the way is one, too."""
     checks: list[Check] = []
     for name, look in steps(config):
         tell(name)
         try:
-            checks += look()
+            checks += [_named(check, config.file) for check in look()]
         except BodyschemaError as error:
             checks.append(Check(name, "wrong", str(error)))
     return checks

@@ -154,6 +154,10 @@ class JointsWatch:
         has_all = self._servos is not None or self._speeds.are_known
         return self._seen(self._q) if self._q is not None and has_all else None
 
+    def look_all_over(self) -> Seen | None:
+        """As `look`, so often that each servo was asked how it is."""
+        return [self.look() for _ in self._robot.joints][-1]
+
     def know_temperatures(self) -> None:
         """Ask all for their temperatures."""
         if self._servos is not None:

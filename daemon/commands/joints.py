@@ -93,7 +93,7 @@ def _first(watch: JointsWatch) -> Seen:
     while time.monotonic() < end:
         if watch.look() is not None:
             watch.know_temperatures()
-            seen = watch.look()
+            seen = watch.look_all_over()
             if seen is not None:
                 return seen
     raise SourceError("the joints cannot be read. `bodyschema doctor` tells why")

@@ -45,7 +45,8 @@ class Inspection:
         if exchange.trouble is not None:
             return
         self._looked += 1
-        self._next_s = self._clock.now() + EVERY_S
+        if self._looked >= len(self._servos):  # the first round is made at once
+            self._next_s = self._clock.now() + EVERY_S
         self._judge(servo, exchange)
         if self._looked % SUPPLY_EVERY == 0 or not self._health.knows_supply(servo.joint):
             self._ask_supply(servo)

@@ -86,6 +86,14 @@ def test_a_sensor_without_a_value_is_wrong(tmp_path, capsys) -> None:
 
 
 @pytest.mark.usefixtures("state")
+def test_the_command_to_type_names_the_description_that_was_given(tmp_path, capsys) -> None:
+    with BenchRun(Config.load(EXAMPLE), tmp_path / "bus", faults=["baud@elbow_pitch"]) as run:
+        called("doctor", "--robot", run.robot_file, "--json")
+    wrong = [check for check in json.loads(capsys.readouterr().out)["checks"] if check["state"] == "wrong"]
+    assert [check["mend"].partition("    #")[0] for check in wrong] == [f"bodyschema scan --robot {run.robot_file}"]
+
+
+@pytest.mark.usefixtures("state")
 def test_a_port_that_is_not_there_is_told_once(capsys) -> None:
     assert called("doctor", "--robot", EXAMPLE, "--json") == 1
     checks = json.loads(capsys.readouterr().out)["checks"]
