@@ -109,7 +109,9 @@ def set_(
     if not wishes:
         raise ConfigError("nothing to set", remedy="Write NAME=VALUE; `bodyschema servos show` lists the names")
     if not (joint or bus or port):
-        raise ConfigError("which servos?", remedy="Name them with --joint, --bus, or --port and --id")
+        raise ConfigError(
+            "it is not said which servos are meant", remedy="Name them with --joint, --bus, or --port and --id"
+        )
     wanted = _wanted(robot, joint, bus, port, id, baud)
     with _workbench(wanted) as workbench:
         _carry_out(workbench, plan(workbench, wanted, wishes), _log(robot, port), dry_run=dry_run, yes=yes)
