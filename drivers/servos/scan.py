@@ -94,7 +94,10 @@ class PingScanner:
 
     def scan(self, name: str, port: ScannedPort, clock: Clock, latency_s: float) -> Iterator[FoundServo]:
         """The servos on the port; see `Scanner.scan`."""
-        for id in self._ids(port, clock, latency_s):
+        ids = set(self._ids(port, clock, latency_s))
+        if ids:  # where there is one there may be others, and an answer may be lost
+            ids.update(self._ids(port, clock, latency_s))
+        for id in sorted(ids):
             yield self._found(name, port, clock, latency_s, id)
 
     def _ids(self, port: ScannedPort, clock: Clock, latency_s: float) -> list[int]:
