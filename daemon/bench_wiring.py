@@ -162,9 +162,12 @@ def _counted(count: int, what: str) -> str:
 
 
 def _require_free(link: Path) -> None:
-    """ConfigError when something is there that no earlier bench left."""
-    left_behind = link.is_symlink() and os.readlink(link).startswith(PSEUDO_TERMINALS)
-    if not left_behind and os.path.lexists(link):
+    """ConfigError when something is there that no earlier bench left, or the terminal it leads to is still open."""
+    is_of_a_bench = link.is_symlink() and os.readlink(link).startswith(PSEUDO_TERMINALS)
+    if is_of_a_bench and link.exists():
+        remedy = f"Give another --port, or end that bench. If none runs: rm {link}"
+        raise ConfigError("another bench has this port", file=link, remedy=remedy)
+    if not is_of_a_bench and os.path.lexists(link):
         raise ConfigError("is there already", file=link, remedy="Give another --port, a name that is not taken")
     if not link.parent.is_dir():
         raise ConfigError("there is no such folder", file=link.parent, remedy="Give another --port")

@@ -8,6 +8,7 @@ import re
 import shutil
 import socket
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import msgspec
@@ -21,6 +22,7 @@ from .servo_wiring import (
     Check,
     configured_ports,
     encoder_checks,
+    joint_state_checks,
     other_holders,
     port_checks,
     ports_are_there,
@@ -51,6 +53,8 @@ def steps(config: Config) -> Iterator[Step]:
         yield "servos", lambda: _on_the_ports(config, servo_checks)
     elif configured_ports(config):
         yield "encoders", lambda: _on_the_ports(config, encoder_checks)
+    if config.tables.drivers.ros2 is not None:
+        yield "router", lambda: joint_state_checks(config)
     yield "disk", lambda: disk_checks(config.state_dir)
     yield "clock", clock_checks
     yield "zenoh", lambda: _zenoh(config)
@@ -174,13 +178,18 @@ def _is_listening(endpoint: str) -> bool:
         return False
 
 
+def _named(check: Check, file: Path) -> Check:
+    """With the description's own name in what there is to type."""
+    return replace(check, mend=check.mend.replace("robot.toml", str(file)))
+
+
 def run(config: Config, tell: Callable[[str], None]) -> list[Check]:
     """All checks; what fails on the way is one, too."""
     checks: list[Check] = []
     for name, look in steps(config):
         tell(name)
         try:
-            checks += look()
+            checks += [_named(check, config.file) for check in look()]
         except BodyschemaError as error:
             checks.append(Check(name, "wrong", str(error)))
     return checks

@@ -51,7 +51,7 @@ class Fitted(Protocol):
 
 
 class EncoderJoints(JointSource, Protocol):
-    """Encoders that know how they are; see `drivers.serial_lines.joints.SerialLineJoints`."""
+    """A real arm's joints, which know how they are; see `drivers.serial_lines.joints.SerialLineJoints`."""
 
     @property
     def health(self) -> tuple[str, ...]: ...
@@ -153,6 +153,10 @@ class JointsWatch:
             self._feel_one()
         has_all = self._servos is not None or self._speeds.are_known
         return self._seen(self._q) if self._q is not None and has_all else None
+
+    def look_all_over(self) -> Seen | None:
+        """As `look`, so often that each servo was asked how it is."""
+        return [self.look() for _ in self._robot.joints][-1]
 
     def know_temperatures(self) -> None:
         """Ask all for their temperatures."""

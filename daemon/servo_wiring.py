@@ -146,3 +146,13 @@ def encoder_checks(config: Config) -> Iterator[Check]:
     board = config.tables.drivers.serial_lines
     if board is not None:
         yield from checks_of_encoders(board, config.robot.joints, SystemClock())
+
+
+def joint_state_checks(config: Config) -> Iterator[Check]:
+    """Of the ROS 2 robot of robot.toml, if it has one. Only listens."""
+    robot = config.tables.drivers.ros2
+    if robot is not None:
+        from drivers.ros2.checks import joint_state_checks as checks_of_joint_states
+
+        prismatic = config.robot.chain.prismatic.tolist()
+        yield from checks_of_joint_states(robot, config.robot.joints, SystemClock(), prismatic=prismatic)

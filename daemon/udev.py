@@ -1,4 +1,4 @@
-"""The udev rules for serial adapters of servos."""
+"""The udev rules for the serial ports of servos and encoders."""
 
 from __future__ import annotations
 
@@ -13,13 +13,17 @@ from interfaces.errors import ConfigError
 
 FILE = Path("etc/udev/rules.d/60-bodyschema.rules")
 ROOT = Path("/")
-# Vendor and product of USB adapters that servos come with.
+# Vendor and product of USB adapters that servos come with, and of boards that read encoders.
 ADAPTERS = (
     ("0403", "6014", "FTDI FT232H: U2D2"),
     ("0403", "6001", "FTDI FT232R: USB2Dynamixel and many others"),
     ("1a86", "7523", "WCH CH340: Feetech's and Waveshare's adapters"),
     ("1a86", "55d3", "WCH CH343: Waveshare's bus servo adapter"),
     ("2f5d", "2202", "OpenCM and OpenRB of ROBOTIS"),
+    ("10c4", "ea60", "Silicon Labs CP210x: many ESP32 boards"),
+    ("1a86", "55d4", "WCH CH9102: many ESP32 boards"),
+    ("303a", "1001", "ESP32 with USB of its own"),
+    ("2341", "0043", "Arduino Uno"),
 )
 _LATENCY = """\
 # Adapters of FTDI keep bytes back for 16 ms, unless they are told otherwise.

@@ -13,7 +13,6 @@ from drivers.feetech.config import FeetechConfig
 from drivers.ros2.config import Ros2Config
 from drivers.serial_lines.config import SerialLinesConfig
 from drivers.serial_lines.joints import SerialLineJoints
-from drivers.servos.joints import ServoJoints as ServoArm
 from interfaces.clock import SystemClock
 from interfaces.errors import ConfigError
 from interfaces.protocols import Clock, JointSource
@@ -56,7 +55,7 @@ def check_sources(config: Config, *, sim: bool) -> None:
         require_simulation()
 
 
-def open_joints(config: Config, clock: Clock) -> JointSource:
+def open_joints(config: Config, clock: Clock) -> EncoderJoints:
     """The encoders alone of the arm that robot.toml describes, not opened yet.
 
     Raises:
@@ -74,7 +73,7 @@ def open_joints(config: Config, clock: Clock) -> JointSource:
     return driver_of(hardware, config, clock, last_pose=_last_pose(config))
 
 
-def driver_of(hardware: Hardware, config: Config, clock: Clock, *, last_pose: list[float] | None) -> JointSource:
+def driver_of(hardware: Hardware, config: Config, clock: Clock, *, last_pose: list[float] | None) -> EncoderJoints:
     """The driver of the joints of robot.toml on `hardware`, not opened yet.
 
     Args:
@@ -96,19 +95,6 @@ def driver_of(hardware: Hardware, config: Config, clock: Clock, *, last_pose: li
             return SerialLineJoints(hardware, joints, clock, limits=limits, last_pose=last_pose)
         case Ros2Config():
             return _ros2_joints(config, hardware, clock)
-
-
-def open_encoders(config: Config, clock: Clock) -> EncoderJoints:
-    """As `open_joints`, of an arm whose servos or encoders are on a serial port.
-
-    Raises:
-        ConfigError: they are not.
-    """
-    match open_joints(config, clock):
-        case ServoArm() | SerialLineJoints() as joints:
-            return joints
-    remedy = "This is for [drivers.dynamixel], [drivers.feetech] and [drivers.serial_lines]"
-    raise ConfigError("the joints are neither servos nor encoders on a port", file=config.file, remedy=remedy)
 
 
 def _ros2_joints(config: Config, robot: Ros2Config, clock: Clock) -> Ros2Joints:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
-from daemon.commands.options import HERE, RobotFile, flag
+from daemon.commands.options import HERE, RobotFile, flag, several
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -26,7 +26,7 @@ def bench(
     robot: RobotFile = HERE,
     fault: Annotated[
         tuple[str, ...],
-        Parameter(help="KIND[@JOINT][=SHARE], as in late=0.05 or overload@elbow; more than once for several."),
+        several("KIND[@JOINT][=SHARE], as in late=0.05 or overload@elbow"),
     ] = (),
     list_faults: Annotated[bool, flag("Show the kinds of faults and end.", name="--list-faults")] = False,
     return_delay_us: Annotated[

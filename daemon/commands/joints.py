@@ -32,7 +32,7 @@ def joints(
     marker went by the joint that you moved last: if it went the other way, the sign is wrong. Angles beyond the URDF's
     limits are told, too.
 
-    Needs: robot.toml with servos (`bodyschema robot new`) or encoders, and no sampler that runs.
+    Needs: robot.toml with servos (`bodyschema robot new`), encoders or a ROS 2 robot, and no sampler that runs.
 
     Next: mend direction and zero_ticks in robot.toml; then `bodyschema run`.
     """
@@ -44,14 +44,14 @@ def joints(
     from daemon.joints_watch import JointsWatch, ServoJoints
     from daemon.powered import find_powered
     from daemon.signals import on_termination
-    from daemon.wiring import open_encoders
+    from daemon.wiring import open_joints
     from interfaces.clock import SystemClock
 
     clock = SystemClock()
     config = Config.load(robot)
     console = Console(highlight=False)
     ending = _Ending()
-    source = open_encoders(config, clock)
+    source = open_joints(config, clock)
     drives = source.drives if isinstance(source, ServoJoints) else ()
     force = find_powered(drives, "zero_force", config.file) if zero_force else None
     with on_termination(ending.end), JointsWatch(config, source, clock) as watch:
@@ -94,7 +94,7 @@ def _first(watch: JointsWatch) -> Seen:
     while time.monotonic() < end:
         if watch.look() is not None:
             watch.know_temperatures()
-            seen = watch.look()
+            seen = watch.look_all_over()
             if seen is not None:
                 return seen
     raise SourceError("the joints cannot be read. `bodyschema doctor` tells why")

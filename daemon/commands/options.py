@@ -23,6 +23,11 @@ def flag(text: str, *, name: str | None = None) -> Parameter:
     return Parameter(name=name, help=text, negative="", show_default=False)
 
 
+def several(text: str) -> Parameter:
+    """An option that may be given more than once; without it there is none."""
+    return Parameter(help=f"{text}; more than once for several.", negative="", show_default=False)
+
+
 def robot_file(given: Path | None, source: Path | None) -> Path:
     """The robot.toml that was given; else the one beside `source`, else what the environment or the folder has."""
     if given is not None:

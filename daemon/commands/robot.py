@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import cyclopts
 from cyclopts import Parameter
 
-from daemon.commands.options import HERE, flag
+from daemon.commands.options import HERE, flag, several
 
 if TYPE_CHECKING:
     from daemon.servo_fitting import Candidate, Fitting
@@ -34,8 +34,8 @@ def new(
     source: Annotated[
         str, Parameter(name="--from", help="`scan` to look who is there, or a file that `scan --json` wrote.")
     ] = SCAN,
-    port: Annotated[tuple[str, ...], Parameter(help="Scan only this port; more than once for several.")] = (),
-    baud: Annotated[tuple[int, ...], Parameter(help="Scan only at this rate; more than once for several.")] = (),
+    port: Annotated[tuple[str, ...], several("Scan only this port")] = (),
+    baud: Annotated[tuple[int, ...], several("Scan only at this rate")] = (),
     out: Annotated[Path, Parameter(name="--robot", help="The file to write.")] = HERE,
     yes: Annotated[bool, flag("Do not ask: the joints of the URDF get the servos in the order of their IDs.")] = False,
 ) -> None:

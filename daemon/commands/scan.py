@@ -8,13 +8,13 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from daemon.commands.options import flag
+from daemon.commands.options import flag, several
 
 
 def scan(
     *,
-    port: Annotated[tuple[str, ...], Parameter(help="Only this port; more than once for several.")] = (),
-    baud: Annotated[tuple[int, ...], Parameter(help="Only at this rate; more than once for several.")] = (),
+    port: Annotated[tuple[str, ...], several("Only this port")] = (),
+    baud: Annotated[tuple[int, ...], several("Only at this rate")] = (),
     robot: Annotated[
         Path | None, Parameter(help="Hold what is found against this robot.toml.", show_default=False)
     ] = None,

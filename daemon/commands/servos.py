@@ -10,7 +10,7 @@ import cyclopts
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
-from daemon.commands.options import HERE, RobotFile, flag
+from daemon.commands.options import HERE, RobotFile, flag, several
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -34,7 +34,7 @@ servos = cyclopts.App(
     """,
 )
 
-Joints = Annotated[tuple[str, ...], Parameter(help="The servo of this joint; more than once for several.")]
+Joints = Annotated[tuple[str, ...], several("The servo of this joint")]
 OneBus = Annotated[str | None, Parameter(help="All servos of this bus of robot.toml.", show_default=False)]
 Port = Annotated[str | None, Parameter(help="With --id: a servo that robot.toml does not know.", show_default=False)]
 Id = Annotated[
@@ -109,7 +109,9 @@ def set_(
     if not wishes:
         raise ConfigError("nothing to set", remedy="Write NAME=VALUE; `bodyschema servos show` lists the names")
     if not (joint or bus or port):
-        raise ConfigError("which servos?", remedy="Name them with --joint, --bus, or --port and --id")
+        raise ConfigError(
+            "it is not said which servos are meant", remedy="Name them with --joint, --bus, or --port and --id"
+        )
     wanted = _wanted(robot, joint, bus, port, id, baud)
     with _workbench(wanted) as workbench:
         _carry_out(workbench, plan(workbench, wanted, wishes), _log(robot, port), dry_run=dry_run, yes=yes)

@@ -34,12 +34,17 @@ PROTOCOL1, PROTOCOL2 = _kind(1), _kind(2)
 
 
 class Protocol2Scanner(PingScanner):
-    """One question asks for all; when something comes that cannot be understood, each ID is asked by itself."""
+    """At slow rates one question asks for all; when something comes that is not understood, each ID is asked by itself.
+
+    Where a packet takes less time than a servo's turn to answer that question, each ID is asked at once.
+    """
 
     def __init__(self) -> None:
         super().__init__(PROTOCOL2, question=PING2)
 
     def _ids(self, port: ScannedPort, clock: Clock, latency_s: float) -> list[int]:
+        if self._spacing_s(port.baud) < SLOT_S:
+            return super()._ids(port, clock, latency_s)
         port.flush()
         port.write(PACKETS2.ping(BROADCAST))
         wire_s = sum(self._ping_sizes) * BITS_PER_BYTE / port.baud

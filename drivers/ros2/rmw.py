@@ -5,6 +5,7 @@ After docs/design.md of ros2/rmw_zenoh.
 
 from __future__ import annotations
 
+import re
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -15,6 +16,7 @@ ANY = "*"
 GRAPH = "@ros2_lv"
 PUBLISHER = "MP"
 GID_BYTES = 16
+DOMAIN = re.compile(r"[0-9]{1,3}")  # 0 … 232
 # Reliable, volatile, keep the last 10. A field is empty where it is rmw_zenoh's default, whose depth is 42.
 QOS = "::,10:,:,:,,"
 # Sizes of what goes with a message: since rmw_zenoh 0.2.4, and before, with the fields' names.
@@ -69,5 +71,5 @@ def topics_in(tokens: list[str]) -> Iterator[Topic]:
     """The topics of publishers' tokens; whatever is none is passed over."""
     for token in tokens:
         parts = token.split("/")
-        if len(parts) >= 13 and parts[0] == GRAPH and parts[5] == PUBLISHER and parts[1].isdecimal():
+        if len(parts) >= 13 and parts[0] == GRAPH and parts[5] == PUBLISHER and DOMAIN.fullmatch(parts[1]):
             yield Topic(int(parts[1]), parts[9].replace("%", "/"), parts[10])

@@ -16,12 +16,13 @@ from interfaces.errors import SourceError, SourceLost
 from interfaces.protocols import Clock
 from interfaces.records import JointReading, frozen_array
 
-from .bus import Bus, Counts, Exchange, Request
+from .bus import Bus, Counts, Request
 from .channel import Channel, Punctuality, Sample, middle
 from .config import ServoConfig, ServosConfig
 from .drive import Drive
 from .handshake import RETRY_S, Finding, FittedServo, identify, require_all, restore_torque, switch_torque_off
-from .health import BusHealth, Health, ServoHealth, supply_of
+from .health import BusHealth, Health, ServoHealth
+from .inspection import Inspection
 from .make import Make
 from .port import Port
 
@@ -30,8 +31,6 @@ log = logging.getLogger(__name__)
 LOST_AFTER_S = 0.25  # without a reading; within this no joint turns by half a turn unseen
 FEW_POLLS = 3  # so many have to fail besides: the program itself may have been held up
 DOUBTS = 5  # so many answers in a row that cannot be: the servo was restarted
-LOOK_AFTER_S = 0.1  # one servo's torque and health in turn
-SUPPLY_EVERY = 11  # so many looks: voltage and temperature of that one too
 ANCHOR_POLLS = 50
 SLACK_TICKS = 3
 GOLDEN = 0.618034  # multiples of it, modulo 1, are spread most evenly
@@ -232,8 +231,8 @@ class ServoJoints:
         self._gate = SpeedGate([speed / s.model.rad_per_tick for s in self.servos], [SLACK_TICKS] * len(self.servos))
         self._punctuality = Punctuality()
         now = self._clock.now()
-        self._believed_s, self._failures, self._next_poll, self._next_look = now, 0, now, now
-        self._looked = self._polls = 0
+        self._believed_s, self._failures, self._next_poll, self._polls = now, 0, now, 0
+        self._inspection = Inspection(self._buses, self.servos, self._health, self._drives, self._clock)
         self._why = "no answer"
 
     def _anchor(self) -> None:
@@ -281,8 +280,7 @@ class ServoJoints:
     def _poll(self) -> JointReading | None:
         samples = self._ask_all()
         reading = None if samples is None else self._judge(samples)
-        if self._clock.now() >= self._next_look:
-            self._look_after_one()
+        self._inspection.go_on()
         for why in [drive.step(reading, self.samples) for drive in self._drives]:
             if why is not None:
                 self._release(why)
@@ -361,16 +359,7 @@ class ServoJoints:
         self.dropped += 1
         self._failures += 1
         if self._failures >= FEW_POLLS and self._clock.now() - self._believed_s > LOST_AFTER_S:
-            raise SourceLost(self._blame(), retry_s=RETRY_S)
-
-    def _blame(self) -> str:
-        """Who does not answer when asked alone, else what went wrong last."""
-        for servo in self.servos:
-            trouble = self._ask_state(servo).trouble
-            if trouble is not None:
-                self._health.note_silent(servo.joint, trouble)
-                return f"joint {servo.joint!r} (ID {servo.id}): {trouble}"
-        return self._why
+            raise SourceLost(self._inspection.first_silent() or self._why, retry_s=RETRY_S)
 
     def _refuse_restarted(self, channel: Channel) -> None:
         if channel.doubts >= DOUBTS:
@@ -383,35 +372,6 @@ class ServoJoints:
             return True
         bus, *_ = self._buses.values()
         return bus.listen(t)
-
-    def _look_after_one(self) -> None:
-        """Verify one servo's torque and health; SourceLost when its torque is on."""
-        servo = self.servos[self._looked % len(self.servos)]
-        exchange = self._ask_state(servo)
-        if exchange.trouble is not None:
-            return
-        self._looked += 1
-        self._next_look = self._clock.now() + LOOK_AFTER_S
-        status = exchange.answers[0].status
-        layout = servo.model.layout
-        has_register = "hardware_error" in layout
-        bits = layout.value("hardware_error", status.data, layout.state.address) if has_register else status.error
-        has_torque = layout.value("torque", status.data, layout.state.address)
-        if has_torque and not any(servo.joint in drive.holding for drive in self._drives):
-            raise SourceLost(f"the torque of joint {servo.joint!r} was switched on by another program", retry_s=0.0)
-        self._health.note_alert(servo.joint, bits)
-        if self._looked % SUPPLY_EVERY == 0 or not self._health.knows_supply(servo.joint):
-            self._ask_supply(servo)
-
-    def _ask_supply(self, servo: FittedServo) -> None:
-        bus = self._buses[servo.bus]
-        exchange = bus.ask(bus.read_request(servo.model, servo.id, supply_of(servo.model)))
-        if exchange.trouble is None:
-            self._health.note_supply(servo.joint, servo.model, exchange.answers[0].status.data)
-
-    def _ask_state(self, servo: FittedServo) -> Exchange:
-        bus = self._buses[servo.bus]
-        return bus.ask(bus.read_request(servo.model, servo.id, servo.model.layout.state))
 
 
 def _close(port: Port) -> None:

@@ -94,13 +94,16 @@ class PingScanner:
 
     def scan(self, name: str, port: ScannedPort, clock: Clock, latency_s: float) -> Iterator[FoundServo]:
         """The servos on the port; see `Scanner.scan`."""
-        for id in self._ids(port, clock, latency_s):
+        ids = set(self._ids(port, clock, latency_s))
+        if ids:  # where there is one there may be others, and an answer may be lost
+            ids.update(self._ids(port, clock, latency_s))
+        for id in sorted(ids):
             yield self._found(name, port, clock, latency_s, id)
 
     def _ids(self, port: ScannedPort, clock: Clock, latency_s: float) -> list[int]:
         """Who answers when each is asked. An ID whose answers are not understood counts when it is asked again."""
         port.flush()
-        spacing = max(sum(self._ping_sizes) * BITS_PER_BYTE / port.baud + SLOWEST_DELAY_S, APART_S)
+        spacing = self._spacing_s(port.baud)
         received = b""
         for id in IDS:
             begin = clock.now()
@@ -110,6 +113,10 @@ class PingScanner:
         statuses, is_clean = self._statuses(received)
         ids = {status.id for status in statuses}
         return sorted(ids if is_clean else ids | self._unclear(port, clock, latency_s, ids))
+
+    def _spacing_s(self, baud: int) -> float:
+        """Time between two questions, so that the answer to the first is over."""
+        return max(sum(self._ping_sizes) * BITS_PER_BYTE / baud + SLOWEST_DELAY_S, APART_S)
 
     def _unclear(self, port: ScannedPort, clock: Clock, latency_s: float, known: set[int]) -> set[int]:
         """Who answers something, asked one after the other."""

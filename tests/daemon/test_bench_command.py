@@ -95,6 +95,20 @@ def test_a_file_in_the_place_of_the_port_is_kept(config, folder) -> None:
     assert (folder / "bus").read_text() == "precious"
 
 
+def test_a_bench_that_runs_keeps_its_port(config, folder) -> None:
+    with BenchRun(config, folder / "bus"):
+        terminal = (folder / "bus").readlink()
+        with pytest.raises(ConfigError, match="another bench has this port"):
+            BenchRun(config, folder / "bus")
+        assert (folder / "bus").readlink() == terminal
+
+
+def test_the_port_of_a_bench_that_was_killed_is_taken_over(config, folder) -> None:
+    (folder / "bus").symlink_to("/dev/pts/99999")
+    with BenchRun(config, folder / "bus"):
+        assert (folder / "bus").exists()
+
+
 def test_a_robot_toml_in_the_place_of_its_own_is_kept(config, folder) -> None:
     (folder / "bus.toml").write_text("precious")
     with pytest.raises(ConfigError, match="no bench wrote it"), BenchRun(config, folder / "bus"):

@@ -86,6 +86,26 @@ def test_a_sensor_without_a_value_is_wrong(tmp_path, capsys) -> None:
 
 
 @pytest.mark.usefixtures("state")
+def test_the_command_to_type_names_the_description_that_was_given(tmp_path, capsys) -> None:
+    with BenchRun(Config.load(EXAMPLE), tmp_path / "bus", faults=["baud@elbow_pitch"]) as run:
+        called("doctor", "--robot", run.robot_file, "--json")
+    wrong = [check for check in json.loads(capsys.readouterr().out)["checks"] if check["state"] == "wrong"]
+    assert [check["mend"].partition("    #")[0] for check in wrong] == [f"bodyschema scan --robot {run.robot_file}"]
+
+
+@pytest.mark.usefixtures("state")
+def test_a_ros_2_robot_whose_router_is_not_there_is_wrong(tmp_path, free_endpoint, capsys) -> None:
+    text = EXAMPLE.with_name("robot.toml").read_text()
+    text = text.replace('"desk_arm.urdf"', f'"{EXAMPLE.with_name("desk_arm.urdf")}"')
+    (tmp_path / "robot.toml").write_text(f'{text}\n[drivers.ros2]\nrouter = "{free_endpoint()}"\n')
+    assert called("doctor", "--robot", tmp_path / "robot.toml", "--json") == 1
+    wrong = [check for check in json.loads(capsys.readouterr().out)["checks"] if check["state"] == "wrong"]
+    assert [(check["subject"], check["mend"]) for check in wrong] == [
+        ("router", "Start it on the robot: ros2 run rmw_zenoh_cpp rmw_zenohd")
+    ]
+
+
+@pytest.mark.usefixtures("state")
 def test_a_port_that_is_not_there_is_told_once(capsys) -> None:
     assert called("doctor", "--robot", EXAMPLE, "--json") == 1
     checks = json.loads(capsys.readouterr().out)["checks"]

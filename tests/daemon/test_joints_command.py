@@ -170,3 +170,10 @@ def test_what_is_not_measured_is_a_dash() -> None:
 
 def test_an_angle_beyond_the_limits_is_told() -> None:
     assert "elbow was from +0° to +80°, its limits are -57° to +57°" in shown(high=1.4, within_limits=False)
+
+
+def test_one_table_tells_what_is_wrong_with_any_servo(tmp_path, capsys) -> None:
+    with BenchRun(Config.load(EXAMPLE), tmp_path / "bus", faults=["overload@wrist_roll"]) as run:
+        app(["joints", "--robot", str(run.robot_file), "--once", "--json"], result_action="return_value")
+    (complaint,) = json.loads(capsys.readouterr().out)["health"]
+    assert complaint.startswith("joint 'wrist_roll': it is overloaded")

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from random import Random
 from typing import Literal
 
-from bench_arm import Path, swing
+from servo_arm import Path, ServoArm
 
-from drivers.bench.faults import Planned
-from drivers.bench.virtual_port import VirtualClock, VirtualPort, at_once
+from drivers.bench.virtual_port import VirtualPort
 from drivers.feetech.bench.chain import Chain
 from drivers.feetech.bench.frames import Code, Instruction, instructions_in
 from drivers.feetech.bench.servo import Servo
@@ -35,8 +33,8 @@ class HeardPort(VirtualPort):
         return [(i.params[0], i.params[1:]) for i in told]
 
 
-class FeetechArm:
-    """A driver with a bench behind it."""
+class FeetechArm(ServoArm):
+    """A driver of Feetech servos with a bench behind it."""
 
     def __init__(
         self,
@@ -52,32 +50,9 @@ class FeetechArm:
         multi_turn: bool = False,
         **settings,
     ) -> None:
-        self.clock, rng = VirtualClock(), Random(seed)
-        self.paths = [swing(k) for k in range(len(models))] if paths is None else list(paths)
-        self.names = tuple(f"joint{k}" for k in range(1, len(models) + 1))
-        self.faults = Planned(rng)
-        servos = [
-            Servo(BY_NAME[model], k, self.paths[k - 1], return_delay_s=delay_s, multi_turn=multi_turn)
-            for k, model in enumerate(models, 1)
-        ]
-        self.chain = Chain(servos, self.faults)
-        jitter = (lambda: rng.uniform(0, latency_s)) if latency_s else at_once
-        self.port = HeardPort(self.chain, self.clock, outwards=at_once, inwards=jitter)
-        fitted = zip(self.names, models, strict=True)
-        entries = tuple(ServoConfig(name, k, model) for k, (name, model) in enumerate(fitted, 1))
-        self.joints = FeetechJoints(
-            FeetechConfig({"arm": BusConfig("bench", sync_read=sync)}, entries, **settings),
-            self.names,
-            self.clock,
-            limits=limits,
-            last_pose=last_pose,
-            open_port=lambda *_: (self.port, latency_s / 2),
-        )
+        def servo(model: str, id: int, path: Path) -> Servo:
+            return Servo(BY_NAME[model], id, path, return_delay_s=delay_s, multi_turn=multi_turn)
 
-    def error(self, reading) -> float:
-        """Largest error of the reading's angles against the truth at its time [rad]."""
-        return max(abs(q - path(reading.t)) for q, path in zip(reading.q, self.paths, strict=True))
-
-    def sampled(self) -> float:
-        """The middle of the times at which the positions were really taken [s]."""
-        return sum(sampling.t for sampling in self.chain.samplings.values()) / len(self.chain.samplings)
+        super().__init__(models, paths, servo=servo, chain=Chain, port=HeardPort, latency_s=latency_s, seed=seed)
+        config = FeetechConfig({"arm": BusConfig("bench", sync_read=sync)}, self.entries(ServoConfig), **settings)
+        self.driven(FeetechJoints, config, limits=limits, last_pose=last_pose)

@@ -9,7 +9,8 @@ from random import Random
 
 import numpy as np
 import pytest
-from bench_arm import TICK, Arm, swing
+from bench_arm import Arm
+from servo_arm import TICK, swing
 
 from drivers.bench.faults import corrupt, garbage, half, late, mute, wrong_checksum
 from drivers.bench.virtual_port import VirtualClock, VirtualPort

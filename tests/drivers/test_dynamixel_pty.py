@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bench_arm import swing
+from servo_arm import swing
 
 from drivers.bench.pty_shell import PtyShell
 from drivers.dynamixel.bench.chain import Chain

@@ -9,10 +9,10 @@ from random import Random
 
 import numpy as np
 import pytest
-from bench_arm import TICK, swing
 from feetech_arm import FeetechArm
 from hypothesis import given
 from hypothesis import strategies as st
+from servo_arm import TICK, swing
 
 from drivers.bench.faults import corrupt, garbage, half, late, mute, wrong_checksum
 from drivers.feetech.bench.faults import storm, swapped

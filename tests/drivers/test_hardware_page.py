@@ -95,7 +95,7 @@ def type_of_table():
 
 def test_the_bench_starts_as_shown(tmp_path, monkeypatch, capsys) -> None:
     monkeypatch.chdir(tmp_path)
-    exec(block("python"), {})
+    exec(block("python", "speak to"), {})
     assert capsys.readouterr().out == "speak to bus\n"
 
 

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
+from itertools import count
 from pathlib import Path
 
 import pytest
 
-from drivers.bench.device import OnlyAnswers, Reply
+from drivers.bench.device import Faults, OnlyAnswers, Reply, no_faults
 from drivers.bench.pty_shell import PtyShell
 from drivers.bench.virtual_port import VirtualClock, VirtualPort
 from drivers.dynamixel.bench.chain import Chain
@@ -36,9 +38,9 @@ def feetech(model: str, id: int, baud: int = 1_000_000, rad: float = 0.1) -> Fee
 class Cable(OnlyAnswers):
     """Servos of both makes on one wire."""
 
-    def __init__(self, servos: Sequence[Servo | FeetechServo]) -> None:
+    def __init__(self, servos: Sequence[Servo | FeetechServo], faults: Faults) -> None:
         self._chains = (
-            Chain(servo for servo in servos if isinstance(servo, Servo)),
+            Chain((servo for servo in servos if isinstance(servo, Servo)), faults),
             FeetechChain(servo for servo in servos if isinstance(servo, FeetechServo)),
         )
 
@@ -49,8 +51,8 @@ class Cable(OnlyAnswers):
 class Bench:
     """Servos in virtual time."""
 
-    def __init__(self, servos: Sequence[Servo | FeetechServo]) -> None:
-        self.chain, self.clock = Cable(servos), VirtualClock()
+    def __init__(self, servos: Sequence[Servo | FeetechServo], faults: Faults = no_faults) -> None:
+        self.chain, self.clock = Cable(servos, faults), VirtualClock()
         self.said: list[str] = []
         self.sent = bytearray()
 
@@ -230,3 +232,14 @@ def test_ports_are_named_by_what_stays_the_same(tmp_path: Path) -> None:
 
 def test_a_machine_without_adapters_has_no_ports(tmp_path: Path) -> None:
     assert serial_ports(tmp_path) == []
+
+
+@pytest.mark.parametrize("lost", [1, 2, 3, 4])
+def test_a_servo_is_found_although_one_of_its_answers_is_lost(lost) -> None:
+    answers = count(1)
+
+    def lose(reply: Reply) -> Reply:
+        return replace(reply, data=b"") if next(answers) == lost else reply
+
+    bench = Bench([servo("XM430-W350", id) for id in (1, 2, 3, 4)], lose)
+    assert [found.id for found in bench.scan(1_000_000).servos] == [1, 2, 3, 4]

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from bench_arm import swing
+from servo_arm import swing
 
 from daemon.reopen import Reopening
 from drivers.bench.pty_shell import PtyShell

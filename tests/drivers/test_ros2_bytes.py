@@ -276,3 +276,17 @@ def test_the_topics_of_tokens_are_told() -> None:
     token = rmw.publisher_token(3, ZID, CLI, "/arm/tip", POINT_STAMPED)
     known = [token, rmw.node_token(3, ZID, CLI), "@ros2_lv/x", "", token.replace("lv/3", "lv/three")]
     assert list(rmw.topics_in(known)) == [rmw.Topic(3, "/arm/tip", POINT_STAMPED.name)]
+
+
+parts = st.one_of(st.sampled_from([rmw.GRAPH, rmw.PUBLISHER, "0", "%", "%arm%tip", "٣", "9" * 5000]), texts)
+
+
+@given(st.lists(st.lists(parts, max_size=16).map("/".join), max_size=4))
+def test_any_other_tokens_are_passed_over(tokens) -> None:
+    assert all(0 <= topic.domain < 1000 for topic in rmw.topics_in(tokens))
+
+
+@given(parts)
+def test_a_token_of_whatever_domain_is_a_topic_or_passed_over(domain) -> None:
+    token = rmw.publisher_token(3, ZID, CLI, "/arm/tip", POINT_STAMPED).replace("lv/3", f"lv/{domain}")
+    assert {topic.name for topic in rmw.topics_in([token])} <= {"/arm/tip"}

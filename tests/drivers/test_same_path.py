@@ -13,8 +13,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bench_arm import TICK, Arm
+from bench_arm import Arm
 from feetech_arm import FeetechArm
+from servo_arm import TICK
 from test_serial_lines import BoardArm
 
 from drivers.bench.motion import Angle, played

@@ -14,9 +14,9 @@ from random import Random
 
 import numpy as np
 import pytest
-from bench_arm import swing
 from hypothesis import given
 from hypothesis import strategies as st
+from servo_arm import swing
 
 from drivers.bench.device import Reply
 from drivers.bench.faults import Planned, corrupt, garbage, half, late, mute, storm, wrong_checksum

@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 
 import pytest
-from bench_arm import Arm, swing
+from bench_arm import Arm
 from feetech_arm import FeetechArm
+from servo_arm import swing
 
 from drivers.dynamixel.bench.servo import Servo
 from drivers.feetech.bench.servo import Servo as FeetechServo

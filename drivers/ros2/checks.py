@@ -1,0 +1,89 @@
+"""Whether a ROS 2 robot's joint states come, and how. Only listens."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+
+from drivers.checks import Check
+from interfaces.errors import SourceError
+from interfaces.protocols import Clock
+
+from .config import Ros2Config
+from .joints import SILENT_AFTER_S, Ros2Joints
+from .link import OpenLink, open_zenoh
+
+READ_S = 1.0
+FEW_PER_S = 20.0
+MANY_TROUBLES = 0.01
+WAIT_S = 0.1
+LAST_PART = re.compile(r"[;.] (?!.*[;.] )", re.DOTALL)
+
+
+def joint_state_checks(
+    config: Ros2Config,
+    joints: Sequence[str],
+    clock: Clock,
+    *,
+    prismatic: Sequence[bool] | None = None,
+    open_link: OpenLink = open_zenoh,
+    read_s: float = READ_S,
+) -> Iterator[Check]:
+    """Whether the router answers, all joints are told there, and how often. A session is opened for that.
+
+    Args:
+        joints, prismatic, open_link: as for `Ros2Joints`.
+        read_s: how long the rate is measured [s].
+    """
+    try:
+        with Ros2Joints(config, joints, clock, prismatic=prismatic, open_link=open_link) as robot:
+            yield Check("router", "ok", f"{config.router} answers")
+            if not _begins(robot, clock):
+                yield Check("joint states", "wrong", *_parted(robot.health))
+                return
+            yield Check("joint states", "ok", f"all {len(joints)} joints of robot.toml are in {config.topic}")
+            lost, heard = _counted(robot)
+            end, readings = clock.now() + read_s, 0
+            while clock.now() < end:
+                readings += robot.read(end - clock.now()) is not None
+            lost_since, heard_since = _counted(robot)
+            yield _rate(readings / read_s)
+            yield _troubles(lost_since - lost, heard_since - heard)
+    except SourceError as error:
+        yield Check("router", "wrong", *_parted((str(error),)))
+
+
+def _begins(robot: Ros2Joints, clock: Clock) -> bool:
+    """Whether a reading comes before the robot counts as silent."""
+    end = clock.now() + SILENT_AFTER_S + WAIT_S
+    while clock.now() < end:
+        if robot.read(WAIT_S) is not None:
+            return True
+    return False
+
+
+def _parted(complaints: Sequence[str]) -> tuple[str, str]:
+    """What was found, and what to do, which a complaint says last."""
+    if not complaints:
+        return "too few joint states come", "let the robot's nodes publish more often"
+    *said, mend = LAST_PART.split(complaints[0])
+    return "".join(said), mend
+
+
+def _rate(rate_hz: float) -> Check:
+    said = f"{rate_hz:.0f} readings/s come"
+    if rate_hz < FEW_PER_S:
+        return Check("rate", "warning", said, "let the robot's nodes publish more often")
+    return Check("rate", "ok", said)
+
+
+def _counted(robot: Ros2Joints) -> tuple[int, int]:
+    """Messages that gave nothing, and all that were sent, so far."""
+    return robot.lost + robot.refused.total(), robot.lost + robot.received
+
+
+def _troubles(lost: int, messages: int) -> Check:
+    said = f"{lost} of {messages} messages were lost or not used"
+    if lost > MANY_TROUBLES * messages:
+        return Check("errors", "warning", said, "bodyschema joints    # its log says why, once for each reason")
+    return Check("errors", "ok", said)

@@ -1,0 +1,80 @@
+"""Servos looked at one after the other, between readings: torque, what is wrong with them, their supply."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from interfaces.errors import SourceLost
+from interfaces.protocols import Clock
+
+from .bus import Bus, Exchange
+from .drive import Drive
+from .handshake import FittedServo
+from .health import Health, supply_of
+
+EVERY_S = 0.1  # one servo in turn
+SUPPLY_EVERY = 11  # so many looks: voltage and temperature of that one too
+
+
+class Inspection:
+    """Verifies that torque is where it shall be, and notes how the servos are."""
+
+    def __init__(
+        self,
+        buses: Mapping[str, Bus],
+        servos: Sequence[FittedServo],
+        health: Health,
+        drives: Sequence[Drive],
+        clock: Clock,
+    ) -> None:
+        """Of `servos`, on `buses` that are open; `health` is told, and `drives` may hold some of them."""
+        self._buses, self._servos, self._health, self._drives = buses, servos, health, drives
+        self._clock, self._next_s = clock, clock.now()
+        self._looked = 0
+
+    def go_on(self) -> None:
+        """Look at the next servo, if it is time.
+
+        Raises:
+            SourceLost: its torque is on, and none of ours switched it on.
+        """
+        if self._clock.now() < self._next_s:
+            return
+        servo = self._servos[self._looked % len(self._servos)]
+        exchange = self._ask_state(servo)
+        if exchange.trouble is not None:
+            return
+        self._looked += 1
+        if self._looked >= len(self._servos):  # the first round is made at once
+            self._next_s = self._clock.now() + EVERY_S
+        self._judge(servo, exchange)
+        if self._looked % SUPPLY_EVERY == 0 or not self._health.knows_supply(servo.joint):
+            self._ask_supply(servo)
+
+    def first_silent(self) -> str | None:
+        """The first servo that does not answer when it is asked alone, and what came instead; None: all answer."""
+        for servo in self._servos:
+            trouble = self._ask_state(servo).trouble
+            if trouble is not None:
+                self._health.note_silent(servo.joint, trouble)
+                return f"joint {servo.joint!r} (ID {servo.id}): {trouble}"
+        return None
+
+    def _judge(self, servo: FittedServo, exchange: Exchange) -> None:
+        status, layout = exchange.answers[0].status, servo.model.layout
+        has_register = "hardware_error" in layout
+        bits = layout.value("hardware_error", status.data, layout.state.address) if has_register else status.error
+        has_torque = layout.value("torque", status.data, layout.state.address)
+        if has_torque and not any(servo.joint in drive.holding for drive in self._drives):
+            raise SourceLost(f"the torque of joint {servo.joint!r} was switched on by another program", retry_s=0.0)
+        self._health.note_alert(servo.joint, bits)
+
+    def _ask_supply(self, servo: FittedServo) -> None:
+        bus = self._buses[servo.bus]
+        exchange = bus.ask(bus.read_request(servo.model, servo.id, supply_of(servo.model)))
+        if exchange.trouble is None:
+            self._health.note_supply(servo.joint, servo.model, exchange.answers[0].status.data)
+
+    def _ask_state(self, servo: FittedServo) -> Exchange:
+        bus = self._buses[servo.bus]
+        return bus.ask(bus.read_request(servo.model, servo.id, servo.model.layout.state))

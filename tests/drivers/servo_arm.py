@@ -1,0 +1,72 @@
+"""Arms of servos on a bench in virtual time, whatever their make."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from random import Random
+from typing import Any
+
+from drivers.bench.chain import ServoChain
+from drivers.bench.faults import Planned
+from drivers.bench.virtual_port import VirtualClock, VirtualPort, at_once
+from drivers.servos.config import ServosConfig
+from drivers.servos.joints import ServoJoints
+
+TICK = 2 * math.pi / 4096
+Path = Callable[[float], float]
+
+
+def swing(phase: float) -> Path:
+    """A joint that is moved by hand, at up to 50°/s."""
+    return lambda t: 1.2 * math.sin(0.7 * t + phase)
+
+
+class ServoArm:
+    """A driver with a bench behind it.
+
+    Args:
+        servo: makes one of a model's name, an ID and its path.
+        port: a class of ports, which may keep what is sent.
+    """
+
+    joints: ServoJoints
+
+    def __init__(
+        self,
+        models: Sequence[str],
+        paths: Sequence[Path] | None,
+        *,
+        servo: Callable[[str, int, Path], Any],
+        chain: Callable[..., ServoChain[Any]],
+        port: type[VirtualPort],
+        latency_s: float,
+        seed: int,
+    ) -> None:
+        self.clock, rng = VirtualClock(), Random(seed)
+        self.paths = [swing(k) for k in range(len(models))] if paths is None else list(paths)
+        self.names = tuple(f"joint{k}" for k in range(1, len(models) + 1))
+        self.faults = Planned(rng)
+        servos = [servo(model, k, self.paths[k - 1]) for k, model in enumerate(models, 1)]
+        self.chain: Any = chain(servos, self.faults)
+        jitter = (lambda: rng.uniform(0, latency_s)) if latency_s else at_once
+        self.port: Any = port(self.chain, self.clock, outwards=at_once, inwards=jitter)
+        self._latency_s, self._models = latency_s, models
+
+    def entries(self, kind: Callable[[str, int, str], Any]) -> tuple[Any, ...]:
+        """The servos as robot.toml would tell of them."""
+        fitted = zip(self.names, self._models, strict=True)
+        return tuple(kind(name, k, model) for k, (name, model) in enumerate(fitted, 1))
+
+    def driven(self, driver: Callable[..., ServoJoints], config: ServosConfig[Any], **settings: Any) -> None:
+        """Put `driver` before the bench."""
+        opened = self.port, self._latency_s / 2
+        self.joints = driver(config, self.names, self.clock, open_port=lambda *_: opened, **settings)
+
+    def error(self, reading) -> float:
+        """Largest error of the reading's angles against the truth at its time [rad]."""
+        return max(abs(q - path(reading.t)) for q, path in zip(reading.q, self.paths, strict=True))
+
+    def sampled(self) -> float:
+        """The middle of the times at which the positions were really taken [s]."""
+        return sum(sampling.t for sampling in self.chain.samplings.values()) / len(self.chain.samplings)
