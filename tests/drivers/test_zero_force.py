@@ -308,7 +308,7 @@ def test_a_program_that_is_held_up_ends_it() -> None:
 def test_readings_that_are_doubtful_for_long_end_it() -> None:
     with (arm := FloatingArm(heartbeat_ms=500)).joints:
         arm.float()
-        arm.faults.add(1, mute, 12)
+        arm.faults.add(1, mute, 20)
         assert "could not be believed" in dropped(arm)
 
 
