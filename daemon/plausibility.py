@@ -36,6 +36,8 @@ FAR_OFF_SIGMAS = 5.0
 # Rows that other readings of the columns are judged by, how many readings are fitted, and how much better the named
 # one has to fit.
 JUDGED_ROWS, FITTED, MUCH_BETTER = 60, 4, 3.0
+# ... and how much worse the one may fit that changes less.
+AS_GOOD = 1.2
 # As badly made as an arm may be, with what robot.toml says of camera and marker as rough as a guess.
 _ROUGH = ChainTolerances(
     axes=0.06, points=0.03, zeros=0.1, slide_zeros=0.02, tool=0.1, base_rotation=0.5, base_translation=0.5
@@ -124,6 +126,11 @@ def mixed_up(robot: RobotDescription, recording: Recording) -> str | None:
     likely = _ranked(robot.chain, some, (changed | twice) - {as_it_is})[:FITTED]
     fitted = {columns: _left_by_a_learnt_chain(robot, some, columns) for columns in (as_it_is, *likely)}
     best = min(fitted, key=lambda columns: fitted[columns])
+    # A joint whose sign hardly shows is left as it is.
+    for fewer in sorted(best.changed(), key=lambda columns: columns.order):
+        if fewer.changes < best.changes:
+            left_m = fitted[fewer] = _left_by_a_learnt_chain(robot, some, fewer)
+            best = fewer if left_m < AS_GOOD * fitted[best] else best
     if MUCH_BETTER * fitted[best] > fitted[as_it_is]:
         return None
     return (
@@ -158,6 +165,11 @@ class _Columns:
             )
             for j, k in itertools.combinations(joints, 2)
         }
+
+    @property
+    def changes(self) -> int:
+        """How many columns are not in their place, or count the other way."""
+        return sum(k != column for k, column in enumerate(self.order)) + sum(sign < 0 for sign in self.signs)
 
     def said(self, joints: tuple[str, ...]) -> str:
         return f"With {' and '.join(self._changes(joints))}"

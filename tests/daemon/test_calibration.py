@@ -298,7 +298,7 @@ def test_columns_in_another_order_are_named_and_nothing_is_written(pairs_file, t
 def test_a_joint_that_counts_the_other_way_is_named() -> None:
     arm = planted(2)
     q = arm.recording.q * [1.0, -1.0, 1.0, 1.0]
-    assert "With shoulder_pitch counting the other way" in (
+    assert "With shoulder_pitch counting the other way, the pairs" in (
         mixed_up(arm.robot, Recording(arm.robot.joints, q, arm.recording.x)) or ""
     )
 
