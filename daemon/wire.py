@@ -16,6 +16,8 @@ from interfaces.errors import RequestError
 from interfaces.records import Pair, frozen_array
 from interfaces.suggest import with_choices
 
+from .command_names import CommandName
+
 JSON = "application/json"
 MSGPACK = "application/msgpack"
 OCTETS = "application/octet-stream"
@@ -133,18 +135,7 @@ class IkReply(msgspec.Struct, frozen=True):
 class CommandRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A command to one of the processes; which it knows is in its documentation."""
 
-    command: Literal[
-        "pause",
-        "resume",
-        "accept_turns",
-        "zero_force_on",
-        "zero_force_off",
-        "gaze_on",
-        "gaze_off",
-        "reset_to_prior",
-        "tool_changed",
-        "checkpoint",
-    ]
+    command: CommandName
 
 
 class CommandReply(msgspec.Struct, frozen=True):

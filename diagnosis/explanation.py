@@ -96,6 +96,8 @@ def explain(
 
 def _is_as_good(fewer: Explanation, explanation: Explanation) -> bool:
     """Whether fewer causes do as well beside ways without a name that are no others."""
+    if len(fewer.fit.causes) >= len(explanation.fit.causes):
+        return False
     ways, needed = ({way.family.what for way in one.unknown} for one in (explanation, fewer))
     return bool(needed) and needed <= ways and fewer.worth > explanation.worth - _AS_GOOD
 

@@ -6,28 +6,14 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
+from daemon.command_names import BOTHS, SAMPLERS, CommandName
 from daemon.commands.options import HERE, RobotFile
 
-Name = Literal[
-    "pause",
-    "resume",
-    "accept_turns",
-    "zero_force_on",
-    "zero_force_off",
-    "gaze_on",
-    "gaze_off",
-    "reset_to_prior",
-    "tool_changed",
-    "checkpoint",
-]
 Process = Literal["sampler", "learner"]
-
-BOTHS = ("pause", "resume")
-SAMPLERS = (*BOTHS, "accept_turns", "zero_force_on", "zero_force_off", "gaze_on", "gaze_off")
 
 
 def command(
-    name: Annotated[Name, Parameter(help="What to do.")],
+    name: Annotated[CommandName, Parameter(help="What to do.")],
     /,
     *,
     to: Annotated[

@@ -139,3 +139,11 @@ def test_a_moment_is_sought_again_beside_causes_that_came_later(robot) -> None:
     found = search.run(start.with_causes([early, at_rest(turned)]))
     (moment,) = [effect.value("t0") for effect in found.causes if effect.name == "tool_slip"]
     assert abs(moment - 30.0) <= INTERVAL_S
+
+
+def test_a_camera_that_stands_elsewhere_all_the_time_is_no_drift() -> None:
+    robot = surveyed_arm()
+    moved = Effect.at(robot, "camera_pose", values=[4e-4, -3e-4, 2e-4, 0.0, 0.0, 0.0])
+    start = start_of(robot, walk(robot, 4), (moved,), 4)
+    hypotheses = [Effect.at(robot, name) for name in ("camera_pose", "thermal_drift")]
+    assert names(Search(hypotheses, lambda _: None).run(start)) == {("camera_pose", None)}

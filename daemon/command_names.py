@@ -1,0 +1,20 @@
+"""The commands that a process can be told, and whose they are."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+CommandName = Literal[
+    "pause",
+    "resume",
+    "accept_turns",
+    "zero_force_on",
+    "zero_force_off",
+    "gaze_on",
+    "gaze_off",
+    "reset_to_prior",
+    "tool_changed",
+    "checkpoint",
+]
+BOTHS: tuple[CommandName, ...] = ("pause", "resume")
+SAMPLERS: tuple[CommandName, ...] = (*BOTHS, "accept_turns", "zero_force_on", "zero_force_off", "gaze_on", "gaze_off")
