@@ -55,8 +55,32 @@ class JointSource(Source, Protocol):
 
 
 @runtime_checkable
+class StereoEyes(Source, Protocol):
+    """Two cameras side by side, or one that has two eyes, as the images come: neither calibrated nor rectified."""
+
+    @property
+    def image_size_px(self) -> tuple[int, int]:
+        """Width and height of each eye's image."""
+        ...
+
+    @property
+    def serials(self) -> tuple[str, str]:
+        """What tells the left and the right device from all others: serial number, path or file name."""
+        ...
+
+    def read(self, timeout_s: float) -> StereoFrame | None:
+        """The next pair of images, in strictly increasing time; None when none came within `timeout_s`.
+
+        Raises:
+            SourceEnded: there will be no more.
+            SourceLost: a device went away.
+        """
+        ...
+
+
+@runtime_checkable
 class StereoCamera(Source, Protocol):
-    """Two eyes on one clock with the encoders."""
+    """Two calibrated eyes on one clock with the encoders; their images are rectified."""
 
     @property
     def calibration(self) -> StereoCalibration:

@@ -57,11 +57,13 @@ class StereoFrame:
         t: middle of the exposure on the same clock as the joint readings [s].
         left, right: images, shape (height, width, 3), uint8, BGR as OpenCV has it. Pixel (i, j) (column, row)
             covers the square around (i, j): its centre has the image coordinates u = i, v = j.
+        t_sigma: 1-sigma of `t`, and of the time that lies between the two eyes' exposures [s].
     """
 
     t: float
     left: ImageArray
     right: ImageArray
+    t_sigma: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
