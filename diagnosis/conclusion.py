@@ -85,7 +85,7 @@ def _mean_mm(diagnosis: Diagnosis) -> Errors:
 def _causes(diagnosis: Diagnosis) -> tuple[Cause, ...]:
     fit, kept = diagnosis.extended, diagnosis.markers
     full = float(np.square(diagnosis.held_out["extended"][kept]).sum())
-    losses = [max(float(np.square(diagnosis.without[c.key][kept]).sum()) - full, 0.0) for c in fit.causes]
+    losses = [max(float(np.square(diagnosis.without[c.identity][kept]).sum()) - full, 0.0) for c in fit.causes]
     causes = []
     for cause, standing, loss in zip(fit.causes, diagnosis.standings, losses, strict=True):
         causes.append(

@@ -11,7 +11,7 @@ from effects import Effect
 from interfaces.records import FloatArray
 
 from .fit import Fit
-from .search import NAMED, Search
+from .search import NAMED, Search, named
 from .unknown import Apart, Unknowns, Way
 
 # What has no name is taken for so much more probability than the named causes alone [nats].
@@ -78,12 +78,12 @@ def explain(
     # Where the causes explain by far the most, they are not given up for what explains the rest.
     is_rest = best.size < _REST * whole
     margin = _MARGIN if is_rest else 0.0
-    keys = {frozenset(effect.key for effect in found.causes)}
+    looked_at = {named(found.causes)}
     for fit in [*path[:_FIRST], *path[_FIRST:][-_LAST:]]:
-        causes = frozenset(effect.key for effect in fit.causes)
-        if causes in keys:
+        causes = named(fit.causes)
+        if causes in looked_at:
             continue
-        keys.add(causes)
+        looked_at.add(causes)
         other = _with_unknown(fit, unknowns, search)
         better = other.worth > best.worth + (margin if best.fit is found else 0.0) or _is_as_good(other, best)
         if other.apart is not None and better and unknowns.predicts(other.apart, found):

@@ -231,7 +231,7 @@ class Fit:
 
     def without(self, cause: Effect) -> Fit:
         """All causes but one, refitted."""
-        return self.with_causes([effect for effect in self.causes if effect.key != cause.key])
+        return self.with_causes([effect for effect in self.causes if effect.identity != cause.identity])
 
     def with_causes(self, causes: Sequence[Effect]) -> Fit:
         """Other causes in the place of these, all refitted."""
