@@ -19,12 +19,12 @@ from .scan import Candidate, Scan
 NAMED = 3.0
 # Candidates within this share of the best gain are refitted in full, so many at most.
 _NEAR, _MOST = 0.4, 6
-_MOST_CAUSES = 9
+_MOST_CAUSES = 20
 # So many sets of causes are looked at, and none twice.
-_MOST_SETS = 40
+_MOST_SETS = 80
 Key = tuple[str, str | None, str | None]
 Named = frozenset[tuple[Key, int]]
-# Of one kind at one place there are so many at most: moments, periods.
+# Of what begins at a moment there are so many at one place at most.
 _MOST_OF_A_KIND = 4
 # What a number costs at least [nats].
 _CHEAPEST = 1.5
@@ -32,6 +32,8 @@ _CHEAPEST = 1.5
 _COMES_NEAR, _EQUAL = 0.8, 0.3
 # A moment or a period that seems to explain so much more than that of the fit is tried in its place.
 _ELSEWHERE = 1.0
+# An exchange that loses no more than this may be worth it with one cause more [nats].
+_WITH_ONE_MORE = 100.0
 # The camera's pose and the marker's place are simpler than the link next to them.
 _OF_A_LINK = 1
 
@@ -87,20 +89,21 @@ class Search:
         if start.causes:
             fit = self._reviewed(start)
             self.path.append(fit)
-        for _ in range(_MOST_CAUSES):
-            better = self._added(fit)
+        while len(self.path) <= _MOST_CAUSES:
+            better = self._added(fit)[0] or self._simpler_and_one_more(fit)
             if better is None:
                 break
             causes = named(better.causes)
             if causes in self._seen:
                 break
+            self._tell(f"found {describe(better.causes[-1])}")
             self._seen.add(causes)
             fit = self._reviewed(better)
             self.path.append(fit)
         return fit
 
-    def _added(self, fit: Fit) -> Fit | None:
-        """With one more cause; None where nothing is probable enough."""
+    def _added(self, fit: Fit) -> tuple[Fit | None, float]:
+        """With one more cause, and what that is worth [nats]; None where nothing is probable enough."""
         best, most = None, NAMED
         for candidate in self.shortlist(fit, self._open(fit)):
             if self._agreed(fit, candidate) < NAMED:
@@ -109,12 +112,37 @@ class Search:
             worth = nats(2.0 * (tried.log_likelihood - fit.log_likelihood), candidate.dof) - self.doubt(candidate)
             if worth > most and tried.causes[-1].is_possible:
                 best, most = tried, worth
-        if best is not None:
-            self._tell(f"found {describe(best.causes[-1])}")
-        return best
+        return best, most
+
+    def _simpler_and_one_more(self, fit: Fit) -> Fit | None:
+        """With a simpler rival in the place of a cause and another cause beside it; None where none is worth it.
+
+        A cause of many numbers may stand for a simpler one and a small one together.
+        """
+        for cause in fit.causes:
+            beside = self.beside(fit, cause)
+            itself = beside.itself or Candidate(cause, 0.0, 1)
+            for candidate in beside.candidates:
+                if candidate.dof >= itself.dof or candidate.gain < _COMES_NEAR * itself.gain:
+                    continue
+                tried, worth = self._exchanged(fit, beside, itself, candidate)
+                if worth < -_WITH_ONE_MORE or named(tried.causes) in self._seen or not tried.causes[-1].is_possible:
+                    continue
+                better, more = self._added(tried)
+                if better is not None and worth + more > 1.0:
+                    self._tell(f"exchanged {describe(cause)} for {describe(candidate.effect)}")
+                    return better
+        return None
+
+    def _exchanged(self, fit: Fit, beside: Beside, itself: Candidate, candidate: Candidate) -> tuple[Fit, float]:
+        """With a candidate in the place of a cause, refitted, and what that is worth [nats]."""
+        without = beside.without
+        tried = self.refined(without.with_causes([*without.causes, candidate.effect]), candidate.effect)
+        worth = nats(2.0 * (tried.log_likelihood - fit.log_likelihood), candidate.dof - itself.dof)
+        return tried, worth + self.doubt(itself) - self.doubt(candidate)
 
     def _open(self, fit: Fit) -> list[Effect]:
-        """The hypotheses that no cause of a fit is, and one more of those of which there may be several."""
+        """The hypotheses that no cause of a fit is, and one more of those that begin at a moment."""
         present = Counter(effect.key for effect in fit.causes)
         taken = {effect.identity for effect in fit.causes}
         others = []
@@ -122,7 +150,7 @@ class Search:
             count = present[effect.key]
             if count == 0:
                 others.append(effect)
-            elif effect.kind.repeats and count < _MOST_OF_A_KIND:
+            elif effect.kind.begins and count < _MOST_OF_A_KIND:
                 more = (effect.one_more(ordinal) for ordinal in range(count + 1))
                 others.append(next(one for one in more if one.identity not in taken))
         return others
@@ -203,9 +231,7 @@ class Search:
             for candidate in beside.candidates:
                 if candidate.gain < _COMES_NEAR * itself.gain:
                     continue
-                tried = self.refined(fit.with_causes([*others, candidate.effect]), candidate.effect)
-                worth = nats(2.0 * (tried.log_likelihood - fit.log_likelihood), candidate.dof - itself.dof)
-                worth += self.doubt(itself) - self.doubt(candidate)
+                tried, worth = self._exchanged(fit, beside, itself, candidate)
                 better = worth > 1.0 or (abs(worth) < _EQUAL and simplicity(candidate.effect) < simplicity(cause))
                 if better and tried.causes[-1].is_possible:
                     self._tell(f"exchanged {describe(cause)} for {describe(candidate.effect)}")

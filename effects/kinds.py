@@ -41,11 +41,6 @@ class Kind:
         return self.sliding if prismatic else self.turning
 
     @property
-    def repeats(self) -> bool:
-        """Whether there may be several at one place: at other moments, or of other periods."""
-        return self.begins or any(parameter.name.startswith("cycles_per_") for parameter in self.turning)
-
-    @property
     def takes_source(self) -> bool:
         """Whether another joint causes it."""
         return self.encoder is not None and self.encoder.takes_source

@@ -160,19 +160,22 @@ def test_a_tool_that_slipped_twice_is_named_twice(robot) -> None:
     assert moments == pytest.approx([30.0, 70.0], abs=2.0 * INTERVAL_S)
 
 
-def test_two_ripples_at_one_joint_are_both_named(robot) -> None:
-    ripples = (
-        Effect.at(robot, "joint_ripple", ELBOW, values=[4e-3, 0.0, 7.0]),
-        Effect.at(robot, "joint_ripple", ELBOW, values=[0.0, 3e-3, 18.0]),
-    )
-    start = start_of(robot, walk(robot, 3), ripples, 3)
-    found = Search([Effect.at(robot, "joint_ripple", ELBOW)], lambda _: None).run(start)
-    periods = sorted(effect.value("cycles_per_turn") for effect in found.causes)
-    assert periods == pytest.approx([7.0, 18.0], abs=0.1)
-
-
 def test_there_is_one_offset_at_a_joint_and_no_second(robot) -> None:
     offset = Effect.at(robot, "joint_offset", ELBOW, values=[0.02])
     start = start_of(robot, walk(robot, 3), (offset,), 3)
     found = Search([Effect.at(robot, "joint_offset", ELBOW)], lambda _: None).run(start)
     assert len(found.causes) == 1
+
+
+def test_a_link_that_stands_for_an_offset_and_a_small_jump_gives_way_to_both() -> None:
+    robot = surveyed_arm()
+    offset = Effect.at(robot, "joint_offset", SHOULDER, values=[4e-3])
+    jump = Effect.at(robot, "encoder_jump", ELBOW, values=[1.2e-3, 40.1])
+    start = start_of(robot, walk(robot, 5), (offset, jump), 5)
+    hypotheses = [
+        Effect.at(robot, name, joint)
+        for name in ("link_geometry", "joint_offset", "encoder_jump")
+        for joint in (SHOULDER, ELBOW)
+    ]
+    found = Search(hypotheses, lambda _: None).run(start)
+    assert names(found) == {("joint_offset", SHOULDER), ("encoder_jump", ELBOW)}
