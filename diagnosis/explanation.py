@@ -122,7 +122,7 @@ def _length(fit: Fit, change: FloatArray) -> float:
 
 def _with_unknown(fit: Fit, unknowns: Unknowns, search: Search) -> Explanation:
     apart: Apart | None = None
-    while apart is None or len(apart.chosen) < _MOST_UNKNOWNS:
+    while not fit.is_exact and (apart is None or len(apart.chosen) < _MOST_UNKNOWNS):
         here, chosen = (fit, ()) if apart is None else (apart.fit, apart.chosen)
         near = unknowns.nearest(here, chosen)
         way, more = near[0]
