@@ -14,6 +14,7 @@ from interfaces.records import FloatArray, ImageArray
 
 from .board import Board, dictionary
 from .exposure import image_fault
+from .refine import refined
 from .sharpness import blur_px
 from .squares import squares_seen
 
@@ -92,7 +93,9 @@ class BoardDetector:
         if numbers is None or len(numbers) < _LEAST_CORNERS:
             return self._nothing(grey, len(markers))
         order = np.argsort(np.ravel(numbers))
-        return Corners(np.ravel(numbers)[order].astype(np.int64), np.reshape(px, (-1, 2))[order].astype(np.float64))
+        rough = np.ravel(numbers)[order].astype(np.int64), np.reshape(px, (-1, 2))[order].astype(np.float64)
+        found = refined(grey, self.board, *rough)
+        return Corners(*found) if len(found[0]) >= _LEAST_CORNERS else self._nothing(grey, len(markers))
 
     def _nothing(self, grey: ImageArray, markers: int) -> NotFound:
         if markers:
