@@ -84,10 +84,13 @@ class Rectification:
 
     def points(self, px: FloatArray, eye: int) -> FloatArray:
         """Where what an eye (0 left, 1 right) sees at (n, 2) [px] is in its rectified image, shape (n, 2) [px]."""
-        lens, R = self.eyes[eye]
         calibration = self.calibration
-        directions = _turned(lens.directions(px), R)
-        return calibration.focal_px * directions + np.array(calibration.principal_point_px)
+        return calibration.focal_px * self.directions(px, eye) + np.array(calibration.principal_point_px)
+
+    def directions(self, px: FloatArray, eye: int) -> FloatArray:
+        """The same as directions (x/z, y/z), shape (n, 2)."""
+        lens, R = self.eyes[eye]
+        return _turned(lens.directions(px), R)
 
     def maps(self, eye: int) -> tuple[ImageArray, ImageArray]:
         """OpenCV's fixed-point maps that rectify the images of an eye (0 left, 1 right)."""
@@ -131,8 +134,10 @@ class RectifiedCamera:
     """The rectified images of two calibrated cameras: a `StereoCamera`."""
 
     def __init__(self, eyes: StereoEyes, rig: StereoRig) -> None:
-        """Compute the maps.
+        """Compute the maps. Whether these are the cameras that were calibrated is seen when they are opened.
 
+        Raises:
+            CalibrationError: the calibrated eyes do not look the same way.
         """
         self._eyes, self._rig = eyes, rig
         rectification = Rectification(rig)
@@ -146,6 +151,7 @@ class RectifiedCamera:
         return self._calibration
 
     def __enter__(self) -> Self:
+        """Open the cameras; CalibrationError when they are not the calibrated ones."""
         self._eyes.__enter__()
         try:
             self._rig.require(self._eyes.image_size_px, self._eyes.serials)

@@ -23,8 +23,8 @@ from .view import View
 
 ModelChoice = Literal["auto", "pinhole", "fisheye"]
 
-_OUTLIER_SPREADS = 6.0
-_OUTLIER_RATIO = 1.8
+_OUTLIER_SPREADS = 8.0
+_OUTLIER_RATIO = 3.0
 _MOST_LEFT_OUT = 0.35
 
 

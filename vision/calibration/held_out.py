@@ -40,8 +40,8 @@ class HeldOut:
         return np.sqrt(self.squares / self.freedom)
 
     def is_better_than(self, other: HeldOut) -> bool:
-        """Whether views are foretold better than by `other`, by more than twice the standard error of the gain."""
-        gain = other.squares - self.squares
+        """Whether views are foretold better than by `other`, in the logarithm by more than twice its standard error."""
+        gain = np.log(other.squares / self.squares)
         return float(gain.mean()) > 2.0 * float(gain.std(ddof=1)) / np.sqrt(len(gain))
 
 
