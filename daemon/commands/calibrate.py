@@ -9,10 +9,13 @@ import cyclopts
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
+from daemon.commands.calibrate_cameras import cameras, check
 from daemon.commands.options import SourceRobotFile, flag, robot_file
 
 # Without a help of its own its page shows what `arm` says, beside the commands.
 calibrate = cyclopts.App(name="calibrate")
+calibrate.command(cameras, sort_key=1)
+calibrate.command(check, sort_key=2)
 
 
 @calibrate.default

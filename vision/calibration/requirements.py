@@ -104,8 +104,8 @@ def contradicts(rig: StereoRig, baseline_m: float) -> str | None:
         return None
     return (
         f"the baseline is {1e3 * rig.baseline_m:.2f} ± {2e3 * rig.baseline_sigma_m:.2f} mm if a square is what was "
-        f"said, measured by hand were {1e3 * baseline_m:.2f} mm. If the hand is right, squares are {ratio:.1%} of that: "
-        "was the board scaled in printing? Measure the ruler on it and give --ruler-mm"
+        f"said; by hand it is {1e3 * baseline_m:.2f} mm, which would make the squares {ratio:.1%} of their size. Was "
+        "the board scaled in printing? Measure the ruler on it and give --ruler-mm"
     )
 
 
