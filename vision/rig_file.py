@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import tempfile
 from pathlib import Path
 from typing import Annotated
 
@@ -92,15 +91,16 @@ def write_rig(rig: StereoRig, file: Path) -> None:
         ConfigError: the folder cannot be written to.
     """
     text = f"# Written by `bodyschema calibrate cameras`. docs/calibrating_cameras.md says what each entry is.\n{_text(rig)}"
+    part = file.with_name(f"{file.name}.part")
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile("w", dir=file.parent, suffix=".part", delete=False, encoding="utf-8") as part:
-            part.write(text)
-            part.flush()
-            os.fsync(part.fileno())
-        os.chmod(part.name, 0o644)
-        os.replace(part.name, file)
+        with part.open("w", encoding="utf-8") as stream:
+            stream.write(text)
+            stream.flush()
+            os.fsync(stream.fileno())
+        os.replace(part, file)
     except OSError as error:
+        part.unlink(missing_ok=True)
         raise ConfigError(f"cannot be written: {error.strerror}", file=file, remedy="Mend folder or disk") from error
 
 

@@ -35,11 +35,12 @@ class TrueLens:
         return np.column_stack(distorted) * self.focal_px + self.principal_point_px
 
     def rays(self, px: FloatArray) -> FloatArray:
-        """Directions (n, 2) with z = 1, by Newton's method on `image`."""
+        """Directions (n, 2) with z = 1, by Newton's method: on the angle of a fisheye lens, else on `image`."""
         goal = px
         at = (px - self.principal_point_px) / np.array(self.focal_px)
         if self.fisheye:
-            at = at * np.minimum(np.tan(np.minimum(r := np.linalg.norm(at, axis=1), 1.4)) / np.maximum(r, 1e-9), 8.0)[:, None]
+            bent = np.maximum(np.hypot(*at.T), 1e-12)
+            return at * (np.tan(self._angle(bent)) / bent)[:, None]
         for _ in range(12):
             here = self.image(np.column_stack([at, np.ones(len(at))]))
             slopes = []
@@ -53,6 +54,17 @@ class TrueLens:
             if np.abs(e).max() < 1e-9:
                 break
         return at
+
+    def _angle(self, bent: FloatArray) -> FloatArray:
+        """The angle off the axis whose image is at this distance from the centre, in focal lengths."""
+        k = np.array(self.distortion)
+        t = bent
+        for _ in range(12):
+            powers = [t ** (2 * n) for n in range(1, 5)]
+            value = t * (1 + sum(c * p for c, p in zip(k, powers, strict=True)))
+            slope = 1 + sum((2 * n + 1) * k[n - 1] * powers[n - 1] for n in range(1, 5))
+            t = t - (value - bent) / slope
+        return t
 
     def _radial_tangential(self, a: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray]:
         k1, k2, p1, p2, k3 = self.distortion
@@ -153,9 +165,13 @@ class Photographer:
 
     def pair(self, R: FloatArray, t_m: FloatArray, time: float = 0.0) -> StereoFrame:
         """Both eyes' images of the board at a pose in the left eye's frame (R board -> eye, t its origin)."""
-        left = self._image(0, self.rig.left, R, t_m)
+        left = self.left(R, t_m)
         right = self._image(1, self.rig.right, self.rig.R @ R, self.rig.R @ t_m + self.rig.t_m)
         return StereoFrame(time, left, right)
+
+    def left(self, R: FloatArray, t_m: FloatArray) -> ImageArray:
+        """The left eye's image alone."""
+        return self._image(0, self.rig.left, R, t_m)
 
     def corners(self, R: FloatArray, t_m: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Where the board's inner corners are in both eyes' images, in exact arithmetic, shape (n, 2) each [px]."""

@@ -13,7 +13,7 @@ from .sharpness import sharpest_edge_px
 _DARK_LEVEL = 16
 _WHITE_LEVEL = 250
 _MOST_WHITE = 0.4
-_MOST_EDGE_PX = 3.5
+_MOST_EDGE_PX = 2.7
 
 
 def image_fault(grey: ImageArray) -> tuple[Literal["dark", "over_exposed", "blurred"], str] | None:

@@ -44,15 +44,20 @@ def refined(grey: ImageArray, board: Board, numbers: IntArray, px: FloatArray) -
 
 
 def _frames(board: Board, numbers: IntArray, px: FloatArray) -> FloatArray:
-    """What one square to the right and one down are in pixels at each corner, as columns, shape (n, 2, 2)."""
+    """What one square to the right and one down are in pixels at each corner, as columns, shape (n, 2, 2).
+
+    Not a number where nothing tells.
+    """
     places = board.corners_m[numbers, :2] / board.square_m
-    H, _ = cv2.findHomography(places, px, cv2.LMEDS)
-    found = np.empty((len(px), 2, 2))
+    H, _ = cv2.findHomography(places, px, 0)
+    found = np.full((len(px), 2, 2), np.nan)
     for k, place in enumerate(places):
         offsets = places - place
         near = np.max(np.abs(offsets), axis=1) < _NEIGHBOURS
         model = offsets[near] - offsets[near].mean(axis=0)
         if np.linalg.matrix_rank(model) < 2:
+            if H is None:
+                continue
             steps = np.array([place - [0.5, 0.0], place + [0.5, 0.0], place - [0.0, 0.5], place + [0.0, 0.5]])
             seen = cv2.perspectiveTransform(steps[:, None], H)[:, 0]
             found[k] = np.column_stack([seen[1] - seen[0], seen[3] - seen[2]])
@@ -63,6 +68,8 @@ def _frames(board: Board, numbers: IntArray, px: FloatArray) -> FloatArray:
 
 def _crossing(slopes: FloatArray, start: FloatArray, frame: FloatArray, board: Board) -> FloatArray | None:
     """Where the edges cross near `start`; None where that is not in the image or far away."""
+    if not np.all(np.isfinite(frame)) or abs(np.linalg.det(frame)) < 1.0:
+        return None
     height, width = slopes.shape[:2]
     into_squares = np.linalg.inv(frame)
     # What is left white of a square beside its marker.

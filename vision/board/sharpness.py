@@ -46,11 +46,16 @@ def _across(grey: ImageArray, numbers: NDArray[np.int64], px: FloatArray, board:
 
 
 def sharpest_edge_px(grey: FloatArray) -> float:
-    """1-sigma of the blur [px] of the sharpest edges in an image (height, width); it need not show a board."""
+    """1-sigma of the blur [px] of the sharpest edges in an image (height, width); it need not show a board.
+
+    That of the direction in which they are least sharp: motion blurs along its own alone.
+    """
     smooth = cv2.GaussianBlur(grey, (0, 0), 1.0)
-    across = np.hypot(smooth[1:-1, 2:] - smooth[1:-1, :-2], smooth[2:, 1:-1] - smooth[:-2, 1:-1])
+    right, down = smooth[1:-1, 2:] - smooth[1:-1, :-2], smooth[2:, 1:-1] - smooth[:-2, 1:-1]
     low, high = np.quantile(smooth, [0.01, 0.99])
-    return _sigma(float(np.quantile(across, _STEEPEST)) / max(high - low, 1.0))
+    directions = (right, down, (right + down) / np.sqrt(2.0), (right - down) / np.sqrt(2.0))
+    steepest = min(float(np.quantile(np.abs(each), _STEEPEST)) for each in directions)
+    return _sigma(steepest / max(high - low, 1.0))
 
 
 def _sigma(steepness: float) -> float:

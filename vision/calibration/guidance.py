@@ -126,14 +126,14 @@ def extent(corners: Corners, image_size_px: tuple[int, int]) -> float:
 
 
 def rough_tilt_deg(corners: Corners, board: Board, image_size_px: tuple[int, int]) -> tuple[float, float]:
-    """How far the board is turned out of the plane it would have square to the line of sight, as `Coverage` has it."""
+    """How far the board is turned out of the image plane, as `Coverage` has it.
+
+    Not out of the plane square to the line of sight: parallel to the image plane a board is seen without perspective
+    wherever it is, and tells nothing of the focal length.
+    """
     width, height = image_size_px
     focal = _USUAL_FOCAL * width
     lens = Lens("pinhole", (focal, focal), (0.5 * (width - 1), 0.5 * (height - 1)), (0.0,) * 5)
-    pose = pose_of(corners, board.corners_m, lens)
-    R = cv2.Rodrigues(pose[:3])[0]
-    middle = R @ board.corners_m.mean(axis=0) + pose[3:]
-    sight = middle / np.linalg.norm(middle)
-    normal = R[:, 2] * np.sign(R[:, 2] @ sight)
-    off = normal - sight
-    return tuple(np.degrees(np.arcsin(np.clip(-off[:2], -1.0, 1.0))).tolist())
+    normal = cv2.Rodrigues(pose_of(corners, board.corners_m, lens)[:3])[0][:, 2]
+    right, lower = np.degrees(np.arcsin(-normal[:2] * np.sign(normal[2]))).tolist()
+    return right, lower

@@ -35,8 +35,8 @@ def lacking(coverage: Coverage) -> list[str]:
     tilted = np.count_nonzero(coverage.largest_tilts_deg > _TILTED_DEG)
     if coverage.stereo_views and tilted < _LEAST_TILTED:
         reasons.append(
-            f"the board faces the cameras in all views but {tilted}: focal length and distance cannot be told apart. "
-            "Tilt it by 20° to 40°, each way"
+            f"the board faces the cameras in all views{f' but {tilted}' if tilted else ''}: focal length and distance "
+            "cannot be told apart. Tilt it by 20° to 40°, each way"
         )
     for eye in EYES:
         covered = coverage.covered(eye)
