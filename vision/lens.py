@@ -20,6 +20,8 @@ DISTORTION_NAMES: dict[Model, tuple[str, ...]] = {
 }
 _ITERATIONS = 30
 _CONVERGED = 1e-12
+_WIDEST_RAD = 1.5
+_LEAST_SLOPE = 0.05
 
 
 @dataclass(frozen=True)
@@ -82,17 +84,41 @@ class Lens:
     def directions(self, px: FloatArray) -> FloatArray:
         """Directions (n, 2) as (x/z, y/z) of what is seen at (n, 2) [px], by Newton's method."""
         px = np.reshape(np.asarray(px, dtype=np.float64), (-1, 2))
-        found = (px - np.array(self.principal_point_px)) / np.array(self.focal_px)
+        flat = (px - np.array(self.principal_point_px)) / np.array(self.focal_px)
+        if self.model == "fisheye":
+            seen = np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-12)
+            return flat / seen * np.tan(self._angle(seen))
+        return self._undistorted(flat, px)
+
+    def _angle(self, seen: FloatArray) -> FloatArray:
+        """Angle off the axis [rad] of what is seen this far from the principal point, in focal lengths."""
+        # Kannala & Brandt 2006, eq. (6)
+        powers = np.array([3, 5, 7, 9])
+        k = np.array(self.distortion)
+        angle = np.minimum(seen, _WIDEST_RAD)
         for _ in range(_ITERATIONS):
-            step = self._newton_step(found, px)
+            value = angle + (angle[..., None] ** powers) @ k
+            slope = 1.0 + (angle[..., None] ** (powers - 1)) @ (k * powers)
+            moved = np.clip(angle - (value - seen) / np.maximum(slope, _LEAST_SLOPE), 0.0, _WIDEST_RAD)
+            done = np.max(np.abs(moved - angle), initial=0.0) < _CONVERGED
+            angle = moved
+            if done:
+                break
+        return angle
+
+    def _undistorted(self, start: FloatArray, px: FloatArray) -> FloatArray:
+        found = start
+        for _ in range(_ITERATIONS):
+            ahead = np.column_stack([found, np.ones(len(found))])
+            h = 1e-6
+            shifts = h * np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+            value, right, down = (self.project(ahead + shift) for shift in shifts)
+            (a, c), (b, d) = ((right - value) / h).T, ((down - value) / h).T
+            u, v = (value - px).T
+            # Where a lens folds the image over there is no direction; the step is kept short, and says nothing.
+            determinant = np.maximum(a * d - b * c, _LEAST_SLOPE * self.focal_px[0] * self.focal_px[1])
+            step = np.column_stack([d * u - b * v, a * v - c * u]) / determinant[:, None]
             found = found - step
             if np.max(np.abs(step), initial=0.0) < _CONVERGED:
                 break
         return found
-
-    def _newton_step(self, at: FloatArray, px: FloatArray) -> FloatArray:
-        ahead = np.column_stack([at, np.ones(len(at))])
-        h = 1e-6
-        value, right, down = (self.project(ahead + shift) for shift in h * np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]]))
-        slopes = np.stack([right - value, down - value], axis=2) / h
-        return np.linalg.solve(slopes, (value - px)[..., None])[..., 0]

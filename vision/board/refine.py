@@ -20,12 +20,14 @@ IntArray = NDArray[np.int64]
 
 _REACH = 0.35  # of a square: how far along the edges
 _NEIGHBOURS = 1.6  # squares: what tells the board's directions at a corner
-_ITERATIONS = 12
+_ITERATIONS = 8
 _CONVERGED_PX = 1e-3
 _MOST_MOVED = 0.2  # of a square
 _LEAST_STRIP_PX = 1.0
 _BLURRED_PX = 1.5  # beside an edge: what gradients mix in
 _BORDER_PX = 2.0
+_MOST_REACH_PX = 40
+_MOST_CONDITION = 1e4
 
 
 def refined(grey: ImageArray, board: Board, numbers: IntArray, px: FloatArray) -> tuple[IntArray, FloatArray]:
@@ -38,9 +40,14 @@ def refined(grey: ImageArray, board: Board, numbers: IntArray, px: FloatArray) -
     levels = np.asarray(grey, dtype=np.float64)
     slopes = np.stack([cv2.Scharr(levels, cv2.CV_64F, 1, 0), cv2.Scharr(levels, cv2.CV_64F, 0, 1)], axis=-1) / 32.0
     frames = _frames(board, numbers, px)
-    moved = [_crossing(slopes, at, frame, board) for at, frame in zip(px, frames, strict=True)]
-    kept = [k for k, each in enumerate(moved) if each is not None]
-    return numbers[kept], np.array([each for each in moved if each is not None]).reshape(-1, 2)
+    usable = np.isfinite(frames).all(axis=(1, 2)) & (np.abs(np.linalg.det(np.nan_to_num(frames))) > 1.0)
+    numbers, px, frames = numbers[usable], px[usable], frames[usable]
+    moved = _crossings(slopes, px, frames, board)
+    squares = np.linalg.norm(np.linalg.solve(frames, (moved - px)[..., None])[..., 0], axis=1)
+    size = np.array([levels.shape[1], levels.shape[0]])
+    inside = ((moved > _BORDER_PX) & (moved < size - 1 - _BORDER_PX)).all(axis=1)
+    kept = inside & (squares < _MOST_MOVED)
+    return numbers[kept], moved[kept]
 
 
 def _frames(board: Board, numbers: IntArray, px: FloatArray) -> FloatArray:
@@ -66,42 +73,40 @@ def _frames(board: Board, numbers: IntArray, px: FloatArray) -> FloatArray:
     return found
 
 
-def _crossing(slopes: FloatArray, start: FloatArray, frame: FloatArray, board: Board) -> FloatArray | None:
-    """Where the edges cross near `start`; None where that is not in the image or far away."""
-    if not np.all(np.isfinite(frame)) or abs(np.linalg.det(frame)) < 1.0:
-        return None
-    height, width = slopes.shape[:2]
-    into_squares = np.linalg.inv(frame)
+def _crossings(slopes: FloatArray, start: FloatArray, frames: FloatArray, board: Board) -> FloatArray:
+    """Where the edges cross near `start`, shape (n, 2) [px]; not a number where nothing tells."""
+    into_squares = np.linalg.inv(frames)
     # What is left white of a square beside its marker.
     strip = 0.5 * (1.0 - board.marker_side_m / board.square_m)
-    strip_px = strip / np.linalg.norm(into_squares, axis=1)
-    half_widths = np.maximum(strip_px - _BLURRED_PX, np.minimum(strip_px, _LEAST_STRIP_PX)) * np.linalg.norm(into_squares, axis=1)
-    reach = np.abs(frame).sum(axis=1) * _REACH + 1.0
+    squares_a_px = np.linalg.norm(into_squares, axis=2)
+    strip_px = strip / squares_a_px
+    half_widths = np.maximum(strip_px - _BLURRED_PX, np.minimum(strip_px, _LEAST_STRIP_PX)) * squares_a_px
+    reach = min(int(np.ceil(_REACH * np.abs(frames).sum(axis=2).max(initial=0.0))) + 1, _MOST_REACH_PX)
+    window = np.stack(np.meshgrid(np.arange(-reach, reach + 1), np.arange(-reach, reach + 1)), axis=-1).reshape(-1, 2)
+    padded = np.pad(slopes, ((reach, reach), (reach, reach), (0, 0)))
+    limits = np.array([slopes.shape[1], slopes.shape[0]]) - 1
     at = start
     for _ in range(_ITERATIONS):
-        if not np.all((at > _BORDER_PX) & (at < np.array([width, height]) - 1 - _BORDER_PX)):
-            return None
-        low = np.maximum(np.floor(at - reach).astype(int), 1)
-        high = np.minimum(np.ceil(at + reach).astype(int) + 1, [width - 1, height - 1])
-        u, v = np.meshgrid(np.arange(low[0], high[0]), np.arange(low[1], high[1]))
-        p = np.stack([u.ravel(), v.ravel()], axis=1).astype(np.float64)
-        squares = np.abs((p - at) @ into_squares.T)
-        weights = _cross(squares, half_widths)
-        g = slopes[low[1] : high[1], low[0] : high[0]].reshape(-1, 2)
-        G = (g * weights[:, None]).T @ g
-        if np.linalg.cond(G) > 1e4:
-            return None
-        along = np.einsum("ni,ni->n", g, p - at)
-        step = np.linalg.solve(G, g.T @ (weights * along))
+        middle = np.clip(np.nan_to_num(np.rint(at)), 0, limits).astype(int)
+        p = (middle[:, None] + window) - at[:, None]
+        pixels = middle[:, None] + window + reach
+        g = padded[pixels[..., 1], pixels[..., 0]]
+        weights = _cross(np.abs(np.einsum("nij,nkj->nki", into_squares, p)), half_widths[:, None])
+        weighed = g * weights[..., None]
+        G = np.einsum("nki,nkj->nij", weighed, g)
+        # Edges of one direction alone tell no crossing.
+        told = np.linalg.cond(G) < _MOST_CONDITION
+        h = np.einsum("nki,nk->ni", weighed, np.einsum("nki,nki->nk", g, p))
+        step = np.full_like(at, np.nan)
+        step[told] = np.linalg.solve(G[told], h[told][..., None])[..., 0]
         at = at + step
-        if np.linalg.norm(step) < _CONVERGED_PX:
+        if np.nanmax(np.abs(step), initial=0.0) < _CONVERGED_PX:
             break
-    moved = np.linalg.norm(into_squares @ (at - start))
-    return at if moved < _MOST_MOVED else None
+    return at
 
 
 def _cross(squares: FloatArray, half_widths: FloatArray) -> FloatArray:
-    """Weights of places (n, 2) [squares from the corner]: of a strip along each edge, fading at its end and sides."""
+    """Weights of places (..., 2) [squares from the corner]: of a strip along each edge, fading at its end and sides."""
     fade = np.clip((_REACH - squares) / 0.12, 0.0, 1.0)
     within = np.clip((half_widths - squares) / (0.4 * half_widths), 0.0, 1.0)
-    return np.maximum(within[:, 1] * fade[:, 0], within[:, 0] * fade[:, 1])
+    return np.maximum(within[..., 1] * fade[..., 0], within[..., 0] * fade[..., 1])

@@ -97,10 +97,7 @@ def calibrate(
     if reasons := lacking(coverage):
         raise CalibrationError(together(reasons))
     models: tuple[Model, ...] = ("pinhole", "fisheye") if asked.model == "auto" else (asked.model,)
-    fits: dict[Model, Fitted] = {}
-    for model in models:
-        tell(f"fitting {model} lenses to {len(views)} views")
-        fits[model] = fit(views, board.corners_m, asked.image_size_px, model)
+    fits = _fits(views, board, asked.image_size_px, models, tell)
     model = _chosen(fits)
     rig = _rig(fits[model], board, asked)
     reasons = unsure(rig)
@@ -112,6 +109,23 @@ def calibrate(
     return Calibrated(rig, board, fits[model], rivals, coverage)
 
 
+def _fits(
+    views: Sequence[View], board: Board, image_size_px: tuple[int, int], models: Sequence[Model], tell: Callable[[str], None]
+) -> dict[Model, Fitted]:
+    """What fits of the models; CalibrationError with the first one's reason when none does."""
+    fits: dict[Model, Fitted] = {}
+    refusals: list[CalibrationError] = []
+    for model in models:
+        tell(f"fitting {model} lenses to {len(views)} views")
+        try:
+            fits[model] = fit(views, board.corners_m, image_size_px, model)
+        except CalibrationError as error:
+            refusals.append(error)
+    if not fits:
+        raise refusals[0]
+    return fits
+
+
 def fit(views: Sequence[View], corners_m: FloatArray, image_size_px: tuple[int, int], model: Model) -> Fitted:
     """One model's fit; views that do not fit the others are left out, the worst first.
 
@@ -121,7 +135,6 @@ def fit(views: Sequence[View], corners_m: FloatArray, image_size_px: tuple[int, 
     kept = list(views)
     left_out: list[LeftOut] = []
     vector, poses = start(kept, corners_m, image_size_px, model)
-    _require_places(model, vector)
     while True:
         bundle = solve(kept, corners_m, model, vector, poses)
         worst = _outlier(bundle.view_rms_px())
@@ -136,6 +149,7 @@ def fit(views: Sequence[View], corners_m: FloatArray, image_size_px: tuple[int, 
                 "instant?"
             )
         vector, poses = bundle.vector, np.delete(bundle.poses, worst, axis=0)
+    _require_places(model, bundle.vector)
     return Fitted(tuple(kept), tuple(left_out), bundle, held_out(kept, corners_m, bundle))
 
 

@@ -42,7 +42,7 @@ def pair_files(folder: Path, left: str | None, right: str | None, *, side_by_sid
     folders; what else the names have is the view's.
 
     Args:
-        left, right: patterns of the eyes' files, as in left*.png; numbers in the names tell what belongs together.
+        left, right: patterns of the eyes' files, as in left*.png; those belong together that have the same for the star.
 
     Raises:
         CalibrationError: there is no such folder, or it has no pairs.
@@ -53,7 +53,7 @@ def pair_files(folder: Path, left: str | None, right: str | None, *, side_by_sid
         files = _images(folder, "*")
         pairs = [PairFiles(file.stem, file, file) for file in files]
     elif left is not None and right is not None:
-        pairs = _matched(*({_number(file): file for file in _images(folder, each)} for each in (left, right)))
+        pairs = _matched(*({_varied(file, each): file for file in _images(folder, each)} for each in (left, right)))
     else:
         pairs = _matched(*_by_eye(folder))
     if not pairs:
@@ -104,8 +104,10 @@ def _images(folder: Path, pattern: str) -> list[Path]:
     return sorted(file for file in folder.glob(pattern) if file.suffix.lower() in _ENDINGS)
 
 
-def _number(file: Path) -> str:
-    return "-".join(number.lstrip("0") or "0" for number in re.findall(r"\d+", file.stem)) or file.stem
+def _varied(file: Path, pattern: str) -> str:
+    """What a file's name has in the place of the stars of its pattern."""
+    wild = re.fullmatch("(.*)".join(map(re.escape, Path(pattern).name.split("*"))), file.name)
+    return file.stem if wild is None else "-".join(wild.groups())
 
 
 def _by_eye(folder: Path) -> tuple[dict[str, Path], dict[str, Path]]:
