@@ -29,7 +29,9 @@ def cameras_view(found: CamerasFile) -> Group:
 def check_view(found: CheckFile, name: str) -> Group:
     """The figures with what they should be, then the verdict."""
     table = _table(f"{name}, {found.corners} corners", "measured", "95 %", "should be")
-    table.add_row(Text("rows of both eyes apart [px]"), f"{found.rows_px:+.3f}", f"± {found.rows_half_width_px:.3f}", "0")
+    table.add_row(
+        Text("rows of both eyes apart [px]"), f"{found.rows_px:+.3f}", f"± {found.rows_half_width_px:.3f}", "0"
+    )
     table.add_row(Text("  RMS of all corners [px]"), f"{found.epipolar_px:.3f}", "", "")
     table.add_row(Text("one eye rolled [°]"), f"{found.roll_deg:+.3f}", f"± {found.roll_half_width_deg:.3f}", "0")
     table.add_row(
@@ -42,8 +44,9 @@ def check_view(found: CheckFile, name: str) -> Group:
 def _sentences(found: CamerasFile) -> list[str]:
     across, down, ahead = found.position_half_widths_mm
     said = [
-        f"Baseline {found.baseline_mm:.2f} ± {found.baseline_half_width_mm:.2f} mm (95 %). A position {AHEAD_M:g} m ahead "
-        f"is known to ± {across:.2f} mm across, {down:.2f} down, {ahead:.2f} in depth, as far as the calibration goes.",
+        f"Baseline {found.baseline_mm:.2f} ± {found.baseline_half_width_mm:.2f} mm (95 %). A position {AHEAD_M:g} m "
+        f"ahead is known to ± {across:.2f} mm across, {down:.2f} down, {ahead:.2f} in depth, as far as the calibration "
+        "goes.",
         f"Views that were not fitted are foretold to {found.held_out_px:.3f} px (RMS per coordinate; fitted "
         f"{found.reprojection_px:.3f}); {len(found.views)} views of {found.board}. {_rivals(found)}",
     ]

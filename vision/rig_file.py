@@ -90,7 +90,8 @@ def write_rig(rig: StereoRig, file: Path) -> None:
     Raises:
         ConfigError: the folder cannot be written to.
     """
-    text = f"# Written by `bodyschema calibrate cameras`. docs/calibrating_cameras.md says what each entry is.\n{_text(rig)}"
+    heading = "# Written by `bodyschema calibrate cameras`. docs/calibrating_cameras.md says what each entry is."
+    text = f"{heading}\n{_text(rig)}"
     part = file.with_name(f"{file.name}.part")
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
@@ -147,7 +148,7 @@ def _checked(found: _File, file: Path, text: str) -> StereoRig:
         for at, size in zip(eye.principal_point_px, found.image_size_px, strict=True):
             if not 0 <= at <= size:
                 raise wrong(f"{at:g} is outside an image of {found.image_size_px}", name, "principal_point_px")
-    if not 1e-3 <= float(np.linalg.norm(found.right_from_left.translation_m)):
+    if not float(np.linalg.norm(found.right_from_left.translation_m)) >= 1e-3:
         raise wrong("the eyes are in one place", "right_from_left", "translation_m")
     uncertainty = found.uncertainty
     names = parameter_names(found.model)

@@ -18,7 +18,9 @@ def covariance_of(rig: StereoRig, figures: Callable[[StereoRig], FloatArray]) ->
     vector, sigma = rig.vector, rig.sigma
     slopes = []
     for k, step in enumerate(_STEP * sigma):
-        forward, backward = (figures(rig.with_vector(vector + sign * step * np.eye(len(vector))[k])) for sign in (1, -1))
+        forward, backward = (
+            figures(rig.with_vector(vector + sign * step * np.eye(len(vector))[k])) for sign in (1, -1)
+        )
         slopes.append((forward - backward) / (2.0 * step))
     J = np.array(slopes)
     return J.T @ rig.covariance @ J

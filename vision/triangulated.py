@@ -9,7 +9,6 @@ from interfaces.records import FloatArray
 from .rig import StereoRig
 
 
-
 def triangulated(rig: StereoRig, left_px: FloatArray, right_px: FloatArray) -> FloatArray:
     """Points (n, 3) [m] in the left camera's own frame of what is seen at (n, 2) [px] by each eye.
 
@@ -24,5 +23,3 @@ def triangulated(rig: StereoRig, left_px: FloatArray, right_px: FloatArray) -> F
     along_a = (ae * bb - ab * be) / nearness
     along_b = (ab * ae - aa * be) / nearness
     return 0.5 * (along_a[:, None] * a + eye + along_b[:, None] * b)
-
-

@@ -37,8 +37,8 @@ def board(
     made = board_of(squares, square_mm, marker_mm=marker_mm, dictionary=dictionary, pattern=pattern)
     across, upright = write_board(made, paper, out)
     Console(highlight=False).print(
-        f"{out} written: {made.name}. Print it at 100 %, then measure: the line below the board is {across:g} mm, the one "
-        f"beside it {upright:g} mm.",
+        f"{out} written: {made.name}. Print it at 100 %, then measure: the line below the board is {across:g} mm, the "
+        f"one beside it {upright:g} mm.",
         markup=False,
         soft_wrap=True,
     )

@@ -78,9 +78,7 @@ def cameras(
     from daemon.camera_calibration_view import cameras_view
     from daemon.wire import encode
 
-    board = board_of(
-        squares, square_mm, marker_mm=marker_mm, dictionary=dictionary, pattern=pattern, ruler_mm=ruler_mm
-    )
+    board = board_of(squares, square_mm, marker_mm=marker_mm, dictionary=dictionary, pattern=pattern, ruler_mm=ruler_mm)
     wanted = Wanted((left_serial, right_serial), lens, 0.01 * scale_sigma_percent, baseline_mm)
     progress = Console(stderr=True, highlight=False)
 
@@ -130,9 +128,7 @@ def check(
     from daemon.camera_calibration_view import check_view
     from daemon.wire import encode
 
-    board = board_of(
-        squares, square_mm, marker_mm=marker_mm, dictionary=dictionary, pattern=pattern, ruler_mm=ruler_mm
-    )
+    board = board_of(squares, square_mm, marker_mm=marker_mm, dictionary=dictionary, pattern=pattern, ruler_mm=ruler_mm)
     found, name = checked(calibration, Images(images, left, right, side_by_side), board)
     if as_json:
         sys.stdout.write(encode(found).decode() + "\n")

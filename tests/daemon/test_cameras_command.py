@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from contextlib import redirect_stdout
 from io import StringIO
 from pathlib import Path
@@ -11,16 +10,14 @@ import cv2
 import msgspec
 import numpy as np
 import pytest
+from board_renderer import Photographer, Printed, Taken
+from shown_board import photographed
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "vision"))
-from board_renderer import Photographer, Printed, Taken  # noqa: E402
-from shown_board import photographed  # noqa: E402
-
-from daemon.camera_calibration import CamerasFile, CheckFile  # noqa: E402
-from daemon.cli import app  # noqa: E402
-from interfaces.errors import ConfigError  # noqa: E402
-from vision.rig import CalibrationError  # noqa: E402
-from vision.rig_file import read_rig  # noqa: E402
+from daemon.camera_calibration import CamerasFile, CheckFile
+from daemon.cli import app
+from interfaces.errors import ConfigError
+from vision.rig import CalibrationError
+from vision.rig_file import read_rig
 
 
 def called(*arguments: object) -> None:
@@ -145,5 +142,5 @@ def test_the_board_is_written(tmp_path, ending, capsys) -> None:
 
 
 def test_a_board_of_another_ending_is_refused(tmp_path) -> None:
-    with pytest.raises(ConfigError, match="neither .pdf nor .svg"):
+    with pytest.raises(ConfigError, match=r"neither \.pdf nor \.svg"):
         called("board", "--out", tmp_path / "board.png")

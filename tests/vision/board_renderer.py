@@ -122,7 +122,8 @@ class Printed:
         words = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{self.dictionary}"))
         inner = words.markerSize + 2
         n = round(inner / self.marker_share)
-        assert abs(n * self.marker_share - inner) < 1e-9 and (n - inner) % 2 == 0
+        assert abs(n * self.marker_share - inner) < 1e-9
+        assert (n - inner) % 2 == 0
         picture = np.ones((self.rows * n, self.columns * n), np.uint8)
         number = 0
         for r in range(self.rows):
@@ -214,7 +215,10 @@ class Photographer:
         height, width = picture.shape
         lit = taken.black + (taken.white - taken.black) * picture
         direction = self.rng.uniform(0, 2 * np.pi)
-        across = np.cos(direction) * np.linspace(-0.5, 0.5, width) + np.sin(direction) * np.linspace(-0.5, 0.5, height)[:, None]
+        across = (
+            np.cos(direction) * np.linspace(-0.5, 0.5, width)
+            + np.sin(direction) * np.linspace(-0.5, 0.5, height)[:, None]
+        )
         lit = taken.exposure * lit * (1 + taken.shading * across)
         if taken.motion_px > 0:
             length = int(np.ceil(taken.motion_px)) | 1
@@ -225,7 +229,9 @@ class Photographer:
         grey = np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
         image = cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR)
         if taken.jpeg is not None:
-            image = cv2.imdecode(cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, taken.jpeg])[1], cv2.IMREAD_COLOR)
+            image = cv2.imdecode(
+                cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, taken.jpeg])[1], cv2.IMREAD_COLOR
+            )
         return image
 
 
@@ -258,7 +264,9 @@ def webcams(rng: np.random.Generator, *, fisheye: bool = False, size_px: tuple[i
     return TrueRig(lens(), lens(), turned, t, size_px)
 
 
-def poses(rng: np.random.Generator, rig: TrueRig, board: Printed, count: int = 20) -> list[tuple[FloatArray, FloatArray]]:
+def poses(
+    rng: np.random.Generator, rig: TrueRig, board: Printed, count: int = 20
+) -> list[tuple[FloatArray, FloatArray]]:
     """Poses as a careful person shows the board: all over both images, tilted each way, near and far."""
     found: list[tuple[FloatArray, FloatArray]] = []
     width, height = rig.size_px
@@ -267,12 +275,16 @@ def poses(rng: np.random.Generator, rig: TrueRig, board: Printed, count: int = 2
     while len(found) < count:
         tilt = rng.uniform(np.radians(5), np.radians(40))
         axis = rng.uniform(0, 2 * np.pi)
-        R = Rotation.from_rotvec(tilt * np.array([np.cos(axis), np.sin(axis), 0])) * Rotation.from_euler("z", rng.normal(0, 0.3))
+        R = Rotation.from_rotvec(tilt * np.array([np.cos(axis), np.sin(axis), 0])) * Rotation.from_euler(
+            "z", rng.normal(0, 0.3)
+        )
         share = rng.uniform(0.35, 0.75)
         z = rig.left.focal_px[0] * board.square_m * board.columns / (share * width)
         cell = np.array([wanted % 3, wanted // 3 % 3])
         at = (cell + rng.uniform(0.1, 0.9, 2)) / 3 * (0.5 + 0.5 * (1 - share)) + 0.25 * share
-        middle_eye = np.array([(at[0] - 0.5) * width, (at[1] - 0.5) * height, rig.left.focal_px[0]]) * z / rig.left.focal_px[0]
+        middle_eye = (
+            np.array([(at[0] - 0.5) * width, (at[1] - 0.5) * height, rig.left.focal_px[0]]) * z / rig.left.focal_px[0]
+        )
         middle_eye[0] += 0.5 * rig.baseline_m
         pose = R.as_matrix(), middle_eye - R.as_matrix() @ middle
         if _seen(rig, board, *pose) > 0.75:

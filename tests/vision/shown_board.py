@@ -38,7 +38,8 @@ def corner_views(rig: TrueRig, rng: np.random.Generator, count: int = 20, noise_
     """Views whose corners are the exact ones and noise."""
     photographer = Photographer(rig, Printed(), Taken(), rng)
     return [
-        view_of(f"{k:02d}", photographer, pose, rng, noise_px) for k, pose in enumerate(poses(rng, rig, Printed(), count))
+        view_of(f"{k:02d}", photographer, pose, rng, noise_px)
+        for k, pose in enumerate(poses(rng, rig, Printed(), count))
     ]
 
 
@@ -58,7 +59,9 @@ def view_of(
 
 
 @cache
-def photographed(seed: int = 7, count: int = 12) -> tuple[TrueRig, tuple[ImagePair, ...], tuple[tuple[FloatArray, FloatArray], ...]]:
+def photographed(
+    seed: int = 7, count: int = 12
+) -> tuple[TrueRig, tuple[ImagePair, ...], tuple[tuple[FloatArray, FloatArray], ...]]:
     """A rig, its images of the board, and the board's poses in them."""
     rng = np.random.default_rng(seed)
     rig = webcams(rng)

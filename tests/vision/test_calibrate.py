@@ -66,7 +66,7 @@ def test_intervals_cover_over_many_rigs() -> None:
     z = np.abs(np.concatenate(misses))
     # Parameters of one rig are not independent: 10 rigs are worth about sixty.
     assert 0.55 < np.mean(z < 1.0) < 0.81
-    assert 0.88 < np.mean(z < 2.0)
+    assert np.mean(z < 2.0) > 0.88
 
 
 def test_opencvs_stereo_calibration_agrees(planted) -> None:
@@ -86,7 +86,9 @@ def test_views_of_one_eye_alone_count_too(planted) -> None:
     _, views = planted
     alone = [replace(view, right=None) if k % 3 == 0 else view for k, view in enumerate(views)]
     without = [view for view in alone if view.is_stereo]
-    sigmas = [np.sqrt(np.diag(fit(each, BOARD.corners_m, SIZE, "pinhole").bundle.covariance())) for each in (alone, without)]
+    sigmas = [
+        np.sqrt(np.diag(fit(each, BOARD.corners_m, SIZE, "pinhole").bundle.covariance())) for each in (alone, without)
+    ]
     assert sigmas[0][0] < sigmas[1][0]
 
 
@@ -107,7 +109,7 @@ def test_the_held_out_error_is_that_of_new_views(planted) -> None:
 
 def test_a_view_that_moved_between_the_eyes_is_left_out_and_named(planted) -> None:
     _, views = planted
-    moved = replace(views[6], right=replace(views[6].right, px=views[6].right.px + [2.5, 0.5]))
+    moved = replace(views[6], right=replace(views[6].right, px=views[6].right.px + np.array([2.5, 0.5])))
     found = fit([*views[:6], moved, *views[7:]], BOARD.corners_m, SIZE, "pinhole")
     assert [each.name for each in found.left_out] == [moved.name]
     assert found.left_out[0].rms_px > 5 * found.left_out[0].usual_px

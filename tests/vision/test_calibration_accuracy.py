@@ -1,4 +1,6 @@
-"""Calibrations from rendered images of many rigs: `python -m pytest -m soak tests/vision/test_calibration_accuracy.py -s`.
+"""Calibrations from rendered images of many rigs.
+
+`python -m pytest -m soak tests/vision/test_calibration_accuracy.py -s --timeout 3600` prints the figures.
 
 No rig is left out of the figures; one that is refused counts as a failure and is printed.
 """

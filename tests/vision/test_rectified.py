@@ -108,9 +108,9 @@ def test_cameras_that_were_not_calibrated_are_refused_and_closed_again() -> None
 def test_an_image_of_another_size_is_an_error_of_the_source() -> None:
     black = np.zeros((SIZE[1], SIZE[0], 3), np.uint8)
     eyes = Eyes([StereoFrame(0.0, black, black[::2])])
-    with RectifiedCamera(eyes, known_rig(webcams(np.random.default_rng(6)))) as camera:
-        with pytest.raises(SourceError, match="an image of 640x240, calibrated was 640x480"):
-            camera.read(0.1)
+    camera = RectifiedCamera(eyes, known_rig(webcams(np.random.default_rng(6))))
+    with camera, pytest.raises(SourceError, match="an image of 640x240, calibrated was 640x480"):
+        camera.read(0.1)
 
 
 # --- check

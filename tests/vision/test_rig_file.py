@@ -58,10 +58,18 @@ DAMAGE = [
     (r"image_size_px = .*", 'image_size_px = "VGA"', r"image_size_px"),
     (r"principal_point_px = \[[^,]*,", "principal_point_px = [9000.0,", r"left.principal_point_px: 9000 is outside"),
     (r"distortion = \[[^,]*, ", "distortion = [", r"left.distortion: \d coefficients, (pinhole has 5|fisheye has 4)"),
-    (r"translation_m = .*", "translation_m = [0.0, 0.0, 0.0]", r"right_from_left.translation_m: the eyes are in one place"),
+    (
+        r"translation_m = .*",
+        "translation_m = [0.0, 0.0, 0.0]",
+        r"right_from_left.translation_m: the eyes are in one place",
+    ),
     (r"sigma = \[[^,]*, ", "sigma = [", r"uncertainty.sigma: \d\d numbers, not \d\d"),
     (r"sigma = \[[^,]*,", "sigma = [-1.0,", r"uncertainty.sigma"),
-    (r"correlation = \[\[1.0,", "correlation = [[0.5,", r"uncertainty.correlation: not symmetric with 1 on its diagonal"),
+    (
+        r"correlation = \[\[1.0,",
+        "correlation = [[0.5,",
+        r"uncertainty.correlation: not symmetric with 1 on its diagonal",
+    ),
     (r"correlation = \[\[[^\]]*\],", "correlation = [", r"uncertainty.correlation: not \d\d rows of \d\d numbers"),
     (r'names = \["left.fx_px"', 'names = ["left.gx_px"', r"uncertainty.names: not the parameters of"),
     (r'format = ".*"', 'format = "bodyschema stereo rig 9"', r"of another format: 'bodyschema stereo rig 9'"),
@@ -80,7 +88,7 @@ def test_damage_is_named_with_its_line(rig, tmp_path, what, by, said) -> None:
     file.write_text(damaged)
     with pytest.raises(ConfigError, match=said) as raised:
         read_rig(file)
-    if 'format = ".*"\\n' != what:
+    if what != 'format = ".*"\\n':
         assert raised.value.line is not None
 
 

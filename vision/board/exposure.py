@@ -27,5 +27,3 @@ def image_fault(grey: ImageArray) -> tuple[Literal["dark", "over_exposed", "blur
     if edge > _MOST_EDGE_PX:
         return "blurred", f"blurred: the sharpest edge has a 1-sigma of {edge:.1f} px. Focus; hold the board still"
     return None
-
-

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import pairwise
 
 from interfaces.errors import ConfigError
 
@@ -143,8 +144,10 @@ def _markers(board: Board, x: float, y: float) -> list[Rectangle]:
 
 def _black_runs(cells: list[float]) -> list[tuple[int, int]]:
     """Neighbouring black cells are one rectangle: viewers draw hairs between two."""
-    edges = [k for k in range(len(cells) + 1) if (0 < k < len(cells) and cells[k] != cells[k - 1]) or k in (0, len(cells))]
-    return [(a, b) for a, b in zip(edges, edges[1:], strict=False) if cells[a] == 0]
+    edges = [
+        k for k in range(len(cells) + 1) if (0 < k < len(cells) and cells[k] != cells[k - 1]) or k in (0, len(cells))
+    ]
+    return [(a, b) for a, b in pairwise(edges) if cells[a] == 0]
 
 
 def _ruler(x: float, y: float, length: float, *, upright: bool) -> list[Rectangle]:

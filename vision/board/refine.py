@@ -65,7 +65,7 @@ def _frames(board: Board, numbers: IntArray, px: FloatArray) -> FloatArray:
         if np.linalg.matrix_rank(model) < 2:
             if H is None:
                 continue
-            steps = np.array([place - [0.5, 0.0], place + [0.5, 0.0], place - [0.0, 0.5], place + [0.0, 0.5]])
+            steps = place + 0.5 * np.array([[-1.0, 0.0], [1.0, 0.0], [0.0, -1.0], [0.0, 1.0]])
             seen = cv2.perspectiveTransform(steps[:, None], H)[:, 0]
             found[k] = np.column_stack([seen[1] - seen[0], seen[3] - seen[2]])
             continue

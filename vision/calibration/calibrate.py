@@ -110,7 +110,11 @@ def calibrate(
 
 
 def _fits(
-    views: Sequence[View], board: Board, image_size_px: tuple[int, int], models: Sequence[Model], tell: Callable[[str], None]
+    views: Sequence[View],
+    board: Board,
+    image_size_px: tuple[int, int],
+    models: Sequence[Model],
+    tell: Callable[[str], None],
 ) -> dict[Model, Fitted]:
     """What fits of the models; CalibrationError with the first one's reason when none does."""
     fits: dict[Model, Fitted] = {}

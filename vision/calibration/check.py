@@ -127,7 +127,7 @@ def _wrong(found: FloatArray, sigma: FloatArray, focal_px: float, width_px: int,
         f"rows are {rows_px:+.2f} px apart: a camera has been turned up or down by "
         f"{np.degrees(abs(rows_px) / focal_px):.2f}°",
         f"a camera has been turned about its line of sight by {abs(roll_deg):.2f}°",
-        f"a square of {1e3 * nominal_m:g} mm is measured as {1e3 * square_m:.2f} mm: a camera has been turned inwards or "
-        "outwards, moved or refocused, or this is another board",
+        f"a square of {1e3 * nominal_m:g} mm is measured as {1e3 * square_m:.2f} mm: a camera has been turned inwards "
+        "or outwards, moved or refocused, or this is another board",
     )
     return [text for text, is_off in zip(texts, off, strict=True) if is_off]

@@ -15,6 +15,7 @@ from vision.rig import CalibrationError
 
 _ENDINGS = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".webp"}
 _EYE = re.compile(r"(?<![a-z])(left|right|l|r)(?![a-z])", re.IGNORECASE)
+_WILDCARD = re.compile(r"(\*|\?|\[[^\]]*\])")
 
 
 @dataclass(frozen=True)
@@ -42,7 +43,8 @@ def pair_files(folder: Path, left: str | None, right: str | None, *, side_by_sid
     folders; what else the names have is the view's.
 
     Args:
-        left, right: patterns of the eyes' files, as in left*.png; those belong together that have the same for the star.
+        left, right: patterns of the eyes' files, as in left*.png; equal texts for the star
+            belong together.
 
     Raises:
         CalibrationError: there is no such folder, or it has no pairs.
@@ -105,9 +107,12 @@ def _images(folder: Path, pattern: str) -> list[Path]:
 
 
 def _varied(file: Path, pattern: str) -> str:
-    """What a file's name has in the place of the stars of its pattern."""
-    wild = re.fullmatch("(.*)".join(map(re.escape, Path(pattern).name.split("*"))), file.name)
-    return file.stem if wild is None else "-".join(wild.groups())
+    """What a file's name has in the place of the stars and other wildcards of its pattern."""
+    parts = _WILDCARD.split(Path(pattern).name)
+    words = {"*": "(.*)", "?": "(.)"}
+    wild = "".join(words.get(part, f"({part})") if k % 2 else re.escape(part) for k, part in enumerate(parts))
+    found = re.fullmatch(wild, file.name)
+    return file.stem if found is None else "".join(found.groups())
 
 
 def _by_eye(folder: Path) -> tuple[dict[str, Path], dict[str, Path]]:

@@ -86,13 +86,19 @@ def unsure(rig: StereoRig) -> list[str]:
     for eye in EYES:
         focal = max(sigma[f"{eye}.f{axis}_px"] / value[f"{eye}.f{axis}_px"] for axis in "xy")
         if focal > _MOST_FOCAL_SIGMA:
-            reasons.append(f"the {eye} focal length is known to {focal:.1%} only. Take views with the board tilted more")
+            reasons.append(
+                f"the {eye} focal length is known to {focal:.1%} only. Take views with the board tilted more"
+            )
         centre = max(sigma[f"{eye}.c{axis}_px"] for axis in "xy")
         if centre > _MOST_CENTRE_SIGMA * width:
-            reasons.append(f"the {eye} principal point is known to {centre:.1f} px only. Take tilted views near corners")
+            reasons.append(
+                f"the {eye} principal point is known to {centre:.1f} px only. Take tilted views near corners"
+            )
     share = rig.baseline_sigma_m / rig.baseline_m
     if share > _MOST_BASELINE_SIGMA:
-        reasons.append(f"the baseline is known to {share:.1%} only. Take more views that both eyes see, near and tilted")
+        reasons.append(
+            f"the baseline is known to {share:.1%} only. Take more views that both eyes see, near and tilted"
+        )
     return reasons
 
 

@@ -53,14 +53,14 @@ def pose_of(seen: Corners, corners_m: FloatArray, lens: Lens) -> FloatArray:
     return min(found, key=lambda pose: float(np.sum((lens.project_posed(model, pose[:3], pose[3:])[0] - seen.px) ** 2)))
 
 
-def _lens(
-    seen: Sequence[Corners], corners_m: FloatArray, size_px: tuple[int, int], model: Model, eye: Eye
-) -> Lens:
+def _lens(seen: Sequence[Corners], corners_m: FloatArray, size_px: tuple[int, int], model: Model, eye: Eye) -> Lens:
     usable = [corners for corners in seen if len(corners) >= _LEAST_CORNERS]
     if len(usable) < 3:
         raise CalibrationError(f"the {eye} eye saw the board in {len(usable)} views. Take at least 3, better 20")
     if model == "fisheye":
-        return min((_fisheye(usable, corners_m, size_px, share) for share in _FISHEYE_FOCALS), key=lambda each: each[1])[0]
+        return min(
+            (_fisheye(usable, corners_m, size_px, share) for share in _FISHEYE_FOCALS), key=lambda each: each[1]
+        )[0]
     try:
         _, matrix, distortion, _, _ = cv2.calibrateCamera(
             [corners_m[each.numbers].astype(np.float32) for each in usable],
@@ -90,7 +90,10 @@ def _fisheye(
     lens = Lens("fisheye", (focal, focal), centre, (0.0,) * len(DISTORTION_NAMES["fisheye"]))
     try:
         off = [
-            np.linalg.norm(lens.project_posed(corners_m[each.numbers], *np.split(pose_of(each, corners_m, lens), 2))[0] - each.px, axis=1)
+            np.linalg.norm(
+                lens.project_posed(corners_m[each.numbers], *np.split(pose_of(each, corners_m, lens), 2))[0] - each.px,
+                axis=1,
+            )
             for each in seen
         ]
     except (cv2.error, np.linalg.LinAlgError, ValueError):
@@ -98,9 +101,7 @@ def _fisheye(
     return lens, float(np.median(np.concatenate(off)))
 
 
-def _between(
-    left: Sequence[FloatArray | None], right: Sequence[FloatArray | None]
-) -> tuple[Rotation, FloatArray]:
+def _between(left: Sequence[FloatArray | None], right: Sequence[FloatArray | None]) -> tuple[Rotation, FloatArray]:
     """The left eye's pose in the right one's frame: what most views agree on."""
     turns, places = [], []
     for a, b in zip(left, right, strict=True):

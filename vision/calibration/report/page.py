@@ -25,8 +25,8 @@ def page(found: Calibrated, gathered: Gathered) -> str:
     style = files(__package__).joinpath("page.css").read_text(encoding="utf-8")
     head = (
         f"<h1>Cameras calibrated: views that were not fitted are foretold to {rig.made.held_out_px:.2f} px</h1>"
-        f'<p class="of">{escape(rig.made.board)} · {escape(rig.made.date)} · left {escape(rig.serials[0] or "not named")}'
-        f" · right {escape(rig.serials[1] or 'not named')}</p>"
+        f'<p class="of">{escape(rig.made.board)} · {escape(rig.made.date)} '
+        f"· left {escape(rig.serials[0] or 'not named')} · right {escape(rig.serials[1] or 'not named')}</p>"
     )
     parts = (_tiles(found), _coverage(found), _residuals(found), _parameters(found), _views(found, gathered))
     return (
@@ -61,8 +61,8 @@ def _coverage(found: Calibrated) -> str:
     wishes = f"<ul>{''.join(f'<li>{escape(text)}' for text in missing)}</ul>" if missing else ""
     said = "It would be better with these views:" if missing else "Nothing is missing."
     return (
-        "<section><h2>Where the board was</h2><p>Every corner that was found. Red parts have too few: there the lens is "
-        f'a guess.</p><div class="pair">{figures}</div><p>{said}</p>{wishes}</section>'
+        "<section><h2>Where the board was</h2><p>Every corner that was found. Red parts have too few: there the lens "
+        f'is a guess.</p><div class="pair">{figures}</div><p>{said}</p>{wishes}</section>'
     )
 
 
@@ -76,9 +76,9 @@ def _residuals(found: Calibrated) -> str:
         for eye in EYES
     )
     return (
-        f"<section><h2>What is left</h2><p>From where each corner should be to where it was found, {stretch:g} times as "
-        "long as it is. Arrows that point in all directions are noise. Neighbours that agree are a lens that this model "
-        f'does not have, or a board that is not flat.</p><div class="pair">{figures}</div></section>'
+        f"<section><h2>What is left</h2><p>From where each corner should be to where it was found, {stretch:g} times "
+        "as long as it is. Arrows that point in all directions are noise. Neighbours that agree are a lens that this "
+        f'model does not have, or a board that is not flat.</p><div class="pair">{figures}</div></section>'
     )
 
 
@@ -108,9 +108,7 @@ def _views(found: Calibrated, gathered: Gathered) -> str:
             each = left_out[view.name]
             text = f"left out: {each.rms_px:.2f} px, the others have {each.usual_px:.2f}"
         figures.append(_view(view, gathered, text, is_bad=view.name in left_out))
-    faults = "".join(
-        f"<li>{escape(each.name)}, {each.eye}: {escape(each.fault.text)}" for each in gathered.unusable
-    )
+    faults = "".join(f"<li>{escape(each.name)}, {each.eye}: {escape(each.fault.text)}" for each in gathered.unusable)
     unusable = f"<h2>Images that could not be used</h2><ul>{faults}</ul>" if faults else ""
     return (
         f"<section><h2>The views</h2><p>Circles are the corners that were found; the first one is red.</p>"
