@@ -259,7 +259,7 @@ def figures(result: Calibrated, found: Gathered) -> CamerasFile:
         position_half_widths_mm=_position_half_widths_mm(rig),
         reprojection_px=rig.made.reprojection_px,
         held_out_px=rig.made.held_out_px,
-        held_out_by_model_px=dict[str, float](result.rivals_px),
+        held_out_by_model_px={str(model): px for model, px in result.rivals_px.items()},
         rectified_focal_px=Rectification(rig).calibration.focal_px,
         parameters=[Parameter(*each) for each in zip(rig.names, rig.vector.tolist(), widths.tolist(), strict=True)],
         views=[ViewFigures(view.name, rms, held_out) for view, rms, held_out in errors],

@@ -76,9 +76,11 @@ class Lens:
         """
         points, distortion = np.ascontiguousarray(x, dtype=np.float64).reshape(-1, 1, 3), np.array(self.distortion)
         if self.model == "pinhole":
-            px, J = cv2.projectPoints(points, rotation, translation, self.matrix, distortion)[:2]
+            seen = cv2.projectPoints(points, rotation, translation, self.matrix, distortion)
+            px, J = (np.asarray(each, dtype=np.float64) for each in seen[:2])
             return px.reshape(-1, 2), J[:, :6], J[:, 6 : 10 + len(distortion)]
-        px, J = cv2.fisheye.projectPoints(points, rotation, translation, self.matrix, distortion)[:2]
+        seen = cv2.fisheye.projectPoints(points, rotation, translation, self.matrix, distortion)
+        px, J = (np.asarray(each, dtype=np.float64) for each in seen[:2])
         return px.reshape(-1, 2), J[:, 8:14], J[:, :8]
 
     def directions(self, px: FloatArray) -> FloatArray:

@@ -271,7 +271,7 @@ def poses(
     found: list[tuple[FloatArray, FloatArray]] = []
     width, height = rig.size_px
     middle = 0.5 * board.square_m * np.array([board.columns, board.rows, 0.0])
-    wanted = 0
+    wanted = tries = 0
     while len(found) < count:
         tilt = rng.uniform(np.radians(5), np.radians(40))
         axis = rng.uniform(0, 2 * np.pi)
@@ -279,7 +279,8 @@ def poses(
             "z", rng.normal(0, 0.3)
         )
         share = rng.uniform(0.35, 0.75)
-        z = rig.left.focal_px[0] * board.square_m * board.columns / (share * width)
+        nearest = 2.0 * rig.baseline_m  # below that the eyes hardly share a view
+        z = max(rig.left.focal_px[0] * board.square_m * board.columns / (share * width), nearest)
         cell = np.array([wanted % 3, wanted // 3 % 3])
         at = (cell + rng.uniform(0.1, 0.9, 2)) / 3 * (0.5 + 0.5 * (1 - share)) + 0.25 * share
         middle_eye = (
@@ -287,9 +288,12 @@ def poses(
         )
         middle_eye[0] += 0.5 * rig.baseline_m
         pose = R.as_matrix(), middle_eye - R.as_matrix() @ middle
-        if _seen(rig, board, *pose) > 0.75:
+        tries += 1
+        is_seen = _seen(rig, board, *pose) > 0.75
+        if is_seen:
             found.append(pose)
-            wanted += 1
+        if tries > 50 or is_seen:
+            wanted, tries = wanted + 1, 0
     return found
 
 

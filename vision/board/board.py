@@ -93,7 +93,7 @@ class Board:
     def corners_m(self) -> FloatArray:
         """Where four squares meet, in the order of the corners' numbers, shape (n, 3) [m], z = 0."""
         c, r = np.meshgrid(np.arange(1, self.columns), np.arange(1, self.rows))
-        return self.square_m * np.stack([c.ravel(), r.ravel(), np.zeros(c.size)], axis=1)
+        return np.asarray(self.square_m * np.stack([c.ravel(), r.ravel(), np.zeros(c.size)], axis=1), dtype=np.float64)
 
     @property
     def name(self) -> str:

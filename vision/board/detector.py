@@ -68,7 +68,7 @@ class BoardDetector:
 
     def find(self, image: ImageArray) -> Corners | NotFound:
         """The board's corners in `image`, shape (height, width, 3) BGR or (height, width)."""
-        grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+        grey = image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
         found = self._plain(grey) if self._charuco is None else self._marked(grey)
         if isinstance(found, NotFound):
             fault = image_fault(grey)
@@ -81,9 +81,11 @@ class BoardDetector:
 
     def _marked(self, grey: ImageArray) -> Corners | NotFound:
         px, numbers, marker_px, marker_numbers = self._charuco.detectBoard(grey)  # pyright: ignore
-        markers = [] if marker_numbers is None else np.ravel(marker_numbers).tolist()
+        markers = [] if marker_numbers is None else [int(number) for number in np.ravel(marker_numbers)]
         if len(markers) >= 3:
-            seen = squares_seen(markers, [np.reshape(each, (4, 2)) for each in marker_px], self.board)
+            seen = squares_seen(
+                markers, [np.reshape(each, (4, 2)).astype(np.float64) for each in marker_px], self.board
+            )
             if seen is not None:
                 wanted = f"{self.board.columns}x{self.board.rows}"
                 text = f"the board has {seen} squares, not {wanted}. Give --squares {seen}, or take the right board"

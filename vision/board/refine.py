@@ -38,7 +38,8 @@ def refined(grey: ImageArray, board: Board, numbers: IntArray, px: FloatArray) -
         numbers, px: the corners roughly, shapes (n,) and (n, 2).
     """
     levels = np.asarray(grey, dtype=np.float64)
-    slopes = np.stack([cv2.Scharr(levels, cv2.CV_64F, 1, 0), cv2.Scharr(levels, cv2.CV_64F, 0, 1)], axis=-1) / 32.0
+    both = [cv2.Scharr(levels, cv2.CV_64F, *axis) for axis in ((1, 0), (0, 1))]
+    slopes = np.asarray(np.stack(both, axis=-1) / 32.0, dtype=np.float64)
     frames = _frames(board, numbers, px)
     usable = np.isfinite(frames).all(axis=(1, 2)) & (np.abs(np.linalg.det(np.nan_to_num(frames))) > 1.0)
     numbers, px, frames = numbers[usable], px[usable], frames[usable]

@@ -129,7 +129,8 @@ def eye_of(
     left, right, rotation, translation = split(model, vector)
     if eye == "left":
         return left, pose[:3], pose[3:], (np.zeros((6, 6)), np.eye(6))
-    r, t, r_r1, r_t1, r_r2, r_t2, t_r1, t_t1, t_r2, t_t2 = cv2.composeRT(pose[:3], pose[3:], rotation, translation)
+    composed = cv2.composeRT(pose[:3], pose[3:], rotation, translation)
+    r, t, r_r1, r_t1, r_r2, r_t2, t_r1, t_t1, t_r2, t_t2 = (np.asarray(each, dtype=np.float64) for each in composed)
     by_rig = np.block([[r_r2, r_t2], [t_r2, t_t2]])
     by_pose = np.block([[r_r1, r_t1], [t_r1, t_t1]])
     return right, r.ravel(), t.ravel(), (by_rig, by_pose)

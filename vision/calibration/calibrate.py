@@ -105,7 +105,7 @@ def calibrate(
         reasons.append(reason)
     if reasons:
         raise CalibrationError(together(reasons))
-    rivals = {each: found.held_out.rms_px for each, found in fits.items()}
+    rivals: dict[Model, float] = {each: found.held_out.rms_px for each, found in fits.items()}
     return Calibrated(rig, board, fits[model], rivals, coverage)
 
 
@@ -182,7 +182,7 @@ def _outlier(rms_px: FloatArray) -> int | None:
 
 def _require_places(model: Model, vector: FloatArray) -> None:
     _, _, rotation, translation = split(model, vector)
-    reason = misplaced(cv2.Rodrigues(rotation)[0], translation)
+    reason = misplaced(np.asarray(cv2.Rodrigues(rotation)[0], dtype=np.float64), translation)
     if reason is not None:
         raise CalibrationError(reason)
 

@@ -114,7 +114,7 @@ def _noise(rig: StereoRig, left: FloatArray, right: FloatArray, model: FloatArra
     for place in np.ndindex(px.shape):
         moved = px.copy()
         moved[place] += _STEP_PX
-        slopes.append(_figures(rig, *np.split(moved, 2), model))
+        slopes.append(_figures(rig, moved[: len(left)], moved[len(left) :], model))
     J = (np.array(slopes) - _figures(rig, left, right, model)) / _STEP_PX
     return J.T @ J
 

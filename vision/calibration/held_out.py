@@ -54,9 +54,9 @@ def held_out(views: Sequence[View], corners_m: FloatArray, whole: Bundle) -> Hel
     groups = np.arange(len(views)) % min(_FOLDS, len(views))
     squares = np.zeros(len(views))
     for group in range(groups.max() + 1):
-        kept = np.flatnonzero(groups != group)
+        kept = np.flatnonzero(groups != group).tolist()
         part = solve([views[k] for k in kept], corners_m, whole.model, whole.vector, whole.poses[kept])
-        for k in np.flatnonzero(groups == group):
+        for k in np.flatnonzero(groups == group).tolist():
             squares[k] = view_pose(views[k], corners_m, whole.model, part.vector, whole.poses[k]).squares
     freedom = np.array([2 * view.corner_count - _POSE_FREEDOM for view in views])
     return HeldOut(squares, freedom)

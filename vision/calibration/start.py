@@ -49,7 +49,9 @@ def pose_of(seen: Corners, corners_m: FloatArray, lens: Lens) -> FloatArray:
     _, rotations, translations, _ = cv2.solvePnPGeneric(
         model, directions[:, None], np.eye(3), np.zeros(5), flags=cv2.SOLVEPNP_IPPE
     )
-    found = [np.concatenate([r.ravel(), t.ravel()]) for r, t in zip(rotations, translations, strict=True)]
+    found = [
+        np.concatenate([r.ravel(), t.ravel()], dtype=np.float64) for r, t in zip(rotations, translations, strict=True)
+    ]
     return min(found, key=lambda pose: float(np.sum((lens.project_posed(model, pose[:3], pose[3:])[0] - seen.px) ** 2)))
 
 

@@ -22,7 +22,7 @@ _ARROW_SHARE = 0.04  # of the image's width: the arrow of a residual that is lar
 def page(found: Calibrated, gathered: Gathered) -> str:
     """report.html of a calibration and the images that it was made of."""
     rig = found.rig
-    style = files(__package__).joinpath("page.css").read_text(encoding="utf-8")
+    style = files("vision.calibration.report").joinpath("page.css").read_text(encoding="utf-8")
     head = (
         f"<h1>Cameras calibrated: views that were not fitted are foretold to {rig.made.held_out_px:.2f} px</h1>"
         f'<p class="of">{escape(rig.made.board)} · {escape(rig.made.date)} '
