@@ -8,7 +8,8 @@ import numpy as np
 from board_renderer import Photographer, Printed, Taken, TrueRig, poses, webcams
 from scipy.spatial.transform import Rotation
 
-from interfaces.records import FloatArray
+from interfaces.errors import SourceEnded
+from interfaces.records import FloatArray, StereoFrame
 from vision.board import Board, Corners
 from vision.calibration.images import ImagePair
 from vision.calibration.view import View
@@ -69,3 +70,25 @@ def photographed(
     shown = tuple(poses(rng, rig, Printed(), count))
     frames = [photographer.pair(*pose) for pose in shown]
     return rig, tuple(ImagePair(f"{k:02d}", f.left, f.right) for k, f in enumerate(frames)), shown
+
+
+class Eyes:
+    """Cameras that give the frames they were made with."""
+
+    def __init__(self, frames: list[StereoFrame], serials: tuple[str, str] = ("A1", "B2")) -> None:
+        self.frames, self.serials = iter(frames), serials
+        self.image_size_px = (frames[0].left.shape[1], frames[0].left.shape[0])
+        self.is_open = False
+
+    def __enter__(self):
+        self.is_open = True
+        return self
+
+    def __exit__(self, *_) -> None:
+        self.is_open = False
+
+    def read(self, timeout_s: float) -> StereoFrame | None:
+        try:
+            return next(self.frames)
+        except StopIteration:
+            raise SourceEnded("through") from None

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from board_renderer import Photographer, Printed, Taken, webcams
 from scipy.spatial.transform import Rotation
-from shown_board import BOARD, SIZE, corner_views, known_rig, photographed
+from shown_board import BOARD, SIZE, Eyes, corner_views, known_rig, photographed
 
-from interfaces.errors import SourceEnded, SourceError
+from interfaces.errors import SourceError
 from interfaces.records import StereoFrame
 from vision.board import BoardDetector, Corners
 from vision.calibration.calibrate import Asked, calibrate
@@ -20,28 +20,6 @@ from vision.calibration.view import View
 from vision.rectified import Rectification, RectifiedCamera
 from vision.rig import CalibrationError, StereoRig
 from vision.triangulated import triangulated
-
-
-class Eyes:
-    """Cameras that give the frames they were made with."""
-
-    def __init__(self, frames: list[StereoFrame], serials: tuple[str, str] = ("A1", "B2")) -> None:
-        self.frames, self.serials = iter(frames), serials
-        self.image_size_px = (frames[0].left.shape[1], frames[0].left.shape[0])
-        self.is_open = False
-
-    def __enter__(self):
-        self.is_open = True
-        return self
-
-    def __exit__(self, *_) -> None:
-        self.is_open = False
-
-    def read(self, timeout_s: float) -> StereoFrame | None:
-        try:
-            return next(self.frames)
-        except StopIteration:
-            raise SourceEnded("through") from None
 
 
 @pytest.mark.parametrize("fisheye", [False, True], ids=["pinhole", "fisheye"])
