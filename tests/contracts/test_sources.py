@@ -49,6 +49,9 @@ from interfaces.recording import Recording
 from interfaces.records import JointReading, MarkerFix, MarkerMiss, StereoFrame, frozen_array
 from interfaces.robot import RobotDescription
 from sim_backend import SimConfig, SimWorld, model_file
+from vision.lens import Lens
+from vision.rectified import RectifiedCamera
+from vision.rig import Made, StereoRig
 from vision.tracked_camera import TrackedCamera
 from vision.tracker import StereoTracker
 
@@ -155,6 +158,41 @@ def simulated_camera() -> Iterator[Rig]:
         yield Rig(world.camera, world.joints, close(world))
 
 
+class Unrectified:
+    """The simulated camera as two that are neither calibrated nor rectified."""
+
+    serials = ("A1", "B2")
+
+    def __init__(self, camera: StereoCamera) -> None:
+        self._camera = camera
+        self.image_size_px = camera.calibration.image_size_px
+
+    def __enter__(self) -> Unrectified:
+        self._camera.__enter__()
+        return self
+
+    def __exit__(self, *error: Any) -> None:
+        self._camera.__exit__(*error)
+
+    def read(self, timeout_s: float) -> StereoFrame | None:
+        return self._camera.read(timeout_s)
+
+
+def rig_of(camera: StereoCamera) -> StereoRig:
+    """The simulated camera's calibration, as one of two cameras."""
+    true = camera.calibration
+    lens = Lens("pinhole", (true.focal_px, true.focal_px), true.principal_point_px, (0.0,) * 5)
+    place = np.array([-true.baseline_m, 0.0, 0.0])
+    made = Made("2026-01-01T00:00:00Z", "none", 1, 0, 0.1, 0.1, 0.0)
+    return StereoRig(lens, lens, np.zeros(3), place, true.image_size_px, Unrectified.serials, np.eye(24), made)
+
+
+@contextmanager
+def rectified_camera() -> Iterator[Rig]:
+    with simulated_world() as world:
+        yield Rig(RectifiedCamera(Unrectified(world.camera), rig_of(world.camera)), world.joints, close(world))
+
+
 @contextmanager
 def tracked_camera() -> Iterator[Rig]:
     with simulated_world() as world:
@@ -259,7 +297,7 @@ JOINTS = [*ENDING_JOINTS, servos_on_the_bench, feetech_servos_on_the_bench, enco
 SILENT_SERVOS = [servos_that_fall_silent, feetech_servos_that_fall_silent]
 SILENT = [*SILENT_SERVOS, encoders_that_fall_silent, ros_2_robot_that_falls_silent]
 MARKERS = [replayed_marker, scripted_marker, pytest.param(tracked_camera, marks=SIMULATED)]
-CAMERAS = [pytest.param(simulated_camera, marks=SIMULATED)]
+CAMERAS = [pytest.param(camera, marks=SIMULATED) for camera in (simulated_camera, rectified_camera)]
 STANDING_STILL = [ENDING_JOINTS[2], *MARKERS[2:], *CAMERAS]
 Make = Callable[[], AbstractContextManager[Rig]]
 
