@@ -156,6 +156,8 @@ class Config:
         _check_endpoints(tables.zenoh, file, text)
         tables.drivers.check(robot.joints, file, text)
         _check_router(tables, file, text)
+        if tables.vision.cameras is not None:
+            tables.vision.cameras.check(file, text)
         if tables.vision.radius_m > LARGEST_BALL_M:
             raise ConfigError(
                 f"vision.radius_m = {tables.vision.radius_m:g}: this looks like millimetres",
