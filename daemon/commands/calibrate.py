@@ -5,13 +5,18 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
+import cyclopts
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
 from daemon.commands.options import SourceRobotFile, flag, robot_file
 
+# Without a help of its own its page shows what `arm` says, beside the commands.
+calibrate = cyclopts.App(name="calibrate")
 
-def calibrate(
+
+@calibrate.default
+def arm(
     source: Annotated[
         Path | None,
         Parameter(help="A recording (.csv, .parquet) or a pair store (.sqlite); else the robot's own store."),
