@@ -89,6 +89,11 @@ class Film:
         return self._made.serials
 
     @property
+    def health(self) -> tuple[str, ...]:
+        """Files have no complaints: what is wrong with them is an error."""
+        return ()
+
+    @property
     def _made(self) -> Roll:
         if self._roll is None:
             self._roll = self._make()
