@@ -104,7 +104,7 @@ class Film:
         roll.open(self._next)
         self._is_open = True
         if self._speed and self._next < len(roll.t):
-            self._start_s = self._clock.now() - (roll.t[self._next] - roll.t[0]) / self._speed
+            self._start_s = self._clock.now() - float(roll.t[self._next] - roll.t[0]) / self._speed
         return self
 
     def __exit__(
