@@ -149,22 +149,22 @@ def moving(tmp_path: Path, free_endpoint: Callable[[], str]) -> Iterator[tuple[C
 def test_servos_and_a_stereo_camera_give_pairs_that_agree_in_time(library, moving) -> None:
     config, _ = moving
     with sampling(config, preloaded(library)) as status:
-        said = until(status, lambda said: said.pairs >= 60)
+        until(status, lambda said: said.pairs >= 60)
     pairs = pairs_of(config)
     error = config.robot.chain.positions(np.array([pair.q for pair in pairs])) - [pair.x for pair in pairs]
     assert np.sqrt(np.mean(error**2)) < 1.5e-3  # 70 ms are 13 mm at this speed
-    assert said.health == []
 
 
-def test_a_camera_that_is_unplugged_is_told_of_and_taken_again(library, moving) -> None:
+def test_a_camera_that_is_unplugged_is_told_of_and_taken_again_while_the_servos_are_read_on(library, moving) -> None:
     config, camera = moving
     with sampling(config, preloaded(library)) as status:
         until(status, lambda said: said.pairs >= 5)
         camera.set(unplugged=1)
         lost = until(status, lambda said: any("cameras are lost" in text for text in said.health))
-        assert lost.readings_per_s > 0
+        until(status, lambda said: said.buses["arm"].exchanges > lost.buses["arm"].exchanges + 50)
         camera.set(unplugged=0)
-        until(status, lambda said: said.pairs >= lost.pairs + 5 and said.health == [])
+        back = until(status, lambda said: said.pairs >= lost.pairs + 5)
+        assert not any("cameras are lost" in text for text in back.health)
 
 
 def test_servos_and_images_in_a_folder_give_pairs(tmp_path, free_endpoint) -> None:
