@@ -62,7 +62,9 @@ def drawn(config: Config, q: FloatArray) -> tuple[np.ndarray, np.ndarray]:
 def write_arm(folder: Path, free_endpoint: Callable[[], str], cameras: str, tables: str = "") -> Config:
     for name in ("desk_arm.urdf", "servos.toml"):
         shutil.copy(ARM / name, folder)
-    with (folder / "servos.toml").open("a", encoding="utf-8") as file:
+    toml = folder / "servos.toml"
+    toml.write_text(toml.read_text().replace("baud =", "latency_ms = 100\nbaud ="))  # on a busy machine, patience
+    with toml.open("a", encoding="utf-8") as file:
         file.write(f'\n[zenoh]\nsampler = "{free_endpoint()}"\nlearner = "{free_endpoint()}"\n{tables}\n{cameras}')
     return Config.load(folder / "servos.toml", {})
 
