@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from contextlib import ExitStack
+from dataclasses import dataclass
 from time import monotonic
 
 from drivers.checks import Check, holders
@@ -19,6 +20,9 @@ from vision.cameras.ideal import IdealCamera
 from vision.cameras.live import CameraFigures, LiveEyes
 from vision.cameras.opened import eyes_of
 from vision.cameras.serials import connected
+from vision.cameras.watched import PlainEyes, WatchedCamera
+from vision.rectified import RectifiedCamera
+from vision.rig_file import read_rig
 
 from .config import Config
 
@@ -52,34 +56,28 @@ def open_eyes(config: Config, clock: Clock) -> LiveEyes | Film:
 
 
 def camera_of(config: Config, eyes: LiveEyes | Film) -> StereoCamera:
-    """`eyes` with rectified images, not opened yet.
+    """`eyes` with rectified images, not opened yet: by the calibration file, else as [camera] describes them.
 
     Raises:
-        ConfigError: robot.toml says in no way how they see.
+        ConfigError: nothing says how they see, or the file cannot be read.
     """
-    require_calibrated(config)
-    calibration = config.robot.calibration
-    if calibration is None:
-        raise ConfigError("[camera] describes no stereo pair", file=config.file)
-    return IdealCamera(eyes, calibration)
-
-
-def require_calibrated(config: Config) -> None:
-    """ConfigError when neither a calibration file nor [camera] says how the cameras see."""
-    if require_cameras(config).calibration is not None or config.robot.calibration is not None:
-        return
-    raise ConfigError(
-        "nothing says how the cameras see",
-        file=config.file,
-        line=line_of(read_toml(config.file)[1], ("vision", "cameras")),
-        remedy="Type `bodyschema calibrate cameras`; or, where the images are rectified already, describe the stereo "
-        "pair in [camera]",
-    )
+    named = require_cameras(config).calibration
+    if named is not None:
+        return RectifiedCamera(eyes, read_rig(config.file.parent / named))
+    if config.robot.calibration is None:
+        raise ConfigError(
+            "nothing says how the cameras see",
+            file=config.file,
+            line=line_of(read_toml(config.file)[1], ("vision", "cameras")),
+            remedy="Type `bodyschema calibrate cameras`; or, where the images are rectified already, describe the "
+            "stereo pair in [camera]",
+        )
+    return IdealCamera(eyes, config.robot.calibration)
 
 
 def require_usable(config: Config) -> None:
     """ConfigError when pairs cannot be made of the cameras' images and the encoders' readings."""
-    require_calibrated(config)
+    camera_of(config, open_eyes(config, SystemClock()))
     layout = require_cameras(config).layout
     if isinstance(layout, ImagesConfig | VideosConfig) and not layout.speed:
         raise ConfigError(
@@ -88,6 +86,29 @@ def require_usable(config: Config) -> None:
             line=line_of(read_toml(config.file)[1], ("vision", "cameras")),
             remedy="Give a speed above 0",
         )
+
+
+@dataclass(frozen=True, slots=True)
+class Watched:
+    """Cameras for a person to look at.
+
+    Attributes:
+        camera: gives the pictures, not opened yet. eyes: tells how the cameras are.
+        is_calibrated: whether the marker is looked for.
+    """
+
+    camera: WatchedCamera | PlainEyes
+    eyes: LiveEyes | Film
+    is_calibrated: bool
+
+
+def open_watched(config: Config) -> Watched:
+    """The cameras of robot.toml with what is seen drawn into their images, not opened yet."""
+    eyes = open_eyes(config, SystemClock())
+    is_calibrated = require_cameras(config).calibration is not None or config.robot.calibration is not None
+    if not is_calibrated:
+        return Watched(PlainEyes(eyes), eyes, is_calibrated)
+    return Watched(WatchedCamera(camera_of(config, eyes), config.tables.vision), eyes, is_calibrated)
 
 
 # --- what `doctor` says
