@@ -14,8 +14,8 @@ from vision.colour import ColourGate
 from vision.config import VisionConfig
 from vision.sphere import Pinhole
 
-GREEN, YELLOW, RED, WHITE, BLACK = (80, 220, 80), (0, 220, 255), (60, 60, 255), (255, 255, 255), (0, 0, 0)
-FONT, LINE_PX = cv2.FONT_HERSHEY_SIMPLEX, 18
+GREEN, YELLOW, RED, BLACK = (80, 220, 80), (0, 220, 255), (110, 110, 255), (0, 0, 0)
+FONT, LETTERS, LINE_PX = cv2.FONT_HERSHEY_SIMPLEX, 0.5, 18
 SUBPIXEL_BITS = 4
 MAGNIFIED = 10  # the difference of the rows, which is a fraction of a pixel
 
@@ -67,9 +67,14 @@ class Annotator:
     def drawn(self, frame: StereoFrame, seen: MarkerFix | MarkerMiss) -> ImageArray:
         """Both images side by side (height, 2 width, 3), with what was seen in them."""
         eyes = [np.ascontiguousarray(image).copy() for image in (frame.left, frame.right)]
-        for eye, image in zip(eyes, (frame.left, frame.right), strict=True):
-            for sight in self.sights(image):
+        sights = [self.sights(image) for image in (frame.left, frame.right)]
+        for place, eye in enumerate(eyes):
+            for sight in sights[place]:
                 self._draw_sight(eye, sight)
+            if isinstance(seen, MarkerMiss):
+                for sight in sights[1 - place]:  # where the other eye's discs should be in this one
+                    if sight.reason is None:
+                        _row(eye, sight.centre_px[1], YELLOW)
         if isinstance(seen, MarkerFix):
             self._draw_fix(eyes, seen)
         joined = np.hstack(eyes)
@@ -124,7 +129,8 @@ def _row(image: ImageArray, v_px: float, colour: tuple[int, int, int]) -> None:
 
 
 def _write(image: ImageArray, text: str, at: tuple[int, int], colour: tuple[int, int, int]) -> None:
-    """Letters that can be read on any ground."""
-    at = max(at[0], 2), max(at[1], 12)
-    cv2.putText(image, text, at, FONT, 0.45, BLACK, 3, cv2.LINE_AA)
-    cv2.putText(image, text, at, FONT, 0.45, colour, 1, cv2.LINE_AA)
+    """Letters on a ground of their own."""
+    (width, height), _ = cv2.getTextSize(text, FONT, LETTERS, 1)
+    x, y = max(at[0], 2), max(at[1], height + 2)
+    cv2.rectangle(image, (x - 2, y - height - 3), (x + width + 2, y + 4), BLACK, -1)
+    cv2.putText(image, text, (x, y), FONT, LETTERS, colour, 1, cv2.LINE_AA)
