@@ -94,10 +94,10 @@ def test_a_latency_beyond_the_range_is_refused() -> None:
 
 
 def test_too_few_fixes_are_named() -> None:
-    whole = wiggle(0, 0.05)
+    whole, few = wiggle(0, 0.05), slice(20, 32)
+    hardly = Wiggle(whole.t_joints, whole.q, whole.t_marker[few], whole.x[few])
     with pytest.raises(LatencyError, match="was seen 12 times, 60 are needed"):
-        few = slice(20, 32)
-        latency_of(Wiggle(whole.t_joints, whole.q, whole.t_marker[few], whole.x[few]), ARM.chain)
+        latency_of(hardly, ARM.chain)
 
 
 def test_without_readings_the_encoders_are_named() -> None:

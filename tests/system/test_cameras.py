@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import math
 import shutil
 import signal
@@ -167,6 +168,18 @@ def test_a_camera_that_is_unplugged_is_told_of_and_taken_again_while_the_servos_
         camera.set(unplugged=0)
         back = until(status, lambda said: said.pairs >= lost.pairs + 5)
         assert not any("cameras are lost" in text for text in back.health)
+
+
+def test_a_hidden_latency_is_found_by_moving_the_arm(library, moving) -> None:
+    config, _ = moving
+    file = config.file
+    file.write_text(file.read_text().replace(f"latency_s = {LATENCY_S}", "latency_s = 0.01"))
+    command = [sys.executable, "-m", "daemon", "calibrate", "latency", "--robot", str(file), "--json"]
+    done = subprocess.run(command, check=False, env=preloaded(library), capture_output=True, text=True, timeout=LIMIT_S)
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout)
+    assert abs(found["latency_s"] - LATENCY_S) < 3 * found["sigma_s"] + 1e-3
+    assert found["sigma_s"] < 3e-3
 
 
 def test_servos_and_images_in_a_folder_give_pairs(tmp_path, free_endpoint) -> None:
