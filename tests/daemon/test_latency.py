@@ -53,17 +53,22 @@ def test_the_claimed_uncertainty_covers() -> None:
 @pytest.mark.soak
 def test_over_many_seeds_the_latency_is_nearer_than_speeds_alone_tell() -> None:
     hidden = np.random.default_rng(6).uniform(0, 0.12, 200)
-    errors, by_speed, claimed = [], [], []
+    errors, by_speed, claimed, refused = [], [], [], 0
     for seed, latency in enumerate(hidden.tolist()):
         moved = wiggle(seed, latency)
-        found = latency_of(moved, ARM.chain)
+        try:
+            found = latency_of(moved, ARM.chain)
+        except LatencyError:
+            refused += 1
+            continue
         errors.append(found.latency_s - latency)
         claimed.append(found.sigma_s)
         by_speed.append(latency_by_speed(moved, ARM.chain) - latency)
     rms, rms_by_speed = (1e3 * np.sqrt(np.mean(np.square(each))) for each in (errors, by_speed))
     within = np.mean(np.abs(errors) < np.array(claimed))
     worst = 1e3 * np.abs(errors).max()
-    print(f"rms {rms:.2f} ms, worst {worst:.2f} ms, 1 sigma covers {within:.0%}; by speeds {rms_by_speed:.2f} ms")
+    print(f"{refused} refused; rms {rms:.2f} ms, worst {worst:.2f} ms, 1 sigma covers {within:.0%}; by speeds {rms_by_speed:.2f} ms")
+    assert refused < 0.05 * len(hidden)
     assert worst < 2.0
     assert rms < rms_by_speed
     assert within > 0.65

@@ -31,17 +31,18 @@ from interfaces.records import FloatArray, Pair
 pytestmark = pytest.mark.timeout(240)
 LIMIT_S = 90.0
 ARM = Path(__file__).parents[2] / "examples" / "desk_arm"
-FPS, FRAMES = 30.0, 90
+FPS, FRAMES = 30.0, 240
 LATENCY_S = 0.070
 KEYS = Keys("desk_arm")
 MIDDLE = np.array([0.1, 0.4, 0.6, 0.0])
 SWING = np.array([0.20, 0.12, 0.15, 0.10])
+TURNS = np.array([[2, 7], [3, 5], [5, 11], [7, 3]])  # while all images are shown once: uneven
 
 
 def angles(t: float) -> FloatArray:
     """The joints at a time: they come back to where they were when the camera's images do."""
-    turn = 2 * math.pi * t * FPS / FRAMES
-    return MIDDLE + SWING * np.sin(turn * np.array([1, 2, 1, 1]) + np.array([0.0, 0.7, 1.5, 2.0]))
+    swing = np.sin(2 * math.pi * t * FPS / FRAMES * TURNS + np.array([[0.0, 0.7], [0.7, 1.9], [1.5, 0.2], [2.0, 1.0]]))
+    return MIDDLE + SWING * (swing @ [0.6, 0.4])
 
 
 def drawn(config: Config, q: FloatArray) -> tuple[np.ndarray, np.ndarray]:
