@@ -1,7 +1,8 @@
 """How long before its time stamp an image was taken, from encoders and marker while the arm was moved.
 
 The marker is where the joint angles of the exposure's middle bring it. Nobody needs to know
-that function well: among all shifts in time the true one lets the positions follow most closely from the angles by a smooth function.
+that function well: among all shifts in time the true one lets the positions follow most closely from the angles by a
+smooth function.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ RIVAL = 1.15  # a second minimum whose residual is less than this many times the
 APART_S = 0.03  # from the first
 SMALL = 1e-3  # of the largest motion: a direction in which nothing moved
 RIDGE = 1e-6
-LARGEST_SIGMA_S = 0.004
+LARGEST_SIGMA_S = 0.0025
 
 
 class LatencyError(BodyschemaError):

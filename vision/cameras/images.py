@@ -56,7 +56,11 @@ class ImageRoll:
         if config.times is not None:
             return read_times(folder / config.times, count), together
         if config.name_ticks_per_s is not None:
-            left, right = (_named_times(files, config.name_ticks_per_s) for files in (self._left, self._right))
+            first = _ticks(self._left[0], 0)
+            left, right = (
+                frozen_array([_ticks(file, int(first)) / config.name_ticks_per_s for file in files])
+                for files in (self._left, self._right)
+            )
             return checked_times(0.5 * (left + right), folder), frozen_array(np.abs(left - right))
         return frozen_array(np.arange(count) / (config.fps or 1.0)), together
 
@@ -92,16 +96,14 @@ def _natural(name: str) -> list[tuple[int, float, str]]:
     return [(0, float(word), "") if NUMBER.fullmatch(word) else (1, 0.0, word) for word in words if word]
 
 
-def _named_times(files: list[Path], ticks_per_s: float) -> FloatArray:
-    numbers = [NUMBER.findall(file.stem) for file in files]
-    for file, found in zip(files, numbers, strict=True):
-        if not found:
-            remedy = "Give fps or times in the place of name_ticks_per_s"
-            raise ConfigError("there is no number in this name", file=file, remedy=remedy)
-    # From the first on, so that nanoseconds of a wall clock keep their digits.
-    first = int(float(numbers[0][-1])) if "." in numbers[0][-1] else int(numbers[0][-1])
-    ticks = [float(found[-1]) - first if "." in found[-1] else float(int(found[-1]) - first) for found in numbers]
-    return frozen_array(np.array(ticks) / ticks_per_s)
+def _ticks(file: Path, since: int) -> float:
+    """The last number in a name, less `since`: taken off first, so that nanoseconds of a wall clock keep their digits."""
+    numbers = NUMBER.findall(file.stem)
+    if not numbers:
+        remedy = "Give fps or times in the place of name_ticks_per_s"
+        raise ConfigError("there is no number in this name", file=file, remedy=remedy)
+    whole, _, fraction = numbers[-1].partition(".")
+    return (int(whole) - since) + (float(f"0.{fraction}") if fraction else 0.0)
 
 
 def _image(file: Path) -> ImageArray:
