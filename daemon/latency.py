@@ -99,6 +99,8 @@ def latency_of(wiggle: Wiggle, chain: RigidChain) -> Latency:
             "looking at the same motion?"
         )
     _require_one(grid, cost, best)
+    residual_m = math.sqrt(fit.cost(grid[best]) / len(fit.x))
+    fit = fit.whitened(grid[best])
     lag = _minimum(fit, grid[best])
     sigma_s = _sigma(fit, lag)
     if sigma_s > LARGEST_SIGMA_S:
@@ -106,9 +108,8 @@ def latency_of(wiggle: Wiggle, chain: RigidChain) -> Latency:
             f"the latency is known to {1e3 * sigma_s:.1f} ms only. Move the arm faster, to and fro, "
             "the marker in sight of both eyes"
         )
-    residual = math.sqrt(fit.cost(lag) / len(fit.x))
-    speed = float(np.sqrt(np.mean(np.sum(_slope(fit.x, fit.t) ** 2, axis=1))))
-    return Latency(lag, sigma_s, len(fit.x), residual, speed)
+    speed = float(np.sqrt(np.mean(np.sum(np.gradient(wiggle.x, wiggle.t_marker, axis=0) ** 2, axis=1))))
+    return Latency(lag, sigma_s, len(fit.x), residual_m, speed)
 
 
 def latency_by_speed(wiggle: Wiggle, chain: RigidChain) -> float:
@@ -177,8 +178,16 @@ class _Fit:
         weights = np.linalg.solve(A.T @ A + RIDGE * np.eye(A.shape[1]), A.T @ x)
         return x - A @ weights
 
+    def whitened(self, lag: float) -> _Fit:
+        """The same with positions in units of their noise, larger in depth, as the residual at `lag` has it."""
+        residual = self.residual(lag)
+        noise = residual.T @ residual / len(residual)
+        least = SMALL * float(np.trace(noise)) + np.finfo(float).tiny
+        factor = np.linalg.cholesky(noise + least * np.eye(len(noise)))
+        return replace(self, x=np.linalg.solve(factor, self.x.T).T)
+
     def cost(self, lag: float, keep: NDArray[np.bool_] | slice = slice(None)) -> float:
-        """Sum of squares of the residual [m²]."""
+        """Sum of squares of the residual [m²], or in units of the noise."""
         return float(np.sum(self.residual(lag, keep) ** 2))
 
 
@@ -214,7 +223,3 @@ def _require_one(grid: FloatArray, cost: FloatArray, best: int) -> None:
             f"{1e3 * grid[best]:.0f} ms and {1e3 * other:.0f} ms fit nearly as well: the motion repeats itself. Move "
             "irregularly, more than one joint"
         )
-
-
-def _slope(x: FloatArray, t: FloatArray) -> FloatArray:
-    return np.gradient(x, t, axis=0)

@@ -67,9 +67,8 @@ def test_over_many_seeds_the_latency_is_nearer_than_speeds_alone_tell() -> None:
     rms, rms_by_speed = (1e3 * np.sqrt(np.mean(np.square(each))) for each in (errors, by_speed))
     within = np.mean(np.abs(errors) < np.array(claimed))
     worst = 1e3 * np.abs(errors).max()
-    print(
-        f"{refused} refused; rms {rms:.2f} ms, worst {worst:.2f} ms, 1 sigma covers {within:.0%}; by speeds {rms_by_speed:.2f} ms"
-    )
+    print(f"{refused} refused; rms {rms:.2f} ms, worst {worst:.2f} ms, 1 sigma covers {within:.0%}")
+    print(f"by speeds alone: rms {rms_by_speed:.2f} ms")
     assert refused < 0.05 * len(hidden)
     assert worst < 2.0
     assert rms < rms_by_speed

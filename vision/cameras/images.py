@@ -97,7 +97,7 @@ def _natural(name: str) -> list[tuple[int, float, str]]:
 
 
 def _ticks(file: Path, since: int) -> float:
-    """The last number in a name, less `since`: taken off first, so that nanoseconds of a wall clock keep their digits."""
+    """The last number in a name, less `since`: taken off here, so that nanoseconds since 1970 keep their digits."""
     numbers = NUMBER.findall(file.stem)
     if not numbers:
         remedy = "Give fps or times in the place of name_ticks_per_s"
