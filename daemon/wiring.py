@@ -19,7 +19,6 @@ from interfaces.protocols import Clock, JointSource
 from kbmaps import RigidChain
 
 from .bench_wiring import require_bench, through_bench
-from .camera_wiring import camera_of, cameras_of, open_eyes, require_usable
 from .config import Config
 from .joints_watch import EncoderJoints, ServoJoints
 from .powered_wiring import open_drives
@@ -140,12 +139,14 @@ def _require_source(config: Config, *, sim: bool) -> None:
             remedy="Give --sim for the simulated robot, or name a recording as recording in the table [drivers]; with "
             "an arm of your own: docs/hardware.md",
         )
-    if cameras_of(config) is None:
+    if config.tables.vision.cameras is None:
         raise ConfigError(
             "the joints have a driver, but nothing tells where the marker is: no cameras are configured",
             file=config.file,
             remedy="Add the table [vision.cameras] (docs/cameras.md); or give --sim for the simulated robot",
         )
+    from .camera_wiring import require_usable
+
     require_usable(config)
 
 
@@ -172,6 +173,8 @@ def demonstration_model() -> Path:
 def _real(config: Config) -> Sources:
     from vision.tracked_camera import TrackedCamera
     from vision.tracker import StereoTracker
+
+    from .camera_wiring import camera_of, open_eyes
 
     clock = SystemClock()
     joints = open_joints(config, clock)

@@ -65,7 +65,6 @@ def check(*, robot: RobotFile = HERE) -> None:
 
     Next: `bodyschema replay` for a recording that you have; `bodyschema run`.
     """
-    from daemon.camera_wiring import camera_lines
     from daemon.config import Config
     from daemon.synthesis import without_consequence
     from interfaces.urdf import REVOLUTE
@@ -90,6 +89,8 @@ def check(*, robot: RobotFile = HERE) -> None:
     )
     cameras = checked.tables.vision.cameras
     if cameras is not None:
+        from daemon.camera_wiring import camera_lines
+
         for line in camera_lines(cameras):
             say(f"  {line}")
     if cameras is None or cameras.calibration is None:

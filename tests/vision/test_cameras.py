@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tomllib
 from pathlib import Path
 
 import cv2
@@ -12,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from interfaces.errors import ConfigError, SourceEnded, SourceError
-from vision.cameras.config import CamerasConfig, ImagesConfig, VideosConfig
+from vision.cameras.config import CamerasConfig, ImagesConfig, TwoConfig, VideosConfig
 from vision.cameras.images import ImageRoll
 from vision.cameras.look import of_image
 from vision.cameras.opened import eyes_of
@@ -255,3 +256,20 @@ def test_two_films_give_as_many_pairs_as_the_shorter_has(tmp_path) -> None:
         with pytest.raises(SourceEnded):
             eyes.read(1.0)
     assert [frame.t for frame in frames if frame] == pytest.approx([0.0, 0.05, 0.1, 0.15, 0.2])
+
+
+# --- the page
+
+
+def test_the_page_shows_tables_that_are_taken() -> None:
+    page = (Path(__file__).parents[2] / "docs" / "cameras.md").read_text(encoding="utf-8")
+    text = page.split("```toml\n")[1].split("```")[0]
+    shown = msgspec.convert(tomllib.loads(text)["vision"]["cameras"], CamerasConfig)
+    shown.check(FILE, text)
+    assert shown.two is not None
+
+
+def test_the_page_names_every_setting_of_a_camera() -> None:
+    page = (Path(__file__).parents[2] / "docs" / "cameras.md").read_text(encoding="utf-8")
+    fields = [field.name for kind in (TwoConfig, ImagesConfig, VideosConfig) for field in msgspec.structs.fields(kind)]
+    assert [name for name in fields if f"`{name}`" not in page and f"`{name} = " not in page] == []
