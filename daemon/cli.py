@@ -26,6 +26,7 @@ COMMANDS = {
     "install": "Rules of this machine: install udev, for serial ports.",
     "robot": "robot new: a robot.toml for the servos that were found.",
     "joints": "Angles live while you move the arm: signs, ranges, health.",
+    "watch": "watch cameras: what they see, in a browser or as files.",
     "servos": "What servos keep without power: show, set, zero, undo.",
     "bench": "Your servos without the arm: a dry run of robot.toml.",
     "run": "Start sampler and learner, and keep them running.",

@@ -20,9 +20,9 @@ from kbmaps import RigidChain
 
 from .bench_wiring import require_bench, through_bench
 from .config import Config
-from .joints_watch import EncoderJoints
+from .joints_watch import EncoderJoints, ServoJoints
 from .powered_wiring import open_drives
-from .sources import MarkerTopic, Sources, StampedJoints
+from .sources import Head, MarkerTopic, Powered, Sources, StampedJoints
 from .store import PairReader
 
 if TYPE_CHECKING:
@@ -36,13 +36,15 @@ def open_sources(config: Config, *, sim: bool) -> Iterator[Sources]:
     """The sources that robot.toml asks for; with `sim`, the simulation in their place.
 
     Raises:
-        ConfigError: no driver is configured, or the simulation cannot be made of this description.
+        ConfigError: no driver or no cameras are configured, or the simulation cannot be made of this description.
         RecordingError: the configured recording cannot be read.
     """
     _require_source(config, sim=sim)
     recording = None if sim else _recording(config)
     if recording is not None:
         yield _recorded(config, recording)
+    elif not sim:
+        yield _real(config)
     else:
         with _simulated(config) as sources:
             yield sources
@@ -130,17 +132,22 @@ def _require_source(config: Config, *, sim: bool) -> None:
         require_bench(config)
     if sim or config.tables.drivers.recording is not None:
         return
-    if config.tables.drivers.hardware is not None:
+    if config.tables.drivers.hardware is None:
         raise ConfigError(
-            "the joints have a driver, but nothing tells where the marker is: no camera is configured",
+            "no driver is configured",
             file=config.file,
-            remedy="Give --sim for the simulated robot, or name a recording as recording in the table [drivers]",
+            remedy="Give --sim for the simulated robot, or name a recording as recording in the table [drivers]; with "
+            "an arm of your own: docs/hardware.md",
         )
-    raise ConfigError(
-        "no driver is configured",
-        file=config.file,
-        remedy="Give --sim for the simulated robot, or name a recording as recording in the table [drivers]",
-    )
+    if config.tables.vision.cameras is None:
+        raise ConfigError(
+            "the joints have a driver, but nothing tells where the marker is: no cameras are configured",
+            file=config.file,
+            remedy="Add the table [vision.cameras] (docs/cameras.md); or give --sim for the simulated robot",
+        )
+    from .camera_wiring import require_usable
+
+    require_usable(config)
 
 
 def _recording(config: Config) -> Path | None:
@@ -161,6 +168,29 @@ def demonstration_model() -> Path:
     from sim_backend.models import model_file
 
     return model_file("upper_body")
+
+
+def _real(config: Config) -> Sources:
+    from vision.tracked_camera import TrackedCamera
+    from vision.tracker import StereoTracker
+
+    from .camera_wiring import camera_of, open_eyes
+
+    clock = SystemClock()
+    joints = open_joints(config, clock)
+    eyes = open_eyes(config, clock)
+    camera = camera_of(config, eyes)
+    drives = joints.drives if isinstance(joints, ServoJoints) else ()
+    return Sources(
+        joints,
+        TrackedCamera(camera, StereoTracker(camera.calibration, config.tables.vision)),
+        clock,
+        powered=tuple(drive for drive in drives if isinstance(drive, Powered)),
+        head=next((drive for drive in drives if isinstance(drive, Head)), None),
+        cameras=eyes,
+        calibration=camera.calibration,
+        live=True,
+    )
 
 
 @contextmanager

@@ -34,6 +34,7 @@ class Reason(StrEnum):
     MOVING = "moving"  # joints too fast for the uncertainty of the time stamps
     TOO_NEAR = "too_near"  # nearer than the smallest step to the predecessor: wait
     PAUSED = "paused"  # an operator paused the sampler
+    NOT_BORNE = "not_borne"  # zero-force is to bear the arm, and is off
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,12 +77,14 @@ class MarkerFix:
         cov: its covariance [m²], shape (3, 3).
         centres_px: (ul, vl, ur, vr), where the centre is seen by the left and the right eye, or None
             when the source measures positions directly (a laser tracker, a recording).
+        t_sigma: 1-sigma of `t` [s].
     """
 
     t: float
     x: FloatArray
     cov: FloatArray
     centres_px: tuple[float, float, float, float] | None = None
+    t_sigma: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,6 +7,8 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
+from .cameras.config import CamerasConfig
+
 Positive = Annotated[float, Meta(gt=0)]
 Ratio = Annotated[float, Meta(gt=1)]
 Fraction = Annotated[float, Meta(ge=0, le=1)]
@@ -56,6 +58,7 @@ class VisionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         eye_size_ratio: largest ratio of the sizes the two eyes claim for the ball.
         depth_size_ratio: largest ratio between the radius seen and the one expected at the triangulated depth.
         max_candidates: at most this many patches per eye are looked at closely, the most disc-like first.
+        cameras: where images come from; without it there are none.
     """
 
     colour: ColourName | HueBand = "red"
@@ -69,6 +72,7 @@ class VisionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     eye_size_ratio: Ratio = 1.2
     depth_size_ratio: Ratio = 1.3
     max_candidates: Annotated[int, Meta(ge=1)] = 12
+    cameras: CamerasConfig | None = None
 
     @property
     def band(self) -> HueBand:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import TracebackType
 from typing import Self
 
@@ -36,4 +37,7 @@ class TrackedCamera:
             SourceError: the images do not fit the calibration.
         """
         frame = self._camera.read(timeout_s)
-        return None if frame is None else self._tracker.track(frame)
+        if frame is None:
+            return None
+        seen = self._tracker.track(frame)
+        return replace(seen, t_sigma=frame.t_sigma) if isinstance(seen, MarkerFix) else seen

@@ -116,3 +116,6 @@ def arm(
             markup=False,
             soft_wrap=True,
         )
+
+
+calibrate.command("daemon.commands.latency:latency", name="latency")

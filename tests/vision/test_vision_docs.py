@@ -26,7 +26,9 @@ def test_the_pages_example_runs(capsys):
 
 def test_the_page_shows_every_setting_with_its_default():
     shown = msgspec.toml.decode(blocks("toml")[0])["vision"]
-    assert shown == msgspec.to_builtins(VisionConfig())
+    defaults = msgspec.to_builtins(VisionConfig())
+    del defaults["cameras"]  # docs/cameras.md
+    assert shown == defaults
 
 
 def test_the_page_shows_every_setting_of_a_band_of_hues_with_its_default():
