@@ -76,12 +76,18 @@ class MarkerFix:
         cov: its covariance [m²], shape (3, 3).
         centres_px: (ul, vl, ur, vr), where the centre is seen by the left and the right eye, or None
             when the source measures positions directly (a laser tracker, a recording).
+        R: how the marker is turned in the measurement frame: a unit quaternion (x, y, z, w), shape (4,), or None
+            where the marker looks the same from all sides.
+        cov_R: covariance of a small turn of it about the axes of the measurement frame [rad²], shape (3, 3), or None
+            when the source does not tell.
     """
 
     t: float
     x: FloatArray
     cov: FloatArray
     centres_px: tuple[float, float, float, float] | None = None
+    R: FloatArray | None = None
+    cov_R: FloatArray | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,7 +111,7 @@ class Pair:
         q: joint angles interpolated to the frame's time [rad], shape (d,).
         x: marker position in the measurement frame [m], shape (3,).
         cov: covariance of x [m²], shape (3, 3).
-        centres_px: as in `MarkerFix`.
+        centres_px, R, cov_R: as in `MarkerFix`.
     """
 
     store: str
@@ -117,3 +123,5 @@ class Pair:
     x: FloatArray
     cov: FloatArray
     centres_px: tuple[float, float, float, float] | None = None
+    R: FloatArray | None = None
+    cov_R: FloatArray | None = None
