@@ -75,7 +75,9 @@ def test_every_finite_number_survives_the_row_format(numbers, with_centres) -> N
     cov = np.reshape([*numbers[5:8], numbers[6], *numbers[8:10], numbers[7], *numbers[9:11]], (3, 3))
     centres = tuple(numbers[10:14]) if with_centres else None
     turn = (frozen_array(numbers[3:7]), frozen_array(cov)) if with_centres else (None, None)
-    pair = Pair("id", 1, 2, numbers[0], "utc", frozen_array(numbers[:2]), frozen_array(numbers[2:5]), cov, centres, *turn)
+    pair = Pair(
+        "id", 1, 2, numbers[0], "utc", frozen_array(numbers[:2]), frozen_array(numbers[2:5]), cov, centres, *turn
+    )
     assert same(pair, pair_of("id", row_of(pair)))
 
 
