@@ -21,6 +21,7 @@ from kbmaps import RigidChain
 from .bench_wiring import require_bench, through_bench
 from .config import Config
 from .joints_watch import EncoderJoints
+from .marker_wiring import simulation_settings
 from .powered_wiring import open_drives
 from .sources import MarkerTopic, Sources, StampedJoints
 from .store import PairReader
@@ -169,12 +170,13 @@ def _simulated(config: Config) -> Iterator[Sources]:
     from sim_backend import SimWorld
     from sim_backend.guided_path import exact_encoders
     from vision.tracked_camera import TrackedCamera
-    from vision.tracker import StereoTracker
+    from vision.trackers import tracker_of
 
     on_bench = config.tables.sim.servo_bench
-    settings = exact_encoders(config.tables.sim) if on_bench else config.tables.sim
+    settings = simulation_settings(config)
+    settings = exact_encoders(settings) if on_bench else settings
     with SimWorld(config.robot, settings, config.simulation) as world:
-        marker = TrackedCamera(world.camera, StereoTracker(world.camera.calibration, config.tables.vision))
+        marker = TrackedCamera(world.camera, tracker_of(world.camera.calibration, config.tables.vision))
         joints = _through_bench(config, world.joints) if on_bench else world.joints
         yield Sources(joints, marker, world.clock, world)
 
@@ -195,11 +197,12 @@ def open_postures(config: Config, count: int) -> Iterator[Sources]:
     from sim_backend.posed import PosedWorld
     from sim_backend.postures import visible_postures
     from vision.tracked_camera import TrackedCamera
-    from vision.tracker import StereoTracker
+    from vision.trackers import tracker_of
 
-    postures = visible_postures(config.robot, config.tables.sim, count, config.simulation)
-    with PosedWorld(config.robot, config.tables.sim, postures, config.simulation) as world:
-        marker = TrackedCamera(world.camera, StereoTracker(world.camera.calibration, config.tables.vision))
+    settings = simulation_settings(config)
+    postures = visible_postures(config.robot, settings, count, config.simulation)
+    with PosedWorld(config.robot, settings, postures, config.simulation) as world:
+        marker = TrackedCamera(world.camera, tracker_of(world.camera.calibration, config.tables.vision))
         yield Sources(world.joints, marker, world.clock)
 
 

@@ -7,6 +7,8 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
+from .tag_config import ClusterConfig, TagConfig
+
 Positive = Annotated[float, Meta(gt=0)]
 Ratio = Annotated[float, Meta(gt=1)]
 Fraction = Annotated[float, Meta(ge=0, le=1)]
@@ -45,6 +47,8 @@ class VisionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The table [vision]: what the marker looks like, and when a find is doubtful.
 
     Attributes:
+        marker: what is looked for: a ball, one tag ([vision.tag]), or a rigid cluster of tags ([vision.cluster]). The
+            other keys of this table are a ball's.
         colour: a name, or a band of hues as the table [vision.colour].
         radius_m: radius of the marker ball [m].
         min_pixels: a patch of the marker's colour smaller than this is no candidate [px²].
@@ -56,8 +60,11 @@ class VisionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         eye_size_ratio: largest ratio of the sizes the two eyes claim for the ball.
         depth_size_ratio: largest ratio between the radius seen and the one expected at the triangulated depth.
         max_candidates: at most this many patches per eye are looked at closely, the most disc-like first.
+        tag: the tag, or what the tags of a cluster have in common.
+        cluster: where on the marker which tag is.
     """
 
+    marker: Literal["ball", "tag", "cluster"] = "ball"
     colour: ColourName | HueBand = "red"
     radius_m: Positive = 0.020
     min_pixels: Annotated[int, Meta(ge=12)] = 30
@@ -69,6 +76,8 @@ class VisionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     eye_size_ratio: Ratio = 1.2
     depth_size_ratio: Ratio = 1.3
     max_candidates: Annotated[int, Meta(ge=1)] = 12
+    tag: TagConfig = TagConfig()
+    cluster: ClusterConfig = ClusterConfig()
 
     @property
     def band(self) -> HueBand:

@@ -116,7 +116,7 @@ class PoseEstimator:
     def _all_of(self, right: bool) -> Sighting:
         """What one eye sees of all points."""
         seen = [sighting for sighting in self._sightings if sighting.right == right]
-        points, pixels = (np.concatenate(values) for values in zip(*((s.points, s.pixels) for s in seen), strict=True))
+        points, pixels = np.concatenate([s.points for s in seen]), np.concatenate([s.pixels for s in seen])
         return Sighting(points, pixels, np.asarray(block_diag(*(s.cov_px for s in seen))), right)
 
     def _root(self, sighting: Sighting) -> FloatArray:

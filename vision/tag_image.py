@@ -27,7 +27,7 @@ _PLAIN = 0.35
 # Free of the corners, whose blur rounds the edges off.
 _CORNER_PX, _CORNER_SHARE = 2.0, 0.08
 _FEWEST_POINTS, _MOST_POINTS = 6, 80
-_ROUNDS = 2
+_ROUNDS = 3
 # Interpolation between pixels takes up to this factor from the variance of a point, and gives it to its neighbours.
 _SMOOTHED = 1.5
 # What is left of an edge's place when all noise has averaged out [px].

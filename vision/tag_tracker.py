@@ -23,7 +23,8 @@ from .triangulate import triangulate
 
 _log = logging.getLogger(__name__)
 
-_DICTIONARIES: dict[Dictionary, int] = {
+# OpenCV's numbers of the dictionaries.
+DICTIONARIES: dict[Dictionary, int] = {
     "apriltag_36h11": cv2.aruco.DICT_APRILTAG_36h11,
     "aruco_6x6_50": cv2.aruco.DICT_6X6_50,
     "aruco_6x6_100": cv2.aruco.DICT_6X6_100,
@@ -58,7 +59,7 @@ class TagTracker:
         """
         check_calibration(calibration)
         self.calibration, self.body, self.config = calibration, body, config or TagConfig()
-        dictionary = cv2.aruco.getPredefinedDictionary(_DICTIONARIES[self.config.dictionary])
+        dictionary = cv2.aruco.getPredefinedDictionary(DICTIONARIES[self.config.dictionary])
         most = len(dictionary.bytesList)
         for id in body.corners:
             if id >= most:
@@ -68,6 +69,7 @@ class TagTracker:
         parameters = cv2.aruco.DetectorParameters()
         parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_NONE  # `measure_tag` does better
         self._detector = cv2.aruco.ArucoDetector(dictionary, parameters)
+        self._whole = (0, 0, *calibration.image_size_px)
         self._last: tuple[float, list[FloatArray]] | None = None
 
     def track(self, frame: StereoFrame) -> MarkerFix | MarkerMiss:
@@ -83,7 +85,7 @@ class TagTracker:
         if regions is not None:
             found = self._look(frame.t, greys, regions)
         if not isinstance(found, Pose):
-            found = self._look(frame.t, greys, [(0, 0, *self.calibration.image_size_px)] * 2)
+            found = self._look(frame.t, greys, [self._whole, self._whole])
         if isinstance(found, Reason):
             if self._last is not None:
                 _log.debug("marker lost at %.3f s: %s", frame.t, found)
@@ -111,9 +113,10 @@ class TagTracker:
         both = sorted(seen[0].keys() & seen[1].keys())
         if not both:
             return Reason.OCCLUDED
-        for id in both:
-            if not self._rows_agree(seen[0][id], seen[1][id]):
-                return Reason.EPIPOLAR
+        apart = {id for id in both if not self._rows_agree(seen[0][id], seen[1][id])}
+        if apart.issuperset(both):
+            return Reason.EPIPOLAR
+        seen = [{id: tag for id, tag in eye.items() if id not in apart} for eye in seen]
         found = self._pose(seen)
         if isinstance(found, Pose):
             self._last = t, [np.concatenate([tag.corners_px for tag in eye.values()]) for eye in seen]

@@ -16,6 +16,49 @@ STATE = "state"
 # A folder with this file is a demo's, and may be emptied by the next one.
 MARK = ".bodyschema-demo"
 Bus = Literal["dynamixel", "feetech", "serial", "ros2"]
+Marker = Literal["ball", "tag", "cluster"]
+# A cube of 50 mm on the tool's tip: a tag on each face but the one that is on the stick.
+CUBE = """
+[vision]
+marker = "cluster"
+
+[vision.tag]
+side_m = 0.04
+
+[[vision.cluster.tags]]
+id = 0
+xyz = [0.025, 0.0, 0.0]
+rpy = [0.0, 1.5707963267948966, 0.0]
+
+[[vision.cluster.tags]]
+id = 1
+xyz = [-0.025, 0.0, 0.0]
+rpy = [0.0, -1.5707963267948966, 0.0]
+
+[[vision.cluster.tags]]
+id = 2
+xyz = [0.0, 0.025, 0.0]
+rpy = [-1.5707963267948966, 0.0, 0.0]
+
+[[vision.cluster.tags]]
+id = 3
+xyz = [0.0, -0.025, 0.0]
+rpy = [1.5707963267948966, 0.0, 0.0]
+
+[[vision.cluster.tags]]
+id = 4
+xyz = [0.0, 0.0, -0.025]
+rpy = [3.141592653589793, 0.0, 0.0]
+"""
+# One tag, which looks at what is in front of the robot when the arm hangs.
+TAG = """
+[vision]
+marker = "tag"
+
+[vision.tag]
+side_m = 0.06
+"""
+MARKERS: dict[Marker, str] = {"ball": "", "tag": TAG, "cluster": CUBE}
 # Light ones in the neck, strong ones in the shoulder.
 DYNAMIXEL = {
     "neck_yaw": "XL330-M288",
@@ -71,11 +114,12 @@ class Scene:
         return self.folder / "learning_curve.png"
 
 
-def prepare(folder: Path, seed: int, *, bus: Bus | None = None) -> Scene:
+def prepare(folder: Path, seed: int, *, bus: Bus | None = None, marker: Marker = "ball") -> Scene:
     """Lay out the demo's folder; what an earlier demo left there is replaced.
 
     Args:
         bus: what the joints are read through, from a bench.
+        marker: what is in the hand.
 
     Raises:
         ConfigError: the folder is neither empty nor a demo's, or cannot be written.
@@ -93,7 +137,9 @@ def prepare(folder: Path, seed: int, *, bus: Bus | None = None) -> Scene:
             if path.suffix in {".urdf", ".toml"}:
                 shutil.copyfile(path, folder / path.name)
         scene = Scene(folder.resolve())
-        scene.robot_file.write_text(model.read_text(encoding="utf-8") + _own_tables(seed, bus), encoding="utf-8")
+        scene.robot_file.write_text(
+            model.read_text(encoding="utf-8") + _own_tables(seed, bus) + MARKERS[marker], encoding="utf-8"
+        )
     except OSError as error:
         raise ConfigError(
             f"cannot be written: {error.strerror}", file=folder, remedy="Give another --out or free some space"
