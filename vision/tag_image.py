@@ -18,9 +18,10 @@ from .tag_config import TagConfig
 
 # Black border, data and border of all dictionaries that are offered: 6 + 2 modules.
 MODULES = 8.0
-# Lines across an edge reach so far to either side, in modules: the black border and the white margin have one each.
-_REACH_MODULES = 0.75
-_LONGEST_REACH_PX, _SHORTEST_REACH_PX = 6.0, 1.5
+# The black border and the white margin are one module wide each. Lines across an edge stay so far from where they end:
+# blur mixes what is beyond into them.
+_CLEAR_PX = 1.8
+_LONGEST_REACH_PX, _SHORTEST_REACH_PX = 6.0, 1.0
 _SAMPLE_PX = 0.5
 # Ends of the lines across, as a share of their reach, which show plain black and plain white.
 _PLAIN = 0.35
@@ -98,7 +99,7 @@ def _edge(grey: ImageArray, corners_px: FloatArray, side: int, config: TagConfig
     along = (end - begin) / length
     normal = np.array([along[1], -along[0]])  # corners go round clockwise: out of the tag
     depth = min(float(-normal @ (corners_px[side - 1] - begin)), float(-normal @ (corners_px[(side + 2) % 4] - end)))
-    reach = min(_REACH_MODULES * depth / MODULES, _LONGEST_REACH_PX)
+    reach = min(depth / MODULES - _CLEAR_PX, _LONGEST_REACH_PX)
     free = max(_CORNER_PX, _CORNER_SHARE * length)
     count = min(int(length - 2.0 * free), _MOST_POINTS)
     if reach < _SHORTEST_REACH_PX or count < _FEWEST_POINTS:

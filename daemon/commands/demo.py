@@ -30,7 +30,7 @@ def demo(
     marker: Annotated[
         Literal["ball", "tag", "cluster"],
         Parameter(
-            help="In the hand: a red ball, one AprilTag, or a cube of five, which the cameras see from all sides."
+            help="In the hand: a red ball, one AprilTag, or a cube of six, which the cameras see from all sides."
         ),
     ] = "ball",
 ) -> None:

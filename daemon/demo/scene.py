@@ -9,47 +9,19 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
+
 from daemon.wiring import demonstration_model
 from interfaces.errors import ConfigError
+from interfaces.robot import RobotDescription
+
+from .cube import cube_tables
 
 STATE = "state"
 # A folder with this file is a demo's, and may be emptied by the next one.
 MARK = ".bodyschema-demo"
 Bus = Literal["dynamixel", "feetech", "serial", "ros2"]
 Marker = Literal["ball", "tag", "cluster"]
-# A cube of 50 mm on the tool's tip: a tag on each face but the one that is on the stick.
-CUBE = """
-[vision]
-marker = "cluster"
-
-[vision.tag]
-side_m = 0.04
-
-[[vision.cluster.tags]]
-id = 0
-xyz = [0.025, 0.0, 0.0]
-rpy = [0.0, 1.5707963267948966, 0.0]
-
-[[vision.cluster.tags]]
-id = 1
-xyz = [-0.025, 0.0, 0.0]
-rpy = [0.0, -1.5707963267948966, 0.0]
-
-[[vision.cluster.tags]]
-id = 2
-xyz = [0.0, 0.025, 0.0]
-rpy = [-1.5707963267948966, 0.0, 0.0]
-
-[[vision.cluster.tags]]
-id = 3
-xyz = [0.0, -0.025, 0.0]
-rpy = [1.5707963267948966, 0.0, 0.0]
-
-[[vision.cluster.tags]]
-id = 4
-xyz = [0.0, 0.0, -0.025]
-rpy = [3.141592653589793, 0.0, 0.0]
-"""
 # One tag, which looks at what is in front of the robot when the arm hangs.
 TAG = """
 [vision]
@@ -58,7 +30,6 @@ marker = "tag"
 [vision.tag]
 side_m = 0.06
 """
-MARKERS: dict[Marker, str] = {"ball": "", "tag": TAG, "cluster": CUBE}
 # Light ones in the neck, strong ones in the shoulder.
 DYNAMIXEL = {
     "neck_yaw": "XL330-M288",
@@ -138,7 +109,7 @@ def prepare(folder: Path, seed: int, *, bus: Bus | None = None, marker: Marker =
                 shutil.copyfile(path, folder / path.name)
         scene = Scene(folder.resolve())
         scene.robot_file.write_text(
-            model.read_text(encoding="utf-8") + _own_tables(seed, bus) + MARKERS[marker], encoding="utf-8"
+            model.read_text(encoding="utf-8") + _own_tables(seed, bus) + _marker(marker, model), encoding="utf-8"
         )
     except OSError as error:
         raise ConfigError(
@@ -161,6 +132,17 @@ state_dir = "{STATE}"
 [sim]
 seed = {seed}
 {bench}"""
+
+
+def _marker(marker: Marker, model: Path) -> str:
+    """The table [vision] for what is in the hand."""
+    match marker:
+        case "ball":
+            return ""
+        case "tag":
+            return TAG
+        case "cluster":
+            return cube_tables(-np.array(RobotDescription.load(model).robot.marker_xyz))
 
 
 def _joints(bus: Bus) -> str:

@@ -50,12 +50,12 @@ class _Lines:
             return
         self._next = time.monotonic() + PLAIN_EVERY_S
         learner, verdict = snapshot.learner, snapshot.verdict
-        truth = mm(verdict.error_m) if verdict else "-"
+        truth, what = mm(verdict.error_m) if verdict else "-", "error: "
         if verdict and verdict.angle_rad is not None:
-            truth += f" {degrees(verdict.angle_rad)}"
+            truth, what = f"{truth} {degrees(verdict.angle_rad)}", ""  # no room for both
         said = (
             f"{learner.pairs:5d} of {snapshot.target} pairs; "
-            f"error: next pair {mm(learner.prequential_m.get(learner.answering))}, "
+            f"{what}next pair {mm(learner.prequential_m.get(learner.answering))}, "
             f"claimed {mm(learner.claimed_error_m)}, held out {truth}"
         )
         if said != self._said:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import shutil
 import time
 from collections.abc import Callable, Iterator
@@ -13,6 +14,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 from scripted_sources import COV, Scripted
@@ -48,9 +50,13 @@ from interfaces.protocols import JointSource, MarkerSource, StereoCamera
 from interfaces.recording import Recording
 from interfaces.records import JointReading, MarkerFix, MarkerMiss, StereoFrame, frozen_array
 from interfaces.robot import RobotDescription
-from sim_backend import SimConfig, SimWorld, model_file
+from sim_backend import CameraConfig, SimConfig, SimWorld, model_file
+from sim_backend.config import SimTag
+from vision.config import VisionConfig
+from vision.tag_config import ClusterConfig, PlacedTag, TagConfig
 from vision.tracked_camera import TrackedCamera
 from vision.tracker import StereoTracker
+from vision.trackers import tracker_of
 
 LIMIT_S = 60.0
 WAIT_S = 0.005
@@ -162,6 +168,18 @@ def tracked_camera() -> Iterator[Rig]:
 
 
 @contextmanager
+def tracked_tags() -> Iterator[Rig]:
+    facing = PlacedTag(id=0, rpy=(math.pi, 0.0, 0.0))
+    vision = VisionConfig(marker="cluster", cluster=ClusterConfig(tags=(facing, PlacedTag(id=1, rpy=(0.0, 1.6, 0.0)))))
+    tags = tuple(SimTag(id=tag.id, xyz=tag.xyz, rpy=tag.rpy, side_m=0.08) for tag in vision.cluster.tags)
+    vision = msgspec.structs.replace(vision, tag=TagConfig(side_m=0.08))
+    config = SimConfig(camera=CameraConfig(tags=tags))
+    with SimWorld(RobotDescription.load(model_file("upper_body")), config) as world:
+        tracker = tracker_of(world.camera.calibration, vision)
+        yield Rig(TrackedCamera(world.camera, tracker), world.joints, close(world))
+
+
+@contextmanager
 def servos_on_the_bench(faults: Faults = no_faults) -> Iterator[Rig]:
     clock = VirtualClock()
     chain = Chain((Servo(BY_NAME["XM430-W350"], id, swinging(id)) for id in (1, 2)), faults)
@@ -258,7 +276,8 @@ ENDING_JOINTS = [replayed_joints, scripted_joints, pytest.param(simulated_joints
 JOINTS = [*ENDING_JOINTS, servos_on_the_bench, feetech_servos_on_the_bench, encoders_on_the_bench, ros_2_robot]
 SILENT_SERVOS = [servos_that_fall_silent, feetech_servos_that_fall_silent]
 SILENT = [*SILENT_SERVOS, encoders_that_fall_silent, ros_2_robot_that_falls_silent]
-MARKERS = [replayed_marker, scripted_marker, pytest.param(tracked_camera, marks=SIMULATED)]
+TRACKED = [pytest.param(make, marks=SIMULATED) for make in (tracked_camera, tracked_tags)]
+MARKERS = [replayed_marker, scripted_marker, *TRACKED]
 CAMERAS = [pytest.param(simulated_camera, marks=SIMULATED)]
 STANDING_STILL = [ENDING_JOINTS[2], *MARKERS[2:], *CAMERAS]
 Make = Callable[[], AbstractContextManager[Rig]]
@@ -382,6 +401,17 @@ def test_a_fix_has_a_positive_definite_covariance(seen) -> None:
             assert is_frozen(fix.cov, (3, 3))
             assert fix.cov == pytest.approx(fix.cov.T, rel=1e-9)
             assert np.linalg.eigvalsh(fix.cov)[0] > 0
+
+
+def test_a_fix_that_tells_how_the_marker_is_turned_does_so_by_a_unit_quaternion(seen) -> None:
+    for fix in seen[1]:
+        if isinstance(fix, MarkerFix) and fix.R is not None:
+            assert is_frozen(fix.R, (4,))
+            assert np.linalg.norm(fix.R) == pytest.approx(1.0, abs=1e-9)
+        if isinstance(fix, MarkerFix) and fix.cov_R is not None:
+            assert fix.R is not None
+            assert is_frozen(fix.cov_R, (3, 3))
+            assert np.linalg.eigvalsh(fix.cov_R)[0] > 0
 
 
 def test_a_camera_gives_two_colour_images_of_its_calibration_s_size(frames) -> None:
