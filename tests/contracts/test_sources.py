@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import shutil
 import time
 from collections.abc import Callable, Iterator
@@ -21,6 +20,7 @@ from scripted_sources import COV, Scripted
 
 from daemon.bench_wiring import through_bench
 from daemon.config import Config
+from daemon.demo.cube import cube_tables
 from daemon.wiring import driver_of
 from drivers.bench.device import Faults
 from drivers.bench.virtual_port import VirtualClock, VirtualPort
@@ -53,7 +53,6 @@ from interfaces.robot import RobotDescription
 from sim_backend import CameraConfig, SimConfig, SimWorld, model_file
 from sim_backend.config import SimTag
 from vision.config import VisionConfig
-from vision.tag_config import ClusterConfig, PlacedTag, TagConfig
 from vision.tracked_camera import TrackedCamera
 from vision.tracker import StereoTracker
 from vision.trackers import tracker_of
@@ -169,12 +168,12 @@ def tracked_camera() -> Iterator[Rig]:
 
 @contextmanager
 def tracked_tags() -> Iterator[Rig]:
-    facing = PlacedTag(id=0, rpy=(math.pi, 0.0, 0.0))
-    vision = VisionConfig(marker="cluster", cluster=ClusterConfig(tags=(facing, PlacedTag(id=1, rpy=(0.0, 1.6, 0.0)))))
-    tags = tuple(SimTag(id=tag.id, xyz=tag.xyz, rpy=tag.rpy, side_m=0.08) for tag in vision.cluster.tags)
-    vision = msgspec.structs.replace(vision, tag=TagConfig(side_m=0.08))
+    robot = RobotDescription.load(model_file("upper_body"))
+    vision = msgspec.toml.decode(cube_tables(-np.array(robot.robot.marker_xyz)), type=dict[str, VisionConfig])["vision"]
+    placed = vision.cluster.tags
+    tags = tuple(SimTag(id=tag.id, xyz=tag.xyz, rpy=tag.rpy, side_m=vision.tag.side_m) for tag in placed)
     config = SimConfig(camera=CameraConfig(tags=tags))
-    with SimWorld(RobotDescription.load(model_file("upper_body")), config) as world:
+    with SimWorld(robot, config) as world:
         tracker = tracker_of(world.camera.calibration, vision)
         yield Rig(TrackedCamera(world.camera, tracker), world.joints, close(world))
 
