@@ -8,6 +8,8 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import msgspec
+
 from drivers.dynamixel.config import DynamixelConfig
 from drivers.feetech.config import FeetechConfig
 from drivers.ros2.config import Ros2Config
@@ -21,13 +23,14 @@ from kbmaps import RigidChain
 from .bench_wiring import require_bench, through_bench
 from .config import Config
 from .joints_watch import EncoderJoints
-from .marker_wiring import simulation_settings
 from .powered_wiring import open_drives
 from .sources import MarkerTopic, Sources, StampedJoints
 from .store import PairReader
 
 if TYPE_CHECKING:
     from drivers.ros2.joints import Ros2Joints
+    from sim_backend.config import SimConfig, SimTag
+    from vision.config import VisionConfig
 
 Hardware = DynamixelConfig | FeetechConfig | SerialLinesConfig | Ros2Config
 
@@ -173,12 +176,32 @@ def _simulated(config: Config) -> Iterator[Sources]:
     from vision.trackers import tracker_of
 
     on_bench = config.tables.sim.servo_bench
-    settings = simulation_settings(config)
+    settings = _simulation_settings(config)
     settings = exact_encoders(settings) if on_bench else settings
     with SimWorld(config.robot, settings, config.simulation) as world:
         marker = TrackedCamera(world.camera, tracker_of(world.camera.calibration, config.tables.vision))
         joints = _through_bench(config, world.joints) if on_bench else world.joints
         yield Sources(joints, marker, world.clock, world)
+
+
+def _simulation_settings(config: Config) -> SimConfig:
+    """The table [sim], with the tags that [vision] looks for in the hand unless [sim.camera] names others."""
+    sim, vision = config.tables.sim, config.tables.vision
+    if vision.marker == "ball" or sim.camera.tags:
+        return sim
+    from vision.tag_tracker import DICTIONARIES
+
+    number = DICTIONARIES[vision.tag.dictionary]
+    camera = msgspec.structs.replace(sim.camera, tags=_tags(vision), tag_dictionary=number)
+    return msgspec.structs.replace(sim, camera=camera)
+
+
+def _tags(vision: VisionConfig) -> tuple[SimTag, ...]:
+    from sim_backend.config import SimTag
+    from vision.tag_config import PlacedTag
+
+    placed = (PlacedTag(id=vision.tag.id),) if vision.marker == "tag" else vision.cluster.tags
+    return tuple(SimTag(id=tag.id, xyz=tag.xyz, rpy=tag.rpy, side_m=tag.side_m or vision.tag.side_m) for tag in placed)
 
 
 def _through_bench(config: Config, joints: JointSource) -> JointSource:
@@ -199,7 +222,7 @@ def open_postures(config: Config, count: int) -> Iterator[Sources]:
     from vision.tracked_camera import TrackedCamera
     from vision.trackers import tracker_of
 
-    settings = simulation_settings(config)
+    settings = _simulation_settings(config)
     postures = visible_postures(config.robot, settings, count, config.simulation)
     with PosedWorld(config.robot, settings, postures, config.simulation) as world:
         marker = TrackedCamera(world.camera, tracker_of(world.camera.calibration, config.tables.vision))

@@ -102,7 +102,7 @@ class StereoEyes:
         patch[:] = np.round(samples.reshape(height, fine, width, fine, 3).mean(axis=(1, 3)))
 
     def _window(self, x_eye: FloatArray) -> tuple[int, int, int, int] | None:
-        """The rectangle (left, top, width, height) around the marker that lies in the image; None when there is none."""
+        """The rectangle (left, top, width, height) around the marker, as far as in the image; None when it is not."""
         radius = self._config.marker_radius_m
         if x_eye[2] < 2 * radius:
             return None

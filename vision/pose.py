@@ -123,7 +123,7 @@ class PoseEstimator:
         """What makes residuals independent and of sigma 1."""
         shared = np.tile(np.eye(2), (len(sighting.points), 1))
         cov = sighting.cov_px + self._calibration.pixel_sigma**2 * shared @ shared.T
-        return np.asarray(np.linalg.inv(np.linalg.cholesky(cov)))
+        return np.asarray(np.linalg.inv(np.linalg.cholesky(cov)), dtype=np.float64)
 
     def _in_eye(self, x: FloatArray, sighting: Sighting) -> FloatArray:
         return x - np.array([self._calibration.baseline_m, 0.0, 0.0]) if sighting.right else x
@@ -160,7 +160,8 @@ class PoseEstimator:
     def _result(self, rotation: FloatArray, x: FloatArray, residuals: FloatArray, jacobian: FloatArray) -> Pose:
         pairs = zip(self._sightings, self._own_roots, strict=True)
         parts = tuple(self._squares(sighting, root, rotation, x) for sighting, root in pairs)
-        return Pose(rotation, x, np.linalg.inv(jacobian.T @ jacobian), float(residuals @ residuals), parts)
+        cov = np.asarray(np.linalg.inv(jacobian.T @ jacobian), dtype=np.float64)
+        return Pose(rotation, x, cov, float(residuals @ residuals), parts)
 
 
 def _turned(arms: FloatArray) -> FloatArray:
@@ -185,7 +186,10 @@ def mirrored(rotation: FloatArray, x: FloatArray) -> FloatArray:
 
 
 def fitted_motion(body: FloatArray, seen: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Rotation (3, 3) and origin (3,) that take points (k, 3) of the body to where they are seen (k, 3). Kabsch 1976."""
+    """Rotation (3, 3) and origin (3,) that take points of the body (k, 3) to where they are seen (k, 3).
+
+    Kabsch 1976.
+    """
     middle_body, middle_seen = body.mean(axis=0), seen.mean(axis=0)
     u, _, vt = np.linalg.svd((seen - middle_seen).T @ (body - middle_body))
     rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt

@@ -177,7 +177,7 @@ def _line(
         return Reason.OCCLUDED
     # With few points the scatter may be larger than it seems: Student's t has this variance.
     variance = float(np.square(residuals[kept]).sum()) / max(freedom - 2.0, 1.0)
-    cov = _SMOOTHED * variance * np.linalg.inv(design[kept].T @ design[kept])
+    cov = np.asarray(_SMOOTHED * variance * np.linalg.inv(design[kept].T @ design[kept]), dtype=np.float64)
     cov += np.diag([common + _FLOOR_PX**2, _FLOOR_PX**2])
     return float(solution[0]), float(solution[1]), cov
 

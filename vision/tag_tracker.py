@@ -79,7 +79,7 @@ class TagTracker:
             SourceError: the images are not uint8 BGR of the calibration's size.
         """
         check_images(frame, self.calibration)
-        greys = [cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) for image in (frame.left, frame.right)]
+        greys = [np.asarray(cv2.cvtColor(eye, cv2.COLOR_BGR2GRAY), np.uint8) for eye in (frame.left, frame.right)]
         found: Pose | Reason = Reason.NO_MARKER
         regions = self._predicted(frame.t)
         if regions is not None:
@@ -127,13 +127,13 @@ class TagTracker:
         x0, y0, x1, y1 = region
         corners, ids, _ = self._detector.detectMarkers(np.ascontiguousarray(grey[y0:y1, x0:x1]))
         tags: Seen = {}
-        for quad, id in zip(corners, () if ids is None else ids.ravel().tolist(), strict=True):
+        for quad, id in zip(corners, _numbers(ids), strict=True):
             if id not in self.body.corners:
                 continue
             if id in tags:
                 tags[id] = Reason.AMBIGUOUS
                 continue
-            rough = np.asarray(quad, dtype=np.float64).reshape(4, 2) + (x0, y0)
+            rough = np.asarray(quad, dtype=np.float64).reshape(4, 2) + np.array([x0, y0])
             tags[id] = measure_tag(grey, id, rough, self.config)
         return tags
 
@@ -232,6 +232,11 @@ def _why(eyes: Iterable[Seen]) -> Reason:
     """Why eyes without a measured tag have none: of what was refused there, the most telling reason."""
     reasons = {reason for eye in eyes for reason in eye.values()}
     return next((reason for reason in _TELLING if reason in reasons), Reason.NO_MARKER)
+
+
+def _numbers(ids: object) -> list[int]:
+    """The tags' numbers as OpenCV tells them: an array (n, 1), or None."""
+    return [] if ids is None else [int(id) for id in np.ravel(np.asarray(ids))]
 
 
 def _apart(one: Pose, other: Pose) -> float:

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from interfaces.records import FloatArray
 
 # Side of the cube, and of the black squares on it: the white margin of a tag is an eighth of its side [m].
-CUBE_M, TAG_M = 0.05, 0.04
+CUBE_M, TAG_M = 0.07, 0.056
 
 
 def cube_tables(towards_hand: FloatArray) -> str:

@@ -1,4 +1,4 @@
-"""What orientations say of all pairs at once: the rigid chain with its marker turned, and maps of e1, e2, e3 around it."""
+"""What orientations say of all pairs at once: the rigid chain, its marker turned, and maps of e1, e2, e3 around it."""
 
 from __future__ import annotations
 

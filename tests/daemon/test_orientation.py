@@ -64,7 +64,8 @@ def test_how_a_tag_is_turned_is_learnt_better_than_it_is_measured(scene, taught)
 def test_the_claimed_angle_is_about_the_true_one(scene, taught) -> None:
     q = near(np.random.default_rng(1), scene.q)
     status = taught.orientation_status()
-    assert status is not None and status.claimed_rad is not None
+    assert status is not None
+    assert status.claimed_rad is not None
     angle = np.linalg.norm(errors_rad(taught, scene.chain, q), axis=1).mean()
     assert 0.4 < status.claimed_rad / angle < 3.0
 
@@ -86,7 +87,8 @@ def test_positions_are_learnt_as_without_orientations(scene, taught) -> None:
 def test_pairs_without_orientation_give_predictions_without(scene) -> None:
     learning = new_learning()
     teach(learning, scene.pairs[:30], every=NOW_AND_THEN)
-    assert learning.snapshot.predict(scene.q).R is None and learning.orientation_status() is None
+    assert learning.snapshot.predict(scene.q).R is None
+    assert learning.orientation_status() is None
 
 
 def test_the_first_orientation_is_answered_with_at_once(scene) -> None:
@@ -125,7 +127,8 @@ def test_a_checkpoint_keeps_what_was_learnt_of_orientations(scene, taught, tmp_p
     restored = new_learning()
     restored.restore(state)
     before, after = taught.snapshot.predict(scene.q), restored.snapshot.predict(scene.q)
-    assert np.array_equal(before.R, after.R) and np.array_equal(before.sigma_R, after.sigma_R)
+    assert np.array_equal(before.R, after.R)
+    assert np.array_equal(before.sigma_R, after.sigma_R)
     assert restored.orientation_status() == taught.orientation_status()
 
 
@@ -142,7 +145,8 @@ def test_the_model_file_has_the_maps_of_the_axes(scene, taught) -> None:
     kbmap = taught.snapshot.require_map()
     q = near(np.random.default_rng(5), scene.q)
     answer = taught.snapshot.predict(q)
-    assert kbmap.has_orientation and answer.R is not None
+    assert kbmap.has_orientation
+    assert answer.R is not None
     angles = rotation_vectors(
         kbmap.orientation(q, orthonormal=True) @ Rotation.from_quat(answer.R).as_matrix().swapaxes(1, 2)
     )
@@ -161,7 +165,7 @@ def test_the_solver_in_its_own_process_finds_the_same_orientations() -> None:
         teach(apart, pairs, background=False)
         while not apart.at_rest:
             apart.work()
-    assert direct.snapshot.predict(q).R == pytest.approx(apart.snapshot.predict(q).R, abs=1e-9)
+    assert pytest.approx(apart.snapshot.predict(q).R, abs=1e-9) == direct.snapshot.predict(q).R
 
 
 def test_where_the_hand_bends_the_maps_of_the_axes_answer() -> None:
@@ -178,4 +182,5 @@ def test_where_the_hand_bends_the_maps_of_the_axes_answer() -> None:
     learning = new_learning()
     teach(learning, pairs, every=50)
     status = learning.orientation_status()
-    assert status is not None and status.answering == "exact"
+    assert status is not None
+    assert status.answering == "exact"

@@ -145,12 +145,13 @@ def test_orientations_are_copied_where_every_pair_has_one(sampler, robot, tmp_pa
     sampler.pairs = [turned(seq) for seq in range(1, 4)]
     record(tmp_path / "a.csv", "--robot", robot)
     orientation = Recording.read(tmp_path / "a.csv", JOINTS).orientation
-    assert orientation is not None and orientation.tolist() == [[0.0, 0.6, 0.0, 0.8]] * 3
+    assert orientation is not None
+    assert orientation.tolist() == [[0.0, 0.6, 0.0, 0.8]] * 3
 
 
 def test_following_csv_ends_where_orientations_begin(history, sampler, tmp_path) -> None:
     sampler.pairs = [pair(1), pair(2), turned(3), turned(4)]
-    with pytest.raises(RecordingError, match="from pair 3 to 4 some tell how the marker is turned .* 2 rows so far"):
+    with pytest.raises(RecordingError, match=r"from pair 3 to 4 some tell how the marker is turned .* 2 rows so far"):
         follow_history(history, JOINTS, tmp_path / "a.csv", lambda: history.next_seq > 4)
     assert len(Recording.read(tmp_path / "a.csv", JOINTS)) == 2
 

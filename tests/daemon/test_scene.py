@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from daemon.config import Config
+from daemon.demo.cube import CUBE_M
 from daemon.demo.scene import prepare
 from interfaces.errors import ConfigError
 from vision.tag_body import TagBody
@@ -41,8 +42,8 @@ def test_the_cube_in_the_demos_hand_looks_to_all_sides_and_stands_on_its_corner(
     body = TagBody.cluster(vision.cluster, vision.tag)
     middles = np.array([corners.mean(axis=0) for corners in body.corners.values()])
     normals = np.array([np.cross(c[1] - c[0], c[0] - c[3]) for c in body.corners.values()]) / vision.tag.side_m**2
-    assert normals @ middles.T == pytest.approx(0.025 * (normals @ normals.T), abs=1e-9)
-    assert normals == pytest.approx(middles / 0.025, abs=1e-6)
+    assert normals @ middles.T == pytest.approx(CUBE_M / 2 * (normals @ normals.T), abs=1e-9)
+    assert normals == pytest.approx(middles / (CUBE_M / 2), abs=1e-6)
     assert np.linalg.matrix_rank(np.round(normals, 6)) == 3
 
 

@@ -123,7 +123,8 @@ def test_a_store_from_before_orientations_goes_on_with_them(before_orientation) 
         store.append(1, "utc", frozen_array([0.2, 0.2]), turned_fix(1.0))
         old, new = store.read()
     assert (old.seq, old.R, old.centres_px) == (1, None, (1, 2, 3, 4))
-    assert new.R is not None and new.seq == 2
+    assert new.R is not None
+    assert new.seq == 2
 
 
 def test_a_store_from_before_orientations_is_read_without_changing_it(before_orientation) -> None:

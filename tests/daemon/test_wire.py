@@ -41,7 +41,8 @@ def test_an_orientation_comes_out_of_the_wire_as_it_went_in(encoding) -> None:
     turn, cov_R = frozen_array([0.0, 0.6, 0.0, 0.8]), frozen_array(1e-4 * np.eye(3) + 1e-6)
     pair = Pair("id", 3, 2, 1.5, "utc", np.zeros(3), np.zeros(3), np.eye(3), None, turn, cov_R)
     back = pair_from_wire(decode(encode(pair_to_wire(pair), encoding), PairMessage, encoding), 3)
-    assert np.array_equal(back.R, turn) and np.array_equal(back.cov_R, cov_R)
+    assert np.array_equal(back.R, turn)
+    assert np.array_equal(back.cov_R, cov_R)
 
 
 def message(**changed: object) -> bytes:

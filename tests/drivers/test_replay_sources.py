@@ -78,7 +78,8 @@ def test_pixel_centres_are_played() -> None:
 
 def test_orientations_are_played() -> None:
     _, fixes = play(Replay(recording(1, orientation=[[0.0, 0.6, 0.0, 0.8]]), speed=0))
-    assert fixes[0].R is not None and fixes[0].R.tolist() == [0.0, 0.6, 0.0, 0.8]
+    assert fixes[0].R is not None
+    assert fixes[0].R.tolist() == [0.0, 0.6, 0.0, 0.8]
 
 
 def test_times_are_made_up_for_rows_without() -> None:

@@ -7,13 +7,14 @@ from scipy.spatial.transform import Rotation
 
 from interfaces.camera import StereoCalibration
 from sim_backend import CameraConfig
-from sim_backend.config import SimTag
 from sim_backend.bullet import load_pybullet
+from sim_backend.config import SimTag
 from sim_backend.eye import TO_LIGHT, StereoEyes
 from sim_backend.panorama import cluttered_room
 from sim_backend.raster import Grid, Raster
 
 PLAIN = CameraConfig(noise=0, clutter=0)
+UNTURNED = np.eye(3)
 CALIBRATION = StereoCalibration(600.0, (319.5, 239.5), 0.09, (640, 480))
 RADIUS = CameraConfig().ball_radius_m
 
@@ -27,7 +28,7 @@ def bullet():
     module.disconnect(physicsClientId=client)
 
 
-def painted(bullet, x, config=PLAIN, seed=0, T_world_camera=None, turn=np.eye(3)):
+def painted(bullet, x, config=PLAIN, seed=0, T_world_camera=None, turn=UNTURNED):
     """Left and right image of a marker at `x` in the left eye."""
     T = np.eye(4) if T_world_camera is None else T_world_camera
     images = tuple(np.zeros((480, 640, 3), dtype=np.uint8) for _ in range(2))
@@ -165,7 +166,7 @@ def test_a_tag_is_where_its_pose_says(bullet) -> None:
     """The black square of an upright tag that faces the eye, by where its outline crosses the middle grey."""
     x = np.array([0.02, -0.03, 0.6])
     image = painted(bullet, x, TAGS, turn=FACING)[0].mean(axis=2)
-    u, v = np.array([319.5, 239.5]) + 600.0 * (x[:2] + [0.01, 0.0]) / 0.6
+    u, v = np.array([319.5, 239.5]) + 600.0 * np.array([x[0] + 0.01, x[1]]) / 0.6
     black = image < 60.0
     rows, columns = np.flatnonzero(black[:, round(u - 27)]), np.flatnonzero(black[round(v - 27)])
     assert (rows.min() + rows.max()) / 2 == pytest.approx(v, abs=0.5)
@@ -175,7 +176,7 @@ def test_a_tag_is_where_its_pose_says(bullet) -> None:
 
 def test_a_tag_is_not_seen_from_behind(bullet) -> None:
     x = np.array([0.0, 0.0, 0.6])
-    from_behind = painted(bullet, x, TAGS, turn=np.eye(3))[0]
+    from_behind = painted(bullet, x, TAGS, turn=UNTURNED)[0]
     assert from_behind.min() > 60
 
 

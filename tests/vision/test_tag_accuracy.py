@@ -17,7 +17,7 @@ from vision.tag_body import TagBody
 from vision.tag_config import TagConfig
 from vision.tag_tracker import TagTracker
 
-FRAMES = 200
+FRAMES = 120
 SIDE_M = 0.05
 TILT_DEG = 55.0
 LOOKS = {

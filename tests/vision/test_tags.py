@@ -1,12 +1,12 @@
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
 from ball_renderer import SMALL, Look
+from numpy.typing import ArrayLike
 from scenes import reason
 from scipy.spatial.transform import Rotation
 from tag_renderer import Card, Sheet, photograph
@@ -40,12 +40,12 @@ def tracker(config: TagConfig = CONFIG, calibration: StereoCalibration = SMALL) 
     return TagTracker(calibration, TagBody.single(config), config)
 
 
-def tilted(about: Sequence[float], degrees: float) -> FloatArray:
-    axis = np.array(about) / np.linalg.norm(about)
+def tilted(about: ArrayLike, degrees: float) -> FloatArray:
+    axis = np.asarray(about, dtype=np.float64) / np.linalg.norm(about)
     return Rotation.from_rotvec(np.radians(degrees) * axis).as_matrix() @ FACING
 
 
-def sheet(id: int = 0, rotation: FloatArray = FACING, x: FloatArray = MIDDLE, side_m: float = SIDE_M) -> Sheet:
+def sheet(id: int = 0, rotation: FloatArray = FACING, x: ArrayLike = MIDDLE, side_m: float = SIDE_M) -> Sheet:
     return Sheet(id, rotation, np.asarray(x, dtype=np.float64), side_m)
 
 
@@ -67,10 +67,11 @@ def off(answer: MarkerFix | MarkerMiss, rotation: FloatArray, x: FloatArray) -> 
         return np.inf, np.inf
     turned = rotation_vectors((Rotation.from_quat(answer.R).as_matrix() @ rotation.T)[None])[0]
     moved = answer.x - x
-    return tuple(
-        float(np.sqrt(error @ np.linalg.solve(cov, error)))
-        for error, cov in ((moved, answer.cov), (turned, answer.cov_R))
-    )
+    return _length(moved, answer.cov), _length(turned, answer.cov_R)
+
+
+def _length(error: FloatArray, cov: FloatArray) -> float:
+    return float(np.sqrt(error @ np.linalg.solve(cov, error)))
 
 
 @pytest.mark.parametrize("degrees", [0.0, 20.0, 45.0])
@@ -109,7 +110,7 @@ def test_corners_come_out_to_hundredths_of_a_pixel() -> None:
 
 def test_a_followed_tag_is_found_after_a_step_and_after_a_jump() -> None:
     found = tracker()
-    for number, x in enumerate([MIDDLE, MIDDLE + [0.004, 0.0, 0.0], MIDDLE + [-0.04, 0.03, 0.05]]):
+    for number, x in enumerate(MIDDLE + np.array([[0.0, 0.0, 0.0], [0.004, 0.0, 0.0], [-0.04, 0.03, 0.05]])):
         assert max(off(found.track(seen(sheet(x=x), t=number / 30.0, seed=number)), FACING, x)) < 4.0
 
 
