@@ -7,8 +7,8 @@ from scipy.spatial.transform import Rotation
 
 from interfaces.records import FloatArray
 
-# Side of the cube, and of the black squares on it: the white margin of a tag is an eighth of its side [m].
-CUBE_M, TAG_M = 0.07, 0.056
+# Side of the cube [m], and of the black squares on it as a share: the white margin of a tag is an eighth of its side.
+CUBE_M, SQUARE = 0.07, 0.8
 
 
 def cube_tables(towards_hand: FloatArray) -> str:
@@ -19,7 +19,7 @@ def cube_tables(towards_hand: FloatArray) -> str:
     Args:
         towards_hand: where the tool comes from (3,), in the marker's frame, any length.
     """
-    lines = ["", "[vision]", 'marker = "cluster"', "", "[vision.tag]", f"side_m = {TAG_M}"]
+    lines = ["", "[vision]", 'marker = "cluster"', "", "[vision.tag]", f"side_m = {SQUARE * CUBE_M:.6f}"]
     on_corner = Rotation.align_vectors(towards_hand[None] / np.linalg.norm(towards_hand), np.ones((1, 3)) / np.sqrt(3))[
         0
     ]

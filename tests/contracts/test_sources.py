@@ -168,11 +168,13 @@ def tracked_camera() -> Iterator[Rig]:
 
 @contextmanager
 def tracked_tags() -> Iterator[Rig]:
+    """The demo's cube in the demo's hand."""
     robot = RobotDescription.load(model_file("upper_body"))
-    vision = msgspec.toml.decode(cube_tables(-np.array(robot.robot.marker_xyz)), type=dict[str, VisionConfig])["vision"]
+    tables = cube_tables(-np.array(robot.robot.marker_xyz))
+    vision = msgspec.toml.decode(tables, type=dict[str, VisionConfig])["vision"]
     placed = vision.cluster.tags
     tags = tuple(SimTag(id=tag.id, xyz=tag.xyz, rpy=tag.rpy, side_m=vision.tag.side_m) for tag in placed)
-    config = SimConfig(camera=CameraConfig(tags=tags))
+    config = SimConfig(seed=0, camera=CameraConfig(tags=tags))
     with SimWorld(robot, config) as world:
         tracker = tracker_of(world.camera.calibration, vision)
         yield Rig(TrackedCamera(world.camera, tracker), world.joints, close(world))
