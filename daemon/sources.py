@@ -24,6 +24,10 @@ class Simulation(Protocol):
         """The robot as it really is."""
         ...
 
+    def true_turn(self) -> FloatArray:
+        """How the marker really is turned on the hand, shape (3, 3)."""
+        ...
+
 
 @runtime_checkable
 class Powered(Protocol):

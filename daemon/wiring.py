@@ -8,6 +8,8 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import msgspec
+
 from drivers.dynamixel.config import DynamixelConfig
 from drivers.feetech.config import FeetechConfig
 from drivers.ros2.config import Ros2Config
@@ -27,6 +29,8 @@ from .store import PairReader
 
 if TYPE_CHECKING:
     from drivers.ros2.joints import Ros2Joints
+    from sim_backend.config import SimConfig, SimTag
+    from vision.config import VisionConfig
 
 Hardware = DynamixelConfig | FeetechConfig | SerialLinesConfig | Ros2Config
 
@@ -172,7 +176,7 @@ def demonstration_model() -> Path:
 
 def _real(config: Config) -> Sources:
     from vision.tracked_camera import TrackedCamera
-    from vision.tracker import StereoTracker
+    from vision.trackers import tracker_of
 
     from .camera_wiring import camera_of, open_eyes
 
@@ -183,7 +187,7 @@ def _real(config: Config) -> Sources:
     drives = joints.drives if isinstance(joints, ServoJoints) else ()
     return Sources(
         joints,
-        TrackedCamera(camera, StereoTracker(camera.calibration, config.tables.vision)),
+        TrackedCamera(camera, tracker_of(camera.calibration, config.tables.vision)),
         clock,
         powered=tuple(drive for drive in drives if isinstance(drive, Powered)),
         head=next((drive for drive in drives if isinstance(drive, Head)), None),
@@ -199,14 +203,35 @@ def _simulated(config: Config) -> Iterator[Sources]:
     from sim_backend import SimWorld
     from sim_backend.guided_path import exact_encoders
     from vision.tracked_camera import TrackedCamera
-    from vision.tracker import StereoTracker
+    from vision.trackers import tracker_of
 
     on_bench = config.tables.sim.servo_bench
-    settings = exact_encoders(config.tables.sim) if on_bench else config.tables.sim
+    settings = _simulation_settings(config)
+    settings = exact_encoders(settings) if on_bench else settings
     with SimWorld(config.robot, settings, config.simulation) as world:
-        marker = TrackedCamera(world.camera, StereoTracker(world.camera.calibration, config.tables.vision))
+        marker = TrackedCamera(world.camera, tracker_of(world.camera.calibration, config.tables.vision))
         joints = _through_bench(config, world.joints) if on_bench else world.joints
         yield Sources(joints, marker, world.clock, world)
+
+
+def _simulation_settings(config: Config) -> SimConfig:
+    """The table [sim], with the tags that [vision] looks for in the hand unless [sim.camera] names others."""
+    sim, vision = config.tables.sim, config.tables.vision
+    if vision.marker == "ball" or sim.camera.tags:
+        return sim
+    from vision.tag_tracker import DICTIONARIES
+
+    number = DICTIONARIES[vision.tag.dictionary]
+    camera = msgspec.structs.replace(sim.camera, tags=_tags(vision), tag_dictionary=number)
+    return msgspec.structs.replace(sim, camera=camera)
+
+
+def _tags(vision: VisionConfig) -> tuple[SimTag, ...]:
+    from sim_backend.config import SimTag
+    from vision.tag_config import PlacedTag
+
+    placed = (PlacedTag(id=vision.tag.id),) if vision.marker == "tag" else vision.cluster.tags
+    return tuple(SimTag(id=tag.id, xyz=tag.xyz, rpy=tag.rpy, side_m=tag.side_m or vision.tag.side_m) for tag in placed)
 
 
 def _through_bench(config: Config, joints: JointSource) -> JointSource:
@@ -225,11 +250,12 @@ def open_postures(config: Config, count: int) -> Iterator[Sources]:
     from sim_backend.posed import PosedWorld
     from sim_backend.postures import visible_postures
     from vision.tracked_camera import TrackedCamera
-    from vision.tracker import StereoTracker
+    from vision.trackers import tracker_of
 
-    postures = visible_postures(config.robot, config.tables.sim, count, config.simulation)
-    with PosedWorld(config.robot, config.tables.sim, postures, config.simulation) as world:
-        marker = TrackedCamera(world.camera, StereoTracker(world.camera.calibration, config.tables.vision))
+    settings = _simulation_settings(config)
+    postures = visible_postures(config.robot, settings, count, config.simulation)
+    with PosedWorld(config.robot, settings, postures, config.simulation) as world:
+        marker = TrackedCamera(world.camera, tracker_of(world.camera.calibration, config.tables.vision))
         yield Sources(world.joints, marker, world.clock)
 
 

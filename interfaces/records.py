@@ -28,6 +28,7 @@ class Reason(StrEnum):
     EPIPOLAR = "epipolar"  # the two eyes' rows disagree
     SIZE_MISMATCH = "size_mismatch"  # the two eyes' radii, or radius and depth, disagree
     AMBIGUOUS = "ambiguous"  # more than one candidate fits
+    REPROJECTION = "reprojection"  # what is seen does not fit the marker's shape
     IMPLAUSIBLE_SPEED = "implausible_speed"  # farther from the last fix than a hand can move it
     NO_JOINTS = "no_joints"  # no encoder readings around the frame's time
     STALE = "stale"  # encoder readings around the frame's time too far apart
@@ -78,6 +79,10 @@ class MarkerFix:
         centres_px: (ul, vl, ur, vr), where the centre is seen by the left and the right eye, or None
             when the source measures positions directly (a laser tracker, a recording).
         t_sigma: 1-sigma of `t` [s].
+        R: how the marker is turned in the measurement frame: a unit quaternion (x, y, z, w), shape (4,), or None
+            where the marker looks the same from all sides.
+        cov_R: covariance of a small turn of it about the axes of the measurement frame [rad²], shape (3, 3), or None
+            when the source does not tell.
     """
 
     t: float
@@ -85,6 +90,8 @@ class MarkerFix:
     cov: FloatArray
     centres_px: tuple[float, float, float, float] | None = None
     t_sigma: float = 0.0
+    R: FloatArray | None = None
+    cov_R: FloatArray | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,7 +115,7 @@ class Pair:
         q: joint angles interpolated to the frame's time [rad], shape (d,).
         x: marker position in the measurement frame [m], shape (3,).
         cov: covariance of x [m²], shape (3, 3).
-        centres_px: as in `MarkerFix`.
+        centres_px, R, cov_R: as in `MarkerFix`.
     """
 
     store: str
@@ -120,3 +127,5 @@ class Pair:
     x: FloatArray
     cov: FloatArray
     centres_px: tuple[float, float, float, float] | None = None
+    R: FloatArray | None = None
+    cov_R: FloatArray | None = None

@@ -8,6 +8,7 @@ import msgspec
 from msgspec import Meta
 
 from .cameras.config import CamerasConfig
+from .tag_config import ClusterConfig, TagConfig
 
 Positive = Annotated[float, Meta(gt=0)]
 Ratio = Annotated[float, Meta(gt=1)]
@@ -47,6 +48,8 @@ class VisionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The table [vision]: what the marker looks like, and when a find is doubtful.
 
     Attributes:
+        marker: what is looked for: a ball, one tag ([vision.tag]), or a rigid cluster of tags ([vision.cluster]). The
+            other keys of this table are a ball's.
         colour: a name, or a band of hues as the table [vision.colour].
         radius_m: radius of the marker ball [m].
         min_pixels: a patch of the marker's colour smaller than this is no candidate [px²].
@@ -59,8 +62,11 @@ class VisionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         depth_size_ratio: largest ratio between the radius seen and the one expected at the triangulated depth.
         max_candidates: at most this many patches per eye are looked at closely, the most disc-like first.
         cameras: where images come from; without it there are none.
+        tag: the tag, or what the tags of a cluster have in common.
+        cluster: where on the marker which tag is.
     """
 
+    marker: Literal["ball", "tag", "cluster"] = "ball"
     colour: ColourName | HueBand = "red"
     radius_m: Positive = 0.020
     min_pixels: Annotated[int, Meta(ge=12)] = 30
@@ -73,6 +79,8 @@ class VisionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     depth_size_ratio: Ratio = 1.3
     max_candidates: Annotated[int, Meta(ge=1)] = 12
     cameras: CamerasConfig | None = None
+    tag: TagConfig = TagConfig()
+    cluster: ClusterConfig = ClusterConfig()
 
     @property
     def band(self) -> HueBand:

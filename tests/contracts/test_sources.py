@@ -22,6 +22,7 @@ from scripted_sources import COV, Scripted
 
 from daemon.bench_wiring import through_bench
 from daemon.config import Config
+from daemon.demo.cube import cube_tables
 from daemon.wiring import driver_of
 from drivers.bench.device import Faults
 from drivers.bench.virtual_port import VirtualClock, VirtualPort
@@ -52,16 +53,19 @@ from interfaces.protocols import JointSource, MarkerSource, StereoCamera, Stereo
 from interfaces.recording import Recording
 from interfaces.records import JointReading, MarkerFix, MarkerMiss, StereoFrame, frozen_array
 from interfaces.robot import RobotDescription
-from sim_backend import SimConfig, SimWorld, model_file
-from vision.lens import Lens
-from vision.rectified import RectifiedCamera
-from vision.rig import Made, StereoRig
+from sim_backend import CameraConfig, SimConfig, SimWorld, model_file
+from sim_backend.config import SimTag
 from vision.cameras.config import CamerasConfig
 from vision.cameras.device import OpenCapture
 from vision.cameras.ideal import IdealCamera
 from vision.cameras.opened import eyes_of
+from vision.config import VisionConfig
+from vision.lens import Lens
+from vision.rectified import RectifiedCamera
+from vision.rig import Made, StereoRig
 from vision.tracked_camera import TrackedCamera
 from vision.tracker import StereoTracker
+from vision.trackers import tracker_of
 
 LIMIT_S = 60.0
 WAIT_S = 0.005
@@ -270,6 +274,20 @@ def ideal_camera() -> Iterator[Rig]:
 
 
 @contextmanager
+def tracked_tags() -> Iterator[Rig]:
+    """The demo's cube in the demo's hand."""
+    robot = RobotDescription.load(model_file("upper_body"))
+    tables = cube_tables(-np.array(robot.robot.marker_xyz))
+    vision = msgspec.toml.decode(tables, type=dict[str, VisionConfig])["vision"]
+    placed = vision.cluster.tags
+    tags = tuple(SimTag(id=tag.id, xyz=tag.xyz, rpy=tag.rpy, side_m=vision.tag.side_m) for tag in placed)
+    config = SimConfig(seed=0, camera=CameraConfig(tags=tags))
+    with SimWorld(robot, config) as world:
+        tracker = tracker_of(world.camera.calibration, vision)
+        yield Rig(TrackedCamera(world.camera, tracker), world.joints, close(world))
+
+
+@contextmanager
 def servos_on_the_bench(faults: Faults = no_faults) -> Iterator[Rig]:
     clock = VirtualClock()
     chain = Chain((Servo(BY_NAME["XM430-W350"], id, swinging(id)) for id in (1, 2)), faults)
@@ -366,10 +384,11 @@ ENDING_JOINTS = [replayed_joints, scripted_joints, pytest.param(simulated_joints
 JOINTS = [*ENDING_JOINTS, servos_on_the_bench, feetech_servos_on_the_bench, encoders_on_the_bench, ros_2_robot]
 SILENT_SERVOS = [servos_that_fall_silent, feetech_servos_that_fall_silent]
 SILENT = [*SILENT_SERVOS, encoders_that_fall_silent, ros_2_robot_that_falls_silent]
-MARKERS = [replayed_marker, scripted_marker, pytest.param(tracked_camera, marks=SIMULATED)]
 CAMERAS = [pytest.param(camera, marks=SIMULATED) for camera in (simulated_camera, rectified_camera)]
 ENDING_EYES = [image_folder, video_files, side_by_side_video, ideal_camera]
 WAITING_EYES = [two_cameras, side_by_side_camera, image_folder_in_its_own_time]
+TRACKED = [pytest.param(make, marks=SIMULATED) for make in (tracked_camera, tracked_tags)]
+MARKERS = [replayed_marker, scripted_marker, *TRACKED]
 STANDING_STILL = [ENDING_JOINTS[2], *MARKERS[2:], *CAMERAS]
 Make = Callable[[], AbstractContextManager[Rig]]
 
@@ -500,6 +519,17 @@ def test_a_fix_has_a_positive_definite_covariance(seen) -> None:
             assert is_frozen(fix.cov, (3, 3))
             assert fix.cov == pytest.approx(fix.cov.T, rel=1e-9)
             assert np.linalg.eigvalsh(fix.cov)[0] > 0
+
+
+def test_a_fix_that_tells_how_the_marker_is_turned_does_so_by_a_unit_quaternion(seen) -> None:
+    for fix in seen[1]:
+        if isinstance(fix, MarkerFix) and fix.R is not None:
+            assert is_frozen(fix.R, (4,))
+            assert np.linalg.norm(fix.R) == pytest.approx(1.0, abs=1e-9)
+        if isinstance(fix, MarkerFix) and fix.cov_R is not None:
+            assert fix.R is not None
+            assert is_frozen(fix.cov_R, (3, 3))
+            assert np.linalg.eigvalsh(fix.cov_R)[0] > 0
 
 
 def test_a_camera_gives_two_colour_images_of_its_calibration_s_size(frames) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 from interfaces.protocols import StereoCamera, StereoEyes
 from interfaces.records import ImageArray, MarkerFix, Reason, StereoFrame
 from vision.config import VisionConfig
-from vision.tracker import StereoTracker
+from vision.trackers import tracker_of
 
 from .annotate import Annotator
 
@@ -27,7 +27,7 @@ class WatchedCamera:
     def __init__(self, camera: StereoCamera, config: VisionConfig) -> None:
         """Nothing is opened yet."""
         self._camera = camera
-        self._tracker = StereoTracker(camera.calibration, config)
+        self._tracker = tracker_of(camera.calibration, config)
         self._annotator = Annotator(camera.calibration, config)
         self.frames, self.fixes = 0, 0
         self.reasons: dict[Reason, int] = {}
