@@ -111,7 +111,7 @@ class ReplayMarker:
         x, cov = frozen_array(self._recording.x[row]), frozen_array(self._cov[row])
         turns = self._recording.orientation
         R = None if turns is None else frozen_array(turns[row] / np.linalg.norm(turns[row]))
-        return MarkerFix(float(self._t[row]), x, cov, centres, R)
+        return MarkerFix(float(self._t[row]), x, cov, centres, R=R)
 
 
 class ReplayClock(SystemClock):

@@ -101,7 +101,7 @@ class TagTracker:
         ul, vl, ur, vr = self.calibration.project(pose.x).tolist()
         turn = Rotation.from_matrix(pose.rotation).as_quat(canonical=True)
         cov, cov_R = frozen_array(pose.cov[3:, 3:]), frozen_array(pose.cov[:3, :3])
-        return MarkerFix(t, frozen_array(pose.x), cov, (ul, vl, ur, vr), frozen_array(turn), cov_R)
+        return MarkerFix(t, frozen_array(pose.x), cov, (ul, vl, ur, vr), R=frozen_array(turn), cov_R=cov_R)
 
     def _look(
         self, t: float, greys: Sequence[ImageArray], regions: Sequence[tuple[int, int, int, int]]
