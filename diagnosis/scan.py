@@ -96,6 +96,39 @@ class Scan:
                 gain, amounts, dof = self._explained(columns, effect)
                 return Candidate(_with_amounts(effect, amounts), gain, dof) if dof else None
 
+    def best_pair(self, hypotheses: Iterable[Effect]) -> tuple[Candidate, Candidate] | None:
+        """The two effects of one number each that would explain most together; None where there are not two."""
+        singles = [effect for effect in hypotheses if len(effect.parameters) == 1]
+        singles = [effect for effect in singles if effect.parameters[0].is_amount and effect.name != "backlash"]
+        if len(singles) < 2:
+            return None
+        columns = np.concatenate([self._fit.run.columns(effect) for effect in singles], axis=2)
+        flat = self._fit.weighted(columns).reshape(self._left.size, -1)
+        removed = self._basis.reshape(self._left.size, -1).T @ flat
+        toward = flat.T @ self._left.ravel()
+        # In units of each one's length beside what is fitted; two that are one are left out.
+        inner = flat.T @ flat
+        lengths = np.sqrt(np.maximum(np.diag(inner) - np.square(removed).sum(axis=0), 0.0))
+        told = lengths > np.sqrt(_TOLD_APART * np.diag(inner))
+        lengths = np.where(told, lengths, np.inf)
+        shared = (inner - removed.T @ removed) / np.outer(lengths, lengths)
+        alone = toward / lengths
+        apart = 1.0 - np.square(shared)
+        squares = np.square(alone)[:, None] + np.square(alone) - 2.0 * shared * np.outer(alone, alone)
+        usable = np.outer(told, told) & (apart > _TOLD_APART) & ~np.eye(len(singles), dtype=bool)
+        explained = np.where(usable, squares / np.maximum(apart, _TOLD_APART), 0.0)
+        one, other = np.unravel_index(int(np.argmax(explained)), explained.shape)
+        if explained[one, other] <= 0.0:
+            return None
+        amounts = (alone[[one, other]] - shared[one, other] * alone[[other, one]]) / apart[one, other]
+        gain = -3.0 * self._rows * np.log1p(-min(explained[one, other] / self._rss, 0.999999))
+        values = amounts / lengths[[one, other]]
+        pair = [
+            Candidate(_with_amounts(singles[k], values[[place]]), float(gain), 1)
+            for place, k in enumerate((int(one), int(other)))
+        ]
+        return pair[0], pair[1]
+
     def _finely(self, effect: Effect, shapes: FloatArray) -> Candidate | None:
         """The best of an effect whose last number is its shape, over increasing shapes (m,), then between them."""
         gains, _, dofs = self._each(effect, shapes)

@@ -90,7 +90,7 @@ class Search:
             fit = self._reviewed(start)
             self.path.append(fit)
         while len(self.path) <= _MOST_CAUSES:
-            better = self._added(fit)[0] or self._simpler_and_one_more(fit)
+            better = self._added(fit)[0] or self._two_in_place_of_one(fit) or self._simpler_and_one_more(fit)
             if better is None:
                 break
             causes = named(better.causes)
@@ -113,6 +113,24 @@ class Search:
             if worth > most and tried.causes[-1].is_possible:
                 best, most = tried, worth
         return best, most
+
+    def _two_in_place_of_one(self, fit: Fit) -> Fit | None:
+        """With two causes of one number each in the place of one of many; None where none is worth it."""
+        for cause in fit.causes:
+            beside = self.beside(fit, cause)
+            itself = beside.itself or Candidate(cause, 0.0, 1)
+            if itself.dof <= 2:
+                continue
+            pair = Scan(beside.without).best_pair(effect for effect in self._open(fit) if effect.key != cause.key)
+            if pair is None or pair[0].gain < _COMES_NEAR * itself.gain:
+                continue
+            tried = beside.without.with_causes([*beside.without.causes, *(one.effect for one in pair)])
+            worth = nats(2.0 * (tried.log_likelihood - fit.log_likelihood), len(pair) - itself.dof)
+            worth += self.doubt(itself) - sum(self.doubt(one) for one in pair)
+            if worth > 0.0 and named(tried.causes) not in self._seen and all(c.is_possible for c in tried.causes):
+                self._tell(f"exchanged {describe(cause)} for {' and '.join(describe(one.effect) for one in pair)}")
+                return tried
+        return None
 
     def _simpler_and_one_more(self, fit: Fit) -> Fit | None:
         """With a simpler rival in the place of a cause and another cause beside it; None where none is worth it.

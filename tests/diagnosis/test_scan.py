@@ -114,3 +114,25 @@ def test_a_play_is_found_with_its_width(robot, width) -> None:
     assert candidate is not None
     assert candidate.effect.value("width_rad") == pytest.approx(width, rel=0.2)
     assert start.with_causes([candidate.effect]).causes[0].value("width_rad") == pytest.approx(width, rel=0.05)
+
+
+def test_the_best_pair_is_what_both_together_would_explain(robot) -> None:
+    planted = (
+        Effect.at(robot, "joint_offset", SHOULDER, values=[0.004]),
+        Effect.at(robot, "joint_scale", ELBOW, values=[-0.003]),
+    )
+    start = start_of(robot, walk(robot, 6), planted, 6)
+    hypotheses = [
+        Effect.at(robot, name, joint) for name in ("joint_offset", "joint_scale") for joint in (BASE, SHOULDER, ELBOW)
+    ]
+    pair = Scan(start).best_pair(hypotheses)
+    assert pair is not None
+    assert {one.effect.key for one in pair} == {effect.key for effect in planted}
+    for one in pair:
+        (true,) = [effect.values[0] for effect in planted if effect.key == one.effect.key]
+        assert one.effect.values[0] == pytest.approx(true, rel=0.2)
+
+
+def test_one_effect_is_no_pair(robot) -> None:
+    start = start_of(robot, walk(robot, 6), (), 6)
+    assert Scan(start).best_pair([Effect.at(robot, "joint_offset", SHOULDER)]) is None

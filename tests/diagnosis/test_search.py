@@ -179,3 +179,15 @@ def test_a_link_that_stands_for_an_offset_and_a_small_jump_gives_way_to_both() -
     ]
     found = Search(hypotheses, lambda _: None).run(start)
     assert names(found) == {("joint_offset", SHOULDER), ("encoder_jump", ELBOW)}
+
+
+def test_two_offsets_are_named_rather_than_the_link_between_them_that_can_do_both() -> None:
+    robot = surveyed_arm()
+    offsets = (
+        Effect.at(robot, "joint_offset", BASE, values=[0.012]),
+        Effect.at(robot, "joint_offset", SHOULDER, values=[-0.009]),
+    )
+    start = start_of(robot, walk(robot, 6), offsets, 6)
+    hypotheses = [Effect.at(robot, "link_geometry", SHOULDER), *map(at_rest, offsets)]
+    found = Search(hypotheses, lambda _: None).run(start)
+    assert names(found) == {("joint_offset", BASE), ("joint_offset", SHOULDER)}
