@@ -25,7 +25,7 @@ _MOST_SETS = 80
 Key = tuple[str, str | None, str | None]
 Named = frozenset[tuple[Key, int]]
 # Of what begins at a moment there are so many at one place at most.
-_MOST_OF_A_KIND = 4
+_MOST_OF_A_KIND = 2
 # What a number costs at least [nats].
 _CHEAPEST = 1.5
 # What explains a smaller share of what a cause explains is no rival of it; within so much two are as probable [nats].
