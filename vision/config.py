@@ -11,6 +11,7 @@ Positive = Annotated[float, Meta(gt=0)]
 Ratio = Annotated[float, Meta(gt=1)]
 Fraction = Annotated[float, Meta(ge=0, le=1)]
 
+MarkerKind = Literal["ball", "bright_ball", "tag", "cluster"]
 ColourName = Literal["red", "orange", "yellow", "green", "cyan", "blue", "magenta"]
 
 
@@ -45,6 +46,7 @@ class VisionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The table [vision]: what the marker looks like, and when a find is doubtful.
 
     Attributes:
+        marker: a coloured ball, one that is brighter than all around it, a tag, or a rigid cluster of markers.
         colour: a name, or a band of hues as the table [vision.colour].
         radius_m: radius of the marker ball [m].
         min_pixels: a patch of the marker's colour smaller than this is no candidate [px²].
@@ -58,6 +60,7 @@ class VisionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         max_candidates: at most this many patches per eye are looked at closely, the most disc-like first.
     """
 
+    marker: MarkerKind = "ball"
     colour: ColourName | HueBand = "red"
     radius_m: Positive = 0.020
     min_pixels: Annotated[int, Meta(ge=12)] = 30
