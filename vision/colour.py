@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import cast
+from typing import Protocol, cast
 
 import cv2
 import numpy as np
@@ -13,6 +13,18 @@ from interfaces.records import ImageArray
 from .config import HueBand
 
 Float32Array = NDArray[np.float32]
+
+
+class Gate(Protocol):
+    """What tells the marker's pixels from all others."""
+
+    def mask(self, image: ImageArray) -> ImageArray:
+        """255 where a BGR image (height, width, 3) may show the marker, else 0; shape (height, width)."""
+        ...
+
+    def amount(self, image: ImageArray | Float32Array) -> Float32Array:
+        """How much of the marker's light each pixel of a BGR image (..., 3) has, shape (...), in grey levels."""
+        ...
 
 
 class ColourGate:
