@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from interfaces.records import ImageArray
 
-from .config import HueBand
+from .config import HueBand, VisionConfig
 
 Float32Array = NDArray[np.float32]
 
@@ -49,6 +49,28 @@ class ColourGate:
         nothing, and a pixel that the marker covers by half has half of it.
         """
         return image.astype(np.float32, copy=False) @ self._weights_bgr
+
+
+class BrightGate:
+    """Tells what is brighter than all around it, of whatever colour: a lamp, a white ball, a retro-reflective one."""
+
+    def __init__(self, min_brightness: float) -> None:
+        """Pixels from `min_brightness` on count, where 1 is white."""
+        self._lowest = 255.0 * min_brightness
+
+    def mask(self, image: ImageArray) -> ImageArray:
+        """255 where a BGR image (height, width, 3) is bright, else 0; shape (height, width)."""
+        grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+        return cast(ImageArray, cv2.threshold(grey, self._lowest, 255, cv2.THRESH_BINARY)[1])
+
+    def amount(self, image: ImageArray | Float32Array) -> Float32Array:
+        """The brightness of each pixel of a BGR image (..., 3), shape (...), in grey levels."""
+        return image.astype(np.float32, copy=False) @ np.full(3, 1 / 3, np.float32)
+
+
+def gate_of(config: VisionConfig) -> Gate:
+    """What tells the ball that `config` describes."""
+    return BrightGate(config.min_brightness) if config.marker == "bright_ball" else ColourGate(config.band)
 
 
 def _hsv_ranges(band: HueBand) -> list[tuple[ImageArray, ImageArray]]:

@@ -91,7 +91,9 @@ def find_edge_points(
     towards = apart / contrast[:, None]
     seen = np.matmul(profile, towards[:, :, None])[..., 0]
     ball = level * (towards @ colour)[:, None]
-    behind = np.einsum("nc,nc->n", towards, background)[:, None]
+    slope_behind = _slope(seen[:, at >= at[strip][0]], at[at >= at[strip][0]], angles)
+    beyond = _depth_inside(-at, width) - at[strip].mean()
+    behind = np.einsum("nc,nc->n", towards, background)[:, None] + slope_behind[:, None] * beyond
     share = ndtr(-at / width)
     slope = np.exp(-0.5 * (at / width) ** 2) / (np.sqrt(2 * np.pi) * width)
     unlike = seen - ball * share - behind * (1.0 - share)
@@ -162,6 +164,22 @@ def _shaded(angles: FloatArray, rho: FloatArray, amount: FloatArray, wanted: Flo
         weight = area / (1.0 + (off / (3.0 * median(off) + 1.0)) ** 2)
         design[:, 1:] = normals * (normals @ light[1:] > 0)[:, None]
     return np.maximum(light[0] + np.maximum(_normals(angles, np.clip(wanted, 0.0, 1.0)) @ light[1:], 0.0), 0.0)
+
+
+def _slope(seen: FloatArray, at: FloatArray, angles: FloatArray) -> FloatArray:
+    """How steeply the background (n, m) rises along each ray (n,) [1/px], as far as it does so in the slowest waves.
+
+    A part of it is left out: as much as noise alone would make (James and Stein's estimator).
+    """
+    lever = (at - at.mean()) / np.sum((at - at.mean()) ** 2)
+    slopes = seen @ lever
+    middle = median(slopes)
+    spread = 1.4826 * median(np.abs(slopes - middle))
+    slopes = np.clip(slopes, middle - 3.0 * spread, middle + 3.0 * spread)
+    slow = _slow(slopes, angles)
+    waves = 2 * _MISFIT_WAVES + 1
+    by_noise = waves / len(slopes) * np.mean((slopes - slow) ** 2)
+    return slow * max(0.0, 1.0 - by_noise / max(float(np.mean(slow**2)), 1e-9))
 
 
 def _slow(values: FloatArray, angles: FloatArray) -> FloatArray:

@@ -51,8 +51,8 @@ _SMOOTHING_PX = 1.0
 _PRIOR_DEGREES = 4.0
 # Points farther than this from the outline that was captured are no edges of the ball [px].
 _FAR_PX = 1.0
-# Passes of the exact fit, and where a point begins to count less (sigmas).
-_PASSES, _CAUCHY_SIGMAS = 4, 2.5
+# Passes of the exact fit, and where a point counts for a quarter (sigmas).
+_PASSES, _FAR_SIGMAS = 7, 4.0
 # A correction for shading is right to this part of it (1-sigma).
 _DOUBT = 0.5
 # What is left when all noise has averaged out [px].
@@ -71,6 +71,7 @@ class Outline:
         cov_px: covariance of the centre, shape (2, 2) [px²].
         visible: share of the outline that nothing hides.
         uneven: share of the outline at which the background is too uneven to tell.
+        misfit: variance of the outline's points about the ellipse, in units of the one that the image's noise makes.
     """
 
     centre_px: FloatArray
@@ -78,6 +79,7 @@ class Outline:
     cov_px: FloatArray
     visible: float
     uneven: float
+    misfit: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,6 +130,7 @@ def fit_outline(
         cov_px=shape @ exact.cov @ shape + _FLOOR_PX**2 * np.eye(2),
         visible=circle.visible,
         uneven=float(np.mean(edges.uneven)),
+        misfit=exact.misfit,
     )
 
 
@@ -239,10 +242,11 @@ def _fit_circle(edges: _Edges, centre_px: FloatArray, shape: FloatArray) -> _Cir
 
 @dataclass(frozen=True, slots=True)
 class _Exact:
-    """Shift of the centre and radius, shape (3,) [px], and the covariance (2, 2) of the shift [px²]."""
+    """Shift of the centre and radius, shape (3,) [px]; covariance (2, 2) of the shift [px²]; see `Outline.misfit`."""
 
     solution: FloatArray
     cov: FloatArray
+    misfit: float
 
 
 def _solve(angles: FloatArray, points: EdgePoints, weight: FloatArray) -> _Exact | None:
@@ -259,14 +263,14 @@ def _solve(angles: FloatArray, points: EdgePoints, weight: FloatArray) -> _Exact
         residual = distance_px - design @ solution
         sigmas = np.abs(residual) * np.sqrt(weight)
         usual = max(1.0, 1.4826 * median(sigmas[weight > 0]))
-        # Cauchy's weights: a point far off counts by how far.
-        used = weight / (1.0 + (sigmas / (_CAUCHY_SIGMAS * usual)) ** 2)
+        # Geman and McClure's weights: a point far off counts for nothing in the end.
+        used = weight / (1.0 + (sigmas / (_FAR_SIGMAS * usual)) ** 2) ** 2
     if solution[2] <= 0:
         return None
     density = _noise_density(angles, np.sqrt(used) * residual, float(solution[2]))
     inverse = np.linalg.inv(normal)[:2]
     moved = inverse @ (design.T @ (used * points.shading_px))
-    return _Exact(solution, density * inverse[:, :2] + _DOUBT**2 * np.outer(moved, moved))
+    return _Exact(solution, density * inverse[:, :2] + _DOUBT**2 * np.outer(moved, moved), density)
 
 
 def _design(angles: FloatArray) -> FloatArray:

@@ -13,9 +13,9 @@ from interfaces.errors import ConfigError, SourceError
 from interfaces.records import FloatArray, ImageArray, MarkerFix, MarkerMiss, Reason, StereoFrame, frozen_array
 
 from .blob import Disc, Region, find_patches, measure
-from .colour import ColourGate
+from .colour import gate_of
 from .config import VisionConfig
-from .match import StereoMatcher
+from .match import StereoMatcher, is_reflection_of
 from .sphere import Pinhole
 from .triangulate import Location
 
@@ -25,6 +25,9 @@ _log = logging.getLogger(__name__)
 _REGION_RADII, _REGION_PX, _REGION_STEPS = 1.6, 14.0, 0.7
 # After a longer pause the last fixes predict nothing [s].
 _LONGEST_PAUSE_S = 0.5
+# So long after the last fix the marker is expected within reach of it [s], if it moved on for no longer than this [s];
+# the reach is so many radii larger.
+_LONGEST_MEMORY_S, _FAIR_PAUSE_S, _JUMP_RADII = 1.0, 0.1, 2.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,6 +38,15 @@ class _Track:
     centres_px: FloatArray
     velocity_px_s: FloatArray
     radius_px: float
+
+
+@dataclass(frozen=True, slots=True)
+class _Last:
+    """The last fix: time [s], place (3,) [m], level of its colour [grey levels]."""
+
+    t: float
+    x: FloatArray
+    level: float
 
 
 class StereoTracker:
@@ -49,12 +61,13 @@ class StereoTracker:
         _check_calibration(calibration)
         self.calibration = calibration
         self.config = config or VisionConfig()
-        self._gate = ColourGate(self.config.band)
+        self._gate = gate_of(self.config)
         self._eye = Pinhole(calibration.focal_px, calibration.principal_point_px)
         self._matcher = StereoMatcher(calibration, self.config)
         width, height = calibration.image_size_px
         self._whole = Region(0, 0, width, height)
         self._track: _Track | None = None
+        self._last: _Last | None = None
 
     def track(self, frame: StereoFrame) -> MarkerFix | MarkerMiss:
         """The marker in `frame`, in the left optical frame, or why there is none.
@@ -68,6 +81,8 @@ class StereoTracker:
         found = self._look(frame, regions) if regions else None
         if not isinstance(found, Location):
             found = self._look(frame, (self._whole, self._whole))
+        if isinstance(found, Location):
+            found = self._doubt(frame.t, found) or found
         if isinstance(found, Reason):
             if self._track is not None:
                 _log.debug("marker lost at %.3f s: %s", frame.t, found)
@@ -79,7 +94,7 @@ class StereoTracker:
 
     def forget(self) -> None:
         """Look for the marker in the whole images next time."""
-        self._track = None
+        self._track = self._last = None
 
     def _look(self, frame: StereoFrame, regions: tuple[Region, Region]) -> Location | Reason:
         left = self._discs(frame.left, regions[0])
@@ -117,11 +132,24 @@ class StereoTracker:
         high = np.clip(np.ceil(centre_px + half_px) + 1, 0, (width, height)).astype(int)
         return Region(*low.tolist(), *high.tolist()) if (high > low).all() else None
 
+    def _doubt(self, t: float, found: Location) -> Reason | None:
+        """Why what was found in the images cannot be the marker that was seen a moment ago."""
+        last = self._last
+        if last is None or not 0 <= t - last.t <= _LONGEST_MEMORY_S:
+            return None
+        away_m = float(np.linalg.norm(found.x - last.x))
+        if away_m <= _JUMP_RADII * self.config.radius_m + self.config.max_speed_m_s * min(t - last.t, _FAIR_PAUSE_S):
+            return None
+        if is_reflection_of(found, last.level, float(np.linalg.norm(last.x))):
+            return Reason.REFLECTION
+        return Reason.IMPLAUSIBLE_SPEED
+
     def _remember(self, t: float, found: Location) -> None:
         velocity = np.zeros(4)
         if self._track is not None and 0 < t - self._track.t <= _LONGEST_PAUSE_S:
             velocity = (found.centres_px - self._track.centres_px) / (t - self._track.t)
         radius_px = self.calibration.focal_px * self.config.radius_m / float(found.x[2])
+        self._last = _Last(t, found.x, found.level)
         self._track = _Track(t, found.centres_px, velocity, radius_px)
 
     def _check_image(self, eye: str, image: ImageArray) -> None:
