@@ -106,6 +106,8 @@ def measure(image: ImageArray, patch: Patch, eye: Pinhole, gate: Gate, config: V
     height, width = image.shape[:2]
     if not _clear_of_border(patch.box, config.border_margin_px, (width, height)):
         return Reason.AT_BORDER
+    if config.marker != "bright_ball" and _washed_out(image, patch):
+        return Reason.SATURATED
     if patch.fill < _LEAST_FILL:
         return Reason.OCCLUDED
     around = patch.box.grown(_APRON_PX, (width, height))
@@ -121,8 +123,6 @@ def measure(image: ImageArray, patch: Patch, eye: Pinhole, gate: Gate, config: V
         return Reason.OCCLUDED
     if outline.misfit > _LARGEST_MISFIT:
         return Reason.SHAPE
-    if _washed_out(image, patch):
-        return Reason.SATURATED
     centre_px = outline.centre_px + corner
     reach = outline.radius_px + config.border_margin_px
     if (centre_px - reach < 0).any() or (centre_px + reach > (width - 1, height - 1)).any():

@@ -28,7 +28,7 @@ from .rays import ball_colour, median, sample_rays
 _STEP_PX = 0.5
 _INSIDE_PX, _OUTSIDE_PX = 2.5, 5.0
 # The background is told beyond the blur, from a strip of this width [px].
-_CLEAR_PX, _CLEAR_WIDTHS, _STRIP_PX = 1.5, 2.0, 2.0
+_CLEAR_PX, _CLEAR_WIDTHS, _STRIP_PX = 1.5, 2.0, 3.0
 # Blurs that are tried (1-sigma) [px], on the samples this near to the edge [px].
 _WIDTHS_PX = np.linspace(0.35, 2.2, 38)
 _WIDTH_REACH_PX = 2.6
@@ -114,7 +114,7 @@ def _width(profile: Float32Array, at: FloatArray) -> float:
     clear = contrast > _USUAL_CONTRAST**2 * median(contrast)
     share = np.matmul(profile[clear] - background[clear, None], apart[clear, :, None])[..., 0] / contrast[clear, None]
     near = np.abs(at) < _WIDTH_REACH_PX
-    usual = np.median(share[:, near], axis=0)
+    usual = np.partition(share[:, near], len(share) // 2, axis=0)[len(share) // 2]
     models = _edges_of_all_widths(tuple(at[near].tolist()))
     scale = (models @ usual) / np.einsum("wm,wm->w", models, models)
     return float(_WIDTHS_PX[np.argmin(((usual - scale[:, None] * models) ** 2).sum(axis=1))])
@@ -167,25 +167,24 @@ def _shaded(angles: FloatArray, rho: FloatArray, amount: FloatArray, wanted: Flo
 
 
 def _slope(seen: FloatArray, at: FloatArray, angles: FloatArray) -> FloatArray:
-    """How steeply the background (n, m) rises along each ray (n,) [1/px], as far as it does so in the slowest waves.
-
-    A part of it is left out: as much as noise alone would make (James and Stein's estimator).
-    """
+    """How steeply the background (n, m) rises along each ray (n,) [1/px], as far as it does so in the slowest waves."""
     lever = (at - at.mean()) / np.sum((at - at.mean()) ** 2)
-    slopes = seen @ lever
-    middle = median(slopes)
-    spread = 1.4826 * median(np.abs(slopes - middle))
-    slopes = np.clip(slopes, middle - 3.0 * spread, middle + 3.0 * spread)
-    slow = _slow(slopes, angles)
-    waves = 2 * _MISFIT_WAVES + 1
-    by_noise = waves / len(slopes) * np.mean((slopes - slow) ** 2)
-    return slow * max(0.0, 1.0 - by_noise / max(float(np.mean(slow**2)), 1e-9))
+    return _slow(seen @ lever, angles)
 
 
 def _slow(values: FloatArray, angles: FloatArray) -> FloatArray:
-    """The mean and the slowest waves of `values` (n,) round the outline."""
+    """The mean and the slowest waves of `values` (n,) round the outline, less what noise alone would make of them.
+
+    James and Stein's estimator: where `values` are noise, nearly nothing is left; waves well above it stay.
+    """
+    middle = median(values)
+    spread = 3.0 * 1.4826 * median(np.abs(values - middle))
+    clipped = np.clip(values, middle - spread, middle + spread)
     waves = np.exp(1j * np.arange(1, _MISFIT_WAVES + 1)[:, None] * angles)
-    return values.mean() + 2.0 / len(values) * np.real((waves.conj() @ values) @ waves)
+    slow = clipped.mean() + 2.0 / len(values) * np.real((waves.conj() @ clipped) @ waves)
+    off = clipped - slow
+    by_noise = (2 * _MISFIT_WAVES + 1) / len(values) * float(off @ off)
+    return slow * max(0.0, 1.0 - by_noise / max(float(slow @ slow), 1e-9))
 
 
 def _normals(angles: FloatArray, rho: FloatArray) -> FloatArray:

@@ -23,15 +23,13 @@ from .rays import ball_colour, median, ray_angles, sample_rays
 BoolArray = NDArray[np.bool_]
 
 # Half-widths [px] of the ring in which the edge is looked for: about the rough circle, then about the outline.
-_WINDOWS_PX = (4.0, 2.0, 2.0)
-# The outline is found when a step in the narrow ring moved it less than this [px].
-_SETTLED_PX = 0.3
+_WINDOWS_PX = (3.5, 2.0, 2.0)
+# The outline is found when a step moved it, centre and radius together, less than this [px].
+_SETTLED_PX = 0.6
 _RING_STEP_PX = 0.5
 _BACKGROUND_PX = 2.0
 _INNER_COLUMNS = 6
-# How much the brightness at the limb may differ from the one a little inside (1-sigma, relative) ...
-_SHADING_SIGMA = 0.3
-# ... and how much any channel may, apart from that (1-sigma, grey levels).
+# How much any channel at the limb may differ from the one a little inside, brightness apart (1-sigma, grey levels).
 _CHANNEL_SIGMA = 4.0
 # A ray tells the edge where ball and background are this many of these sigmas apart.
 _LEAST_SEPARATION = 3.0
@@ -53,6 +51,8 @@ _PRIOR_DEGREES = 4.0
 _FAR_PX = 1.0
 # Passes of the exact fit, and where a point counts for a quarter (sigmas).
 _PASSES, _FAR_SIGMAS = 7, 4.0
+# The exact fit has settled when a pass moves it less than this [px].
+_UNMOVED_PX = 5e-4
 # A correction for shading is right to this part of it (1-sigma).
 _DOUBT = 0.5
 # What is left when all noise has averaged out [px].
@@ -119,8 +119,8 @@ def fit_outline(
     points = find_edge_points(image, gate, circle.centre_px, circle.radius_px, shape, edges.angles)
     if points is None:
         return None
-    told = edges.weight > 0
-    weight = np.where(told & (np.abs(points.distance_px - circle.radius_px) < _FAR_PX), points.sigma_px**-2, 0.0)
+    told = circle.told & (np.abs(points.distance_px - circle.radius_px) < _FAR_PX)
+    weight = np.where(told, points.sigma_px**-2, 0.0)
     exact = _solve(edges.angles, points, weight)
     if exact is None:
         return None
@@ -136,11 +136,18 @@ def fit_outline(
 
 @dataclass(frozen=True, slots=True)
 class _Circle:
-    """The outline to a tenth of a pixel: centre (2,) and radius [px], and the share of it that nothing hides."""
+    """The outline to a tenth of a pixel.
+
+    Attributes:
+        centre_px, radius_px: centre (2,) and radius [px].
+        visible: share of the outline that nothing hides.
+        told: the rays that tell it, shape (n,); those next to what hides it do not.
+    """
 
     centre_px: FloatArray
     radius_px: float
     visible: float
+    told: BoolArray
 
 
 def _capture(
@@ -159,7 +166,7 @@ def _capture(
             return None
         found = circle, edges
         centre_px, radius_px = circle.centre_px, circle.radius_px
-        if half <= _WINDOWS_PX[-1] and moved_px < _SETTLED_PX:
+        if moved_px < _SETTLED_PX:
             break
     return found
 
@@ -182,7 +189,7 @@ def _find_edges(
     level = np.maximum(_mean_of_three(gate.amount(inside[:, -2:]).mean(axis=1)), 0.0)
     covered = level < _LEAST_LEVEL * median(level)
     background = _mean_of_three(outside.mean(axis=1))
-    towards, separation = _discriminant(level, colour, background)
+    towards, separation = _discriminant(level, colour, background, gate.shading_sigma)
     told = (separation > _LEAST_SEPARATION**2) & ~covered
     scale = 1.0 / np.where(told, separation, 1.0)
     # The share of ball in each sample: 1 on the ball, 0 on the background.
@@ -193,7 +200,9 @@ def _find_edges(
     return _Edges(angles, distance, weight, covered, ~told | (unevenness_px > _UNEVEN_PX))
 
 
-def _discriminant(level: FloatArray, colour: FloatArray, background: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _discriminant(
+    level: FloatArray, colour: FloatArray, background: FloatArray, shading_sigma: float
+) -> tuple[FloatArray, FloatArray]:
     """Fisher's linear discriminant between ball and background, ray by ray.
 
     The ball is `level · colour`, with a covariance of (σ_s · level)² along `colour` and of σ_c² in all channels.
@@ -206,7 +215,7 @@ def _discriminant(level: FloatArray, colour: FloatArray, background: FloatArray)
         The direction in colour space (n, 3), and the squared separation along it (n,) in sigmas.
     """
     apart = level[:, None] * colour - background
-    along = (_SHADING_SIGMA * level) ** 2
+    along = (shading_sigma * level) ** 2
     # Inverse of σ_c² I + along · colour colourᵀ by Sherman and Morrison.
     share = along * (apart @ colour) / (_CHANNEL_SIGMA**2 + along * (colour @ colour))
     direction = (apart - share[:, None] * colour) / _CHANNEL_SIGMA**2
@@ -237,7 +246,9 @@ def _fit_circle(edges: _Edges, centre_px: FloatArray, shape: FloatArray) -> _Cir
     if solution[2] <= 0:
         return None
     hidden = edges.covered | ((weight == 0) & ~edges.uneven)
-    return _Circle(centre_px + shape @ solution[:2], float(solution[2]), 1.0 - float(np.mean(hidden)))
+    beside = np.roll(hidden, 1) | np.roll(hidden, -1) | np.roll(hidden, 2) | np.roll(hidden, -2)
+    seen = (weight > 0) & ~beside
+    return _Circle(centre_px + shape @ solution[:2], float(solution[2]), 1.0 - float(np.mean(hidden)), seen)
 
 
 @dataclass(frozen=True, slots=True)
@@ -259,8 +270,10 @@ def _solve(angles: FloatArray, points: EdgePoints, weight: FloatArray) -> _Exact
         normal = (design * used[:, None]).T @ design
         if _is_singular(normal):
             return None
-        solution = np.linalg.solve(normal, design.T @ (used * distance_px))
+        before, solution = solution, np.linalg.solve(normal, design.T @ (used * distance_px))
         residual = distance_px - design @ solution
+        if np.abs(solution - before).max() < _UNMOVED_PX:
+            break
         sigmas = np.abs(residual) * np.sqrt(weight)
         usual = max(1.0, 1.4826 * median(sigmas[weight > 0]))
         # Geman and McClure's weights: a point far off counts for nothing in the end.

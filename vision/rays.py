@@ -40,7 +40,9 @@ def ball_colour(inside: Float32Array, gate: Gate) -> FloatArray | None:
     coloured = amount > 1.0
     if np.count_nonzero(coloured) < len(amount) // 2:
         return None
-    return np.median(samples[coloured] / amount[coloured, None], axis=0).astype(np.float64)
+    ratios = samples[coloured] / amount[coloured, None]
+    middle = len(ratios) // 2
+    return np.partition(ratios, middle, axis=0)[middle].astype(np.float64)
 
 
 def median(values: FloatArray) -> float:

@@ -29,6 +29,9 @@ _LONGEST_PAUSE_S = 0.5
 # the reach is so many radii larger.
 _LONGEST_MEMORY_S, _FAIR_PAUSE_S, _JUMP_RADII = 1.0, 0.1, 2.0
 
+# Fixes between two looks at the ball's colour.
+_COLOUR_EVERY = 5
+
 
 @dataclass(frozen=True, slots=True)
 class _Track:
@@ -68,6 +71,7 @@ class StereoTracker:
         self._whole = Region(0, 0, width, height)
         self._track: _Track | None = None
         self._last: _Last | None = None
+        self._fixes = 0
 
     def track(self, frame: StereoFrame) -> MarkerFix | MarkerMiss:
         """The marker in `frame`, in the left optical frame, or why there is none.
@@ -89,12 +93,14 @@ class StereoTracker:
             self._track = None
             return MarkerMiss(frame.t, found)
         self._remember(frame.t, found)
+        self._follow_colour(frame, found)
         ul, vl, ur, vr = (float(value) for value in found.centres_px)
         return MarkerFix(frame.t, frozen_array(found.x), frozen_array(found.cov), (ul, vl, ur, vr))
 
     def forget(self) -> None:
         """Look for the marker in the whole images next time."""
         self._track = self._last = None
+        self._gate.reset()
 
     def _look(self, frame: StereoFrame, regions: tuple[Region, Region]) -> Location | Reason:
         left = self._discs(frame.left, regions[0])
@@ -151,6 +157,16 @@ class StereoTracker:
         radius_px = self.calibration.focal_px * self.config.radius_m / float(found.x[2])
         self._last = _Last(t, found.x, found.level)
         self._track = _Track(t, found.centres_px, velocity, radius_px)
+
+    def _follow_colour(self, frame: StereoFrame, found: Location) -> None:
+        """Show the colours' gate the middle of the ball in the left image, now and then."""
+        self._fixes += 1
+        if self._fixes % _COLOUR_EVERY:
+            return
+        half = max(1.0, 0.5 * self.calibration.focal_px * self.config.radius_m / float(found.x[2]))
+        middle = self._region(found.centres_px[:2], half)
+        if middle is not None:
+            self._gate.follow(middle.crop(frame.left))
 
     def _check_image(self, eye: str, image: ImageArray) -> None:
         width, height = self.calibration.image_size_px
