@@ -28,8 +28,8 @@ from vision.tracker import StereoTracker
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "vision"))
 
-from ball_renderer import VGA, Look, backdrop, in_eyes, paint_ball, random_light, take  # noqa: E402
-from scenes import RADIUS_M, place  # noqa: E402
+from ball_renderer import VGA, Look, backdrop, in_eyes, paint_ball, random_light, take
+from scenes import RADIUS_M, place
 
 WEBCAM = Look(noise_sd=1.5, shot=0.03, samples=8)
 LOOKS = {
@@ -124,7 +124,9 @@ def compare_centres(name: str, look: Look, frames: int, seed: int) -> None:
         rms, worst = np.sqrt(np.mean(off**2)), np.quantile(np.abs(off), 0.99)
         bias = np.abs(off.mean(axis=0)).max()
         rate = 1e3 * seconds[rival] / frames
-        print(f"| {name} | {rival} | {rms:.3f} | {np.median(np.abs(off)):.3f} | {worst:.3f} | {bias:.3f} | {100 * len(off) / frames:.1f} | {rate:.2f} |")
+        print(
+            f"| {name} | {rival} | {rms:.3f} | {np.median(np.abs(off)):.3f} | {worst:.3f} | {bias:.3f} | {100 * len(off) / frames:.1f} | {rate:.2f} |"
+        )
 
 
 def information(x: FloatArray, look: Look, pictures: list[FloatArray], calibration: StereoCalibration) -> FloatArray:
@@ -134,6 +136,7 @@ def information(x: FloatArray, look: Look, pictures: list[FloatArray], calibrati
     # Large beside the rays' spacing, small beside the blur: 0.2 px.
     steps = np.diag([2e-4, 2e-4, 2e-3])
     for eye, picture in enumerate(pictures):
+
         def light(at: FloatArray, eye: int = eye, picture: FloatArray = picture) -> FloatArray:
             painted = paint_ball(picture, in_eyes(at, calibration)[eye], RADIUS_M, fine, calibration)
             return cv2.GaussianBlur(255.0 * look.exposure * painted, (0, 0), look.blur_px)
@@ -169,7 +172,9 @@ def against_the_bound(name: str, look: Look, frames: int, bounds: int, seed: int
     covered = 100 * np.mean(np.abs(off) < np.array(sigmas), axis=0)
     spread = np.quantile(np.abs(off), 0.683, axis=0)
     micro = " ".join(f"{1e6 * value:.0f}" for value in rms)
-    print(f"| {name} | {micro} | {' '.join(f'{1e6 * b:.0f}' for b in bound)} | {' '.join(f'{r:.2f}' for r in rms / bound)} | {' '.join(f'{r:.2f}' for r in spread / bound)} | {' '.join(f'{c:.0f}' for c in covered)} | {len(off)} of {frames} |")
+    print(
+        f"| {name} | {micro} | {' '.join(f'{1e6 * b:.0f}' for b in bound)} | {' '.join(f'{r:.2f}' for r in rms / bound)} | {' '.join(f'{r:.2f}' for r in spread / bound)} | {' '.join(f'{c:.0f}' for c in covered)} | {len(off)} of {frames} |"
+    )
 
 
 def main() -> None:
@@ -179,10 +184,16 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     arguments = parser.parse_args()
     cv2.setNumThreads(1)
-    print("| scene | detector | RMS [px] | median [px] | 99 % [px] | bias [px] | found [%] | ms |\n" + "| --- " * 8 + "|")
+    print(
+        "| scene | detector | RMS [px] | median [px] | 99 % [px] | bias [px] | found [%] | ms |\n" + "| --- " * 8 + "|"
+    )
     for name, look in LOOKS.items():
         compare_centres(name, look, arguments.frames, arguments.seed)
-    print("\n| at 1 m | RMS x y z [µm] | bound [µm] | RMS / bound | 68 % / bound | within 1 sigma [%] | fixes |\n" + "| --- " * 7 + "|")
+    print(
+        "\n| at 1 m | RMS x y z [µm] | bound [µm] | RMS / bound | 68 % / bound | within 1 sigma [%] | fixes |\n"
+        + "| --- " * 7
+        + "|"
+    )
     for name in ("even wall", "clutter"):
         against_the_bound(name, LOOKS[name], arguments.frames // 2, arguments.bounds, arguments.seed)
 

@@ -10,10 +10,10 @@ shows beside the ball from a scene's first frame on and has to be called ambiguo
 from __future__ import annotations
 
 import argparse
+import sys
 from collections import Counter
 from dataclasses import dataclass, replace
 from pathlib import Path
-import sys
 
 import cv2
 import numpy as np
@@ -23,9 +23,9 @@ from vision.tracker import StereoTracker
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "vision"))
 
-from ball_renderer import SMALL, Look, clutter, in_eyes, paint_ball, random_light, take  # noqa: E402
-from hand import paint_fingers  # noqa: E402
-from scenes import RADIUS_M, place  # noqa: E402
+from ball_renderer import SMALL, Look, clutter, in_eyes, paint_ball, random_light, take
+from hand import paint_fingers
+from scenes import RADIUS_M, place
 
 FRAMES_OF_A_SCENE = 12
 FRAME_S = 1 / 30

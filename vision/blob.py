@@ -23,10 +23,13 @@ _WHOLE_DISC_FILL = 0.8
 _STRONG_SHARES = (0.5, 0.7)
 # A part of the ball or of a brick has an edge on some sides only; on the others its surroundings are as colourful.
 _MOST_UNEVEN = 0.3
-# An outline whose points scatter about the ellipse with more than this many times the expected variance is no ball's.
-_LARGEST_MISFIT = 8.0
+# An outline whose points scatter about the ellipse with more than this many times the expected variance, and by more
+# than this [px], is no ball's.
+_LARGEST_MISFIT, _LARGEST_SCATTER_PX = 8.0, 0.06
 # A pixel is over-exposed from here [grey levels]; a ball with more than this share of them cannot be measured.
 _WHITE, _MOST_WHITE = 250, 0.35
+# A round patch with more than this part of a disc's radius may be another ball.
+_RIVAL_RADIUS = 0.6
 # Pixels around a patch that the outline may reach into.
 _APRON_PX = 12
 
@@ -91,6 +94,15 @@ class Disc:
         return float(np.linalg.norm(self.centre_px - other.centre_px)) < max(self.radius_px, other.radius_px)
 
 
+def is_rival(patch: Patch, discs: list[Disc]) -> bool:
+    """Whether a patch that was refused may be another ball than the `discs`: round, beside them, not much smaller."""
+    return (
+        patch.fill >= _WHOLE_DISC_FILL
+        and any(patch.radius_px > _RIVAL_RADIUS * disc.radius_px for disc in discs)
+        and not any(np.linalg.norm(patch.centre_px - disc.centre_px) < disc.radius_px for disc in discs)
+    )
+
+
 def find_patches(image: ImageArray, region: Region, gate: Gate, config: VisionConfig) -> list[Patch]:
     """Patches of the marker's colour in `region` of a BGR image, the most disc-like first."""
     pixels = region.crop(image)
@@ -121,7 +133,7 @@ def measure(image: ImageArray, patch: Patch, eye: Pinhole, gate: Gate, config: V
     )
     if outline is None or not _is_whole(outline, config):
         return Reason.OCCLUDED
-    if outline.misfit > _LARGEST_MISFIT:
+    if outline.misfit > _LARGEST_MISFIT and outline.scatter_px > _LARGEST_SCATTER_PX:
         return Reason.SHAPE
     centre_px = outline.centre_px + corner
     reach = outline.radius_px + config.border_margin_px

@@ -16,7 +16,6 @@ from .config import VisionConfig
 from .sphere import Pinhole
 from .triangulate import Location, locate
 
-
 # A mirror gives back less than this of the light, and its copy stands farther off.
 _MIRRORED_LIGHT = 0.8
 

@@ -10,7 +10,9 @@ anti-aliased edge counts by its coverage.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -51,6 +53,8 @@ _PRIOR_DEGREES = 4.0
 _FAR_PX = 1.0
 # Passes of the exact fit, and where a point counts for a quarter (sigmas).
 _PASSES, _FAR_SIGMAS = 7, 4.0
+# So many rays on both sides of what hides the outline may be pulled by it.
+_BESIDE = 4
 # The exact fit has settled when a pass moves it less than this [px].
 _UNMOVED_PX = 5e-4
 # A correction for shading is right to this part of it (1-sigma).
@@ -72,6 +76,7 @@ class Outline:
         visible: share of the outline that nothing hides.
         uneven: share of the outline at which the background is too uneven to tell.
         misfit: variance of the outline's points about the ellipse, in units of the one that the image's noise makes.
+        scatter_px: 1-sigma of those points, far ones included [px].
     """
 
     centre_px: FloatArray
@@ -80,6 +85,7 @@ class Outline:
     visible: float
     uneven: float
     misfit: float
+    scatter_px: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,6 +137,7 @@ def fit_outline(
         visible=circle.visible,
         uneven=float(np.mean(edges.uneven)),
         misfit=exact.misfit,
+        scatter_px=exact.scatter_px,
     )
 
 
@@ -246,18 +253,19 @@ def _fit_circle(edges: _Edges, centre_px: FloatArray, shape: FloatArray) -> _Cir
     if solution[2] <= 0:
         return None
     hidden = edges.covered | ((weight == 0) & ~edges.uneven)
-    beside = np.roll(hidden, 1) | np.roll(hidden, -1) | np.roll(hidden, 2) | np.roll(hidden, -2)
+    beside = np.any([np.roll(hidden, by) for by in range(-_BESIDE, _BESIDE + 1)], axis=0)
     seen = (weight > 0) & ~beside
     return _Circle(centre_px + shape @ solution[:2], float(solution[2]), 1.0 - float(np.mean(hidden)), seen)
 
 
 @dataclass(frozen=True, slots=True)
 class _Exact:
-    """Shift of the centre and radius, shape (3,) [px]; covariance (2, 2) of the shift [px²]; see `Outline.misfit`."""
+    """Shift of the centre and radius, shape (3,) [px]; covariance (2, 2) of the shift [px²]; else as in `Outline`."""
 
     solution: FloatArray
     cov: FloatArray
     misfit: float
+    scatter_px: float
 
 
 def _solve(angles: FloatArray, points: EdgePoints, weight: FloatArray) -> _Exact | None:
@@ -281,9 +289,10 @@ def _solve(angles: FloatArray, points: EdgePoints, weight: FloatArray) -> _Exact
     if solution[2] <= 0:
         return None
     density = _noise_density(angles, np.sqrt(used) * residual, float(solution[2]))
+    scatter_px = math.sqrt(float(weight @ residual**2 / weight.sum()))
     inverse = np.linalg.inv(normal)[:2]
     moved = inverse @ (design.T @ (used * points.shading_px))
-    return _Exact(solution, density * inverse[:, :2] + _DOUBT**2 * np.outer(moved, moved), density)
+    return _Exact(solution, density * inverse[:, :2] + _DOUBT**2 * np.outer(moved, moved), density, scatter_px)
 
 
 def _design(angles: FloatArray) -> FloatArray:

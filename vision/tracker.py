@@ -12,7 +12,7 @@ from interfaces.camera import StereoCalibration
 from interfaces.errors import ConfigError, SourceError
 from interfaces.records import FloatArray, ImageArray, MarkerFix, MarkerMiss, Reason, StereoFrame, frozen_array
 
-from .blob import Disc, Region, find_patches, measure
+from .blob import Disc, Patch, Region, find_patches, is_rival, measure
 from .colour import gate_of
 from .config import VisionConfig
 from .match import StereoMatcher, is_reflection_of
@@ -103,25 +103,32 @@ class StereoTracker:
         self._gate.reset()
 
     def _look(self, frame: StereoFrame, regions: tuple[Region, Region]) -> Location | Reason:
-        left = self._discs(frame.left, regions[0])
+        left, left_rivals = self._discs(frame.left, regions[0])
         if isinstance(left, Reason):
             return left
-        right = self._discs(frame.right, regions[1])
+        right, right_rivals = self._discs(frame.right, regions[1])
         if isinstance(right, Reason):
             return right
-        return self._matcher.match(left, right)
+        found = self._matcher.match(left, right)
+        # Without a track nothing tells the marker from a round thing of its colour that could not be measured.
+        if self._last is None and (left_rivals or right_rivals) and isinstance(found, Location):
+            return Reason.AMBIGUOUS
+        return found
 
-    def _discs(self, image: ImageArray, region: Region) -> list[Disc] | Reason:
-        """The discs in one eye; when there is none, why the most disc-like patch is none."""
+    def _discs(self, image: ImageArray, region: Region) -> tuple[list[Disc] | Reason, bool]:
+        """The discs in one eye; when there is none, why the most disc-like patch is none. And whether a patch that is
+        as round as a ball and not much smaller than a disc was refused."""
         discs: list[Disc] = []
+        refused: list[Patch] = []
         reason: Reason | None = None
         for patch in find_patches(image, region, self._gate, self.config):
             outcome = measure(image, patch, self._eye, self._gate, self.config)
             if isinstance(outcome, Reason):
                 reason = reason or outcome
+                refused.append(patch)
             elif not any(outcome.is_same_as(disc) for disc in discs):
                 discs.append(outcome)
-        return discs or reason or Reason.NO_MARKER
+        return discs or reason or Reason.NO_MARKER, any(is_rival(patch, discs) for patch in refused)
 
     def _predicted_regions(self, t: float) -> tuple[Region, Region] | None:
         track = self._track

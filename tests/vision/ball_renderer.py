@@ -187,7 +187,12 @@ def take(picture: FloatArray, look: Look, rng: np.random.Generator) -> ImageArra
     image = np.clip(np.rint(grey_levels + noise), 0, 255).astype(np.uint8)
     if look.jpeg is None:
         return image
-    settings = [cv2.IMWRITE_JPEG_QUALITY, look.jpeg, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_420]
+    settings = [
+        cv2.IMWRITE_JPEG_QUALITY,
+        look.jpeg,
+        cv2.IMWRITE_JPEG_SAMPLING_FACTOR,
+        cv2.IMWRITE_JPEG_SAMPLING_FACTOR_420,
+    ]
     return np.asarray(cv2.imdecode(cv2.imencode(".jpg", image, settings)[1], cv2.IMREAD_COLOR), dtype=np.uint8)
 
 
