@@ -125,7 +125,8 @@ def compare_centres(name: str, look: Look, frames: int, seed: int) -> None:
         bias = np.abs(off.mean(axis=0)).max()
         rate = 1e3 * seconds[rival] / frames
         print(
-            f"| {name} | {rival} | {rms:.3f} | {np.median(np.abs(off)):.3f} | {worst:.3f} | {bias:.3f} | {100 * len(off) / frames:.1f} | {rate:.2f} |"
+            f"| {name} | {rival} | {rms:.3f} | {np.median(np.abs(off)):.3f} | {worst:.3f} | {bias:.3f} "
+            f"| {100 * len(off) / frames:.1f} | {rate:.2f} |"
         )
 
 
@@ -173,7 +174,14 @@ def against_the_bound(name: str, look: Look, frames: int, bounds: int, seed: int
     spread = np.quantile(np.abs(off), 0.683, axis=0)
     micro = " ".join(f"{1e6 * value:.0f}" for value in rms)
     print(
-        f"| {name} | {micro} | {' '.join(f'{1e6 * b:.0f}' for b in bound)} | {' '.join(f'{r:.2f}' for r in rms / bound)} | {' '.join(f'{r:.2f}' for r in spread / bound)} | {' '.join(f'{c:.0f}' for c in covered)} | {len(off)} of {frames} |"
+        columns = [
+            micro,
+            " ".join(f"{1e6 * b:.0f}" for b in bound),
+            " ".join(f"{r:.2f}" for r in rms / bound),
+            " ".join(f"{r:.2f}" for r in spread / bound),
+            " ".join(f"{c:.0f}" for c in covered),
+        ]
+        print(f"| {name} | {' | '.join(columns)} | {len(off)} of {frames} |")
     )
 
 

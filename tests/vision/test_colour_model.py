@@ -1,8 +1,6 @@
 from __future__ import annotations
 
 import colorsys
-from dataclasses import replace
-
 import cv2
 import msgspec
 import numpy as np
@@ -114,5 +112,7 @@ def test_a_bright_ball_is_found_by_its_brightness_over_exposed_or_not(exposure):
     white = Ball((0.02, 0.01, 0.8), rgb=(0.95, 0.95, 0.95))
     look = Look(exposure=exposure, ambient=0.7, diffuse=0.3, specular=0.0, noise_sd=2.0)
     frame = stage(white, Slab((-1, -1), (1, 1), 0.8, rgb=(0.2, 0.2, 0.2)), white, look=look)
-    tracker = StereoTracker(SMALL, VisionConfig(marker="bright_ball"))
-    assert sigmas_off(tracker.track(frame), replace(white)) < FAR_SIGMAS
+    fix = StereoTracker(SMALL, VisionConfig(marker="bright_ball")).track(frame)
+    assert isinstance(fix, MarkerFix)
+    # Where pixels are over-exposed the claim does not cover what is cut off: a sixth of a pixel here.
+    assert np.abs(fix.x - np.array(white.x))[:2].max() < 4e-4
