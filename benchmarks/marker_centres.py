@@ -172,17 +172,14 @@ def against_the_bound(name: str, look: Look, frames: int, bounds: int, seed: int
     rms, bound = np.sqrt(np.mean(off**2, axis=0)), np.sqrt(np.mean(limits, axis=0))
     covered = 100 * np.mean(np.abs(off) < np.array(sigmas), axis=0)
     spread = np.quantile(np.abs(off), 0.683, axis=0)
-    micro = " ".join(f"{1e6 * value:.0f}" for value in rms)
-    print(
-        columns = [
-            micro,
-            " ".join(f"{1e6 * b:.0f}" for b in bound),
-            " ".join(f"{r:.2f}" for r in rms / bound),
-            " ".join(f"{r:.2f}" for r in spread / bound),
-            " ".join(f"{c:.0f}" for c in covered),
-        ]
-        print(f"| {name} | {' | '.join(columns)} | {len(off)} of {frames} |")
-    )
+    columns = [
+        " ".join(f"{1e6 * value:.0f}" for value in rms),
+        " ".join(f"{1e6 * value:.0f}" for value in bound),
+        " ".join(f"{ratio:.2f}" for ratio in rms / bound),
+        " ".join(f"{ratio:.2f}" for ratio in spread / bound),
+        " ".join(f"{share:.0f}" for share in covered),
+    ]
+    print(f"| {name} | {' | '.join(columns)} | {len(off)} of {frames} |")
 
 
 def main() -> None:

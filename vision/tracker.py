@@ -111,7 +111,7 @@ class StereoTracker:
             return right
         found = self._matcher.match(left, right)
         # Without a track nothing tells the marker from a round thing of its colour that could not be measured.
-        if self._last is None and (left_rivals or right_rivals) and isinstance(found, Location):
+        if self._last is None and left_rivals and right_rivals and isinstance(found, Location):
             return Reason.AMBIGUOUS
         return found
 

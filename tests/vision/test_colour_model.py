@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import colorsys
+
 import cv2
 import msgspec
 import numpy as np
