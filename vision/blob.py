@@ -25,7 +25,7 @@ _STRONG_SHARES = (0.5, 0.7)
 _MOST_UNEVEN = 0.3
 # An outline whose points scatter about the ellipse with more than this many times the expected variance, and by more
 # than this [px], is no ball's.
-_LARGEST_MISFIT, _LARGEST_SCATTER_PX = 8.0, 0.06
+_LARGEST_MISFIT, _LARGEST_SCATTER_PX = 8.0, 0.45
 # A pixel is over-exposed from here [grey levels]; a ball with more than this share of them cannot be measured.
 _WHITE, _MOST_WHITE = 250, 0.35
 # A round patch with more than this part of a disc's radius may be another ball.
