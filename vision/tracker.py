@@ -27,7 +27,7 @@ _REGION_RADII, _REGION_PX, _REGION_STEPS = 1.6, 14.0, 0.7
 _LONGEST_PAUSE_S = 0.5
 # So long after the last fix the marker is expected within reach of it [s], if it moved on for no longer than this [s];
 # the reach is so many radii larger.
-_LONGEST_MEMORY_S, _FAIR_PAUSE_S, _JUMP_RADII = 1.0, 0.1, 2.0
+_LONGEST_MEMORY_S, _FAIR_PAUSE_S, _JUMP_RADII = 0.9, 0.1, 2.0
 
 # Fixes between two looks at the ball's colour.
 _COLOUR_EVERY = 5
