@@ -25,29 +25,41 @@ class JointBuffer:
     """Recent joint readings, put in by the encoders' thread and asked for by the frames' thread.
 
     Both sides come in strictly increasing time. Readings before the frame that was asked for last are forgotten.
-    When the buffer is full `put` waits for room, because a recording can be read faster than its frames are stored.
+    When the buffer is full `put` waits for room, because a recording can be read faster than its frames are stored;
+    of live encoders it forgets the oldest, because who reads them may bear the arm and can wait for nobody.
     """
 
-    def __init__(self, prismatic: NDArray[np.bool_], max_gap_s: float, capacity: int = CAPACITY) -> None:
+    def __init__(
+        self,
+        prismatic: NDArray[np.bool_],
+        max_gap_s: float,
+        capacity: int = CAPACITY,
+        *,
+        live: bool = False,
+        kept_s: float = 0.0,
+    ) -> None:
         """An empty buffer.
 
         Args:
             prismatic: which joints are prismatic, shape (d,).
             max_gap_s: readings around a frame may be this far apart [s].
             capacity: number of readings that are kept at most.
+            live: `put` never waits.
+            kept_s: readings of so long before the frame are not forgotten yet [s].
         """
         self._prismatic = prismatic
         self._max_gap_s = max_gap_s
         self._capacity = capacity
-        self._readings: deque[JointReading] = deque()
+        self._live, self._kept_s = live, kept_s
+        self._readings: deque[JointReading] = deque(maxlen=capacity if live else None)
         self._changed = Condition()
         self._expecting = True
         self._closed = False
 
     def put(self, reading: JointReading) -> None:
-        """Add the newest reading; waits while the buffer is full, and does nothing once it is closed."""
+        """Add the newest reading; waits while the buffer is full and not live, does nothing once it is closed."""
         with self._changed:
-            self._changed.wait_for(lambda: self._closed or len(self._readings) < self._capacity)
+            self._changed.wait_for(lambda: self._closed or self._live or len(self._readings) < self._capacity)
             if self._closed:
                 return
             self._readings.append(reading)
@@ -61,7 +73,7 @@ class JointBuffer:
             self._changed.notify_all()
 
     def forget_before(self, t: float) -> None:
-        """No frame before `t` will be asked for: keep only the last reading at or before it, and what follows."""
+        """No frame before `t` will be asked for: keep the last reading `kept_s` before it, and what follows."""
         with self._changed:
             self._forget_before(t)
 
@@ -100,16 +112,32 @@ class JointBuffer:
         fraction = (t - before.t) / (after.t - before.t)
         return frozen_array(before.q + fraction * joint_difference(after.q, before.q, self._prismatic))
 
+    def moved(self, t: float, during_s: float, timeout_s: float) -> FloatArray | Reason:
+        """How far the joints move within `during_s` of time `t`, shape (d,) [rad or m]; a reason as of `at`.
+
+        The mean over both sides, so that a step of an encoder counts half. Where `during_s` is longer than `kept_s`,
+        by the speed within that.
+        """
+        span_s = min(during_s, self._kept_s)
+        before = self.at(t - span_s, timeout_s)
+        if isinstance(before, Reason):
+            return before
+        after = self.at(t + span_s, timeout_s)
+        if isinstance(after, Reason):
+            return after
+        return frozen_array(0.5 * during_s / span_s * joint_difference(after, before, self._prismatic))
+
     def _reaches(self, t: float) -> bool:
         return bool(self._readings) and self._readings[-1].t >= t
 
     def _forget_before(self, t: float) -> None:
-        while len(self._readings) > 1 and self._readings[1].t <= t:
+        while len(self._readings) > 1 and self._readings[1].t <= t - self._kept_s:
             self._readings.popleft()
         self._changed.notify_all()
 
     def _around(self, t: float) -> tuple[JointReading, JointReading]:
-        first = self._readings[0]
-        if first.t == t:
-            return first, first
-        return next((a, b) for a, b in pairwise(self._readings) if b.t >= t)
+        """The last reading at or before `t`, and the one after it."""
+        for before, after in pairwise(self._readings):
+            if after.t > t:
+                return before, after
+        return self._readings[-1], self._readings[-1]

@@ -44,6 +44,8 @@ class Answers:
             model=snapshot.digest,
             pairs=snapshot.pairs,
             age_s=age,
+            R=None if prediction.R is None else prediction.R.tolist(),
+            sigma_R=None if prediction.sigma_R is None else prediction.sigma_R.tolist(),
         )
         return encode(reply, request.encoding)
 

@@ -61,6 +61,8 @@ class DaemonConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             of its own where the step is larger than `max_step_deg`.
         max_reading_gap_s: encoder readings around a frame may be this far apart.
         max_marker_speed_m_s: a marker that moved faster since its last fix is not believed.
+        max_time_error_deg: joints that move farther than this while the time of a frame is uncertain (1-sigma, and
+            what lies between the two eyes' images) are too fast for a pair.
         segment_gap_s: a pause between pairs longer than this starts a new segment.
     """
 
@@ -71,6 +73,7 @@ class DaemonConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     any_step: bool = False
     max_reading_gap_s: Positive = 0.1
     max_marker_speed_m_s: Positive = 3.0
+    max_time_error_deg: Positive = 0.2
     segment_gap_s: Positive = 1.0
 
 
@@ -156,6 +159,8 @@ class Config:
         _check_endpoints(tables.zenoh, file, text)
         tables.drivers.check(robot.joints, file, text)
         _check_router(tables, file, text)
+        if tables.vision.cameras is not None:
+            tables.vision.cameras.check(file, text)
         if tables.vision.radius_m > LARGEST_BALL_M:
             raise ConfigError(
                 f"vision.radius_m = {tables.vision.radius_m:g}: this looks like millimetres",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
@@ -14,6 +15,7 @@ import numpy as np
 from diagnosis.conclusion import conclusion
 from diagnosis.diagnosis import Diagnosis
 from diagnosis.diagnosis import diagnose as diagnosed
+from diagnosis.hypotheses import STILL
 from diagnosis.observations import ticks
 from diagnosis.remedies import remedies
 from diagnosis.report import About, page
@@ -65,8 +67,11 @@ class Asked:
 
     @classmethod
     def of(cls, only: str | None, without: str | None, seed: int) -> Asked:
-        """From names with commas between; RequestError where there is no such effect."""
-        return cls(_names(only, "--effects"), _names(without, "--exclude"), seed)
+        """From names with commas between; RequestError where there is no such effect, or none is left."""
+        asked = cls(_names(only, "--effects"), _names(without, "--exclude"), seed)
+        if set(asked.only or KINDS) <= set(asked.without):
+            raise RequestError("--effects and --exclude leave nothing to look for. Exclude fewer")
+        return asked
 
 
 def _names(text: str | None, option: str) -> tuple[str, ...]:
@@ -164,6 +169,8 @@ def run(config: Config, source: Source, asked: Asked, tell: Tell) -> Found:
             f"{source.name}: {len(recording)} pairs are too few to tell causes of {len(robot.joints)} joints apart. "
             f"Record at least {fewest}; some hundred are better"
         )
+    if np.ptp(recording.q, axis=0).max() < STILL:
+        raise DiagnosisError(f"{source.name}: no joint ever moved. Guide each joint through its range")
     tell(f"{len(recording)} pairs of {source.name}")
     _require_columns(robot, recording, source.name)
     diagnosis = diagnosed(
@@ -213,6 +220,17 @@ def _require_this_robot(robot: RobotDescription, recording: Recording, predicted
             f"{name}: whatever is tried, half of the pairs are missed by over {1e3 * float(np.median(left)):.3g} mm: "
             f"they are hardly of this robot. {_asked(robot, recording)}"
         )
+
+
+def require_folder(folder: Path) -> None:
+    """Make DIR, before minutes of work are lost; RecordingError where nothing can be written to it."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        told = f"cannot be written: {error.strerror or error}"
+        raise RecordingError(told, file=folder, remedy="Give another folder") from error
 
 
 def written(found: Found, folder: Path) -> None:

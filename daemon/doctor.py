@@ -16,6 +16,7 @@ import msgspec
 from interfaces.errors import BodyschemaError
 
 from .bus import Bus, is_alive
+from .camera_wiring import camera_checks, cameras_of
 from .config import Config
 from .keys import Keys
 from .servo_wiring import (
@@ -53,6 +54,8 @@ def steps(config: Config) -> Iterator[Step]:
         yield "servos", lambda: _on_the_ports(config, servo_checks)
     elif configured_ports(config):
         yield "encoders", lambda: _on_the_ports(config, encoder_checks)
+    if cameras_of(config) is not None:
+        yield "cameras", lambda: _cameras(config)
     if config.tables.drivers.ros2 is not None:
         yield "router", lambda: joint_state_checks(config)
     yield "disk", lambda: disk_checks(config.state_dir)
@@ -73,6 +76,9 @@ def _description(config: Config) -> Iterator[Check]:
     if config.tables.drivers.hardware is None:
         said = "no servos are configured, so none were looked at"
         yield Check("robot.toml", "warning", said, "bodyschema robot new --from scan")
+    cameras = cameras_of(config)
+    if cameras is not None and cameras.calibration is not None:
+        return
     if config.robot.calibration is None:
         said = "[camera] describes no stereo pair: images cannot be used, recordings can"
         yield Check(
@@ -80,6 +86,16 @@ def _description(config: Config) -> Iterator[Check]:
         )
     else:
         yield Check("camera", "ok", "[camera] describes a stereo pair")
+
+
+def _cameras(config: Config) -> Iterator[Check]:
+    """What the cameras send; while the sampler runs it has them, and tells."""
+    if not is_alive(config.tables.zenoh.sampler, Keys(config.robot.name).alive("sampler"), open_timeout_s=OPEN_S):
+        yield from camera_checks(config)
+        return
+    with Bus(connect=config.tables.zenoh.sampler, client=True) as bus:
+        status = decode(bus.ask_one(Keys(config.robot.name).status("sampler")), SamplerStatus)
+    yield Check("cameras", "ok", f"the running sampler takes {status.frames_per_s:.1f} stereo frames/s")
 
 
 def _on_the_ports(config: Config, look: Callable[[Config], Iterator[Check]]) -> Iterator[Check]:

@@ -89,6 +89,10 @@ class Gate:
         self._t, self._q, self._broken = t, q, False
         return Accepted(self._segment)
 
+    def is_too_fast(self, moved: FloatArray) -> bool:
+        """Whether joints that moved by `moved` [rad or m], (d,), while the time is uncertain make no pair."""
+        return float(np.linalg.norm(moved * self._degrees_per_unit)) > self._rules.max_time_error_deg
+
     def _step_deg(self, q: FloatArray) -> float:
         if self._q is None:
             return np.inf

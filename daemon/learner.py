@@ -158,6 +158,7 @@ class Learner:
             checkpoint_age_s=None if written is None else now - written,
             uptime_s=now - self._started_at,
             health=list(self._health()),
+            orientation=self._learning.orientation_status(),
             version=version("bodyschema"),
         )
 

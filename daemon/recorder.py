@@ -131,12 +131,20 @@ def _follow(history: History, stopped: Callable[[], bool], take: Callable[[list[
 class _CsvRows:
     def __init__(self, stream: TextIO, joints: tuple[str, ...]) -> None:
         self._stream, self._joints = stream, joints
+        self._names: tuple[str, ...] = ()
         self.count = 0
 
     def add(self, pairs: list[Pair]) -> None:
         table = recordings.from_pairs(pairs, self._joints).to_table()
-        if not self.count:
+        if not self._names:
+            self._names = table.names
             self._stream.write(",".join(table.names) + "\n")
+        if table.names != self._names:
+            raise RecordingError(
+                f"from pair {pairs[0].seq} to {pairs[-1].seq} some tell how the marker is turned and some do not",
+                file=Path(self._stream.name),
+                remedy=f"The {self.count} rows so far are whole; record what follows into another file",
+            )
         integers = frozenset(i for i, name in enumerate(table.names) if name in INTEGER_COLUMNS)
         write_csv_rows(self._stream, table.values.tolist(), integers)
         self._stream.flush()

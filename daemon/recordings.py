@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -16,6 +17,8 @@ from interfaces.records import Pair
 from .mcap_export import write_mcap
 from .store import Devices, PairReader
 
+log = logging.getLogger(__name__)
+
 MCAP, URDF = ".mcap", ".urdf"
 STORE_ENDINGS = (".sqlite", ".sqlite3", ".db")
 
@@ -27,8 +30,11 @@ _WRITERS: dict[str, Callable[[Recording, Path, Sequence[Devices]], None]] = {
 
 
 def from_pairs(pairs: Sequence[Pair], joints: tuple[str, ...]) -> Recording:
-    """The recording of `pairs`, at least one; with pixel centres where every pair has them."""
+    """The recording of `pairs`, at least one; with pixel centres and orientations where every pair has them."""
     centres = [pair.centres_px for pair in pairs]
+    turns = [pair.R for pair in pairs if pair.R is not None]
+    if 0 < len(turns) < len(pairs):
+        log.warning("%d of %d pairs have no orientation, so it is left out", len(pairs) - len(turns), len(pairs))
     return Recording(
         joints=joints,
         q=np.array([pair.q for pair in pairs]),
@@ -37,6 +43,7 @@ def from_pairs(pairs: Sequence[Pair], joints: tuple[str, ...]) -> Recording:
         cov=np.array([pair.cov for pair in pairs]),
         segment=np.array([pair.segment for pair in pairs]),
         centres_px=None if None in centres else np.array(centres),
+        orientation=np.array(turns) if len(turns) == len(pairs) else None,
     )
 
 

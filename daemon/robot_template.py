@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -76,11 +77,29 @@ max_step_deg = 3.0
 colour = "red"
 # Of the marker ball [m].
 radius_m = 0.020
+
+# CHECK: the cameras; `bodyschema scan` names those that are plugged in, docs/cameras.md tells the rest.
+{cameras}"""
+
+_CAMERAS = """\
+[vision.cameras]
+# calibration = "cameras.toml"   # as `bodyschema calibrate cameras` wrote it; without it images are rectified already
+# latency_s = 0.0                # as `bodyschema calibrate latency` says, with its latency_sigma_s
+[vision.cameras.two]
+left = {left}
+right = {right}
+image_size_px = [640, 480]
+fps = 30.0
+# exposure_s = 0.005             # a short one: a moving ball blurs. Without a value the camera chooses.
+# gain = 64
+# white_balance_k = 4600
+# focus = 0
 """
+_EXAMPLES = "/dev/v4l/by-id/usb-LEFT-video-index0", "/dev/v4l/by-id/usb-RIGHT-video-index0"
 
 
-def robot_toml(guess: Guess) -> str:
-    """The text of a commented robot.toml."""
+def robot_toml(guess: Guess, cameras: Sequence[str] = ()) -> str:
+    """The text of a commented robot.toml; with two cameras or more, the first two are its eyes."""
     joints = "[" + ", ".join(_quoted(joint) for joint in guess.joints) + "]"
     return _TEMPLATE.format(
         name=_quoted(guess.name),
@@ -88,7 +107,17 @@ def robot_toml(guess: Guess) -> str:
         joints=joints,
         marker_link=_quoted(guess.marker_link),
         camera_link=_quoted(guess.camera_link),
+        cameras=_camera_tables(cameras),
     )
+
+
+def _camera_tables(cameras: Sequence[str]) -> str:
+    """The cameras' tables; as an example, which does nothing, where there are not two."""
+    left, right = map(_quoted, cameras[:2] if len(cameras) >= 2 else _EXAMPLES)
+    text = _CAMERAS.format(left=left, right=right)
+    if len(cameras) >= 2:
+        return text
+    return "".join(line if line.startswith("#") else f"# {line}" for line in text.splitlines(keepends=True))
 
 
 def _quoted(text: str) -> str:

@@ -8,6 +8,7 @@ import shutil
 import threading
 import time
 from contextlib import ExitStack
+from dataclasses import replace
 from importlib.metadata import version
 
 import numpy as np
@@ -39,9 +40,11 @@ log = logging.getLogger(__name__)
 
 READ_TIMEOUT_S = 0.2
 JOINTS_TIMEOUT_S = 1.0  # how long a frame waits for the encoders to reach its time
+AROUND_S = 0.1  # of a frame whose time is uncertain: how fast the joints are
 PREDICT_S = 0.2  # what the gaze waits for the learner
 STATUS_EVERY_S = 1.0
 SILENT_AFTER_S = 2.0  # a source that has said nothing for so long is reported
+ZERO_FORCE = "zero_force"  # that [robot] hold says, and the drive is called
 PAIR_CACHE = 1000
 LOW_DISK_BYTES = 200 * 2**20
 
@@ -82,13 +85,16 @@ class Sampler:
         self._wall = SystemClock() if wall is None else wall
         self._keys = Keys(config.robot.name)
         self._powered = {drive.name: drive for drive in sources.powered}
+        held = config.robot.robot.hold == "zero_force"
+        self._bears = self._powered.get(ZERO_FORCE) if held else None
+        self._cameras, self._calibration = sources.cameras, sources.calibration
         self._gaze = None if sources.head is None else self._gaze_loop(sources.head)
         self._simulation, self._source_clock = sources.simulation, sources.clock
         self._joints = Reopening(sources.joints, "the encoders", self._wall)
         self._encoders, self._devices = sources.joints, DeviceWatch(sources.joints, store, self._wall)
         self._marker = Reopening(sources.marker, "the cameras", self._wall)
         rules, prismatic = config.tables.daemon, config.robot.chain.prismatic
-        self._buffer = JointBuffer(prismatic, rules.max_reading_gap_s)
+        self._buffer = JointBuffer(prismatic, rules.max_reading_gap_s, live=sources.live, kept_s=AROUND_S)
         self._gate = Gate(rules, prismatic, store.last())
         self._tally = Tally(config.robot, self._wall, store.reader.joint_ranges())
         self._seq = store.reader.last_seq()
@@ -207,9 +213,12 @@ class Sampler:
             return Reason.PAUSED
         if isinstance(seen, MarkerMiss):
             return seen.reason
-        q = self._buffer.at(seen.t, JOINTS_TIMEOUT_S)
+        q = self._angles(seen)
         if isinstance(q, Reason):
             return q
+        if self._bears is not None and self._bears.state != "on":
+            self._gate.break_segment()
+            return Reason.NOT_BORNE
         with self._deciding:
             if self._paused:
                 self._gate.break_segment()
@@ -221,6 +230,16 @@ class Sampler:
                 return verdict
             self._accept(verdict, q, seen)
         return None
+
+    def _angles(self, fix: MarkerFix) -> FloatArray | Reason:
+        """Joint angles at the time of a fix, if they are known well enough for how well that time is known."""
+        if fix.t_sigma > 0:
+            moved = self._buffer.moved(fix.t, fix.t_sigma, JOINTS_TIMEOUT_S)
+            if isinstance(moved, Reason):
+                return moved
+            if self._gate.is_too_fast(moved):
+                return Reason.MOVING
+        return self._buffer.at(fix.t, JOINTS_TIMEOUT_S)
 
     def _accept(self, verdict: Accepted, q: FloatArray, fix: MarkerFix) -> None:
         pair: Pair = self._store.append(verdict.segment, self._wall.utc(), q, fix)
@@ -294,7 +313,10 @@ class Sampler:
         def predict(payload: bytes) -> bytes:
             return self._bus.ask_one(self._keys.predict, payload, timeout_s=PREDICT_S)
 
-        return GazeLoop(self._config.robot, head, HandModel(self._config.robot, predict, self._wall))
+        robot = self._config.robot
+        if self._calibration is not None:
+            robot = replace(robot, calibration=self._calibration)
+        return GazeLoop(robot, head, HandModel(robot, predict, self._wall))
 
     def _power(self, name: str, *, on: bool) -> str:
         if name not in self._powered:
@@ -327,6 +349,12 @@ class Sampler:
         elif not self._ended:
             said += self._silences()
         said += [text for drive in self._powered.values() for text in drive.complaints]
+        if self._cameras is not None and self._marker.trouble is None:
+            said += self._cameras.health
+        if self._bears is not None and self._bears.state != "on":
+            said.append(
+                f"{ZERO_FORCE} is to bear the arm ([robot] hold) and is {self._bears.state}: no pairs are taken"
+            )
         if self._bad_readings:
             said.append(f"{self._bad_readings} encoder readings were not finite and were not used")
         if self._disk_free() < LOW_DISK_BYTES:

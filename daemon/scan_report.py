@@ -79,11 +79,13 @@ class ScanReport:
     Attributes:
         joints: for each servo of robot.toml what is in its place; None without a robot.toml.
         strangers: who is on one of its ports, but not in it.
+        cameras: of this machine, by the names for robot.toml.
     """
 
     ports: Sequence[ScannedPort]
     joints: tuple[JointFinding, ...] | None = None
     strangers: tuple[Servo, ...] = ()
+    cameras: tuple[str, ...] = ()
 
     @property
     def servos(self) -> list[Servo]:
@@ -138,8 +140,8 @@ def _place(found: Sequence[Servo], id: int, model: str, port: str, baud: int) ->
 
 
 def as_json(report: ScanReport) -> str:
-    """The report as JSON: `ports` with `servos`, and with a robot.toml `joints` and `strangers`."""
-    contents: dict[str, Any] = {"well": report.is_well, "ports": report.ports}
+    """The report as JSON: `ports` with `servos`, `cameras`, and with a robot.toml `joints` and `strangers`."""
+    contents: dict[str, Any] = {"well": report.is_well, "ports": report.ports, "cameras": report.cameras}
     if report.joints is not None:
         contents |= {"joints": report.joints, "strangers": report.strangers}
     return msgspec.json.format(msgspec.json.encode(contents)).decode()

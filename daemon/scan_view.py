@@ -25,6 +25,8 @@ def show(console: Console, report: ScanReport) -> None:
             console.print("  nobody answers, at no rate")
         if port.trouble is not None:
             console.print(Text(f"  {port.trouble}", style="red"), soft_wrap=True)
+    for camera in report.cameras:
+        console.print(Text(f"camera {camera}"), soft_wrap=True)
     troubles = list(_troubles(report))
     for line in troubles:
         console.print(Text(line, style="yellow"), soft_wrap=True)

@@ -21,6 +21,14 @@ def mm(metres: float | None, unit: str = " mm") -> str:
     return f"{value:.{0 if value >= 100 else 1 if value >= 1 else 2 if value >= 0.1 else 3}f}{unit}"
 
 
+def degrees(radians: float | None, unit: str = "°") -> str:
+    """A small angle in degrees with sensible digits; a dash for none."""
+    if radians is None or not math.isfinite(radians):
+        return "-"
+    value = math.degrees(radians)
+    return f"{value:.{1 if value >= 10 else 2 if value >= 1 else 3}f}{unit}"
+
+
 def two_digits(value: float) -> str:
     """A positive number with two significant digits, never in powers of ten."""
     if value <= 0.0 or not math.isfinite(value):

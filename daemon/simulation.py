@@ -31,12 +31,14 @@ class TruthReply(msgspec.Struct, frozen=True):
         axes: shape (d, 3).
         prismatic: shape (d,).
         t: simulated time [s].
+        turn: how the marker is turned in the chain's last frame, shape (3, 3).
     """
 
     fixed: list[list[list[float]]]
     axes: list[list[float]]
     prismatic: list[bool]
     t: float
+    turn: list[list[float]]
     schema: int = SCHEMA
 
 
@@ -48,7 +50,8 @@ def answer_simulation(world: Simulation, clock: Clock, request: Request) -> byte
     """
     if not request.payload:
         chain = world.true_chain()
-        truth = TruthReply(chain.fixed.tolist(), chain.axes.tolist(), chain.prismatic.tolist(), clock.now())
+        turn = world.true_turn().tolist()
+        truth = TruthReply(chain.fixed.tolist(), chain.axes.tolist(), chain.prismatic.tolist(), clock.now(), turn)
         return encode(truth, request.encoding)
     tool = decode(request.payload, ToolRequest, request.encoding).tool
     if not math.dist(tool, (0.0, 0.0, 0.0)) <= LONGEST_TOOL_M:

@@ -24,9 +24,10 @@ import numpy as np
 
 from daemon.learning import DirectSolver, Solved, Task
 from daemon.learning.members import RESIDUAL
+from daemon.learning.orientation_solver import OrientationSolution
 from interfaces.errors import BodyschemaError
 from interfaces.records import FloatArray
-from kbmaps import ChainBelief, ChainTolerances, KBMap, ResidualModel
+from kbmaps import ChainBelief, ChainTolerances, KBMap, OrientedChain, ResidualModel
 
 NICENESS = 5
 LONGEST_REST_S = 5.0
@@ -50,15 +51,25 @@ class StartTask(msgspec.Struct, frozen=True, tag="start"):
 
 
 class Learn(msgspec.Struct, frozen=True, tag="learn"):
-    """Pairs: q (n, joints) and x (n, 3) as little-endian float64."""
+    """Pairs: q (n, joints), x (n, 3) and orientations (n, 4) as little-endian float64."""
 
     joints: int
     q: bytes
     x: bytes
+    turns: bytes | None = None
 
 
 class Solve(msgspec.Struct, frozen=True, tag="solve"):
     """Solve for all pairs so far."""
+
+
+class Oriented(msgspec.Struct, frozen=True):
+    """An `OrientationSolution`, its models as bytes."""
+
+    pairs: int
+    chain: bytes
+    map: bytes | None
+    map_noise: float
 
 
 class Solution(msgspec.Struct, frozen=True):
@@ -74,6 +85,7 @@ class Solution(msgspec.Struct, frozen=True):
     belief: bytes | None
     last: bool
     wide: bytes | None
+    orientation: Oriented | None = None
 
 
 _orders = msgspec.msgpack.Decoder(StartTask | Learn | Solve)
@@ -123,9 +135,10 @@ class SolverProcess:
             )
         )
 
-    def learn(self, q: FloatArray, x: FloatArray) -> None:
-        """More pairs, q (n, d) [rad] and x (n, 3) [m]."""
-        self._send(Learn(q.shape[1], q.astype("<f8").tobytes(), x.astype("<f8").tobytes()))
+    def learn(self, q: FloatArray, x: FloatArray, turns: FloatArray | None = None) -> None:
+        """More pairs, q (n, d) [rad], x (n, 3) [m] and orientations (n, 4), NaN where a pair has none."""
+        told = None if turns is None else turns.astype("<f8").tobytes()
+        self._send(Learn(q.shape[1], q.astype("<f8").tobytes(), x.astype("<f8").tobytes(), told))
 
     def solve(self) -> None:
         """Ask for the solution of all pairs so far."""
@@ -188,9 +201,19 @@ def _unpacked(solution: Solution) -> Solved:
         model = belief = ResidualModel.from_bytes(solution.model)
     elif solution.model is not None:
         model, belief = KBMap.from_bytes(solution.model), _belief(solution.belief)
-    return Solved(
-        solution.task, solution.pairs, solution.name, model, belief, solution.last, wide=_belief(solution.wide)
-    )
+    turned = None if solution.orientation is None else _orientation_from(solution.orientation)
+    wide = _belief(solution.wide)
+    return Solved(solution.task, solution.pairs, solution.name, model, belief, solution.last, wide, turned)
+
+
+def _orientation_from(packed: Oriented) -> OrientationSolution:
+    kbmap = None if packed.map is None else KBMap.from_bytes(packed.map)
+    return OrientationSolution(packed.pairs, OrientedChain.from_bytes(packed.chain), kbmap, packed.map_noise)
+
+
+def _packed_orientation(solution: OrientationSolution) -> Oriented:
+    kbmap = None if solution.map is None else solution.map.to_bytes()
+    return Oriented(solution.pairs, solution.chain.to_bytes(), kbmap, solution.map_noise)
 
 
 def _belief(data: bytes | None) -> ChainBelief | None:
@@ -210,6 +233,7 @@ def serve(orders: IO[bytes], solutions: IO[bytes]) -> None:
             solver.learn(
                 np.frombuffer(order.q, dtype="<f8").reshape(-1, order.joints),
                 np.frombuffer(order.x, dtype="<f8").reshape(-1, 3),
+                None if order.turns is None else np.frombuffer(order.turns, dtype="<f8").reshape(-1, 4),
             )
         else:
             time.sleep(max(rested_at - time.monotonic(), 0.0))
@@ -223,7 +247,8 @@ def _solve(solver: DirectSolver, solutions: IO[bytes]) -> float:
         learnt = None if solved.model is None else solved.model.to_bytes()
         belief = solved.belief.to_bytes() if isinstance(solved.belief, ChainBelief) else None
         wide = None if solved.wide is None else solved.wide.to_bytes()
-        _write(solutions, Solution(solved.task, solved.pairs, solved.name, learnt, belief, solved.last, wide))
+        turned = None if solved.orientation is None else _packed_orientation(solved.orientation)
+        _write(solutions, Solution(solved.task, solved.pairs, solved.name, learnt, belief, solved.last, wide, turned))
     return time.process_time() - begin
 
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
+from interfaces.camera import StereoCalibration
 from interfaces.protocols import Clock, JointSource, MarkerSource, Source
 from interfaces.records import FloatArray
 from kbmaps import RigidChain
@@ -20,6 +22,10 @@ class Simulation(Protocol):
 
     def true_chain(self) -> RigidChain:
         """The robot as it really is."""
+        ...
+
+    def true_turn(self) -> FloatArray:
+        """How the marker really is turned on the hand, shape (3, 3)."""
         ...
 
 
@@ -47,6 +53,7 @@ class Powered(Protocol):
         ...
 
 
+@runtime_checkable
 class Head(Powered, Protocol):
     """A head that turns to where it is told to look."""
 
@@ -75,6 +82,15 @@ class Head(Powered, Protocol):
         ...
 
 
+class TellsHealth(Protocol):
+    """What can say how it is."""
+
+    @property
+    def health(self) -> Sequence[str]:
+        """What is wrong, and what to do."""
+        ...
+
+
 @dataclass(frozen=True, slots=True)
 class Sources:
     """Encoders and marker, not opened yet, on one clock; and the simulated world when there is one.
@@ -82,6 +98,9 @@ class Sources:
     Attributes:
         powered: what may move the arm or the head, once a person asks for it.
         head: the one of them that turns the cameras.
+        cameras: what tells how the cameras are, where there are some.
+        calibration: how they see, where that is not what [camera] says.
+        live: neither encoders nor cameras wait for the other; else what is not read yet stays to be read.
     """
 
     joints: JointSource
@@ -90,6 +109,9 @@ class Sources:
     simulation: Simulation | None = None
     powered: tuple[Powered, ...] = ()
     head: Head | None = None
+    cameras: TellsHealth | None = None
+    calibration: StereoCalibration | None = None
+    live: bool = False
 
 
 class StampedJoints(JointSource, Protocol):

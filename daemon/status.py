@@ -165,6 +165,22 @@ class Outlook(msgspec.Struct, frozen=True, kw_only=True):
     enough: bool
 
 
+class OrientationStatus(msgspec.Struct, frozen=True):
+    """How well it is known how the marker is turned.
+
+    Attributes:
+        pairs: pairs with the present tool that said it.
+        answering: which model answers.
+        prequential_rad: recent mean angle between prediction and measurement, before learning [rad], by model.
+        claimed_rad: the angle to the truth [rad] that the learner claims where data is; null before a few pairs.
+    """
+
+    pairs: int
+    answering: str
+    prequential_rad: dict[str, float]
+    claimed_rad: float | None
+
+
 class ToolChange(msgspec.Struct, frozen=True):
     """The last change of the tool: sequence number of the first pair with it, and whether it was found, not told."""
 
@@ -197,6 +213,7 @@ class LearnerStatus(msgspec.Struct, frozen=True, kw_only=True):
         at_rest: whether nothing is left to do with the pairs that came: to fit, to solve, to replay or to find out.
         checkpoint_age_s: time since the last checkpoint, or null before any.
         health: sentences about what is wrong; empty when all is well.
+        orientation: null where no pair with the present tool said how the marker is turned.
     """
 
     robot: str
@@ -224,4 +241,5 @@ class LearnerStatus(msgspec.Struct, frozen=True, kw_only=True):
     uptime_s: float
     health: list[str]
     version: str
+    orientation: OrientationStatus | None = None
     schema: int = SCHEMA

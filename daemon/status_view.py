@@ -19,9 +19,9 @@ from .bus import Bus
 from .config import Config
 from .findings_view import calibration_table, outlook_lines
 from .keys import Keys
-from .screen import coverage_table, mm, rejected
+from .screen import coverage_table, degrees, mm, rejected
 from .servos_view import servos_table
-from .status import BusStatus, LearnerStatus, SamplerStatus
+from .status import BusStatus, LearnerStatus, OrientationStatus, SamplerStatus
 from .wire import decode
 
 ANSWER_LIMIT_S = 2.0
@@ -139,6 +139,8 @@ def _learner(status: LearnerStatus) -> list[RenderableType]:
     facts.add_row("pairs", f"{status.pairs} learnt, {status.replayed} replay steps{doubted}{refused}")
     facts.add_row("next pair", f"missed by: {errors}")
     facts.add_row("claimed", f"{mm(status.claimed_error_m)} mean error where data is{_elsewhere(status)}")
+    if status.orientation is not None:
+        facts.add_row("orientation", _orientation(status.orientation))
     if status.changes:
         facts.add_row("tool", _tool_change(status))
     for name, line in zip(("enough?", ""), outlook_lines(status.outlook), strict=False):
@@ -180,3 +182,11 @@ def _duration(seconds: float) -> str:
     minutes, seconds = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours} h {minutes:02d} min" if hours else f"{minutes} min {seconds:02d} s" if minutes else f"{seconds} s"
+
+
+def _orientation(status: OrientationStatus) -> str:
+    errors = ", ".join(f"{name} {degrees(error)}" for name, error in status.prequential_rad.items())
+    return (
+        f"{status.answering} answers, of {status.pairs} pairs; next pair: {errors}; "
+        f"claimed {degrees(status.claimed_rad)} where data is"
+    )

@@ -15,14 +15,14 @@ from types import TracebackType
 from typing import Any, Self
 
 import msgspec
-import numpy as np
 
 from interfaces.errors import StoreError
 from interfaces.records import FloatArray, MarkerFix, Pair, frozen_array
 
 from .store_file import NOTHING_CHANGED, damaged, explained, lock
+from .store_rows import COLUMNS, COLUMNS_BEFORE_ORIENTATION, pair_of, row_of
 
-SCHEMA_VERSION = 2
+SCHEMA_VERSION = 3
 APPLICATION_ID = 0x42534348  # "BSCH": how `file` and we tell a pair store from another SQLite file
 
 _TABLES = """
@@ -36,15 +36,18 @@ CREATE TABLE pairs (
     t REAL NOT NULL, utc TEXT NOT NULL, q TEXT NOT NULL, x TEXT NOT NULL, cov TEXT NOT NULL, centres_px TEXT
 );
 """
-# Since schema 2. What the joints were read with from pair `from_seq` on.
-_DEVICES = """
+# The statements that lead to each schema from the one before. Those of schema 2: what the joints were read with from
+# pair `from_seq` on. Of schema 3: how the marker is turned.
+_MIGRATIONS = {
+    2: """
 CREATE TABLE devices (
     id INTEGER PRIMARY KEY, session INTEGER NOT NULL REFERENCES sessions, from_seq INTEGER NOT NULL, utc TEXT NOT NULL,
     record TEXT NOT NULL
-);
-"""
-_COLUMNS = "seq, segment, t, utc, q, x, cov, centres_px"
-_UPPER = np.triu_indices(3)
+)""",
+    3: """
+ALTER TABLE pairs ADD COLUMN R TEXT;
+ALTER TABLE pairs ADD COLUMN cov_R TEXT""",
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,6 +98,7 @@ class PairReader:
         self.identity = ""
         self.joints: tuple[str, ...] = ()
         self._connection: sqlite3.Connection | None = None
+        self._columns = COLUMNS
         self._lock = Lock()
 
     def __enter__(self) -> Self:
@@ -105,6 +109,8 @@ class PairReader:
             try:
                 _check_kind(self._connection, self.file)
                 meta = _meta(self._connection)
+                if _version(self._connection) < 3:
+                    self._columns = COLUMNS_BEFORE_ORIENTATION
             except BaseException:
                 self._close()
                 raise
@@ -123,15 +129,15 @@ class PairReader:
             StoreError: the file cannot be read.
         """
         rows = self._rows(
-            f"SELECT {_COLUMNS} FROM pairs WHERE seq BETWEEN ? AND ? ORDER BY seq LIMIT ?",
+            f"SELECT {self._columns} FROM pairs WHERE seq BETWEEN ? AND ? ORDER BY seq LIMIT ?",
             (from_seq, 2**62 if to_seq is None else to_seq, -1 if limit is None else limit),
         )
-        return [_pair(self.identity, row) for row in rows]
+        return [pair_of(self.identity, row) for row in rows]
 
     def last(self) -> Pair | None:
         """The newest pair, or None when there is none."""
-        rows = self._rows(f"SELECT {_COLUMNS} FROM pairs ORDER BY seq DESC LIMIT 1", ())
-        return _pair(self.identity, rows[0]) if rows else None
+        rows = self._rows(f"SELECT {self._columns} FROM pairs ORDER BY seq DESC LIMIT 1", ())
+        return pair_of(self.identity, rows[0]) if rows else None
 
     def last_seq(self) -> int:
         """Sequence number of the newest pair; 0 when there is none."""
@@ -208,11 +214,12 @@ class PairStore:
         """
         if self._connection is None:
             raise StoreError(f"the store {self.file} is closed; use it in a with statement")
-        pair = Pair(self.identity, self._seq + 1, segment, fix.t, utc, q, fix.x, fix.cov, fix.centres_px)
+        measured = (fix.x, fix.cov, fix.centres_px, fix.R, fix.cov_R)
+        pair = Pair(self.identity, self._seq + 1, segment, fix.t, utc, q, *measured)
         with explained(self.file), _transaction(self._connection):
             self._connection.execute(
-                f"INSERT INTO pairs (session, {_COLUMNS}) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)",
-                (self._session_id, *_row(pair)),
+                f"INSERT INTO pairs (session, {COLUMNS}) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+                (self._session_id, *row_of(pair)),
             )
         self._seq = pair.seq
         return pair
@@ -271,7 +278,7 @@ class PairStore:
         meta = {"store": str(uuid.uuid4()), "created_utc": self._session.started_utc}
         meta["joints"] = msgspec.json.encode(self._session.joints).decode()
         with _transaction(connection):
-            for statement in (_TABLES + _DEVICES).split(";"):
+            for statement in ";".join([_TABLES, *_MIGRATIONS.values()]).split(";"):
                 connection.execute(statement)
             connection.executemany("INSERT INTO meta VALUES (?, ?)", meta.items())
             connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
@@ -333,7 +340,7 @@ def _check_kind(connection: sqlite3.Connection, file: Path) -> None:
             f"{file} is not a pair store but another SQLite file. Move it away, or give another --state-dir. "
             f"{NOTHING_CHANGED}"
         )
-    version = connection.execute("PRAGMA user_version").fetchone()[0]
+    version = _version(connection)
     if version > SCHEMA_VERSION:
         raise StoreError(
             f"{file} was written by a newer bodyschema (schema {version}, this one knows {SCHEMA_VERSION}). "
@@ -341,11 +348,18 @@ def _check_kind(connection: sqlite3.Connection, file: Path) -> None:
         )
 
 
+def _version(connection: sqlite3.Connection) -> int:
+    return int(connection.execute("PRAGMA user_version").fetchone()[0])
+
+
 def _migrate(connection: sqlite3.Connection) -> None:
     """Bring a store of an older version to this one; its pairs stay as they are."""
-    if connection.execute("PRAGMA user_version").fetchone()[0] < SCHEMA_VERSION:
+    version = _version(connection)
+    if version < SCHEMA_VERSION:
         with _transaction(connection):
-            connection.execute(_DEVICES)
+            for schema in range(version + 1, SCHEMA_VERSION + 1):
+                for statement in _MIGRATIONS[schema].split(";"):
+                    connection.execute(statement)
             connection.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
 
 
@@ -361,28 +375,5 @@ def _meta(connection: sqlite3.Connection) -> dict[str, str]:
     return dict(connection.execute("SELECT key, value FROM meta").fetchall())
 
 
-def _row(pair: Pair) -> tuple[Any, ...]:
-    centres = None if pair.centres_px is None else _json(pair.centres_px)
-    arrays = (_json(pair.q.tolist()), _json(pair.x.tolist()), _json(pair.cov[_UPPER].tolist()))
-    return (pair.seq, pair.segment, pair.t, pair.utc, *arrays, centres)
-
-
-def _pair(store: str, row: tuple[Any, ...]) -> Pair:
-    seq, segment, t, utc, q, x, upper, centres = row
-    cov = np.zeros((3, 3))
-    cov[_UPPER] = msgspec.json.decode(upper)
-    return Pair(
-        store=store,
-        seq=seq,
-        segment=segment,
-        t=t,
-        utc=utc,
-        q=frozen_array(msgspec.json.decode(q)),
-        x=frozen_array(msgspec.json.decode(x)),
-        cov=frozen_array(cov + np.triu(cov, 1).T),
-        centres_px=None if centres is None else tuple(msgspec.json.decode(centres)),
-    )
-
-
-def _json(numbers: object) -> str:
-    return msgspec.json.encode(numbers).decode()
+def _json(value: object) -> str:
+    return msgspec.json.encode(value).decode()

@@ -5,6 +5,7 @@ Requests are checked for unknown keys; replies and publications may grow keys, s
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Annotated, Any, Literal, TypeVar
 
@@ -13,7 +14,8 @@ import numpy as np
 from msgspec import Meta
 
 from interfaces.errors import RequestError
-from interfaces.records import Pair, frozen_array
+from interfaces.recording_columns import QUATERNION_TOLERANCE
+from interfaces.records import FloatArray, Pair, frozen_array
 from interfaces.suggest import with_choices
 
 from .command_names import CommandName
@@ -31,7 +33,10 @@ _msgpack_encoder = msgspec.msgpack.Encoder()
 
 
 class PairMessage(msgspec.Struct, frozen=True):
-    """One pair: units and frames as in `interfaces.records.Pair`; `cov` is the upper triangle row by row [m²]."""
+    """One pair: units and frames as in `interfaces.records.Pair`.
+
+    `cov` [m²] and `cov_R` [rad²] are upper triangles, row by row.
+    """
 
     store: str
     seq: Annotated[int, Meta(ge=1)]
@@ -42,6 +47,7 @@ class PairMessage(msgspec.Struct, frozen=True):
     x: tuple[float, float, float]
     cov: tuple[float, float, float, float, float, float]
     R: tuple[float, float, float, float] | None = None
+    cov_R: tuple[float, float, float, float, float, float] | None = None
     schema: int = SCHEMA
 
 
@@ -70,6 +76,8 @@ class PredictReply(msgspec.Struct, frozen=True):
         model: hash of the model that answered.
         pairs: how many pairs it had learnt.
         age_s: time since the last of them, or null before any since the learner started.
+        R: orientations of the marker in the measurement frame, unit quaternions x, y, z, w; null where none is learnt.
+        sigma_R: their 1-sigma, of a small turn about each axis of the measurement frame [rad]; null with R.
     """
 
     x: list[list[float]]
@@ -78,7 +86,8 @@ class PredictReply(msgspec.Struct, frozen=True):
     model: str
     pairs: int
     age_s: float | None
-    R: None = None
+    R: list[list[float]] | None = None
+    sigma_R: list[list[float]] | None = None
     schema: int = SCHEMA
 
 
@@ -173,7 +182,6 @@ def decode(payload: bytes, kind: type[M], encoding: str = JSON) -> M:
 
 def pair_to_wire(pair: Pair) -> PairMessage:
     """A pair as its message."""
-    xx, xy, xz, yy, yz, zz = pair.cov[np.triu_indices(3)].tolist()
     x, y, z = pair.x.tolist()
     return PairMessage(
         store=pair.store,
@@ -183,7 +191,9 @@ def pair_to_wire(pair: Pair) -> PairMessage:
         utc=pair.utc,
         q=pair.q.tolist(),
         x=(x, y, z),
-        cov=(xx, xy, xz, yy, yz, zz),
+        cov=_upper(pair.cov),
+        R=None if pair.R is None else _four(pair.R),
+        cov_R=None if pair.cov_R is None else _upper(pair.cov_R),
     )
 
 
@@ -191,16 +201,16 @@ def pair_from_wire(message: PairMessage, joints: int) -> Pair:
     """A message as a pair.
 
     Raises:
-        RequestError: it has another number of joints, or a number that is not finite.
+        RequestError: it has another number of joints, a number that is not finite, or a quaternion that is none.
     """
     q = np.array(message.q)
-    numbers = np.concatenate([q, message.x, message.cov, [message.t]])
+    numbers = np.concatenate([q, message.x, message.cov, [message.t], message.R or (), message.cov_R or ()])
     if len(q) != joints:
         raise RequestError(f"pair {message.seq} has {len(q)} joint angles, this robot has {joints}")
     if not np.isfinite(numbers).all():
         raise RequestError(f"pair {message.seq} has a number that is not finite")
-    cov = np.zeros((3, 3))
-    cov[np.triu_indices(3)] = message.cov
+    if message.R is not None and abs(math.hypot(*message.R) - 1.0) > QUATERNION_TOLERANCE:
+        raise RequestError(f"pair {message.seq} has an R of the length {math.hypot(*message.R):.6g}, not 1")
     return Pair(
         store=message.store,
         seq=message.seq,
@@ -209,8 +219,26 @@ def pair_from_wire(message: PairMessage, joints: int) -> Pair:
         utc=message.utc,
         q=frozen_array(q),
         x=frozen_array(message.x),
-        cov=frozen_array(cov + np.triu(cov, 1).T),
+        cov=_symmetric(message.cov),
+        R=None if message.R is None else frozen_array(message.R),
+        cov_R=None if message.cov_R is None else _symmetric(message.cov_R),
     )
+
+
+def _upper(cov: FloatArray) -> tuple[float, float, float, float, float, float]:
+    xx, xy, xz, yy, yz, zz = cov[np.triu_indices(3)].tolist()
+    return xx, xy, xz, yy, yz, zz
+
+
+def _four(turn: FloatArray) -> tuple[float, float, float, float]:
+    x, y, z, w = turn.tolist()
+    return x, y, z, w
+
+
+def _symmetric(upper: Sequence[float]) -> FloatArray:
+    cov = np.zeros((3, 3))
+    cov[np.triu_indices(3)] = upper
+    return frozen_array(cov + np.triu(cov, 1).T)
 
 
 def finite_vector(name: str, values: Sequence[float], joints: tuple[str, ...]) -> np.ndarray:

@@ -8,6 +8,8 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import msgspec
+
 from drivers.dynamixel.config import DynamixelConfig
 from drivers.feetech.config import FeetechConfig
 from drivers.ros2.config import Ros2Config
@@ -20,13 +22,15 @@ from kbmaps import RigidChain
 
 from .bench_wiring import require_bench, through_bench
 from .config import Config
-from .joints_watch import EncoderJoints
+from .joints_watch import EncoderJoints, ServoJoints
 from .powered_wiring import open_drives
-from .sources import MarkerTopic, Sources, StampedJoints
+from .sources import Head, MarkerTopic, Powered, Sources, StampedJoints
 from .store import PairReader
 
 if TYPE_CHECKING:
     from drivers.ros2.joints import Ros2Joints
+    from sim_backend.config import SimConfig, SimTag
+    from vision.config import VisionConfig
 
 Hardware = DynamixelConfig | FeetechConfig | SerialLinesConfig | Ros2Config
 
@@ -36,13 +40,15 @@ def open_sources(config: Config, *, sim: bool) -> Iterator[Sources]:
     """The sources that robot.toml asks for; with `sim`, the simulation in their place.
 
     Raises:
-        ConfigError: no driver is configured, or the simulation cannot be made of this description.
+        ConfigError: no driver or no cameras are configured, or the simulation cannot be made of this description.
         RecordingError: the configured recording cannot be read.
     """
     _require_source(config, sim=sim)
     recording = None if sim else _recording(config)
     if recording is not None:
         yield _recorded(config, recording)
+    elif not sim:
+        yield _real(config)
     else:
         with _simulated(config) as sources:
             yield sources
@@ -130,17 +136,22 @@ def _require_source(config: Config, *, sim: bool) -> None:
         require_bench(config)
     if sim or config.tables.drivers.recording is not None:
         return
-    if config.tables.drivers.hardware is not None:
+    if config.tables.drivers.hardware is None:
         raise ConfigError(
-            "the joints have a driver, but nothing tells where the marker is: no camera is configured",
+            "no driver is configured",
             file=config.file,
-            remedy="Give --sim for the simulated robot, or name a recording as recording in the table [drivers]",
+            remedy="Give --sim for the simulated robot, or name a recording as recording in the table [drivers]; with "
+            "an arm of your own: docs/hardware.md",
         )
-    raise ConfigError(
-        "no driver is configured",
-        file=config.file,
-        remedy="Give --sim for the simulated robot, or name a recording as recording in the table [drivers]",
-    )
+    if config.tables.vision.cameras is None:
+        raise ConfigError(
+            "the joints have a driver, but nothing tells where the marker is: no cameras are configured",
+            file=config.file,
+            remedy="Add the table [vision.cameras] (docs/cameras.md); or give --sim for the simulated robot",
+        )
+    from .camera_wiring import require_usable
+
+    require_usable(config)
 
 
 def _recording(config: Config) -> Path | None:
@@ -163,20 +174,64 @@ def demonstration_model() -> Path:
     return model_file("upper_body")
 
 
+def _real(config: Config) -> Sources:
+    from vision.tracked_camera import TrackedCamera
+    from vision.trackers import tracker_of
+
+    from .camera_wiring import camera_of, open_eyes
+
+    clock = SystemClock()
+    joints = open_joints(config, clock)
+    eyes = open_eyes(config, clock)
+    camera = camera_of(config, eyes)
+    drives = joints.drives if isinstance(joints, ServoJoints) else ()
+    return Sources(
+        joints,
+        TrackedCamera(camera, tracker_of(camera.calibration, config.tables.vision)),
+        clock,
+        powered=tuple(drive for drive in drives if isinstance(drive, Powered)),
+        head=next((drive for drive in drives if isinstance(drive, Head)), None),
+        cameras=eyes,
+        calibration=camera.calibration,
+        live=True,
+    )
+
+
 @contextmanager
 def _simulated(config: Config) -> Iterator[Sources]:
     require_simulation()
     from sim_backend import SimWorld
     from sim_backend.guided_path import exact_encoders
     from vision.tracked_camera import TrackedCamera
-    from vision.tracker import StereoTracker
+    from vision.trackers import tracker_of
 
     on_bench = config.tables.sim.servo_bench
-    settings = exact_encoders(config.tables.sim) if on_bench else config.tables.sim
+    settings = _simulation_settings(config)
+    settings = exact_encoders(settings) if on_bench else settings
     with SimWorld(config.robot, settings, config.simulation) as world:
-        marker = TrackedCamera(world.camera, StereoTracker(world.camera.calibration, config.tables.vision))
+        marker = TrackedCamera(world.camera, tracker_of(world.camera.calibration, config.tables.vision))
         joints = _through_bench(config, world.joints) if on_bench else world.joints
         yield Sources(joints, marker, world.clock, world)
+
+
+def _simulation_settings(config: Config) -> SimConfig:
+    """The table [sim], with the tags that [vision] looks for in the hand unless [sim.camera] names others."""
+    sim, vision = config.tables.sim, config.tables.vision
+    if vision.marker == "ball" or sim.camera.tags:
+        return sim
+    from vision.tag_tracker import DICTIONARIES
+
+    number = DICTIONARIES[vision.tag.dictionary]
+    camera = msgspec.structs.replace(sim.camera, tags=_tags(vision), tag_dictionary=number)
+    return msgspec.structs.replace(sim, camera=camera)
+
+
+def _tags(vision: VisionConfig) -> tuple[SimTag, ...]:
+    from sim_backend.config import SimTag
+    from vision.tag_config import PlacedTag
+
+    placed = (PlacedTag(id=vision.tag.id),) if vision.marker == "tag" else vision.cluster.tags
+    return tuple(SimTag(id=tag.id, xyz=tag.xyz, rpy=tag.rpy, side_m=tag.side_m or vision.tag.side_m) for tag in placed)
 
 
 def _through_bench(config: Config, joints: JointSource) -> JointSource:
@@ -195,11 +250,12 @@ def open_postures(config: Config, count: int) -> Iterator[Sources]:
     from sim_backend.posed import PosedWorld
     from sim_backend.postures import visible_postures
     from vision.tracked_camera import TrackedCamera
-    from vision.tracker import StereoTracker
+    from vision.trackers import tracker_of
 
-    postures = visible_postures(config.robot, config.tables.sim, count, config.simulation)
-    with PosedWorld(config.robot, config.tables.sim, postures, config.simulation) as world:
-        marker = TrackedCamera(world.camera, StereoTracker(world.camera.calibration, config.tables.vision))
+    settings = _simulation_settings(config)
+    postures = visible_postures(config.robot, settings, count, config.simulation)
+    with PosedWorld(config.robot, settings, postures, config.simulation) as world:
+        marker = TrackedCamera(world.camera, tracker_of(world.camera.calibration, config.tables.vision))
         yield Sources(world.joints, marker, world.clock)
 
 

@@ -78,14 +78,15 @@ def _mean_mm(diagnosis: Diagnosis) -> Errors:
     # The mean length of a normal vector, to second order in the spread of its square.
     noise = diagnosis.noise[kept]
     traces = np.trace(noise, axis1=1, axis2=2)
-    lengths = np.sqrt(traces) * (1.0 - np.square(noise).sum(axis=(1, 2)) / (4.0 * np.square(traces)))
+    shape = noise / np.maximum(traces, 1e-300)[:, None, None]
+    lengths = np.sqrt(traces) * (1.0 - np.square(shape).sum(axis=(1, 2)) / 4.0)
     return Errors(**figures, noise_floor=1e3 * float(lengths.mean()))
 
 
 def _causes(diagnosis: Diagnosis) -> tuple[Cause, ...]:
     fit, kept = diagnosis.extended, diagnosis.markers
     full = float(np.square(diagnosis.held_out["extended"][kept]).sum())
-    losses = [max(float(np.square(diagnosis.without[c.key][kept]).sum()) - full, 0.0) for c in fit.causes]
+    losses = [max(float(np.square(diagnosis.without[c.identity][kept]).sum()) - full, 0.0) for c in fit.causes]
     causes = []
     for cause, standing, loss in zip(fit.causes, diagnosis.standings, losses, strict=True):
         causes.append(

@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 from scipy import stats
 
-from effects import Effect, Simulation
+from effects import Effect, Identity, Simulation
 from interfaces.recording import Recording
 from interfaces.records import FloatArray
 
@@ -145,9 +145,9 @@ class Diagnosis:
         return gain_percent(self.held_out["aligned"] * kept, self.held_out["extended"] * kept, self.blocks, self.seed)
 
     @cached_property
-    def without(self) -> dict[tuple[str, str | None, str | None], FloatArray]:
+    def without(self) -> dict[Identity, FloatArray]:
         """Distances (n,) [m] on rows not fitted, without each of the causes."""
-        errors = {c.key: self._extended_errors(self.extended.without(c)) for c in self.causes}
+        errors = {c.identity: self._extended_errors(self.extended.without(c)) for c in self.causes}
         return {key: np.linalg.norm(error, axis=1) for key, error in errors.items()}
 
     @cached_property

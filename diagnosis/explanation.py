@@ -11,7 +11,7 @@ from effects import Effect
 from interfaces.records import FloatArray
 
 from .fit import Fit
-from .search import NAMED, Search
+from .search import NAMED, Search, named
 from .unknown import Apart, Unknowns, Way
 
 # What has no name is taken for so much more probability than the named causes alone [nats].
@@ -78,12 +78,16 @@ def explain(
     # Where the causes explain by far the most, they are not given up for what explains the rest.
     is_rest = best.size < _REST * whole
     margin = _MARGIN if is_rest else 0.0
-    keys = {frozenset(effect.key for effect in found.causes)}
+    # So much may a way be worth beside fewer causes at most: to first order it explains no more than beside them all.
+    hope = found.log_likelihood + unknowns.nearest(found)[0][1] if best.apart is None else np.inf
+    looked_at = {named(found.causes)}
     for fit in [*path[:_FIRST], *path[_FIRST:][-_LAST:]]:
-        causes = frozenset(effect.key for effect in fit.causes)
-        if causes in keys:
+        causes = named(fit.causes)
+        if causes in looked_at:
             continue
-        keys.add(causes)
+        looked_at.add(causes)
+        if hope - _names(fit, search) < best.worth - (_AS_GOOD if best.unknown else 0.0):
+            continue
         other = _with_unknown(fit, unknowns, search)
         better = other.worth > best.worth + (margin if best.fit is found else 0.0) or _is_as_good(other, best)
         if other.apart is not None and better and unknowns.predicts(other.apart, found):
@@ -118,7 +122,7 @@ def _length(fit: Fit, change: FloatArray) -> float:
 
 def _with_unknown(fit: Fit, unknowns: Unknowns, search: Search) -> Explanation:
     apart: Apart | None = None
-    while apart is None or len(apart.chosen) < _MOST_UNKNOWNS:
+    while not fit.is_exact and (apart is None or len(apart.chosen) < _MOST_UNKNOWNS):
         here, chosen = (fit, ()) if apart is None else (apart.fit, apart.chosen)
         near = unknowns.nearest(here, chosen)
         way, more = near[0]
@@ -126,11 +130,16 @@ def _with_unknown(fit: Fit, unknowns: Unknowns, search: Search) -> Explanation:
             break
         tried = [unknowns.apart(fit, (*chosen, way), apart) for way, _ in near]
         apart = max(tried, key=lambda one: one.fit.log_likelihood - unknowns.cost(one))
-    names = sum(_NUMBER * len(effect.amounts) + search.doubt_of(effect) for effect in fit.causes)
+    names = _names(fit, search)
     if apart is None:
         return Explanation(fit, None, fit.log_likelihood - names)
     worth = apart.fit.log_likelihood - names - unknowns.cost(apart)
     return Explanation(fit, apart, worth, _length(fit, apart.predicted - fit.run.measured))
+
+
+def _names(fit: Fit, search: Search) -> float:
+    """What the causes of a fit cost where sets of causes are compared [nats]."""
+    return sum(_NUMBER * len(effect.amounts) + search.doubt_of(effect) for effect in fit.causes)
 
 
 def _pruned(explanation: Explanation, unknowns: Unknowns, search: Search, *, rest: bool) -> Explanation:

@@ -30,6 +30,8 @@ _FEWEST_OUTLIERS = 1e-4
 # Of time, whose agreement says how far the numbers are sure.
 _BLOCKS = 60
 _EM_ROUNDS = 6
+# What is left is never taken to be smaller, in units of the stated noise: it would be the rounding of numbers.
+ROUNDED = 1e-9
 # So large a share of so many rows is no outliers.
 _WINDOW, _BURST = 61, 0.45
 
@@ -58,7 +60,7 @@ class Noise:
         trusted, outlier_density = observations.trusted, observations.outlier_density
         squares = np.einsum("ni,ni->n", residuals, residuals)
         # Of three squared normal coordinates the median is 2.366.
-        sigma = float(np.sqrt(max(np.median(squares[trusted]) / 2.366, 1e-18)))
+        sigma = float(np.sqrt(max(np.median(squares[trusted]) / 2.366, ROUNDED**2)))
         share = 0.02 if start is None else start.share
         weights, total = np.ones(len(squares)), -np.inf
         for _ in range(_EM_ROUNDS):
@@ -71,7 +73,7 @@ class Noise:
             share = float(np.clip(1.0 - weights[trusted].mean(), _FEWEST_OUTLIERS, 0.5))
             weights[~trusted] = 0.0
             total = float(np.where(bursts, inlier, both)[trusted].sum())
-            sigma = float(np.sqrt(max((weights @ squares) / (3.0 * max(weights.sum(), 1.0)), 1e-18)))
+            sigma = float(np.sqrt(max((weights @ squares) / (3.0 * max(weights.sum(), 1.0)), ROUNDED**2)))
         return cls(sigma, share, weights, total)
 
 
@@ -104,7 +106,7 @@ class Fit:
     def without_outliers(self) -> float:
         """The log-likelihood if all fixes were the marker [nats]."""
         squares = np.square(self.residuals[self.observations.trusted]).sum(axis=1)
-        variance = max(float(squares.mean()) / 3.0, 1e-18)
+        variance = max(float(squares.mean()) / 3.0, ROUNDED**2)
         return float(-1.5 * len(squares) * (np.log(2.0 * np.pi * variance) + 1.0))
 
     @cached_property
@@ -114,6 +116,11 @@ class Fit:
         inlier = np.log1p(-noise.share) - 1.5 * np.log(2.0 * np.pi * noise.sigma**2) - 0.5 * squares / noise.sigma**2
         either = np.logaddexp(inlier, np.log(noise.share) + self.observations.outlier_density)
         return np.where(self.observations.trusted, either, 0.0)
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether only the rounding of numbers is left, as of the simulation's own output."""
+        return self.noise.sigma <= ROUNDED
 
     @property
     def log_likelihood(self) -> float:
@@ -231,7 +238,7 @@ class Fit:
 
     def without(self, cause: Effect) -> Fit:
         """All causes but one, refitted."""
-        return self.with_causes([effect for effect in self.causes if effect.key != cause.key])
+        return self.with_causes([effect for effect in self.causes if effect.identity != cause.identity])
 
     def with_causes(self, causes: Sequence[Effect]) -> Fit:
         """Other causes in the place of these, all refitted."""

@@ -107,7 +107,8 @@ def _added(fit: Fit, effect: Effect, before: float, blocks: Blocks) -> Added:
     usual = np.array([effect.parameters[j].usual for j in effect.amounts])
     precision = [prior_precision(fit.simulation, fit.nuisances), 1.0 / np.square(LARGEST * usual)]
     after = held_out_square(fit, np.concatenate([fit.columns, own], axis=2), np.concatenate(precision), blocks)
-    return Added(100.0 * (1.0 - after / max(before, 1e-300)), block_p_value(fit, own, blocks))
+    gain = 1.0 - after / before if before > 0.0 else 0.0
+    return Added(100.0 * gain, block_p_value(fit, own, blocks))
 
 
 def held_out_square(fit: Fit, columns: FloatArray, precision: FloatArray, blocks: Blocks) -> float:

@@ -12,7 +12,7 @@ from effects import KINDS, Effect, Kind, Simulation
 from .observations import Observations
 
 # A joint that moves less than this tells nothing of itself [rad, m].
-_STILL = 1e-4
+STILL = 1e-4
 _FEWEST_ROWS = 20
 
 
@@ -61,7 +61,7 @@ class _Limits:
     def __init__(self, simulation: Simulation, observations: Observations) -> None:
         self._simulation, self._motion = simulation, observations.motion
         robot = simulation.robot
-        self.still = np.ptp(observations.motion.q, axis=0) < _STILL
+        self.still = np.ptp(observations.motion.q, axis=0) < STILL
         self.sentences: list[str] = []
         standing = [joint for joint, still in zip(robot.joints, self.still, strict=True) if still]
         if standing:

@@ -43,6 +43,8 @@ class Leftover:
 def leftover(explanation: Explanation, unknowns: Unknowns, blocks: Blocks) -> Leftover:
     """What the families of an explanation say of what its causes leave."""
     fit, apart = explanation.fit, explanation.apart
+    if fit.is_exact:
+        return Leftover((), (), False, 1.0)
     if apart is None:
         beside = unknowns.apart(fit, (unknowns.nearest(fit)[0][0],))
         return Leftover((), (), False, min(1.0, _chance(fit, beside, unknowns) * unknowns.count))

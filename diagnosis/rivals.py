@@ -95,15 +95,15 @@ def _standing(fit: Fit, cause: Effect, search: Search, blocks: Blocks, seed: int
     for candidate in beside.candidates:
         if candidate.gain < _COMES_NEAR * itself.gain:
             continue
-        rival = search.refined(without.with_causes([*without.causes, candidate.effect]), candidate.effect.key)
+        rival = search.refined(without.with_causes([*without.causes, candidate.effect]), candidate.effect)
         doubt = float(np.log(max(candidate.trials / max(itself.trials, 1), 1e-3)))
-        tried.append((Instead(rival, candidate.dof - itself.dof, doubt), candidate.effect.key))
+        tried.append((Instead(rival, candidate.dof - itself.dof, doubt), candidate.effect))
     behind = [nats(2.0 * (one.fit.log_likelihood - fit.log_likelihood), one.dof) - one.doubt for one, _ in tried]
     odds = np.exp(np.clip([0.0, -worth, *behind], -500.0, 50.0))
     shares = odds / odds.sum()
     rivals = [
-        Rival(one.fit, _effect(one.fit, key), float(share), _difference(fit, one.fit), _anywhere(fit, one.fit))
-        for (one, key), share in zip(tried, shares[2:], strict=True)
+        Rival(one.fit, _as_fitted(one.fit, effect), float(share), _difference(fit, one.fit), _anywhere(fit, one.fit))
+        for (one, effect), share in zip(tried, shares[2:], strict=True)
         if share >= PROBABLE
     ]
     same = sum(rival.probability for rival in rivals if rival.is_same_anywhere)
@@ -119,8 +119,8 @@ def _standing(fit: Fit, cause: Effect, search: Search, blocks: Blocks, seed: int
     )
 
 
-def _effect(fit: Fit, key: tuple[str, str | None, str | None]) -> Effect:
-    return next(effect for effect in fit.causes if effect.key == key)
+def _as_fitted(fit: Fit, effect: Effect) -> Effect:
+    return next(cause for cause in fit.causes if cause.identity == effect.identity)
 
 
 def _difference(one: Fit, other: Fit) -> float:

@@ -14,7 +14,7 @@ from effects import Effect
 from effects.simulation import settled
 from interfaces.records import FloatArray
 
-from .fit import LARGEST, SHORTEST_DRIFT, Fit
+from .fit import LARGEST, ROUNDED, SHORTEST_DRIFT, Fit
 
 # The finest ripple that is looked for.
 _MOST_CYCLES = 100
@@ -62,8 +62,9 @@ class Scan:
         basis = self._basis.reshape(self._left.size, self._basis.shape[2])
         flat = fit.left.ravel()
         self._left = (flat - basis @ (basis.T @ flat)).reshape(fit.left.shape)
-        self._rss = float(np.square(self._left).sum())
         self._rows = float(fit.noise.weights.sum())
+        # A simulation's own output leaves nothing, or what is rounded.
+        self._rss = max(float(np.square(self._left).sum()), 3.0 * self._rows * ROUNDED**2)
         self._ports: dict[int, _Rows] = {}
 
     def candidates(self, hypotheses: Iterable[Effect]) -> list[Candidate]:

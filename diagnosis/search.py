@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy import stats
 
-from effects import Effect
+from effects import Effect, Identity
 
 from .fit import Fit
 from .held_out import Blocks, block_p_value
@@ -18,16 +19,21 @@ from .scan import Candidate, Scan
 NAMED = 3.0
 # Candidates within this share of the best gain are refitted in full, so many at most.
 _NEAR, _MOST = 0.4, 6
-_MOST_CAUSES = 9
+_MOST_CAUSES = 20
 # So many sets of causes are looked at, and none twice.
-_MOST_SETS = 40
+_MOST_SETS = 80
 Key = tuple[str, str | None, str | None]
+Named = frozenset[tuple[Key, int]]
+# Of what begins at a moment there are so many at one place at most.
+_MOST_OF_A_KIND = 4
 # What a number costs at least [nats].
 _CHEAPEST = 1.5
 # What explains a smaller share of what a cause explains is no rival of it; within so much two are as probable [nats].
 _COMES_NEAR, _EQUAL = 0.8, 0.3
 # A moment or a period that seems to explain so much more than that of the fit is tried in its place.
 _ELSEWHERE = 1.0
+# An exchange that loses no more than this may be worth it with one cause more [nats].
+_WITH_ONE_MORE = 100.0
 # The camera's pose and the marker's place are simpler than the link next to them.
 _OF_A_LINK = 1
 
@@ -72,44 +78,82 @@ class Search:
         self._hypotheses, self._tell = hypotheses, tell
         self._doubt = np.log(max(len(hypotheses), 1))
         self._trials: dict[Key, int] = {}
-        self._beside: tuple[Fit | None, dict[Key, Beside]] = (None, {})
+        self._beside: tuple[Fit | None, dict[Identity, Beside]] = (None, {})
         self.path: list[Fit] = []
 
     def run(self, start: Fit) -> Fit:
         """The causes on top of what `start` has fitted."""
         fit = start
-        self._seen: set[frozenset[Key]] = set()
+        self._seen: set[Named] = set()
         self.path = [start]
         if start.causes:
             fit = self._reviewed(start)
             self.path.append(fit)
-        for _ in range(_MOST_CAUSES):
-            better = self._added(fit)
+        while len(self.path) <= _MOST_CAUSES:
+            better = self._added(fit)[0] or self._simpler_and_one_more(fit)
             if better is None:
                 break
-            causes = frozenset(effect.key for effect in better.causes)
+            causes = named(better.causes)
             if causes in self._seen:
                 break
+            self._tell(f"found {describe(better.causes[-1])}")
             self._seen.add(causes)
             fit = self._reviewed(better)
             self.path.append(fit)
         return fit
 
-    def _added(self, fit: Fit) -> Fit | None:
-        """With one more cause; None where nothing is probable enough."""
-        present = {effect.key for effect in fit.causes}
-        others = [h for h in self._hypotheses if h.key not in present]
+    def _added(self, fit: Fit) -> tuple[Fit | None, float]:
+        """With one more cause, and what that is worth [nats]; None where nothing is probable enough."""
         best, most = None, NAMED
-        for candidate in self.shortlist(fit, others):
+        for candidate in self.shortlist(fit, self._open(fit)):
             if self._agreed(fit, candidate) < NAMED:
                 continue
-            tried = self.refined(fit.with_causes([*fit.causes, candidate.effect]), candidate.effect.key)
+            tried = self.refined(fit.with_causes([*fit.causes, candidate.effect]), candidate.effect)
             worth = nats(2.0 * (tried.log_likelihood - fit.log_likelihood), candidate.dof) - self.doubt(candidate)
             if worth > most and tried.causes[-1].is_possible:
                 best, most = tried, worth
-        if best is not None:
-            self._tell(f"found {describe(best.causes[-1])}")
-        return best
+        return best, most
+
+    def _simpler_and_one_more(self, fit: Fit) -> Fit | None:
+        """With a simpler rival in the place of a cause and another cause beside it; None where none is worth it.
+
+        A cause of many numbers may stand for a simpler one and a small one together.
+        """
+        for cause in fit.causes:
+            beside = self.beside(fit, cause)
+            itself = beside.itself or Candidate(cause, 0.0, 1)
+            for candidate in beside.candidates:
+                if candidate.dof >= itself.dof or candidate.gain < _COMES_NEAR * itself.gain:
+                    continue
+                tried, worth = self._exchanged(fit, beside, itself, candidate)
+                if worth < -_WITH_ONE_MORE or named(tried.causes) in self._seen or not tried.causes[-1].is_possible:
+                    continue
+                better, more = self._added(tried)
+                if better is not None and worth + more > 1.0:
+                    self._tell(f"exchanged {describe(cause)} for {describe(candidate.effect)}")
+                    return better
+        return None
+
+    def _exchanged(self, fit: Fit, beside: Beside, itself: Candidate, candidate: Candidate) -> tuple[Fit, float]:
+        """With a candidate in the place of a cause, refitted, and what that is worth [nats]."""
+        without = beside.without
+        tried = self.refined(without.with_causes([*without.causes, candidate.effect]), candidate.effect)
+        worth = nats(2.0 * (tried.log_likelihood - fit.log_likelihood), candidate.dof - itself.dof)
+        return tried, worth + self.doubt(itself) - self.doubt(candidate)
+
+    def _open(self, fit: Fit) -> list[Effect]:
+        """The hypotheses that no cause of a fit is, and one more of those that begin at a moment."""
+        present = Counter(effect.key for effect in fit.causes)
+        taken = {effect.identity for effect in fit.causes}
+        others = []
+        for effect in self._hypotheses:
+            count = present[effect.key]
+            if count == 0:
+                others.append(effect)
+            elif effect.kind.begins and count < _MOST_OF_A_KIND:
+                more = (effect.one_more(ordinal) for ordinal in range(count + 1))
+                others.append(next(one for one in more if one.identity not in taken))
+        return others
 
     def doubt(self, candidate: Candidate) -> float:
         """What having looked for it in so many places costs [nats]."""
@@ -137,12 +181,12 @@ class Search:
         floor = _NEAR * ranked[0].gain
         return [c for c in ranked[: 3 * _MOST] if c.gain >= floor][:_MOST]
 
-    def refined(self, fit: Fit, key: tuple[str, str | None, str | None]) -> Fit:
+    def refined(self, fit: Fit, sought: Effect) -> Fit:
         """With the moment or period of one cause sought again beside the others as they are now fitted."""
-        cause = next(effect for effect in fit.causes if effect.key == key)
+        cause = next(effect for effect in fit.causes if effect.identity == sought.identity)
         if all(parameter.is_amount for parameter in cause.parameters):
             return fit
-        others = [effect for effect in fit.causes if effect.key != key]
+        others = [effect for effect in fit.causes if effect is not cause]
         again = Scan(fit.with_causes(others)).candidate(cause)
         if again is None or np.allclose(again.effect.values, cause.values):
             return fit
@@ -154,7 +198,7 @@ class Search:
         changed = len(fit.causes) > 0
         while changed and len(self._seen) < _MOST_SETS:
             fit, changed = self._second_thoughts(fit)
-            causes = frozenset(effect.key for effect in fit.causes)
+            causes = named(fit.causes)
             changed = changed and causes not in self._seen
             self._seen.add(causes)
         return fit
@@ -164,12 +208,11 @@ class Search:
         if self._beside[0] is not fit:
             self._beside = (fit, {})
         known = self._beside[1]
-        if cause.key not in known:
+        if cause.identity not in known:
             without = fit.without(cause)
-            present = {effect.key for effect in fit.causes}
-            rivals = [h for h in self._hypotheses if h.key not in present]
-            known[cause.key] = Beside(without, Scan(without).candidate(cause), self.shortlist(without, rivals))
-        return known[cause.key]
+            rivals = [effect for effect in self._open(fit) if effect.key != cause.key]
+            known[cause.identity] = Beside(without, Scan(without).candidate(cause), self.shortlist(without, rivals))
+        return known[cause.identity]
 
     def _second_thoughts(self, fit: Fit) -> tuple[Fit, bool]:
         for cause in fit.causes:
@@ -188,14 +231,17 @@ class Search:
             for candidate in beside.candidates:
                 if candidate.gain < _COMES_NEAR * itself.gain:
                     continue
-                tried = self.refined(fit.with_causes([*others, candidate.effect]), candidate.effect.key)
-                worth = nats(2.0 * (tried.log_likelihood - fit.log_likelihood), candidate.dof - itself.dof)
-                worth += self.doubt(itself) - self.doubt(candidate)
+                tried, worth = self._exchanged(fit, beside, itself, candidate)
                 better = worth > 1.0 or (abs(worth) < _EQUAL and simplicity(candidate.effect) < simplicity(cause))
                 if better and tried.causes[-1].is_possible:
                     self._tell(f"exchanged {describe(cause)} for {describe(candidate.effect)}")
                     return tried, True
         return fit, False
+
+
+def named(causes: Sequence[Effect]) -> Named:
+    """Which causes these are, whatever their numbers: how many of each kind at each place."""
+    return frozenset(Counter(effect.key for effect in causes).items())
 
 
 def simplicity(effect: Effect) -> int:

@@ -188,18 +188,22 @@ class Unknowns:
 
     def cost(self, apart: Apart) -> float:
         """What the ways and their numbers cost [nats]."""
-        return len(apart.chosen) * self._doubt + _NUMBER * (self.told(apart).shape[2] + apart.choice)
+        numbers = self._beside(apart)[0].shape[0] + apart.choice
+        return len(apart.chosen) * self._doubt + _NUMBER * numbers
 
     def told(self, apart: Apart) -> FloatArray:
         """What ways can change beside the causes (n, 3, r) [m], in directions that the data tell."""
         fit = apart.fit
+        values, mix = self._beside(apart)
         columns = np.concatenate([way.columns for way in apart.chosen], axis=1)
-        basis = fit.orthogonal.reshape(fit.left.size, -1)
-        weighted = columns * np.repeat(fit.root_weights[:, 0], 3)[:, None]
-        _, values, mix = np.linalg.svd(weighted - basis @ (basis.T @ weighted), full_matrices=False)
-        there = values > np.sqrt(_LEFT)
-        directions = (columns @ (mix[there].T / values[there])).reshape(*fit.left.shape, -1)
+        directions = (columns @ (mix / np.sqrt(values))).reshape(*fit.left.shape, -1)
         return np.asarray(np.linalg.solve(fit.observations.whitening, directions), dtype=np.float64)
+
+    def _beside(self, apart: Apart) -> tuple[FloatArray, FloatArray]:
+        """Squared lengths (r,) of what ways change beside the causes, and by which of their numbers (p, r)."""
+        fit = apart.fit
+        basis = fit.orthogonal.reshape(fit.left.size, -1)
+        return _directions(np.concatenate([way.columns for way in apart.chosen], axis=1), fit, basis)[1:]
 
     def predicts(self, apart: Apart, alone: Fit) -> bool:
         """Whether ways to differ predict rows that they were not fitted to as well as a fit without them does."""
@@ -258,10 +262,17 @@ class Unknowns:
 
     def _fresh(self, fit: Fit, basis: FloatArray, way: Way) -> FloatArray:
         """An orthonormal basis (3 n, r) of what a way changes beside a basis."""
-        columns = way.columns * np.repeat(fit.root_weights[:, 0], 3)[:, None]
-        columns = columns - basis @ (basis.T @ columns)
-        left, values, _ = np.linalg.svd(columns, full_matrices=False)
-        return left[:, values > np.sqrt(_LEFT)]
+        columns, values, mix = _directions(way.columns, fit, basis)
+        return columns @ (mix / np.sqrt(values))
+
+
+def _directions(columns: FloatArray, fit: Fit, basis: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Columns (3 n, p) weighted and beside a basis, and the squared lengths (r,) and mixtures (p, r) that are told."""
+    weighted = columns * np.repeat(fit.root_weights[:, 0], 3)[:, None]
+    weighted = weighted - basis @ (basis.T @ weighted)
+    values, vectors = np.linalg.eigh(weighted.T @ weighted)
+    there = values > _LEFT
+    return weighted, values[there], vectors[:, there]
 
 
 def _nats(explained: float, rss: float, rows: float) -> float:

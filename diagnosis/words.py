@@ -114,10 +114,11 @@ def sentence(verdict: Verdict, causes: Sequence[Cause], rms: Errors, gain: Gain)
         "unexplained": ". Something is left that none of the known effects explains",
     }
     explained = round(gain.held_out_percent)
-    if explained <= 0:
+    if gain.held_out_percent <= 0.0:
         return f"{head}: this explains the pairs that were fitted and no others ({figures}){ends[verdict]}"
     what = "it explains" if len(ordered) == 1 else "together they explain"
-    return f"{head}: {what} {explained} % of the error ({figures}){ends[verdict]}"
+    share = f"{explained} %" if explained > 0 else "less than 1 %"
+    return f"{head}: {what} {share} of the error ({figures}){ends[verdict]}"
 
 
 def beside_geometry(rms: Errors, alike: Sequence[Alike]) -> list[str]:

@@ -85,7 +85,7 @@ class ReplayJoints:
 
 
 class ReplayMarker:
-    """The marker positions of a recording as a `MarkerSource`."""
+    """The marker positions of a recording, and its orientations if it has any, as a `MarkerSource`."""
 
     def __init__(self, recording: Recording, t: FloatArray, cov: FloatArray, pace: _Pace) -> None:
         self._recording, self._t, self._cov, self._pace = recording, t, cov, pace
@@ -109,7 +109,9 @@ class ReplayMarker:
             ul, vl, ur, vr = self._recording.centres_px[row].tolist()
             centres = (ul, vl, ur, vr)
         x, cov = frozen_array(self._recording.x[row]), frozen_array(self._cov[row])
-        return MarkerFix(float(self._t[row]), x, cov, centres)
+        turns = self._recording.orientation
+        R = None if turns is None else frozen_array(turns[row] / np.linalg.norm(turns[row]))
+        return MarkerFix(float(self._t[row]), x, cov, centres, R=R)
 
 
 class ReplayClock(SystemClock):

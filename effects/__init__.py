@@ -4,7 +4,7 @@ What `diagnosis` fits is what `sim_backend` applies.
 """
 
 from .corrected import corrected_file, write_corrected
-from .effect import Effect
+from .effect import Effect, Identity
 from .files import load_simulation, read_effects, read_unexplained, simulation_of, write_extended
 from .gravity import GravityLoad
 from .kinds import KINDS, Kind
@@ -19,6 +19,7 @@ __all__ = [
     "KINDS",
     "Effect",
     "GravityLoad",
+    "Identity",
     "Kind",
     "LiveEncoders",
     "Motion",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Self
 
 import numpy as np
@@ -19,6 +19,9 @@ from .parameter import Parameter
 # A play, a spring or a rate that is negative is none.
 _POSITIVE = frozenset({"cycles_per_turn", "cycles_per_m", "time_constant_s"})
 
+# Name, where, source, and which of several of one kind at one place.
+Identity = tuple[str, str | None, str | None, int]
+
 
 @dataclass(frozen=True, eq=False)
 class Effect:
@@ -29,6 +32,7 @@ class Effect:
         where, source: the joint it sits at, and the one that causes it; None where there is none.
         values: its numbers (p,), in the order of `parameters`.
         prismatic: whether the joint slides.
+        ordinal: which of several of one kind at one place, counted from 0.
     """
 
     kind: Kind
@@ -36,6 +40,7 @@ class Effect:
     source: str | None
     values: FloatArray
     prismatic: bool = False
+    ordinal: int = 0
 
     @classmethod
     def at(
@@ -84,6 +89,11 @@ class Effect:
         return self.kind.name, self.where, self.source
 
     @property
+    def identity(self) -> Identity:
+        """What it is among the effects of one simulation: `key` and `ordinal`."""
+        return *self.key, self.ordinal
+
+    @property
     def parameters(self) -> tuple[Parameter, ...]:
         """What its values are."""
         return self.kind.parameters(self.prismatic)
@@ -105,7 +115,11 @@ class Effect:
 
     def with_values(self, values: FloatArray) -> Effect:
         """The same effect with other numbers (p,)."""
-        return Effect(self.kind, self.where, self.source, frozen_array(values), self.prismatic)
+        return replace(self, values=frozen_array(values))
+
+    def one_more(self, ordinal: int) -> Effect:
+        """Another one of its kind at its place, with the same numbers."""
+        return replace(self, ordinal=ordinal)
 
     def value(self, name: str) -> float:
         """The number called `name`; KeyError when it has none."""

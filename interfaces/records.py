@@ -24,19 +24,20 @@ class Reason(StrEnum):
 
     NO_MARKER = "no_marker"  # nothing of the marker's colour, or too few pixels
     AT_BORDER = "at_border"  # the marker touches the image border
-    OCCLUDED = "occluded"  # something hides part of its outline
-    SHAPE = "shape"  # its outline is not a ball's
+    OCCLUDED = "occluded"  # its outline is not a whole disc
     SATURATED = "saturated"  # too much of it is over-exposed
     REFLECTION = "reflection"  # a dimmer copy of the marker, or one at a place that it cannot have
     EPIPOLAR = "epipolar"  # the two eyes' rows disagree
     SIZE_MISMATCH = "size_mismatch"  # the two eyes' radii, or radius and depth, disagree
     AMBIGUOUS = "ambiguous"  # more than one candidate fits
+    REPROJECTION = "reprojection"  # what is seen does not fit the marker's shape
     IMPLAUSIBLE_SPEED = "implausible_speed"  # farther from the last fix than a hand can move it
     NO_JOINTS = "no_joints"  # no encoder readings around the frame's time
     STALE = "stale"  # encoder readings around the frame's time too far apart
     MOVING = "moving"  # joints too fast for the uncertainty of the time stamps
     TOO_NEAR = "too_near"  # nearer than the smallest step to the predecessor: wait
     PAUSED = "paused"  # an operator paused the sampler
+    NOT_BORNE = "not_borne"  # zero-force is to bear the arm, and is off
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,12 +80,20 @@ class MarkerFix:
         cov: its covariance [m²], shape (3, 3).
         centres_px: (ul, vl, ur, vr), where the centre is seen by the left and the right eye, or None
             when the source measures positions directly (a laser tracker, a recording).
+        t_sigma: 1-sigma of `t` [s].
+        R: how the marker is turned in the measurement frame: a unit quaternion (x, y, z, w), shape (4,), or None
+            where the marker looks the same from all sides.
+        cov_R: covariance of a small turn of it about the axes of the measurement frame [rad²], shape (3, 3), or None
+            when the source does not tell.
     """
 
     t: float
     x: FloatArray
     cov: FloatArray
     centres_px: tuple[float, float, float, float] | None = None
+    t_sigma: float = 0.0
+    R: FloatArray | None = None
+    cov_R: FloatArray | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,7 +117,7 @@ class Pair:
         q: joint angles interpolated to the frame's time [rad], shape (d,).
         x: marker position in the measurement frame [m], shape (3,).
         cov: covariance of x [m²], shape (3, 3).
-        centres_px: as in `MarkerFix`.
+        centres_px, R, cov_R: as in `MarkerFix`.
     """
 
     store: str
@@ -120,3 +129,5 @@ class Pair:
     x: FloatArray
     cov: FloatArray
     centres_px: tuple[float, float, float, float] | None = None
+    R: FloatArray | None = None
+    cov_R: FloatArray | None = None

@@ -8,6 +8,7 @@ from kbmaps.autocorrelation import shared_by
 from kbmaps.chains.align import Alignment, align
 from kbmaps.chains.belief import ChainBelief
 from kbmaps.chains.chain import RigidChain
+from kbmaps.chains.oriented import OrientedChain, fitted_orientation
 from kbmaps.chains.parameters import ChainParameters, ChainTolerances
 from kbmaps.chains.refitted_tool import with_refitted_tool
 from kbmaps.chains.report import ChainReport, Interval
@@ -51,7 +52,7 @@ from kbmaps.planning.lack_of_fit import systematic_error
 from kbmaps.planning.posterior import ChainPosterior, Posterior
 from kbmaps.residual.learner import ResidualLearner
 from kbmaps.residual.model import ResidualModel
-from kbmaps.rotations import nearest_rotation
+from kbmaps.rotations import nearest_rotation, quaternions, rotation_matrices, rotation_vectors
 from kbmaps.trains.core_prior import CoreFamily, CorePrior
 from kbmaps.trains.learner import TensorLearner
 from kbmaps.trains.posterior import TensorPosterior
@@ -93,6 +94,7 @@ __all__ = [
     "NetSizeError",
     "NonFiniteError",
     "NotNumbersError",
+    "OrientedChain",
     "PoseModel",
     "PositionModel",
     "Posterior",
@@ -119,6 +121,7 @@ __all__ = [
     "candidate_motions",
     "expected_gain",
     "find_chain",
+    "fitted_orientation",
     "follow_a_path",
     "kernels_in_use",
     "learning_bases",
@@ -127,7 +130,10 @@ __all__ = [
     "next_poses",
     "next_stretch",
     "prediction_errors",
+    "quaternions",
     "resolved_rates",
+    "rotation_matrices",
+    "rotation_vectors",
     "shared_by",
     "systematic_error",
     "with_refitted_tool",

@@ -72,6 +72,20 @@ def rotation_vector(rotation: FloatArray) -> FloatArray:
     return np.asarray(Rotation.from_matrix(rotation).as_rotvec(), dtype=np.float64)
 
 
+def rotation_vectors(rotations: FloatArray) -> FloatArray:
+    """Axis times angle (n, 3) [rad], angles at most π, of rotation matrices (n, 3, 3)."""
+    if not len(rotations):  # scipy refuses an empty batch
+        return np.empty((0, 3))
+    return np.asarray(Rotation.from_matrix(rotations).as_rotvec(), dtype=np.float64)
+
+
+def quaternions(rotations: FloatArray) -> FloatArray:
+    """Unit quaternions x, y, z, w (n, 4), with w not negative, of rotation matrices (n, 3, 3)."""
+    if not len(rotations):
+        return np.empty((0, 4))
+    return np.asarray(Rotation.from_matrix(rotations).as_quat(canonical=True), dtype=np.float64)
+
+
 def exponentials(turns: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Rotations exp([φ]×) (n, 3, 3) of rotation vectors (n, 3) [rad], and their left Jacobians (n, 3, 3).
 

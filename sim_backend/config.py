@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated
 
 import msgspec
@@ -28,6 +29,27 @@ class EncoderConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     rate_hz: Rate = 120
 
 
+class SimTag(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """One of [[sim.camera.tags]]: a tag in the hand in the place of the ball.
+
+    Attributes:
+        id: its number.
+        xyz: its centre in the marker's frame [m].
+        rpy: how its frame (x right, y up, z out of it) is turned in the marker's [rad], URDF convention.
+        side_m: side of its black square [m]; the white margin is an eighth of it.
+    """
+
+    id: Annotated[int, Meta(ge=0)]
+    xyz: tuple[float, float, float]
+    rpy: tuple[float, float, float]
+    side_m: Positive
+
+    @property
+    def half_sheet_m(self) -> float:
+        """Half the side of the sheet that it is printed on."""
+        return 0.625 * self.side_m
+
+
 class CameraConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """The table [sim.camera].
 
@@ -39,6 +61,8 @@ class CameraConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
         supersampling: samples across one pixel around the marker.
         ball_radius_m: radius of the marker ball [m].
         ball_rgb: its colour.
+        tags: what is in the hand instead of the ball; without this table, what [vision] looks for.
+        tag_dictionary: OpenCV's number of the tags' dictionary.
     """
 
     rate_hz: Rate = 30
@@ -48,6 +72,15 @@ class CameraConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     supersampling: Annotated[int, Meta(ge=1, le=8)] = 3
     ball_radius_m: Positive = 0.02
     ball_rgb: tuple[float, float, float] = (0.86, 0.07, 0.06)
+    tags: tuple[SimTag, ...] = ()
+    tag_dictionary: Annotated[int, Meta(ge=0)] = 20
+
+    @property
+    def marker_radius_m(self) -> float:
+        """Radius of the smallest ball around the marker's origin that holds it [m]."""
+        if not self.tags:
+            return self.ball_radius_m
+        return max(math.hypot(*tag.xyz, math.sqrt(2.0) * tag.half_sheet_m) for tag in self.tags)
 
 
 class ErrorConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -60,6 +93,7 @@ class ErrorConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
         camera_position_m: each coordinate of the cameras' place [m].
         camera_rotation_rad: each component of their rotation [rad].
         tool_m: each coordinate of the marker's place on the hand [m].
+        tool_rotation_rad: each component of the marker's rotation on the hand [rad]; of a ball nobody sees it.
     """
 
     joint_offset_rad: NonNegative = 0.045
@@ -68,6 +102,7 @@ class ErrorConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     camera_position_m: NonNegative = 0.005
     camera_rotation_rad: NonNegative = 0.02
     tool_m: NonNegative = 0.01
+    tool_rotation_rad: NonNegative = 0.1
 
 
 class GuideConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

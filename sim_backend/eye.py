@@ -1,4 +1,4 @@
-"""One stereo frame: the robot by TinyRenderer, the ball by ray casting, the room behind, the sensor's noise."""
+"""One stereo frame: the robot by TinyRenderer, the marker by ray casting, the room behind, the sensor's noise."""
 
 from __future__ import annotations
 
@@ -13,9 +13,10 @@ from .config import CameraConfig
 from .panorama import background, cluttered_room
 from .randomness import Stream, generator
 from .raster import Grid, Raster
+from .tags import TagSheets
 
 TO_LIGHT = np.array([0.35, 0.45, 0.82]) / np.linalg.norm([0.35, 0.45, 0.82])
-# Free pixels around the ball in its finely sampled rectangle, and the most samples across it.
+# Free pixels around the marker in its finely sampled rectangle, and the most samples across it.
 _MARGIN_PX = 4
 _MOST_SAMPLES = 480
 _NOISE_FIELDS = 8
@@ -38,22 +39,29 @@ class StereoEyes:
         self._room = cluttered_room(config.clutter, generator(seed, Stream.BACKGROUND))
         self._noise = self._noise_fields(width, height)
         self._bgr = np.array(config.ball_rgb[::-1])
+        self._sheets = TagSheets(config.tags, config.tag_dictionary) if config.tags else None
 
     def paint(
-        self, number: int, T_world_camera: FloatArray, x_eyes: FloatArray, images: tuple[ImageArray, ImageArray]
+        self,
+        number: int,
+        T_world_camera: FloatArray,
+        x_eyes: FloatArray,
+        R_camera_marker: FloatArray,
+        images: tuple[ImageArray, ImageArray],
     ) -> None:
         """Paint frame `number` into the left and the right image (height, width, 3), BGR.
 
         Args:
             T_world_camera: pose of the left eye (4, 4).
-            x_eyes: where the ball's centre looks to be in each eye's optical frame (2, 3) [m].
+            x_eyes: where the marker's centre looks to be in each eye's optical frame (2, 3) [m].
+            R_camera_marker: how it is turned there (3, 3).
         """
         far = background(self._room, self._directions, T_world_camera[:3, :3])
         rng = generator(self._seed, Stream.IMAGE_NOISE, number)
         T_world_eye = T_world_camera.copy()
         for image, x_eye in zip(images, x_eyes, strict=True):
             self._paint_scene(image, T_world_eye, far)
-            self._paint_ball(image, T_world_eye, x_eye)
+            self._paint_marker(image, T_world_eye, x_eye, R_camera_marker, rng)
             self._add_noise(image, rng)
             T_world_eye[:3, 3] += T_world_camera[:3, 0] * self._calibration.baseline_m
 
@@ -66,7 +74,14 @@ class StereoEyes:
             scene = cv2.resize(scene, (self._scene.columns * step, self._scene.rows * step))
         image[:] = scene[:height, :width]
 
-    def _paint_ball(self, image: ImageArray, T_world_eye: FloatArray, x_eye: FloatArray) -> None:
+    def _paint_marker(
+        self,
+        image: ImageArray,
+        T_world_eye: FloatArray,
+        x_eye: FloatArray,
+        R_eye_marker: FloatArray,
+        rng: np.random.Generator,
+    ) -> None:
         window = self._window(x_eye)
         if window is None:
             return
@@ -76,20 +91,19 @@ class StereoEyes:
         bgr, depth = self._raster.render(T_world_eye, grid)
         patch = image[top : top + height, left : left + width]
         samples = np.where(np.isinf(depth)[..., None], patch.repeat(fine, 0).repeat(fine, 1), bgr).astype(np.float32)
-        mask, colours = cast_ball(
-            grid.directions(self._calibration),
-            x_eye,
-            self._config.ball_radius_m,
-            depth,
-            self._bgr,
-            T_world_eye[:3, :3].T @ TO_LIGHT,
-        )
+        directions, to_light = grid.directions(self._calibration), T_world_eye[:3, :3].T @ TO_LIGHT
+        if self._sheets is None:
+            mask, colours = cast_ball(directions, x_eye, self._config.ball_radius_m, depth, self._bgr, to_light)
+        else:
+            # Rays in rows would all miss a straight edge along the row at once.
+            directions[..., :2] += (rng.random((*depth.shape, 2)) - 0.5) / (fine * self._calibration.focal_px)
+            mask, colours = self._sheets.cast(directions, x_eye, R_eye_marker, depth, to_light)
         samples[mask] = colours
         patch[:] = np.round(samples.reshape(height, fine, width, fine, 3).mean(axis=(1, 3)))
 
     def _window(self, x_eye: FloatArray) -> tuple[int, int, int, int] | None:
-        """The rectangle (left, top, width, height) around the ball that lies in the image; None when there is none."""
-        radius = self._config.ball_radius_m
+        """The rectangle (left, top, width, height) around the marker, as far as in the image; None when it is not."""
+        radius = self._config.marker_radius_m
         if x_eye[2] < 2 * radius:
             return None
         calibration = self._calibration

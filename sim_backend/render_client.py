@@ -88,6 +88,7 @@ class RenderProcess:
                 angles=scene.angles.tolist(),
                 T_world_camera=scene.T_world_camera.ravel().tolist(),
                 x_eyes=scene.x_eyes.ravel().tolist(),
+                R_camera_marker=scene.R_camera_marker.ravel().tolist(),
             )
         )
 

@@ -44,13 +44,15 @@ class Frame(msgspec.Struct, frozen=True, tag=True):
     Attributes:
         angles: true joint angles [rad or m].
         T_world_camera: pose of the left eye, row by row, 16 numbers.
-        x_eyes: where the ball's centre looks to be in the left, then in the right eye's frame [m], 6 numbers.
+        x_eyes: where the marker's centre looks to be in the left, then in the right eye's frame [m], 6 numbers.
+        R_camera_marker: how it is turned there, row by row, 9 numbers.
     """
 
     number: int
     angles: list[float]
     T_world_camera: list[float]
     x_eyes: list[float]
+    R_camera_marker: list[float]
 
 
 Message = Setup | Tool | Frame

@@ -93,7 +93,7 @@ def _paint(frame: Frame, body: Body, stick: Stick, eyes: StereoEyes, images: tup
     body.set_angles(np.array(frame.angles))
     stick.follow()
     T_world_camera, x_eyes = np.array(frame.T_world_camera).reshape(4, 4), np.array(frame.x_eyes).reshape(2, 3)
-    eyes.paint(frame.number, T_world_camera, x_eyes, images)
+    eyes.paint(frame.number, T_world_camera, x_eyes, np.array(frame.R_camera_marker).reshape(3, 3), images)
 
 
 def _next(requests: int) -> Message | None:

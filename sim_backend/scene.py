@@ -1,4 +1,4 @@
-"""What a frame shows: the robot as it stands, and the ball as each eye sees it."""
+"""What a frame shows: the robot as it stands, and the marker as each eye sees it."""
 
 from __future__ import annotations
 
@@ -25,6 +25,7 @@ class Scene:
         tip: the same in the marker link, where the tool ends [m], shape (3,).
         x_eyes: where it looks to be in the left and the right eye's optical frame [m], shape (2, 3): where it is,
             unless the lenses differ from the calibration.
+        R_camera_marker: how the marker is turned in the left eye's optical frame, shape (3, 3).
         x_seen: what an ideal tracker with the described calibration makes of it [m], shape (3,).
     """
 
@@ -33,6 +34,7 @@ class Scene:
     x_world: FloatArray
     tip: FloatArray
     x_eyes: FloatArray
+    R_camera_marker: FloatArray
     x_seen: FloatArray
 
 
@@ -52,7 +54,8 @@ def scene_of(
     x_world = T_world_hand[:3, :3] @ tip + T_world_hand[:3, 3]
     x_camera = T_world_camera[:3, :3].T @ (x_world - T_world_camera[:3, 3])
     x_eyes, x_seen = _through_lenses(beyond, calibration, x_camera, beyond.added(row)[0])
-    return Scene(body.angles(), T_world_camera, x_world, tip, x_eyes, x_seen)
+    R_camera_marker = T_world_camera[:3, :3].T @ T_world_hand[:3, :3] @ truth.tool_turn
+    return Scene(body.angles(), T_world_camera, x_world, tip, x_eyes, R_camera_marker, x_seen)
 
 
 def _through_lenses(

@@ -35,11 +35,11 @@ class Sight:
         roles: JointRoles,
         gaze: Gaze,
         body: Body,
-        ball_radius_m: float,
+        marker_radius_m: float,
     ) -> None:
         self._truth, self._calibration, self._roles, self._gaze = truth, calibration, roles, gaze
         self._body = body
-        self._radius = ball_radius_m
+        self._radius = marker_radius_m
         self._near_pairs = self._clearance_pairs()
         self._chain = truth.chain(np.array(truth.robot.robot.marker_xyz))
 

@@ -35,6 +35,7 @@ class TrueRobot:
         offsets: reported minus true angle [rad or m], shape (d,), in the order of `robot.joints`.
         T_parent_camera: true pose of the left eye in the camera's parent link, shape (4, 4).
         tool_error: true minus described place of the marker in the marker link [m], shape (3,).
+        tool_turn: rotation of the marker in the marker link, shape (3, 3); described as none.
     """
 
     robot: RobotDescription
@@ -43,6 +44,7 @@ class TrueRobot:
     offsets: FloatArray
     T_parent_camera: FloatArray
     tool_error: FloatArray
+    tool_turn: FloatArray
 
     @classmethod
     def draw(cls, robot: RobotDescription, config: SimConfig, extension: Simulation | None = None) -> TrueRobot:
@@ -70,6 +72,7 @@ class TrueRobot:
         tool_error = errors.tool_m * rng.standard_normal(3)
         for effect in _named(extension, "tool_offset"):
             tool_error = tool_error + effect.values
+        tool_turn = Rotation.from_rotvec(errors.tool_rotation_rad * rng.standard_normal(3)).as_matrix()
         for name, joint in joints.items():
             if joint.kind in MOVING and name not in robot.joints:
                 held_at = robot.robot.held_at.get(name, 0.0) - offsets.get(name, 0.0)
@@ -81,6 +84,7 @@ class TrueRobot:
             offsets=frozen_array([offsets[name] for name in robot.joints]),
             T_parent_camera=frozen_array(robot.camera.pose @ extension.camera_pose @ camera_error),
             tool_error=frozen_array(tool_error),
+            tool_turn=frozen_array(tool_turn),
         )
 
     def true_eyes(self, calibration: StereoCalibration) -> StereoCalibration:

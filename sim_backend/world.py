@@ -131,6 +131,10 @@ class SimWorld:
             wanted = self._physics.marker_xyz if self._wanted_tool is None else self._wanted_tool
             return self._truth.chain(wanted)
 
+    def true_turn(self) -> FloatArray:
+        """The truth, for judges: how the marker is turned on the hand, shape (3, 3)."""
+        return self._truth.tool_turn
+
     def open_joints(self, is_open: bool) -> None:
         """Begin or end to keep readings for the joint source."""
         with self._moved:

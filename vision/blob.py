@@ -23,9 +23,6 @@ _WHOLE_DISC_FILL = 0.8
 _STRONG_SHARES = (0.5, 0.7)
 # A part of the ball or of a brick has an edge on some sides only; on the others its surroundings are as colourful.
 _MOST_UNEVEN = 0.3
-# An outline whose points scatter about the ellipse with more than this many times the expected variance, and by more
-# than this [px], is no ball's.
-_LARGEST_MISFIT, _LARGEST_SCATTER_PX = 8.0, 0.45
 # A pixel is over-exposed from here [grey levels]; a ball with more than this share of them cannot be measured.
 _WHITE, _MOST_WHITE = 250, 0.35
 # A round patch with more than this part of a disc's radius may be another ball.
@@ -133,8 +130,6 @@ def measure(image: ImageArray, patch: Patch, eye: Pinhole, gate: Gate, config: V
     )
     if outline is None or not _is_whole(outline, config):
         return Reason.OCCLUDED
-    if outline.misfit > _LARGEST_MISFIT and outline.scatter_px > _LARGEST_SCATTER_PX:
-        return Reason.SHAPE
     centre_px = outline.centre_px + corner
     reach = outline.radius_px + config.border_margin_px
     if (centre_px - reach < 0).any() or (centre_px + reach > (width - 1, height - 1)).any():

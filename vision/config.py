@@ -7,6 +7,9 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
+from .cameras.config import CamerasConfig
+from .tag_config import ClusterConfig, TagConfig
+
 Positive = Annotated[float, Meta(gt=0)]
 Ratio = Annotated[float, Meta(gt=1)]
 Fraction = Annotated[float, Meta(ge=0, le=1)]
@@ -46,7 +49,8 @@ class VisionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The table [vision]: what the marker looks like, and when a find is doubtful.
 
     Attributes:
-        marker: a coloured ball, one that is brighter than all around it, a tag, or a rigid cluster of markers.
+        marker: what is looked for: a coloured ball, a ball that is brighter than all around it, one tag ([vision.tag]),
+            or a rigid cluster of tags ([vision.cluster]). The other keys of this table are a ball's.
         colour: a name, or a band of hues as the table [vision.colour].
         min_brightness: of a bright ball, where 1 is the brightest that the camera can tell.
         radius_m: radius of the marker ball [m].
@@ -60,6 +64,9 @@ class VisionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         depth_size_ratio: largest ratio between the radius seen and the one expected at the triangulated depth.
         max_speed_m_s: faster than this the marker does not move; what is farther off is something else [m/s].
         max_candidates: at most this many patches per eye are looked at closely, the most disc-like first.
+        cameras: where images come from; without it there are none.
+        tag: the tag, or what the tags of a cluster have in common.
+        cluster: where on the marker which tag is.
     """
 
     marker: MarkerKind = "ball"
@@ -68,7 +75,7 @@ class VisionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     min_brightness: Annotated[float, Meta(gt=0, le=1)] = 0.6
     min_pixels: Annotated[int, Meta(ge=12)] = 30
     border_margin_px: Annotated[float, Meta(ge=0)] = 3.0
-    min_visible: Annotated[float, Meta(ge=0.5, le=1)] = 0.89
+    min_visible: Annotated[float, Meta(ge=0.5, le=1)] = 0.85
     max_centre_sigma_px: Positive = 0.4
     epipolar_px: Annotated[float, Meta(ge=0)] = 0.5
     epipolar_sigmas: Annotated[float, Meta(ge=0)] = 4.0
@@ -76,6 +83,9 @@ class VisionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     depth_size_ratio: Ratio = 1.3
     max_speed_m_s: Positive = 3.0
     max_candidates: Annotated[int, Meta(ge=1)] = 12
+    cameras: CamerasConfig | None = None
+    tag: TagConfig = TagConfig()
+    cluster: ClusterConfig = ClusterConfig()
 
     @property
     def band(self) -> HueBand:

@@ -10,24 +10,23 @@ anti-aliased edge counts by its coverage.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
+from typing import cast
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from interfaces.records import FloatArray
 
 from .colour import Float32Array, Gate
-from .edge import EdgePoints, find_edge_points
-from .rays import ball_colour, median, ray_angles, sample_rays
 
 BoolArray = NDArray[np.bool_]
 
 # Half-widths [px] of the ring in which the edge is looked for: about the rough circle, then about the outline.
-_WINDOWS_PX = (3.5, 2.0, 2.0)
-# The outline is found when a step moved it, centre and radius together, less than this [px].
-_SETTLED_PX = 0.6
+_WINDOWS_PX = (4.0, 2.0, 2.0)
+# The outline is found when a step in the narrow ring moved it less than this [px].
+_SETTLED_PX = 0.3
 _RING_STEP_PX = 0.5
 _BACKGROUND_PX = 2.0
 _INNER_COLUMNS = 6
@@ -47,18 +46,6 @@ _LEAST_GATE_PX, _LARGEST_GATE_PX, _GATE_SIGMAS = 0.8, 2.0, 3.5
 _LEAST_WAVES, _WAVE_RADIUS_PX = 4, 3.0
 # Lens and interpolation smooth along the outline too, which takes power from the quicker waves (1-sigma) [px].
 _SMOOTHING_PX = 1.0
-# The expected variance counts as this many degrees of freedom beside those of the waves.
-_PRIOR_DEGREES = 4.0
-# Points farther than this from the outline that was captured are no edges of the ball [px].
-_FAR_PX = 1.0
-# Passes of the exact fit, and where a point counts for a quarter (sigmas).
-_PASSES, _FAR_SIGMAS = 7, 4.0
-# So many rays on both sides of what hides the outline may be pulled by it.
-_BESIDE = 4
-# The exact fit has settled when a pass moves it less than this [px].
-_UNMOVED_PX = 5e-4
-# A correction for shading is right to this part of it (1-sigma).
-_DOUBT = 0.5
 # What is left when all noise has averaged out [px].
 _FLOOR_PX = 0.005
 # Below this, relative to the cubed trace, the outline points do not determine centre and radius.
@@ -75,8 +62,6 @@ class Outline:
         cov_px: covariance of the centre, shape (2, 2) [px²].
         visible: share of the outline that nothing hides.
         uneven: share of the outline at which the background is too uneven to tell.
-        misfit: variance of the outline's points about the ellipse, in units of the one that the image's noise makes.
-        scatter_px: 1-sigma of those points, far ones included [px].
     """
 
     centre_px: FloatArray
@@ -84,8 +69,6 @@ class Outline:
     cov_px: FloatArray
     visible: float
     uneven: float
-    misfit: float
-    scatter_px: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,83 +101,40 @@ def fit_outline(
         radius_px: rough radius [px], right to about a fifth.
         shape: the ellipse's shape (2, 2), see `sphere.Ellipse`.
     """
-    found = _capture(image, gate, centre_px, radius_px, shape)
-    if found is None:
-        return None
-    circle, edges = found
-    points = find_edge_points(image, gate, circle.centre_px, circle.radius_px, shape, edges.angles)
-    if points is None:
-        return None
-    told = circle.told & (np.abs(points.distance_px - circle.radius_px) < _FAR_PX)
-    weight = np.where(told, points.sigma_px**-2, 0.0)
-    exact = _solve(edges.angles, points, weight)
-    if exact is None:
-        return None
-    return Outline(
-        centre_px=circle.centre_px + shape @ exact.solution[:2],
-        radius_px=float(exact.solution[2]),
-        cov_px=shape @ exact.cov @ shape + _FLOOR_PX**2 * np.eye(2),
-        visible=circle.visible,
-        uneven=float(np.mean(edges.uneven)),
-        misfit=exact.misfit,
-        scatter_px=exact.scatter_px,
-    )
-
-
-@dataclass(frozen=True, slots=True)
-class _Circle:
-    """The outline to a tenth of a pixel.
-
-    Attributes:
-        centre_px, radius_px: centre (2,) and radius [px].
-        visible: share of the outline that nothing hides.
-        told: the rays that tell it, shape (n,); those next to what hides it do not.
-    """
-
-    centre_px: FloatArray
-    radius_px: float
-    visible: float
-    told: BoolArray
-
-
-def _capture(
-    image: Float32Array, gate: Gate, centre_px: FloatArray, radius_px: float, shape: FloatArray
-) -> tuple[_Circle, _Edges] | None:
-    """From the rough circle to the outline in ever narrower rings, and the edges around it."""
-    found = None
+    outline = None
     for window_px in _WINDOWS_PX:
         half = min(window_px, 0.6 * radius_px)
         edges = _find_edges(image, gate, centre_px, radius_px, shape, half)
-        circle = None if edges is None else _fit_circle(edges, centre_px, shape)
-        if edges is None or circle is None:
+        outline = None if edges is None else _fit_circle(edges, centre_px, shape)
+        if outline is None:
             return None
-        moved_px = float(np.linalg.norm(circle.centre_px - centre_px)) + abs(circle.radius_px - radius_px)
+        moved_px = float(np.linalg.norm(outline.centre_px - centre_px)) + abs(outline.radius_px - radius_px)
         if moved_px > max(2.0, 0.5 * radius_px):
             return None
-        found = circle, edges
-        centre_px, radius_px = circle.centre_px, circle.radius_px
-        if moved_px < _SETTLED_PX:
+        centre_px, radius_px = outline.centre_px, outline.radius_px
+        if half <= _WINDOWS_PX[-1] and moved_px < _SETTLED_PX:
             break
-    return found
+    return outline
 
 
 def _find_edges(
     image: Float32Array, gate: Gate, centre_px: FloatArray, radius_px: float, shape: FloatArray, half_px: float
 ) -> _Edges | None:
-    angles = ray_angles(radius_px)
+    count = int(np.clip(round(2 * np.pi * radius_px), 24, 400))
+    angles: FloatArray = np.linspace(0.0, 2 * np.pi, count, endpoint=False)
     cells = max(2, round(2 * half_px / _RING_STEP_PX))
     step = 2 * half_px / cells
     inner = np.linspace(0.3 * radius_px, radius_px - half_px, _INNER_COLUMNS)
     ring = radius_px - half_px + (np.arange(cells) + 0.5) * step
     outer = radius_px + half_px + (np.arange(round(_BACKGROUND_PX / _RING_STEP_PX)) + 0.5) * _RING_STEP_PX
-    samples = sample_rays(image, centre_px, angles, np.concatenate([inner, ring, outer]), shape)
+    samples = _sample(image, centre_px, angles, np.concatenate([inner, ring, outer]).astype(np.float64), shape)
     inside, outside = samples[:, : len(inner)], samples[:, len(inner) + cells :]
 
-    colour = ball_colour(inside, gate)
+    colour = _ball_colour(inside, gate)
     if colour is None:
         return None
     level = np.maximum(_mean_of_three(gate.amount(inside[:, -2:]).mean(axis=1)), 0.0)
-    covered = level < _LEAST_LEVEL * median(level)
+    covered = level < _LEAST_LEVEL * _median(level)
     background = _mean_of_three(outside.mean(axis=1))
     towards, separation = _discriminant(level, colour, background, gate.shading_sigma)
     told = (separation > _LEAST_SEPARATION**2) & ~covered
@@ -205,6 +145,26 @@ def _find_edges(
     unevenness_px = half_px * np.sqrt(np.mean(share[:, cells:] ** 2, axis=1))
     weight = told / (1.0 + (unevenness_px / _EDGE_SIGMA_PX) ** 2)
     return _Edges(angles, distance, weight, covered, ~told | (unevenness_px > _UNEVEN_PX))
+
+
+def _sample(
+    image: Float32Array, centre_px: FloatArray, angles: FloatArray, radii: FloatArray, shape: FloatArray
+) -> Float32Array:
+    """`image` at every angle (rows) and radius (columns) of the ellipse's own polar coordinates."""
+    directions = np.stack([np.cos(angles), np.sin(angles)], axis=1) @ shape
+    at = (centre_px + directions[:, None, :] * radii[:, None]).astype(np.float32)
+    samples = cv2.remap(image, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return cast(Float32Array, samples)
+
+
+def _ball_colour(inside: Float32Array, gate: Gate) -> FloatArray | None:
+    """The ball's colour (3,) per unit of its amount; the median leaves highlights out."""
+    samples = inside.reshape(-1, 3)
+    amount = gate.amount(samples)
+    coloured = amount > 1.0
+    if np.count_nonzero(coloured) < len(amount) // 2:
+        return None
+    return np.median(samples[coloured] / amount[coloured, None], axis=0).astype(np.float64)
 
 
 def _discriminant(
@@ -235,87 +195,58 @@ def _mean_of_three(values: NDArray[np.floating]) -> FloatArray:
     return (wrapped[:-2] + wrapped[1:-1] + wrapped[2:]) / 3.0
 
 
-def _fit_circle(edges: _Edges, centre_px: FloatArray, shape: FloatArray) -> _Circle | None:
+def _median(values: FloatArray) -> float:
+    """The upper median; NumPy's own costs ten times as much for the few values here."""
+    middle = len(values) // 2
+    return float(np.partition(values, middle)[middle])
+
+
+def _fit_circle(edges: _Edges, centre_px: FloatArray, shape: FloatArray) -> Outline | None:
     """Least squares for the centre's shift and the radius; points too far off are left out in turn."""
-    design = _design(edges.angles)
+    design = np.stack([np.cos(edges.angles), np.sin(edges.angles), np.ones_like(edges.angles)], axis=1)
     told = edges.weight > 0
-    weight, solution = edges.weight, np.zeros(3)
+    weight = edges.weight
+    solution, normal, residual, used = np.zeros(3), np.eye(3), edges.distance_px, weight
     for _ in range(3):
         if np.count_nonzero(weight) < len(weight) // 2:
             return None
         normal = (design * weight[:, None]).T @ design
-        if _is_singular(normal):
+        if np.linalg.det(normal) < _LEAST_DETERMINANT * np.trace(normal) ** 3:
             return None
         solution = np.linalg.solve(normal, design.T @ (weight * edges.distance_px))
-        residual = np.abs(edges.distance_px - design @ solution)
-        gate = min(max(_GATE_SIGMAS * 1.4826 * median(residual[told]), _LEAST_GATE_PX), _LARGEST_GATE_PX)
-        weight = np.where(residual < gate, edges.weight, 0.0)
+        residual = edges.distance_px - design @ solution
+        spread = 1.4826 * _median(np.abs(residual[told]))
+        gate = min(max(_GATE_SIGMAS * spread, _LEAST_GATE_PX), _LARGEST_GATE_PX)
+        used, weight = weight, np.where(np.abs(residual) < gate, edges.weight, 0.0)
     if solution[2] <= 0:
         return None
+    density = _noise_density(edges.angles, np.sqrt(used) * residual, float(solution[2]))
     hidden = edges.covered | ((weight == 0) & ~edges.uneven)
-    beside = np.any([np.roll(hidden, by) for by in range(-_BESIDE, _BESIDE + 1)], axis=0)
-    seen = (weight > 0) & ~beside
-    return _Circle(centre_px + shape @ solution[:2], float(solution[2]), 1.0 - float(np.mean(hidden)), seen)
-
-
-@dataclass(frozen=True, slots=True)
-class _Exact:
-    """Shift of the centre and radius, shape (3,) [px]; covariance (2, 2) of the shift [px²]; else as in `Outline`."""
-
-    solution: FloatArray
-    cov: FloatArray
-    misfit: float
-    scatter_px: float
-
-
-def _solve(angles: FloatArray, points: EdgePoints, weight: FloatArray) -> _Exact | None:
-    """The circle through points at `angles` (n,) that count by `weight` (n,), 1 over their variance [1/px²]."""
-    design, distance_px = _design(angles), points.distance_px
-    used, residual, solution, normal = weight, distance_px, np.zeros(3), np.eye(3)
-    for _ in range(_PASSES):
-        if np.count_nonzero(used) < len(used) // 2:
-            return None
-        normal = (design * used[:, None]).T @ design
-        if _is_singular(normal):
-            return None
-        before, solution = solution, np.linalg.solve(normal, design.T @ (used * distance_px))
-        residual = distance_px - design @ solution
-        if np.abs(solution - before).max() < _UNMOVED_PX:
-            break
-        sigmas = np.abs(residual) * np.sqrt(weight)
-        usual = max(1.0, 1.4826 * median(sigmas[weight > 0]))
-        # Geman and McClure's weights: a point far off counts for nothing in the end.
-        used = weight / (1.0 + (sigmas / (_FAR_SIGMAS * usual)) ** 2) ** 2
-    if solution[2] <= 0:
-        return None
-    density = _noise_density(angles, np.sqrt(used) * residual, float(solution[2]))
-    scatter_px = math.sqrt(float(weight @ residual**2 / weight.sum()))
-    inverse = np.linalg.inv(normal)[:2]
-    moved = inverse @ (design.T @ (used * points.shading_px))
-    return _Exact(solution, density * inverse[:, :2] + _DOUBT**2 * np.outer(moved, moved), density, scatter_px)
-
-
-def _design(angles: FloatArray) -> FloatArray:
-    return np.stack([np.cos(angles), np.sin(angles), np.ones_like(angles)], axis=1)
-
-
-def _is_singular(normal: FloatArray) -> bool:
-    return bool(np.linalg.det(normal) < _LEAST_DETERMINANT * np.trace(normal) ** 3)
+    return Outline(
+        centre_px=centre_px + shape @ solution[:2],
+        radius_px=float(solution[2]),
+        cov_px=density * (shape @ np.linalg.inv(normal)[:2, :2] @ shape) + _FLOOR_PX**2 * np.eye(2),
+        visible=1.0 - float(np.mean(hidden)),
+        uneven=float(np.mean(edges.uneven)),
+    )
 
 
 def _noise_density(angles: FloatArray, residual: FloatArray, radius_px: float) -> float:
-    """Variance of one outline point, in units of the one expected, in the slow waves round the outline.
+    """Variance [px²] of one outline point in the slow waves round the outline, of which the centre's error is one.
 
     Neighbouring outline points share pixels and background, so their variance alone would claim too little. A
     shift of the centre is the wave that goes once round. It was fitted away, and the next ones tell its size, the
-    nearer the better. There are few of them, so that the variance that the image's noise makes, which is
-    known, counts as much as two more.
+    nearer the better. Pixel noise gives all waves the same power; what is behind the ball disturbs whole arcs and
+    makes the slow ones larger. So their excess over the quick ones counts once more.
     """
-    last = max(_LEAST_WAVES, round(radius_px / _WAVE_RADIUS_PX))
-    harmonics = np.arange(2, last + 1)
+    last_slow = max(_LEAST_WAVES, round(radius_px / _WAVE_RADIUS_PX))
+    last_quick = max(last_slow + 1, min(2 * last_slow, round(radius_px)))
+    harmonics = np.arange(2, last_quick + 1)
     waves = np.exp(-1j * harmonics[:, None] * angles) @ residual
     power = np.abs(waves) ** 2 * np.exp((harmonics * _SMOOTHING_PX / radius_px) ** 2) / np.count_nonzero(residual)
-    share = harmonics**-2.0 / np.sum(harmonics**-2.0)
-    degrees = 2.0 / float(share @ share)
-    # The posterior mean of a variance with an inverse gamma prior around 1.
-    return (_PRIOR_DEGREES + degrees * float(share @ power)) / (_PRIOR_DEGREES + degrees)
+    is_slow = harmonics <= last_slow
+    share = harmonics[is_slow] ** -2.0 / np.sum(harmonics[is_slow] ** -2.0)
+    slow, quick = float(share @ power[is_slow]), float(np.mean(power[~is_slow]))
+    # Student's t with two degrees of freedom per wave: 1-sigma of a spread that is itself estimated.
+    student = 1.0 + 0.25 * float(share @ share)
+    return student**2 * (slow + max(0.0, slow - quick))

@@ -2,19 +2,30 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import TracebackType
-from typing import Self
+from typing import Protocol, Self
 
 from interfaces.protocols import StereoCamera
-from interfaces.records import MarkerFix, MarkerMiss
+from interfaces.records import MarkerFix, MarkerMiss, StereoFrame
 
-from .tracker import StereoTracker
+
+class MarkerTracker(Protocol):
+    """Finds the marker in stereo images, frame by frame."""
+
+    def track(self, frame: StereoFrame) -> MarkerFix | MarkerMiss:
+        """The marker in `frame`, in the left optical frame, or why there is none; SourceError for unfit images."""
+        ...
+
+    def forget(self) -> None:
+        """What was seen so far says nothing of the next frame."""
+        ...
 
 
 class TrackedCamera:
     """A `MarkerSource`: opens and closes the camera, and tracks the marker in every frame."""
 
-    def __init__(self, camera: StereoCamera, tracker: StereoTracker) -> None:
+    def __init__(self, camera: StereoCamera, tracker: MarkerTracker) -> None:
         self._camera, self._tracker = camera, tracker
 
     def __enter__(self) -> Self:
@@ -36,4 +47,7 @@ class TrackedCamera:
             SourceError: the images do not fit the calibration.
         """
         frame = self._camera.read(timeout_s)
-        return None if frame is None else self._tracker.track(frame)
+        if frame is None:
+            return None
+        seen = self._tracker.track(frame)
+        return replace(seen, t_sigma=frame.t_sigma) if isinstance(seen, MarkerFix) else seen

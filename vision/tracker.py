@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import logging
-import math
 from dataclasses import dataclass
 
 import numpy as np
 
 from interfaces.camera import StereoCalibration
-from interfaces.errors import ConfigError, SourceError
 from interfaces.records import FloatArray, ImageArray, MarkerFix, MarkerMiss, Reason, StereoFrame, frozen_array
 
 from .blob import Disc, Patch, Region, find_patches, is_rival, measure
 from .colour import gate_of
 from .config import VisionConfig
+from .images import check_calibration, check_images
 from .match import StereoMatcher, is_reflection_of
 from .sphere import Pinhole
 from .triangulate import Location
@@ -61,7 +60,7 @@ class StereoTracker:
 
     def __init__(self, calibration: StereoCalibration, config: VisionConfig | None = None) -> None:
         """Prepare for images of `calibration`; ConfigError when it describes no stereo pair."""
-        _check_calibration(calibration)
+        check_calibration(calibration)
         self.calibration = calibration
         self.config = config or VisionConfig()
         self._gate = gate_of(self.config)
@@ -79,8 +78,7 @@ class StereoTracker:
         Raises:
             SourceError: the images are not uint8 BGR of the calibration's size.
         """
-        for eye, image in (("left", frame.left), ("right", frame.right)):
-            self._check_image(eye, image)
+        check_images(frame, self.calibration)
         regions = self._predicted_regions(frame.t)
         found = self._look(frame, regions) if regions else None
         if not isinstance(found, Location):
@@ -174,30 +172,3 @@ class StereoTracker:
         middle = self._region(found.centres_px[:2], half)
         if middle is not None:
             self._gate.follow(middle.crop(frame.left))
-
-    def _check_image(self, eye: str, image: ImageArray) -> None:
-        width, height = self.calibration.image_size_px
-        if image.shape != (height, width, 3) or image.dtype != np.uint8:
-            raise SourceError(
-                f"the {eye} image is {_described(image)}; the calibration is for {width}x{height} pixels of three "
-                "colours (uint8, BGR). Set the camera to that size, or mend [camera] image_size_px"
-            )
-
-
-def _described(image: ImageArray) -> str:
-    size = f"{image.shape[1]}x{image.shape[0]} pixels" if image.ndim in (2, 3) else f"an array of shape {image.shape}"
-    colours = f" of {image.shape[2]} channels" if image.ndim == 3 else " of grey" if image.ndim == 2 else ""
-    return f"{size}{colours} ({image.dtype})"
-
-
-def _check_calibration(calibration: StereoCalibration) -> None:
-    width, height = calibration.image_size_px
-    for name, value in (("focal_px", calibration.focal_px), ("baseline_m", calibration.baseline_m)):
-        if not (math.isfinite(value) and value > 0):
-            raise ConfigError(f"[camera] {name} is {value}", remedy="It has to be a number above 0")
-    if not (math.isfinite(calibration.pixel_sigma) and calibration.pixel_sigma >= 0):
-        raise ConfigError(f"[camera] pixel_sigma is {calibration.pixel_sigma}", remedy="It has to be 0 or more")
-    if not all(math.isfinite(value) for value in calibration.principal_point_px):
-        raise ConfigError(f"[camera] principal_point_px is {calibration.principal_point_px}", remedy="Give two numbers")
-    if min(width, height) < 16:
-        raise ConfigError(f"[camera] image_size_px is {width}x{height}", remedy="16x16 is the least")

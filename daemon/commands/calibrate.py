@@ -5,13 +5,21 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
+import cyclopts
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
+from daemon.commands.calibrate_cameras import cameras, check
 from daemon.commands.options import SourceRobotFile, flag, robot_file
 
+# Without a help of its own its page shows what `arm` says, beside the commands.
+calibrate = cyclopts.App(name="calibrate")
+calibrate.command(cameras, sort_key=1)
+calibrate.command(check, sort_key=2)
 
-def calibrate(
+
+@calibrate.default
+def arm(
     source: Annotated[
         Path | None,
         Parameter(help="A recording (.csv, .parquet) or a pair store (.sqlite); else the robot's own store."),
@@ -108,3 +116,6 @@ def calibrate(
             markup=False,
             soft_wrap=True,
         )
+
+
+calibrate.command("daemon.commands.latency:latency", name="latency")

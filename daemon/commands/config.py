@@ -87,8 +87,15 @@ def check(*, robot: RobotFile = HERE) -> None:
         f"  camera on {camera.parent_link} at {_numbers(camera.xyz)} m, roll, pitch, yaw "
         f"{_numbers(map(math.degrees, camera.rpy))}°, {known[camera.pose_known]}"
     )
-    stereo = "described" if description.calibration else "not described: no images can be used, recordings can"
-    say(f"  stereo calibration {stereo}")
+    cameras = checked.tables.vision.cameras
+    if cameras is not None:
+        from daemon.camera_wiring import camera_lines
+
+        for line in camera_lines(cameras):
+            say(f"  {line}")
+    if cameras is None or cameras.calibration is None:
+        stereo = "described" if description.calibration else "not described: no images can be used, recordings can"
+        say(f"  stereo calibration {stereo}")
     for effect in checked.simulation.effects:
         say(f"  effect {_effect_line(effect)}")
     for sentence in without_consequence(checked.simulation):

@@ -27,11 +27,20 @@ def demo(
         Literal["dynamixel", "feetech", "serial", "ros2"] | None,
         Parameter(help="The joints stand on a bench and are read by this driver.", show_default=False),
     ] = None,
+    marker: Annotated[
+        Literal["ball", "tag", "cluster"],
+        Parameter(
+            help="In the hand: a red ball, one AprilTag, or a cube of six, which the cameras see from all sides."
+        ),
+    ] = "ball",
 ) -> None:
     """Watch the whole thing learn, in simulation, in about a minute.
 
     A humanoid's arm is guided by a virtual hand, its head cameras see a red ball on the tool. The sampler and the
     learner run as the two real processes; half-way the tool becomes 250 mm longer.
+
+    With --marker cluster the ball is a cube of AprilTags, and how it is turned is learnt too. One tag alone is seen
+    only while it faces the cameras, so that its pairs take longer to come.
 
     With --bus the joints are read as on a real arm, by the driver: from Dynamixel or Feetech servos or a board of
     encoders (serial) on a serial port, or from a ROS 2 robot behind a zenoh router. All of these are a bench at the
@@ -53,7 +62,7 @@ def demo(
 
     require_simulation()
     console = Console(highlight=False)
-    scene = prepare(out, seed, bus=bus)
+    scene = prepare(out, seed, bus=bus, marker=marker)
     if bus is not None:
         console.print(f"The joints are {WHAT[bus]} on a bench; {scene.log_file} tells of them.", soft_wrap=True)
     with shown_on(console) as show:

@@ -50,12 +50,14 @@ def diagnose(
     from rich.console import Console
 
     from daemon.config import Config
-    from daemon.diagnosis_run import Asked, measured, run, written
+    from daemon.diagnosis_run import Asked, measured, require_folder, run, written
     from daemon.diagnosis_view import view
 
     config = Config.load(robot_file(robot, recording))
     asked = Asked.of(effects, exclude, seed)
     source = measured(config, recording, live=live)
+    if out is not None:
+        require_folder(out)
     with _progress(Console(stderr=True, highlight=False)) as tell:
         found = run(config, source, asked, tell)
         if out is not None:

@@ -48,6 +48,7 @@ def new(
 
     Next: mend what is marked CHECK; `bodyschema joints` for signs and zeros; `bodyschema config check`.
     """
+    from daemon.camera_wiring import connected_cameras
     from daemon.commands.config import say, write_new
     from daemon.config import Config
     from daemon.robot_template import guess_from, robot_toml
@@ -58,7 +59,7 @@ def new(
     if out.exists():
         raise ConfigError("is there already", file=out, remedy="Give another --robot, or move it away")
     fitting = fit(guess.joints, _candidates(source, port, baud), first_of if yes else _asked)
-    text = robot_toml(guess._replace(joints=list(fitting.servos))) + servo_tables(fitting)
+    text = robot_toml(guess._replace(joints=list(fitting.servos)), connected_cameras()) + servo_tables(fitting)
     try:
         write_new(out, text)
     except OSError as error:

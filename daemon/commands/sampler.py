@@ -23,7 +23,7 @@ def sampler(
     The store takes each pair before it is published; when it cannot (the disk is full), the sampler ends with exit
     code 1 and nothing is lost.
 
-    Needs: robot.toml (`bodyschema config init`), and --sim or a recording named in its table [drivers].
+    Needs: robot.toml (`bodyschema config init`) with joints and cameras or a recording; or --sim.
 
     Next: `bodyschema learner`, `bodyschema status --watch`.
     """

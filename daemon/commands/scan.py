@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -24,8 +25,8 @@ def scan(
 
     Dynamixel servos of both protocols, and Feetech servos: a table of ID, model, firmware, supply, temperature, torque,
     and of what is wrong. With --robot also which servos are missing, of another model, at another rate, double, or not
-    in robot.toml. Nothing is written to any servo, and torque stays as it is. Exit code 1 when not all is as it should
-    be, or nobody answers.
+    in robot.toml. Below, the cameras, by the names for robot.toml. Nothing is written to any servo, and torque stays as
+    it is. Exit code 1 when not all is as it should be, or nobody answers.
 
     Needs: servos with their supply on, and the right to open the port (`bodyschema doctor` tells).
 
@@ -33,7 +34,7 @@ def scan(
     """
     from rich.console import Console
 
-    from daemon import servo_wiring
+    from daemon import camera_wiring, servo_wiring
     from daemon.progress import shown_on
     from daemon.scan_report import as_json, report_of
     from daemon.scan_view import show
@@ -51,7 +52,9 @@ def scan(
         servo_wiring.require_servos(config)
     ports = servo_wiring.ports_to_scan(port, config)
     with shown_on(Console(stderr=True, highlight=False), "scan") as tell:
-        report = report_of(servo_wiring.scan(ports, baud, tell), config)
+        report = replace(
+            report_of(servo_wiring.scan(ports, baud, tell), config), cameras=tuple(camera_wiring.connected_cameras())
+        )
     if json:
         sys.stdout.write(as_json(report) + "\n")
     else:

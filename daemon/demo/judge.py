@@ -16,7 +16,7 @@ from daemon.keys import Keys
 from daemon.wire import JointsRequest, PairsReply, PredictReply, decode, encode
 from interfaces.records import FloatArray
 from interfaces.robot import RobotDescription
-from kbmaps import RigidChain
+from kbmaps import RigidChain, nearest_rotation, rotation_matrices, rotation_vectors
 
 POSES = 300
 JITTER_DEG = 3.0
@@ -31,12 +31,16 @@ class Verdict:
         error_m: mean distance between prediction and truth on held-out poses [m].
         nominal_m: the same for the nominal model [m].
         within_sigma: share of coordinates that lie within the claimed 1-sigma.
+        angle_rad: mean angle between predicted and true orientation there [rad]; None where none is learnt.
+        angles_within_sigma: share of their components that lie within the claimed 1-sigma.
     """
 
     pairs: int
     error_m: float
     nominal_m: float
     within_sigma: float
+    angle_rad: float | None = None
+    angles_within_sigma: float | None = None
 
 
 class Judge:
@@ -73,11 +77,11 @@ class Judge:
         self._sampler.ask_one(self._keys.simulation, json.dumps({"tool": marker_xyz.tolist()}).encode())
 
     def truth(self) -> RigidChain:
-        """The simulated robot as it really is."""
+        """The simulated robot as it really is, its last frame turned as the marker is."""
         raw = json.loads(self._sampler.ask_one(self._keys.simulation))
-        return RigidChain(
-            fixed=np.array(raw["fixed"]), axes=np.array(raw["axes"]), prismatic=np.array(raw["prismatic"], dtype=bool)
-        )
+        fixed = np.array(raw["fixed"])
+        fixed[-1, :3, :3] = nearest_rotation(fixed[-1, :3, :3] @ np.array(raw["turn"]))
+        return RigidChain(fixed, axes=np.array(raw["axes"]), prismatic=np.array(raw["prismatic"], dtype=bool))
 
     def verdict(self) -> Verdict | None:
         """Hold the learner's present answers against the truth; None before any pair."""
@@ -88,7 +92,8 @@ class Judge:
         poses = region[self._rng.integers(len(region), size=POSES)]
         poses = poses + self._rng.normal(0.0, np.radians(JITTER_DEG), poses.shape)
         poses = np.clip(poses, self._robot.lower, self._robot.upper)
-        x_true = self.truth().positions(poses)
+        truth = self.truth()
+        x_true = truth.positions(poses)
         request = encode(JointsRequest(poses.tolist()))
         answer = decode(self._learner.ask_one(self._keys.predict, request), PredictReply)
         miss = np.array(answer.x) - x_true
@@ -97,4 +102,16 @@ class Judge:
             error_m=float(np.linalg.norm(miss, axis=1).mean()),
             nominal_m=float(np.linalg.norm(self._robot.chain.positions(poses) - x_true, axis=1).mean()),
             within_sigma=float((np.abs(miss) <= np.array(answer.sigma)).mean()),
+            **_turned(answer, truth.orientation(poses)),
         )
+
+
+def _turned(answer: PredictReply, truth: FloatArray) -> dict[str, float]:
+    """How far predicted orientations are from the true ones (n, 3, 3); nothing where none are learnt."""
+    if answer.R is None or answer.sigma_R is None:
+        return {}
+    turns = rotation_vectors(rotation_matrices("R", answer.R) @ truth.swapaxes(1, 2))
+    return {
+        "angle_rad": float(np.linalg.norm(turns, axis=1).mean()),
+        "angles_within_sigma": float((np.abs(turns) <= np.array(answer.sigma_R)).mean()),
+    }

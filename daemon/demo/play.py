@@ -49,12 +49,14 @@ class Chapter:
         pairs: pairs learnt with this part's tool.
         verdict: what the judge found.
         claimed_m: the error that the learner claimed [m], or None.
+        claimed_rad: the same of the marker's orientation [rad], or None.
         outlook: what the learner expected of further pairs, or None.
     """
 
     pairs: int
     verdict: Verdict
     claimed_m: float | None
+    claimed_rad: float | None
     outlook: Outlook | None
 
 
@@ -133,7 +135,8 @@ class _Stage:
             self.show(snapshot)
             if done and snapshot.verdict is not None:
                 told = snapshot.learner
-                return Chapter(told.pairs - begin, snapshot.verdict, told.claimed_error_m, told.outlook)
+                claimed_rad = None if told.orientation is None else told.orientation.claimed_rad
+                return Chapter(told.pairs - begin, snapshot.verdict, told.claimed_error_m, claimed_rad, told.outlook)
             if time.monotonic() - progress_at > STALL_LIMIT_S:
                 raise BusError(f"no new pair for {STALL_LIMIT_S:.0f} s; the scene's daemon.log says why")
             time.sleep(GLANCE_S)
@@ -163,6 +166,7 @@ class _Stage:
                     claimed_m=learner.claimed_error_m,
                     prequential_m=learner.prequential_m.get(learner.answering),
                     nominal_m=verdict.nominal_m,
+                    angle_rad=verdict.angle_rad,
                 )
             )
         return verdict

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,23 +11,31 @@ from pathlib import Path
 
 @dataclass(frozen=True, slots=True)
 class CurveRow:
-    """One moment of the demo: errors are mean distances [m]; the truth is known to the judge alone."""
+    """One moment of the demo: errors are mean distances [m]; the truth is known to the judge alone.
+
+    `angle_rad` is the mean angle to the true orientation on held-out poses [rad], None where none is learnt.
+    """
 
     pairs: int
     truth_m: float
     claimed_m: float | None
     prequential_m: float | None
     nominal_m: float
+    angle_rad: float | None = None
 
 
 def write_curve(rows: Sequence[CurveRow], file: Path) -> None:
-    """The curve as CSV, in mm."""
+    """The curve as CSV, in mm and degrees; the angles are there where orientations are learnt."""
+    turned = any(row.angle_rad is not None for row in rows)
     with file.open("w", newline="", encoding="utf-8") as stream:
         writer = csv.writer(stream)
-        writer.writerow(["pairs", "held_out_error_mm", "claimed_error_mm", "prequential_error_mm", "nominal_error_mm"])
+        heading = ["pairs", "held_out_error_mm", "claimed_error_mm", "prequential_error_mm", "nominal_error_mm"]
+        writer.writerow([*heading, "held_out_angle_deg"] if turned else heading)
         for row in rows:
             errors = (row.truth_m, row.claimed_m, row.prequential_m, row.nominal_m)
-            writer.writerow([row.pairs, *("" if e is None else f"{1e3 * e:.3f}" for e in errors)])
+            angle = "" if row.angle_rad is None else f"{math.degrees(row.angle_rad):.4f}"
+            cells = ["" if e is None else f"{1e3 * e:.3f}" for e in errors]
+            writer.writerow([row.pairs, *cells, angle] if turned else [row.pairs, *cells])
 
 
 def plot_curve(rows: Sequence[CurveRow], change_at: int | None, file: Path) -> None:

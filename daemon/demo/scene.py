@@ -9,13 +9,27 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
+
 from daemon.wiring import demonstration_model
 from interfaces.errors import ConfigError
+from interfaces.robot import RobotDescription
+
+from .cube import cube_tables
 
 STATE = "state"
 # A folder with this file is a demo's, and may be emptied by the next one.
 MARK = ".bodyschema-demo"
 Bus = Literal["dynamixel", "feetech", "serial", "ros2"]
+Marker = Literal["ball", "tag", "cluster"]
+# One tag, which looks at what is in front of the robot when the arm hangs.
+TAG = """
+[vision]
+marker = "tag"
+
+[vision.tag]
+side_m = 0.06
+"""
 # Light ones in the neck, strong ones in the shoulder.
 DYNAMIXEL = {
     "neck_yaw": "XL330-M288",
@@ -71,11 +85,12 @@ class Scene:
         return self.folder / "learning_curve.png"
 
 
-def prepare(folder: Path, seed: int, *, bus: Bus | None = None) -> Scene:
+def prepare(folder: Path, seed: int, *, bus: Bus | None = None, marker: Marker = "ball") -> Scene:
     """Lay out the demo's folder; what an earlier demo left there is replaced.
 
     Args:
         bus: what the joints are read through, from a bench.
+        marker: what is in the hand.
 
     Raises:
         ConfigError: the folder is neither empty nor a demo's, or cannot be written.
@@ -93,7 +108,9 @@ def prepare(folder: Path, seed: int, *, bus: Bus | None = None) -> Scene:
             if path.suffix in {".urdf", ".toml"}:
                 shutil.copyfile(path, folder / path.name)
         scene = Scene(folder.resolve())
-        scene.robot_file.write_text(model.read_text(encoding="utf-8") + _own_tables(seed, bus), encoding="utf-8")
+        scene.robot_file.write_text(
+            model.read_text(encoding="utf-8") + _own_tables(seed, bus) + _marker(marker, model), encoding="utf-8"
+        )
     except OSError as error:
         raise ConfigError(
             f"cannot be written: {error.strerror}", file=folder, remedy="Give another --out or free some space"
@@ -115,6 +132,17 @@ state_dir = "{STATE}"
 [sim]
 seed = {seed}
 {bench}"""
+
+
+def _marker(marker: Marker, model: Path) -> str:
+    """The table [vision] for what is in the hand."""
+    match marker:
+        case "ball":
+            return ""
+        case "tag":
+            return TAG
+        case "cluster":
+            return cube_tables(-np.array(RobotDescription.load(model).robot.marker_xyz))
 
 
 def _joints(bus: Bus) -> str:

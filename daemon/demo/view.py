@@ -15,7 +15,7 @@ from rich.table import Table
 from rich.text import Text
 
 from daemon.findings_view import outlook_sentence
-from daemon.screen import coverage_table, mm, rejected, titled_table
+from daemon.screen import coverage_table, degrees, mm, rejected, titled_table
 from daemon.status import SamplerStatus
 
 from .play import Outcome, Snapshot
@@ -50,10 +50,12 @@ class _Lines:
             return
         self._next = time.monotonic() + PLAIN_EVERY_S
         learner, verdict = snapshot.learner, snapshot.verdict
-        truth = mm(verdict.error_m) if verdict else "-"
+        truth, what = mm(verdict.error_m) if verdict else "-", "error: "
+        if verdict and verdict.angle_rad is not None:
+            truth, what = f"{truth} {degrees(verdict.angle_rad)}", ""  # no room for both
         said = (
             f"{learner.pairs:5d} of {snapshot.target} pairs; "
-            f"error: next pair {mm(learner.prequential_m.get(learner.answering))}, "
+            f"{what}next pair {mm(learner.prequential_m.get(learner.answering))}, "
             f"claimed {mm(learner.claimed_error_m)}, held out {truth}"
         )
         if said != self._said:
@@ -89,6 +91,8 @@ def _errors(snapshot: Snapshot) -> Table:
         "held-out poses, learnt model", Text(mm(verdict.error_m if verdict else None, unit=""), style="bold green")
     )
     table.add_row("the same, as the learner claims", mm(learner.claimed_error_m, unit=""))
+    if verdict is not None and verdict.angle_rad is not None:
+        table.add_row("how the marker is turned, held out [°]", degrees(verdict.angle_rad, unit=""))
     for name, error in learner.prequential_m.items():
         mark = " (answers)" if name == learner.answering else ""
         table.add_row(f"next pair, {name}{mark}", mm(error, unit=""))
@@ -134,6 +138,12 @@ def show_outcome(console: Console, outcome: Outcome, scene: Scene) -> None:
         "The claim is the learner's own, who does not know the truth. A third process asked for "
         f"{outcome.answers + outcome.unanswered} predictions meanwhile; {outcome.unanswered} went unanswered."
     )
+    for name, chapter in (("first tool", first), ("tool 250 mm longer", second)):
+        if chapter.verdict.angle_rad is not None and chapter.verdict.angles_within_sigma is not None:
+            console.print(
+                f"\nHow the marker is turned, {name}: {degrees(chapter.verdict.angle_rad)} from the truth on held-out "
+                f"poses; claimed {degrees(chapter.claimed_rad)}; {chapter.verdict.angles_within_sigma:.0%} within 1σ."
+            )
     if second.outlook is not None:
         console.print(f"\n{outlook_sentence(second.outlook)}")
     console.print()

@@ -18,6 +18,8 @@ from .gate import DOUBT, limit_m, sound
 from .learnt import LearntModel
 from .members import EXACT, INSTANT, PRIOR, RESIDUAL, RIGID, Members
 from .memory import PairMemory, Permutations
+from .orientation import OrientationModel, Orientations
+from .orientation_solver import OrientationSolution
 from .solver import Solved, Task
 from .state import LearningHeader
 
@@ -53,6 +55,7 @@ class Era:
         members: the models.
         memory: the pairs with this tool.
         doubts: those that are doubted.
+        orientations: how the marker is turned, where pairs say so.
         arm: as given, or with the last solutions where these stand for pairs that are no longer kept.
         answering: the model that answers.
         task_number: of the solver's present task.
@@ -64,6 +67,7 @@ class Era:
         self.members = Members(prior, settings.step_size)
         self.memory = PairMemory(prior.joints, settings.replay_capacity)
         self.doubts = Doubts(prior.joints)
+        self.orientations = Orientations(arm.chain.chain)
         self.arm = arm
         self.answering = self._answering_map = PRIOR
         self._claims, self._replays_per_pair = claims, settings.replays_per_pair
@@ -126,23 +130,26 @@ class Era:
         self._claims.predicted(pair.q, pair.x, errors, np.diag(pair.cov), delayed)
         self._choose()
         self.members.learn(pair.q, errors[INSTANT], np.inf)
-        self._keep(pair.q, pair.x)
+        self._learn_turn(pair.q, pair.R, pair.cov_R)
+        self._keep(pair.q, pair.x, pair.R)
         self._replays_due += self._replays_per_pair
         return True
 
-    def learn_waiting(self, q: FloatArray, x: FloatArray, belief: ChainBelief) -> None:
+    def learn_waiting(self, q: FloatArray, x: FloatArray, turns: FloatArray, belief: ChainBelief) -> None:
         """Learn pairs, q (n, d) and x (n, 3), that waited for the prior: each once, in their order.
 
         Args:
+            turns: their orientations, quaternions (n, 4), NaN where a pair has none.
             belief: what they let believe of the chain.
         """
         self._claims.fitted(belief)
         variance = np.full(3, belief.noise**2)
-        for row_q, row_x in zip(q, x, strict=True):
+        for row_q, row_x, turn in zip(q, x, turns, strict=True):
             errors = self.members.errors(row_q, row_x)
             self._claims.predicted(row_q, row_x, errors, variance)
             self.members.learn(row_q, errors[INSTANT], np.inf)
-            self._keep(row_q, row_x)
+            self._learn_turn(row_q, turn)
+            self._keep(row_q, row_x, turn)
         self._choose()
         self._replays_due += self._replays_per_pair * len(q)
 
@@ -169,13 +176,13 @@ class Era:
 
         They are perhaps still those of the old tool.
         """
-        q, x = self.memory.all()
+        (q, x), turns = self.memory.all(), self.memory.turns_since(0)
         belongs = sound(np.linalg.norm(x - prior.predict(q), axis=1), self._claims.noise_m)
         if belongs.all():
             return 0
         self.memory.clear()
-        for row_q, row_x in zip(q[belongs], x[belongs], strict=True):
-            self.memory.append(row_q, row_x)
+        for row_q, row_x, turn in zip(q[belongs], x[belongs], turns[belongs], strict=True):
+            self.memory.append(row_q, row_x, turn)
         self._order.restart()
         self._claims.forget_contest()
         self.task_number = next(self._task_numbers)
@@ -204,6 +211,15 @@ class Era:
         self._judge_late(solved.name, model, solved.pairs)
         self._choose()
 
+    def take_orientation(self, solution: OrientationSolution) -> None:
+        """A solution of this era's task for the orientations."""
+        self.orientations.take(solution)
+
+    @property
+    def orientation(self) -> OrientationModel | None:
+        """The model that answers how the marker is turned; None where nothing was learnt of it."""
+        return self.orientations.model(self._claims.support)
+
     def solve_from_what_is_known(self) -> None:
         """Where pairs are no longer kept, the last solutions stand for them in the place of what was before."""
         if EXACT in self.members.names and not self.memory.complete:
@@ -217,6 +233,7 @@ class Era:
         header.belief = self.arm.chain.to_bytes()
         header.residual = None if self.arm.residual is None else self.arm.residual.to_bytes()
         header.replay_position = self._order.position
+        header.orientation = self.orientations.state()
         q, x = self.doubts.run()
         return {"doubted_q": q, "doubted_x": x} | {NET + name: net for name, net in self.members.nets().items()}
 
@@ -224,7 +241,9 @@ class Era:
         """Go on from a state of an era with this prior and arm."""
         nets = {name.removeprefix(NET): net for name, net in arrays.items() if name.startswith(NET)}
         self.members.restore(nets, self._claims.residual)
-        self.memory.restore(arrays["q"], arrays["x"], header.kept_of)
+        self.memory.restore(arrays["q"], arrays["x"], header.kept_of, arrays.get("turns"))
+        if header.orientation is not None:
+            self.orientations.restore(header.orientation)
         self.doubts.restore(arrays["doubted_q"], arrays["doubted_x"], header.doubted_in_a_row)
         self.answering, self._replays_due = header.answering, header.replays_due
         self._order.restore(header.replay_position)
@@ -239,8 +258,12 @@ class Era:
                 name, model.predict, q, x - model.predict(q), anew=len(q) >= JUDGED_ANEW * pairs
             )
 
-    def _keep(self, q: FloatArray, x: FloatArray) -> None:
-        self.memory.append(q, x)
+    def _learn_turn(self, q: FloatArray, turn: FloatArray | None, cov: FloatArray | None = None) -> None:
+        if turn is not None and np.isfinite(turn).all():
+            self.orientations.learn(q, turn, cov, self._claims.support)
+
+    def _keep(self, q: FloatArray, x: FloatArray, turn: FloatArray | None = None) -> None:
+        self.memory.append(q, x, turn)
         self._claims.learnt(q)
 
     def _choose(self) -> None:

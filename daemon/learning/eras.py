@@ -75,7 +75,7 @@ class Eras:
         eras.fitting.restore(header.next_fit, header.first_fit, arrays)
         eras.claims.restore(header.claims, arrays)
         if header.belief is None:
-            eras.waiting.restore(arrays["q"], arrays["x"], header.kept_of)
+            eras.waiting.restore(arrays["q"], arrays["x"], header.kept_of, arrays.get("turns"))
         else:
             arm = KnownArm.from_bytes(header.belief, eras._tolerances, header.residual)
             eras.present = eras._era(KBMap(nominal.bases, arrays[NET + PRIOR]), arm)
@@ -96,6 +96,9 @@ class Eras:
             first_fit=self.fitting.is_first,
         )
         arrays = self.claims.arrays() | self.fitting.arrays() | {"q": q, "x": x}
+        turns = self.memory.turns_since(0)
+        if np.isfinite(turns).any():
+            arrays["turns"] = turns
         if self.present is not None:
             arrays |= self.present.store(header)
         return LearningState(header, arrays)
@@ -134,11 +137,11 @@ class Eras:
 
     def _begin_first(self, fit: Fit, belief: ChainBelief) -> int:
         """The frame is known: the pairs that waited for it are learnt now, but for those that the fit contradicts."""
-        q, x = self.waiting.all()
+        (q, x), turns = self.waiting.all(), self.waiting.turns_since(0)
         belongs = sound(np.linalg.norm(x - fit.prior.predict(q), axis=1), self.claims.noise_m)
         self.waiting.clear()
         self.present = self._era(fit.prior, self._drawn(fit.chain))
-        self.present.learn_waiting(q[belongs], x[belongs], belief)
+        self.present.learn_waiting(q[belongs], x[belongs], turns[belongs], belief)
         return int((~belongs).sum())
 
     def _next(self, era: Era, expected_m: float, first_fit: int = PAIRS_TO_REFIT) -> Era:

@@ -13,7 +13,7 @@ import threading
 import numpy as np
 
 from daemon.config import LearnerConfig
-from daemon.status import CurvePoint
+from daemon.status import CurvePoint, OrientationStatus
 from interfaces.records import Pair
 from kbmaps import ChainBelief
 
@@ -116,6 +116,19 @@ class Learning:
             q, _ = era.memory.at(rng.integers(len(era.memory), size=REGION_SAMPLES))
         return snapshot.expected_error_m(q + rng.normal(0.0, 1.0, q.shape) * self._nominal.reach(REGION_RAD))
 
+    def orientation_status(self) -> OrientationStatus | None:
+        """How well it is known how the marker is turned; None where no pair with the present tool said it."""
+        with self._lock:
+            era, model = self._eras.present, self._snapshot.orientation
+            if era is None or model is None:
+                return None
+            pairs, errors = era.orientations.pairs, era.orientations.prequential_rad()
+            rng = np.random.default_rng(0)
+            q, _ = era.memory.at(rng.integers(len(era.memory), size=REGION_SAMPLES))
+        near = q + rng.normal(0.0, 1.0, q.shape) * self._nominal.reach(REGION_RAD)
+        claimed = model.expected_error(near) if pairs >= FEWEST_TO_CLAIM else None
+        return OrientationStatus(pairs, model.name, errors, claimed)
+
     def known(self) -> Known | None:
         """What is known of the chain now; None before the first solution with the present tool.
 
@@ -153,7 +166,7 @@ class Learning:
             self._counters.since_change += 1
             self._learnt_at = now
             if self._eras.present is None:
-                self._eras.waiting.append(pair.q, pair.x)
+                self._eras.waiting.append(pair.q, pair.x, pair.R)
             else:
                 self._learn_online(self._eras.present, pair)
             self._publish()
@@ -264,10 +277,11 @@ class Learning:
             if era is None or era.task_number != task.number:
                 return True
             q, x, fed = era.memory.since(solving.fed, FEED_PAIRS)
+            turns = era.memory.turns_since(solving.fed, FEED_PAIRS)
             if not len(q) and solving.due:
                 era.ask()
         if len(q):
-            solving.feed(q, x, fed)
+            solving.feed(q, x, fed, turns if np.isfinite(turns).any() else None)
         elif solving.due:
             solving.ask()
         else:
@@ -280,9 +294,13 @@ class Learning:
             return False
         with self._lock:
             era = self._eras.present
-            if era is not None and solved.task == era.task_number and solved.model is not None:
+            if era is None or solved.task != era.task_number:
+                return True
+            if solved.model is not None:
                 era.take(solved, solved.model, self._solving.fed)
-                self._publish()
+            if solved.orientation is not None:
+                era.take_orientation(solved.orientation)
+            self._publish()
         return True
 
     def _replay(self) -> bool:
@@ -305,6 +323,7 @@ class Learning:
             pairs=self._counters.pairs,
             learnt_at=self._learnt_at,
             waiting_for=self._waiting_for() if era is None else "",
+            orientation=None if era is None else era.orientation,
         )
 
     def _waiting_for(self) -> str:

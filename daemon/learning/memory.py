@@ -19,6 +19,7 @@ class PairMemory:
     def __init__(self, joints: int, capacity: int) -> None:
         self._q = np.empty((capacity, joints))
         self._x = np.empty((capacity, 3))
+        self._turns = np.full((capacity, 4), np.nan)
         self._count = self._first = 0
 
     @property
@@ -34,27 +35,34 @@ class PairMemory:
     def __len__(self) -> int:
         return self._count - self._oldest
 
-    def append(self, q: FloatArray, x: FloatArray) -> None:
-        """Keep one pair, q (d,) and x (3,); the oldest makes room."""
+    def append(self, q: FloatArray, x: FloatArray, turn: FloatArray | None = None) -> None:
+        """Keep one pair, q (d,) and x (3,), and its orientation (4,) if it has one; the oldest makes room."""
         place = self._count % len(self._q)
         self._q[place], self._x[place] = q, x
+        self._turns[place] = np.nan if turn is None else turn
         self._count += 1
 
     def clear(self) -> None:
         """Forget all pairs."""
         self._count = self._first = 0
 
-    def restore(self, q: FloatArray, x: FloatArray, count: int) -> None:
-        """Hold the pairs q (n, d), x (n, 3): the newest of `count`."""
+    def restore(self, q: FloatArray, x: FloatArray, count: int, turns: FloatArray | None = None) -> None:
+        """Hold the pairs q (n, d), x (n, 3), with `turns` as `turns_since` gives them: the newest of `count`."""
         self._count = self._first = count - len(q)
-        for row_q, row_x in zip(q, x, strict=True):
-            self.append(row_q, row_x)
+        for row_q, row_x, turn in zip(q, x, np.full((len(q), 4), np.nan) if turns is None else turns, strict=True):
+            self.append(row_q, row_x, turn)
 
     def since(self, count: int, limit: int | None = None) -> tuple[FloatArray, FloatArray, int]:
         """The kept pairs from the one numbered `count` (from 0) on: q (n, d), x (n, 3), and the count after them."""
         begin = max(count, self._oldest)
         end = self._count if limit is None else min(self._count, begin + limit)
         return *self._numbered(np.arange(begin, end)), end
+
+    def turns_since(self, count: int, limit: int | None = None) -> FloatArray:
+        """Orientations (n, 4) of the pairs that `since` gives: quaternions x, y, z, w, NaN where a pair has none."""
+        begin = max(count, self._oldest)
+        end = self._count if limit is None else min(self._count, begin + limit)
+        return self._turns[np.arange(begin, end) % len(self._turns)]
 
     def all(self) -> tuple[FloatArray, FloatArray]:
         """All kept pairs in order: q (n, d), x (n, 3)."""

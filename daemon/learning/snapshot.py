@@ -10,10 +10,12 @@ from numpy.typing import NDArray
 
 from interfaces.errors import RequestError
 from interfaces.records import FloatArray
-from kbmaps import KBMap, SupportSet
+from kbmaps import KBMap, SupportSet, quaternions
 
 from .claims import Claim
 from .learnt import LearntModel
+from .orientation import OrientationModel
+from .solver import LARGEST_NET
 from .unknowns import unexplained
 
 # Beyond this share of the prior's variance left open, joint angles do not lie where data was.
@@ -34,11 +36,15 @@ class Prediction:
         x: positions in the measurement frame (n, 3) [m].
         sigma: their 1-sigma per axis (n, 3) [m].
         in_support: whether each row lies where data was (n,).
+        R: orientations in the measurement frame, quaternions x, y, z, w (n, 4); None where none are learnt.
+        sigma_R: their 1-sigma about each axis of the measurement frame (n, 3) [rad]; None likewise.
     """
 
     x: FloatArray
     sigma: FloatArray
     in_support: NDArray[np.bool_]
+    R: FloatArray | None = None
+    sigma_R: FloatArray | None = None
 
 
 @dataclass(frozen=True)
@@ -54,6 +60,7 @@ class Snapshot:
         pairs: how many pairs it had learnt.
         learnt_at: time of the last of them [s], or None.
         waiting_for: what is missing while there is no model.
+        orientation: the model of how the marker is turned; None where nothing was learnt of it.
     """
 
     answering: str
@@ -64,6 +71,7 @@ class Snapshot:
     pairs: int
     learnt_at: float | None
     waiting_for: str
+    orientation: OrientationModel | None = None
 
     @cached_property
     def digest(self) -> str:
@@ -77,15 +85,20 @@ class Snapshot:
         return self.model
 
     def require_map(self) -> KBMap:
-        """The best KB-Map; NoFrameError when there is none yet."""
+        """The best KB-Map, with the planes of e1, e2, e3 where they are learnt; NoFrameError when there is none yet."""
         if self.map is None:
             raise NoFrameError(self.waiting_for)
-        return self.map
+        turned = self.orientation
+        return self.map if turned is None or self.map.size > LARGEST_NET else turned.planes(self.map)
 
     def predict(self, q: FloatArray) -> Prediction:
         """Predictions for joint angles q (n, d) [rad]; NoFrameError while there is no model."""
         x = self.require_model().predict(q)
-        return Prediction(x, np.sqrt(self.claim.variance(q)), unexplained(self.support, q) < IN_SUPPORT)
+        sigma, in_support = np.sqrt(self.claim.variance(q)), unexplained(self.support, q) < IN_SUPPORT
+        if self.orientation is None:
+            return Prediction(x, sigma, in_support)
+        rotations, variance = self.orientation.predict(q)
+        return Prediction(x, sigma, in_support, quaternions(rotations), np.sqrt(variance))
 
     def expected_error_m(self, q: FloatArray) -> float:
         """Mean distance to the truth [m] that the sigmas of predictions at q (n, d) [rad] claim."""

@@ -29,6 +29,7 @@ from kbmaps import (
 
 from .learnt import LearntModel
 from .members import EXACT, RESIDUAL, RIGID
+from .orientation_solver import OrientationSolution, OrientationSolver
 from .workmanship import Made, best_made, workmanship
 
 log = logging.getLogger(__name__)
@@ -89,6 +90,7 @@ class Solved:
         last: whether this is all that one `solve` gives.
         wide: of a rigid chain, what would be believed of it were it not for how well it seems to be made; what other
             pairs are added to.
+        orientation: what was found for the orientations; None: nothing new.
     """
 
     task: int
@@ -98,6 +100,7 @@ class Solved:
     belief: ChainBelief | ResidualModel | None = None
     last: bool = True
     wide: ChainBelief | None = None
+    orientation: OrientationSolution | None = None
 
 
 class Solver(Protocol):
@@ -107,8 +110,12 @@ class Solver(Protocol):
         """Forget all pairs and begin a new task."""
         ...
 
-    def learn(self, q: FloatArray, x: FloatArray) -> None:
-        """More pairs, q (n, d) [rad] and x (n, 3) [m]."""
+    def learn(self, q: FloatArray, x: FloatArray, turns: FloatArray | None = None) -> None:
+        """More pairs, q (n, d) [rad] and x (n, 3) [m].
+
+        Args:
+            turns: their orientations, quaternions (n, 4), NaN where a pair has none; None where no pair has any.
+        """
         ...
 
     def solve(self) -> None:
@@ -130,6 +137,7 @@ class DirectSolver:
         self._folded_residual: ChainBelief | ResidualModel | None = None
         self._residual_at = 0
         self._exact: ExactLearner | None = None
+        self._orientations: OrientationSolver | None = None
         self._precision: float | None = None
         self._tuned_at = self._pairs = 0
         self._solved: list[Solved] = []
@@ -140,12 +148,16 @@ class DirectSolver:
         self._solved_at = 0
         self._task, self._folded, self._folded_residual = task, task.belief, task.residual or task.belief
         within = Memory(window=WINDOW)
-        self._exact = ExactLearner(task.prior, memory=within) if task.prior.size <= LARGEST_NET else None
+        small = task.prior.size <= LARGEST_NET
+        self._exact = ExactLearner(task.prior, memory=within) if small else None
+        self._orientations = OrientationSolver(task.prior.bases, with_map=small)
         self._precision, self._tuned_at, self._residual_at, self._pairs, self._solved = None, 0, 0, 0, []
         self._q, self._x = np.empty((0, task.prior.joints)), np.empty((0, 3))
 
-    def learn(self, q: FloatArray, x: FloatArray) -> None:
-        """More pairs, q (n, d) [rad] and x (n, 3) [m]."""
+    def learn(self, q: FloatArray, x: FloatArray, turns: FloatArray | None = None) -> None:
+        """More pairs, q (n, d) [rad], x (n, 3) [m] and orientations (n, 4), NaN where a pair has none."""
+        if self._orientations is not None and turns is not None:
+            self._orientations.learn(q, x, turns)
         if self._exact is not None:
             self._exact.learn(q, x)
         self._pairs += len(q)
@@ -173,18 +185,22 @@ class DirectSolver:
         wide = fitted_belief(self._before, self._q, self._x)
         made = _ways_made(wide, task)
         residual_due = self._pairs >= RESIDUAL_GROWTH * self._residual_at
+        turns = self._orientations if self._orientations is not None and self._orientations.due else None
         rigid = _solved_chain(task, self._pairs, wide, made)
-        yield replace(rigid, last=self._exact is None and not residual_due)
+        yield replace(rigid, last=self._exact is None and not residual_due and turns is None)
         if self._exact is not None:
             if not task.prior_stays and isinstance(rigid.model, KBMap):
                 self._exact.rebase(rigid.model)
-            yield self._solve_exact(task, self._exact, last=not residual_due)
+            yield self._solve_exact(task, self._exact, last=not residual_due and turns is None)
         if residual_due:
             self._residual_at = self._pairs
             before = self._residual_before
             before = _as_made(before, task, made) if isinstance(before, ChainBelief) else before
             residual = fitted_residual(before, self._q, self._x)
-            yield Solved(task.number, self._pairs, RESIDUAL if residual else "", residual, residual)
+            name = RESIDUAL if residual else ""
+            yield Solved(task.number, self._pairs, name, residual, residual, last=turns is None)
+        if turns is not None and isinstance(rigid.belief, ChainBelief):
+            yield Solved(task.number, self._pairs, orientation=turns.solve(rigid.belief))
 
     def _solved_of_some(self, task: Task) -> Iterator[Solved]:
         """The chain of the first pairs only: the others can judge it, even if none come after them."""

@@ -60,9 +60,16 @@ class Solving:
         self._task = task.number
         return True
 
-    def feed(self, q: FloatArray, x: FloatArray, fed: int) -> None:
-        """More pairs, q (n, d) [rad] and x (n, 3) [m]; with them the solver has `fed`."""
-        self._solver.learn(q, x)
+    def feed(self, q: FloatArray, x: FloatArray, fed: int, turns: FloatArray | None = None) -> None:
+        """More pairs, q (n, d) [rad] and x (n, 3) [m]; with them the solver has `fed`.
+
+        Args:
+            turns: their orientations, quaternions (n, 4), NaN where a pair has none; None where no pair has any.
+        """
+        if turns is None:
+            self._solver.learn(q, x)
+        else:
+            self._solver.learn(q, x, turns)
         self._fed = fed
 
     def ask(self) -> None:

@@ -13,6 +13,7 @@ from interfaces.records import FloatArray
 
 from .claims import ClaimsState
 from .members import PRIOR
+from .orientation import OrientationState
 
 
 class StateError(BodyschemaError):
@@ -55,6 +56,7 @@ class LearningHeader(msgspec.Struct, kw_only=True):
         replay_position: how far they are: epochs begun, pairs of the present one, and how many of these were replayed.
         belief: what was believed of the chain before the first of these pairs, as bytes; None before the alignment.
         residual: what was known of the arm beyond that, as bytes; None if nothing was.
+        orientation: what is known of how the marker is turned; None in a checkpoint of an older version.
     """
 
     fingerprint: str
@@ -71,6 +73,7 @@ class LearningHeader(msgspec.Struct, kw_only=True):
     replay_position: tuple[int, int, int] = (0, 0, 0)
     belief: bytes | None = None
     residual: bytes | None = None
+    orientation: OrientationState | None = None
 
 
 @dataclass(frozen=True)

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import math
 import textwrap
 
 import msgspec
+import numpy as np
 
 from daemon.evaluate import BLOCKS, ErrorFigures
 from daemon.findings_view import outlook_sentence
 from daemon.screen import mm
 from daemon.status import Outlook
+from interfaces.records import FloatArray
 
 
 class Figures(msgspec.Struct, frozen=True):
@@ -26,6 +29,27 @@ class Figures(msgspec.Struct, frozen=True):
         """The same in mm."""
         metres = (figures.mean_m, figures.rms_m, figures.median_m, figures.p95_m, figures.max_m)
         return cls(*(1e3 * value for value in metres))
+
+
+class AngleFigures(msgspec.Struct, frozen=True):
+    """Angles between predicted and measured orientation on the held-out rows [°], and the learner's claim.
+
+    Attributes:
+        claimed_deg: mean angle to the truth that the learner claims where data is, or null.
+    """
+
+    mean_deg: float
+    median_deg: float
+    p95_deg: float
+    claimed_deg: float | None
+
+    @classmethod
+    def of(cls, angles_rad: FloatArray, claimed_rad: float | None) -> AngleFigures:
+        """Those of angles (n,) [rad]."""
+        mean, median, p95 = np.degrees(
+            [angles_rad.mean(), np.median(angles_rad), np.quantile(angles_rad, 0.95)]
+        ).tolist()
+        return cls(mean, median, p95, None if claimed_rad is None else math.degrees(claimed_rad))
 
 
 class ReplayReport(msgspec.Struct, frozen=True, kw_only=True):
@@ -48,6 +72,7 @@ class ReplayReport(msgspec.Struct, frozen=True, kw_only=True):
         outlook: what the learner expects of further pairs, or null.
         doubt: why no figure is to be trusted, or null: the rows are far from any arm like the drawn one.
         learning_s: time from the first pair to the end of learning [s].
+        angle: of the marker's orientation; null where the recording has none.
     """
 
     recording: str
@@ -72,6 +97,7 @@ class ReplayReport(msgspec.Struct, frozen=True, kw_only=True):
     outlook: Outlook | None
     doubt: str | None
     learning_s: float
+    angle: AngleFigures | None = None
     schema: int = 1
 
 
@@ -92,6 +118,7 @@ def as_text(report: ReplayReport, width: int = 80) -> str:
         f"before: aligned          {_row(report.before)}",
         f"after: learnt            {_row(report.after)}",
         "",
+        *([] if report.angle is None else [_angles(report.angle)]),
         f"before is {fitted} to the rows that were learnt; after is what the learner answers (model: "
         f"{report.answering}). {_verdict(report)}",
         f"error on new pairs before they were learnt: {_by_model(report.prequential_mm)}",
@@ -103,6 +130,14 @@ def as_text(report: ReplayReport, width: int = 80) -> str:
         f"{report.replayed} replay steps, {report.doubted} pairs doubted, {report.learning_s:.1f} s",
     ]
     return "\n".join(_wrapped(line, width) for line in lines)
+
+
+def _angles(angle: AngleFigures) -> str:
+    claim = "" if angle.claimed_deg is None else f"; the learner claims {angle.claimed_deg:.3f}° to the truth"
+    return (
+        f"orientation on the held-out rows: mean {angle.mean_deg:.3f}°, median {angle.median_deg:.3f}°, 95 % within "
+        f"{angle.p95_deg:.3f}°{claim}"
+    )
 
 
 def _wrapped(line: str, width: int) -> str:

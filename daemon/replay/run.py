@@ -21,9 +21,10 @@ from daemon.wire import JointsRequest, PredictReply, decode, encode
 from interfaces.errors import BusError, RecordingError
 from interfaces.recording import Recording
 from interfaces.records import FloatArray
+from kbmaps import rotation_matrices, rotation_vectors
 
 from .processes import Process, free_endpoint, override, started
-from .report import Figures, ReplayReport
+from .report import AngleFigures, Figures, ReplayReport
 from .steps import Steps
 
 GLANCE_S = 0.25
@@ -140,7 +141,18 @@ def _report(job: Job, before: FloatArray, learnt: Learnt, prediction: PredictRep
         outlook=learner.outlook,
         doubt=_doubt(job, before),
         learning_s=learnt.seconds,
+        angle=_angles(held_out, prediction, learner),
     )
+
+
+def _angles(held_out: Recording, prediction: PredictReply, learner: LearnerStatus) -> AngleFigures | None:
+    if held_out.orientation is None or prediction.R is None:
+        return None
+    lengths = np.linalg.norm(held_out.orientation, axis=1, keepdims=True)
+    measured = rotation_matrices("orientation", held_out.orientation / lengths)
+    turns = rotation_vectors(rotation_matrices("R", prediction.R) @ measured.swapaxes(1, 2))
+    claimed = None if learner.orientation is None else learner.orientation.claimed_rad
+    return AngleFigures.of(np.linalg.norm(turns, axis=1), claimed)
 
 
 def _doubt(job: Job, before: FloatArray) -> str | None:
@@ -203,6 +215,9 @@ class _Live:
             model=replies[-1].model,
             pairs=replies[-1].pairs,
             age_s=replies[-1].age_s,
+            R=None
+            if any(reply.R is None for reply in replies)
+            else [row for reply in replies for row in reply.R or []],
         )
 
     def _status(self) -> tuple[SamplerStatus, LearnerStatus]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
+from itertools import zip_longest
 from pathlib import Path
 
 import numpy as np
@@ -125,11 +126,12 @@ def _glance(residuals: Residuals, file: DiagnosisFile) -> str:
 def _causes(residuals: Residuals, file: DiagnosisFile, remedies: Sequence[str]) -> str:
     if not file.causes:
         return ""
-    ordered = sorted(file.causes, key=lambda cause: -cause.share_of_gain_percent)
-    effects = {effect.key: effect for effect in residuals.diagnosis.causes}
+    # Outliers come last and are no effect.
+    fitted = zip_longest(file.causes, residuals.diagnosis.causes)
+    ordered = sorted(fitted, key=lambda pair: -pair[0].share_of_gain_percent)
     articles = [
-        _cause(residuals, cause, effects.get((cause.effect, cause.where, cause.source)), remedy, opened=k < _OPEN)
-        for k, (cause, remedy) in enumerate(zip(ordered, remedies, strict=True))
+        _cause(residuals, cause, effect, remedy, opened=k < _OPEN)
+        for k, ((cause, effect), remedy) in enumerate(zip(ordered, remedies, strict=True))
     ]
     return (
         f'<section id="causes"><h2>Causes</h2>{tables.causes(file, timed=residuals.timed)}'

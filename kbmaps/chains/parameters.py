@@ -240,6 +240,24 @@ class ChainParameters:
         jacobian[:, :, self.tool] = rotations[-1] @ self._frames[-1, :3, :3]
         return x, jacobian
 
+    def turned(self, change: FloatArray, q: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Rotations R (n, 3, 3) of the marker frame at q (n, d), and Ω (n, 3, size); the inputs are trusted.
+
+        A small change δ turns them by dR = [Ω δ]× R. What turns them is what moves the marker by a lever in
+        `linearised`; shifts, tool and sliding joints turn nothing.
+        """
+        geometry = self._geometry(change)
+        rotations = self._placed(geometry, q + geometry.zeros)[..., :3, :3]
+        before, after = rotations[:-1], rotations[1:]
+        omega = np.zeros((len(q), 3, self.size))
+        omega[:, :, self.base_turn] = geometry.base_turns
+        tilts = (before - after) @ geometry.tilt_turns[:, None]
+        omega[:, :, self.tilts] = tilts.transpose(1, 2, 0, 3).reshape(len(q), 3, -1)
+        axes = (before @ geometry.axes[:, None, :, None])[..., 0]
+        axes[self._slides] = 0.0
+        omega[:, :, self.zeros] = axes.transpose(1, 2, 0)
+        return rotations[-1] @ self._frames[-1, :3, :3], omega
+
     def _geometry(self, change: FloatArray) -> _Geometry:
         d = self.reference.joints
         tilts = (self._tangents @ change[self.tilts].reshape(d, 2, 1))[..., 0]

@@ -13,12 +13,16 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+import cv2
+import msgspec
 import numpy as np
 import pytest
+from fake_capture import SIZE_PX, FakeCapture
 from scripted_sources import COV, Scripted
 
 from daemon.bench_wiring import through_bench
 from daemon.config import Config
+from daemon.demo.cube import cube_tables
 from daemon.wiring import driver_of
 from drivers.bench.device import Faults
 from drivers.bench.virtual_port import VirtualClock, VirtualPort
@@ -42,20 +46,32 @@ from drivers.ros2.joints import Ros2Joints
 from drivers.serial_lines.bench.board import EncoderBoard
 from drivers.serial_lines.config import EncoderConfig, SerialLinesConfig
 from drivers.serial_lines.joints import SerialLineJoints
+from interfaces.camera import StereoCalibration
 from interfaces.clock import SystemClock
 from interfaces.errors import SourceEnded, SourceError
-from interfaces.protocols import JointSource, MarkerSource, StereoCamera
+from interfaces.protocols import JointSource, MarkerSource, StereoCamera, StereoEyes
 from interfaces.recording import Recording
 from interfaces.records import JointReading, MarkerFix, MarkerMiss, StereoFrame, frozen_array
 from interfaces.robot import RobotDescription
-from sim_backend import SimConfig, SimWorld, model_file
+from sim_backend import CameraConfig, SimConfig, SimWorld, model_file
+from sim_backend.config import SimTag
+from vision.cameras.config import CamerasConfig
+from vision.cameras.device import OpenCapture
+from vision.cameras.ideal import IdealCamera
+from vision.cameras.opened import eyes_of
+from vision.config import VisionConfig
+from vision.lens import Lens
+from vision.rectified import RectifiedCamera
+from vision.rig import Made, StereoRig
 from vision.tracked_camera import TrackedCamera
 from vision.tracker import StereoTracker
+from vision.trackers import tracker_of
 
 LIMIT_S = 60.0
 WAIT_S = 0.005
 SOME = 10
 ROWS = 60
+PICTURES = 150
 TIMES = np.cumsum(np.random.default_rng(1).uniform(0.01, 0.1, ROWS))
 
 
@@ -155,10 +171,120 @@ def simulated_camera() -> Iterator[Rig]:
         yield Rig(world.camera, world.joints, close(world))
 
 
+class Unrectified:
+    """The simulated camera as two that are neither calibrated nor rectified."""
+
+    serials = ("A1", "B2")
+
+    def __init__(self, camera: StereoCamera) -> None:
+        self._camera = camera
+        self.image_size_px = camera.calibration.image_size_px
+
+    def __enter__(self) -> Unrectified:
+        self._camera.__enter__()
+        return self
+
+    def __exit__(self, *error: Any) -> None:
+        self._camera.__exit__(*error)
+
+    def read(self, timeout_s: float) -> StereoFrame | None:
+        return self._camera.read(timeout_s)
+
+
+def rig_of(camera: StereoCamera) -> StereoRig:
+    """The simulated camera's calibration, as one of two cameras."""
+    true = camera.calibration
+    lens = Lens("pinhole", (true.focal_px, true.focal_px), true.principal_point_px, (0.0,) * 5)
+    place = np.array([-true.baseline_m, 0.0, 0.0])
+    made = Made("2026-01-01T00:00:00Z", "none", 1, 0, 0.1, 0.1, 0.0)
+    return StereoRig(lens, lens, np.zeros(3), place, true.image_size_px, Unrectified.serials, np.eye(24), made)
+
+
+@contextmanager
+def rectified_camera() -> Iterator[Rig]:
+    with simulated_world() as world:
+        yield Rig(RectifiedCamera(Unrectified(world.camera), rig_of(world.camera)), world.joints, close(world))
+
+
 @contextmanager
 def tracked_camera() -> Iterator[Rig]:
     with simulated_world() as world:
         yield Rig(TrackedCamera(world.camera, StereoTracker(world.camera.calibration)), world.joints, close(world))
+
+
+@contextmanager
+def eyes(tables: dict[str, Any], open_capture: OpenCapture = lambda _: FakeCapture()) -> Iterator[Rig]:
+    """Cameras as [vision.cameras] asks for them, with what they read in a folder of its own."""
+    with TemporaryDirectory() as name:
+        folder = Path(name)
+        write_pictures(folder)
+        for device in ("left", "right", "device"):
+            (folder / device).touch()
+        text = msgspec.json.encode(tables).decode().replace("HERE/", f"{folder}/")
+        config = msgspec.json.decode(text, type=CamerasConfig)
+        yield Rig(eyes_of(config, folder, SystemClock(), open_capture))
+
+
+def write_pictures(folder: Path) -> None:
+    rng = np.random.default_rng(3)
+    films = [
+        cv2.VideoWriter(str(folder / f"{eye}.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 30.0, SIZE_PX) for eye in "lr"
+    ]
+    for number in range(PICTURES):
+        for eye, film in zip("lr", films, strict=True):
+            image = rng.integers(0, 255, (SIZE_PX[1], SIZE_PX[0], 3), np.uint8)
+            cv2.imwrite(str(folder / f"{eye}_{number}.png"), image)
+            film.write(image)
+    for film in films:
+        film.release()
+
+
+def two_cameras() -> AbstractContextManager[Rig]:
+    phases = iter([0.0, 0.004] * 100)
+    two = {"left": "HERE/left", "right": "HERE/right", "image_size_px": SIZE_PX, "fourcc": "YUYV", "fps": 100.0}
+    return eyes({"two": two}, lambda device: FakeCapture(phase_s=next(phases)))
+
+
+def side_by_side_camera() -> AbstractContextManager[Rig]:
+    one = {"device": "HERE/device", "image_size_px": SIZE_PX, "fourcc": "YUYV", "fps": 100.0}
+    return eyes({"side_by_side": one}, lambda device: FakeCapture((2 * SIZE_PX[0], SIZE_PX[1])))
+
+
+def image_folder() -> AbstractContextManager[Rig]:
+    return eyes({"images": {"left": "l_*.png", "right": "r_*.png", "fps": 30.0, "speed": 0.0}})
+
+
+def image_folder_in_its_own_time() -> AbstractContextManager[Rig]:
+    return eyes({"images": {"left": "l_*.png", "right": "r_*.png", "fps": 50.0}})
+
+
+def video_files() -> AbstractContextManager[Rig]:
+    return eyes({"videos": {"left": "l.avi", "right": "r.avi", "speed": 0.0}})
+
+
+def side_by_side_video() -> AbstractContextManager[Rig]:
+    return eyes({"videos": {"side_by_side": "l.avi", "fps": 25.0, "speed": 0.0}})
+
+
+@contextmanager
+def ideal_camera() -> Iterator[Rig]:
+    calibration = StereoCalibration(60.0, (31.5, 23.5), 0.1, SIZE_PX)
+    with image_folder() as rig:
+        yield Rig(IdealCamera(rig.source, calibration))
+
+
+@contextmanager
+def tracked_tags() -> Iterator[Rig]:
+    """The demo's cube in the demo's hand."""
+    robot = RobotDescription.load(model_file("upper_body"))
+    tables = cube_tables(-np.array(robot.robot.marker_xyz))
+    vision = msgspec.toml.decode(tables, type=dict[str, VisionConfig])["vision"]
+    placed = vision.cluster.tags
+    tags = tuple(SimTag(id=tag.id, xyz=tag.xyz, rpy=tag.rpy, side_m=vision.tag.side_m) for tag in placed)
+    config = SimConfig(seed=0, camera=CameraConfig(tags=tags))
+    with SimWorld(robot, config) as world:
+        tracker = tracker_of(world.camera.calibration, vision)
+        yield Rig(TrackedCamera(world.camera, tracker), world.joints, close(world))
 
 
 @contextmanager
@@ -258,13 +384,16 @@ ENDING_JOINTS = [replayed_joints, scripted_joints, pytest.param(simulated_joints
 JOINTS = [*ENDING_JOINTS, servos_on_the_bench, feetech_servos_on_the_bench, encoders_on_the_bench, ros_2_robot]
 SILENT_SERVOS = [servos_that_fall_silent, feetech_servos_that_fall_silent]
 SILENT = [*SILENT_SERVOS, encoders_that_fall_silent, ros_2_robot_that_falls_silent]
-MARKERS = [replayed_marker, scripted_marker, pytest.param(tracked_camera, marks=SIMULATED)]
-CAMERAS = [pytest.param(simulated_camera, marks=SIMULATED)]
+CAMERAS = [pytest.param(camera, marks=SIMULATED) for camera in (simulated_camera, rectified_camera)]
+ENDING_EYES = [image_folder, video_files, side_by_side_video, ideal_camera]
+WAITING_EYES = [two_cameras, side_by_side_camera, image_folder_in_its_own_time]
+TRACKED = [pytest.param(make, marks=SIMULATED) for make in (tracked_camera, tracked_tags)]
+MARKERS = [replayed_marker, scripted_marker, *TRACKED]
 STANDING_STILL = [ENDING_JOINTS[2], *MARKERS[2:], *CAMERAS]
 Make = Callable[[], AbstractContextManager[Rig]]
 
 
-@pytest.fixture(scope="module", params=[*JOINTS, *MARKERS, *CAMERAS])
+@pytest.fixture(scope="module", params=[*JOINTS, *MARKERS, *CAMERAS, *ENDING_EYES, *WAITING_EYES])
 def rig(request: pytest.FixtureRequest) -> Iterator[Rig]:
     """A closed source of each kind, shared by the laws after which it can still be used."""
     with request.param() as rig:
@@ -314,7 +443,7 @@ def test_an_error_in_the_block_passes_through_the_closing(rig: Rig) -> None:
         raise ZeroDivisionError
 
 
-@pytest.mark.parametrize("make", [*ENDING_JOINTS, *MARKERS, *CAMERAS])
+@pytest.mark.parametrize("make", [*ENDING_JOINTS, *MARKERS, *CAMERAS, *ENDING_EYES])
 def test_the_end_is_said_each_time_one_reads(make: Make) -> None:
     with make() as rig, rig.opened():
         rig.read(1)
@@ -327,7 +456,9 @@ def test_the_end_is_said_each_time_one_reads(make: Make) -> None:
 # --- waiting
 
 
-@pytest.mark.parametrize("make", [replayed_joints, replayed_marker, ENDING_JOINTS[2], *SILENT, *MARKERS[2:], *CAMERAS])
+@pytest.mark.parametrize(
+    "make", [replayed_joints, replayed_marker, ENDING_JOINTS[2], *SILENT, *MARKERS[2:], *CAMERAS, *WAITING_EYES]
+)
 def test_where_nothing_comes_in_time_none_is_returned(make: Make) -> None:
     with make() as rig, rig.opened():
         while rig.source.read(0.01) is not None:  # time stands still until the other side is read too
@@ -350,7 +481,13 @@ def seen(request: pytest.FixtureRequest) -> Iterator[tuple[MarkerSource, list[An
         yield rig.source, rig.read()
 
 
-@pytest.fixture(scope="module", params=CAMERAS)
+@pytest.fixture(scope="module", params=[*ENDING_EYES[:-1], *WAITING_EYES])
+def looks(request: pytest.FixtureRequest) -> Iterator[tuple[StereoEyes, list[Any]]]:
+    with request.param() as rig, rig.opened():
+        yield rig.source, rig.read()
+
+
+@pytest.fixture(scope="module", params=[*CAMERAS, ideal_camera])
 def frames(request: pytest.FixtureRequest) -> Iterator[tuple[StereoCamera, list[Any]]]:
     with request.param() as rig, rig.opened():
         yield rig.source, rig.read()
@@ -384,6 +521,17 @@ def test_a_fix_has_a_positive_definite_covariance(seen) -> None:
             assert np.linalg.eigvalsh(fix.cov)[0] > 0
 
 
+def test_a_fix_that_tells_how_the_marker_is_turned_does_so_by_a_unit_quaternion(seen) -> None:
+    for fix in seen[1]:
+        if isinstance(fix, MarkerFix) and fix.R is not None:
+            assert is_frozen(fix.R, (4,))
+            assert np.linalg.norm(fix.R) == pytest.approx(1.0, abs=1e-9)
+        if isinstance(fix, MarkerFix) and fix.cov_R is not None:
+            assert fix.R is not None
+            assert is_frozen(fix.cov_R, (3, 3))
+            assert np.linalg.eigvalsh(fix.cov_R)[0] > 0
+
+
 def test_a_camera_gives_two_colour_images_of_its_calibration_s_size(frames) -> None:
     camera, items = frames
     assert isinstance(camera, StereoCamera)
@@ -392,6 +540,24 @@ def test_a_camera_gives_two_colour_images_of_its_calibration_s_size(frames) -> N
         assert type(frame) is StereoFrame
         for image in (frame.left, frame.right):
             assert (image.shape, image.dtype) == ((height, width, 3), np.uint8)
+
+
+def test_eyes_give_two_colour_images_of_one_size_and_say_how_sure_the_time_is(looks) -> None:
+    source, items = looks
+    assert isinstance(source, StereoEyes)
+    width, height = source.image_size_px
+    for frame in items:
+        assert type(frame) is StereoFrame
+        assert (type(frame.t), frame.t_sigma >= 0, type(frame.t_sigma)) == (float, True, float)
+        for image in (frame.left, frame.right):
+            assert (image.shape, image.dtype) == ((height, width, 3), np.uint8)
+
+
+def test_eyes_tell_their_devices_apart(looks) -> None:
+    left, right = looks[0].serials
+    assert left
+    assert right
+    assert left != right
 
 
 @pytest.mark.parametrize("make", THROUGH)

@@ -11,7 +11,7 @@ import numpy as np
 from daemon.sources import Simulation, Sources
 from interfaces.clock import SystemClock
 from interfaces.errors import SourceEnded, SourceError
-from interfaces.records import JointReading, MarkerFix, MarkerMiss, frozen_array
+from interfaces.records import FloatArray, JointReading, MarkerFix, MarkerMiss, frozen_array
 from interfaces.robot import RobotDescription
 from kbmaps import RigidChain
 
@@ -110,6 +110,9 @@ class World:
 
     def true_chain(self) -> RigidChain:
         return self._chain
+
+    def true_turn(self) -> FloatArray:
+        return np.eye(3)
 
 
 def simulated(sources: Sources, world: Simulation) -> Sources:

@@ -139,3 +139,31 @@ def test_a_prismatic_joint_knows_no_wrap() -> None:
 def test_the_revolute_difference_is_never_more_than_half_a_turn(angles) -> None:
     difference = joint_difference(np.array(angles), np.zeros(2), REVOLUTE)
     assert (np.abs(difference) <= np.pi + 1e-12).all()
+
+
+def test_live_encoders_never_wait_for_frames_and_the_oldest_readings_go() -> None:
+    buffer = JointBuffer(REVOLUTE, max_gap_s=0.1, capacity=10, live=True)
+    for step in range(100):
+        buffer.put(reading(0.01 * step, 0.0, 0.0))  # not live, the eleventh would wait for ever
+    assert buffer.at(0.5, 0.0) is Reason.NO_JOINTS
+    assert not isinstance(buffer.at(0.95, 0.0), Reason)
+
+
+@given(rate=st.floats(-5, 5), during_s=st.floats(0.001, 0.3))
+def test_how_far_an_even_motion_goes_while_the_time_is_uncertain_is_known_also_beyond_what_is_kept(
+    rate, during_s
+) -> None:
+    buffer = JointBuffer(REVOLUTE, max_gap_s=0.1, kept_s=0.1)
+    for step in range(60):
+        buffer.put(reading(0.01 * step, rate * 0.01 * step, 0.0))
+    moved = buffer.moved(0.3, during_s, 0.0)
+    assert not isinstance(moved, Reason)
+    assert moved.tolist() == pytest.approx([rate * during_s, 0.0], abs=1e-9)
+
+
+def test_after_asking_how_far_the_joints_moved_the_frame_itself_still_has_its_angles() -> None:
+    buffer = JointBuffer(REVOLUTE, max_gap_s=0.1, kept_s=0.1)
+    for step in range(60):
+        buffer.put(reading(0.01 * step, 0.01 * step, 0.0))
+    buffer.moved(0.3, 0.05, 0.0)
+    assert buffer.at(0.3, 0.0).tolist() == pytest.approx([0.3, 0.0])

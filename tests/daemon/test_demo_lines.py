@@ -11,9 +11,10 @@ from daemon.demo import view
 from daemon.demo.play import Snapshot
 
 
-def snapshot(pairs: int) -> Snapshot:
+def snapshot(pairs: int, angle_rad: float | None = None) -> Snapshot:
     learner = SimpleNamespace(pairs=pairs, answering="rigid", prequential_m={"rigid": 0.3456}, claimed_error_m=0.2345)
-    told = SimpleNamespace(phase="guided", target=900, learner=learner, verdict=SimpleNamespace(error_m=0.1234))
+    verdict = SimpleNamespace(error_m=0.1234, angle_rad=angle_rad)
+    told = SimpleNamespace(phase="guided", target=900, learner=learner, verdict=verdict)
     return cast(Snapshot, told)
 
 
@@ -22,10 +23,10 @@ def lines(monkeypatch):
     monkeypatch.setattr(view, "PLAIN_EVERY_S", 0.0)
     console = Console(file=io.StringIO(), width=200, force_terminal=False, record=True)
 
-    def shown(*pairs: int) -> list[str]:
+    def shown(*pairs: int, angle_rad: float | None = None) -> list[str]:
         with view.shown_on(console) as show:
             for number in pairs:
-                show(snapshot(number))
+                show(snapshot(number, angle_rad))
         return console.export_text().splitlines()
 
     return shown
@@ -37,3 +38,9 @@ def test_without_a_terminal_the_demo_says_nothing_twice(lines) -> None:
 
 def test_without_a_terminal_the_demos_lines_fit_80_columns(lines) -> None:
     assert max(len(line) for line in lines(900)) < 80
+
+
+def test_the_demos_lines_have_the_held_out_angle_where_orientations_are_learnt(lines) -> None:
+    said = lines(900, angle_rad=0.0123)
+    assert "held out 123 mm 0.705°" in said[-1]
+    assert max(len(line) for line in said) < 80

@@ -124,7 +124,10 @@ def test_how_fast_a_servo_answers_is_no_other_calibration() -> None:
 def as_schema_1(file: Path) -> None:
     """The store as the version before wrote it."""
     connection = sqlite3.connect(file)
-    connection.executescript("DROP TABLE devices; PRAGMA user_version = 1;")
+    connection.executescript(
+        "DROP TABLE devices; ALTER TABLE pairs DROP COLUMN R; ALTER TABLE pairs DROP COLUMN cov_R;"
+        "PRAGMA user_version = 1;"
+    )
     connection.close()
 
 

@@ -343,6 +343,32 @@ def test_effects_that_this_recording_cannot_show_are_not_called_absent(robot, tm
     assert "no times" in line
 
 
-def test_a_folder_that_cannot_be_written_is_named(file, tmp_path) -> None:
-    (tmp_path / "taken").write_text("")
-    assert str(tmp_path / "taken") in refused(file, "--robot", DESK_ARM, *FEW, "--out", tmp_path / "taken")
+def test_a_folder_that_cannot_be_written_is_named_before_anything_is_diagnosed(file, tmp_path) -> None:
+    taken = tmp_path / "taken"
+    taken.write_text("")
+    ended = diagnose(file, "--robot", DESK_ARM, *FEW, "--out", taken)
+    assert ended.err.count("\n") == 1
+    assert str(taken) in ended.err
+
+
+def test_an_arm_that_never_moved_is_said_to_have_stood_still(recording, tmp_path) -> None:
+    file = tmp_path / "still.csv"
+    n = len(recording)
+    dataclasses.replace(
+        recording, q=np.repeat(recording.q[:1], n, axis=0), x=np.repeat(recording.x[:1], n, axis=0)
+    ).write_csv(file)
+    assert "no joint ever moved" in refused(file, "--robot", DESK_ARM)
+
+
+def test_excluding_all_that_was_asked_for_leaves_nothing_to_look_for(file) -> None:
+    line = refused(file, "--robot", DESK_ARM, "--effects", "backlash", "--exclude", "backlash")
+    assert "nothing to look for" in line
+
+
+def test_nothing_is_found_in_the_simulations_own_output(robot, recording, tmp_path) -> None:
+    file = tmp_path / "own.csv"
+    dataclasses.replace(recording, x=robot.chain.positions(recording.q), cov=None).write_csv(file)
+    ended = diagnose(file, "--robot", DESK_ARM)
+    assert ended.code == 0
+    assert "NOTHING FOUND" in ended.out
+    assert "100" not in ended.out

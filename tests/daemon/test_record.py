@@ -6,6 +6,7 @@ import socket
 import subprocess
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -134,6 +135,25 @@ def test_following_csv_leaves_whole_lines_at_any_moment(history, sampler, tmp_pa
 
     follow_history(history, JOINTS, tmp_path / "a.csv", stopped)
     assert seen == [2, 4, 5]
+
+
+def turned(seq: int) -> Pair:
+    return replace(pair(seq), R=np.array([0.0, 0.6, 0.0, 0.8]))
+
+
+def test_orientations_are_copied_where_every_pair_has_one(sampler, robot, tmp_path) -> None:
+    sampler.pairs = [turned(seq) for seq in range(1, 4)]
+    record(tmp_path / "a.csv", "--robot", robot)
+    orientation = Recording.read(tmp_path / "a.csv", JOINTS).orientation
+    assert orientation is not None
+    assert orientation.tolist() == [[0.0, 0.6, 0.0, 0.8]] * 3
+
+
+def test_following_csv_ends_where_orientations_begin(history, sampler, tmp_path) -> None:
+    sampler.pairs = [pair(1), pair(2), turned(3), turned(4)]
+    with pytest.raises(RecordingError, match=r"from pair 3 to 4 some tell how the marker is turned .* 2 rows so far"):
+        follow_history(history, JOINTS, tmp_path / "a.csv", lambda: history.next_seq > 4)
+    assert len(Recording.read(tmp_path / "a.csv", JOINTS)) == 2
 
 
 def test_following_without_any_pair_leaves_no_file(history: History, tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from small_arm import JOINTS, write_small_arm
 from daemon.cli import app
 from daemon.config import Config, DaemonConfig
 from daemon.evaluate import EvaluationError, split_blocks
-from daemon.replay.report import Figures, ReplayReport, as_text
+from daemon.replay.report import AngleFigures, Figures, ReplayReport, as_text
 from daemon.replay.run import Job
 from daemon.replay.steps import Steps, require_path
 from interfaces.errors import ConfigError, RecordingError
@@ -178,6 +178,14 @@ def test_the_report_says_that_the_errors_have_the_measurements_noise() -> None:
     assert (
         "the learner claims 0.090 mm to the truth where data is; its 1-sigma and that noise together cover 88%" in said
     )
+
+
+def test_the_report_says_how_far_orientations_are_off_where_there_are_any() -> None:
+    angle = AngleFigures.of(np.radians([0.1, 0.1, 0.4]), np.radians(0.05))
+    said = " ".join(as_text(report(angle=angle)).split())
+    assert "orientation on the held-out rows: mean 0.200°, median 0.100°" in said
+    assert "the learner claims 0.050° to the truth" in said
+    assert max(map(len, as_text(report(angle=angle), 80).splitlines())) <= 80
 
 
 def test_a_doubt_about_the_recording_takes_the_place_of_the_verdict() -> None:

@@ -400,3 +400,22 @@ def test_silent_sources_are_reported(config, monkeypatch) -> None:
         "the encoders have said nothing",
         "the cameras have said nothing",
     ]
+
+
+# --- how sure the time is
+
+
+def uncertain(walk: Walk, t_sigma: float) -> list[MarkerFix]:
+    return [replace(fix, t_sigma=t_sigma) for fix in walk.fixes[2:-2]]
+
+
+def test_joints_too_fast_for_how_well_the_time_is_known_make_no_pair(config) -> None:
+    walk = Walk(config.robot, 20)  # 45°/s
+    pairs, status = sample(config, walk.sources(fixes=uncertain(walk, 0.01)))
+    assert (pairs, status.rejected) == ([], {"moving": 16})
+
+
+def test_the_same_joints_make_pairs_where_the_time_is_known_well(config) -> None:
+    walk = Walk(config.robot, 20)
+    pairs, _ = sample(config, walk.sources(fixes=uncertain(walk, 0.001)))
+    assert len(pairs) == 16

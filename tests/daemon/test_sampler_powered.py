@@ -5,13 +5,15 @@ from __future__ import annotations
 import threading
 import time
 from concurrent.futures import Future
+from dataclasses import replace
 from queue import Queue
 
+import msgspec
 import numpy as np
 import pytest
-from scripted_sources import Scripted
+from scripted_sources import Scripted, Walk
 from small_arm import write_small_arm
-from test_sampler import command, running, status_when
+from test_sampler import command, running, sample, status_when
 
 from daemon import powered
 from daemon.config import Config
@@ -136,3 +138,36 @@ def test_gaze_without_a_stereo_pair_is_refused(config) -> None:
         running(config, Sources(joints, marker, SystemClock(), head=head)),
     ):
         pass
+
+
+def walking(config: Config, drive: Powered) -> Sources:
+    return replace(Walk(config.robot, 10).sources(), powered=(drive,))
+
+
+@pytest.fixture
+def borne(config) -> Config:
+    section = msgspec.structs.replace(config.robot.robot, hold="zero_force")
+    return replace(config, robot=replace(config.robot, robot=section))
+
+
+def test_while_zero_force_shall_bear_the_arm_and_is_off_no_pairs_are_taken(borne) -> None:
+    pairs, status = sample(borne, walking(borne, Powered()))
+    assert (pairs, status.rejected) == ([], {"not_borne": 10})
+    assert any("zero_force is to bear the arm" in text for text in status.health)
+
+
+def test_while_zero_force_bears_the_arm_pairs_are_taken(borne) -> None:
+    drive = Powered()
+    drive.state = "on"
+    assert len(sample(borne, walking(borne, drive))[0]) == 10
+
+
+class Cameras:
+    """Eyes with a complaint."""
+
+    health = ("the left camera's image is black: is the lens cap on?",)
+
+
+def test_what_the_cameras_say_is_in_the_status(config) -> None:
+    with running(config, replace(sources(config, Powered()), cameras=Cameras())) as bus:
+        assert Cameras.health[0] in status_when(bus, lambda status: bool(status.health)).health

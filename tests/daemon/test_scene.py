@@ -2,10 +2,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from daemon.config import Config
+from daemon.demo.cube import CUBE_M
 from daemon.demo.scene import prepare
 from interfaces.errors import ConfigError
+from vision.tag_body import TagBody
 
 
 def everything(folder: Path) -> dict[str, bytes]:
@@ -31,3 +35,18 @@ def test_what_an_earlier_demo_left_is_replaced(tmp_path) -> None:
     assert not again.recording_file.exists()
     assert not again.store_file.exists()
     assert "seed = 1" in again.robot_file.read_text()
+
+
+def test_the_cube_in_the_demos_hand_looks_to_all_sides_and_stands_on_its_corner(tmp_path) -> None:
+    vision = Config.load(prepare(tmp_path / "demo", seed=0, marker="cluster").robot_file).tables.vision
+    body = TagBody.cluster(vision.cluster, vision.tag)
+    middles = np.array([corners.mean(axis=0) for corners in body.corners.values()])
+    normals = np.array([np.cross(c[1] - c[0], c[0] - c[3]) for c in body.corners.values()]) / vision.tag.side_m**2
+    assert normals @ middles.T == pytest.approx(CUBE_M / 2 * (normals @ normals.T), abs=1e-9)
+    assert normals == pytest.approx(middles / (CUBE_M / 2), abs=1e-6)
+    assert np.linalg.matrix_rank(np.round(normals, 6)) == 3
+
+
+@pytest.mark.parametrize("marker", ["ball", "tag", "cluster"])
+def test_the_demo_looks_for_what_is_in_the_hand(tmp_path, marker) -> None:
+    assert Config.load(prepare(tmp_path / "demo", seed=0, marker=marker).robot_file).tables.vision.marker == marker

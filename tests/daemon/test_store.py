@@ -1,10 +1,12 @@
 from __future__ import annotations
 
+import contextlib
 import sqlite3
 import subprocess
 import sys
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +14,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from daemon.store import APPLICATION_ID, PairReader, PairStore, Session, _pair, _row
+from daemon.store import APPLICATION_ID, PairReader, PairStore, Session
+from daemon.store_rows import pair_of, row_of
 from interfaces.errors import StoreError
 from interfaces.records import MarkerFix, Pair, frozen_array
 
@@ -25,12 +28,16 @@ def fix(t: float) -> MarkerFix:
     return MarkerFix(t, frozen_array([0.1 * t, 0.2, 1.0]), COV, (1.0, 2.0, 3.0, 4.5))
 
 
+def turned_fix(t: float) -> MarkerFix:
+    return replace(fix(t), R=frozen_array([0.0, 0.6, 0.0, 0.8]), cov_R=frozen_array(1e-4 * np.eye(3) + 1e-6))
+
+
 def fill(store: PairStore, count: int) -> list[Pair]:
     return [store.append(1, f"utc {i}", frozen_array([0.1 * i, -0.1]), fix(float(i))) for i in range(count)]
 
 
 def same(a: Pair, b: Pair) -> bool:
-    arrays = all(np.array_equal(getattr(a, name), getattr(b, name)) for name in ("q", "x", "cov"))
+    arrays = all(np.array_equal(getattr(a, name), getattr(b, name)) for name in ("q", "x", "cov", "R", "cov_R"))
     plain = ("store", "seq", "segment", "t", "utc", "centres_px")
     return arrays and all(getattr(a, name) == getattr(b, name) for name in plain)
 
@@ -67,8 +74,64 @@ def test_what_is_read_is_what_was_appended_bit_by_bit(store) -> None:
 def test_every_finite_number_survives_the_row_format(numbers, with_centres) -> None:
     cov = np.reshape([*numbers[5:8], numbers[6], *numbers[8:10], numbers[7], *numbers[9:11]], (3, 3))
     centres = tuple(numbers[10:14]) if with_centres else None
-    pair = Pair("id", 1, 2, numbers[0], "utc", frozen_array(numbers[:2]), frozen_array(numbers[2:5]), cov, centres)
-    assert same(pair, _pair("id", _row(pair)))
+    turn = (frozen_array(numbers[3:7]), frozen_array(cov)) if with_centres else (None, None)
+    pair = Pair(
+        "id", 1, 2, numbers[0], "utc", frozen_array(numbers[:2]), frozen_array(numbers[2:5]), cov, centres, *turn
+    )
+    assert same(pair, pair_of("id", row_of(pair)))
+
+
+def test_orientations_come_back_as_they_were_measured(store) -> None:
+    pair = store.append(1, "utc", frozen_array([0.0, 0.1]), turned_fix(1.0))
+    assert same(pair, store.read()[0])
+    assert pair.R is not None
+
+
+# As schema 2 laid a store out.
+SCHEMA_2 = """
+CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID;
+CREATE TABLE sessions (
+    id INTEGER PRIMARY KEY, started_utc TEXT NOT NULL, robot_toml TEXT NOT NULL, urdf TEXT NOT NULL,
+    config TEXT NOT NULL, version TEXT NOT NULL, host TEXT NOT NULL
+);
+CREATE TABLE pairs (
+    seq INTEGER PRIMARY KEY, session INTEGER NOT NULL REFERENCES sessions, segment INTEGER NOT NULL,
+    t REAL NOT NULL, utc TEXT NOT NULL, q TEXT NOT NULL, x TEXT NOT NULL, cov TEXT NOT NULL, centres_px TEXT
+);
+CREATE TABLE devices (
+    id INTEGER PRIMARY KEY, session INTEGER NOT NULL REFERENCES sessions, from_seq INTEGER NOT NULL, utc TEXT NOT NULL,
+    record TEXT NOT NULL
+);
+INSERT INTO meta VALUES ('store', '5c6e'), ('created_utc', ''), ('joints', '["waist","shoulder"]');
+INSERT INTO sessions VALUES (1, '', '', '', '{}', '0', 'host');
+INSERT INTO pairs VALUES (1, 1, 1, 0.5, 'utc', '[0.1,0.2]', '[0.0,0.2,1.0]', '[1e-6,0,0,1e-6,0,1e-6]', '[1,2,3,4]');
+PRAGMA application_id = 0x42534348;
+PRAGMA user_version = 2;
+"""
+
+
+@pytest.fixture
+def before_orientation(file: Path) -> Path:
+    file.parent.mkdir()
+    with contextlib.closing(sqlite3.connect(file)) as connection:
+        connection.executescript(SCHEMA_2)
+    return file
+
+
+def test_a_store_from_before_orientations_goes_on_with_them(before_orientation) -> None:
+    with PairStore(before_orientation, SESSION) as store:
+        store.append(1, "utc", frozen_array([0.2, 0.2]), turned_fix(1.0))
+        old, new = store.read()
+    assert (old.seq, old.R, old.centres_px) == (1, None, (1, 2, 3, 4))
+    assert new.R is not None
+    assert new.seq == 2
+
+
+def test_a_store_from_before_orientations_is_read_without_changing_it(before_orientation) -> None:
+    before = before_orientation.read_bytes()
+    with PairReader(before_orientation) as reader:
+        assert [pair.R for pair in reader.read()] == [None]
+    assert before_orientation.read_bytes() == before
 
 
 def test_a_range_of_pairs_is_read_up_to_the_limit(store) -> None:

@@ -36,6 +36,15 @@ def test_a_pair_comes_out_of_the_wire_as_it_went_in(numbers, encoding) -> None:
     assert (back.store, back.seq, back.segment, back.t, back.utc) == ("id", 3, 2, 1.5, "utc")
 
 
+@pytest.mark.parametrize("encoding", [JSON, MSGPACK])
+def test_an_orientation_comes_out_of_the_wire_as_it_went_in(encoding) -> None:
+    turn, cov_R = frozen_array([0.0, 0.6, 0.0, 0.8]), frozen_array(1e-4 * np.eye(3) + 1e-6)
+    pair = Pair("id", 3, 2, 1.5, "utc", np.zeros(3), np.zeros(3), np.eye(3), None, turn, cov_R)
+    back = pair_from_wire(decode(encode(pair_to_wire(pair), encoding), PairMessage, encoding), 3)
+    assert np.array_equal(back.R, turn)
+    assert np.array_equal(back.cov_R, cov_R)
+
+
 def message(**changed: object) -> bytes:
     fields = {
         "store": "id",
@@ -76,6 +85,11 @@ def test_a_pair_of_another_number_of_joints_is_refused() -> None:
 def test_a_pair_with_an_infinite_number_is_refused() -> None:
     with pytest.raises(RequestError, match="pair 1 has a number that is not finite"):
         pair_from_wire(PairMessage("id", 1, 1, 0.0, "", [0, 0, float("inf")], (0, 0, 0), (0,) * 6), 3)
+
+
+def test_a_pair_with_a_quaternion_that_is_none_is_refused() -> None:
+    with pytest.raises(RequestError, match="pair 1 has an R of the length 2, not 1"):
+        pair_from_wire(decode(message(R=[0, 0, 0, 2]), PairMessage), 3)
 
 
 def test_a_request_with_an_unknown_key_is_refused() -> None:

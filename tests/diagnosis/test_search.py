@@ -147,3 +147,35 @@ def test_a_camera_that_stands_elsewhere_all_the_time_is_no_drift() -> None:
     start = start_of(robot, walk(robot, 4), (moved,), 4)
     hypotheses = [Effect.at(robot, name) for name in ("camera_pose", "thermal_drift")]
     assert names(Search(hypotheses, lambda _: None).run(start)) == {("camera_pose", None)}
+
+
+def test_a_tool_that_slipped_twice_is_named_twice(robot) -> None:
+    slips = (
+        Effect.at(robot, "tool_slip", values=[2e-3, 0.0, 0.0, 30.0]),
+        Effect.at(robot, "tool_slip", values=[0.0, -1.5e-3, 1e-3, 70.0]),
+    )
+    start = start_of(robot, walk(robot, 3), slips, 3)
+    found = Search([Effect.at(robot, "tool_slip")], lambda _: None).run(start)
+    moments = sorted(effect.value("t0") for effect in found.causes)
+    assert moments == pytest.approx([30.0, 70.0], abs=2.0 * INTERVAL_S)
+
+
+def test_there_is_one_offset_at_a_joint_and_no_second(robot) -> None:
+    offset = Effect.at(robot, "joint_offset", ELBOW, values=[0.02])
+    start = start_of(robot, walk(robot, 3), (offset,), 3)
+    found = Search([Effect.at(robot, "joint_offset", ELBOW)], lambda _: None).run(start)
+    assert len(found.causes) == 1
+
+
+def test_a_link_that_stands_for_an_offset_and_a_small_jump_gives_way_to_both() -> None:
+    robot = surveyed_arm()
+    offset = Effect.at(robot, "joint_offset", SHOULDER, values=[4e-3])
+    jump = Effect.at(robot, "encoder_jump", ELBOW, values=[1.2e-3, 40.1])
+    start = start_of(robot, walk(robot, 5), (offset, jump), 5)
+    hypotheses = [
+        Effect.at(robot, name, joint)
+        for name in ("link_geometry", "joint_offset", "encoder_jump")
+        for joint in (SHOULDER, ELBOW)
+    ]
+    found = Search(hypotheses, lambda _: None).run(start)
+    assert names(found) == {("joint_offset", SHOULDER), ("encoder_jump", ELBOW)}

@@ -25,6 +25,11 @@ def test_a_shift_that_the_recording_does_not_tell_is_in_no_sentence():
     assert "1 mm and 0.57°" in sentence("explained", [_link(1.0)], errors, Gain(80.0, (75.0, 85.0)))
 
 
+def test_a_gain_below_a_percent_is_one_all_the_same():
+    said = sentence("explained", [_link(1.0)], Errors(5.0, 3.6, 1.8, 3.59, 3.5), Gain(0.3, (0.1, 0.5)))
+    assert "explains less than 1 % of the error" in said
+
+
 def test_a_gain_on_fitted_pairs_alone_is_called_none():
     errors = Errors(5.0, 3.6, 1.8, 3.9, 0.7)
     said = sentence("unexplained", [_link(1.0)], errors, Gain(-9.0, (-20.0, 2.0)))

@@ -76,6 +76,12 @@ def test_pixel_centres_are_played() -> None:
     assert fixes[0].centres_px == (1, 2, 3, 4)
 
 
+def test_orientations_are_played() -> None:
+    _, fixes = play(Replay(recording(1, orientation=[[0.0, 0.6, 0.0, 0.8]]), speed=0))
+    assert fixes[0].R is not None
+    assert fixes[0].R.tolist() == [0.0, 0.6, 0.0, 0.8]
+
+
 def test_times_are_made_up_for_rows_without() -> None:
     assert np.allclose(np.diff(Replay(recording(30)).t), 1 / 30)
 

@@ -8,11 +8,13 @@ from scipy.spatial.transform import Rotation
 from interfaces.camera import StereoCalibration
 from sim_backend import CameraConfig
 from sim_backend.bullet import load_pybullet
+from sim_backend.config import SimTag
 from sim_backend.eye import TO_LIGHT, StereoEyes
 from sim_backend.panorama import cluttered_room
 from sim_backend.raster import Grid, Raster
 
 PLAIN = CameraConfig(noise=0, clutter=0)
+UNTURNED = np.eye(3)
 CALIBRATION = StereoCalibration(600.0, (319.5, 239.5), 0.09, (640, 480))
 RADIUS = CameraConfig().ball_radius_m
 
@@ -26,12 +28,12 @@ def bullet():
     module.disconnect(physicsClientId=client)
 
 
-def painted(bullet, x, config=PLAIN, seed=0, T_world_camera=None):
-    """Left and right image of a ball at `x` in the left eye."""
+def painted(bullet, x, config=PLAIN, seed=0, T_world_camera=None, turn=UNTURNED):
+    """Left and right image of a marker at `x` in the left eye."""
     T = np.eye(4) if T_world_camera is None else T_world_camera
     images = tuple(np.zeros((480, 640, 3), dtype=np.uint8) for _ in range(2))
     eyes = StereoEyes(Raster(*bullet, CALIBRATION, TO_LIGHT), CALIBRATION, config, seed)
-    eyes.paint(0, T, np.stack([x, x - [CALIBRATION.baseline_m, 0, 0]]), images)
+    eyes.paint(0, T, np.stack([x, x - [CALIBRATION.baseline_m, 0, 0]]), turn, images)
     return images
 
 
@@ -152,3 +154,37 @@ def test_the_shipped_calibration_has_its_axis_in_the_middle_of_the_image():
     calibration = shipped().calibration
     assert calibration is not None
     assert calibration.principal_point_px == (319.5, 239.5)
+
+
+TAGS = CameraConfig(
+    noise=0, clutter=0, supersampling=6, tags=(SimTag(id=3, xyz=(0.01, 0.0, 0.0), rpy=(0.0, 0.0, 0.0), side_m=0.06),)
+)
+FACING = np.diag([1.0, -1.0, -1.0])
+
+
+def test_a_tag_is_where_its_pose_says(bullet) -> None:
+    """The black square of an upright tag that faces the eye, by where its outline crosses the middle grey."""
+    x = np.array([0.02, -0.03, 0.6])
+    image = painted(bullet, x, TAGS, turn=FACING)[0].mean(axis=2)
+    u, v = np.array([319.5, 239.5]) + 600.0 * np.array([x[0] + 0.01, x[1]]) / 0.6
+    black = image < 60.0
+    rows, columns = np.flatnonzero(black[:, round(u - 27)]), np.flatnonzero(black[round(v - 27)])
+    assert (rows.min() + rows.max()) / 2 == pytest.approx(v, abs=0.5)
+    assert (columns.min() + columns.max()) / 2 == pytest.approx(u, abs=0.5)
+    assert len(rows) == len(columns) == pytest.approx(60, abs=1)
+
+
+def test_a_tag_is_not_seen_from_behind(bullet) -> None:
+    x = np.array([0.0, 0.0, 0.6])
+    from_behind = painted(bullet, x, TAGS, turn=UNTURNED)[0]
+    assert from_behind.min() > 60
+
+
+def test_what_stands_before_a_tag_hides_it(bullet) -> None:
+    module, client = bullet
+    shape = module.createVisualShape(
+        module.GEOM_BOX, halfExtents=[0.1] * 3, rgbaColor=[0, 1, 0, 1], physicsClientId=client
+    )
+    module.createMultiBody(0, -1, shape, basePosition=[0, 0, 0.4], physicsClientId=client)
+    image = painted(bullet, np.array([0.0, 0.0, 0.6]), TAGS, turn=FACING)[0]
+    assert (image[200:280, 290:350, 1] > image[200:280, 290:350, 2]).all()

@@ -1,0 +1,317 @@
+"""Cameras and the board from the command line: what is asked, what is run, what is written."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from interfaces.clock import SystemClock
+from interfaces.errors import ConfigError
+from interfaces.protocols import StereoEyes
+from vision.board import Board
+from vision.board.board import Pattern
+from vision.board.page import page as board_page
+from vision.board.pdf import pdf
+from vision.board.svg import svg
+from vision.calibration.calibrate import Asked, Calibrated, ModelChoice, calibrate
+from vision.calibration.check import Check, check
+from vision.calibration.gather import Gathered, gathered, gathered_live, require_any
+from vision.calibration.images import PairFiles, pair_files, read_pairs
+from vision.calibration.report import page as report_page
+from vision.rectified import Rectification
+from vision.rig import CalibrationError, StereoRig
+from vision.rig_file import read_rig, write_rig
+from vision.spread import covariance_of
+from vision.triangulated import triangulated
+
+REPORT = "report.html"
+NORMAL_95 = 1.96
+# Where the uncertainty of a position is told: straight ahead, at this distance [m].
+AHEAD_M = 0.6
+_SQUARES = re.compile(r"(\d+)\s*[xX×]\s*(\d+)")
+
+Tell = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Images:
+    """Where images are.
+
+    Attributes:
+        folder: the folder.
+        left, right: patterns of the eyes' files.
+        side_by_side: whether each image shows both eyes.
+    """
+
+    folder: Path
+    left: str | None = None
+    right: str | None = None
+    side_by_side: bool = False
+
+    def files(self) -> list[PairFiles]:
+        """Which files belong together; CalibrationError when there are none."""
+        if (self.left is None) != (self.right is None):
+            raise ConfigError("--left and --right belong together", remedy="Give both patterns, or none")
+        return pair_files(self.folder, self.left, self.right, side_by_side=self.side_by_side)
+
+
+class Parameter(msgspec.Struct):
+    """A parameter with half the width of its 95 % interval."""
+
+    name: str
+    value: float
+    half_width: float
+
+
+class ViewFigures(msgspec.Struct):
+    """RMS errors of a view per image coordinate, fitted and not fitted [px]."""
+
+    name: str
+    rms_px: float
+    held_out_px: float
+
+
+class LeftOutView(msgspec.Struct):
+    """A view that does not fit the others."""
+
+    name: str
+    rms_px: float
+    usual_px: float
+
+
+class UnusableImage(msgspec.Struct):
+    """An image that could not be used."""
+
+    name: str
+    eye: str
+    why: str
+    text: str
+
+
+class CamerasFile(msgspec.Struct):
+    """What `bodyschema calibrate cameras --json` prints. Half widths are those of 95 % intervals."""
+
+    model: str
+    image_size_px: tuple[int, int]
+    serials: tuple[str, str]
+    board: str
+    baseline_mm: float
+    baseline_half_width_mm: float
+    position_half_widths_mm: tuple[float, float, float]
+    reprojection_px: float
+    held_out_px: float
+    held_out_by_model_px: dict[str, float]
+    rectified_focal_px: float
+    parameters: list[Parameter]
+    views: list[ViewFigures]
+    left_out: list[LeftOutView]
+    unusable: list[UnusableImage]
+    missing: list[str]
+
+
+class CheckFile(msgspec.Struct):
+    """What `bodyschema calibrate check --json` prints. Half widths are those of 95 % intervals."""
+
+    holds: bool
+    wrong: list[str]
+    corners: int
+    epipolar_px: float
+    rows_px: float
+    rows_half_width_px: float
+    roll_deg: float
+    roll_half_width_deg: float
+    square_mm: float
+    square_half_width_mm: float
+    nominal_mm: float
+
+
+def board_of(
+    squares: str,
+    square_mm: float,
+    *,
+    marker_mm: float | None = None,
+    dictionary: str | None = None,
+    pattern: Pattern = "charuco",
+    ruler_mm: float | None = None,
+    paper: str = "A4",
+) -> Board:
+    """The board that options describe.
+
+    Args:
+        squares: as in 8x6.
+        ruler_mm: what the page's longer ruler measures on the print; scales squares and markers.
+
+    Raises:
+        ConfigError: there is no such board.
+    """
+    read = _SQUARES.fullmatch(squares.strip())
+    if read is None:
+        raise ConfigError(f"--squares {squares} is not as in 8x6", remedy="Give columns x rows, of squares")
+    columns, rows = int(read[1]), int(read[2])
+    drawn = Board(columns, rows, 1e-3 * square_mm, _metres(marker_mm), dictionary, pattern)
+    if ruler_mm is None:
+        return drawn
+    length = board_page(drawn, paper).rulers_mm[0]
+    scale = ruler_mm / length
+    if not 0.5 < scale < 2.0:
+        raise ConfigError(
+            f"--ruler-mm {ruler_mm:g}: the ruler across of this page is {length:g} mm as drawn",
+            remedy="Measure the line below the board, from the outer edge of its first tick to that of its last",
+        )
+    return Board(columns, rows, scale * drawn.square_m, scale * drawn.marker_side_m, dictionary, pattern)
+
+
+def write_board(board: Board, paper: str, out: Path) -> tuple[float, float]:
+    """Write the board's page as PDF or SVG; the lengths of its rulers, across and upright [mm].
+
+    Raises:
+        ConfigError: it does not fit, the ending is neither, or the file cannot be written.
+    """
+    writers = {".pdf": pdf, ".svg": svg}
+    writer = writers.get(out.suffix.lower())
+    if writer is None:
+        raise ConfigError(f"{out}: neither .pdf nor .svg", remedy="Name a file that ends so")
+    page = board_page(board, paper)
+    try:
+        out.write_bytes(writer(page))
+    except OSError as error:
+        raise ConfigError(f"cannot be written: {error.strerror}", file=out, remedy="Name another folder") from error
+    return page.rulers_mm
+
+
+def from_images(images: Images, board: Board, tell: Tell) -> Gathered:
+    """All views in a folder's images.
+
+    Raises:
+        CalibrationError: there are no pairs, sizes differ, or no image shows a usable board.
+    """
+    files = images.files()
+    tell(f"looking for the board in {len(files)} pairs of images")
+    found = gathered(read_pairs(files, side_by_side=images.side_by_side), board, tell)
+    require_any(found)
+    return found
+
+
+def from_cameras(eyes: StereoEyes, board: Board, tell: Tell) -> tuple[Gathered, tuple[str, str]]:
+    """Views from two cameras, with guidance until nothing is missing; and the cameras' serials.
+
+    Args:
+        eyes: cameras that are not open; they are closed again.
+
+    Raises:
+        CalibrationError: nothing usable was seen.
+        SourceError: a camera cannot be opened, or went away.
+    """
+    with eyes:
+        found = gathered_live(eyes, board, tell)
+        require_any(found)
+        return found, eyes.serials
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """Of a calibration, besides views and board; as `vision.calibration.calibrate.Asked` has it."""
+
+    serials: tuple[str, str] = ("", "")
+    model: ModelChoice = "auto"
+    scale_sigma: float = 0.001
+    baseline_mm: float | None = None
+
+
+def calibrated(found: Gathered, wanted: Wanted, tell: Tell) -> Calibrated:
+    """The calibration of views; CalibrationError with the reasons when it is not good enough."""
+    asked = Asked(
+        image_size_px=found.image_size_px,
+        serials=wanted.serials,
+        date=SystemClock().utc(),
+        model=wanted.model,
+        scale_sigma=wanted.scale_sigma,
+        baseline_m=_metres(wanted.baseline_mm),
+    )
+    return calibrate(found.views, found.board, asked, tell)
+
+
+def write_calibrated_cameras(result: Calibrated, found: Gathered, out: Path) -> Path:
+    """Write cameras.toml and its report beside it; where the report is."""
+    write_rig(result.rig, out)
+    report = out.with_name(f"{out.stem}_{REPORT}")
+    report.write_text(report_page(result, found), encoding="utf-8")
+    return report
+
+
+def figures(result: Calibrated, found: Gathered) -> CamerasFile:
+    """A calibration in figures."""
+    rig, fitted = result.rig, result.fitted
+    errors = zip(fitted.views, fitted.bundle.view_rms_px().tolist(), fitted.held_out.view_rms_px.tolist(), strict=True)
+    widths = NORMAL_95 * rig.sigma
+    return CamerasFile(
+        model=rig.model,
+        image_size_px=rig.image_size_px,
+        serials=rig.serials,
+        board=rig.made.board,
+        baseline_mm=1e3 * rig.baseline_m,
+        baseline_half_width_mm=1e3 * NORMAL_95 * rig.baseline_sigma_m,
+        position_half_widths_mm=_position_half_widths_mm(rig),
+        reprojection_px=rig.made.reprojection_px,
+        held_out_px=rig.made.held_out_px,
+        held_out_by_model_px={str(model): px for model, px in result.rivals_px.items()},
+        rectified_focal_px=Rectification(rig).calibration.focal_px,
+        parameters=[Parameter(*each) for each in zip(rig.names, rig.vector.tolist(), widths.tolist(), strict=True)],
+        views=[ViewFigures(view.name, rms, held_out) for view, rms, held_out in errors],
+        left_out=[LeftOutView(each.name, each.rms_px, each.usual_px) for each in fitted.left_out],
+        unusable=[UnusableImage(each.name, each.eye, each.fault.why, each.fault.text) for each in found.unusable],
+        missing=result.coverage.missing(),
+    )
+
+
+def checked(file: Path, images: Images, board: Board) -> tuple[CheckFile, str]:
+    """One look at the board with the calibration in `file`, and which pair it was: the newest that shows the board.
+
+    Raises:
+        ConfigError: the file is damaged.
+        CalibrationError: no pair shows the board to both eyes, or the images are of another size.
+    """
+    rig = read_rig(file)
+    files = images.files()
+    for pair in reversed(files):
+        found = gathered(read_pairs([pair], side_by_side=images.side_by_side), board)
+        rig.require(found.image_size_px, rig.serials)
+        if found.views and found.views[0].is_stereo:
+            return _check_figures(check(rig, found.views[0], board)), pair.name
+    require_any(gathered(read_pairs(files, side_by_side=images.side_by_side), board))
+    raise CalibrationError("no pair of images shows the board to both eyes. Hold it into the middle of both images")
+
+
+def _check_figures(found: Check) -> CheckFile:
+    return CheckFile(
+        holds=found.holds,
+        wrong=list(found.wrong),
+        corners=found.corners,
+        epipolar_px=found.epipolar_px,
+        rows_px=found.rows_px,
+        rows_half_width_px=NORMAL_95 * found.rows_sigma_px,
+        roll_deg=found.roll_deg,
+        roll_half_width_deg=NORMAL_95 * found.roll_sigma_deg,
+        square_mm=1e3 * found.square_m,
+        square_half_width_mm=1e3 * NORMAL_95 * found.square_sigma_m,
+        nominal_mm=1e3 * found.nominal_m,
+    )
+
+
+def _position_half_widths_mm(rig: StereoRig) -> tuple[float, float, float]:
+    """95 % half widths of a position straight ahead, in the left camera's frame, as the calibration alone has them."""
+    eye = -rig.R_right_left.T @ rig.translation_m
+    x = np.array([[0.5 * eye[0], 0.5 * eye[1], AHEAD_M]])
+    left, right = rig.left.project(x), rig.right.project(x @ rig.R_right_left.T + rig.translation_m)
+    covariance = covariance_of(rig, lambda other: triangulated(other, left, right)[0])
+    across, down, ahead = (1e3 * NORMAL_95 * np.sqrt(np.diag(covariance))).tolist()
+    return across, down, ahead
+
+
+def _metres(mm: float | None) -> float | None:
+    return None if mm is None else 1e-3 * mm

@@ -1,0 +1,44 @@
+"""`bodyschema board`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+from cyclopts.validators import Number
+
+from daemon.commands.options import BoardDictionary, BoardMarkerMm, BoardPattern, BoardSquares
+
+
+def board(
+    *,
+    squares: BoardSquares = "8x6",
+    square_mm: Annotated[float, Parameter(help="Side of a square [mm].", validator=Number(gt=0))] = 30.0,
+    marker_mm: BoardMarkerMm = None,
+    dictionary: BoardDictionary = None,
+    pattern: BoardPattern = "charuco",
+    paper: Annotated[str, Parameter(help="A4, A3, A2, A1, A0, letter, legal or tabloid.")] = "A4",
+    out: Annotated[Path, Parameter(help="The file to write, .pdf or .svg.")] = Path("board.pdf"),
+) -> None:
+    """Write the calibration board as a page to print, in true size.
+
+    Print it at 100 % ("actual size"), measure the two rulers on the page, and glue the sheet onto something flat and
+    stiff: glass, aluminium, thick board. A bent sheet is a wrong calibration that looks like a good one.
+
+    Needs: a printer.
+
+    Next: `bodyschema calibrate cameras` with the same options; --ruler-mm if the ruler is not what it says.
+    """
+    from rich.console import Console
+
+    from daemon.camera_calibration import board_of, write_board
+
+    made = board_of(squares, square_mm, marker_mm=marker_mm, dictionary=dictionary, pattern=pattern)
+    across, upright = write_board(made, paper, out)
+    Console(highlight=False).print(
+        f"{out} written: {made.name}. Print it at 100 %, then measure: the line below the board is {across:g} mm, the "
+        f"one beside it {upright:g} mm.",
+        markup=False,
+        soft_wrap=True,
+    )

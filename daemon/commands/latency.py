@@ -1,0 +1,83 @@
+"""`bodyschema calibrate latency`."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import Parameter
+from cyclopts.validators import Number
+
+from daemon.commands.options import HERE, RobotFile, flag
+
+if TYPE_CHECKING:
+    from daemon.config import Config
+    from daemon.latency import Wiggle
+
+SECONDS = 5.0
+
+
+def latency(
+    recording: Annotated[
+        Path | None, Parameter(help="What an earlier call saved; else the arm and the cameras themselves.")
+    ] = None,
+    /,
+    *,
+    robot: RobotFile = HERE,
+    seconds: Annotated[
+        float, Parameter(help="How long the arm is moved [s].", validator=Number(gte=3, lte=120))
+    ] = SECONDS,
+    save: Annotated[Path | None, Parameter(help="Keep readings and positions in this CSV file.")] = None,
+    as_json: Annotated[bool, flag("Print the figures as JSON.", name="--json")] = False,
+) -> None:
+    """How long before its time stamp an image was taken, with its uncertainty. Move the arm by hand for 5 s.
+
+    Move it to and fro, quickly but not evenly, more than one joint, the marker in sight of both eyes. The shift in time
+    is looked for at which the marker follows the joint angles best. No calibrated model is needed: how the real arm
+    differs from the drawn one is fitted along.
+
+    Needs: robot.toml with encoders and cameras, and no sampler that runs; or a recording.
+
+    Next: put the two lines that are printed into [vision.cameras].
+    """
+    from rich.console import Console
+
+    from daemon.config import Config
+    from daemon.latency import latency_of
+    from daemon.wiggling import write_wiggle
+    from daemon.wire import encode
+
+    config = Config.load(robot)
+    console = Console(highlight=False, soft_wrap=True)
+    wiggle = _wiggle(config, recording, seconds)
+    if save is not None:
+        write_wiggle(wiggle, config.robot.joints, save)
+    found = latency_of(wiggle, config.robot.chain)
+    if as_json:
+        sys.stdout.write(encode(found).decode() + "\n")
+        return
+    console.print(
+        f"{found.fixes} fixes at {found.speed_m_s:.2f} m/s, {1e3 * found.residual_m:.1f} mm from a smooth function of "
+        f"the angles: images are taken {1e3 * found.latency_s:.1f} ± {1e3 * found.sigma_s:.1f} ms before their time "
+        "stamps. In [vision.cameras] write",
+        markup=False,
+    )
+    console.print(f"latency_s = {found.latency_s:.4f}", markup=False)
+    console.print(f"latency_sigma_s = {found.sigma_s:.4f}", markup=False)
+
+
+def _wiggle(config: Config, recording: Path | None, seconds: float) -> Wiggle:
+    from rich.console import Console
+
+    from daemon.wiggling import collected, read_wiggle
+    from daemon.wiring import open_sources
+
+    if recording is not None:
+        return read_wiggle(recording, config.robot.joints)
+    console = Console(stderr=True, highlight=False)
+    cameras = config.tables.vision.cameras
+    known_s = 0.0 if cameras is None else cameras.latency_s
+    with open_sources(config, sim=False) as sources, console.status("move the arm to and fro, unevenly") as status:
+        seen = collected(sources, seconds, lambda t: status.update(f"go on moving: {max(seconds - t, 0):.0f} s"))
+    return seen.with_stamps_later(known_s)  # as the camera gave them, before robot.toml's latency was taken off

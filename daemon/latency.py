@@ -1,0 +1,225 @@
+"""How long before its time stamp an image was taken, from encoders and marker while the arm was moved.
+
+The marker is where the joint angles of the exposure's middle bring it. Nobody needs to know
+that function well: among all shifts in time the true one lets the positions follow most closely from the angles by a
+smooth function.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize_scalar
+
+from interfaces.errors import BodyschemaError
+from interfaces.records import FloatArray, frozen_array
+from kbmaps import RigidChain
+
+EARLIEST_S, LATEST_S = -0.05, 0.25  # that is looked for
+STEP_S = 0.004
+FEWEST_FIXES = 60
+BLOCKS = 10
+RIVAL = 1.15  # a second minimum whose residual is less than this many times the best one's
+APART_S = 0.03  # from the first
+SMALL = 1e-3  # of the largest motion: a direction in which nothing moved
+RIDGE = 1e-6
+LARGEST_SIGMA_S = 0.0025
+
+
+class LatencyError(BodyschemaError):
+    """The motion does not tell the latency."""
+
+
+@dataclass(frozen=True)
+class Wiggle:
+    """Readings and fixes as they came, each with its own time stamp.
+
+    Attributes:
+        t_joints, q: of the encoders [s] (n,), [rad or m] (n, d).
+        t_marker, x: of the marker [s] (m,), [m] (m, 3).
+    """
+
+    t_joints: FloatArray
+    q: FloatArray
+    t_marker: FloatArray
+    x: FloatArray
+
+    def __post_init__(self) -> None:
+        for name in ("t_joints", "q", "t_marker", "x"):
+            object.__setattr__(self, name, frozen_array(getattr(self, name)))
+
+    def with_stamps_later(self, by_s: float) -> Wiggle:
+        """The same with the marker's time stamps later by so much [s]."""
+        return replace(self, t_marker=self.t_marker + by_s)
+
+    def angles(self, t: FloatArray) -> FloatArray:
+        """Joint angles at times (m,), interpolated, shape (m, d)."""
+        return np.stack([np.interp(t, self.t_joints, column) for column in self.q.T], axis=1)
+
+
+@dataclass(frozen=True, slots=True)
+class Latency:
+    """What was found.
+
+    Attributes:
+        latency_s: from the exposure's middle to the time stamp, with its 1-sigma sigma_s [s].
+        fixes: how many positions it was found with.
+        residual_m: RMS distance of these from the smooth function.
+        speed_m_s: RMS speed of the marker.
+    """
+
+    latency_s: float
+    sigma_s: float
+    fixes: int
+    residual_m: float
+    speed_m_s: float
+
+
+def latency_of(wiggle: Wiggle, chain: RigidChain) -> Latency:
+    """The latency of the marker's time stamps against the encoders'.
+
+    Args:
+        chain: roughly the arm; only the curvature of its map matters.
+
+    Raises:
+        LatencyError: too few fixes, too little motion, or motion that repeats itself.
+    """
+    fit = _Fit.of(wiggle, chain)
+    grid = np.arange(EARLIEST_S, LATEST_S + STEP_S, STEP_S)
+    cost = np.array([fit.cost(lag) for lag in grid])
+    best = int(np.argmin(cost))
+    if best in (0, len(grid) - 1):
+        raise LatencyError(
+            f"no latency between {1e3 * EARLIEST_S:.0f} and {1e3 * LATEST_S:.0f} ms fits. Were encoders and camera "
+            "looking at the same motion?"
+        )
+    _require_one(grid, cost, best)
+    residual_m = math.sqrt(fit.cost(grid[best]) / len(fit.x))
+    fit = fit.whitened(grid[best])
+    lag = _minimum(fit, grid[best])
+    sigma_s = _sigma(fit, lag)
+    if sigma_s > LARGEST_SIGMA_S:
+        raise LatencyError(
+            f"the latency is known to {1e3 * sigma_s:.1f} ms only. Move the arm faster, to and fro, "
+            "the marker in sight of both eyes"
+        )
+    speed = float(np.sqrt(np.mean(np.sum(np.gradient(wiggle.x, wiggle.t_marker, axis=0) ** 2, axis=1))))
+    return Latency(lag, sigma_s, len(fit.x), residual_m, speed)
+
+
+def latency_by_speed(wiggle: Wiggle, chain: RigidChain) -> float:
+    """The latency by speeds alone [s]: the shift at which those of `chain`'s marker and of the seen one correlate best.
+
+    Coarser than `latency_of`, for comparison: the drawn arm's speed is not the real one's, and noise is differentiated.
+    """
+    t = wiggle.t_marker[(wiggle.t_marker - LATEST_S >= wiggle.t_joints[0])]
+    x = wiggle.x[-len(t) :]
+    middle, half = 0.5 * (t[1:] + t[:-1]), 0.5 * float(np.median(np.diff(t)))
+    seen = np.linalg.norm(np.diff(x, axis=0), axis=1) / np.diff(t)
+
+    def mismatch(lag: float) -> float:
+        ends = [chain.positions(wiggle.angles(middle - lag + side)) for side in (half, -half)]
+        return -float(np.corrcoef(np.linalg.norm(ends[0] - ends[1], axis=1), seen)[0, 1])
+
+    grid = np.arange(EARLIEST_S, LATEST_S, STEP_S)
+    best = grid[int(np.argmin([mismatch(lag) for lag in grid]))]
+    return _lowest(mismatch, (best - STEP_S, best + STEP_S))
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """The smooth function's terms, and the positions to be explained: those whose angles are known at every lag."""
+
+    wiggle: Wiggle
+    chain: RigidChain
+    t: FloatArray
+    x: FloatArray
+    centre: FloatArray
+    axes: FloatArray  # (d, k): the joints' motion along its principal directions, each scaled to 1
+
+    @classmethod
+    def of(cls, wiggle: Wiggle, chain: RigidChain) -> _Fit:
+        if len(wiggle.t_joints) < 2:
+            raise LatencyError("there are no encoder readings")
+        t = wiggle.t_marker
+        inside = (t - LATEST_S - STEP_S >= wiggle.t_joints[0]) & (t - EARLIEST_S + STEP_S <= wiggle.t_joints[-1])
+        if inside.sum() < FEWEST_FIXES:
+            raise LatencyError(
+                f"the marker was seen {int(inside.sum())} times, {FEWEST_FIXES} are needed: keep it in sight of both "
+                "eyes for all 5 s"
+            )
+        centre = wiggle.q.mean(axis=0)
+        _, size, directions = np.linalg.svd(wiggle.q - centre, full_matrices=False)
+        size = size / math.sqrt(len(wiggle.q))
+        if not size[0] > 0:
+            raise LatencyError("the joints did not move")
+        moving = size > SMALL * size[0]
+        axes = directions[moving].T / size[moving]
+        return cls(wiggle, chain, t[inside], wiggle.x[inside], centre, axes)
+
+    def terms(self, lag: float) -> FloatArray:
+        """The nominal position, and a polynomial of second degree in the angles, at all fixes: (m, p)."""
+        q = self.wiggle.angles(self.t - lag)
+        u = (q - self.centre) @ self.axes
+        rows, columns = np.triu_indices(u.shape[1])
+        nominal = self.chain.positions(q)
+        return np.hstack([np.ones((len(q), 1)), u, u[:, rows] * u[:, columns], nominal - nominal.mean(axis=0)])
+
+    def residual(self, lag: float, keep: NDArray[np.bool_] | slice = slice(None)) -> FloatArray:
+        """What the smooth function with the best coefficients leaves, shape (m, 3) [m]."""
+        A, x = self.terms(lag)[keep], self.x[keep]
+        scale = np.linalg.norm(A, axis=0) + np.finfo(float).tiny
+        A = A / scale
+        weights = np.linalg.solve(A.T @ A + RIDGE * np.eye(A.shape[1]), A.T @ x)
+        return x - A @ weights
+
+    def whitened(self, lag: float) -> _Fit:
+        """The same with positions in units of their noise, larger in depth, as the residual at `lag` has it."""
+        residual = self.residual(lag)
+        noise = residual.T @ residual / len(residual)
+        least = SMALL * float(np.trace(noise)) + np.finfo(float).tiny
+        factor = np.linalg.cholesky(noise + least * np.eye(len(noise)))
+        return replace(self, x=np.linalg.solve(factor, self.x.T).T)
+
+    def cost(self, lag: float, keep: NDArray[np.bool_] | slice = slice(None)) -> float:
+        """Sum of squares of the residual [m²], or in units of the noise."""
+        return float(np.sum(self.residual(lag, keep) ** 2))
+
+
+def _minimum(fit: _Fit, near_s: float, keep: NDArray[np.bool_] | slice = slice(None)) -> float:
+    return _lowest(lambda lag: fit.cost(lag, keep), (near_s - 2 * STEP_S, near_s + 2 * STEP_S))
+
+
+def _lowest(cost: Callable[[float], float], span: tuple[float, float]) -> float:
+    found: Any = minimize_scalar(cost, bounds=span, method="bounded", options={"xatol": 1e-6})
+    return float(found.x)
+
+
+def _sigma(fit: _Fit, lag: float) -> float:
+    """1-sigma [s]: from how the result changes when a stretch of time is left out, which sees residuals that go along
+    with each other; never less than what independent ones would give."""
+    blocks = np.arange(len(fit.x)) * BLOCKS // len(fit.x)
+    without = np.array([_minimum(fit, lag, blocks != block) for block in range(BLOCKS)])
+    jackknife = math.sqrt((BLOCKS - 1) * float(np.mean((without - without.mean()) ** 2)))
+    residual, step = fit.residual(lag), 1e-3
+    slope = (fit.residual(lag + step) - fit.residual(lag - step)) / (2 * step)
+    free = max(residual.size - 3 * fit.terms(lag).shape[1] - 1, 1)
+    independent = math.sqrt(float(np.sum(residual**2)) / free / float(np.sum(slope**2)))
+    return max(jackknife, independent)
+
+
+def _require_one(grid: FloatArray, cost: FloatArray, best: int) -> None:
+    """LatencyError when another latency fits nearly as well."""
+    inner = np.r_[False, (cost[1:-1] <= cost[:-2]) & (cost[1:-1] <= cost[2:]), False]
+    rivals = inner & (np.abs(grid - grid[best]) > APART_S) & (np.sqrt(cost) < RIVAL * math.sqrt(cost[best]))
+    if rivals.any():
+        other = grid[rivals][0]
+        raise LatencyError(
+            f"{1e3 * grid[best]:.0f} ms and {1e3 * other:.0f} ms fit nearly as well: the motion repeats itself. Move "
+            "irregularly, more than one joint"
+        )

@@ -1,0 +1,257 @@
+"""How the marker is turned: models side by side, of which the one that predicts best answers."""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import msgspec
+import numpy as np
+
+from interfaces.records import FloatArray
+from kbmaps import (
+    ChainBelief,
+    ChainParameters,
+    Contest,
+    KBMap,
+    OrientedChain,
+    RigidChain,
+    SupportSet,
+    fitted_orientation,
+    rotation_matrices,
+    rotation_vectors,
+)
+
+from .members import EXACT, PRIOR, RIGID
+from .orientation_solver import OrientationSolution
+from .scores import DISCOUNT
+from .unknowns import unexplained
+
+# Who is believed first when the errors do not tell.
+TRUSTED = (RIGID, EXACT, PRIOR)
+# The turn of the marker on the hand as drawn is fitted to at most so many of the first pairs, whenever they double.
+FIRST = 64
+# Of so many pairs, the solved chain is believed before it has predicted any.
+FEWEST_TO_BELIEVE = 3
+# Mean length of a Gaussian turn over its RMS length, three equal axes.
+MEAN_OVER_RMS = 0.9213
+
+
+class AngleMemory(msgspec.Struct):
+    """Discounted sums over one model's recent prediction errors.
+
+    Attributes:
+        weight: how many errors count.
+        angle: sum of their angles [rad].
+        square: sum of their squares [rad²].
+        noise: sum of the measurements' variances, all three axes [rad²]; of those that tell none, 0.
+        ratio: sum of their squares over what was claimed.
+    """
+
+    weight: float = 0.0
+    angle: float = 0.0
+    square: float = 0.0
+    noise: float = 0.0
+    ratio: float = 0.0
+
+    def add(self, angle: float, noise: float, claimed: float) -> None:
+        """One more error of this angle [rad], where the squares of these were expected: of noise, of both [rad²]."""
+        self.weight = DISCOUNT * self.weight + 1.0
+        self.angle = DISCOUNT * self.angle + angle
+        self.square = DISCOUNT * self.square + angle**2
+        self.noise = DISCOUNT * self.noise + noise
+        self.ratio = DISCOUNT * self.ratio + angle**2 / max(claimed, 1e-18)
+
+    @property
+    def mean_rad(self) -> float:
+        """Mean angle between prediction and measurement [rad]."""
+        return self.angle / max(self.weight, 1.0)
+
+    @property
+    def surprise(self) -> float:
+        """How many times larger than claimed the errors were, at least 1."""
+        few = max(10.0 - self.weight, 0.0)
+        return math.sqrt(max((self.ratio + few) / max(self.weight, 10.0), 1.0))
+
+
+class OrientationState(msgspec.Struct, kw_only=True):
+    """What a checkpoint holds.
+
+    Attributes:
+        pairs: how many pairs had an orientation.
+        answering: the model that answers.
+        errors: prequential errors, by model.
+        prior, chain, map: the models, as bytes; None before there are any.
+        map_noise: 1-sigma of an orientation about one axis around the map [rad].
+        noise: mean variance of the measured orientations about one axis [rad²].
+    """
+
+    pairs: int
+    answering: str
+    errors: dict[str, AngleMemory]
+    prior: bytes | None
+    chain: bytes | None
+    map: bytes | None
+    map_noise: float
+    noise: float
+
+
+@dataclass(frozen=True, eq=False)
+class OrientationModel:
+    """The model that answers, with what is claimed of its error; later learning does not touch it.
+
+    Attributes:
+        name: which one it is.
+        chain: the rigid chain that says how uncertain it is, and answers itself unless there is a map.
+        map: of e1, e2, e3.
+        inside: 1-sigma about each axis where data is, besides what the chain leaves open [rad].
+        surprise: by how much predictions were worse than claimed, at least 1.
+        support: where data was; None before any.
+    """
+
+    name: str
+    chain: OrientedChain
+    map: KBMap | None
+    inside: float
+    surprise: float
+    support: SupportSet | None
+
+    def rotations(self, q: FloatArray) -> FloatArray:
+        """Orientations (n, 3, 3) at q (n, d) [rad]."""
+        return self.chain.orientation(q) if self.map is None else self.map.orientation(q, orthonormal=True)
+
+    def predict(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Orientations (n, 3, 3) at q (n, d) [rad], and their variance about each axis (n, 3) [rad²]."""
+        rotations, left_open = self.chain.orientation_with_variance(q)
+        if self.map is not None:
+            of_chain, rotations = rotations, self.rotations(q)
+            # Away from the data the map is no better than the chain; how far apart they are says how bad.
+            departure = rotation_vectors(rotations @ of_chain.swapaxes(1, 2))
+            left_open = left_open + unexplained(self.support, q)[:, None] * np.square(departure)
+        return rotations, self.surprise**2 * (self.inside**2 + left_open)
+
+    def planes(self, kbmap: KBMap) -> KBMap:
+        """`kbmap` with the nine planes of e1, e2, e3 in its bases."""
+        turned = self.map if self.map is not None else self.chain.chain.to_kbmap(kbmap.bases, orientation=True)
+        return KBMap(kbmap.bases, np.concatenate([kbmap.net[:3], turned.net[3:]]), kbmap.metadata)
+
+    def expected_error(self, q: FloatArray) -> float:
+        """Mean angle to the truth [rad] that the sigmas at q (n, d) [rad] claim."""
+        return MEAN_OVER_RMS * float(np.sqrt(self.predict(q)[1].sum(axis=1)).mean())
+
+
+class Orientations:
+    """Learns how one marker is turned. It has no lock of its own.
+
+    Args:
+        chain: the nominal chain, placed; what the orientations are predicted with before anything is solved.
+    """
+
+    def __init__(self, chain: RigidChain) -> None:
+        parameters = ChainParameters(chain)
+        self._drawn = ChainBelief(parameters, np.zeros(parameters.size), np.zeros((parameters.size, 0)))
+        self._first: list[tuple[FloatArray, FloatArray]] = []
+        self._chains: dict[str, OrientedChain] = {}
+        self._map: KBMap | None = None
+        self._map_noise = self._noise = 0.0
+        self._contest = Contest()
+        self.pairs = 0
+        self.answering = PRIOR
+        self.errors: dict[str, AngleMemory] = {}
+
+    def model(self, support: SupportSet | None) -> OrientationModel | None:
+        """The model that answers; None before the first orientation."""
+        return self._named(self.answering, support) if self.answering in self._names else None
+
+    def prequential_rad(self) -> dict[str, float]:
+        """Recent mean angle between prediction and measurement, before learning [rad], by model."""
+        return {name: memory.mean_rad for name, memory in self.errors.items() if memory.weight}
+
+    def learn(self, q: FloatArray, turn: FloatArray, cov: FloatArray | None, support: SupportSet | None) -> None:
+        """One pair: its orientation is predicted before it is learnt.
+
+        Args:
+            q: joint angles (d,) [rad].
+            turn: unit quaternion x, y, z, w (4,).
+            cov: covariance of it (3, 3) [rad²], if it is known.
+        """
+        measured = rotation_matrices("R", turn / np.linalg.norm(turn))
+        noise = 0.0 if cov is None else float(np.trace(cov))
+        squares: dict[str, float] = {}
+        for name in self._names:
+            rotation, variance = self._named(name, support).predict(q[None])
+            angle = float(np.linalg.norm(rotation_vectors(measured[None] @ rotation.swapaxes(1, 2))))
+            self.errors.setdefault(name, AngleMemory()).add(angle, noise, float(variance.sum()) + noise)
+            squares[name] = angle**2
+        self._contest.add(squares)
+        self.pairs += 1
+        self._noise += (noise / 3.0 - self._noise) / min(self.pairs, 1.0 / (1.0 - DISCOUNT))
+        self._fit_drawn(q, measured)
+        self._choose()
+
+    def take(self, solution: OrientationSolution) -> None:
+        """The solver's solution for the orientations so far."""
+        self._chains[RIGID] = solution.chain
+        self._map, self._map_noise = solution.map, solution.map_noise
+        if solution.map is None and self.answering == EXACT:
+            self.answering = RIGID
+        self._choose()
+
+    def state(self) -> OrientationState:
+        """Everything that `restore` needs."""
+        packed = {name: chain.to_bytes() for name, chain in self._chains.items()}
+        return OrientationState(
+            pairs=self.pairs,
+            answering=self.answering,
+            errors=copy.deepcopy(self.errors),
+            prior=packed.get(PRIOR),
+            chain=packed.get(RIGID),
+            map=None if self._map is None else self._map.to_bytes(),
+            map_noise=self._map_noise,
+            noise=self._noise,
+        )
+
+    def restore(self, state: OrientationState) -> None:
+        """Go on from a state."""
+        self.pairs, self.answering, self.errors = state.pairs, state.answering, dict(state.errors)
+        packed: Mapping[str, bytes | None] = {PRIOR: state.prior, RIGID: state.chain}
+        self._chains = {name: OrientedChain.from_bytes(data) for name, data in packed.items() if data is not None}
+        self._map = None if state.map is None else KBMap.from_bytes(state.map)
+        self._map_noise, self._noise = state.map_noise, state.noise
+
+    @property
+    def _names(self) -> tuple[str, ...]:
+        return (*self._chains, EXACT) if self._map is not None else tuple(self._chains)
+
+    def _named(self, name: str, support: SupportSet | None) -> OrientationModel:
+        solved = self._chains.get(RIGID)
+        chain = self._chains[PRIOR] if name == PRIOR or solved is None else solved
+        around = self._map_noise if name == EXACT else chain.noise
+        surprise = self.errors.get(name, AngleMemory()).surprise
+        mapped = self._map if name == EXACT else None
+        return OrientationModel(name, chain, mapped, self._misfit(around), surprise, support)
+
+    def _misfit(self, around: float) -> float:
+        """1-sigma of the truth around a model [rad], about one axis, of that of the measurements.
+
+        What the measurements say of their own noise is taken out, as far as so many pairs can tell.
+        """
+        resolution = math.sqrt(2.0 / (3.0 * max(self.pairs, 1)))
+        return math.sqrt(max(around**2 - self._noise, around**2 * resolution if self._noise else around**2))
+
+    def _fit_drawn(self, q: FloatArray, measured: FloatArray) -> None:
+        if len(self._first) == FIRST or self.pairs > FIRST:
+            return
+        self._first.append((q, measured))
+        count = len(self._first)
+        if count & (count - 1) == 0:
+            angles, rotations = (np.array(values) for values in zip(*self._first, strict=True))
+            self._chains[PRIOR] = fitted_orientation(self._drawn, angles, rotations)
+
+    def _choose(self) -> None:
+        self.answering = self._contest.best(TRUSTED, self.answering)
+        untried = RIGID in self._chains and not self._contest.compares(RIGID)
+        if self.answering == PRIOR and self.pairs >= FEWEST_TO_BELIEVE and untried:
+            self.answering = RIGID

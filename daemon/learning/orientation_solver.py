@@ -1,0 +1,115 @@
+"""What orientations say of all pairs at once: the rigid chain, its marker turned, and maps of e1, e2, e3 around it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from interfaces.records import FloatArray
+from kbmaps import (
+    ChainBelief,
+    ExactLearner,
+    JointBasis,
+    KBMap,
+    Memory,
+    OrientedChain,
+    SettingError,
+    blockwise_precision,
+    fitted_orientation,
+    rotation_matrices,
+)
+
+# So many of the newest pairs bend the maps.
+WINDOW = 20_000
+# So many of the newest orientations are kept; a chain is fitted to so many of them, evenly spread.
+KEPT, FITTED = 4000, 1000
+# Solved anew when the pairs have grown by this factor; the maps' precision is looked for anew with it.
+GROWTH = 1.15
+# Fewer orientations than this bend no map: the chain says it all.
+FEWEST_FOR_MAP = 30
+# An entry of a rotation matrix errs by this much of a small turn's 1-sigma about one axis: √(2/3).
+ENTRY_OF_TURN = 0.8165
+
+
+@dataclass(frozen=True)
+class OrientationSolution:
+    """What was found for all orientations so far.
+
+    Attributes:
+        pairs: how many pairs had one.
+        chain: the rigid chain.
+        map: 12 planes, of which those of e1, e2, e3 count; None where a map would be too large, or the pairs too few.
+        map_noise: 1-sigma of an orientation about one axis around the map [rad].
+    """
+
+    pairs: int
+    chain: OrientedChain
+    map: KBMap | None = None
+    map_noise: float = 0.0
+
+
+class OrientationSolver:
+    """Keeps the pairs that have an orientation, and solves for them.
+
+    Args:
+        bases: what is learnt in.
+        with_map: whether a map of these bases is small enough to be solved for.
+    """
+
+    def __init__(self, bases: tuple[JointBasis, ...], *, with_map: bool) -> None:
+        self._bases, self._with_map = bases, with_map
+        self._q, self._x, self._turns = np.empty((0, len(bases))), np.empty((0, 3)), np.empty((0, 4))
+        self._exact: ExactLearner | None = None
+        self._fed = self._pairs = self._solved_at = 0
+
+    @property
+    def due(self) -> bool:
+        """Whether there are enough new orientations to solve anew."""
+        return self._pairs > 0 and self._pairs >= GROWTH * self._solved_at
+
+    def learn(self, q: FloatArray, x: FloatArray, turns: FloatArray) -> None:
+        """More pairs q (n, d), x (n, 3) and quaternions (n, 4), NaN where a pair has none."""
+        told = np.isfinite(turns).all(axis=1)
+        self._pairs += int(told.sum())
+        self._q, self._x = np.vstack([self._q, q[told]]), np.vstack([self._x, x[told]])
+        self._turns = np.vstack([self._turns, turns[told]])
+        if self._exact is not None:
+            self._feed(self._exact)
+        self._q, self._x, self._turns = self._q[-KEPT:], self._x[-KEPT:], self._turns[-KEPT:]
+
+    def solve(self, belief: ChainBelief) -> OrientationSolution:
+        """The solution around what is believed of the chain; there has to be an orientation."""
+        self._solved_at = self._pairs
+        chosen = np.linspace(0, len(self._q) - 1, min(len(self._q), FITTED)).round().astype(np.intp)
+        chain = fitted_orientation(belief, self._q[chosen], self._turns[chosen])
+        if not self._with_map or self._pairs < FEWEST_FOR_MAP:
+            return OrientationSolution(self._pairs, chain)
+        return self._with_solved_map(chain)
+
+    def _with_solved_map(self, chain: OrientedChain) -> OrientationSolution:
+        prior = chain.chain.to_kbmap(self._bases, orientation=True)
+        if self._exact is None:
+            self._exact = ExactLearner(prior, memory=Memory(window=WINDOW))
+            self._fed = self._pairs - len(self._q)
+            self._feed(self._exact)
+        self._exact.rebase(prior)
+        try:
+            solution = self._exact.solve(self._precision(prior))
+        except SettingError:  # lost in rounding: the chain goes on answering
+            return OrientationSolution(self._pairs, chain)
+        noise = (solution.orientation_noise_std or 0.0) / ENTRY_OF_TURN
+        return OrientationSolution(self._pairs, chain, solution.map, noise if math.isfinite(noise) else 0.0)
+
+    def _precision(self, prior: KBMap) -> float:
+        """What left-out blocks speak for, asked of the axis e1: neighbours on a path share their errors."""
+        axis = KBMap(prior.bases, prior.net[3:6])
+        rotations = rotation_matrices("turns", self._turns)
+        return blockwise_precision(axis, self._q, rotations[:, :, 0])
+
+    def _feed(self, exact: ExactLearner) -> None:
+        new = self._pairs - self._fed
+        if new:
+            exact.learn(self._q[-new:], self._x[-new:], rotation=self._turns[-new:])
+        self._fed = self._pairs

@@ -1,0 +1,106 @@
+"""Pictures for a browser on this machine: motion JPEG over HTTP on loopback."""
+
+from __future__ import annotations
+
+import threading
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from types import TracebackType
+from typing import Self
+
+from interfaces.errors import ConfigError
+
+LOOPBACK = "127.0.0.1"
+BOUNDARY = "picture"
+PAGE = b"<!doctype html><title>bodyschema</title><body style='margin:0;background:#111'><img src=/stream width=100%>"
+
+
+class MjpegServer:
+    """Serves the newest picture to whoever looks. Who is slow misses pictures and delays nobody."""
+
+    def __init__(self, port: int) -> None:
+        """Nothing listens yet; port 0 takes one that is free."""
+        self._port = port
+        self._newest: bytes | None = None
+        self._number = 0
+        self._changed = threading.Condition()
+        self._is_closing = False
+        self._server: ThreadingHTTPServer | None = None
+
+    def __enter__(self) -> Self:
+        try:
+            self._server = ThreadingHTTPServer((LOOPBACK, self._port), self._handler())
+        except OSError as error:
+            remedy = "Give another --port, or --port 0 for one that is free"
+            raise ConfigError(f"port {self._port} cannot be used: {error.strerror}", remedy=remedy) from error
+        self._server.daemon_threads = True
+        threading.Thread(target=self._server.serve_forever, name="pictures", daemon=True).start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        with self._changed:
+            self._is_closing = True
+            self._changed.notify_all()
+        if self._server is not None:
+            self._server.shutdown()
+            self._server.server_close()
+            self._server = None
+
+    @property
+    def address(self) -> str:
+        """Where to look."""
+        port = self._port if self._server is None else self._server.server_address[1]
+        return f"http://{LOOPBACK}:{port}/"
+
+    def show(self, jpeg: bytes) -> None:
+        """The newest picture."""
+        with self._changed:
+            self._newest, self._number = jpeg, self._number + 1
+            self._changed.notify_all()
+
+    def _after(self, number: int) -> tuple[int, bytes] | None:
+        """A picture newer than the one of this number, and its number; None when the server ends."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._is_closing or self._number > number)
+            if self._is_closing or self._newest is None:
+                return None
+            return self._number, self._newest
+
+    def _handler(self) -> type[BaseHTTPRequestHandler]:
+        server = self
+
+        class Handler(BaseHTTPRequestHandler):
+            def do_GET(self) -> None:
+                if self.path == "/":
+                    self._send("text/html; charset=utf-8", PAGE)
+                elif self.path == "/stream":
+                    self._stream()
+                else:
+                    self.send_error(404)
+
+            def log_message(self, format: str, *args: object) -> None:
+                """Nobody wants a line for each picture."""
+
+            def _send(self, kind: str, body: bytes) -> None:
+                self.send_response(200)
+                self.send_header("Content-Type", kind)
+                self.send_header("Content-Length", str(len(body)))
+                self.end_headers()
+                self.wfile.write(body)
+
+            def _stream(self) -> None:
+                self.send_response(200)
+                self.send_header("Content-Type", f"multipart/x-mixed-replace; boundary={BOUNDARY}")
+                self.send_header("Cache-Control", "no-store")
+                self.end_headers()
+                number = 0
+                try:
+                    while (found := server._after(number)) is not None:
+                        number, jpeg = found
+                        head = f"--{BOUNDARY}\r\nContent-Type: image/jpeg\r\nContent-Length: {len(jpeg)}\r\n\r\n"
+                        self.wfile.write(head.encode() + jpeg + b"\r\n")
+                except OSError:
+                    return  # who looked has gone
+
+        return Handler

@@ -1,0 +1,105 @@
+"""Looking on: pictures of cameras, each encoded and handed on."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Protocol, Self
+
+import cv2
+
+from interfaces.clock import SystemClock
+from interfaces.errors import ConfigError, SourceEnded
+from interfaces.protocols import Clock, Source
+from interfaces.records import ImageArray, Reason
+
+QUALITY = 85
+
+
+class Pictures(Source, Protocol):
+    """Pictures of cameras; see `vision.cameras.watched.WatchedCamera`."""
+
+    @property
+    def frames(self) -> int: ...
+    @property
+    def fixes(self) -> int: ...
+    @property
+    def reasons(self) -> Mapping[Reason, int]: ...
+    def read(self, timeout_s: float) -> ImageArray | None: ...
+
+
+class Watching:
+    """Reads pictures until it is told to stop, there are no more, or enough were shown."""
+
+    def __init__(
+        self,
+        pictures: Pictures,
+        show: Callable[[bytes], None],
+        *,
+        every_s: float = 0.0,
+        count: int | None = None,
+        clock: Clock | None = None,
+    ) -> None:
+        """Nothing was read yet; `pictures` are opened by whoever calls `step`.
+
+        Args:
+            show: given each picture as JPEG.
+            every_s: no two nearer together [s].
+            count: of pictures that are shown.
+        """
+        self._pictures, self._show, self._every_s = pictures, show, every_s
+        self._clock = SystemClock() if clock is None else clock
+        self._left = math.inf if count is None else count
+        self._next_s = -math.inf
+        self._stopping = False
+
+    @classmethod
+    def into(cls, folder: Path, pictures: Pictures, *, every_s: float, count: int | None) -> Self:
+        """Pictures into files 000001.jpg and so on; ConfigError where the folder cannot be made."""
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise ConfigError(f"cannot be made: {error.strerror}", file=folder, remedy="Give another --out") from error
+        numbers = iter(range(1, 10**9))
+        return cls(
+            pictures,
+            lambda jpeg: _write(folder / f"{next(numbers):06}.jpg", jpeg),
+            every_s=every_s,
+            count=count,
+        )
+
+    def stop(self) -> None:
+        """Let `step` say that it is over. Only sets a flag."""
+        self._stopping = True
+
+    def step(self, timeout_s: float) -> bool:
+        """Show the next picture, if one comes in time; False when there will be no more."""
+        if self._stopping or self._left <= 0:
+            return False
+        try:
+            picture = self._pictures.read(timeout_s)
+        except SourceEnded:
+            return False
+        now = self._clock.now()
+        if picture is not None and now >= self._next_s:
+            self._next_s = now + self._every_s
+            self._left -= 1
+            self._show(cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1].tobytes())
+        return True
+
+    @property
+    def said(self) -> str:
+        """In how many frames the marker was found, and why not in the others."""
+        pictures = self._pictures
+        text = f"{pictures.frames} frames"
+        if pictures.fixes or pictures.reasons:
+            text += f", the marker in {pictures.fixes}"
+        return text + "".join(f"; {reason}: {count}" for reason, count in sorted(pictures.reasons.items()))
+
+
+def _write(file: Path, data: bytes) -> None:
+    try:
+        file.write_bytes(data)
+    except OSError as error:
+        raise ConfigError(f"cannot be written: {error.strerror}", file=file, remedy="Give another --out") from error

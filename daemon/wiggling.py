@@ -1,0 +1,137 @@
+"""Encoder readings and marker positions while the arm is moved, each as it came: live, into a file, out of one."""
+
+from __future__ import annotations
+
+import csv
+import threading
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from interfaces.clock import SystemClock
+from interfaces.errors import RecordingError, SourceEnded
+from interfaces.records import JointReading, MarkerFix
+
+from .latency import LATEST_S, LatencyError, Wiggle
+from .sources import Sources
+
+READ_S = 0.2
+LIMIT_S = 30.0  # beyond the asked time, for sources that are slow or silent
+POSITION = ("x", "y", "z")
+
+
+def collected(sources: Sources, duration_s: float, tell: Callable[[float], None]) -> Wiggle:
+    """What the sources say during so long [s], on their own clock, and a little more, for the largest latency.
+
+    Args:
+        tell: called with the time [s] since the first fix.
+
+    Raises:
+        LatencyError: they say nothing.
+        SourceError: they cannot be opened, or are lost.
+    """
+    readings: list[JointReading] = []
+    fixes: list[MarkerFix] = []
+    failures: list[Exception] = []
+    ending = threading.Event()
+
+    def read_joints() -> None:
+        try:
+            while not ending.is_set():
+                reading = sources.joints.read(READ_S)
+                if reading is not None and np.isfinite(reading.q).all():
+                    readings.append(reading)
+        except SourceEnded:
+            return
+        except Exception as error:
+            failures.append(error)
+
+    clock, last = SystemClock(), duration_s + LATEST_S
+    with sources.joints, sources.marker:
+        thread = threading.Thread(target=read_joints, name="encoders")
+        thread.start()
+        try:
+            until = clock.now() + last + LIMIT_S
+            while clock.now() < until and not failures:
+                try:
+                    seen = sources.marker.read(READ_S)
+                except SourceEnded:
+                    break
+                if isinstance(seen, MarkerFix):
+                    fixes.append(seen)
+                    tell(seen.t - fixes[0].t)
+                    if seen.t - fixes[0].t >= last:
+                        break
+        finally:
+            ending.set()
+            thread.join()
+    if failures:
+        raise failures[0]
+    return wiggle_of(readings, fixes)
+
+
+def wiggle_of(readings: Sequence[JointReading], fixes: Sequence[MarkerFix]) -> Wiggle:
+    """Readings and fixes as arrays; LatencyError when there are none."""
+    if not readings or not fixes:
+        who = "the encoders" if not readings else "the cameras"
+        raise LatencyError(f"{who} gave nothing: `bodyschema doctor`, and for the marker `bodyschema watch cameras`")
+    return Wiggle(
+        np.array([reading.t for reading in readings]),
+        np.array([reading.q for reading in readings]),
+        np.array([fix.t for fix in fixes]),
+        np.array([fix.x for fix in fixes]),
+    )
+
+
+def write_wiggle(wiggle: Wiggle, joints: Sequence[str], file: Path) -> None:
+    """A row for each reading and each fix in the order of time; the columns of the other one stay empty.
+
+    Raises:
+        RecordingError: it cannot be written.
+    """
+    rows: list[tuple[float, list[str]]] = []
+    blank_joints, blank_position = [""] * len(joints), [""] * len(POSITION)
+    for t, q in zip(wiggle.t_joints.tolist(), wiggle.q.tolist(), strict=True):
+        rows.append((t, [repr(t), *map(repr, q), *blank_position]))
+    for t, x in zip(wiggle.t_marker.tolist(), wiggle.x.tolist(), strict=True):
+        rows.append((t, [repr(t), *blank_joints, *map(repr, x)]))
+    try:
+        with file.open("w", newline="", encoding="utf-8") as stream:
+            writer = csv.writer(stream)
+            writer.writerow(["t", *joints, *POSITION])
+            writer.writerows(row for _, row in sorted(rows, key=lambda each: each[0]))
+    except OSError as error:
+        raise RecordingError(f"cannot be written: {error.strerror}", file=file) from error
+
+
+def read_wiggle(file: Path, joints: Sequence[str]) -> Wiggle:
+    """What `write_wiggle` wrote.
+
+    Raises:
+        RecordingError: it cannot be read, has other columns, or a row that is neither.
+    """
+    columns = ["t", *joints, *POSITION]
+    readings: list[list[float]] = []
+    fixes: list[list[float]] = []
+    try:
+        with file.open(newline="", encoding="utf-8") as stream:
+            rows = csv.reader(stream)
+            if next(rows, []) != columns:
+                remedy = "Record one with `bodyschema calibrate latency --save`"
+                raise RecordingError(f"the columns are not {', '.join(columns)}", file=file, line=1, remedy=remedy)
+            for number, row in enumerate(rows, 2):
+                angles, position = row[1 : -len(POSITION)], row[-len(POSITION) :]
+                if len(row) != len(columns) or any(angles) == any(position):
+                    raise RecordingError("has to have joint angles or a position", file=file, line=number)
+                cells = [row[0], *(angles if any(angles) else position)]
+                try:
+                    (readings if any(angles) else fixes).append([float(cell) for cell in cells])
+                except ValueError as error:
+                    raise RecordingError(f"{error}", file=file, line=number) from error
+    except (OSError, UnicodeDecodeError) as error:
+        raise RecordingError(f"cannot be read: {error}", file=file) from error
+    if not readings or not fixes:
+        raise RecordingError("has to have rows with joint angles and rows with a position", file=file)
+    q, x = np.array(readings), np.array(fixes)
+    return Wiggle(q[:, 0], q[:, 1:], x[:, 0], x[:, 1:])

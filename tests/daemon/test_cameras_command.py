@@ -1,0 +1,156 @@
+"""`bodyschema board`, `calibrate cameras` and `calibrate check`, from image files."""
+
+from __future__ import annotations
+
+from contextlib import redirect_stdout
+from io import StringIO
+from pathlib import Path
+
+import cv2
+import msgspec
+import numpy as np
+import pytest
+from board_renderer import Photographer, Printed, Taken
+from shown_board import BOARD, Eyes, photographed
+
+from daemon.camera_calibration import CamerasFile, CheckFile, from_cameras
+from daemon.cli import app
+from interfaces.errors import ConfigError
+from interfaces.records import StereoFrame
+from vision.rig import CalibrationError
+from vision.rig_file import read_rig
+
+
+def called(*arguments: object) -> None:
+    app([*map(str, arguments)], exit_on_error=False, result_action="return_value")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    """Pairs of images; beside them cameras.toml, and what was said of it on a terminal of 80 columns."""
+    folder = tmp_path_factory.mktemp("images")
+    for pair in photographed()[1]:
+        cv2.imwrite(str(folder / f"left{pair.name}.png"), pair.left)
+        cv2.imwrite(str(folder / f"right{pair.name}.png"), pair.right)
+    with pytest.MonkeyPatch.context() as patch, redirect_stdout(StringIO()) as said:
+        patch.setenv("COLUMNS", "80")
+        called("calibrate", "cameras", folder, "--out", folder / "cameras.toml", "--left-serial", "A1")
+    (folder / "said.txt").write_text(said.getvalue(), encoding="utf-8")
+    return folder
+
+
+def test_a_folder_of_images_becomes_a_calibration(folder) -> None:
+    rig = read_rig(folder / "cameras.toml")
+    truth = photographed()[0]
+    assert abs(rig.baseline_m - truth.baseline_m) < 2.5 * rig.baseline_sigma_m
+    assert rig.serials == ("A1", "")
+
+
+def test_the_report_is_one_file_with_a_picture_of_every_image(folder) -> None:
+    text = (folder / "cameras_report.html").read_text(encoding="utf-8")
+    pairs = photographed()[1]
+    assert text.count("<img ") == 2 * len(pairs)
+    assert "http" not in text
+    for name in read_rig(folder / "cameras.toml").names:
+        assert f"<td>{name}<" in text
+
+
+def test_figures_fit_a_terminal_of_80_columns(folder) -> None:
+    lines = (folder / "said.txt").read_text(encoding="utf-8").splitlines()
+    assert max(len(line.rstrip()) for line in lines if "written" not in line) <= 80
+    assert any(line.startswith("fx [px]") for line in lines)
+
+
+def test_the_check_of_cameras_that_nobody_touched_holds(folder, capsys) -> None:
+    called("calibrate", "check", folder, "--calibration", folder / "cameras.toml", "--json")
+    assert msgspec.json.decode(capsys.readouterr().out, type=CheckFile).holds
+
+
+def test_the_check_of_a_bumped_camera_ends_with_exit_code_1(folder, tmp_path, capsys) -> None:
+    truth, _, poses = photographed()
+    tilt = cv2.Rodrigues(np.radians([0.3, 0.0, 0.0]))[0]
+    bumped = type(truth)(truth.left, truth.right, tilt @ truth.R, tilt @ truth.t_m)
+    frame = Photographer(bumped, Printed(), Taken(samples=3), np.random.default_rng(1)).pair(*poses[4])
+    cv2.imwrite(str(tmp_path / "left1.png"), frame.left)
+    cv2.imwrite(str(tmp_path / "right1.png"), frame.right)
+    with pytest.raises(SystemExit, match="1"):
+        called("calibrate", "check", tmp_path, "--calibration", folder / "cameras.toml")
+    said = " ".join(capsys.readouterr().out.split())
+    assert "The calibration does not hold" in said
+    assert "turned up or down by 0.3" in said
+
+
+def test_images_side_by_side_are_split(tmp_path, folder, capsys) -> None:
+    pair = photographed()[1][4]
+    cv2.imwrite(str(tmp_path / "both.png"), np.hstack([pair.left, pair.right]))
+    called("calibrate", "check", tmp_path, "--side-by-side", "--calibration", folder / "cameras.toml", "--json")
+    assert msgspec.json.decode(capsys.readouterr().out, type=CheckFile).holds
+
+
+@pytest.mark.parametrize(
+    ("left", "right", "options"),
+    [
+        ("left/a.png", "right/a.png", ()),
+        ("a_l.png", "a_r.png", ()),
+        ("cam0_007.jpg", "cam1_007.jpg", ("--left", "cam0_*", "--right", "cam1_*")),
+    ],
+)
+def test_pairs_are_found_by_their_names(tmp_path, folder, capsys, left, right, options) -> None:
+    pair = photographed()[1][4]
+    for name, image in ((left, pair.left), (right, pair.right)):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        cv2.imwrite(str(tmp_path / name), image)
+    called("calibrate", "check", tmp_path, *options, "--calibration", folder / "cameras.toml", "--json")
+    assert msgspec.json.decode(capsys.readouterr().out, type=CheckFile).corners > 20
+
+
+def test_a_folder_without_pairs_says_how_to_name_them(tmp_path) -> None:
+    with pytest.raises(CalibrationError, match=r"no pairs of images. Name them left01.png and right01.png"):
+        called("calibrate", "cameras", tmp_path)
+
+
+def test_a_file_that_is_no_image_is_named(tmp_path) -> None:
+    (tmp_path / "left1.png").write_bytes(b"not an image")
+    (tmp_path / "right1.png").write_bytes(b"")
+    with pytest.raises(CalibrationError, match=r"left1.png: no image that can be read"):
+        called("calibrate", "cameras", tmp_path)
+
+
+def test_the_wrong_number_of_squares_is_said(folder, tmp_path) -> None:
+    with pytest.raises(CalibrationError, match=r"the board has 8x6 squares, not 7x5. Give --squares 8x6"):
+        called("calibrate", "cameras", folder, "--squares", "7x5", "--out", tmp_path / "c.toml")
+
+
+def test_a_refused_calibration_writes_nothing(folder, tmp_path) -> None:
+    with pytest.raises(CalibrationError, match="which would make the squares"):
+        called("calibrate", "cameras", folder, "--baseline-mm", 200, "--out", tmp_path / "c.toml", "--lens", "pinhole")
+    assert not (tmp_path / "c.toml").exists()
+
+
+def test_the_ruler_on_the_print_scales_the_baseline(folder, tmp_path, capsys) -> None:
+    out = tmp_path / "c.toml"
+    called("calibrate", "cameras", folder, "--ruler-mm", 0.97 * 240, "--out", out, "--lens", "pinhole", "--json")
+    found = msgspec.json.decode(capsys.readouterr().out, type=CamerasFile)
+    assert found.baseline_mm == pytest.approx(970 * read_rig(folder / "cameras.toml").baseline_m, rel=1e-6)
+    assert (len(found.parameters), len(found.held_out_by_model_px)) == (24, 1)
+
+
+def test_views_from_cameras_come_with_their_serials_and_the_cameras_are_closed() -> None:
+    pair = photographed()[1][4]
+    eyes = Eyes([StereoFrame(t, pair.left, pair.right) for t in (0.0, 0.1)])
+    said: list[str] = []
+    found, serials = from_cameras(eyes, BOARD, said.append)
+    assert (len(found.views), serials, eyes.is_open) == (1, ("A1", "B2"), False)
+    assert said[-1].startswith("1 views, ")
+
+
+@pytest.mark.parametrize("ending", ["pdf", "svg"])
+def test_the_board_is_written(tmp_path, ending, capsys) -> None:
+    called("board", "--out", tmp_path / f"board.{ending}")
+    assert (tmp_path / f"board.{ending}").stat().st_size > 4000
+    assert "the line below the board is 240 mm" in capsys.readouterr().out
+
+
+def test_a_board_of_another_ending_is_refused(tmp_path) -> None:
+    with pytest.raises(ConfigError, match=r"neither \.pdf nor \.svg"):
+        called("board", "--out", tmp_path / "board.png")

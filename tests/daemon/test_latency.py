@@ -1,0 +1,127 @@
+"""The camera's latency against the encoders, from a wiggle of the arm."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from daemon.latency import LatencyError, Wiggle, latency_by_speed, latency_of
+from daemon.wiggling import read_wiggle, wiggle_of, write_wiggle
+from interfaces.errors import RecordingError
+from interfaces.robot import RobotDescription
+
+ARM = RobotDescription.load(Path(__file__).parents[2] / "examples" / "desk_arm" / "robot.toml")
+TICK_RAD = 2 * np.pi / 4096
+POSE = np.array([0.1, 0.4, 0.6, 0.0])
+
+
+def wiggle(seed: int, latency_s: float, noise_mm: float = 0.5, joints: int = 4, harmonics: int = 6) -> Wiggle:
+    """5 s of uneven motion of an arm that is not quite the drawn one: zeros 3° off, another tool."""
+    rng = np.random.default_rng(seed)
+    pace = 2 * np.pi * rng.uniform(0.3, 1.2, (joints, harmonics))
+    width = 0.2 * rng.normal(size=(joints, harmonics)) * np.sqrt(2 / harmonics) / pace * 3.8
+    phase = rng.uniform(0, 2 * np.pi, (joints, harmonics))
+
+    def q(t: np.ndarray) -> np.ndarray:
+        moved = np.sum(width * np.sin(pace * t[:, None, None] + phase), axis=2)
+        return POSE + np.pad(moved, ((0, 0), (0, len(POSE) - joints)))
+
+    t_joints = np.arange(500) / 100 + rng.normal(0, 5e-4, 500)
+    t_marker = 0.013 + np.arange(150) / 30
+    real = ARM.chain.with_tool(np.array(ARM.robot.marker_xyz) + rng.normal(0, 0.03, 3))
+    x = real.positions(q(t_marker - latency_s) + np.radians(rng.normal(0, 3, 4)))
+    noise = rng.normal(0, 1e-3 * noise_mm, x.shape) * [0.7, 0.7, 2.0]
+    return Wiggle(t_joints, np.round(q(t_joints) / TICK_RAD) * TICK_RAD, t_marker, x + noise)
+
+
+@pytest.mark.parametrize("latency_s", [0.0, 0.033, 0.12])
+def test_a_hidden_latency_is_found_to_two_milliseconds(latency_s) -> None:
+    for seed in range(3):
+        assert abs(latency_of(wiggle(seed, latency_s), ARM.chain).latency_s - latency_s) < 2e-3
+
+
+def test_the_claimed_uncertainty_covers() -> None:
+    hidden = np.random.default_rng(5).uniform(0, 0.12, 12)
+    found = [latency_of(wiggle(seed, latency), ARM.chain) for seed, latency in enumerate(hidden.tolist())]
+    off = np.array([(each.latency_s - latency) / each.sigma_s for each, latency in zip(found, hidden, strict=True)])
+    assert (np.abs(off) < 3).all()
+    assert np.sqrt(np.mean(off**2)) > 0.2  # and claims no more than there is
+
+
+@pytest.mark.soak
+def test_over_many_seeds_the_latency_is_nearer_than_speeds_alone_tell() -> None:
+    hidden = np.random.default_rng(6).uniform(0, 0.12, 200)
+    errors, by_speed, claimed, refused = [], [], [], 0
+    for seed, latency in enumerate(hidden.tolist()):
+        moved = wiggle(seed, latency)
+        try:
+            found = latency_of(moved, ARM.chain)
+        except LatencyError:
+            refused += 1
+            continue
+        errors.append(found.latency_s - latency)
+        claimed.append(found.sigma_s)
+        by_speed.append(latency_by_speed(moved, ARM.chain) - latency)
+    rms, rms_by_speed = (1e3 * np.sqrt(np.mean(np.square(each))) for each in (errors, by_speed))
+    within = np.mean(np.abs(errors) < np.array(claimed))
+    worst = 1e3 * np.abs(errors).max()
+    print(f"{refused} refused; rms {rms:.2f} ms, worst {worst:.2f} ms, 1 sigma covers {within:.0%}")
+    print(f"by speeds alone: rms {rms_by_speed:.2f} ms")
+    assert refused < 0.05 * len(hidden)
+    assert worst < 2.0
+    assert rms < rms_by_speed
+    assert within > 0.65
+
+
+def test_an_arm_that_hardly_moves_is_refused() -> None:
+    still = wiggle(0, 0.05)
+    rng = np.random.default_rng(0)
+    x = still.x[:1] + rng.normal(0, 5e-4, still.x.shape)
+    with pytest.raises(LatencyError):
+        latency_of(Wiggle(still.t_joints, POSE + 1e-4 * (still.q - POSE), still.t_marker, x), ARM.chain)
+
+
+def test_an_even_motion_of_one_joint_is_refused_as_it_repeats_itself() -> None:
+    t_joints, t_marker = np.arange(500) / 100, np.arange(150) / 30
+    q = np.tile(POSE, (500, 1))
+    q[:, 0] += 0.3 * np.sin(2 * np.pi * 5 * t_joints)
+    seen = np.tile(POSE, (150, 1))
+    seen[:, 0] += 0.3 * np.sin(2 * np.pi * 5 * (t_marker - 0.04))
+    x = ARM.chain.positions(seen) + np.random.default_rng(0).normal(0, 1e-3, (150, 3))
+    with pytest.raises(LatencyError, match="repeats itself"):
+        latency_of(Wiggle(t_joints, q, t_marker, x), ARM.chain)
+
+
+def test_a_latency_beyond_the_range_is_refused() -> None:
+    with pytest.raises(LatencyError):
+        latency_of(wiggle(0, 0.6), ARM.chain)
+
+
+def test_too_few_fixes_are_named() -> None:
+    whole, few = wiggle(0, 0.05), slice(20, 32)
+    hardly = Wiggle(whole.t_joints, whole.q, whole.t_marker[few], whole.x[few])
+    with pytest.raises(LatencyError, match="was seen 12 times, 60 are needed"):
+        latency_of(hardly, ARM.chain)
+
+
+def test_without_readings_the_encoders_are_named() -> None:
+    with pytest.raises(LatencyError, match="the encoders gave nothing"):
+        wiggle_of([], [])
+
+
+def test_a_wiggle_comes_back_from_its_file_as_it_was(tmp_path) -> None:
+    moved = wiggle(1, 0.05)
+    write_wiggle(moved, ARM.joints, tmp_path / "wiggle.csv")
+    back = read_wiggle(tmp_path / "wiggle.csv", ARM.joints)
+    for name in ("t_joints", "q", "t_marker", "x"):
+        assert np.array_equal(getattr(back, name), getattr(moved, name))
+
+
+@pytest.mark.parametrize("row", ["0.1,,,,,,,", "0.1,1,2,3,4,5,6,7", "0.1,1,2,3,nothing,,,", "0.1"])
+def test_a_row_that_is_neither_reading_nor_position_is_named(tmp_path, row) -> None:
+    file = tmp_path / "wiggle.csv"
+    file.write_text(f"t,{','.join(ARM.joints)},x,y,z\n{row}\n")
+    with pytest.raises(RecordingError, match="line 2"):
+        read_wiggle(file, ARM.joints)

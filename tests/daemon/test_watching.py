@@ -1,0 +1,153 @@
+"""`bodyschema watch cameras`, and what the other commands say of cameras."""
+
+from __future__ import annotations
+
+import http.client
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from small_arm import write_small_arm
+
+from daemon.camera_wiring import camera_checks
+from daemon.cli import app
+from daemon.config import Config
+from daemon.mjpeg import MjpegServer
+from daemon.robot_template import EXAMPLE, robot_toml
+from daemon.wiring import check_sources
+from interfaces.errors import ConfigError
+
+STEREO = """
+focal_px = 300.0
+principal_point_px = [159.5, 119.5]
+baseline_m = 0.1
+image_size_px = [320, 240]
+"""
+SERVOS = """
+[drivers.serial_lines]
+port = "/dev/serial/by-id/none"
+[[drivers.serial_lines.encoders]]
+joint = "waist"
+[[drivers.serial_lines.encoders]]
+joint = "shoulder"
+"""
+IMAGES = '\n[vision.cameras.images]\nleft = "l_*.png"\nright = "r_*.png"\nfps = 10.0\nspeed = {speed}\n'
+
+
+def write_robot(folder: Path, tables: str, stereo: str = STEREO) -> Path:
+    file = write_small_arm(folder, tables)
+    text = file.read_text()
+    file.write_text(text.replace("[camera]\n", f"[camera]{stereo}\n"))
+    return file
+
+
+def write_images(folder: Path, count: int = 4) -> None:
+    """A red ball at 0.5 m before a grey wall; in the last pair the right image is 4 rows lower."""
+    for number in range(count):
+        for eye, u in (("l", 160), ("r", 100)):
+            image = np.full((240, 320, 3), 128, np.uint8)
+            v = 120 + 4 * (number == count - 1 and eye == "r")
+            cv2.circle(image, (16 * u, 16 * v), 16 * 12, (30, 30, 220), -1, cv2.LINE_AA, 4)
+            cv2.imwrite(str(folder / f"{eye}_{number}.png"), cv2.GaussianBlur(image, (5, 5), 0.7))
+
+
+def run(*words: str) -> None:
+    app(list(words), result_action="return_value")
+
+
+def test_pictures_are_written_with_what_was_seen_in_them(tmp_path, capsys) -> None:
+    write_images(tmp_path)
+    file = write_robot(tmp_path, IMAGES.format(speed=0.0))
+    run("watch", "cameras", "--robot", str(file), "--out", str(tmp_path / "seen"), "--every", "0")
+    assert "4 frames, the marker in 3; epipolar: 1" in capsys.readouterr().out
+    pictures = sorted((tmp_path / "seen").iterdir())
+    assert [picture.name for picture in pictures] == [f"{number:06}.jpg" for number in (1, 2, 3, 4)]
+    picture = cv2.imread(str(pictures[0]))
+    assert picture is not None
+    row = picture[120, :60].astype(int)  # of the other eye, through the ball: yellow on grey
+    assert (row[:, 2] - row[:, 0]).min() > 60
+
+
+def test_cameras_that_nobody_calibrated_are_shown_as_they_are(tmp_path, capsys) -> None:
+    write_images(tmp_path)
+    file = write_robot(tmp_path, IMAGES.format(speed=0.0), "")
+    run("watch", "cameras", "--robot", str(file), "--out", str(tmp_path / "seen"), "--every", "0")
+    said = capsys.readouterr().out
+    assert "nothing says how the cameras see" in said
+    assert "4 frames\n" in said
+
+
+def test_a_browser_gets_the_newest_picture() -> None:
+    with MjpegServer(0) as server:
+        server.show(b"old")
+        server.show(b"newest")
+        connection = http.client.HTTPConnection(server.address.split("/")[2], timeout=30)
+        connection.request("GET", "/stream")
+        answer = connection.getresponse()
+        assert answer.headers["Content-Type"].startswith("multipart/x-mixed-replace")
+        lines = [answer.readline() for _ in range(4)]
+        assert b"Content-Length: 6\r\n" in lines
+        assert answer.read(6) == b"newest"
+        connection.close()
+
+
+def test_a_port_that_is_taken_is_named() -> None:
+    with MjpegServer(0) as server:
+        port = int(server.address.split(":")[2].strip("/"))
+        with pytest.raises(ConfigError, match=f"port {port} cannot be used"), MjpegServer(port):
+            raise AssertionError
+
+
+def test_joints_without_cameras_are_told_which_table_is_missing(tmp_path) -> None:
+    config = Config.load(write_robot(tmp_path, SERVOS), {})
+    with pytest.raises(ConfigError, match=r"no cameras are configured. Add the table \[vision.cameras\]"):
+        check_sources(config, sim=False)
+
+
+def test_cameras_that_nothing_calibrates_are_refused_with_both_ways_out(tmp_path) -> None:
+    config = Config.load(write_robot(tmp_path, SERVOS + IMAGES.format(speed=1.0), ""), {})
+    with pytest.raises(ConfigError, match=r"nothing says how the cameras see.*calibrate cameras.*\[camera\]"):
+        check_sources(config, sim=False)
+
+
+def test_images_that_are_not_on_the_encoders_clock_are_refused(tmp_path) -> None:
+    config = Config.load(write_robot(tmp_path, SERVOS + IMAGES.format(speed=0.0)), {})
+    with pytest.raises(ConfigError, match="speed 0 are not on the encoders' clock"):
+        check_sources(config, sim=False)
+
+
+def test_a_misspelt_key_is_named_with_its_line(tmp_path) -> None:
+    file = write_robot(tmp_path, IMAGES.format(speed=1.0).replace("fps", "fsp"))
+    with pytest.raises(ConfigError, match=r"robot.toml, line \d+: unknown key 'fsp'.*Did you mean 'fps'"):
+        Config.load(file, {})
+
+
+def test_config_check_says_where_images_come_from(tmp_path, capsys) -> None:
+    run("config", "check", "--robot", str(write_robot(tmp_path, IMAGES.format(speed=1.0))))
+    assert "images l_*.png and r_*.png, at 1 times their speed" in capsys.readouterr().out
+
+
+def test_doctor_names_a_camera_that_is_not_there(tmp_path) -> None:
+    cameras = '[vision.cameras.side_by_side]\ndevice = "/dev/v4l/by-id/none"\nimage_size_px = [320, 240]\n'
+    checks = list(camera_checks(Config.load(write_robot(tmp_path, cameras), {})))
+    assert [(check.state, "is not there" in check.said) for check in checks] == [("wrong", True)]
+
+
+def test_doctor_opens_what_is_there(tmp_path) -> None:
+    write_images(tmp_path)
+    checks = list(camera_checks(Config.load(write_robot(tmp_path, IMAGES.format(speed=1.0)), {})))
+    assert [check.state for check in checks] == ["ok"]
+    assert "320x240 pixels" in checks[0].said
+
+
+def test_two_cameras_that_are_plugged_in_are_the_eyes_of_a_new_robot() -> None:
+    text = robot_toml(EXAMPLE, ["/dev/v4l/by-id/a", "/dev/v4l/by-id/b"])
+    assert 'left = "/dev/v4l/by-id/a"\nright = "/dev/v4l/by-id/b"\n' in text
+
+
+def test_without_cameras_the_tables_are_an_example_that_does_nothing() -> None:
+    lines = robot_toml(EXAMPLE).split("docs/cameras.md tells the rest.\n")[1].splitlines()
+    assert all(line.startswith("#") for line in lines)
+    assert json.dumps("/dev/v4l/by-id/usb-LEFT-video-index0") in "\n".join(lines)

@@ -1,0 +1,94 @@
+"""Views of a board with exact truth: rendered, or its corners alone, which is quick."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+from board_renderer import Photographer, Printed, Taken, TrueRig, poses, webcams
+from scipy.spatial.transform import Rotation
+
+from interfaces.errors import SourceEnded
+from interfaces.records import FloatArray, StereoFrame
+from vision.board import Board, Corners
+from vision.calibration.images import ImagePair
+from vision.calibration.view import View
+from vision.lens import Model
+from vision.rig import Made, StereoRig, parameter_names, split
+
+SIZE = (640, 480)
+BOARD = Board()
+NOISE_PX = 0.04
+
+
+def true_vector(rig: TrueRig) -> FloatArray:
+    """The rig's parameters in the order of `StereoRig.vector`."""
+    lenses = ([*lens.focal_px, *lens.principal_point_px, *lens.distortion] for lens in (rig.left, rig.right))
+    return np.concatenate([*lenses, Rotation.from_matrix(rig.R).as_rotvec(), rig.t_m])
+
+
+def known_rig(rig: TrueRig, serials: tuple[str, str] = ("A1", "B2")) -> StereoRig:
+    """The true rig as a calibration that is all but certain."""
+    model: Model = "fisheye" if rig.left.fisheye else "pinhole"
+    n = len(parameter_names(model))
+    made = Made("2026-01-01T00:00:00Z", BOARD.name, 20, 0, 0.03, 0.03, 0.0)
+    return StereoRig(*split(model, true_vector(rig)), rig.size_px, serials, 1e-10 * np.eye(n), made)
+
+
+def corner_views(rig: TrueRig, rng: np.random.Generator, count: int = 20, noise_px: float = NOISE_PX) -> list[View]:
+    """Views whose corners are the exact ones and noise."""
+    photographer = Photographer(rig, Printed(), Taken(), rng)
+    return [
+        view_of(f"{k:02d}", photographer, pose, rng, noise_px)
+        for k, pose in enumerate(poses(rng, rig, Printed(), count))
+    ]
+
+
+def view_of(
+    name: str,
+    photographer: Photographer,
+    pose: tuple[FloatArray, FloatArray],
+    rng: np.random.Generator,
+    noise_px: float = NOISE_PX,
+) -> View:
+    """The exact corners of a pose that are in the images, with noise."""
+    eyes = []
+    for px in photographer.corners(*pose):
+        inside = ((px > 2) & (px < np.array(photographer.rig.size_px) - 3)).all(axis=1)
+        eyes.append(Corners(np.flatnonzero(inside), px[inside] + rng.normal(0, noise_px, (inside.sum(), 2))))
+    return View(name, *eyes)
+
+
+@cache
+def photographed(
+    seed: int = 7, count: int = 12
+) -> tuple[TrueRig, tuple[ImagePair, ...], tuple[tuple[FloatArray, FloatArray], ...]]:
+    """A rig, its images of the board, and the board's poses in them."""
+    rng = np.random.default_rng(seed)
+    rig = webcams(rng)
+    photographer = Photographer(rig, Printed(), Taken(samples=3), rng)
+    shown = tuple(poses(rng, rig, Printed(), count))
+    frames = [photographer.pair(*pose) for pose in shown]
+    return rig, tuple(ImagePair(f"{k:02d}", f.left, f.right) for k, f in enumerate(frames)), shown
+
+
+class Eyes:
+    """Cameras that give the frames they were made with."""
+
+    def __init__(self, frames: list[StereoFrame], serials: tuple[str, str] = ("A1", "B2")) -> None:
+        self.frames, self.serials = iter(frames), serials
+        self.image_size_px = (frames[0].left.shape[1], frames[0].left.shape[0])
+        self.is_open = False
+
+    def __enter__(self):
+        self.is_open = True
+        return self
+
+    def __exit__(self, *_) -> None:
+        self.is_open = False
+
+    def read(self, timeout_s: float) -> StereoFrame | None:
+        try:
+            return next(self.frames)
+        except StopIteration:
+            raise SourceEnded("through") from None

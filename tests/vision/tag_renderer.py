@@ -1,0 +1,147 @@
+"""A small ray tracer for printed tags: rays against planes, and squares of black and white on them.
+
+Every sub-pixel sends a ray; where it meets the nearest sheet of paper, the square of the tag's pattern that it hits
+says black or white. Light, blur, exposure and noise come after. Nothing here projects a corner.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from ball_renderer import Look, backdrop, take
+
+from interfaces.camera import StereoCalibration
+from interfaces.records import FloatArray, StereoFrame
+
+BLACK, WHITE = 0.07, 0.85
+
+
+def pattern(id: int, dictionary: int = cv2.aruco.DICT_APRILTAG_36h11) -> np.ndarray:
+    """A tag's 8 by 8 squares (rows from the top), True where it is black."""
+    found = cv2.aruco.getPredefinedDictionary(dictionary)
+    return cv2.aruco.generateImageMarker(found, id, 8, borderBits=1) < 128
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """A tag printed on a square sheet of paper.
+
+    Attributes:
+        id: number of the tag.
+        rotation, x: pose of the tag's middle (x right, y up, z out of the paper) in the left optical frame, [m].
+        side_m: side of the black square.
+        margin: width of the white margin, in squares of the pattern.
+    """
+
+    id: int
+    rotation: FloatArray
+    x: FloatArray
+    side_m: float
+    margin: float = 1.0
+    dictionary: int = cv2.aruco.DICT_APRILTAG_36h11
+
+    @property
+    def half_m(self) -> float:
+        return self.side_m * (0.5 + self.margin / 8.0)
+
+
+@dataclass(frozen=True)
+class Card:
+    """A plain card, such as a finger before the tag: as a sheet without a tag, of `half_m` by `half_m`."""
+
+    rotation: FloatArray
+    x: FloatArray
+    half_m: float
+    grey: float = 0.5
+
+
+def photograph(
+    things: Sequence[Sheet | Card],
+    calibration: StereoCalibration,
+    look: Look,
+    rng: np.random.Generator,
+    *,
+    t: float = 0.0,
+    pictures: Sequence[FloatArray] | None = None,
+) -> StereoFrame:
+    """Both eyes' view of sheets before clutter, or before an even wall where the look has one."""
+    behind = pictures or [backdrop(rng, calibration.image_size_px, look.wall) for _ in range(2)]
+    images = []
+    for eye, picture in enumerate(behind):
+        shift = np.array([calibration.baseline_m * eye, 0.0, 0.0])
+        images.append(take(_painted(picture, things, shift, calibration, look, rng), look, rng))
+    return StereoFrame(t, images[0], images[1])
+
+
+def _painted(
+    picture: FloatArray,
+    things: Sequence[Sheet | Card],
+    eye: FloatArray,
+    calibration: StereoCalibration,
+    look: Look,
+    rng: np.random.Generator,
+) -> FloatArray:
+    painted = picture.copy()
+    rows, columns = _window(things, eye, calibration)
+    n = look.samples
+    # One ray at a random place of each sub-pixel: rays in rows would all miss an edge along the row at once.
+    grid = np.stack(
+        np.meshgrid(np.arange(n * (columns.stop - columns.start)), np.arange(n * (rows.stop - rows.start))), -1
+    )
+    if not grid.size:
+        return painted
+    places = (grid + rng.random(grid.shape)) / n - 0.5 + (columns.start, rows.start)
+    rays = np.concatenate(
+        [(places - calibration.principal_point_px) / calibration.focal_px, np.ones((*grid.shape[:2], 1))], axis=-1
+    )
+    shown = painted[rows, columns].mean(axis=2).repeat(n, axis=0).repeat(n, axis=1)
+    nearest = np.full(shown.shape, np.inf)
+    for thing in things:
+        _cover(thing, rays, eye, look, shown, nearest)
+    blocks = (shown.shape[0] // n, n, shown.shape[1] // n, n)
+    hit = np.isfinite(nearest).reshape(blocks).mean(axis=(1, 3))[..., None]
+    grey = shown.reshape(blocks).mean(axis=(1, 3))[..., None]
+    before = painted[rows, columns]
+    painted[rows, columns] = np.where(hit > 0.0, grey, before)
+    return painted
+
+
+def _window(things: Sequence[Sheet | Card], eye: FloatArray, calibration: StereoCalibration) -> tuple[slice, slice]:
+    """Rows and columns that hold all of the things."""
+    low, high = np.full(2, np.inf), np.full(2, -np.inf)
+    for thing in things:
+        x = thing.x - eye
+        centre = calibration.project(x)[:2]
+        reach = 1.6 * calibration.focal_px * thing.half_m / max(x[2] - 1.5 * thing.half_m, 0.02) + 2.0
+        low, high = np.minimum(low, centre - reach), np.maximum(high, centre + reach)
+    size = np.array(calibration.image_size_px)
+    first, last = np.clip(np.floor(low), 0, size).astype(int), np.clip(np.ceil(high), 0, size).astype(int)
+    return slice(first[1], last[1]), slice(first[0], last[0])
+
+
+def _cover(
+    thing: Sheet | Card, rays: FloatArray, eye: FloatArray, look: Look, shown: FloatArray, nearest: FloatArray
+) -> None:
+    normal = thing.rotation[:, 2]
+    facing = rays @ normal
+    x = thing.x - eye
+    with np.errstate(divide="ignore", invalid="ignore"):
+        depth = (x @ normal) / facing
+        on_plane = (rays * depth[..., None] - x) @ thing.rotation
+    across, up = on_plane[..., 0], on_plane[..., 1]
+    hit = (facing < 0.0) & (depth > 0.0) & (depth < nearest) & (np.maximum(abs(across), abs(up)) < thing.half_m)
+    light = np.array(look.light) / np.linalg.norm(look.light)
+    level = look.ambient + look.diffuse * max(float(normal @ light), 0.0)
+    if isinstance(thing, Sheet):
+        squares = pattern(thing.id, thing.dictionary)
+        column = np.floor((across[hit] / thing.side_m + 0.5) * 8.0).astype(int)
+        row = np.floor((0.5 - up[hit] / thing.side_m) * 8.0).astype(int)
+        inside = (column >= 0) & (column < 8) & (row >= 0) & (row < 8)
+        black = inside & squares[np.clip(row, 0, 7), np.clip(column, 0, 7)]
+        shown[hit] = level * np.where(black, BLACK, WHITE)
+    else:
+        shown[hit] = level * thing.grey
+    nearest[hit] = depth[hit]

@@ -1,0 +1,209 @@
+"""The board's page, and finding a board in images."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from xml.etree import ElementTree
+
+import cv2
+import numpy as np
+import pytest
+from board_renderer import Photographer, Printed, Taken, webcams
+from scipy.spatial.transform import Rotation
+from shown_board import BOARD, photographed
+
+from interfaces.errors import ConfigError
+from interfaces.records import FloatArray, ImageArray
+from vision.board import Board, BoardDetector, Corners, NotFound
+from vision.board.page import page
+from vision.board.pdf import pdf
+from vision.board.svg import svg
+
+PX_A_MM = 4
+BOARDS = [Board(), Board(7, 5, 0.025, dictionary="6X6_250"), Board(10, 7, 0.020, pattern="chessboard")]
+
+
+# --- the page, read back from the files' own numbers
+
+
+def from_pdf(data: bytes) -> tuple[tuple[float, float], FloatArray]:
+    """The sheet and its black rectangles (x, y, width, height) from its upper left corner [mm]."""
+    mm = 25.4 / 72
+    text = data.decode("latin-1")
+    box = re.search(r"MediaBox\[0 0 ([\d.]+) ([\d.]+)\]", text)
+    sheet = float(box[1]) * mm, float(box[2]) * mm
+    found = np.array(re.findall(r"^([-\d.]+) ([-\d.]+) ([\d.]+) ([\d.]+) re$", text, re.MULTILINE), dtype=float) * mm
+    found[:, 1] = sheet[1] - found[:, 1] - found[:, 3]
+    return sheet, found
+
+
+def from_svg(data: bytes) -> tuple[tuple[float, float], FloatArray]:
+    root = ElementTree.fromstring(data)
+    assert root.attrib["viewBox"].split()[2:] == [root.attrib[side].removesuffix("mm") for side in ("width", "height")]
+    rects = root.findall("{http://www.w3.org/2000/svg}g/{http://www.w3.org/2000/svg}rect")
+    return (
+        (float(root.attrib["width"].removesuffix("mm")), float(root.attrib["height"].removesuffix("mm"))),
+        np.array([[float(rect.attrib[name]) for name in ("x", "y", "width", "height")] for rect in rects]),
+    )
+
+
+def rasterised(sheet: tuple[float, float], black: FloatArray) -> ImageArray:
+    """The page as an image, at `PX_A_MM`; pixel k covers k to k + 1."""
+    image = np.full((round(sheet[1] * PX_A_MM), round(sheet[0] * PX_A_MM)), 255, np.uint8)
+    for x, y, w, h in black * PX_A_MM:
+        image[round(y) : round(y + h), round(x) : round(x + w)] = 0
+    return image
+
+
+@pytest.mark.parametrize("board", BOARDS, ids=lambda board: board.name)
+@pytest.mark.parametrize(("write", "read"), [(pdf, from_pdf), (svg, from_svg)], ids=["pdf", "svg"])
+def test_squares_on_the_page_are_of_the_size_that_was_asked_for(board, write, read) -> None:
+    drawn = page(board)
+    image = rasterised(*read(write(drawn)))
+    found = BoardDetector(board).find(cv2.GaussianBlur(image, (0, 0), 1.0))
+    assert isinstance(found, Corners), found
+    mm = (found.px + 0.5) / PX_A_MM - np.array(drawn.board_mm)
+    np.testing.assert_allclose(mm, 1e3 * board.corners_m[:, :2], atol=0.1)
+
+
+@pytest.mark.parametrize(("write", "read"), [(pdf, from_pdf), (svg, from_svg)], ids=["pdf", "svg"])
+def test_rulers_are_as_long_as_the_page_says(write, read) -> None:
+    drawn = page(Board())
+    _, black = read(write(drawn))
+    words = write(drawn).decode("latin-1")
+    across = black[np.isclose(black[:, 3], 0.2, atol=1e-3) & (black[:, 2] > 50)]
+    upright = black[np.isclose(black[:, 2], 0.2, atol=1e-3) & (black[:, 3] > 50)]
+    assert (across[:, 2], upright[:, 3]) == (pytest.approx([240.0], abs=1e-3), pytest.approx([180.0], abs=1e-3))
+    assert "this line is 240 mm, the upright one 180 mm" in words
+
+
+def test_nothing_on_the_page_is_nearer_to_its_edge_than_printers_print() -> None:
+    for board in BOARDS:
+        (width, height), black = from_pdf(pdf(page(board)))
+        assert black[:, :2].min() >= 5.0
+        assert ((black[:, :2] + black[:, 2:]) <= np.array([width, height]) - 5.0).all()
+
+
+def test_the_board_is_opencvs_own() -> None:
+    mine = rasterised(*from_pdf(pdf(page(BOARD))))
+    x, y = (round(each * PX_A_MM) for each in page(BOARD).board_mm)
+    wide, high = (round(1e3 * each * PX_A_MM) for each in BOARD.size_m)
+    theirs = BOARD.opencv().generateImage((wide, high), marginSize=0)
+    assert np.mean(mine[y : y + high, x : x + wide] != theirs) < 0.01
+
+
+def test_the_file_is_a_whole_pdf() -> None:
+    data = pdf(page(BOARD))
+    table = int(re.search(rb"startxref\n(\d+)", data)[1])
+    assert data[table : table + 4] == b"xref"
+    for number, place in enumerate(re.findall(rb"^(\d{10}) 00000 n ", data, re.MULTILINE), 1):
+        assert data[int(place) :].startswith(b"%d 0 obj" % number)
+    length, stream = re.search(rb"/Length (\d+)>>stream\n(.*)\nendstream", data, re.DOTALL).groups()
+    assert int(length) == len(stream)
+
+
+def test_a_board_too_large_for_the_paper_is_refused_with_what_fits() -> None:
+    with pytest.raises(ConfigError, match=r"do not fit on A4. There is room for squares of 3\d"):
+        page(Board(8, 6, 0.040))
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ({"columns": 2}, "2x6 squares"),
+        ({"square_m": 0.0}, "squares of 0 mm"),
+        ({"marker_m": 0.029}, "corners need white around them"),
+        ({"dictionary": "8X8_50"}, "there is no dictionary '8X8_50'"),
+        ({"columns": 20, "rows": 20, "dictionary": "4X4_50"}, "200 markers are needed, 4X4_50 has 50"),
+    ],
+)
+def test_a_board_that_there_is_not_is_refused(wrong, said) -> None:
+    with pytest.raises(ConfigError, match=re.escape(said)):
+        Board(**wrong)
+
+
+# --- the corners
+
+
+def shown(taken: Taken, printed: Printed | None = None, turned: float = 0.2) -> tuple[ImageArray, FloatArray]:
+    """The left eye's image of a board about half a metre away, and where its corners are."""
+    rng = np.random.default_rng(3)
+    rig = webcams(rng)
+    photographer = Photographer(rig, printed or Printed(), replace(taken, samples=3), rng)
+    R = Rotation.from_euler("xyz", [0.3, turned, 0.1]).as_matrix()
+    pose = R, np.array([0.0, 0.0, 0.55]) - R @ np.array([0.12, 0.09, 0.0])
+    return photographer.left(*pose), photographer.corners(*pose)[0]
+
+
+def test_corners_are_found_to_a_few_hundredths_of_a_pixel() -> None:
+    rig, pairs, shown_at = photographed()
+    photographer = Photographer(rig, Printed(), Taken(), np.random.default_rng(0))
+    errors = []
+    for pair, pose in zip(pairs, shown_at, strict=True):
+        for image, px in zip((pair.left, pair.right), photographer.corners(*pose), strict=True):
+            found = BoardDetector(BOARD).find(image)
+            assert isinstance(found, Corners)
+            errors.append(found.px - px[found.numbers])
+    errors = np.concatenate(errors)
+    assert np.sqrt(np.mean(errors**2)) < 0.05
+    assert np.abs(errors.mean(axis=0)).max() < 0.005
+
+
+@pytest.mark.parametrize("turned", [0.2, 2.9, -1.5])
+def test_a_plain_chessboards_corners_are_in_one_order_however_it_is_turned(turned) -> None:
+    rng = np.random.default_rng(3)
+    rig = webcams(rng)
+    printed = Printed(8, 5, 0.025, dictionary=None)
+    photographer = Photographer(rig, printed, Taken(samples=3), rng)
+    R = Rotation.from_euler("zxy", [turned, 0.3, 0.1]).as_matrix()
+    pose = R, np.array([0.0, 0.0, 0.55]) - R @ np.array([0.1, 0.0625, 0.0])
+    found = BoardDetector(Board(8, 5, 0.025, pattern="chessboard")).find(photographer.left(*pose))
+    assert isinstance(found, Corners)
+    assert np.abs(found.px - photographer.corners(*pose)[0]).max() < 0.3
+
+
+def fault(image: ImageArray, board: Board = BOARD) -> NotFound:
+    found = BoardDetector(board).find(image)
+    assert isinstance(found, NotFound)
+    return found
+
+
+def test_a_lens_cap_is_named() -> None:
+    found = fault(shown(Taken(exposure=0.02))[0])
+    assert (found.why, "lens cap" in found.text) == ("dark", True)
+
+
+def test_over_exposure_is_named() -> None:
+    found = fault(shown(Taken(exposure=40.0))[0])
+    assert (found.why, "Shorten the exposure" in found.text) == ("over_exposed", True)
+
+
+@pytest.mark.parametrize("taken", [Taken(blur_px=4.0), Taken(motion_px=13.0), Taken(blur_px=9.0)], ids=str)
+def test_a_blurred_image_is_named(taken) -> None:
+    assert fault(shown(taken)[0]).why == "blurred"
+
+
+@pytest.mark.parametrize("sigma", [0.8, 1.2, 1.8])
+def test_blur_is_measured(sigma) -> None:
+    found = BoardDetector(BOARD).find(shown(Taken(blur_px=sigma))[0])
+    assert isinstance(found, Corners)
+    assert found.blur_px == pytest.approx(np.hypot(sigma, 0.3), rel=0.25)
+
+
+def test_another_dictionary_is_named() -> None:
+    found = fault(shown(Taken(), Printed(dictionary="5X5_50", marker_share=7 / 9))[0])
+    assert found.why == "other_dictionary"
+    assert "the markers are 5X5_1000, not 4X4_50" in found.text
+
+
+@pytest.mark.parametrize(("columns", "rows"), [(10, 7), (6, 6), (9, 6)])
+def test_another_number_of_squares_is_named(columns, rows) -> None:
+    found = fault(shown(Taken(), Printed(columns, rows, 0.024))[0])
+    assert found.why == "other_squares"
+    assert f"the board has {columns}x{rows} squares, not 8x6" in found.text
+
+
+def test_an_image_without_a_board_says_so() -> None:
+    noise = np.random.default_rng(0).integers(60, 190, (240, 320, 3), dtype=np.uint8)
+    assert fault(noise).why == "not_found"

@@ -1,0 +1,230 @@
+"""Two cameras' calibration against planted ones, and what it refuses."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from board_renderer import Photographer, Printed, Taken, poses, webcams
+from scipy.spatial.transform import Rotation
+from shown_board import BOARD, NOISE_PX, SIZE, corner_views, photographed, true_vector, view_of
+
+from vision.board import Corners
+from vision.calibration.calibrate import Asked, calibrate, fit
+from vision.calibration.gather import gathered, require_any
+from vision.calibration.guidance import Coverage
+from vision.calibration.images import ImagePair
+from vision.calibration.view import View
+from vision.rig import CalibrationError
+
+ASKED = Asked(SIZE, ("A1", "B2"), "2026-01-01T00:00:00Z", scale_sigma=0.0)
+PINHOLE = replace(ASKED, model="pinhole")
+
+
+def swapped(view: View) -> View:
+    return View(view.name, view.right, view.left)
+
+
+def upside_down(corners: Corners | None) -> Corners | None:
+    return None if corners is None else replace(corners, px=np.array(SIZE) - 1 - corners.px)
+
+
+def refusal(views: list[View], asked: Asked = PINHOLE, board=BOARD) -> str:
+    with pytest.raises(CalibrationError) as raised:
+        calibrate(views, board, asked)
+    return str(raised.value)
+
+
+@pytest.fixture(scope="module")
+def planted() -> tuple:
+    rng = np.random.default_rng(11)
+    rig = webcams(rng)
+    return rig, corner_views(rig, rng)
+
+
+# --- what is found
+
+
+def test_rendered_images_give_the_planted_rig() -> None:
+    rig, pairs, _ = photographed()
+    found = calibrate(gathered(pairs, BOARD).views, BOARD, ASKED)
+    assert abs(found.rig.baseline_m - rig.baseline_m) < 2e-4
+    assert np.abs((found.rig.vector - true_vector(rig)) / found.rig.sigma).max() < 5.0
+    assert found.rig.model == "pinhole"
+
+
+def test_intervals_cover_over_many_rigs() -> None:
+    misses = []
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        rig = webcams(rng, fisheye=seed % 2 == 1)
+        bundle = fit(corner_views(rig, rng, 14), BOARD.corners_m, SIZE, "fisheye" if seed % 2 else "pinhole").bundle
+        misses.append((bundle.vector - true_vector(rig)) / np.sqrt(np.diag(bundle.covariance())))
+    z = np.abs(np.concatenate(misses))
+    # Parameters of one rig are not independent: 10 rigs are worth about sixty.
+    assert 0.55 < np.mean(z < 1.0) < 0.81
+    assert np.mean(z < 2.0) > 0.88
+
+
+def test_opencvs_stereo_calibration_agrees(planted) -> None:
+    _, views = planted
+    views = [view for view in views if len(view.left) == len(view.right) == len(BOARD.corners_m)]
+    ours = fit(views, BOARD.corners_m, SIZE, "pinhole").bundle
+    model = [BOARD.corners_m.astype(np.float32)] * len(views)
+    eyes = [[getattr(view, eye).px.astype(np.float32) for view in views] for eye in ("left", "right")]
+    start = [cv2.calibrateCamera(model, px, SIZE, np.eye(3), np.zeros(5))[1:3] for px in eyes]
+    theirs = cv2.stereoCalibrate(model, *eyes, *start[0], *start[1], SIZE, flags=cv2.CALIB_USE_INTRINSIC_GUESS)
+    sigma = np.sqrt(np.diag(ours.covariance()))
+    assert abs(ours.vector[0] - theirs[1][0, 0]) < 0.5 * sigma[0]
+    np.testing.assert_array_less(np.abs(ours.vector[-3:] - theirs[6].ravel()), 0.5 * sigma[-3:])
+
+
+def test_views_of_one_eye_alone_count_too(planted) -> None:
+    _, views = planted
+    alone = [replace(view, right=None) if k % 3 == 0 else view for k, view in enumerate(views)]
+    without = [view for view in alone if view.is_stereo]
+    sigmas = [
+        np.sqrt(np.diag(fit(each, BOARD.corners_m, SIZE, "pinhole").bundle.covariance())) for each in (alone, without)
+    ]
+    assert sigmas[0][0] < sigmas[1][0]
+
+
+@pytest.mark.parametrize("fisheye", [False, True])
+def test_the_lens_model_is_chosen_that_foretells_views_better(fisheye) -> None:
+    rng = np.random.default_rng(4)
+    rig = webcams(rng, fisheye=fisheye)
+    found = calibrate(corner_views(rig, rng), BOARD, ASKED)
+    assert found.rig.model == ("fisheye" if fisheye else "pinhole")
+
+
+def test_the_held_out_error_is_that_of_new_views(planted) -> None:
+    _, views = planted
+    found = fit(views, BOARD.corners_m, SIZE, "pinhole")
+    assert found.held_out.rms_px == pytest.approx(NOISE_PX, rel=0.1)
+    assert found.held_out.rms_px > found.bundle.sigma_px
+
+
+def test_a_view_that_moved_between_the_eyes_is_left_out_and_named(planted) -> None:
+    _, views = planted
+    moved = replace(views[6], right=replace(views[6].right, px=views[6].right.px + np.array([2.5, 0.5])))
+    found = fit([*views[:6], moved, *views[7:]], BOARD.corners_m, SIZE, "pinhole")
+    assert [each.name for each in found.left_out] == [moved.name]
+    assert found.left_out[0].rms_px > 5 * found.left_out[0].usual_px
+
+
+def test_a_board_of_unsure_size_makes_the_baseline_as_unsure(planted) -> None:
+    _, views = planted
+    sure, unsure = (calibrate(views, BOARD, replace(PINHOLE, scale_sigma=each)).rig for each in (0.0, 0.002))
+    expected = np.hypot(sure.baseline_sigma_m, 0.002 * sure.baseline_m)
+    assert unsure.baseline_sigma_m == pytest.approx(expected, rel=1e-6)
+
+
+# --- what is refused, and how it is named
+
+
+def test_swapped_cameras_are_named(planted) -> None:
+    _, views = planted
+    said = refusal([swapped(view) for view in views])
+    assert re.search(r"the cameras are swapped: the right one is \d\d mm to the left of the left one", said)
+
+
+def test_a_camera_that_is_upside_down_is_named(planted) -> None:
+    _, views = planted
+    assert "one camera is upside down" in refusal([replace(view, right=upside_down(view.right)) for view in views])
+
+
+def test_too_few_views_are_named(planted) -> None:
+    _, views = planted
+    assert "too few views: both eyes saw the board in 5, at least 8" in refusal(views[:5])
+
+
+def test_views_that_all_face_the_cameras_are_named(planted) -> None:
+    rig, _ = planted
+    rng = np.random.default_rng(1)
+    photographer = Photographer(rig, Printed(), Taken(), rng)
+    frontal = []
+    for k in range(16):
+        R = Rotation.from_euler("zxy", [rng.normal(0, 0.2), *rng.normal(0, 0.02, 2)]).as_matrix()
+        place = np.array([rng.uniform(-0.12, 0.2), rng.uniform(-0.12, 0.12), rng.uniform(0.45, 0.8)])
+        view = view_of(str(k), photographer, (R, place - R @ [0.12, 0.09, 0.0]), rng)
+        if min(len(view.left), len(view.right)) >= 8:
+            frontal.append(view)
+    assert "the board faces the cameras in all views" in refusal(frontal)
+
+
+def test_parts_of_the_image_that_the_board_never_was_in_are_named(planted) -> None:
+    rig, _ = planted
+    rng = np.random.default_rng(1)
+    photographer = Photographer(rig, Printed(), Taken(), rng)
+    views = []
+    for k in range(14):
+        R = Rotation.from_rotvec(rng.normal(0, 0.4, 3)).as_matrix()
+        views.append(view_of(str(k), photographer, (R, np.array([-0.2, -0.14, 1.3]) - R @ [0.12, 0.09, 0.0]), rng))
+    said = refusal(views)
+    assert re.search(r"these parts of the left image: .*lower right", said)
+
+
+def test_a_board_printed_at_97_percent_is_contradicted_by_the_baseline_measured_by_hand(planted) -> None:
+    rig, _ = planted
+    rng = np.random.default_rng(3)
+    small = Printed(square_m=0.97 * 0.030)
+    photographer = Photographer(rig, small, Taken(), rng)
+    views = [view_of(str(k), photographer, pose, rng) for k, pose in enumerate(poses(rng, rig, small))]
+    by_hand = replace(PINHOLE, baseline_m=round(rig.baseline_m, 3))
+    assert "make the squares 97" in refusal(views, by_hand)
+    assert calibrate(views, replace(BOARD, square_m=0.97 * 0.030), by_hand).rig.made.views == 20
+
+
+def test_noise_of_pixels_is_refused_by_the_held_out_error(planted) -> None:
+    rig, _ = planted
+    views = corner_views(rig, np.random.default_rng(5), noise_px=1.5)
+    assert re.search(r"views that were not fitted are off by 1\.\d+ px, 0.96 px is the most", refusal(views))
+
+
+def test_eyes_of_different_resolutions_are_named() -> None:
+    _, pairs, _ = photographed()
+    smaller = ImagePair("00", pairs[0].left, pairs[0].right[::2, ::2])
+    with pytest.raises(CalibrationError, match=r"the left image has 640x480 pixels, the right one 320x240"):
+        gathered([smaller], BOARD)
+
+
+def test_when_no_image_can_be_used_the_usual_reason_is_said() -> None:
+    black = np.zeros((480, 640, 3), np.uint8)
+    found = gathered([ImagePair(str(k), black, black) for k in range(3)], BOARD)
+    with pytest.raises(CalibrationError, match=r"6 of 6: the image is black. Take the lens cap off"):
+        require_any(found)
+
+
+# --- guidance
+
+
+def test_nothing_is_missing_of_a_careful_persons_views(planted) -> None:
+    _, views = planted
+    more = corner_views(planted[0], np.random.default_rng(9), 30)
+    assert Coverage.of([*views, *more], BOARD, SIZE).missing() == []
+
+
+@pytest.mark.parametrize(
+    ("axis", "said"),
+    [
+        ([0, 1, 0], "right edge"),
+        ([0, -1, 0], "left edge"),
+        ([1, 0, 0], "upper edge"),
+        ([-1, 0, 0], "lower edge"),
+    ],
+)
+def test_a_tilt_that_was_shown_is_not_asked_for_again(planted, axis, said) -> None:
+    rig, _ = planted
+    rng = np.random.default_rng(1)
+    photographer = Photographer(rig, Printed(), Taken(), rng)
+    R = Rotation.from_rotvec(-0.5 * np.array(axis)).as_matrix()
+    place = np.array([0.03, 0.0, 0.5])
+    away = {"right edge": R[2, 0], "left edge": -R[2, 0], "lower edge": R[2, 1], "upper edge": -R[2, 1]}
+    assert away[said] > 0.4
+    view = view_of("0", photographer, (R, place - R @ [0.12, 0.09, 0.0]), rng)
+    wishes = [wish for wish in Coverage.of([view, view], BOARD, SIZE).missing() if "tilt" in wish and "edge" in wish]
+    assert len(wishes) == 3
+    assert not any(said in wish for wish in wishes)

@@ -1,0 +1,157 @@
+"""Rectified images against exact truth, and the check of a calibration that no longer holds."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from board_renderer import Photographer, Printed, Taken, webcams
+from scipy.spatial.transform import Rotation
+from shown_board import BOARD, SIZE, Eyes, corner_views, known_rig, photographed
+
+from interfaces.errors import SourceError
+from interfaces.records import StereoFrame
+from vision.board import BoardDetector, Corners
+from vision.calibration.calibrate import Asked, calibrate
+from vision.calibration.check import check
+from vision.calibration.gather import gathered, gathered_live
+from vision.calibration.view import View
+from vision.rectified import Rectification, RectifiedCamera
+from vision.rig import CalibrationError, StereoRig
+from vision.triangulated import triangulated
+
+
+@pytest.mark.parametrize("fisheye", [False, True], ids=["pinhole", "fisheye"])
+def test_rectified_images_are_those_of_two_pinholes_in_the_stated_frame(fisheye) -> None:
+    rng = np.random.default_rng(6)
+    truth = webcams(rng, fisheye=fisheye)
+    rig = known_rig(truth)
+    photographer = Photographer(truth, Printed(square_m=0.04), Taken(samples=3), rng)
+    R = Rotation.from_euler("xyz", [0.2, -0.3, 0.1]).as_matrix()
+    pose = R, np.array([0.02, 0.0, 0.5]) - R @ np.array([0.16, 0.12, 0.0])
+    with RectifiedCamera(Eyes([photographer.pair(*pose)]), rig) as camera:
+        frame = camera.read(0.1)
+    corners = (4 / 3 * BOARD.corners_m) @ R.T + pose[1]
+    expected = camera.calibration.project(corners @ Rectification(rig).R_rectified_left.T)
+    for image, px in ((frame.left, expected[:, :2]), (frame.right, expected[:, 2:])):
+        found = BoardDetector(replace(BOARD, square_m=0.04)).find(image)
+        assert isinstance(found, Corners)
+        errors = found.px - px[found.numbers]
+        assert np.sqrt(np.mean(errors**2)) < 0.15
+        assert np.abs(errors.mean(axis=0)).max() < 0.04
+
+
+@pytest.mark.parametrize("fisheye", [False, True], ids=["pinhole", "fisheye"])
+@pytest.mark.parametrize("seed", range(5))
+def test_every_pixel_of_a_rectified_image_was_seen(fisheye, seed) -> None:
+    truth = webcams(np.random.default_rng(seed), fisheye=fisheye)
+    white = np.full((SIZE[1], SIZE[0], 3), 255, np.uint8)
+    with RectifiedCamera(Eyes([StereoFrame(0.0, white, white)]), known_rig(truth)) as camera:
+        frame = camera.read(0.1)
+    assert min(frame.left.min(), frame.right.min()) == 255
+
+
+def test_rectified_points_and_triangulation_agree() -> None:
+    truth = webcams(np.random.default_rng(6))
+    rig = known_rig(truth)
+    x = np.random.default_rng(0).uniform([-0.1, -0.1, 0.4], [0.15, 0.1, 1.0], (20, 3))
+    left, right = truth.left.image(x), truth.right.image(x @ truth.R.T + truth.t_m)
+    np.testing.assert_allclose(triangulated(rig, left, right), x, atol=1e-9)
+    rectification = Rectification(rig)
+    expected = rectification.calibration.project(x @ rectification.R_rectified_left.T)
+    np.testing.assert_allclose(rectification.points(left, 0), expected[:, :2], atol=1e-6)
+    np.testing.assert_allclose(rectification.points(right, 1), expected[:, 2:], atol=1e-6)
+
+
+def test_the_rectified_frame_is_turned_little_against_the_left_cameras_own() -> None:
+    truth = webcams(np.random.default_rng(6))
+    R = Rectification(known_rig(truth)).R_rectified_left
+    np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
+    assert Rotation.from_matrix(R).magnitude() < np.radians(8)
+
+
+def test_cameras_that_were_not_calibrated_are_refused_and_closed_again() -> None:
+    black = np.zeros((SIZE[1], SIZE[0], 3), np.uint8)
+    rig = known_rig(webcams(np.random.default_rng(6)))
+    eyes = Eyes([StereoFrame(0.0, black, black)], ("A1", "C3"))
+    with pytest.raises(CalibrationError, match="this is the calibration of another pair"), RectifiedCamera(eyes, rig):
+        pass
+    assert not eyes.is_open
+    small = Eyes([StereoFrame(0.0, black[::2, ::2], black[::2, ::2])])
+    with pytest.raises(CalibrationError, match="give images of 320x240"), RectifiedCamera(small, rig):
+        pass
+
+
+def test_an_image_of_another_size_is_an_error_of_the_source() -> None:
+    black = np.zeros((SIZE[1], SIZE[0], 3), np.uint8)
+    eyes = Eyes([StereoFrame(0.0, black, black[::2])])
+    camera = RectifiedCamera(eyes, known_rig(webcams(np.random.default_rng(6))))
+    with camera, pytest.raises(SourceError, match="an image of 640x240, calibrated was 640x480"):
+        camera.read(0.1)
+
+
+# --- check
+
+
+@pytest.fixture(scope="module")
+def calibrated() -> tuple[StereoRig, View]:
+    rng = np.random.default_rng(21)
+    views = corner_views(webcams(rng), rng, 21)
+    asked = Asked(SIZE, ("A1", "B2"), "2026", model="pinhole")
+    return calibrate(views[:-1], BOARD, asked).rig, views[-1]
+
+
+def test_a_calibration_that_holds_is_said_to_hold(calibrated) -> None:
+    found = check(*calibrated, BOARD)
+    assert found.holds
+    assert abs(found.rows_px) < 4 * found.rows_sigma_px
+    assert abs(found.square_m - 0.030) < 4 * found.square_sigma_m
+
+
+@pytest.mark.parametrize(
+    ("axis", "said"),
+    [(0, "turned up or down by 0.3"), (1, "turned inwards or outwards"), (2, "about its line of sight by 0.3")],
+)
+def test_a_bumped_camera_is_noticed(calibrated, axis, said) -> None:
+    rig, view = calibrated
+    bumped = rig.vector.copy()
+    bumped[-6 + axis] += np.radians(0.3)
+    found = check(rig.with_vector(bumped), view, BOARD)
+    assert any(said in text for text in found.wrong), found
+
+
+def test_another_board_than_was_calibrated_with_is_noticed(calibrated) -> None:
+    assert "a square of 29.1 mm is measured as 30.0" in check(*calibrated, replace(BOARD, square_m=0.0291)).wrong[0]
+
+
+def test_too_little_of_the_board_is_said(calibrated) -> None:
+    rig, view = calibrated
+    with pytest.raises(CalibrationError, match="both eyes see 0 corners"):
+        check(rig, replace(view, right=None), BOARD)
+
+
+# --- live
+
+
+def test_live_views_are_taken_when_still_and_new_until_nothing_is_missing() -> None:
+    pairs = photographed()[1][:5]
+    frames, t = [], 0.0
+    for pair in pairs:
+        for _ in range(2):
+            frames.append(StereoFrame(t, pair.left, pair.right))
+            t += 0.1
+    said: list[str] = []
+    with Eyes(frames) as eyes:
+        found = gathered_live(eyes, BOARD, said.append)
+    stereo = [view for view in gathered(pairs, BOARD).views if view.is_stereo]
+    assert len(found.views) == len(stereo)
+    assert said[0].startswith("0 views, 0%. Next: tilt the board's right edge away")
+    assert said[-1].startswith(f"{len(stereo)} views")
+
+
+def test_a_moving_board_is_not_taken() -> None:
+    pairs = photographed()[1][:4]
+    frames = [StereoFrame(0.1 * k, pair.left, pair.right) for k, pair in enumerate(pairs)]
+    with Eyes(frames) as eyes:
+        assert gathered_live(eyes, BOARD, lambda _: None).views == []

@@ -1,0 +1,75 @@
+"""Tags at random poses in random light before clutter: errors against the exact truth, and whether the claims cover."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from ball_renderer import VGA, Look, backdrop
+from scipy.spatial.transform import Rotation
+from tag_renderer import Sheet, photograph
+
+from interfaces.records import FloatArray, MarkerFix
+from kbmaps import rotation_vectors
+from vision.tag_body import TagBody
+from vision.tag_config import TagConfig
+from vision.tag_tracker import TagTracker
+
+FRAMES = 120
+SIDE_M = 0.05
+TILT_DEG = 55.0
+LOOKS = {
+    "clean": Look(noise_sd=1.0),
+    "usual": Look(),
+    "noisy": Look(noise_sd=8.0),
+    "defocused": Look(blur_px=1.0, noise_sd=4.0),
+}
+pytestmark = pytest.mark.soak
+
+
+def pose(rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+    """Rotation (3, 3) and place (3,) [m] of a tag that both eyes see whole."""
+    z = rng.uniform(0.3, 0.8)
+    disparity = VGA.focal_px * VGA.baseline_m / z
+    u, v = rng.uniform((disparity + 80, 80), (560, 400))
+    x = np.array([(u - 319.5) * z / VGA.focal_px, (v - 239.5) * z / VGA.focal_px, z])
+    tilt = np.append(rng.normal(size=2), 0.0)
+    tilt *= np.radians(rng.uniform(0.0, TILT_DEG)) / np.linalg.norm(tilt)
+    spin = Rotation.from_euler("z", rng.uniform(0.0, 2.0 * np.pi)).as_matrix()
+    return Rotation.from_rotvec(tilt).as_matrix() @ np.diag([1.0, -1.0, -1.0]) @ spin, x
+
+
+@pytest.mark.parametrize("name", LOOKS)
+def test_place_and_turn_of_a_tag_are_as_sure_as_claimed(name, capsys) -> None:
+    config = TagConfig(side_m=SIDE_M)
+    tracker, rng = TagTracker(VGA, TagBody.single(config), config), np.random.default_rng(0)
+    pictures = [[backdrop(rng, VGA.image_size_px, None) for _ in range(2)] for _ in range(8)]
+    errors, sigmas, misses = [], [], Counter()
+    for number in range(FRAMES):
+        rotation, x = pose(rng)
+        light = (float(rng.uniform(-1.0, 1.0)), float(rng.uniform(-1.0, 0.3)), -1.0)
+        look = replace(LOOKS[name], samples=6, light=light, exposure=float(rng.uniform(0.6, 1.1)))
+        sheet = Sheet(0, rotation, x, SIDE_M)
+        answer = tracker.track(photograph([sheet], VGA, look, rng, t=10.0 * number, pictures=pictures[number % 8]))
+        if not isinstance(answer, MarkerFix) or answer.R is None or answer.cov_R is None:
+            misses[str(getattr(answer, "reason", ""))] += 1
+            continue
+        turn = rotation_vectors((Rotation.from_quat(answer.R).as_matrix() @ rotation.T)[None])[0]
+        errors.append([*(answer.x - x), *turn])
+        sigmas.append(np.sqrt([*np.diag(answer.cov), *np.diag(answer.cov_R)]))
+    off, claimed = np.array(errors), np.array(sigmas)
+    median = np.median(np.abs(off), axis=0)
+    within = 100.0 * (np.abs(off) < claimed).mean(axis=0)
+    twice = 100.0 * (np.abs(off) < 2.0 * claimed).mean(axis=0)
+    with capsys.disabled():
+        print(
+            f"\n| {name} | {' '.join(f'{1e3 * value:.3f}' for value in median[:3])} | "
+            f"{' '.join(f'{np.degrees(value):.3f}' for value in median[3:])} | "
+            f"{' '.join(f'{value:.0f}' for value in within)} | {' '.join(f'{value:.0f}' for value in twice)} | "
+            f"{dict(misses)} |"
+        )
+    assert len(errors) > 0.85 * FRAMES
+    assert 58.0 < within.mean() < 78.0
+    assert twice.mean() > 88.0

@@ -1,0 +1,245 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from ball_renderer import SMALL, Look
+from numpy.typing import ArrayLike
+from scenes import reason
+from scipy.spatial.transform import Rotation
+from tag_renderer import Card, Sheet, photograph
+
+from interfaces.camera import StereoCalibration
+from interfaces.errors import ConfigError, SourceError
+from interfaces.records import FloatArray, MarkerFix, MarkerMiss, Reason, StereoFrame
+from kbmaps import rotation_vectors
+from vision.config import VisionConfig
+from vision.pose import PoseEstimator, Sighting, mirrored
+from vision.tag_body import TagBody
+from vision.tag_config import ClusterConfig, PlacedTag, TagConfig
+from vision.tag_tracker import TagTracker
+from vision.tracker import StereoTracker
+from vision.trackers import tracker_of
+
+SIDE_M = 0.03
+CONFIG = TagConfig(side_m=SIDE_M)
+WALL = Look(wall=0.4, samples=6)
+FACING = np.diag([1.0, -1.0, -1.0])
+MIDDLE = np.array([0.02, 0.0, 0.4])
+# Two tags on faces of a cube, in the cube's frame.
+PLACED = (
+    PlacedTag(id=1, xyz=(0.0, 0.0, 0.02)),
+    PlacedTag(id=2, xyz=(0.02, 0.0, 0.0), rpy=(0.0, np.pi / 2, 0.0)),
+)
+CUBE = TagBody.cluster(ClusterConfig(tags=PLACED), CONFIG)
+
+
+def tracker(config: TagConfig = CONFIG, calibration: StereoCalibration = SMALL) -> TagTracker:
+    return TagTracker(calibration, TagBody.single(config), config)
+
+
+def tilted(about: ArrayLike, degrees: float) -> FloatArray:
+    axis = np.asarray(about, dtype=np.float64) / np.linalg.norm(about)
+    return Rotation.from_rotvec(np.radians(degrees) * axis).as_matrix() @ FACING
+
+
+def sheet(id: int = 0, rotation: FloatArray = FACING, x: ArrayLike = MIDDLE, side_m: float = SIDE_M) -> Sheet:
+    return Sheet(id, rotation, np.asarray(x, dtype=np.float64), side_m)
+
+
+def seen(*things: Sheet | Card, seed: int = 0, t: float = 0.0, look: Look = WALL) -> StereoFrame:
+    return photograph(things, SMALL, look, np.random.default_rng(seed), t=t)
+
+
+def cube_at(rotation: FloatArray, x: FloatArray) -> list[Sheet]:
+    """The two tags of the cube where it is."""
+    return [
+        sheet(tag.id, rotation @ Rotation.from_euler("xyz", tag.rpy).as_matrix(), x + rotation @ np.array(tag.xyz))
+        for tag in PLACED
+    ]
+
+
+def off(answer: MarkerFix | MarkerMiss, rotation: FloatArray, x: FloatArray) -> tuple[float, float]:
+    """Errors of place and turn in units of their own claimed covariance; infinite for a miss."""
+    if isinstance(answer, MarkerMiss) or answer.R is None or answer.cov_R is None:
+        return np.inf, np.inf
+    turned = rotation_vectors((Rotation.from_quat(answer.R).as_matrix() @ rotation.T)[None])[0]
+    moved = answer.x - x
+    return _length(moved, answer.cov), _length(turned, answer.cov_R)
+
+
+def _length(error: FloatArray, cov: FloatArray) -> float:
+    return float(np.sqrt(error @ np.linalg.solve(cov, error)))
+
+
+@pytest.mark.parametrize("degrees", [0.0, 20.0, 45.0])
+def test_a_tag_is_found_where_and_as_it_is(degrees) -> None:
+    rotation = tilted([1.0, 0.5, 0.3], degrees)
+    assert max(off(tracker().track(seen(sheet(rotation=rotation))), rotation, MIDDLE)) < 4.0
+
+
+def sigmas_off(frames: int, seed: int) -> FloatArray:
+    """Errors of place and turn (n, 6) in units of their claimed sigmas, tags at random poses."""
+    rng, off_by = np.random.default_rng(seed), []
+    found = tracker()
+    for number in range(frames):
+        axis = np.append(rng.normal(size=2), 0.0)
+        rotation = tilted(axis, rng.uniform(0.0, 45.0)) @ Rotation.from_euler("z", rng.uniform(0, 6.3)).as_matrix()
+        x = MIDDLE + rng.uniform((-0.02, -0.02, -0.1), (0.02, 0.02, 0.05))
+        answer = found.track(seen(sheet(rotation=rotation, x=x), seed=number, t=10.0 * number))
+        if isinstance(answer, MarkerFix) and answer.R is not None and answer.cov_R is not None:
+            turned = rotation_vectors((Rotation.from_quat(answer.R).as_matrix() @ rotation.T)[None])[0]
+            sigmas = np.sqrt([*np.diag(answer.cov), *np.diag(answer.cov_R)])
+            off_by.append(np.array([*(answer.x - x), *turned]) / sigmas)
+    return np.array(off_by)
+
+
+def test_few_errors_are_larger_than_two_claimed_sigmas() -> None:
+    off_by = sigmas_off(15, seed=1)
+    assert len(off_by) >= 13
+    assert (np.abs(off_by) < 2.0).mean() > 0.85
+
+
+def test_corners_come_out_to_hundredths_of_a_pixel() -> None:
+    answer = tracker().track(seen(sheet(), look=replace(WALL, noise_sd=1.0)))
+    assert isinstance(answer, MarkerFix)
+    assert np.abs(np.array(answer.centres_px) - SMALL.project(MIDDLE)).max() < 0.03
+
+
+def test_a_followed_tag_is_found_after_a_step_and_after_a_jump() -> None:
+    found = tracker()
+    for number, x in enumerate(MIDDLE + np.array([[0.0, 0.0, 0.0], [0.004, 0.0, 0.0], [-0.04, 0.03, 0.05]])):
+        assert max(off(found.track(seen(sheet(x=x), t=number / 30.0, seed=number)), FACING, x)) < 4.0
+
+
+def test_an_empty_picture_has_no_marker() -> None:
+    assert reason(tracker().track(seen(look=Look(samples=2)))) is Reason.NO_MARKER
+
+
+def test_a_tag_of_another_number_is_no_marker() -> None:
+    assert reason(tracker().track(seen(sheet(id=7)))) is Reason.NO_MARKER
+
+
+def test_a_tag_too_small_to_measure_is_no_marker() -> None:
+    assert reason(tracker().track(seen(sheet(x=[0.02, 0.0, 1.2])))) is Reason.NO_MARKER
+
+
+def test_the_same_tag_twice_is_ambiguous() -> None:
+    twice = seen(sheet(x=[-0.02, 0.0, 0.4]), sheet(x=[0.06, 0.0, 0.4]))
+    assert reason(tracker().track(twice)) is Reason.AMBIGUOUS
+
+
+@pytest.mark.parametrize("printed", [0.9, 1.1])
+def test_a_tag_printed_in_another_size_is_a_size_mismatch(printed) -> None:
+    assert reason(tracker().track(seen(sheet(side_m=printed * SIDE_M)))) is Reason.SIZE_MISMATCH
+
+
+def test_rows_that_disagree_are_epipolar() -> None:
+    frame = seen(sheet())
+    assert reason(tracker().track(replace(frame, right=np.roll(frame.right, 4, axis=0)))) is Reason.EPIPOLAR
+
+
+def test_eyes_that_are_interchanged_are_epipolar() -> None:
+    frame = seen(sheet())
+    assert reason(tracker().track(replace(frame, left=frame.right, right=frame.left))) is Reason.EPIPOLAR
+
+
+def test_a_tag_at_the_border_of_one_eye_gives_no_fix() -> None:
+    u = -SMALL.principal_point_px[0] * 0.4 / SMALL.focal_px
+    x = np.array([u + SMALL.baseline_m + SIDE_M / 2 + 0.0005, 0.0, 0.4])
+    assert reason(tracker().track(seen(sheet(x=x)))) in {Reason.AT_BORDER, Reason.NO_MARKER}
+
+
+@pytest.mark.parametrize("covered", [0.1, 0.3, 0.5, 0.8])
+def test_a_covered_tag_is_never_a_wrong_fix(covered) -> None:
+    edge = MIDDLE[0] - SIDE_M / 2 + covered * SIDE_M - 0.01
+    finger = Card(FACING, np.array([edge, 0.0, 0.38]), 0.01)
+    answer = tracker().track(seen(sheet(), finger))
+    assert isinstance(answer, MarkerMiss) or max(off(answer, FACING, MIDDLE)) < 5.0
+
+
+def test_a_cluster_is_found_where_and_as_it_is() -> None:
+    rotation = tilted([0.0, 1.0, 0.0], 40.0)
+    frame = seen(*cube_at(rotation, MIDDLE))
+    assert max(off(TagTracker(SMALL, CUBE, CONFIG).track(frame), rotation, MIDDLE)) < 4.0
+
+
+def test_a_cluster_of_which_one_tag_is_hidden_is_found_as_well() -> None:
+    rotation = tilted([0.0, 1.0, 0.0], 40.0)
+    frame = seen(cube_at(rotation, MIDDLE)[0])
+    assert max(off(TagTracker(SMALL, CUBE, CONFIG).track(frame), rotation, MIDDLE)) < 4.0
+
+
+def test_more_tags_of_the_same_noise_give_a_surer_orientation() -> None:
+    rotation = tilted([0.0, 1.0, 0.0], 40.0)
+    sightings = []
+    for corners in CUBE.corners.values():
+        pixels = SMALL.project(corners @ rotation.T + MIDDLE)
+        cov = 0.02**2 * np.eye(8)
+        sightings.append([Sighting(corners, pixels[:, 2 * eye : 2 * eye + 2], cov, right=bool(eye)) for eye in (0, 1)])
+    one, both = (
+        PoseEstimator(SMALL, seen).refine(rotation, MIDDLE) for seen in (sightings[0], sightings[0] + sightings[1])
+    )
+    assert one is not None
+    assert both is not None
+    assert np.trace(both.cov[:3, :3]) < 0.7 * np.trace(one.cov[:3, :3])
+
+
+def test_tags_that_are_not_where_the_cluster_has_them_are_refused() -> None:
+    wrong = TagBody.cluster(
+        ClusterConfig(tags=(PLACED[0], PlacedTag(id=2, xyz=(0.03, 0.0, 0.0), rpy=PLACED[1].rpy))), CONFIG
+    )
+    frame = seen(*cube_at(tilted([0.0, 1.0, 0.0], 40.0), MIDDLE))
+    assert reason(TagTracker(SMALL, wrong, CONFIG).track(frame)) in {Reason.REPROJECTION, Reason.SIZE_MISMATCH}
+
+
+def test_images_of_another_size_are_refused() -> None:
+    grey = np.zeros((100, 100, 3), np.uint8)
+    with pytest.raises(SourceError, match="the calibration is for 320x240"):
+        tracker().track(StereoFrame(0.0, grey, grey))
+
+
+def test_a_cluster_without_tags_is_refused() -> None:
+    with pytest.raises(ConfigError, match="has no tags"):
+        tracker_of(SMALL, VisionConfig(marker="cluster"))
+
+
+def test_a_cluster_with_one_tag_twice_is_refused() -> None:
+    with pytest.raises(ConfigError, match="has the tag 1 twice"):
+        TagBody.cluster(ClusterConfig(tags=(PLACED[0], PLACED[0])), CONFIG)
+
+
+def test_a_number_that_the_dictionary_does_not_have_is_refused() -> None:
+    with pytest.raises(ConfigError, match="no tag 999 in apriltag_36h11"):
+        tracker(TagConfig(id=999))
+
+
+@pytest.mark.parametrize(("marker", "kind"), [("ball", StereoTracker), ("tag", TagTracker)])
+def test_the_tracker_is_that_of_the_marker_that_is_named(marker, kind) -> None:
+    assert isinstance(tracker_of(SMALL, VisionConfig(marker=marker)), kind)
+
+
+def test_an_aruco_tag_is_found_in_its_dictionary() -> None:
+    config = TagConfig(dictionary="aruco_6x6_50", id=5, side_m=SIDE_M)
+    printed = replace(sheet(5), dictionary=cv2.aruco.DICT_6X6_50)
+    assert max(off(tracker(config).track(seen(printed)), FACING, MIDDLE)) < 4.0
+
+
+def test_exact_pixels_give_the_exact_pose_from_a_rough_one() -> None:
+    rng = np.random.default_rng(3)
+    points, rotation = 0.05 * rng.normal(size=(8, 3)), Rotation.random(rng=rng).as_matrix()
+    pixels = SMALL.project(points @ rotation.T + MIDDLE)
+    cov = 0.01**2 * np.eye(16)
+    sightings = [Sighting(points, pixels[:, 2 * eye : 2 * eye + 2], cov, right=bool(eye)) for eye in (0, 1)]
+    rough = Rotation.from_rotvec([0.2, -0.1, 0.15]).as_matrix() @ rotation
+    pose = PoseEstimator(SMALL, sightings).refine(rough, MIDDLE + 0.02)
+    assert pose is not None
+    assert pose.rotation == pytest.approx(rotation, abs=1e-8)
+    assert pose.x == pytest.approx(MIDDLE, abs=1e-9)
+
+
+def test_the_mirrored_pose_of_a_mirrored_pose_is_the_first() -> None:
+    rotation = Rotation.random(rng=np.random.default_rng(4)).as_matrix()
+    assert mirrored(mirrored(rotation, MIDDLE), MIDDLE) == pytest.approx(rotation, abs=1e-12)

@@ -1,0 +1,32 @@
+"""docs/tags.md is held to the code."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import msgspec
+
+from interfaces.records import Reason
+from vision.config import VisionConfig
+from vision.tag_body import TagBody
+from vision.tag_config import TagConfig
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGE = (ROOT / "docs" / "tags.md").read_text(encoding="utf-8")
+TABLES = re.findall(r"```toml\n(.*?)```", PAGE, re.DOTALL)
+
+
+def test_the_page_shows_every_setting_with_its_default() -> None:
+    assert msgspec.toml.decode(TABLES[0])["vision"]["tag"] == msgspec.to_builtins(TagConfig())
+
+
+def test_the_page_s_cluster_is_one() -> None:
+    vision = msgspec.convert(msgspec.toml.decode(TABLES[1])["vision"], VisionConfig)
+    assert list(TagBody.cluster(vision.cluster, vision.tag).corners) == [0, 1]
+
+
+def test_the_page_lists_every_reason_of_the_tag_tracker() -> None:
+    files = (ROOT / "vision" / name for name in ("tag_image.py", "tag_tracker.py", "pose.py"))
+    given = {Reason[name].value for file in files for name in re.findall(r"\bReason\.([A-Z_]+)", file.read_text())}
+    assert given == set(re.findall(r"^\| `(\w+)` \|", PAGE, re.MULTILINE))

@@ -1,0 +1,201 @@
+"""Cameras as OpenCV's V4L2 backend reads them, emulated below it, with everything that goes wrong with webcams."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from v4l2_cameras import WALL_CLOCK, ZERO, ShimCamera, compiled, preloaded
+
+PROBE = Path(__file__).parent / "v4l2_shim" / "probe.py"
+ROOT = Path(__file__).parents[2]
+SIZE_PX = (160, 120)
+FPS = 60.0
+LIMIT_S = 60.0
+GREY = [np.full((SIZE_PX[1], SIZE_PX[0], 3), 60 + 2 * k, np.uint8) for k in range(60)]
+WIDE = [np.hstack([image, image + 40]) for image in GREY]
+
+Cameras = dict[str, ShimCamera]
+Make = Callable[..., ShimCamera]
+
+
+@pytest.fixture(scope="module")
+def library(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    found = compiled(tmp_path_factory.mktemp("shim"))
+    if found is None:
+        pytest.skip("no C compiler with V4L2's headers, so cameras cannot be emulated below OpenCV")
+    return found
+
+
+@pytest.fixture
+def camera(tmp_path):
+    """A function that plugs a camera in."""
+    with ExitStack() as stack:
+
+        def plug(name: str, images=GREY, **settings: Any) -> ShimCamera:
+            made = ShimCamera(tmp_path / f"usb-{name}-video-index0", images, **{"fps": FPS, **settings})
+            return stack.enter_context(made)
+
+        yield plug
+
+
+def settings_of(given: dict[str, Any]) -> dict[str, Any]:
+    return {"image_size_px": SIZE_PX, "fps": FPS, **given}
+
+
+def two(left: ShimCamera, right: ShimCamera, **given: Any) -> dict[str, Any]:
+    return {"two": {"left": str(left.file), "right": str(right.file), **settings_of(given)}, "latency_sigma_s": 0.0}
+
+
+def one(device: ShimCamera, **given: Any) -> dict[str, Any]:
+    return {"side_by_side": {"device": str(device.file), **settings_of(given)}, "latency_sigma_s": 0.0}
+
+
+def start(library: Path, table: dict[str, Any], seconds: float) -> subprocess.Popen[bytes]:
+    path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    process = subprocess.Popen(
+        [sys.executable, str(PROBE), str(seconds)], env={**preloaded(library), "PYTHONPATH": path}, **pipes
+    )
+    assert process.stdin is not None
+    process.stdin.write(json.dumps(table).encode())
+    process.stdin.close()
+    process.stdin = None
+    return process
+
+
+def probe(library: Path, table: dict[str, Any], seconds: float = 1.0) -> dict[str, Any]:
+    out, errors = start(library, table, seconds).communicate(timeout=LIMIT_S)
+    assert out, errors.decode()
+    return json.loads(out)
+
+
+def complaint(told: dict[str, Any], words: str) -> str:
+    return next((text for text in told["health"] if words in text), f"nobody complains: {told}")
+
+
+def test_kernel_stamps_are_taken_and_close_to_now(library, camera) -> None:
+    told = probe(library, one(camera("one", WIDE)))
+    assert told["stamps"] == ["kernel"]
+    assert 0 < np.median(told["behind"]) < 0.1
+    assert (np.diff(told["t"]) > 0).all()
+
+
+def test_both_eyes_of_one_camera_come_from_one_image(library, camera) -> None:
+    told = probe(library, one(camera("one", WIDE)))
+    assert {right - left for left, right in told["levels"]} <= {39, 40, 41}
+
+
+def test_two_cameras_say_how_far_apart_their_images_are(library, camera) -> None:
+    told = probe(library, two(camera("left"), camera("right", phase=0.3)))
+    assert np.median(told["sigma"]) == pytest.approx(np.hypot(0.3 / FPS, 1e-3), rel=0.02)
+
+
+def test_uncompressed_images_are_read_too(library, camera) -> None:
+    told = probe(library, one(camera("one", WIDE, fourcc="YUYV"), fourcc="YUYV"))
+    assert len(told["t"]) > 10
+    assert complaint(told, "sends YUYV").startswith("nobody complains")
+
+
+@pytest.mark.parametrize("stamps", [ZERO, WALL_CLOCK])
+def test_stamps_that_are_not_monotonic_are_replaced_by_the_arrival_and_its_uncertainty(library, camera, stamps) -> None:
+    device = camera("one", WIDE)
+    device.set(stamps=stamps)
+    told = probe(library, one(device))
+    assert told["stamps"] == ["arrival"]
+    assert min(told["sigma"]) >= 0.02
+    assert "no monotonic time stamps" in complaint(told, "time stamps")
+
+
+def test_settings_arrive_at_the_camera(library, camera) -> None:
+    device = camera("one", WIDE)
+    wanted = {"exposure_s": 0.008, "gain": 100, "white_balance_k": 5000, "focus": 30}
+    told = probe(library, one(device, **wanted))
+    names = ("exposure", "gain", "wb_temperature", "focus", "auto_exposure", "auto_wb", "autofocus")
+    assert [device.control(name) for name in names] == [80, 100, 5000, 30, 1, 0, 0]
+    assert not any("does not" in text for text in told["health"])
+
+
+def test_a_setting_that_is_not_taken_is_named_with_what_there_is(library, camera) -> None:
+    device = camera("one", WIDE)
+    device.make_deaf("gain")
+    told = probe(library, one(device, gain=100))
+    assert "does not take gain = 100: it has 64" in complaint(told, "gain")
+
+
+def test_an_automatic_that_stays_on_is_named(library, camera) -> None:
+    device = camera("one", WIDE)
+    device.make_deaf("autofocus")
+    told = probe(library, one(device, focus=30))
+    assert "does not switch its automatic for focus off" in complaint(told, "focus")
+
+
+def test_another_image_size_is_refused_with_what_the_camera_sends(library, camera) -> None:
+    told = probe(library, one(camera("one", GREY)))
+    assert told["error"].startswith("SourceError: the stereo camera sends 160x120 pixels, not 320x120")
+
+
+def test_a_third_of_the_frame_rate_is_told_though_the_camera_promised_more(library, camera) -> None:
+    told = probe(library, one(camera("one", WIDE, fps=10.0, told_fps=30.0), fps=30.0), 2.0)
+    assert "sends 10.0 frames/s instead of 30" in complaint(told, "frames/s")
+
+
+def test_a_camera_that_does_not_offer_the_rate_says_so(library, camera) -> None:
+    told = probe(library, one(camera("one", WIDE, fps=10.0), fps=30.0))
+    assert "offers 10 frames/s, not 30" in complaint(told, "offers")
+
+
+def test_a_lens_cap_is_named(library, camera) -> None:
+    told = probe(library, two(camera("left", [image // 30 for image in GREY]), camera("right")))
+    assert "the left camera's image is black: is the lens cap on?" in complaint(told, "black")
+
+
+def test_over_exposure_is_named(library, camera) -> None:
+    told = probe(library, two(camera("left"), camera("right", [np.full_like(image, 255) for image in GREY])))
+    assert "the right camera is over-exposed: 100 %" in complaint(told, "over-exposed")
+
+
+def test_half_images_are_dropped_and_counted(library, camera) -> None:
+    device = camera("one", WIDE)
+    device.set(torn_every=2)
+    told = probe(library, one(device))
+    assert told["damaged"][0] > 5
+    assert {right - left for left, right in told["levels"]} <= {39, 40, 41}
+
+
+def test_a_camera_that_sends_only_half_images_does_not_open(library, camera) -> None:
+    device = camera("one", WIDE)
+    device.set(torn_every=1)
+    assert "sent no whole image" in probe(library, one(device))["error"]
+
+
+def test_a_camera_that_is_not_there_is_named(library, camera) -> None:
+    device = camera("one", WIDE)
+    device.file.unlink()
+    assert "is not there. Plug it in" in probe(library, one(device))["error"]
+
+
+def test_two_cameras_that_are_too_much_for_the_bus_are_named(library, camera) -> None:
+    left, right = camera("left"), camera("right")
+    right.set(silent=1)
+    told = probe(library, two(left, right))
+    assert told["error"].startswith("SourceLost: the right camera sends no images")
+    assert "Two cameras on one hub" in told["error"]
+
+
+def test_unplugging_one_of_two_cameras_is_a_loss(library, camera) -> None:
+    left, right = camera("left"), camera("right", phase=0.4)
+    process = start(library, two(left, right), 20.0)
+    assert process.stderr is not None
+    process.stderr.readline()
+    right.set(unplugged=1)
+    told = json.loads(process.communicate(timeout=LIMIT_S)[0])
+    assert told["error"].startswith("SourceLost: the right camera sends no images")

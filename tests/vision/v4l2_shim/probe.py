@@ -1,0 +1,49 @@
+"""Opens the cameras of a table [vision.cameras] (JSON on standard input) for a while, tells as JSON what came.
+
+python probe.py SECONDS
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from pathlib import Path
+
+import msgspec
+
+from interfaces.clock import SystemClock
+from interfaces.errors import BodyschemaError
+from vision.cameras.config import CamerasConfig
+from vision.cameras.live import LiveEyes
+from vision.cameras.opened import eyes_of
+
+
+def main() -> None:
+    config = msgspec.json.decode(sys.stdin.buffer.read(), type=CamerasConfig)
+    eyes = eyes_of(config, Path(), SystemClock())
+    assert isinstance(eyes, LiveEyes)
+    told = {"t": [], "behind": [], "sigma": [], "levels": [], "health": [], "error": ""}
+    try:
+        with eyes:
+            print("open", file=sys.stderr, flush=True)
+            until = time.monotonic() + float(sys.argv[1])
+            while time.monotonic() < until:
+                frame = eyes.read(0.2)
+                if frame is not None:
+                    told["t"].append(frame.t)
+                    told["behind"].append(time.monotonic() - frame.t)
+                    told["sigma"].append(frame.t_sigma)
+                    told["levels"].append([int(frame.left.mean()), int(frame.right.mean())])
+            told["health"] = list(eyes.health)
+            told["stamps"] = [figures.stamps for figures in eyes.figures]
+            told["damaged"] = [figures.damaged for figures in eyes.figures]
+            told["fps"] = [figures.fps for figures in eyes.figures]
+            told["serials"] = eyes.serials
+    except BodyschemaError as error:
+        told["error"] = f"{type(error).__name__}: {error}"
+    json.dump(told, sys.stdout)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,134 @@
+"""Cameras for `shim.c`: files that OpenCV opens like devices where the shim is preloaded."""
+
+from __future__ import annotations
+
+import mmap
+import os
+import shutil
+import struct
+import subprocess
+from collections.abc import Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+import cv2
+import numpy as np
+
+HERE = Path(__file__).parent
+FRAMES_AT = 4096
+HEADER = struct.Struct("<8s4I3d6I")
+FIELDS = (
+    *("magic", "width", "height", "fourcc", "count", "fps", "told_fps", "phase"),
+    *("unplugged", "stamps", "torn_every", "silent", "served", "controls"),
+)
+CONTROL = struct.Struct("<2I4i")
+PLACE = struct.Struct("<2Q")
+MONOTONIC, ZERO, WALL_CLOCK = range(3)
+
+# Their numbers in linux/v4l2-controls.h, with least and most and the value at the start.
+CONTROLS: dict[str, tuple[int, int, int, int]] = {
+    "gain": (0x00980913, 0, 255, 64),
+    "auto_wb": (0x0098090C, 0, 1, 1),
+    "wb_temperature": (0x0098091A, 2800, 6500, 4000),
+    "auto_exposure": (0x009A0901, 0, 3, 3),
+    "exposure": (0x009A0902, 3, 2047, 250),
+    "focus": (0x009A090A, 0, 250, 0),
+    "autofocus": (0x009A090C, 0, 1, 1),
+}
+
+
+def compiled(folder: Path) -> Path | None:
+    """The shim, compiled into `folder`; None where there is no compiler, or none with V4L2's headers."""
+    compiler = shutil.which("cc") or shutil.which("gcc")
+    if compiler is None or not Path("/usr/include/linux/videodev2.h").exists():
+        return None
+    library = folder / "shim.so"
+    flags = ["-shared", "-fPIC", "-O1", "-Wall", "-Wextra", "-Wno-switch", "-Werror"]
+    subprocess.run([compiler, *flags, HERE / "shim.c", "-o", library, "-ldl", "-lpthread", "-lm"], check=True)
+    return library
+
+
+def preloaded(library: Path) -> dict[str, str]:
+    """The environment of a process that shall see the cameras."""
+    return {**os.environ, "LD_PRELOAD": str(library)}
+
+
+class ShimCamera:
+    """One camera: its file, and what is wrong with it, which may change while it is read.
+
+    What it shows at a time of CLOCK_MONOTONIC: image floor(t·fps − phase) modulo their number.
+    """
+
+    def __init__(
+        self,
+        file: Path,
+        images: Sequence[np.ndarray],
+        *,
+        fps: float = 30.0,
+        told_fps: float | None = None,
+        phase: float = 0.0,
+        fourcc: str = "MJPG",
+        without: Sequence[str] = (),
+    ) -> None:
+        """Write the file.
+
+        Args:
+            told_fps: what it says of its rate. without: controls that it does not have.
+        """
+        self.file = file
+        height, width = images[0].shape[:2]
+        frames = [_encoded(image, fourcc) for image in images]
+        controls = {name: control for name, control in CONTROLS.items() if name not in without}
+        self._places = {name: place for place, name in enumerate(controls)}
+        code = cv2.VideoWriter.fourcc(*fourcc)
+        told = fps if told_fps is None else told_fps
+        values = (b"V4L2SHIM", width, height, code, len(frames), fps, told, phase, 0, 0, 0, 0, 0, len(controls))
+        header = HEADER.pack(*values)
+        for id, least, most, value in controls.values():
+            header += CONTROL.pack(id, 0, least, most, value, 0)
+        at = FRAMES_AT + PLACE.size * len(frames)
+        places = b""
+        for frame in frames:
+            places += PLACE.pack(at, len(frame))
+            at += len(frame)
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_bytes(header.ljust(FRAMES_AT, b"\0") + places + b"".join(frames))
+
+    def __enter__(self) -> Self:
+        with self.file.open("r+b") as stream:
+            self._memory = mmap.mmap(stream.fileno(), 0)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._memory.close()
+
+    def set(self, **fields: float) -> None:
+        """Change fields of the header: unplugged, stamps, torn_every, silent, fps."""
+        values = dict(zip(FIELDS, HEADER.unpack_from(self._memory), strict=True)) | fields
+        HEADER.pack_into(self._memory, 0, *values.values())
+
+    @property
+    def served(self) -> int:
+        """How many frames were taken."""
+        return HEADER.unpack_from(self._memory)[FIELDS.index("served")]
+
+    def control(self, name: str) -> int:
+        """The value of a control."""
+        return CONTROL.unpack_from(self._memory, self._place(name))[4]
+
+    def make_deaf(self, name: str) -> None:
+        """The control keeps its value whatever it is told."""
+        id, _, *rest = CONTROL.unpack_from(self._memory, self._place(name))
+        CONTROL.pack_into(self._memory, self._place(name), id, 1, *rest)
+
+    def _place(self, name: str) -> int:
+        return HEADER.size + CONTROL.size * self._places[name]
+
+
+def _encoded(image: np.ndarray, fourcc: str) -> bytes:
+    if fourcc == "MJPG":
+        return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes()
+    return cv2.cvtColor(image, cv2.COLOR_BGR2YUV_YUYV).tobytes()

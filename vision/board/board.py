@@ -1,0 +1,125 @@
+"""A flat board of known squares."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+
+from interfaces.errors import ConfigError
+from interfaces.records import FloatArray
+
+Pattern = Literal["charuco", "chessboard"]
+
+MARKER_SHARE = 0.75
+_SIZES = (50, 100, 250, 1000)
+_DICTIONARY = re.compile(r"(?:[4-7]X[4-7]_(?:50|100|250|1000)|ARUCO_ORIGINAL|APRILTAG_(?:16h5|25h9|36h10|36h11))")
+
+
+@dataclass(frozen=True)
+class Board:
+    """Squares of a chessboard, with an ArUco marker in each white one where the pattern is `charuco`.
+
+    The board's frame: origin in the outer corner of the upper left square, which is black, x along the rows to the
+    right, y down, z into the board.
+
+    Attributes:
+        columns, rows: number of squares.
+        square_m: side of a square [m].
+        marker_m: side of a marker's black frame [m]; None: 0.75 of a square.
+        dictionary: name of the markers' dictionary as OpenCV has it, without DICT_; None: the smallest one of 4×4 bits.
+        pattern: `chessboard` has no markers: the whole of it has to be in view.
+
+    Raises:
+        ConfigError: such a board there is not.
+    """
+
+    columns: int = 8
+    rows: int = 6
+    square_m: float = 0.030
+    marker_m: float | None = None
+    dictionary: str | None = None
+    pattern: Pattern = "charuco"
+
+    def __post_init__(self) -> None:
+        if not (3 <= self.columns <= 40 and 3 <= self.rows <= 40):
+            raise ConfigError(f"a board of {self.columns}x{self.rows} squares", remedy="Take 3 to 40 squares each way")
+        if not 0.001 <= self.square_m <= 1.0:
+            raise ConfigError(f"squares of {1e3 * self.square_m:g} mm", remedy="Take 1 to 1000 mm")
+        if self.marker_m is not None and not 0.3 * self.square_m <= self.marker_m <= 0.9 * self.square_m:
+            raise ConfigError(
+                f"markers of {1e3 * self.marker_m:g} mm in squares of {1e3 * self.square_m:g} mm",
+                remedy="Take 0.3 to 0.9 of a square: corners need white around them",
+            )
+        if self.dictionary is not None and not _DICTIONARY.fullmatch(self.dictionary):
+            raise ConfigError(
+                f"there is no dictionary {self.dictionary!r}", remedy="Take one as in 4X4_50, 6X6_250, APRILTAG_36h11"
+            )
+        if self.pattern == "charuco" and len(self.marker_squares) > marker_count(self.dictionary_name):
+            raise ConfigError(
+                f"{len(self.marker_squares)} markers are needed, {self.dictionary_name} has "
+                f"{marker_count(self.dictionary_name)}",
+                remedy="Take fewer squares or a larger dictionary",
+            )
+
+    @property
+    def size_m(self) -> tuple[float, float]:
+        """Width and height over all squares [m]."""
+        return self.columns * self.square_m, self.rows * self.square_m
+
+    @property
+    def marker_side_m(self) -> float:
+        """Side of a marker's black frame [m]."""
+        return MARKER_SHARE * self.square_m if self.marker_m is None else self.marker_m
+
+    @property
+    def dictionary_name(self) -> str:
+        """Name of the dictionary as OpenCV has it, without DICT_."""
+        if self.dictionary is not None:
+            return self.dictionary
+        needed = len(self.marker_squares)
+        return f"4X4_{next((size for size in _SIZES if size >= needed), _SIZES[-1])}"
+
+    @cached_property
+    def marker_squares(self) -> list[tuple[int, int]]:
+        """Column and row of the white squares, in the order of the markers' numbers."""
+        return [(c, r) for r in range(self.rows) for c in range(self.columns) if (c + r) % 2 == 1]
+
+    @cached_property
+    def corners_m(self) -> FloatArray:
+        """Where four squares meet, in the order of the corners' numbers, shape (n, 3) [m], z = 0."""
+        c, r = np.meshgrid(np.arange(1, self.columns), np.arange(1, self.rows))
+        return np.asarray(self.square_m * np.stack([c.ravel(), r.ravel(), np.zeros(c.size)], axis=1), dtype=np.float64)
+
+    @property
+    def name(self) -> str:
+        """What it is, in words."""
+        squares = f"{self.columns}x{self.rows} squares of {1e3 * self.square_m:g} mm"
+        return f"{squares}, {self.dictionary_name}" if self.pattern == "charuco" else f"{squares}, plain"
+
+    def opencv(self) -> Any:
+        """The same board as OpenCV's."""
+        return cv2.aruco.CharucoBoard(
+            (self.columns, self.rows), self.square_m, self.marker_side_m, dictionary(self.dictionary_name)
+        )
+
+
+def dictionary(name: str) -> Any:
+    """OpenCV's dictionary of that name, without DICT_."""
+    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{name}"))
+
+
+def marker_count(name: str) -> int:
+    """How many markers a dictionary has."""
+    return len(dictionary(name).bytesList)
+
+
+def marker_bits(board: Board, number: int) -> FloatArray:
+    """The cells of a marker with its black frame of one cell, shape (cells, cells), 1 white and 0 black."""
+    cells = int(dictionary(board.dictionary_name).markerSize) + 2
+    image = cv2.aruco.generateImageMarker(dictionary(board.dictionary_name), number, cells)
+    return np.asarray(image > 127, dtype=np.float64)

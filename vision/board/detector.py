@@ -1,0 +1,149 @@
+"""Finds a board's corners in an image, or says why there are none."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from interfaces.records import FloatArray, ImageArray
+
+from .board import Board, dictionary
+from .exposure import image_fault
+from .refine import refined
+from .sharpness import blur_px
+from .squares import squares_seen
+
+IntArray = NDArray[np.int64]
+Why = Literal["dark", "over_exposed", "blurred", "other_dictionary", "other_squares", "not_found"]
+
+_LEAST_CORNERS = 6
+# A corner's place is known to a small part of its edges' width; from here on it gets too large a part.
+_MOST_BLUR_PX = 2.5
+_FAMILIES = ("4X4_1000", "5X5_1000", "6X6_1000", "7X7_1000", "APRILTAG_36h11", "ARUCO_ORIGINAL")
+
+
+@dataclass(frozen=True)
+class Corners:
+    """A board's corners in one image.
+
+    Attributes:
+        numbers: which of the board's corners, shape (n,), increasing.
+        px: where they are, shape (n, 2) [px].
+        blur_px: 1-sigma of the edges' blur in the blurrier direction [px].
+    """
+
+    numbers: IntArray
+    px: FloatArray
+    blur_px: float = 0.0
+
+    def __len__(self) -> int:
+        return len(self.numbers)
+
+
+@dataclass(frozen=True)
+class NotFound:
+    """Why an image shows no usable board.
+
+    Attributes:
+        why: the kind of reason.
+        text: in words, with what to do.
+    """
+
+    why: Why
+    text: str
+
+
+class BoardDetector:
+    """Finds one board."""
+
+    def __init__(self, board: Board) -> None:
+        """Prepare OpenCV's detector of this board."""
+        self.board = board
+        self._charuco = None if board.pattern == "chessboard" else cv2.aruco.CharucoDetector(board.opencv())
+
+    def find(self, image: ImageArray) -> Corners | NotFound:
+        """The board's corners in `image`, shape (height, width, 3) BGR or (height, width)."""
+        grey = image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
+        found = self._plain(grey) if self._charuco is None else self._marked(grey)
+        if isinstance(found, NotFound):
+            fault = image_fault(grey)
+            return found if fault is None else NotFound(*fault)
+        blur = blur_px(grey, self.board, found.numbers, found.px)
+        if blur > _MOST_BLUR_PX:
+            text = f"blurred: edges have a 1-sigma of {blur:.1f} px. Hold the board still, focus, shorten the exposure"
+            return NotFound("blurred", text)
+        return Corners(found.numbers, found.px, blur)
+
+    def _marked(self, grey: ImageArray) -> Corners | NotFound:
+        px, numbers, marker_px, marker_numbers = self._charuco.detectBoard(grey)  # pyright: ignore
+        markers = [] if marker_numbers is None else [int(number) for number in np.ravel(marker_numbers)]
+        if len(markers) >= 3:
+            seen = squares_seen(
+                markers, [np.reshape(each, (4, 2)).astype(np.float64) for each in marker_px], self.board
+            )
+            if seen is not None:
+                wanted = f"{self.board.columns}x{self.board.rows}"
+                text = f"the board has {seen} squares, not {wanted}. Give --squares {seen}, or take the right board"
+                if seen == wanted:
+                    text = "the markers are not where this board has them: mirrored, bent, or not made by this program"
+                return NotFound("other_squares", text)
+        if numbers is None or len(numbers) < _LEAST_CORNERS:
+            return self._nothing(grey, len(markers))
+        order = np.argsort(np.ravel(numbers))
+        rough = np.ravel(numbers)[order].astype(np.int64), np.reshape(px, (-1, 2))[order].astype(np.float64)
+        found = refined(grey, self.board, *rough)
+        return Corners(*found) if len(found[0]) >= _LEAST_CORNERS else self._nothing(grey, len(markers))
+
+    def _nothing(self, grey: ImageArray, markers: int) -> NotFound:
+        if markers:
+            return NotFound("not_found", f"too little of the board: {markers} of its markers. Bring it into view")
+        other = _other_dictionary(grey, self.board.dictionary_name)
+        if other is not None:
+            text = f"the markers are {other}, not {self.board.dictionary_name}. Give --dictionary, or the right board"
+            return NotFound("other_dictionary", text)
+        return NotFound("not_found", "no board. Bring it into view, larger, and not mirrored or in glare")
+
+    def _plain(self, grey: ImageArray) -> Corners | NotFound:
+        size = (self.board.columns - 1, self.board.rows - 1)
+        found, px = cv2.findChessboardCornersSB(grey, size, flags=cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY)
+        if not found:
+            text = f"no chessboard of {self.board.columns}x{self.board.rows} squares. All of it has to be in view"
+            return NotFound("not_found", text)
+        corners = _in_order(grey, np.reshape(px, (size[1], size[0], 2)).astype(np.float64), self.board)
+        return Corners(np.arange(len(self.board.corners_m)), corners.reshape(-1, 2))
+
+
+def _other_dictionary(grey: ImageArray, wanted: str) -> str | None:
+    """The family of markers that are in the image in the place of those wanted."""
+    families = [name for name in _FAMILIES if name.split("_")[0] != wanted.split("_")[0] or "APRILTAG" in name]
+    counts = {name: _marker_count(grey, name) for name in families if name != wanted}
+    best = max(counts, key=lambda name: counts[name])
+    return best if counts[best] >= 3 else None
+
+
+def _marker_count(grey: ImageArray, family: str) -> int:
+    detector: Any = cv2.aruco.ArucoDetector(dictionary(family))
+    numbers: Sequence[int] | None = detector.detectMarkers(grey)[1]
+    return 0 if numbers is None else len(numbers)
+
+
+def _in_order(grey: ImageArray, grid: FloatArray, board: Board) -> FloatArray:
+    """The corners (rows, columns, 2) turned so that the square up and left of the first one is black.
+
+    Where that cannot tell which way up the board is, the first corner is the one nearer to the image's upper left.
+    """
+    a, b = grid[0, -1] - grid[0, 0], grid[-1, 0] - grid[0, 0]
+    if a[0] * b[1] - a[1] * b[0] < 0:  # a mirrored order
+        grid = grid[:, ::-1]
+    if (board.columns + board.rows) % 2 == 0:
+        return grid if grid[0, 0].sum() <= grid[-1, -1].sum() else grid[::-1, ::-1]
+    inner = 0.25 * (grid[:-1, :-1] + grid[1:, :-1] + grid[:-1, 1:] + grid[1:, 1:])
+    pixels = np.clip(np.rint(inner).astype(int), 0, np.array(grey.shape)[::-1] - 1)
+    levels = grey[pixels[..., 1], pixels[..., 0]].astype(np.float64)
+    dark = np.add.outer(np.arange(levels.shape[0]), np.arange(levels.shape[1])) % 2 == 0
+    return grid if levels[dark].mean() < levels[~dark].mean() else grid[::-1, ::-1]

@@ -1,0 +1,113 @@
+"""Corners of a board with markers, to hundredths of a pixel.
+
+At a corner two edges cross. Every gradient on them is at right angles to the line to the corner, which gives the corner
+as a least-squares solution (Förstner & Gülch 1987; OpenCV's cornerSubPix). What disturbs that are the markers' edges.
+So the pixels are chosen in the board's own directions: a cross of two strips along the edges, which markers leave
+white. A square window has to be so small, where squares are seen aslant, that half of the edges are lost.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from interfaces.records import FloatArray, ImageArray
+
+from .board import Board
+
+IntArray = NDArray[np.int64]
+
+_REACH = 0.35  # of a square: how far along the edges
+_NEIGHBOURS = 1.6  # squares: what tells the board's directions at a corner
+_ITERATIONS = 8
+_CONVERGED_PX = 1e-3
+_MOST_MOVED = 0.2  # of a square
+_LEAST_STRIP_PX = 1.0
+_BLURRED_PX = 1.5  # beside an edge: what gradients mix in
+_BORDER_PX = 2.0
+_MOST_REACH_PX = 40
+_MOST_CONDITION = 1e4
+
+
+def refined(grey: ImageArray, board: Board, numbers: IntArray, px: FloatArray) -> tuple[IntArray, FloatArray]:
+    """The corners, moved to where their edges cross; those are left out of which this cannot be told.
+
+    Args:
+        grey: the image, shape (height, width).
+        numbers, px: the corners roughly, shapes (n,) and (n, 2).
+    """
+    levels = np.asarray(grey, dtype=np.float64)
+    both = [cv2.Scharr(levels, cv2.CV_64F, *axis) for axis in ((1, 0), (0, 1))]
+    slopes = np.asarray(np.stack(both, axis=-1) / 32.0, dtype=np.float64)
+    frames = _frames(board, numbers, px)
+    usable = np.isfinite(frames).all(axis=(1, 2)) & (np.abs(np.linalg.det(np.nan_to_num(frames))) > 1.0)
+    numbers, px, frames = numbers[usable], px[usable], frames[usable]
+    moved = _crossings(slopes, px, frames, board)
+    squares = np.linalg.norm(np.linalg.solve(frames, (moved - px)[..., None])[..., 0], axis=1)
+    size = np.array([levels.shape[1], levels.shape[0]])
+    inside = ((moved > _BORDER_PX) & (moved < size - 1 - _BORDER_PX)).all(axis=1)
+    kept = inside & (squares < _MOST_MOVED)
+    return numbers[kept], moved[kept]
+
+
+def _frames(board: Board, numbers: IntArray, px: FloatArray) -> FloatArray:
+    """What one square to the right and one down are in pixels at each corner, as columns, shape (n, 2, 2).
+
+    Not a number where nothing tells.
+    """
+    places = board.corners_m[numbers, :2] / board.square_m
+    H, _ = cv2.findHomography(places, px, 0)
+    found = np.full((len(px), 2, 2), np.nan)
+    for k, place in enumerate(places):
+        offsets = places - place
+        near = np.max(np.abs(offsets), axis=1) < _NEIGHBOURS
+        model = offsets[near] - offsets[near].mean(axis=0)
+        if np.linalg.matrix_rank(model) < 2:
+            if H is None:
+                continue
+            steps = place + 0.5 * np.array([[-1.0, 0.0], [1.0, 0.0], [0.0, -1.0], [0.0, 1.0]])
+            seen = cv2.perspectiveTransform(steps[:, None], H)[:, 0]
+            found[k] = np.column_stack([seen[1] - seen[0], seen[3] - seen[2]])
+            continue
+        found[k] = np.linalg.lstsq(model, px[near] - px[near].mean(axis=0), rcond=None)[0].T
+    return found
+
+
+def _crossings(slopes: FloatArray, start: FloatArray, frames: FloatArray, board: Board) -> FloatArray:
+    """Where the edges cross near `start`, shape (n, 2) [px]; not a number where nothing tells."""
+    into_squares = np.linalg.inv(frames)
+    # What is left white of a square beside its marker.
+    strip = 0.5 * (1.0 - board.marker_side_m / board.square_m)
+    squares_a_px = np.linalg.norm(into_squares, axis=2)
+    strip_px = strip / squares_a_px
+    half_widths = np.maximum(strip_px - _BLURRED_PX, np.minimum(strip_px, _LEAST_STRIP_PX)) * squares_a_px
+    reach = min(int(np.ceil(_REACH * np.abs(frames).sum(axis=2).max(initial=0.0))) + 1, _MOST_REACH_PX)
+    window = np.stack(np.meshgrid(np.arange(-reach, reach + 1), np.arange(-reach, reach + 1)), axis=-1).reshape(-1, 2)
+    padded = np.pad(slopes, ((reach, reach), (reach, reach), (0, 0)))
+    limits = np.array([slopes.shape[1], slopes.shape[0]]) - 1
+    at = start
+    for _ in range(_ITERATIONS):
+        middle = np.clip(np.nan_to_num(np.rint(at)), 0, limits).astype(int)
+        p = (middle[:, None] + window) - at[:, None]
+        pixels = middle[:, None] + window + reach
+        g = padded[pixels[..., 1], pixels[..., 0]]
+        weights = _cross(np.abs(np.einsum("nij,nkj->nki", into_squares, p)), half_widths[:, None])
+        weighed = g * weights[..., None]
+        G = np.einsum("nki,nkj->nij", weighed, g)
+        # Edges of one direction alone tell no crossing.
+        told = np.linalg.cond(G) < _MOST_CONDITION
+        h = np.einsum("nki,nk->ni", weighed, np.einsum("nki,nki->nk", g, p))
+        step = np.full_like(at, np.nan)
+        step[told] = np.linalg.solve(G[told], h[told][..., None])[..., 0]
+        at = at + step
+        if np.nanmax(np.abs(step), initial=0.0) < _CONVERGED_PX:
+            break
+    return at
+
+
+def _cross(squares: FloatArray, half_widths: FloatArray) -> FloatArray:
+    """Weights of places (..., 2) [squares from the corner]: of a strip along each edge, fading at its end and sides."""
+    fade = np.clip((_REACH - squares) / 0.12, 0.0, 1.0)
+    within = np.clip((half_widths - squares) / (0.4 * half_widths), 0.0, 1.0)
+    return np.maximum(within[..., 1] * fade[..., 0], within[..., 0] * fade[..., 1])

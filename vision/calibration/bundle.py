@@ -1,0 +1,201 @@
+"""The joint least-squares problem of both eyes: lenses, the right eye's place, and the board's pose in every view."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from interfaces.records import FloatArray
+from vision.lens import Lens, Model
+from vision.rig import CalibrationError, split
+
+from .view import EYES, Eye, View
+
+_ITERATIONS = 60
+_CONVERGED = 1e-9  # share of the sum of squares that a step has to gain
+_FIRST_DAMPING = 1e-4
+_MOST_DAMPING = 1e12
+_POSE = 6
+
+
+@dataclass(frozen=True)
+class Bundle:
+    """A solution.
+
+    Attributes:
+        model: the lenses' model.
+        vector: the rig's parameters, as `StereoRig.vector` has them.
+        poses: the board's pose in the left eye's frame for each view, as rotation vector [rad] and position [m],
+            shape (views, 6).
+        residuals: of each view, seen minus expected, shape (corners, 2) [px], the left eye's before the right one's.
+        normal: the normal matrix of `vector` with the poses eliminated, for residuals of 1 px.
+    """
+
+    model: Model
+    vector: FloatArray
+    poses: FloatArray
+    residuals: tuple[FloatArray, ...]
+    normal: FloatArray
+
+    @property
+    def squares(self) -> float:
+        """Sum of squared residuals [px²]."""
+        return float(sum(np.sum(each**2) for each in self.residuals))
+
+    @property
+    def freedom(self) -> int:
+        """Image coordinates less unknowns."""
+        return sum(each.size for each in self.residuals) - len(self.vector) - self.poses.size
+
+    @property
+    def sigma_px(self) -> float:
+        """1-sigma of an image coordinate, as the residuals tell it [px]."""
+        return float(np.sqrt(self.squares / max(self.freedom, 1)))
+
+    def view_rms_px(self) -> FloatArray:
+        """RMS residual per image coordinate of each view [px]."""
+        return np.array([np.sqrt(np.mean(each**2)) for each in self.residuals])
+
+    def covariance(self) -> FloatArray:
+        """Of `vector`, to first order: the inverse normal matrix times the residuals' variance."""
+        scale = 1.0 / np.sqrt(np.diag(self.normal))
+        return self.sigma_px**2 * np.linalg.inv(self.normal * np.outer(scale, scale)) * np.outer(scale, scale)
+
+
+def solve(views: Sequence[View], corners_m: FloatArray, model: Model, vector: FloatArray, poses: FloatArray) -> Bundle:
+    """The least-squares solution from a start, by Levenberg and Marquardt's method.
+
+    Args:
+        corners_m: the board's corners, shape (n, 3) [m].
+        vector, poses: the start, as `Bundle` has them.
+
+    Raises:
+        CalibrationError: the views do not determine the parameters.
+    """
+    damping = _FIRST_DAMPING
+    linear = _linearised(views, corners_m, model, vector, poses)
+    for _ in range(_ITERATIONS):
+        while damping < _MOST_DAMPING:
+            step = linear.step(damping)
+            if step is not None:
+                stepped = _linearised(views, corners_m, model, vector + step[0], poses + step[1])
+                if stepped.squares <= linear.squares:
+                    break
+            damping *= 10.0
+        else:
+            break
+        gained = linear.squares - stepped.squares
+        vector, poses, linear = vector + step[0], poses + step[1], stepped
+        damping = max(0.1 * damping, 1e-12)
+        if gained <= _CONVERGED * linear.squares:
+            break
+    if not np.isfinite(linear.squares):
+        raise CalibrationError("the views do not determine the lenses. Take more views, tilted and all over the image")
+    return Bundle(model, vector, poses, tuple(linear.residuals), linear.reduced(0.0)[0])
+
+
+def view_pose(view: View, corners_m: FloatArray, model: Model, vector: FloatArray, start: FloatArray) -> Bundle:
+    """The best pose of the board in one view for a rig that is held fixed, from a start of shape (6,)."""
+    pose = start[None]
+    linear = _linearised([view], corners_m, model, vector, pose)
+    damping = _FIRST_DAMPING
+    for _ in range(_ITERATIONS):
+        H = linear.pose_normals[0]
+        step = np.linalg.solve(H + damping * np.diag(np.diag(H)), linear.pose_gradients[0])
+        stepped = _linearised([view], corners_m, model, vector, pose + step)
+        if stepped.squares > linear.squares:
+            damping *= 10.0
+            if damping > _MOST_DAMPING:
+                break
+            continue
+        gained = linear.squares - stepped.squares
+        pose, linear, damping = pose + step, stepped, 0.1 * damping
+        if gained <= _CONVERGED * linear.squares:
+            break
+    return Bundle(model, vector, pose, tuple(linear.residuals), linear.reduced(0.0)[0])
+
+
+def eye_of(
+    eye: Eye, model: Model, vector: FloatArray, pose: FloatArray
+) -> tuple[Lens, FloatArray, FloatArray, tuple[FloatArray, ...]]:
+    """Lens of an eye, the board's pose in its frame, and how that pose depends on the rig's and on the left eye's.
+
+    Args:
+        pose: the board's in the left eye's frame, shape (6,).
+    """
+    left, right, rotation, translation = split(model, vector)
+    if eye == "left":
+        return left, pose[:3], pose[3:], (np.zeros((6, 6)), np.eye(6))
+    composed = cv2.composeRT(pose[:3], pose[3:], rotation, translation)
+    r, t, r_r1, r_t1, r_r2, r_t2, t_r1, t_t1, t_r2, t_t2 = (np.asarray(each, dtype=np.float64) for each in composed)
+    by_rig = np.block([[r_r2, r_t2], [t_r2, t_t2]])
+    by_pose = np.block([[r_r1, r_t1], [t_r1, t_t1]])
+    return right, r.ravel(), t.ravel(), (by_rig, by_pose)
+
+
+@dataclass
+class _Linear:
+    """Residuals and normal equations at a point: of the rig, of each pose, and mixed."""
+
+    residuals: list[FloatArray]
+    normal: FloatArray
+    gradient: FloatArray
+    pose_normals: FloatArray
+    pose_gradients: FloatArray
+    mixed: FloatArray
+
+    @property
+    def squares(self) -> float:
+        return float(sum(np.sum(each**2) for each in self.residuals))
+
+    def reduced(self, damping: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Normal matrix and gradient of the rig with the poses eliminated, and the poses' normal matrices."""
+        poses = self.pose_normals + damping * self.pose_normals * np.eye(_POSE)
+        weighed = np.linalg.solve(poses, np.transpose(self.mixed, (0, 2, 1)))
+        normal = self.normal + damping * np.diag(np.diag(self.normal))
+        normal = normal - np.einsum("vij,vjk->ik", self.mixed, weighed)
+        gradient = self.gradient - np.einsum("vji,vj->i", weighed, self.pose_gradients)
+        return normal, gradient, poses
+
+    def step(self, damping: float) -> tuple[FloatArray, FloatArray] | None:
+        """The next step of rig and poses; None where the equations have no solution."""
+        try:
+            normal, gradient, poses = self.reduced(damping)
+            scale = 1.0 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
+            rig = scale * np.linalg.solve(normal * np.outer(scale, scale), scale * gradient)
+            left = self.pose_gradients - np.einsum("vij,i->vj", self.mixed, rig)
+            return rig, np.linalg.solve(poses, left[..., None])[..., 0]
+        except np.linalg.LinAlgError:
+            return None
+
+
+def _linearised(
+    views: Sequence[View], corners_m: FloatArray, model: Model, vector: FloatArray, poses: FloatArray
+) -> _Linear:
+    p, m = len(vector), len(views)
+    n = (p - _POSE) // 2
+    linear = _Linear([], np.zeros((p, p)), np.zeros(p), np.zeros((m, 6, 6)), np.zeros((m, 6)), np.zeros((m, p, 6)))
+    for k, (view, pose) in enumerate(zip(views, poses, strict=True)):
+        residuals = []
+        for eye in EYES:
+            corners = view.eye(eye)
+            if corners is None:
+                continue
+            lens, rotation, translation, (by_rig, by_pose) = eye_of(eye, model, vector, pose)
+            px, J_pose, J_lens = lens.project_posed(corners_m[corners.numbers], rotation, translation)
+            J = np.zeros((len(J_lens), p))
+            J[:, slice(0, n) if eye == "left" else slice(n, 2 * n)] = J_lens
+            J[:, 2 * n :] = J_pose @ by_rig
+            K = J_pose @ by_pose
+            residual = corners.px - px
+            residuals.append(residual)
+            linear.normal += J.T @ J
+            linear.gradient += J.T @ residual.ravel()
+            linear.pose_normals[k] += K.T @ K
+            linear.pose_gradients[k] += K.T @ residual.ravel()
+            linear.mixed[k] += J.T @ K
+        linear.residuals.append(np.concatenate(residuals))
+    return linear

@@ -1,0 +1,205 @@
+"""Two cameras' calibration from views of a board."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import cv2
+import numpy as np
+
+from interfaces.records import FloatArray
+from vision.board import Board
+from vision.lens import Model
+from vision.rig import CalibrationError, Made, StereoRig, split
+
+from .bundle import Bundle, solve
+from .guidance import Coverage
+from .held_out import HeldOut, held_out
+from .requirements import contradicts, lacking, misplaced, together, unsure
+from .start import start
+from .view import View
+
+ModelChoice = Literal["auto", "pinhole", "fisheye"]
+
+_OUTLIER_SPREADS = 8.0
+_OUTLIER_RATIO = 3.0
+_MOST_LEFT_OUT = 0.35
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What a calibration is made for.
+
+    Attributes:
+        image_size_px, serials: of the eyes.
+        date: ISO 8601 in UTC.
+        model: the lenses' model; `auto` takes fisheye where it foretells views better.
+        scale_sigma: 1-sigma of the board's size, as a share of it.
+        baseline_m: the baseline as measured by hand, to check against [m].
+    """
+
+    image_size_px: tuple[int, int]
+    serials: tuple[str, str]
+    date: str
+    model: ModelChoice = "auto"
+    scale_sigma: float = 0.001
+    baseline_m: float | None = None
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """A view that does not fit the others: its name, its RMS error and the median of the others' [px]."""
+
+    name: str
+    rms_px: float
+    usual_px: float
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """One lens model fitted to the views that fit it."""
+
+    views: tuple[View, ...]
+    left_out: tuple[LeftOut, ...]
+    bundle: Bundle
+    held_out: HeldOut
+
+
+@dataclass(frozen=True)
+class Calibrated:
+    """A calibration with what it was made of.
+
+    Attributes:
+        rig: the calibration.
+        fitted: the model that was chosen.
+        rivals_px: held-out error of each model that was tried [px].
+        coverage: what the views cover.
+    """
+
+    rig: StereoRig
+    board: Board
+    fitted: Fitted
+    rivals_px: dict[Model, float]
+    coverage: Coverage
+
+
+def calibrate(
+    views: Sequence[View], board: Board, asked: Asked, tell: Callable[[str], None] = lambda _: None
+) -> Calibrated:
+    """Lenses and places of two cameras.
+
+    Raises:
+        CalibrationError: it is not good enough, and why.
+    """
+    coverage = Coverage.of(views, board, asked.image_size_px)
+    if reasons := lacking(coverage):
+        raise CalibrationError(together(reasons))
+    models: tuple[Model, ...] = ("pinhole", "fisheye") if asked.model == "auto" else (asked.model,)
+    fits = _fits(views, board, asked.image_size_px, models, tell)
+    model = _chosen(fits)
+    rig = _rig(fits[model], board, asked)
+    reasons = unsure(rig)
+    if asked.baseline_m is not None and (reason := contradicts(rig, asked.baseline_m)) is not None:
+        reasons.append(reason)
+    if reasons:
+        raise CalibrationError(together(reasons))
+    rivals: dict[Model, float] = {each: found.held_out.rms_px for each, found in fits.items()}
+    return Calibrated(rig, board, fits[model], rivals, coverage)
+
+
+def _fits(
+    views: Sequence[View],
+    board: Board,
+    image_size_px: tuple[int, int],
+    models: Sequence[Model],
+    tell: Callable[[str], None],
+) -> dict[Model, Fitted]:
+    """What fits of the models; CalibrationError with the first one's reason when none does."""
+    fits: dict[Model, Fitted] = {}
+    refusals: list[CalibrationError] = []
+    for model in models:
+        tell(f"fitting {model} lenses to {len(views)} views")
+        try:
+            fits[model] = fit(views, board.corners_m, image_size_px, model)
+        except CalibrationError as error:
+            refusals.append(error)
+    if not fits:
+        raise refusals[0]
+    return fits
+
+
+def fit(views: Sequence[View], corners_m: FloatArray, image_size_px: tuple[int, int], model: Model) -> Fitted:
+    """One model's fit; views that do not fit the others are left out, the worst first.
+
+    Raises:
+        CalibrationError: the eyes are misplaced, the views do not determine the lenses, or too many are outliers.
+    """
+    kept = list(views)
+    left_out: list[LeftOut] = []
+    vector, poses = start(kept, corners_m, image_size_px, model)
+    while True:
+        bundle = solve(kept, corners_m, model, vector, poses)
+        worst = _outlier(bundle.view_rms_px())
+        if worst is None:
+            break
+        rms = bundle.view_rms_px()
+        left_out.append(LeftOut(kept.pop(worst).name, float(rms[worst]), float(np.median(rms))))
+        if len(left_out) > _MOST_LEFT_OUT * len(views):
+            raise CalibrationError(
+                f"{len(left_out)} of {len(views)} views do not fit the others, {left_out[0].name} with "
+                f"{left_out[0].rms_px:.1f} px the least. Is the board flat, held still, and are both images of one "
+                "instant?"
+            )
+        vector, poses = bundle.vector, np.delete(bundle.poses, worst, axis=0)
+    _require_places(model, bundle.vector)
+    return Fitted(tuple(kept), tuple(left_out), bundle, held_out(kept, corners_m, bundle))
+
+
+def _chosen(fits: dict[Model, Fitted]) -> Model:
+    """Pinhole, unless fisheye foretells views better that both have fitted."""
+    if len(fits) == 1:
+        return next(iter(fits))
+    shared = {view.name for view in fits["pinhole"].views} & {view.name for view in fits["fisheye"].views}
+    pinhole, fisheye = (_of(fits[model], shared) for model in ("pinhole", "fisheye"))
+    return "fisheye" if fisheye.is_better_than(pinhole) else "pinhole"
+
+
+def _of(fitted: Fitted, names: set[str]) -> HeldOut:
+    among = np.array([view.name in names for view in fitted.views])
+    return HeldOut(fitted.held_out.squares[among], fitted.held_out.freedom[among])
+
+
+def _outlier(rms_px: FloatArray) -> int | None:
+    """The view farthest from the usual, if it is too far."""
+    usual = float(np.median(rms_px))
+    spread = 1.4826 * float(np.median(np.abs(rms_px - usual)))
+    worst = int(np.argmax(rms_px))
+    limit = max(usual + _OUTLIER_SPREADS * spread, _OUTLIER_RATIO * usual)
+    return worst if rms_px[worst] > limit else None
+
+
+def _require_places(model: Model, vector: FloatArray) -> None:
+    _, _, rotation, translation = split(model, vector)
+    reason = misplaced(np.asarray(cv2.Rodrigues(rotation)[0], dtype=np.float64), translation)
+    if reason is not None:
+        raise CalibrationError(reason)
+
+
+def _rig(fitted: Fitted, board: Board, asked: Asked) -> StereoRig:
+    bundle = fitted.bundle
+    left, right, rotation, translation = split(bundle.model, bundle.vector)
+    # A board of another size makes all lengths as much longer, and nothing else.
+    covariance = bundle.covariance()
+    covariance[-3:, -3:] += asked.scale_sigma**2 * np.outer(translation, translation)
+    made = Made(
+        date=asked.date,
+        board=board.name,
+        views=len(fitted.views),
+        left_out=len(fitted.left_out),
+        reprojection_px=bundle.sigma_px,
+        held_out_px=fitted.held_out.rms_px,
+        scale_sigma=asked.scale_sigma,
+    )
+    return StereoRig(left, right, rotation, translation, asked.image_size_px, asked.serials, covariance, made)

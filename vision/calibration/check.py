@@ -1,0 +1,133 @@
+"""Whether a calibration still holds, from one look at the board."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.distance import pdist
+
+from interfaces.records import FloatArray
+from vision.board import Board
+from vision.rectified import Rectification
+from vision.rig import CalibrationError, StereoRig
+from vision.spread import covariance_of
+from vision.triangulated import triangulated
+
+from .view import View
+
+_LEAST_CORNERS = 8
+_SIGMAS = 4.0
+# What focus, warmth and a bent sheet of paper may do, besides what the covariance knows of.
+_FREE_ROWS_PX = 0.15
+_FREE_SQUARE = 0.002
+_STEP_PX = 1e-3
+
+
+@dataclass(frozen=True)
+class Check:
+    """What one look tells.
+
+    Attributes:
+        corners: how many both eyes saw.
+        epipolar_px: RMS difference of the rows at which the two rectified images show a corner [px].
+        rows_px, rows_sigma_px: mean of the differences, and what calibration and noise leave unsure of it [px].
+        roll_deg, roll_sigma_deg: how far one eye is turned about its line of sight, as the differences tell [deg].
+        square_m, square_sigma_m: the board's square as it is measured [m].
+        nominal_m: the board's square as it is [m].
+        wrong: what does not hold any more; empty when the calibration holds.
+    """
+
+    corners: int
+    epipolar_px: float
+    rows_px: float
+    rows_sigma_px: float
+    roll_deg: float
+    roll_sigma_deg: float
+    square_m: float
+    square_sigma_m: float
+    nominal_m: float
+    wrong: tuple[str, ...]
+
+    @property
+    def holds(self) -> bool:
+        """Whether the calibration still holds."""
+        return not self.wrong
+
+
+def check(rig: StereoRig, view: View, board: Board) -> Check:
+    """One look at the board with a calibration.
+
+    Raises:
+        CalibrationError: one of the eyes does not see enough of the board.
+    """
+    numbers, left, right = _shared(view)
+    if len(numbers) < _LEAST_CORNERS:
+        raise CalibrationError(
+            f"both eyes see {len(numbers)} corners of the board, at least {_LEAST_CORNERS} are needed. Hold it into "
+            "the middle of both images"
+        )
+    model = board.corners_m[numbers]
+    covariance = covariance_of(rig, lambda other: _figures(other, left, right, model))
+    covariance = covariance + rig.made.held_out_px**2 * _noise(rig, left, right, model)
+    # From focal lengths, radians and shares to what a person reads.
+    focal = Rectification(rig).calibration.focal_px
+    units = np.array([focal, np.degrees(1.0), board.square_m])
+    found = units * _figures(rig, left, right, model)
+    sigma = units * np.sqrt(np.diag(covariance))
+    return Check(
+        len(numbers),
+        focal * float(np.sqrt(np.mean(_rows(rig, left, right)[0] ** 2))),
+        *(float(each) for pair in zip(found, sigma, strict=True) for each in pair),
+        nominal_m=board.square_m,
+        wrong=tuple(_wrong(found, sigma, focal, rig.image_size_px[0], board.square_m)),
+    )
+
+
+def _shared(view: View) -> tuple[np.ndarray, FloatArray, FloatArray]:
+    if view.left is None or view.right is None:
+        empty = np.zeros((0, 2))
+        return np.zeros(0, dtype=np.int64), empty, empty
+    numbers, a, b = np.intersect1d(view.left.numbers, view.right.numbers, return_indices=True)
+    return numbers, view.left.px[a], view.right.px[b]
+
+
+def _rows(rig: StereoRig, left: FloatArray, right: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """By how much lower the right rectified image shows each corner, and where along the row, in focal lengths."""
+    rectification = Rectification(rig)
+    here, there = rectification.directions(left, 0), rectification.directions(right, 1)
+    return there[:, 1] - here[:, 1], there[:, 0]
+
+
+def _figures(rig: StereoRig, left: FloatArray, right: FloatArray, model: FloatArray) -> FloatArray:
+    """Mean difference of the rows, their slope along the rows [rad], and the board's size as measured, to its own."""
+    rows, at = _rows(rig, left, right)
+    along = at - at.mean()
+    seen, true = pdist(triangulated(rig, left, right)), pdist(model)
+    return np.array([rows.mean(), along @ rows / (along @ along), seen @ true / (true @ true)])
+
+
+def _noise(rig: StereoRig, left: FloatArray, right: FloatArray, model: FloatArray) -> FloatArray:
+    """Covariance of the figures for noise of 1 px in every image coordinate."""
+    px = np.concatenate([left, right])
+    slopes = []
+    for place in np.ndindex(px.shape):
+        moved = px.copy()
+        moved[place] += _STEP_PX
+        slopes.append(_figures(rig, moved[: len(left)], moved[len(left) :], model))
+    J = (np.array(slopes) - _figures(rig, left, right, model)) / _STEP_PX
+    return J.T @ J
+
+
+def _wrong(found: FloatArray, sigma: FloatArray, focal_px: float, width_px: int, nominal_m: float) -> list[str]:
+    rows_px, roll_deg, square_m = found.tolist()
+    free = np.array([_FREE_ROWS_PX, np.degrees(4.0 * _FREE_ROWS_PX / width_px), _FREE_SQUARE * nominal_m])
+    off = np.abs(found - np.array([0.0, 0.0, nominal_m])) > _SIGMAS * sigma + free
+    texts = (
+        f"rows are {rows_px:+.2f} px apart: a camera has been turned up or down by "
+        f"{np.degrees(abs(rows_px) / focal_px):.2f}°",
+        f"a camera has been turned about its line of sight by {abs(roll_deg):.2f}°",
+        f"a square of {1e3 * nominal_m:g} mm is measured as {1e3 * square_m:.2f} mm: a camera has been turned inwards "
+        "or outwards, moved or refocused, or this is another board",
+    )
+    return [text for text, is_off in zip(texts, off, strict=True) if is_off]

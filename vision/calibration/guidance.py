@@ -1,0 +1,139 @@
+"""Which views are there, and which is wanted next."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from interfaces.records import FloatArray
+from vision.board import Board, Corners
+from vision.lens import Lens
+
+from .start import pose_of
+from .view import EYES, Eye, View, all_px, seen_by
+
+GRID = (3, 3)
+_ROWS, _COLUMNS = ("upper", "middle", "lower"), ("left", "middle", "right")
+# Before anything is calibrated a webcam's usual focal length is taken, as a share of the image's width.
+_USUAL_FOCAL = 0.9
+_CORNERS_A_CELL = 8
+_TILT_DEG = 15.0
+_TILTED_EACH_WAY = 2
+_NEAR, _FAR = 0.55, 0.40  # the board's extent as a share of the image's
+WANTED_VIEWS = 20
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """What the views have covered.
+
+    Attributes:
+        stereo_views: views that both eyes saw.
+        cells: corners in each cell of a 3×3 grid, for each eye, shape (2, 3, 3).
+        tilts_deg: of the board in each stereo view about the image's upright and level axes, shape (n, 2), roughly:
+            right edge away and lower edge away are positive.
+        extents: of the board in each stereo view, as a share of the image.
+    """
+
+    stereo_views: int
+    cells: NDArray[np.int64]
+    tilts_deg: FloatArray
+    extents: FloatArray
+
+    @classmethod
+    def of(cls, views: Sequence[View], board: Board, image_size_px: tuple[int, int]) -> Coverage:
+        """What these views cover."""
+        stereo = [view for view in views if view.is_stereo]
+        left = seen_by(stereo, "left")
+        tilts = [rough_tilt_deg(corners, board, image_size_px) for corners in left]
+        extents = [extent(corners, image_size_px) for corners in left]
+        cells = np.array([cell_counts(all_px(views, eye), image_size_px) for eye in EYES])
+        return cls(len(stereo), cells, np.reshape(tilts, (-1, 2)), np.array(extents))
+
+    def covered(self, eye: Eye) -> NDArray[np.bool_]:
+        """Which cells of an eye's image have enough corners, shape (3, 3)."""
+        return self.cells[EYES.index(eye)] >= _CORNERS_A_CELL
+
+    @property
+    def largest_tilts_deg(self) -> FloatArray:
+        """Of each stereo view, shape (n,)."""
+        return np.hypot(self.tilts_deg[:, 0], self.tilts_deg[:, 1])
+
+    def missing(self) -> list[str]:
+        """What to show next, the most useful first; empty when nothing is missing."""
+        return [*self._tilts_missing(), *self._cells_missing(), *self._distances_missing(), *self._views_missing()]
+
+    @property
+    def progress(self) -> float:
+        """How much of what is wanted is there, 0 to 1."""
+        wanted = len(self._all_tilts()) + 2 * GRID[0] * GRID[1] + 2 + WANTED_VIEWS
+        lacking = len(self._tilts_missing()) + len(self._cells_missing()) + len(self._distances_missing())
+        return 1.0 - (lacking + max(WANTED_VIEWS - self.stereo_views, 0)) / wanted
+
+    def _all_tilts(self) -> list[tuple[str, NDArray[np.bool_]]]:
+        about_upright, about_level = self.tilts_deg[:, 0], self.tilts_deg[:, 1]
+        return [
+            ("tilt the board's right edge away from the cameras, by 30°", about_upright > _TILT_DEG),
+            ("tilt the board's left edge away from the cameras, by 30°", about_upright < -_TILT_DEG),
+            ("tilt the board's lower edge away from the cameras, by 30°", about_level > _TILT_DEG),
+            ("tilt the board's upper edge away from the cameras, by 30°", about_level < -_TILT_DEG),
+        ]
+
+    def _tilts_missing(self) -> list[str]:
+        return [text for text, tilted in self._all_tilts() if np.count_nonzero(tilted) < _TILTED_EACH_WAY]
+
+    def _cells_missing(self) -> list[str]:
+        return [
+            f"bring the board to the {cell_name(r, c)} of the {eye} image"
+            for eye in EYES
+            for r, c in np.argwhere(~self.covered(eye)).tolist()
+        ]
+
+    def _distances_missing(self) -> list[str]:
+        texts = []
+        if not np.any(self.extents > _NEAR):
+            texts.append("bring the board nearer, until it fills more than half of the image")
+        if not np.any(self.extents < _FAR):
+            texts.append("take the board further away, until it fills a third of the image")
+        return texts
+
+    def _views_missing(self) -> list[str]:
+        lacking = WANTED_VIEWS - self.stereo_views
+        return [f"{lacking} more views, tilted and anywhere"] if lacking > 0 else []
+
+
+def cell_name(row: int, column: int) -> str:
+    """As in "upper left"."""
+    return "middle" if (row, column) == (1, 1) else f"{_ROWS[row]} {_COLUMNS[column]}"
+
+
+def cell_counts(px: FloatArray, image_size_px: tuple[int, int]) -> NDArray[np.int64]:
+    """How many image points (n, 2) lie in each cell of the grid, rows first."""
+    rows = np.clip(px[:, 1] / image_size_px[1] * GRID[0], 0, GRID[0] - 1).astype(int)
+    columns = np.clip(px[:, 0] / image_size_px[0] * GRID[1], 0, GRID[1] - 1).astype(int)
+    counts = np.zeros(GRID, dtype=np.int64)
+    np.add.at(counts, (rows, columns), 1)
+    return counts
+
+
+def extent(corners: Corners, image_size_px: tuple[int, int]) -> float:
+    """How much of the image the corners span: the larger of both directions."""
+    return float(np.max(np.ptp(corners.px, axis=0) / np.array(image_size_px)))
+
+
+def rough_tilt_deg(corners: Corners, board: Board, image_size_px: tuple[int, int]) -> tuple[float, float]:
+    """How far the board is turned out of the image plane, as `Coverage` has it.
+
+    Not out of the plane square to the line of sight: parallel to the image plane a board is seen without perspective
+    wherever it is, and tells nothing of the focal length.
+    """
+    width, height = image_size_px
+    focal = _USUAL_FOCAL * width
+    lens = Lens("pinhole", (focal, focal), (0.5 * (width - 1), 0.5 * (height - 1)), (0.0,) * 5)
+    normal = cv2.Rodrigues(pose_of(corners, board.corners_m, lens)[:3])[0][:, 2]
+    right, lower = np.degrees(np.arcsin(-normal[:2] * np.sign(normal[2]))).tolist()
+    return right, lower

@@ -1,0 +1,62 @@
+"""How well a calibration foretells views that it was not made of."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from interfaces.records import FloatArray
+
+from .bundle import Bundle, solve, view_pose
+from .view import View
+
+_FOLDS = 10
+_POSE_FREEDOM = 6
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """Errors of each view when it was not fitted, its pose apart.
+
+    Attributes:
+        squares: sum of squared residuals of each view [px²].
+        freedom: image coordinates of each less those that its pose takes.
+    """
+
+    squares: FloatArray
+    freedom: NDArray[np.int64]
+
+    @property
+    def rms_px(self) -> float:
+        """RMS error per image coordinate [px]."""
+        return float(np.sqrt(self.squares.sum() / self.freedom.sum()))
+
+    @property
+    def view_rms_px(self) -> FloatArray:
+        """The same of each view."""
+        return np.sqrt(self.squares / self.freedom)
+
+    def is_better_than(self, other: HeldOut) -> bool:
+        """Whether views are foretold better than by `other`, in the logarithm by more than twice its standard error."""
+        gain = np.log(other.squares / self.squares)
+        return float(gain.mean()) > 2.0 * float(gain.std(ddof=1)) / np.sqrt(len(gain))
+
+
+def held_out(views: Sequence[View], corners_m: FloatArray, whole: Bundle) -> HeldOut:
+    """Cross-validation by views: a tenth of them is left out in turn and then foretold.
+
+    Args:
+        whole: the fit of all views, from which each part's fit starts.
+    """
+    groups = np.arange(len(views)) % min(_FOLDS, len(views))
+    squares = np.zeros(len(views))
+    for group in range(groups.max() + 1):
+        kept = np.flatnonzero(groups != group).tolist()
+        part = solve([views[k] for k in kept], corners_m, whole.model, whole.vector, whole.poses[kept])
+        for k in np.flatnonzero(groups == group).tolist():
+            squares[k] = view_pose(views[k], corners_m, whole.model, part.vector, whole.poses[k]).squares
+    freedom = np.array([2 * view.corner_count - _POSE_FREEDOM for view in views])
+    return HeldOut(squares, freedom)

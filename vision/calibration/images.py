@@ -1,0 +1,137 @@
+"""Pairs of images in files: which belong together, and reading them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from interfaces.records import ImageArray
+from vision.rig import CalibrationError
+
+_ENDINGS = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".webp"}
+_EYE = re.compile(r"(?<![a-z])(left|right|l|r)(?![a-z])", re.IGNORECASE)
+_WILDCARD = re.compile(r"(\*|\?|\[[^\]]*\])")
+
+
+@dataclass(frozen=True)
+class PairFiles:
+    """The files of one view: the same one twice where it shows both eyes side by side."""
+
+    name: str
+    left: Path
+    right: Path
+
+
+@dataclass(frozen=True, eq=False)
+class ImagePair:
+    """Both eyes' images of one instant, shape (height, width, 3) BGR each."""
+
+    name: str
+    left: ImageArray
+    right: ImageArray
+
+
+def pair_files(folder: Path, left: str | None, right: str | None, *, side_by_side: bool) -> list[PairFiles]:
+    """Which files of a folder belong together, in the order of their names.
+
+    Without patterns, left and right are told apart by `left`, `right`, `l` or `r` in the names of files or of their
+    folders; what else the names have is the view's.
+
+    Args:
+        left, right: patterns of the eyes' files, as in left*.png; equal texts for the star
+            belong together.
+
+    Raises:
+        CalibrationError: there is no such folder, or it has no pairs.
+    """
+    if not folder.is_dir():
+        raise CalibrationError(f"{folder}: there is no such folder")
+    if side_by_side:
+        files = _images(folder, "*")
+        pairs = [PairFiles(file.stem, file, file) for file in files]
+    elif left is not None and right is not None:
+        pairs = _matched(*({_varied(file, each): file for file in _images(folder, each)} for each in (left, right)))
+    else:
+        pairs = _matched(*_by_eye(folder))
+    if not pairs:
+        raise CalibrationError(
+            f"{folder}: no pairs of images. Name them left01.png and right01.png, or put them into folders left and "
+            "right; else give --left and --right, or --side-by-side"
+        )
+    return pairs
+
+
+def read_pairs(pairs: list[PairFiles], *, side_by_side: bool) -> Iterator[ImagePair]:
+    """The images, one pair after the other.
+
+    Raises:
+        CalibrationError: a file is no image, or the sizes differ.
+    """
+    first: tuple[str, tuple[int, int]] | None = None
+    for files in pairs:
+        left = _read(files.left)
+        right = left if side_by_side else _read(files.right)
+        if side_by_side:
+            half = left.shape[1] // 2
+            left, right = left[:, :half], left[:, half : 2 * half]
+        require_equal_sizes(files.name, left, right)
+        size = (left.shape[1], left.shape[0])
+        first = first or (files.name, size)
+        if size != first[1]:
+            raise CalibrationError(
+                f"{files.name} has {_size(size)}, {first[0]} has {_size(first[1])}: all images have to be of one size"
+            )
+        yield ImagePair(files.name, left, right)
+
+
+def require_equal_sizes(name: str, left: ImageArray, right: ImageArray) -> None:
+    """CalibrationError where the two eyes' images are of different sizes."""
+    if left.shape[:2] != right.shape[:2]:
+        sizes = [_size((image.shape[1], image.shape[0])) for image in (left, right)]
+        raise CalibrationError(
+            f"{name}: the left image has {sizes[0]}, the right one {sizes[1]}. Set both cameras to one resolution"
+        )
+
+
+def _size(size_px: tuple[int, int]) -> str:
+    return f"{size_px[0]}x{size_px[1]} pixels"
+
+
+def _images(folder: Path, pattern: str) -> list[Path]:
+    return sorted(file for file in folder.glob(pattern) if file.suffix.lower() in _ENDINGS)
+
+
+def _varied(file: Path, pattern: str) -> str:
+    """What a file's name has in the place of the stars and other wildcards of its pattern."""
+    parts = _WILDCARD.split(Path(pattern).name)
+    words = {"*": "(.*)", "?": "(.)"}
+    wild = "".join(words.get(part, f"({part})") if k % 2 else re.escape(part) for k, part in enumerate(parts))
+    found = re.fullmatch(wild, file.name)
+    return file.stem if found is None else "".join(found.groups())
+
+
+def _by_eye(folder: Path) -> tuple[dict[str, Path], dict[str, Path]]:
+    eyes: tuple[dict[str, Path], dict[str, Path]] = ({}, {})
+    for file in [*_images(folder, "*"), *_images(folder, "*/*")]:
+        name = file.relative_to(folder).as_posix()
+        found = _EYE.search(re.sub(r"[_\d]", " ", name))
+        if found is not None:
+            which = 0 if found[1].lower().startswith("l") else 1
+            eyes[which][name[: found.start()] + name[found.end() :]] = file
+    return eyes
+
+
+def _matched(left: dict[str, Path], right: dict[str, Path]) -> list[PairFiles]:
+    return [PairFiles(left[key].stem, left[key], right[key]) for key in sorted(left.keys() & right.keys())]
+
+
+def _read(file: Path) -> ImageArray:
+    image = cv2.imdecode(np.frombuffer(file.read_bytes(), np.uint8), cv2.IMREAD_COLOR) if file.stat().st_size else None
+    if image is None:
+        raise CalibrationError(f"{file}: no image that can be read. Remove the file, or take it anew")
+    return np.asarray(image, dtype=np.uint8)

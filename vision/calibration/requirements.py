@@ -1,0 +1,120 @@
+"""When views or a calibration are not good enough, and why."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from interfaces.records import FloatArray
+from vision.rig import StereoRig
+
+from .guidance import Coverage, cell_name
+from .view import EYES
+
+LEAST_VIEWS = 8
+_LEAST_CELLS = 6
+_TILTED_DEG = 10.0
+_LEAST_TILTED = 3
+_MOST_FOCAL_SIGMA = 0.005  # of the focal length
+_MOST_BASELINE_SIGMA = 0.005  # of the baseline
+_MOST_CENTRE_SIGMA = 0.01  # of the image's width
+_MOST_HELD_OUT = 0.0015  # of the image's width
+_MOST_TURNED_RAD = np.radians(45.0)
+_MOST_HAND_ERROR_M = 0.0015
+
+
+def lacking(coverage: Coverage) -> list[str]:
+    """What is wrong with the views, before anything is made of them."""
+    reasons = []
+    if coverage.stereo_views < LEAST_VIEWS:
+        reasons.append(
+            f"too few views: both eyes saw the board in {coverage.stereo_views}, at least {LEAST_VIEWS} are needed, "
+            "20 are good"
+        )
+    tilted = np.count_nonzero(coverage.largest_tilts_deg > _TILTED_DEG)
+    if coverage.stereo_views and tilted < _LEAST_TILTED:
+        reasons.append(
+            f"the board faces the cameras in all views{f' but {tilted}' if tilted else ''}: focal length and distance "
+            "cannot be told apart. Tilt it by 20° to 40°, each way"
+        )
+    for eye in EYES:
+        covered = coverage.covered(eye)
+        if np.count_nonzero(covered) < _LEAST_CELLS:
+            empty = ", ".join(cell_name(r, c) for r, c in np.argwhere(~covered).tolist())
+            reasons.append(f"the board was hardly ever in these parts of the {eye} image: {empty}")
+    return reasons
+
+
+def misplaced(R_right_left: FloatArray, translation_m: FloatArray) -> str | None:
+    """What is wrong with where the eyes are: exchanged, upside down, one above the other; None when nothing is.
+
+    Args:
+        R_right_left, translation_m: a point x of the left eye's frame is at R x + t in the right one's.
+    """
+    about_sight = abs(np.arctan2(R_right_left[1, 0], R_right_left[0, 0]))
+    if about_sight > np.pi - _MOST_TURNED_RAD:
+        return (
+            "one camera is upside down: the images are turned by "
+            f"{np.degrees(about_sight):.0f}° against each other. Turn that camera, or its images where it is configured"
+        )
+    if about_sight > _MOST_TURNED_RAD:
+        return f"one camera lies on its side: the images are turned by {np.degrees(about_sight):.0f}°. Turn it upright"
+    right_eye = -R_right_left.T @ translation_m
+    if abs(right_eye[0]) < np.max(np.abs(right_eye[1:])):
+        where = ", ".join(f"{1e3 * each:.0f}" for each in right_eye)
+        return f"the eyes are not side by side: the right one is at {where} mm (right, down, ahead) of the left one"
+    if right_eye[0] < 0.0:
+        return (
+            f"the cameras are swapped: the right one is {-1e3 * right_eye[0]:.0f} mm to the left of the left one. "
+            "Exchange left and right"
+        )
+    return None
+
+
+def unsure(rig: StereoRig) -> list[str]:
+    """What of a calibration is not determined well enough."""
+    reasons = []
+    width = rig.image_size_px[0]
+    if rig.made.held_out_px > _MOST_HELD_OUT * width:
+        reasons.append(
+            f"views that were not fitted are off by {rig.made.held_out_px:.2f} px, {_MOST_HELD_OUT * width:.2f} px is "
+            "the most. Is the board flat and held still, the right lens model chosen, focus fixed?"
+        )
+    sigma = dict(zip(rig.names, rig.sigma.tolist(), strict=True))
+    value = dict(zip(rig.names, rig.vector.tolist(), strict=True))
+    for eye in EYES:
+        focal = max(sigma[f"{eye}.f{axis}_px"] / value[f"{eye}.f{axis}_px"] for axis in "xy")
+        if focal > _MOST_FOCAL_SIGMA:
+            reasons.append(
+                f"the {eye} focal length is known to {focal:.1%} only. Take views with the board tilted more"
+            )
+        centre = max(sigma[f"{eye}.c{axis}_px"] for axis in "xy")
+        if centre > _MOST_CENTRE_SIGMA * width:
+            reasons.append(
+                f"the {eye} principal point is known to {centre:.1f} px only. Take tilted views near corners"
+            )
+    share = rig.baseline_sigma_m / rig.baseline_m
+    if share > _MOST_BASELINE_SIGMA:
+        reasons.append(
+            f"the baseline is known to {share:.1%} only. Take more views that both eyes see, near and tilted"
+        )
+    return reasons
+
+
+def contradicts(rig: StereoRig, baseline_m: float) -> str | None:
+    """What to say where the baseline that was measured by hand is not the calibrated one; None where it is."""
+    allowed = np.hypot(3.0 * rig.baseline_sigma_m, _MOST_HAND_ERROR_M)
+    ratio = baseline_m / rig.baseline_m
+    if abs(baseline_m - rig.baseline_m) <= allowed:
+        return None
+    return (
+        f"the baseline is {1e3 * rig.baseline_m:.2f} ± {2e3 * rig.baseline_sigma_m:.2f} mm if a square is what was "
+        f"said; by hand it is {1e3 * baseline_m:.2f} mm, which would make the squares {ratio:.1%} of their size. Was "
+        "the board scaled in printing? Measure the ruler on it and give --ruler-mm"
+    )
+
+
+def together(reasons: Sequence[str]) -> str:
+    """The reasons as one message."""
+    return reasons[0] if len(reasons) == 1 else "".join(f"\n- {reason}" for reason in reasons)

@@ -1,0 +1,126 @@
+"""Where the joint fit begins: each eye by itself, then the right eye's place from all views of both."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from interfaces.records import FloatArray
+from vision.board import Corners
+from vision.lens import DISTORTION_NAMES, Lens, Model
+from vision.rig import CalibrationError
+
+from .view import EYES, Eye, View, seen_by
+
+# Of the image's width: the focal lengths that a fisheye lens is tried with.
+_FISHEYE_FOCALS = (0.25, 0.35, 0.5, 0.7, 1.0)
+_LEAST_CORNERS = 6
+
+
+def start(
+    views: Sequence[View], corners_m: FloatArray, image_size_px: tuple[int, int], model: Model
+) -> tuple[FloatArray, FloatArray]:
+    """The rig's parameters and the board's pose in the left eye's frame in each view, shape (views, 6).
+
+    Raises:
+        CalibrationError: no two views were seen by both eyes, or OpenCV finds no lens.
+    """
+    lenses = {eye: _lens(seen_by(views, eye), corners_m, image_size_px, model, eye) for eye in EYES}
+    poses = {
+        eye: [None if (seen := view.eye(eye)) is None else pose_of(seen, corners_m, lenses[eye]) for view in views]
+        for eye in EYES
+    }
+    rotation, translation = _between(poses["left"], poses["right"])
+    in_left = [
+        left if left is not None else _through(right, rotation, translation)
+        for left, right in zip(poses["left"], poses["right"], strict=True)
+    ]
+    vector = np.concatenate([lenses["left"].vector, lenses["right"].vector, rotation.as_rotvec(), translation])
+    return vector, np.array(in_left)
+
+
+def pose_of(seen: Corners, corners_m: FloatArray, lens: Lens) -> FloatArray:
+    """The board's pose in an eye's frame: rotation vector [rad] and position [m], shape (6,)."""
+    model = corners_m[seen.numbers]
+    directions = lens.directions(seen.px)
+    _, rotations, translations, _ = cv2.solvePnPGeneric(
+        model, directions[:, None], np.eye(3), np.zeros(5), flags=cv2.SOLVEPNP_IPPE
+    )
+    found = [
+        np.concatenate([r.ravel(), t.ravel()], dtype=np.float64) for r, t in zip(rotations, translations, strict=True)
+    ]
+    return min(found, key=lambda pose: float(np.sum((lens.project_posed(model, pose[:3], pose[3:])[0] - seen.px) ** 2)))
+
+
+def _lens(seen: Sequence[Corners], corners_m: FloatArray, size_px: tuple[int, int], model: Model, eye: Eye) -> Lens:
+    usable = [corners for corners in seen if len(corners) >= _LEAST_CORNERS]
+    if len(usable) < 3:
+        raise CalibrationError(f"the {eye} eye saw the board in {len(usable)} views. Take at least 3, better 20")
+    if model == "fisheye":
+        return min(
+            (_fisheye(usable, corners_m, size_px, share) for share in _FISHEYE_FOCALS), key=lambda each: each[1]
+        )[0]
+    try:
+        _, matrix, distortion, _, _ = cv2.calibrateCamera(
+            [corners_m[each.numbers].astype(np.float32) for each in usable],
+            [each.px.astype(np.float32) for each in usable],
+            size_px,
+            np.eye(3),
+            np.zeros(5),
+        )
+    except cv2.error as error:
+        raise CalibrationError(
+            f"the {eye} eye's views do not determine its lens. Tilt the board in some of them, by 20° and more"
+        ) from error
+    return Lens(
+        "pinhole",
+        (float(matrix[0, 0]), float(matrix[1, 1])),
+        (float(matrix[0, 2]), float(matrix[1, 2])),
+        tuple(np.ravel(distortion)[: len(DISTORTION_NAMES["pinhole"])].tolist()),
+    )
+
+
+def _fisheye(
+    seen: Sequence[Corners], corners_m: FloatArray, size_px: tuple[int, int], share: float
+) -> tuple[Lens, float]:
+    """An undistorted fisheye lens of a focal length, and how far corners are from where it has them [px]."""
+    focal = share * size_px[0]
+    centre = (0.5 * (size_px[0] - 1), 0.5 * (size_px[1] - 1))
+    lens = Lens("fisheye", (focal, focal), centre, (0.0,) * len(DISTORTION_NAMES["fisheye"]))
+    try:
+        off = [
+            np.linalg.norm(
+                lens.project_posed(corners_m[each.numbers], *np.split(pose_of(each, corners_m, lens), 2))[0] - each.px,
+                axis=1,
+            )
+            for each in seen
+        ]
+    except (cv2.error, np.linalg.LinAlgError, ValueError):
+        return lens, np.inf
+    return lens, float(np.median(np.concatenate(off)))
+
+
+def _between(left: Sequence[FloatArray | None], right: Sequence[FloatArray | None]) -> tuple[Rotation, FloatArray]:
+    """The left eye's pose in the right one's frame: what most views agree on."""
+    turns, places = [], []
+    for a, b in zip(left, right, strict=True):
+        if a is None or b is None:
+            continue
+        turn = Rotation.from_rotvec(b[:3]) * Rotation.from_rotvec(a[:3]).inv()
+        turns.append(turn)
+        places.append(b[3:] - turn.apply(a[3:]))
+    if len(turns) < 2:
+        raise CalibrationError(f"both eyes saw the board in {len(turns)} views. Hold it where both see it")
+    apart = [np.median([(turn * other.inv()).magnitude() for other in turns]) for turn in turns]
+    return turns[int(np.argmin(apart))], np.median(places, axis=0)
+
+
+def _through(right: FloatArray | None, rotation: Rotation, translation: FloatArray) -> FloatArray:
+    """The board's pose in the left eye's frame, of that in the right one's."""
+    if right is None:
+        raise CalibrationError("a view that neither eye saw")
+    turn = rotation.inv() * Rotation.from_rotvec(right[:3])
+    return np.concatenate([turn.as_rotvec(), rotation.inv().apply(right[3:] - translation)])

@@ -1,0 +1,52 @@
+"""One look of both eyes at the board."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from interfaces.records import FloatArray
+from vision.board import Corners
+
+Eye = Literal["left", "right"]
+EYES: tuple[Eye, Eye] = ("left", "right")
+
+
+@dataclass(frozen=True)
+class View:
+    """The board's corners in both eyes' images of one instant; one eye's may be missing.
+
+    Attributes:
+        name: of the images.
+    """
+
+    name: str
+    left: Corners | None
+    right: Corners | None
+
+    def eye(self, eye: Eye) -> Corners | None:
+        """What that eye saw."""
+        return self.left if eye == "left" else self.right
+
+    @property
+    def is_stereo(self) -> bool:
+        """Whether both eyes saw the board."""
+        return self.left is not None and self.right is not None
+
+    @property
+    def corner_count(self) -> int:
+        """Corners in both images together."""
+        return sum(len(corners) for corners in (self.left, self.right) if corners is not None)
+
+
+def seen_by(views: Sequence[View], eye: Eye) -> list[Corners]:
+    """What one eye saw of all views."""
+    return [corners for view in views if (corners := view.eye(eye)) is not None]
+
+
+def all_px(views: Sequence[View], eye: Eye) -> FloatArray:
+    """All corners that one eye saw, shape (n, 2) [px]."""
+    return np.concatenate([np.zeros((0, 2)), *(corners.px for corners in seen_by(views, eye))])

@@ -1,0 +1,1 @@
+"""Cameras: devices, image folders and films as `interfaces.protocols.StereoEyes`; see docs/cameras.md."""

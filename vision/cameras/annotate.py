@@ -1,0 +1,136 @@
+"""What the tracker sees and makes of it, drawn into the images."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from interfaces.camera import StereoCalibration
+from interfaces.records import FloatArray, ImageArray, MarkerFix, MarkerMiss, Reason, StereoFrame
+from vision.blob import Region, find_patches, measure
+from vision.colour import ColourGate
+from vision.config import VisionConfig
+from vision.sphere import Pinhole
+
+GREEN, YELLOW, RED, BLACK = (80, 220, 80), (0, 220, 255), (110, 110, 255), (0, 0, 0)
+FONT, LETTERS, LINE_PX = cv2.FONT_HERSHEY_SIMPLEX, 0.5, 18
+SUBPIXEL_BITS = 4
+MAGNIFIED = 10  # the difference of the rows, which is a fraction of a pixel
+
+WORDS = {
+    Reason.NO_MARKER: "no marker",
+    Reason.AT_BORDER: "at the border",
+    Reason.OCCLUDED: "no whole disc",
+    Reason.EPIPOLAR: "rows differ",
+    Reason.SIZE_MISMATCH: "sizes differ",
+    Reason.AMBIGUOUS: "more than one fits",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Sight:
+    """One patch of the marker's colour in one eye.
+
+    Attributes:
+        centre_px, radius_px: of the disc; roughly of the patch where it is none.
+        reason: why it is no disc, or None.
+    """
+
+    centre_px: tuple[float, float]
+    radius_px: float
+    reason: Reason | None
+
+
+class Annotator:
+    """Draws frames of one camera."""
+
+    def __init__(self, calibration: StereoCalibration, config: VisionConfig) -> None:
+        self._calibration, self._config = calibration, config
+        self._gate = ColourGate(config.band)
+        self._eye = Pinhole(calibration.focal_px, calibration.principal_point_px)
+        width, height = calibration.image_size_px
+        self._whole = Region(0, 0, width, height)
+
+    def sights(self, image: ImageArray) -> list[Sight]:
+        """Everything of the marker's colour in one eye's image, whether it is the marker or not."""
+        found = []
+        for patch in find_patches(image, self._whole, self._gate, self._config):
+            outcome = measure(image, patch, self._eye, self._gate, self._config)
+            if isinstance(outcome, Reason):
+                found.append(Sight(_pair(patch.centre_px), patch.radius_px, outcome))
+            else:
+                found.append(Sight(_pair(outcome.centre_px), outcome.radius_px, None))
+        return found
+
+    def drawn(self, frame: StereoFrame, seen: MarkerFix | MarkerMiss) -> ImageArray:
+        """Both images side by side (height, 2 width, 3), with what was seen in them."""
+        eyes = [np.ascontiguousarray(image).copy() for image in (frame.left, frame.right)]
+        sights = [self.sights(image) for image in (frame.left, frame.right)]
+        for place, eye in enumerate(eyes):
+            for sight in sights[place]:
+                self._draw_sight(eye, sight)
+            if isinstance(seen, MarkerMiss):
+                for sight in sights[1 - place]:  # where the other eye's discs should be in this one
+                    if sight.reason is None:
+                        _row(eye, sight.centre_px[1], YELLOW)
+        if isinstance(seen, MarkerFix):
+            self._draw_fix(eyes, seen)
+        joined = np.hstack(eyes)
+        _write(joined, self._headline(frame, seen), (6, LINE_PX), GREEN if isinstance(seen, MarkerFix) else RED)
+        return joined
+
+    def _draw_sight(self, image: ImageArray, sight: Sight) -> None:
+        colour = YELLOW if sight.reason is None else RED
+        _circle(image, sight.centre_px, sight.radius_px, colour)
+        if sight.reason is not None:
+            at = round(sight.centre_px[0] - sight.radius_px), round(sight.centre_px[1] - sight.radius_px) - 6
+            _write(image, WORDS.get(sight.reason, sight.reason.replace("_", " ")), at, RED)
+
+    def _draw_fix(self, eyes: list[ImageArray], fix: MarkerFix) -> None:
+        """The ball as it would be seen at the fix, and its row in the other eye."""
+        radius_px = self._calibration.focal_px * self._config.radius_m / float(fix.x[2])
+        if fix.centres_px is None:
+            return
+        ul, vl, ur, vr = fix.centres_px
+        for image, own, other in ((eyes[0], (ul, vl), vr), (eyes[1], (ur, vr), vl)):
+            _circle(image, own, radius_px, GREEN)
+            cv2.drawMarker(image, (round(own[0]), round(own[1])), GREEN, cv2.MARKER_CROSS, 9)
+            _row(image, other, YELLOW)
+            # Where the other eye's row is, the distance magnified so that it can be seen.
+            end = own[1] + MAGNIFIED * (other - own[1])
+            at = round(own[0] + 2 * radius_px)
+            cv2.line(image, (at, round(own[1])), (at, round(end)), RED, 2)
+
+    def _headline(self, frame: StereoFrame, seen: MarkerFix | MarkerMiss) -> str:
+        if isinstance(seen, MarkerMiss):
+            return f"{frame.t:.3f} s  refused: {WORDS.get(seen.reason, seen.reason.replace('_', ' '))}"
+        x, y, z = 1e3 * seen.x
+        sigma = 1e3 * float(np.sqrt(np.linalg.eigvalsh(seen.cov)[-1]))
+        rows = "" if seen.centres_px is None else f"  rows differ {seen.centres_px[3] - seen.centres_px[1]:+.2f} px"
+        return f"{frame.t:.3f} s  x {x:.1f} y {y:.1f} z {z:.1f} mm +- {sigma:.2f}{rows}"
+
+
+def _pair(centre_px: FloatArray) -> tuple[float, float]:
+    return float(centre_px[0]), float(centre_px[1])
+
+
+def _circle(image: ImageArray, centre_px: tuple[float, float], radius_px: float, colour: tuple[int, int, int]) -> None:
+    scale = 2**SUBPIXEL_BITS
+    centre = (round(scale * centre_px[0]), round(scale * centre_px[1]))
+    cv2.circle(image, centre, round(scale * (radius_px + 2.0)), colour, 1, cv2.LINE_AA, SUBPIXEL_BITS)
+
+
+def _row(image: ImageArray, v_px: float, colour: tuple[int, int, int]) -> None:
+    scale, width = 2**SUBPIXEL_BITS, image.shape[1]
+    v = round(scale * v_px)
+    cv2.line(image, (0, v), (scale * (width - 1), v), colour, 1, cv2.LINE_AA, SUBPIXEL_BITS)
+
+
+def _write(image: ImageArray, text: str, at: tuple[int, int], colour: tuple[int, int, int]) -> None:
+    """Letters on a ground of their own."""
+    (width, height), _ = cv2.getTextSize(text, FONT, LETTERS, 1)
+    x, y = max(at[0], 2), max(at[1], height + 2)
+    cv2.rectangle(image, (x - 2, y - height - 3), (x + width + 2, y + 4), BLACK, -1)
+    cv2.putText(image, text, (x, y), FONT, LETTERS, colour, 1, cv2.LINE_AA)

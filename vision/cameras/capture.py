@@ -1,0 +1,80 @@
+"""A camera in a thread of its own: the newest image, never a queue of old ones."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable
+from contextlib import ExitStack
+from types import TracebackType
+from typing import Self
+
+from interfaces.errors import SourceError
+
+from .device import CameraDevice
+from .look import Look
+from .shot import Shot
+
+log = logging.getLogger(__name__)
+
+
+class Capture:
+    """Reads a device as fast as it sends, and hands each image on.
+
+    Attributes:
+        look: what its images say of the camera.
+        failure: why it does not read any more, or None.
+    """
+
+    def __init__(
+        self, device: CameraDevice, fps: float, take: Callable[[Shot], None], wake: Callable[[], None]
+    ) -> None:
+        """Nothing is opened yet.
+
+        Args:
+            fps: what is expected.
+            take: given each image, in the thread.
+            wake: called in the thread when it ends.
+        """
+        self._device, self._fps, self._take, self._wake = device, fps, take, wake
+        self.look = Look(device.name, fps)
+        self.failure: SourceError | None = None
+        self._opened = ExitStack()
+        self._stopping = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    @property
+    def device(self) -> CameraDevice:
+        """The camera."""
+        return self._device
+
+    def __enter__(self) -> Self:
+        self.failure, self.look = None, Look(self._device.name, self._fps)
+        self._stopping.clear()
+        self._opened.enter_context(self._device)
+        self._thread = threading.Thread(target=self._run, name=self._device.name, daemon=True)
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._stopping.set()
+        if self._thread is not None:
+            self._thread.join()
+            self._thread = None
+        self._opened.close()
+
+    def _run(self) -> None:
+        try:
+            while not self._stopping.is_set():
+                shot = self._device.read()
+                if shot is not None:
+                    self.look.see(shot.t, shot.image)
+                    self._take(shot)
+        except SourceError as error:
+            self.failure = error
+        except Exception as error:
+            log.exception("the thread of the %s failed", self._device.name)
+            self.failure = SourceError(f"the {self._device.name}: {error}")
+        self._wake()

@@ -1,0 +1,188 @@
+"""The table [vision.cameras] of robot.toml."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Annotated, Literal
+
+import msgspec
+from msgspec import Meta
+
+from interfaces.errors import ConfigError
+from interfaces.toml_file import line_of
+
+Positive = Annotated[float, Meta(gt=0)]
+NonNegative = Annotated[float, Meta(ge=0)]
+Side = Annotated[int, Meta(ge=16, le=16384)]
+
+LAYOUTS = ("two", "side_by_side", "images", "videos")
+# Of a camera whose latency nobody has measured [s]: exposure, readout and transfer of a webcam.
+UNKNOWN_LATENCY_SIGMA_S = 0.015
+ENUMERATED = re.compile(r"\d+|/dev/video\d+")
+
+
+class UvcSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """What a camera is told when it is opened; it is asked afterwards what it took.
+
+    Attributes:
+        image_size_px: width and height of each eye's image.
+        fps: frames per second.
+        fourcc: how images come over the wire: MJPG (compressed) or YUYV (about five times as much).
+        buffers: of the kernel. A camera that loses every second frame with 1 needs 2.
+        exposure_s: exposure time; without it the camera chooses, and the ball's brightness wanders.
+        gain: in the camera's units, as `v4l2-ctl -l` shows them; without it as it is.
+        white_balance_k: colour temperature [K]; without it the camera chooses.
+        focus: in the camera's units; without it as it is. A lens that refocuses changes the calibration.
+    """
+
+    image_size_px: tuple[Side, Side]
+    fps: Positive = 30.0
+    fourcc: Literal["MJPG", "YUYV"] = "MJPG"
+    buffers: Annotated[int, Meta(ge=1, le=10)] = 1
+    exposure_s: Positive | None = None
+    gain: NonNegative | None = None
+    white_balance_k: Positive | None = None
+    focus: NonNegative | None = None
+
+
+class TwoConfig(UvcSettings, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The table [vision.cameras.two]: a camera for each eye, neither waiting for the other.
+
+    Attributes:
+        left, right: the devices, as /dev/v4l/by-id or by-path name them.
+        max_apart_s: images taken further apart make no pair; 0.6 of a frame's time without it.
+    """
+
+    left: str
+    right: str
+    max_apart_s: Positive | None = None
+
+    @property
+    def longest_apart_s(self) -> float:
+        """`max_apart_s`, or what follows from `fps`: free-running cameras are up to half a frame apart."""
+        return self.max_apart_s or 0.6 / self.fps
+
+
+class SideBySideConfig(UvcSettings, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The table [vision.cameras.side_by_side]: one camera whose image has both eyes', the left one at its left."""
+
+    device: str
+
+
+class ImagesConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The table [vision.cameras.images]: image files in the place of cameras, in the order of their names.
+
+    Attributes:
+        left, right: patterns relative to robot.toml, as in "left/*.png".
+        times: a text file with the time of each pair [s], one a line; or
+        name_ticks_per_s: the last number in each name is its time, so many to the second (1e9: nanoseconds); or
+        fps: the time between two follows from it.
+        speed: 1 as they were taken, 2 twice as fast, 0 as fast as they are read.
+    """
+
+    left: str
+    right: str
+    times: str | None = None
+    name_ticks_per_s: Positive | None = None
+    fps: Positive | None = None
+    speed: NonNegative = 1.0
+
+
+class VideosConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The table [vision.cameras.videos]: films in the place of cameras.
+
+    Attributes:
+        left, right: a file for each eye, relative to robot.toml; or
+        side_by_side: one with both eyes' images in each frame, the left one at its left.
+        times: a text file with the time of each frame [s], one a line; without it, it follows from
+        fps: and without that from the rate that the file names.
+        speed: 1 as it was taken, 2 twice as fast, 0 as fast as it is read.
+    """
+
+    left: str | None = None
+    right: str | None = None
+    side_by_side: str | None = None
+    times: str | None = None
+    fps: Positive | None = None
+    speed: NonNegative = 1.0
+
+
+class CamerasConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The table [vision.cameras]: where images come from. Exactly one of the four layouts.
+
+    Attributes:
+        calibration: the file that `bodyschema calibrate cameras` wrote, relative to robot.toml. Without it the
+            images are taken as rectified already, as [camera] describes.
+        latency_s: from the middle of the exposure to the time stamp; `bodyschema calibrate latency` measures it.
+        latency_sigma_s: its 1-sigma; without it 15 ms for devices, 0 for files.
+    """
+
+    calibration: str | None = None
+    latency_s: Annotated[float, Meta(ge=-1, le=1)] = 0.0
+    latency_sigma_s: NonNegative | None = None
+    two: TwoConfig | None = None
+    side_by_side: SideBySideConfig | None = None
+    images: ImagesConfig | None = None
+    videos: VideosConfig | None = None
+
+    @property
+    def layout(self) -> TwoConfig | SideBySideConfig | ImagesConfig | VideosConfig:
+        """The one that is given; call `check` first."""
+        found = self.two or self.side_by_side or self.images or self.videos
+        if found is None:
+            raise ConfigError("[vision.cameras] names no cameras")
+        return found
+
+    @property
+    def devices(self) -> dict[str, str]:
+        """The devices by what they are called; none where images come from files."""
+        match self.layout:
+            case TwoConfig() as two:
+                return {"left camera": two.left, "right camera": two.right}
+            case SideBySideConfig() as one:
+                return {"stereo camera": one.device}
+        return {}
+
+    @property
+    def sigma_s(self) -> float:
+        """1-sigma of the latency [s]."""
+        if self.latency_sigma_s is not None:
+            return self.latency_sigma_s
+        return UNKNOWN_LATENCY_SIGMA_S if self.devices else 0.0
+
+    def check(self, file: Path, text: str) -> None:
+        """ConfigError when there is not exactly one layout, or it is not complete."""
+        given = [name for name in LAYOUTS if getattr(self, name) is not None]
+
+        def refuse(what: str, remedy: str, *keys: str) -> None:
+            place = ("vision", "cameras", *keys)
+            raise ConfigError(f"{'.'.join(place)}: {what}", file=file, line=line_of(text, place), remedy=remedy)
+
+        if not given:
+            refuse("no cameras are named", "Add one of its tables two, side_by_side, images, videos: docs/cameras.md")
+        if len(given) > 1:
+            refuse(f"images cannot come from both {given[0]} and {given[1]}", "Take one out", given[1])
+        for name, device in self.devices.items():
+            if ENUMERATED.fullmatch(device):
+                key = name.split()[0] if self.two is not None else "device"
+                refuse(
+                    f"{device!r} may be another camera after the next plugging in",
+                    "Name it as `ls /dev/v4l/by-id` does, or by-path where two have the same name",
+                    given[0],
+                    key,
+                )
+        if self.two is not None and self.two.left == self.two.right:
+            refuse("both eyes are the same device", "Name two; one with two eyes is the table side_by_side", "two")
+        if self.images is not None and _count(self.images, "times", "name_ticks_per_s", "fps") != 1:
+            refuse("the times have to come from one thing", "Give times, name_ticks_per_s or fps", "images")
+        if self.videos is not None:
+            eyes = _count(self.videos, "left", "right")
+            if (eyes, self.videos.side_by_side is None) not in ((2, True), (0, False)):
+                refuse("which films?", "Give left and right, or side_by_side", "videos")
+            if _count(self.videos, "times", "fps") > 1:
+                refuse("the times have to come from one thing", "Give times or fps", "videos")
+
+
+def _count(table: msgspec.Struct, *keys: str) -> int:
+    return sum(getattr(table, key) is not None for key in keys)

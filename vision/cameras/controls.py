@@ -1,0 +1,123 @@
+"""What a camera is told, and what it says that it took."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Protocol
+
+import cv2
+import numpy as np
+
+from interfaces.errors import SourceError
+
+from .config import SideBySideConfig, UvcSettings
+
+EXPOSURE_UNIT_S = 1e-4  # V4L2_CID_EXPOSURE_ABSOLUTE
+MANUAL_EXPOSURE = 1  # V4L2_EXPOSURE_MANUAL
+ROUNDING = 0.05  # cameras round to their own steps
+
+
+class VideoCapture(Protocol):
+    """What is used of cv2.VideoCapture."""
+
+    def isOpened(self) -> bool: ...
+    def set(self, propId: int, value: float, /) -> bool: ...
+    def get(self, propId: int, /) -> float: ...
+    def grab(self) -> bool: ...
+    def retrieve(self) -> tuple[bool, np.ndarray]: ...
+    def release(self) -> None: ...
+
+
+@dataclass(frozen=True, slots=True)
+class _Control:
+    """One setting: its key, the switch of its automatic with the value for off, property, value, unit of the key."""
+
+    key: str
+    automatic: tuple[int, float] | None
+    property: int
+    value: float | None
+    unit: float = 1.0
+
+
+def raw_size_px(settings: UvcSettings) -> tuple[int, int]:
+    """Width and height of the image that the device sends."""
+    width, height = settings.image_size_px
+    return (2 * width, height) if isinstance(settings, SideBySideConfig) else (width, height)
+
+
+def apply(capture: VideoCapture, settings: UvcSettings, name: str) -> list[str]:
+    """Tell the camera `settings`; what it did not take, in sentences.
+
+    Raises:
+        SourceError: it sends images of another size, for which no calibration holds.
+    """
+    width, height = raw_size_px(settings)
+    capture.set(cv2.CAP_PROP_BUFFERSIZE, settings.buffers)
+    # The format first: it decides which sizes there are, and these which rates.
+    capture.set(cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*settings.fourcc))
+    capture.set(cv2.CAP_PROP_FRAME_WIDTH, width)
+    capture.set(cv2.CAP_PROP_FRAME_HEIGHT, height)
+    capture.set(cv2.CAP_PROP_FPS, settings.fps)
+    got = round(capture.get(cv2.CAP_PROP_FRAME_WIDTH)), round(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
+    if got != (width, height):
+        raise SourceError(
+            f"the {name} sends {got[0]}x{got[1]} pixels, not {width}x{height}. Set image_size_px to what it "
+            "can (`v4l2-ctl --list-formats-ext`), and calibrate at that size"
+        )
+    return [*_format_complaints(capture, settings, name), *_control_complaints(capture, settings, name)]
+
+
+def sends_jpeg(capture: VideoCapture) -> bool:
+    """Whether images come compressed."""
+    return _fourcc(capture) == "MJPG"
+
+
+def _fourcc(capture: VideoCapture) -> str:
+    code = int(capture.get(cv2.CAP_PROP_FOURCC))
+    return code.to_bytes(4, "little", signed=code < 0).decode("ascii", "replace")
+
+
+def _format_complaints(capture: VideoCapture, settings: UvcSettings, name: str) -> Iterator[str]:
+    fourcc, fps = _fourcc(capture), capture.get(cv2.CAP_PROP_FPS)
+    if fourcc != settings.fourcc:
+        yield f"the {name} sends {fourcc}, not {settings.fourcc}: `v4l2-ctl --list-formats-ext` shows what it can"
+    if abs(fps - settings.fps) > ROUNDING * settings.fps:
+        yield (
+            f"the {name} offers {fps:.3g} frames/s, not {settings.fps:g}: set fps to what it can at this size "
+            "(`v4l2-ctl --list-formats-ext`)"
+        )
+
+
+def _controls(settings: UvcSettings) -> tuple[_Control, ...]:
+    exposure = (cv2.CAP_PROP_AUTO_EXPOSURE, MANUAL_EXPOSURE)
+    return (
+        _Control("exposure_s", exposure, cv2.CAP_PROP_EXPOSURE, settings.exposure_s, EXPOSURE_UNIT_S),
+        _Control("gain", None, cv2.CAP_PROP_GAIN, settings.gain),
+        _Control("white_balance_k", (cv2.CAP_PROP_AUTO_WB, 0), cv2.CAP_PROP_WB_TEMPERATURE, settings.white_balance_k),
+        _Control("focus", (cv2.CAP_PROP_AUTOFOCUS, 0), cv2.CAP_PROP_FOCUS, settings.focus),
+    )
+
+
+def _control_complaints(capture: VideoCapture, settings: UvcSettings, name: str) -> Iterator[str]:
+    for control in _controls(settings):
+        if control.value is None:
+            continue
+        wanted = control.value / control.unit
+        if control.automatic is not None:
+            capture.set(*control.automatic)
+            if capture.get(control.automatic[0]) != control.automatic[1]:
+                yield f"the {name} does not switch its automatic for {control.key} off: see `v4l2-ctl -l`"
+                continue
+        capture.set(control.property, wanted)
+        got = capture.get(control.property)
+        if abs(got - wanted) > max(1.0, ROUNDING * wanted):
+            yield (
+                f"the {name} does not take {control.key} = {control.value:g}: it has {got * control.unit:g}. "
+                "`v4l2-ctl -l` shows its range"
+            )
+
+
+def left_to_the_camera(settings: UvcSettings) -> list[str]:
+    """The settings that nobody fixed."""
+    return [control.key for control in _controls(settings) if control.value is None]

@@ -1,0 +1,179 @@
+"""Stereo images that were taken before, played."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from types import TracebackType
+from typing import Protocol, Self
+
+import numpy as np
+
+from interfaces.errors import ConfigError, SourceEnded, SourceError
+from interfaces.protocols import Clock
+from interfaces.records import FloatArray, ImageArray, StereoFrame, frozen_array
+
+
+class Roll(Protocol):
+    """Stereo images in order."""
+
+    @property
+    def t(self) -> FloatArray:
+        """Their times [s], strictly increasing, shape (n,)."""
+        ...
+
+    @property
+    def t_sigma(self) -> FloatArray:
+        """How far apart the two eyes' images were taken [s], shape (n,)."""
+        ...
+
+    @property
+    def image_size_px(self) -> tuple[int, int]: ...
+    @property
+    def serials(self) -> tuple[str, str]: ...
+
+    def open(self, place: int) -> None:
+        """Be ready to give the pair at `place`."""
+        ...
+
+    def close(self) -> None: ...
+
+    def next(self) -> tuple[ImageArray, ImageArray]:
+        """The next pair; SourceError where it cannot be read."""
+        ...
+
+
+class Film:
+    """`StereoEyes` of a roll. What was read is not read again after closing and opening.
+
+    At a speed above 0 the times are the clock's, the first pair is due when the film is opened, and pairs that
+    nobody asked for in time are skipped, as a camera's are. At speed 0 they are the roll's own, one follows the other
+    as fast as it is read, and none is skipped.
+
+    Attributes:
+        dropped: pairs that were skipped.
+    """
+
+    def __init__(
+        self,
+        roll: Callable[[], Roll],
+        clock: Clock,
+        *,
+        speed: float,
+        latency_s: float = 0.0,
+        sigma_s: float = 0.0,
+        sleep: Callable[[float], None] = time.sleep,
+    ) -> None:
+        """Nothing is opened yet.
+
+        Args:
+            roll: makes the roll, at the first opening; ConfigError or SourceError where files are missing or wrong.
+            latency_s, sigma_s: taken off the times [s], and 1-sigma added to their own.
+        """
+        self._make, self._clock, self._sleep = roll, clock, sleep
+        self._speed, self._latency_s, self._sigma_s = speed, latency_s, sigma_s
+        self._roll: Roll | None = None
+        self._is_open = False
+        self._next, self._start_s = 0, 0.0
+        self.dropped = 0
+
+    @property
+    def image_size_px(self) -> tuple[int, int]:
+        """Width and height of each eye's image."""
+        return self._made.image_size_px
+
+    @property
+    def serials(self) -> tuple[str, str]:
+        """The files of the two eyes."""
+        return self._made.serials
+
+    @property
+    def health(self) -> tuple[str, ...]:
+        """Files have no complaints: what is wrong with them is an error."""
+        return ()
+
+    @property
+    def _made(self) -> Roll:
+        if self._roll is None:
+            self._roll = self._make()
+        return self._roll
+
+    def __enter__(self) -> Self:
+        roll = self._made
+        roll.open(self._next)
+        self._is_open = True
+        if self._speed and self._next < len(roll.t):
+            self._start_s = self._clock.now() - float(roll.t[self._next] - roll.t[0]) / self._speed
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._is_open:
+            self._is_open = False
+            self._made.close()
+
+    def read(self, timeout_s: float) -> StereoFrame | None:
+        """The next pair of images; None when none was due within `timeout_s`.
+
+        Raises:
+            SourceEnded: there will be no more.
+        """
+        if not self._is_open:
+            raise SourceError("the images are not open")
+        roll = self._made
+        if self._next >= len(roll.t):
+            raise SourceEnded("the images are through")
+        if self._speed and not self._is_due(timeout_s):
+            return None
+        images = roll.next()
+        if self._speed:
+            images = self._caught_up(images)
+        place, self._next = self._next, self._next + 1
+        t = self._due_s(place) if self._speed else float(roll.t[place])
+        return StereoFrame(t - self._latency_s, *images, float(np.hypot(roll.t_sigma[place], self._sigma_s)))
+
+    def _due_s(self, place: int) -> float:
+        return self._start_s + float(self._made.t[place] - self._made.t[0]) / self._speed
+
+    def _is_due(self, timeout_s: float) -> bool:
+        wait_s = self._due_s(self._next) - self._clock.now()
+        if wait_s > 0:
+            self._sleep(min(wait_s, timeout_s))
+        return wait_s <= timeout_s
+
+    def _caught_up(self, images: tuple[ImageArray, ImageArray]) -> tuple[ImageArray, ImageArray]:
+        """The newest pair that is due."""
+        now = self._clock.now()
+        while self._next + 1 < len(self._made.t) and self._due_s(self._next + 1) <= now:
+            self._next += 1
+            self.dropped += 1
+            images = self._made.next()
+        return images
+
+
+def read_times(file: Path, count: int) -> FloatArray:
+    """The times in a text file [s], the first number of each line; # begins a comment.
+
+    Raises:
+        ConfigError: it cannot be read, has not `count` times, or they do not increase.
+    """
+    try:
+        lines = [line.split("#")[0].replace(",", " ").split() for line in file.read_text(encoding="utf-8").splitlines()]
+        times = np.array([float(words[0]) for words in lines if words])
+    except (OSError, ValueError) as error:
+        remedy = "Write one time in seconds a line"
+        raise ConfigError(f"the times cannot be read: {error}", file=file, remedy=remedy) from error
+    if len(times) != count:
+        raise ConfigError(f"has {len(times)} times for {count} pairs of images", file=file, remedy="Give one for each")
+    return checked_times(times, file)
+
+
+def checked_times(times: FloatArray, file: Path) -> FloatArray:
+    """`times`; ConfigError naming the first that is not later than the one before."""
+    wrong = np.flatnonzero(~(np.diff(times) > 0))
+    if len(wrong) or not np.isfinite(times).all():
+        place = int(wrong[0]) + 2 if len(wrong) else int(np.argmin(np.isfinite(times))) + 1
+        raise ConfigError(f"time {place} is not later than the one before", file=file, remedy="Put them in order")
+    return frozen_array(times)

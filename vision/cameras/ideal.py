@@ -1,0 +1,47 @@
+"""Eyes whose images are rectified already."""
+
+from __future__ import annotations
+
+from types import TracebackType
+from typing import Self
+
+from interfaces.camera import StereoCalibration
+from interfaces.errors import ConfigError
+from interfaces.protocols import StereoEyes
+from interfaces.records import StereoFrame
+
+
+class IdealCamera:
+    """A `StereoCamera` of eyes that [camera] describes as they are: ideal pinholes side by side."""
+
+    def __init__(self, eyes: StereoEyes, calibration: StereoCalibration) -> None:
+        self._eyes, self._calibration = eyes, calibration
+
+    @property
+    def calibration(self) -> StereoCalibration:
+        """The calibration the images belong to."""
+        return self._calibration
+
+    def __enter__(self) -> Self:
+        self._eyes.__enter__()
+        if self._eyes.image_size_px != self._calibration.image_size_px:
+            self._eyes.__exit__(None, None, None)
+            has, wants = (_words(eyes.image_size_px) for eyes in (self._eyes, self._calibration))
+            raise ConfigError(
+                f"the cameras' images have {has} pixels, but [camera] image_size_px says {wants}",
+                remedy="Make both the same, or let `bodyschema calibrate cameras` write a calibration file",
+            )
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._eyes.__exit__(kind, error, trace)
+
+    def read(self, timeout_s: float) -> StereoFrame | None:
+        """The next frame; None when none came within `timeout_s`. Raises as the eyes do."""
+        return self._eyes.read(timeout_s)
+
+
+def _words(size_px: tuple[int, int]) -> str:
+    return f"{size_px[0]}x{size_px[1]}"

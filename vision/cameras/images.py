@@ -1,0 +1,121 @@
+"""Image files in the place of cameras."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from interfaces.errors import ConfigError, SourceError
+from interfaces.records import FloatArray, ImageArray, frozen_array
+
+from .config import ImagesConfig
+from .film import checked_times, read_times
+
+NUMBER = re.compile(r"\d+(?:\.\d+)?")
+
+
+class ImageRoll:
+    """The images that two patterns name, in the order of their names: numbers in them count as numbers.
+
+    Attributes:
+        t: times [s] (n,). t_sigma: between the two eyes' [s] (n,).
+        image_size_px: of each eye's image. serials: folder and pattern of each eye.
+    """
+
+    def __init__(self, config: ImagesConfig, folder: Path) -> None:
+        """Look at the names, and at the first pair.
+
+        Raises:
+            ConfigError: no files are there, not as many of each eye, or without the times that are asked for.
+            SourceError: a file is no image, or the two eyes' have not one size.
+        """
+        self._left, self._right = _files(folder, config.left), _files(folder, config.right)
+        if len(self._left) != len(self._right):
+            raise ConfigError(
+                f"{config.left} are {len(self._left)} images, {config.right} are {len(self._right)}",
+                file=folder,
+                remedy="Give as many of each eye",
+            )
+        self.serials = (config.left, config.right)
+        self.t, self.t_sigma = self._times(config, folder)
+        left, right = _image(self._left[0]), _image(self._right[0])
+        if left.shape != right.shape:
+            raise SourceError(
+                f"the eyes' images are of different sizes: {_size(left)} in {self._left[0]}, {_size(right)} in "
+                f"{self._right[0]}"
+            )
+        self.image_size_px = (left.shape[1], left.shape[0])
+        self._next = 0
+
+    def _times(self, config: ImagesConfig, folder: Path) -> tuple[FloatArray, FloatArray]:
+        count = len(self._left)
+        together = frozen_array(np.zeros(count))
+        if config.times is not None:
+            return read_times(folder / config.times, count), together
+        if config.name_ticks_per_s is not None:
+            first = _ticks(self._left[0], 0)
+            left, right = (
+                frozen_array([_ticks(file, int(first)) / config.name_ticks_per_s for file in files])
+                for files in (self._left, self._right)
+            )
+            return checked_times(0.5 * (left + right), folder), frozen_array(np.abs(left - right))
+        return frozen_array(np.arange(count) / (config.fps or 1.0)), together
+
+    def open(self, place: int) -> None:
+        """Be ready to give the pair at `place`."""
+        self._next = place
+
+    def close(self) -> None:
+        """Nothing is held open."""
+
+    def next(self) -> tuple[ImageArray, ImageArray]:
+        """The next pair; SourceError where a file is none, or of another size."""
+        pair = _image(self._left[self._next]), _image(self._right[self._next])
+        for file, image in zip((self._left[self._next], self._right[self._next]), pair, strict=True):
+            if (image.shape[1], image.shape[0]) != self.image_size_px:
+                raise SourceError(f"{file} is {_size(image)}, the first image is {_words(self.image_size_px)}")
+        self._next += 1
+        return pair
+
+
+def _files(folder: Path, pattern: str) -> list[Path]:
+    if Path(pattern).is_absolute():
+        folder, pattern = Path("/"), str(Path(pattern).relative_to("/"))
+    found = sorted(folder.glob(pattern), key=lambda file: _natural(file.name))
+    if not found:
+        raise ConfigError(f"no image is called {pattern}", file=folder, remedy='Give patterns like "left/*.png"')
+    return found
+
+
+def _natural(name: str) -> list[tuple[int, float, str]]:
+    """A key by which img_2 comes before img_10."""
+    words = re.split(r"(\d+(?:\.\d+)?)", name)
+    return [(0, float(word), "") if NUMBER.fullmatch(word) else (1, 0.0, word) for word in words if word]
+
+
+def _ticks(file: Path, since: int) -> float:
+    """The last number in a name, less `since`: taken off here, so that nanoseconds since 1970 keep their digits."""
+    numbers = NUMBER.findall(file.stem)
+    if not numbers:
+        remedy = "Give fps or times in the place of name_ticks_per_s"
+        raise ConfigError("there is no number in this name", file=file, remedy=remedy)
+    whole, _, fraction = numbers[-1].partition(".")
+    return (int(whole) - since) + (float(f"0.{fraction}") if fraction else 0.0)
+
+
+def _image(file: Path) -> ImageArray:
+    image = cv2.imread(str(file), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    if image is None:
+        raise SourceError(f"{file} is no image that can be read")
+    return np.asarray(image, np.uint8)
+
+
+def _size(image: ImageArray) -> str:
+    return _words((image.shape[1], image.shape[0]))
+
+
+def _words(size_px: tuple[int, int]) -> str:
+    return f"{size_px[0]}x{size_px[1]} pixels"

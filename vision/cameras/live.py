@@ -1,0 +1,203 @@
+"""Cameras that send images now: two of them, or one with two eyes."""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections.abc import Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass
+from functools import partial
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+
+from interfaces.errors import SourceError, SourceLost
+from interfaces.protocols import Clock
+from interfaces.records import StereoFrame
+
+from .capture import Capture
+from .config import CamerasConfig, SideBySideConfig, TwoConfig
+from .device import CameraDevice, OpenCapture, open_v4l2
+from .pairing import Pairing
+from .serials import serial_of
+from .shot import Shot
+
+FIRST_IMAGE_S = 5.0
+MANY_APART = 10
+
+
+@dataclass(frozen=True, slots=True)
+class CameraFigures:
+    """How one camera does.
+
+    Attributes:
+        frames: that came since it was opened. fps: as measured, None as long as too few came.
+        stamps: "kernel" or "arrival"; None before any.
+        damaged, doubted: images with a part missing, and with a time not to be believed.
+    """
+
+    name: str
+    frames: int
+    fps: float | None
+    stamps: str | None
+    damaged: int
+    doubted: int
+
+
+class LiveEyes:
+    """`StereoEyes` of devices. Each is read in its own thread, the newest images win, and none is kept for later.
+
+    Attributes:
+        dropped: stereo images that came and were not asked for in time.
+    """
+
+    def __init__(
+        self,
+        config: CamerasConfig,
+        layout: TwoConfig | SideBySideConfig,
+        clock: Clock,
+        open_capture: OpenCapture = open_v4l2,
+    ) -> None:
+        """Nothing is opened yet; `clock` has to be the machine's monotonic one, as the kernel's stamps are."""
+        self._config, self._layout = config, layout
+        self._changed = threading.Condition()
+        self._captures = [
+            self._capture(eye, CameraDevice(name, device, layout, clock, open_capture))
+            for eye, (name, device) in enumerate(config.devices.items())
+        ]
+        self._pairing = Pairing(layout.longest_apart_s if isinstance(layout, TwoConfig) else 0.0)
+        self._waiting: StereoFrame | None = None
+        self._last_t = -math.inf
+        self._opened = ExitStack()
+        self._is_open = False
+        self.dropped = 0
+
+    @property
+    def image_size_px(self) -> tuple[int, int]:
+        """Width and height of each eye's image."""
+        return self._layout.image_size_px
+
+    @property
+    def serials(self) -> tuple[str, str]:
+        """Serial number of each eye's device; its name where it has none."""
+        found = [serial_of(device) for device in self._config.devices.values()]
+        return (found[0], found[1]) if len(found) == 2 else (f"{found[0]}/left", f"{found[0]}/right")
+
+    @property
+    def health(self) -> tuple[str, ...]:
+        """What is wrong with the cameras, and what to do."""
+        return tuple(self._complaints())
+
+    @property
+    def figures(self) -> tuple[CameraFigures, ...]:
+        """How each camera does."""
+        return tuple(_figures(capture) for capture in self._captures)
+
+    def __enter__(self) -> Self:
+        self._waiting = None
+        with ExitStack() as stack:
+            for capture in self._captures:
+                stack.enter_context(capture)
+            self._await_first()
+            self._opened = stack.pop_all()
+        self._is_open = True
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._is_open = False
+        self._opened.close()
+
+    def read(self, timeout_s: float) -> StereoFrame | None:
+        """The newest pair of images; None when none came within `timeout_s`.
+
+        Raises:
+            SourceLost: a camera went away.
+        """
+        if not self._is_open:
+            raise SourceError("the cameras are not open")
+        with self._changed:
+            self._changed.wait_for(lambda: self._waiting is not None or self._failed() is not None, timeout_s)
+            frame, self._waiting = self._waiting, None
+        if frame is None and (failure := self._failed()) is not None:
+            raise failure
+        return frame
+
+    def _capture(self, eye: int, device: CameraDevice) -> Capture:
+        return Capture(device, self._layout.fps, partial(self._take, eye), self._wake)
+
+    def _await_first(self) -> None:
+        """SourceLost when a camera that could be opened sends nothing."""
+        with self._changed:
+            self._changed.wait_for(lambda: not self._missing() or self._failed() is not None, FIRST_IMAGE_S)
+        if (failure := self._failed()) is not None:
+            raise failure
+        for capture in self._missing():
+            raise SourceLost(
+                f"the {capture.device.name} sent no whole image within {FIRST_IMAGE_S:.0f} s "
+                f"({capture.device.damaged} damaged ones). Try another cable, a port of its own, or a smaller "
+                "image_size_px"
+            )
+
+    def _missing(self) -> list[Capture]:
+        """The cameras that have sent nothing yet."""
+        return [capture for capture in self._captures if capture.look.frames == 0]
+
+    def _failed(self) -> SourceError | None:
+        return next((capture.failure for capture in self._captures if capture.failure is not None), None)
+
+    def _wake(self) -> None:
+        with self._changed:
+            self._changed.notify_all()
+
+    def _take(self, eye: int, shot: Shot) -> None:
+        """An image came; in its camera's thread."""
+        with self._changed:
+            frame = self._split(shot) if len(self._captures) == 1 else self._paired(eye, shot)
+            if frame is not None and frame.t > self._last_t:
+                self.dropped += self._waiting is not None
+                self._waiting, self._last_t = frame, frame.t
+            self._changed.notify_all()
+
+    def _split(self, shot: Shot) -> StereoFrame:
+        width = self.image_size_px[0]
+        left, right = np.ascontiguousarray(shot.image[:, :width]), np.ascontiguousarray(shot.image[:, width:])
+        sigma = math.hypot(shot.t_sigma, self._config.sigma_s)
+        return StereoFrame(shot.t - self._config.latency_s, left, right, sigma)
+
+    def _paired(self, eye: int, shot: Shot) -> StereoFrame | None:
+        self._pairing.put(eye, shot)
+        pair = self._pairing.take()
+        if pair is None:
+            return None
+        left, right = pair
+        sigma = math.hypot(max(left.t_sigma, right.t_sigma), self._config.sigma_s, left.t - right.t)
+        return StereoFrame(0.5 * (left.t + right.t) - self._config.latency_s, left.image, right.image, sigma)
+
+    def _complaints(self) -> Iterator[str]:
+        for capture in self._captures:
+            device = capture.device
+            yield from device.complaints
+            yield from capture.look.complaints()
+            if device.stamps.source == "arrival":
+                yield (
+                    f"the {device.name}'s driver gives no monotonic time stamps: images are dated when they arrive, to "
+                    f"{1e3 * device.stamps.sigma_s:.0f} ms. With uvcvideo: `modprobe uvcvideo clock=MONOTONIC`"
+                )
+            if device.damaged > capture.look.frames:
+                yield f"the {device.name} sends more damaged images than whole ones: try another cable or port"
+        if self._pairing.too_far > MANY_APART and self._pairing.apart_s is not None:
+            yield (
+                f"{self._pairing.too_far} times the two eyes' images were too far apart, last "
+                f"{1e3 * self._pairing.apart_s:.0f} ms: do both cameras have the same fps and exposure_s?"
+            )
+
+
+def _figures(capture: Capture) -> CameraFigures:
+    device, look = capture.device, capture.look
+    return CameraFigures(
+        device.name, look.frames, look.fps, device.stamps.source, device.damaged, device.stamps.doubted
+    )

@@ -1,0 +1,74 @@
+"""What a glance at images and their times says of a camera: too slow, dark, too bright."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator
+from itertools import pairwise
+
+import numpy as np
+
+from interfaces.records import ImageArray
+
+EVERY_S = 0.5  # an image is looked at
+OVER_S = 3.0  # the frame rate is measured
+FEWEST = 5  # frames that make a rate
+SLOW = 0.8  # of the configured rate
+STEP_PX = 8  # between the pixels that are looked at
+BLACK, BLACK_QUANTILE = 20, 0.99
+WHITE, MOST_WHITE = 250, 0.25
+
+
+def of_image(image: ImageArray, name: str) -> str | None:
+    """What is wrong with the light in an image, or None."""
+    levels = image[::STEP_PX, ::STEP_PX]
+    if np.quantile(levels, BLACK_QUANTILE) < BLACK:
+        return f"the {name}'s image is black: is the lens cap on? Else more light, or a longer exposure_s"
+    white = float((levels >= WHITE).all(axis=2).mean())
+    if white > MOST_WHITE:
+        return f"the {name} is over-exposed: {100 * white:.0f} % of its image is white. Shorten exposure_s"
+    return None
+
+
+class Look:
+    """Looks at one camera's images; used by the thread that takes them, asked by others.
+
+    Attributes:
+        frames: how many came.
+    """
+
+    def __init__(self, name: str, fps: float) -> None:
+        self._name, self._fps = name, fps
+        self._times: deque[float] = deque()
+        self._light: str | None = None
+        self._looked_s = -np.inf
+        self.frames = 0
+        self.fps: float | None = None
+
+    def see(self, t: float, image: ImageArray) -> None:
+        """The newest image, and its time [s]."""
+        self.frames += 1
+        self._times.append(t)
+        while self._times[-1] - self._times[0] > OVER_S:
+            self._times.popleft()
+        if t - self._looked_s >= EVERY_S:
+            self._looked_s = t
+            self._light = of_image(image, self._name)
+            self.fps = self._rate()
+
+    def _rate(self) -> float | None:
+        """By the middle step, which a lost frame does not change; a camera that loses every second one is slow."""
+        if len(self._times) < FEWEST:
+            return None
+        return 1.0 / float(np.median([later - earlier for earlier, later in pairwise(self._times)]))
+
+    def complaints(self) -> Iterator[str]:
+        """What is wrong, and what to do."""
+        fps = self.fps
+        if fps is not None and fps < SLOW * self._fps:
+            yield (
+                f"the {self._name} sends {fps:.1f} frames/s instead of {self._fps:g}: shorten exposure_s, take fourcc "
+                '"MJPG" or a smaller image, give it a USB port of its own, or set buffers = 2'
+            )
+        if self._light is not None:
+            yield self._light

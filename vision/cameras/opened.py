@@ -1,0 +1,37 @@
+"""The cameras that [vision.cameras] asks for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from interfaces.protocols import Clock
+
+from .config import CamerasConfig, ImagesConfig, SideBySideConfig, TwoConfig, VideosConfig
+from .device import OpenCapture, open_v4l2
+from .film import Film, Roll
+from .images import ImageRoll
+from .live import LiveEyes
+from .videos import VideoRoll
+
+
+def eyes_of(
+    config: CamerasConfig, folder: Path, clock: Clock, open_capture: OpenCapture = open_v4l2
+) -> LiveEyes | Film:
+    """The configured cameras or files as `StereoEyes`, not opened yet.
+
+    Args:
+        folder: of robot.toml; files are named relative to it.
+        clock: the machine's monotonic one.
+    """
+    match config.layout:
+        case TwoConfig() | SideBySideConfig() as layout:
+            return LiveEyes(config, layout, clock, open_capture)
+        case ImagesConfig() as images:
+            return _film(config, lambda: ImageRoll(images, folder), clock, images.speed)
+        case VideosConfig() as videos:
+            return _film(config, lambda: VideoRoll(videos, folder), clock, videos.speed)
+
+
+def _film(config: CamerasConfig, roll: Callable[[], Roll], clock: Clock, speed: float) -> Film:
+    return Film(roll, clock, speed=speed, latency_s=config.latency_s, sigma_s=config.sigma_s)

@@ -1,0 +1,53 @@
+"""Images of two cameras that do not wait for each other, paired by time."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+
+from .shot import Shot
+
+KEPT = 4  # of each camera; older ones are of no use
+
+
+class Pairing:
+    """Pairs each image of the camera that lags with the nearest of the other one. Newest wins, none is used twice.
+
+    The one that lags is bracketed by the other one's images, so the nearest is known: nothing better can come.
+
+    Attributes:
+        too_far: how many found no partner near enough.
+        apart_s: how far apart the last two were [s], near enough or not; None before any.
+    """
+
+    def __init__(self, longest_apart_s: float) -> None:
+        self._longest_apart_s = longest_apart_s
+        self._shots: tuple[deque[Shot], deque[Shot]] = (deque(maxlen=KEPT), deque(maxlen=KEPT))
+        self._given = [-math.inf, -math.inf]
+        self._tried = -math.inf
+        self.too_far = 0
+        self.apart_s: float | None = None
+
+    def put(self, eye: int, shot: Shot) -> None:
+        """The newest image of the left (0) or the right (1) eye."""
+        self._shots[eye].append(shot)
+
+    def take(self) -> tuple[Shot, Shot] | None:
+        """The newest pair that was not given before."""
+        if not all(self._shots):
+            return None
+        lagging = 0 if self._shots[0][-1].t <= self._shots[1][-1].t else 1
+        shot = self._shots[lagging][-1]
+        if shot.t <= max(self._tried, self._given[lagging]):
+            return None
+        left_over = [candidate for candidate in self._shots[1 - lagging] if candidate.t > self._given[1 - lagging]]
+        if not left_over:
+            return None
+        other = min(left_over, key=lambda candidate: abs(candidate.t - shot.t))
+        self._tried, self.apart_s = shot.t, abs(other.t - shot.t)
+        if self.apart_s > self._longest_apart_s:
+            self.too_far += 1
+            return None
+        left, right = (shot, other) if lagging == 0 else (other, shot)
+        self._given = [left.t, right.t]
+        return left, right

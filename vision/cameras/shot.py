@@ -1,0 +1,22 @@
+"""What one camera took at one instant."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from interfaces.records import ImageArray
+
+
+@dataclass(frozen=True, slots=True)
+class Shot:
+    """An image and when it was taken.
+
+    Attributes:
+        t: time stamp [s], the latency not yet taken off.
+        t_sigma: 1-sigma of it [s].
+        image: (height, width, 3), uint8, BGR.
+    """
+
+    t: float
+    t_sigma: float
+    image: ImageArray

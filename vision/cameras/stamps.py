@@ -1,0 +1,62 @@
+"""Whether a camera's own time stamps can be believed, and what stands in for them."""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+
+TRIALS = 3  # frames that are looked at before any is given away
+FARTHEST_S = 1.0  # from the kernel's stamp to the arrival
+AHEAD_S = 1e-3  # no image is taken after it arrived
+KERNEL_SIGMA_S = 1e-3
+ARRIVAL_SIGMA_S = 0.02  # of when an image was handed over: decoding, scheduling, a busy bus
+
+
+class Stamps:
+    """Decides at the start between the kernel's stamps and the times of arrival, and keeps time strictly increasing.
+
+    The kernel stamps frames of USB cameras with CLOCK_MONOTONIC. Other drivers, and uvcvideo with clock=REALTIME, give
+    zero or the wall clock's time.
+
+    Attributes:
+        source: "kernel" or "arrival"; None while it is not decided.
+        sigma_s: 1-sigma of the stamps [s].
+    """
+
+    def __init__(self) -> None:
+        self._seen: list[tuple[float, float]] = []
+        self._last = -math.inf
+        self.source: str | None = None
+        self.doubted = 0
+
+    @property
+    def sigma_s(self) -> float:
+        """1-sigma of the stamps [s]."""
+        return KERNEL_SIGMA_S if self.source == "kernel" else ARRIVAL_SIGMA_S
+
+    def stamp(self, kernel_s: float, arrival_s: float) -> float | None:
+        """The time of a frame [s]; None for the first ones, and for one whose stamp is not to be believed.
+
+        Args:
+            kernel_s: what the driver said. arrival_s: when the frame was handed over. Both [s], monotonic.
+        """
+        if self.source is None:
+            self._seen.append((kernel_s, arrival_s))
+            if len(self._seen) < TRIALS:
+                return None
+            self.source = "kernel" if self._are_believable() else "arrival"
+        t = kernel_s if self.source == "kernel" else arrival_s
+        if t <= self._last or (self.source == "kernel" and not _near(kernel_s, arrival_s)):
+            self.doubted += 1
+            return None
+        self._last = t
+        return t
+
+    def _are_believable(self) -> bool:
+        stamps = [kernel for kernel, _ in self._seen]
+        increasing = all(later > earlier for earlier, later in pairwise(stamps))
+        return increasing and all(_near(kernel, arrival) for kernel, arrival in self._seen)
+
+
+def _near(kernel_s: float, arrival_s: float) -> bool:
+    return kernel_s > 0 and -AHEAD_S <= arrival_s - kernel_s < FARTHEST_S

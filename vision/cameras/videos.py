@@ -1,0 +1,98 @@
+"""Films in the place of cameras."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from interfaces.errors import ConfigError, SourceError
+from interfaces.records import FloatArray, ImageArray, frozen_array
+
+from .config import VideosConfig
+from .film import read_times
+
+
+class VideoRoll:
+    """Two films, or one whose frames have both eyes' images.
+
+    Attributes:
+        t: times [s] (n,). t_sigma: zeros (n,).
+        image_size_px: of each eye's image. serials: the file of each eye.
+    """
+
+    def __init__(self, config: VideosConfig, folder: Path) -> None:
+        """Look at the files, and count their frames.
+
+        Raises:
+            ConfigError: a file is missing, no film, or the two are not of one size.
+        """
+        both = config.side_by_side
+        self._files = [folder / name for name in ((both,) if both else (config.left, config.right)) if name]
+        self.serials = (f"{both}/left", f"{both}/right") if both else (str(config.left), str(config.right))
+        self._captures: list[cv2.VideoCapture] = []
+        sizes, counts, rates = zip(*(_measured(file) for file in self._files), strict=True)
+        if len(set(sizes)) > 1:
+            said = " and ".join(f"{width}x{height}" for width, height in sizes)
+            raise ConfigError(f"the two films are of different sizes: {said} pixels", file=self._files[1])
+        width, height = sizes[0]
+        if both and width % 2:
+            raise ConfigError(f"{width} pixels cannot be two images side by side", file=self._files[0])
+        self._is_split = both is not None
+        self.image_size_px = (width // 2, height) if both else (width, height)
+        count = min(counts)
+        self.t = self._times(config, folder, count, rates[0])
+        self.t_sigma = frozen_array(np.zeros(count))
+
+    def _times(self, config: VideosConfig, folder: Path, count: int, rate_hz: float) -> FloatArray:
+        if config.times is not None:
+            return read_times(folder / config.times, count)
+        fps = config.fps or rate_hz
+        if not fps > 0:
+            raise ConfigError("the film does not say how fast it was taken", file=self._files[0], remedy="Give fps")
+        return frozen_array(np.arange(count) / fps)
+
+    def open(self, place: int) -> None:
+        """Be ready to give the pair at `place`."""
+        self._captures = [cv2.VideoCapture(str(file)) for file in self._files]
+        for _ in range(place):  # seeking is not exact in every film
+            for capture in self._captures:
+                capture.grab()
+
+    def close(self) -> None:
+        """Close the files."""
+        for capture in self._captures:
+            capture.release()
+        self._captures = []
+
+    def next(self) -> tuple[ImageArray, ImageArray]:
+        """The next pair; SourceError where the film is damaged."""
+        images: list[ImageArray] = []
+        for file, capture in zip(self._files, self._captures, strict=True):
+            is_there, image = capture.read()
+            if not is_there:
+                raise SourceError(f"{file} is damaged, or shorter than it says")
+            images.append(np.asarray(image, np.uint8))
+        if not self._is_split:
+            return images[0], images[1]
+        width = self.image_size_px[0]
+        return np.ascontiguousarray(images[0][:, :width]), np.ascontiguousarray(images[0][:, width:])
+
+
+def _measured(file: Path) -> tuple[tuple[int, int], int, float]:
+    """Size of the frames, how many can be read, and how many there are to the second."""
+    if not file.is_file():
+        raise ConfigError("there is no such film", file=file, remedy="Files are named relative to robot.toml")
+    capture = cv2.VideoCapture(str(file))
+    try:
+        count = 0
+        while capture.grab():  # what the file says of itself is often wrong
+            count += 1
+        size = round(capture.get(cv2.CAP_PROP_FRAME_WIDTH)), round(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
+        rate_hz = capture.get(cv2.CAP_PROP_FPS)
+    finally:
+        capture.release()
+    if not count:
+        raise ConfigError("is no film that can be read", file=file)
+    return size, count, rate_hz

@@ -1,0 +1,91 @@
+"""Cameras as a person looks at them: what they see, and what the tracker makes of it."""
+
+from __future__ import annotations
+
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+
+from interfaces.protocols import StereoCamera, StereoEyes
+from interfaces.records import ImageArray, MarkerFix, Reason, StereoFrame
+from vision.config import VisionConfig
+from vision.trackers import tracker_of
+
+from .annotate import Annotator
+
+
+class WatchedCamera:
+    """Frames with what was seen drawn into them.
+
+    Attributes:
+        frames: how many were looked at.
+        fixes: in how many the marker was found.
+        reasons: in how many it was not, by reason.
+    """
+
+    def __init__(self, camera: StereoCamera, config: VisionConfig) -> None:
+        """Nothing is opened yet."""
+        self._camera = camera
+        self._tracker = tracker_of(camera.calibration, config)
+        self._annotator = Annotator(camera.calibration, config)
+        self.frames, self.fixes = 0, 0
+        self.reasons: dict[Reason, int] = {}
+
+    def __enter__(self) -> Self:
+        self._camera.__enter__()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._camera.__exit__(kind, error, trace)
+
+    def read(self, timeout_s: float) -> ImageArray | None:
+        """The next picture (height, 2 width, 3); None when none came within `timeout_s`. Raises as the camera does."""
+        frame = self._camera.read(timeout_s)
+        if frame is None:
+            return None
+        seen = self._tracker.track(frame)
+        self.frames += 1
+        if isinstance(seen, MarkerFix):
+            self.fixes += 1
+        else:
+            self.reasons[seen.reason] = self.reasons.get(seen.reason, 0) + 1
+        return self._annotator.drawn(frame, seen)
+
+
+class PlainEyes:
+    """Frames of cameras that nobody has calibrated yet: nothing is looked for in them.
+
+    Attributes:
+        frames, fixes, reasons: as of `WatchedCamera`.
+    """
+
+    def __init__(self, eyes: StereoEyes) -> None:
+        """Nothing is opened yet."""
+        self._eyes = eyes
+        self.frames, self.fixes = 0, 0
+        self.reasons: dict[Reason, int] = {}
+
+    def __enter__(self) -> Self:
+        self._eyes.__enter__()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._eyes.__exit__(kind, error, trace)
+
+    def read(self, timeout_s: float) -> ImageArray | None:
+        """The next picture (height, 2 width, 3); None when none came within `timeout_s`. Raises as the eyes do."""
+        frame = self._eyes.read(timeout_s)
+        if frame is None:
+            return None
+        self.frames += 1
+        return joined(frame)
+
+
+def joined(frame: StereoFrame) -> ImageArray:
+    """Both images side by side."""
+    return np.hstack([frame.left, frame.right])

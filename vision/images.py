@@ -1,0 +1,42 @@
+"""What a tracker asks of its images and their calibration."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from interfaces.camera import StereoCalibration
+from interfaces.errors import ConfigError, SourceError
+from interfaces.records import ImageArray, StereoFrame
+
+
+def check_images(frame: StereoFrame, calibration: StereoCalibration) -> None:
+    """SourceError: the images are not uint8 BGR of the calibration's size."""
+    width, height = calibration.image_size_px
+    for eye, image in (("left", frame.left), ("right", frame.right)):
+        if image.shape != (height, width, 3) or image.dtype != np.uint8:
+            raise SourceError(
+                f"the {eye} image is {_described(image)}; the calibration is for {width}x{height} pixels of three "
+                "colours (uint8, BGR). Set the camera to that size, or mend [camera] image_size_px"
+            )
+
+
+def _described(image: ImageArray) -> str:
+    size = f"{image.shape[1]}x{image.shape[0]} pixels" if image.ndim in (2, 3) else f"an array of shape {image.shape}"
+    colours = f" of {image.shape[2]} channels" if image.ndim == 3 else " of grey" if image.ndim == 2 else ""
+    return f"{size}{colours} ({image.dtype})"
+
+
+def check_calibration(calibration: StereoCalibration) -> None:
+    """ConfigError: the calibration describes no stereo pair."""
+    width, height = calibration.image_size_px
+    for name, value in (("focal_px", calibration.focal_px), ("baseline_m", calibration.baseline_m)):
+        if not (math.isfinite(value) and value > 0):
+            raise ConfigError(f"[camera] {name} is {value}", remedy="It has to be a number above 0")
+    if not (math.isfinite(calibration.pixel_sigma) and calibration.pixel_sigma >= 0):
+        raise ConfigError(f"[camera] pixel_sigma is {calibration.pixel_sigma}", remedy="It has to be 0 or more")
+    if not all(math.isfinite(value) for value in calibration.principal_point_px):
+        raise ConfigError(f"[camera] principal_point_px is {calibration.principal_point_px}", remedy="Give two numbers")
+    if min(width, height) < 16:
+        raise ConfigError(f"[camera] image_size_px is {width}x{height}", remedy="16x16 is the least")

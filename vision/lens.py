@@ -1,0 +1,126 @@
+"""A camera's lens: where a direction is seen, and the direction to what is seen."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike
+
+from interfaces.records import FloatArray
+
+Model = Literal["pinhole", "fisheye"]
+
+# k1, k2, p1, p2, k3 of the radial and tangential model; k1 to k4 of Kannala & Brandt 2006.
+DISTORTION_NAMES: dict[Model, tuple[str, ...]] = {
+    "pinhole": ("k1", "k2", "p1", "p2", "k3"),
+    "fisheye": ("k1", "k2", "k3", "k4"),
+}
+_ITERATIONS = 30
+_CONVERGED = 1e-12
+_WIDEST_RAD = 1.5
+_LEAST_SLOPE = 0.05
+
+
+@dataclass(frozen=True)
+class Lens:
+    """OpenCV's pinhole model with five coefficients, or its fisheye model with four.
+
+    Attributes:
+        model: which of the two.
+        focal_px: (fx, fy).
+        principal_point_px: (cx, cy); integer coordinates are pixel centres.
+        distortion: in the order of `DISTORTION_NAMES`.
+    """
+
+    model: Model
+    focal_px: tuple[float, float]
+    principal_point_px: tuple[float, float]
+    distortion: tuple[float, ...]
+
+    @classmethod
+    def from_vector(cls, model: Model, values: ArrayLike) -> Lens:
+        """The lens with these values, in the order of `vector`."""
+        fx, fy, cx, cy, *distortion = np.asarray(values, dtype=np.float64).tolist()
+        return cls(model, (fx, fy), (cx, cy), tuple(distortion))
+
+    @property
+    def vector(self) -> FloatArray:
+        """fx, fy, cx, cy and the distortion."""
+        return np.array([*self.focal_px, *self.principal_point_px, *self.distortion])
+
+    @property
+    def matrix(self) -> FloatArray:
+        """The camera matrix, shape (3, 3)."""
+        (fx, fy), (cx, cy) = self.focal_px, self.principal_point_px
+        return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+
+    def project(self, x: FloatArray) -> FloatArray:
+        """Image coordinates (n, 2) [px] of points (n, 3) in the eye's frame: x right, y down, z forward."""
+        return self.project_posed(x, np.zeros(3), np.zeros(3))[0]
+
+    def project_posed(
+        self, x: FloatArray, rotation: FloatArray, translation: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Where points of a frame are seen that stands at a pose in the eye's frame, and how that depends on both.
+
+        Args:
+            x: points, shape (n, 3).
+            rotation, translation: the frame's pose as rotation vector [rad] and position, shape (3,) each.
+
+        Returns:
+            Image coordinates (n, 2) [px]; their derivatives (2n, 6) by rotation and translation, and (2n, p) by
+            `vector`, with u and v of one point in neighbouring rows.
+        """
+        points, distortion = np.ascontiguousarray(x, dtype=np.float64).reshape(-1, 1, 3), np.array(self.distortion)
+        if self.model == "pinhole":
+            seen = cv2.projectPoints(points, rotation, translation, self.matrix, distortion)
+            px, J = (np.asarray(each, dtype=np.float64) for each in seen[:2])
+            return px.reshape(-1, 2), J[:, :6], J[:, 6 : 10 + len(distortion)]
+        seen = cv2.fisheye.projectPoints(points, rotation, translation, self.matrix, distortion)
+        px, J = (np.asarray(each, dtype=np.float64) for each in seen[:2])
+        return px.reshape(-1, 2), J[:, 8:14], J[:, :8]
+
+    def directions(self, px: FloatArray) -> FloatArray:
+        """Directions (n, 2) as (x/z, y/z) of what is seen at (n, 2) [px], by Newton's method."""
+        px = np.reshape(np.asarray(px, dtype=np.float64), (-1, 2))
+        flat = (px - np.array(self.principal_point_px)) / np.array(self.focal_px)
+        if self.model == "fisheye":
+            seen = np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-12)
+            return flat / seen * np.tan(self._angle(seen))
+        return self._undistorted(flat, px)
+
+    def _angle(self, seen: FloatArray) -> FloatArray:
+        """Angle off the axis [rad] of what is seen this far from the principal point, in focal lengths."""
+        # Kannala & Brandt 2006, eq. (6)
+        powers = np.array([3, 5, 7, 9])
+        k = np.array(self.distortion)
+        angle = np.minimum(seen, _WIDEST_RAD)
+        for _ in range(_ITERATIONS):
+            value = angle + (angle[..., None] ** powers) @ k
+            slope = 1.0 + (angle[..., None] ** (powers - 1)) @ (k * powers)
+            moved = np.clip(angle - (value - seen) / np.maximum(slope, _LEAST_SLOPE), 0.0, _WIDEST_RAD)
+            done = np.max(np.abs(moved - angle), initial=0.0) < _CONVERGED
+            angle = moved
+            if done:
+                break
+        return angle
+
+    def _undistorted(self, start: FloatArray, px: FloatArray) -> FloatArray:
+        found = start
+        for _ in range(_ITERATIONS):
+            ahead = np.column_stack([found, np.ones(len(found))])
+            h = 1e-6
+            shifts = h * np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+            value, right, down = (self.project(ahead + shift) for shift in shifts)
+            (a, c), (b, d) = ((right - value) / h).T, ((down - value) / h).T
+            u, v = (value - px).T
+            # Where a lens folds the image over there is no direction; the step is kept short, and says nothing.
+            determinant = np.maximum(a * d - b * c, _LEAST_SLOPE * self.focal_px[0] * self.focal_px[1])
+            step = np.column_stack([d * u - b * v, a * v - c * u]) / determinant[:, None]
+            found = found - step
+            if np.max(np.abs(step), initial=0.0) < _CONVERGED:
+                break
+        return found

@@ -1,0 +1,196 @@
+"""The most likely pose of a rigid body whose points two eyes see."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import block_diag
+from scipy.spatial.transform import Rotation
+
+from interfaces.camera import StereoCalibration
+from interfaces.records import FloatArray
+
+_STEPS = 25
+_CONVERGED = 1e-10
+# Levenberg's damping, relative to the diagonal of the normal equations.
+_FIRST_DAMPING, _MOST_DAMPING = 1e-4, 1e6
+
+
+@dataclass(frozen=True, slots=True)
+class Sighting:
+    """What one eye sees of some points of the body.
+
+    Attributes:
+        points: in the body's frame (k, 3) [m].
+        pixels: where they are seen (k, 2) [px].
+        cov_px: covariance (2k, 2k) [px²] of u and v of the first, then of the second point ...
+        right: whether it is the right eye.
+    """
+
+    points: FloatArray
+    pixels: FloatArray
+    cov_px: FloatArray
+    right: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Pose:
+    """A pose in the left optical frame, with the covariance of its error.
+
+    Attributes:
+        rotation: (3, 3), from the body's frame to the optical frame.
+        x: the body's origin (3,) [m].
+        cov: covariance (6, 6) of a small turn about the axes of the optical frame [rad], then of x [m].
+        squares: sum of the squared residuals in units of their sigmas.
+        by_sighting: the same of each sighting.
+    """
+
+    rotation: FloatArray
+    x: FloatArray
+    cov: FloatArray
+    squares: float
+    by_sighting: tuple[float, ...]
+
+
+class PoseEstimator:
+    """Maximum likelihood over all pixels of both eyes; their errors are Gaussian.
+
+    `pixel_sigma` of the calibration is what rectification gets wrong around the body: one shift for each eye, which
+    all its points share.
+    """
+
+    def __init__(self, calibration: StereoCalibration, sightings: Sequence[Sighting]) -> None:
+        self._calibration, self._sightings = calibration, tuple(sightings)
+        self._eyes = [self._all_of(right) for right in (False, True) if any(s.right == right for s in sightings)]
+        self._roots = [self._root(eye) for eye in self._eyes]
+        self._own_roots = [self._root(sighting) for sighting in self._sightings]
+
+    def refine(self, rotation: FloatArray, x: FloatArray) -> Pose | None:
+        """The pose of the least squares near a first one; None where the body is not before the eyes.
+
+        Levenberg-Marquardt on the turn about the origin of the body and the origin's place.
+        """
+        damping = _FIRST_DAMPING
+        now = self._linearised(rotation, x)
+        if now is None:
+            return None
+        for _ in range(_STEPS):
+            residuals, jacobian = now
+            normal = jacobian.T @ jacobian
+            scale = np.diag(normal)
+            change = np.linalg.solve(normal + damping * np.diag(scale), jacobian.T @ residuals)
+            turned = Rotation.from_rotvec(change[:3]).as_matrix() @ rotation
+            tried = self._linearised(turned, x + change[3:])
+            if tried is not None and tried[0] @ tried[0] <= residuals @ residuals:
+                rotation, x, now, damping = turned, x + change[3:], tried, damping / 10.0
+                if float(change @ (scale * change)) < _CONVERGED:
+                    break
+            elif (damping := damping * 10.0) > _MOST_DAMPING:
+                break
+        return self._result(rotation, x, *now)
+
+    def scale(self, pose: Pose) -> tuple[float, float]:
+        """By how much the body seems larger than told, as a part of its size, and the 1-sigma of that.
+
+        One more Gauss-Newton step with the size free: the eyes' distance against the printed size.
+        """
+        linearised = self._linearised(pose.rotation, pose.x)
+        if linearised is None:
+            return math.inf, 0.0
+        residuals, jacobian = linearised
+        grown = np.concatenate(
+            [root @ self._moved(eye, pose).ravel() for eye, root in zip(self._eyes, self._roots, strict=True)]
+        )
+        full = np.column_stack([jacobian, grown])
+        cov = np.linalg.inv(full.T @ full)
+        return float((cov @ full.T @ residuals)[6]), math.sqrt(cov[6, 6])
+
+    def _moved(self, eye: Sighting, pose: Pose) -> FloatArray:
+        """What the pixels of an eye do when the body grows (k, 2)."""
+        arms = eye.points @ pose.rotation.T
+        return (self._projection(arms + self._in_eye(pose.x, eye)) @ arms[..., None])[..., 0]
+
+    def _all_of(self, right: bool) -> Sighting:
+        """What one eye sees of all points."""
+        seen = [sighting for sighting in self._sightings if sighting.right == right]
+        points, pixels = np.concatenate([s.points for s in seen]), np.concatenate([s.pixels for s in seen])
+        return Sighting(points, pixels, np.asarray(block_diag(*(s.cov_px for s in seen))), right)
+
+    def _root(self, sighting: Sighting) -> FloatArray:
+        """What makes residuals independent and of sigma 1."""
+        shared = np.tile(np.eye(2), (len(sighting.points), 1))
+        cov = sighting.cov_px + self._calibration.pixel_sigma**2 * shared @ shared.T
+        return np.asarray(np.linalg.inv(np.linalg.cholesky(cov)), dtype=np.float64)
+
+    def _in_eye(self, x: FloatArray, sighting: Sighting) -> FloatArray:
+        return x - np.array([self._calibration.baseline_m, 0.0, 0.0]) if sighting.right else x
+
+    def _projection(self, points: FloatArray) -> FloatArray:
+        """Derivative (k, 2, 3) [px/m] of the pixels of points (k, 3) in an eye's frame."""
+        rows = np.zeros((len(points), 2, 3))
+        scale = self._calibration.focal_px / points[:, 2]
+        rows[:, 0, 0] = rows[:, 1, 1] = scale
+        rows[:, :, 2] = -scale[:, None] * points[:, :2] / points[:, 2:]
+        return rows
+
+    def _linearised(self, rotation: FloatArray, x: FloatArray) -> tuple[FloatArray, FloatArray] | None:
+        """Residuals and their derivative by turn and place, in units of sigma."""
+        residuals, jacobians = [], []
+        for eye, root in zip(self._eyes, self._roots, strict=True):
+            arms = eye.points @ rotation.T
+            points = arms + self._in_eye(x, eye)
+            if (points[:, 2] <= 0.0).any():
+                return None
+            projection = self._projection(points)
+            turned = projection @ _turned(arms)
+            residuals.append(root @ (eye.pixels - self._seen(points)).ravel())
+            jacobians.append(root @ np.concatenate([turned, projection], axis=2).reshape(-1, 6))
+        return np.concatenate(residuals), np.concatenate(jacobians)
+
+    def _seen(self, points: FloatArray) -> FloatArray:
+        return self._calibration.focal_px * points[:, :2] / points[:, 2:] + self._calibration.principal_point_px
+
+    def _squares(self, sighting: Sighting, root: FloatArray, rotation: FloatArray, x: FloatArray) -> float:
+        points = sighting.points @ rotation.T + self._in_eye(x, sighting)
+        return float(np.square(root @ (sighting.pixels - self._seen(points)).ravel()).sum())
+
+    def _result(self, rotation: FloatArray, x: FloatArray, residuals: FloatArray, jacobian: FloatArray) -> Pose:
+        pairs = zip(self._sightings, self._own_roots, strict=True)
+        parts = tuple(self._squares(sighting, root, rotation, x) for sighting, root in pairs)
+        cov = np.asarray(np.linalg.inv(jacobian.T @ jacobian), dtype=np.float64)
+        return Pose(rotation, x, cov, float(residuals @ residuals), parts)
+
+
+def _turned(arms: FloatArray) -> FloatArray:
+    """What a turn ω does to arms (k, 3): matrices (k, 3, 3) with ω × arm = −[arm]× ω."""
+    matrices = np.zeros((len(arms), 3, 3))
+    x, y, z = arms.T
+    matrices[:, 0, 1], matrices[:, 0, 2] = z, -y
+    matrices[:, 1, 0], matrices[:, 1, 2] = -z, x
+    matrices[:, 2, 0], matrices[:, 2, 1] = y, -x
+    return matrices
+
+
+def mirrored(rotation: FloatArray, x: FloatArray) -> FloatArray:
+    """The other rotation (3, 3) under which a small plane at x (3,) with this one looks nearly the same.
+
+    A plane's image without perspective does not tell towards which side it is tilted: half a turn about the line of
+    sight and half a turn about the plane's own normal.
+    """
+    sight = x / np.linalg.norm(x)
+    about_sight = 2.0 * np.outer(sight, sight) - np.eye(3)
+    return about_sight @ rotation @ np.diag([-1.0, -1.0, 1.0])
+
+
+def fitted_motion(body: FloatArray, seen: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Rotation (3, 3) and origin (3,) that take points of the body (k, 3) to where they are seen (k, 3).
+
+    Kabsch 1976.
+    """
+    middle_body, middle_seen = body.mean(axis=0), seen.mean(axis=0)
+    u, _, vt = np.linalg.svd((seen - middle_seen).T @ (body - middle_body))
+    rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    return rotation, middle_seen - rotation @ middle_body

@@ -1,0 +1,188 @@
+"""Two cameras as the two ideal pinholes side by side that everything else works with."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from functools import cached_property
+from types import TracebackType
+from typing import Self
+
+import cv2
+import numpy as np
+
+from interfaces.camera import StereoCalibration
+from interfaces.errors import SourceError
+from interfaces.protocols import StereoEyes
+from interfaces.records import FloatArray, ImageArray, StereoFrame
+
+from .lens import Lens
+from .rig import CalibrationError, StereoRig
+
+_BORDER_POINTS = 64
+# Of directions that a rectified image may show, the largest x/z and y/z: beyond, a fisheye's image is stretched out.
+_WIDEST = 1.2
+
+
+@dataclass(frozen=True, eq=False)
+class Rectification:
+    """How both eyes' images become those of two pinholes that look the same way, side by side.
+
+    The rectified left frame has the left eye's optical centre as its origin; it is the left camera's own frame turned
+    by `R_rectified_left`: its x axis points to the right eye, and its z axis is as near as that allows to the mean of
+    where both cameras look. Nothing is moved and no length changes.
+
+    Attributes:
+        rig: the calibration.
+    """
+
+    rig: StereoRig
+
+    @cached_property
+    def R_rectified_left(self) -> FloatArray:
+        """Turns directions of the left camera's own frame into the rectified one's, shape (3, 3)."""
+        R, t = self.rig.R_right_left, self.rig.translation_m
+        x = -R.T @ t / np.linalg.norm(t)
+        ahead = np.array([0.0, 0.0, 1.0]) + R.T @ np.array([0.0, 0.0, 1.0])
+        y = np.cross(ahead, x)
+        y /= np.linalg.norm(y)
+        return np.stack([x, y, np.cross(x, y)])
+
+    @property
+    def R_rectified_right(self) -> FloatArray:
+        """The same for the right camera's own frame."""
+        return self.R_rectified_left @ self.rig.R_right_left.T
+
+    @property
+    def eyes(self) -> tuple[tuple[Lens, FloatArray], tuple[Lens, FloatArray]]:
+        """Lens and rotation of the left and of the right eye."""
+        return (self.rig.left, self.R_rectified_left), (self.rig.right, self.R_rectified_right)
+
+    @cached_property
+    def calibration(self) -> StereoCalibration:
+        """The two pinholes: the largest view of which both eyes fill every pixel.
+
+        Its `pixel_sigma` is the error of views that were not calibrated with, at the rectified focal length.
+
+        Raises:
+            CalibrationError: the eyes do not look the same way.
+        """
+        width, height = self.rig.image_size_px
+        low, high = self._common_view()
+        if np.any(high - low < 0.1):
+            raise CalibrationError("the cameras do not look the same way: both see almost nothing. Turn them parallel")
+        focal = float(max((width - 1) / (high[0] - low[0]), (height - 1) / (high[1] - low[1])))
+        centre = 0.5 * np.array([width - 1, height - 1]) - 0.5 * focal * (low + high)
+        own = float(np.mean([*self.rig.left.focal_px, *self.rig.right.focal_px]))
+        return StereoCalibration(
+            focal_px=focal,
+            principal_point_px=(float(centre[0]), float(centre[1])),
+            baseline_m=self.rig.baseline_m,
+            image_size_px=self.rig.image_size_px,
+            pixel_sigma=self.rig.made.held_out_px * focal / own,
+        )
+
+    def points(self, px: FloatArray, eye: int) -> FloatArray:
+        """Where what an eye (0 left, 1 right) sees at (n, 2) [px] is in its rectified image, shape (n, 2) [px]."""
+        calibration = self.calibration
+        return calibration.focal_px * self.directions(px, eye) + np.array(calibration.principal_point_px)
+
+    def directions(self, px: FloatArray, eye: int) -> FloatArray:
+        """The same as directions (x/z, y/z), shape (n, 2)."""
+        lens, R = self.eyes[eye]
+        return _turned(lens.directions(px), R)
+
+    def maps(self, eye: int) -> tuple[ImageArray, ImageArray]:
+        """OpenCV's fixed-point maps that rectify the images of an eye (0 left, 1 right)."""
+        lens, R = self.eyes[eye]
+        calibration = self.calibration
+        width, height = calibration.image_size_px
+        u, v = np.meshgrid(np.arange(width), np.arange(height))
+        px = np.stack([u.ravel(), v.ravel()], axis=1)
+        ahead = (px - np.array(calibration.principal_point_px)) / calibration.focal_px
+        own = lens.project(np.column_stack([ahead, np.ones(len(ahead))]) @ R)
+        x, y = (own[:, k].reshape(height, width).astype(np.float32) for k in range(2))
+        return cv2.convertMaps(x, y, cv2.CV_16SC2)  # pyright: ignore
+
+    def _common_view(self) -> tuple[FloatArray, FloatArray]:
+        """Lower and upper limits (x/z, y/z) of the largest upright rectangle that both eyes' images fill."""
+        views = [_filled(lens, R, self.rig.image_size_px) for lens, R in self.eyes]
+        low = np.max([view[0] for view in views], axis=0)
+        return low, np.min([view[1] for view in views], axis=0)
+
+
+def _filled(lens: Lens, R: FloatArray, size_px: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
+    """Limits (x/z, y/z) of an upright rectangle that one eye's image fills."""
+    width, height = size_px
+    along = np.linspace(0.0, 1.0, _BORDER_POINTS)
+    ends = np.zeros_like(along)
+    sides = [
+        np.column_stack([x * (width - 1), y * (height - 1)])
+        for x, y in ((ends, along), (along, ends), (ends + 1.0, along), (along, ends + 1.0))
+    ]
+    left, top, right, bottom = (np.clip(_turned(lens.directions(side), R), -_WIDEST, _WIDEST) for side in sides)
+    low = np.array([left[:, 0].max(), top[:, 1].max()])
+    return low, np.array([right[:, 0].min(), bottom[:, 1].min()])
+
+
+def _turned(directions: FloatArray, R: FloatArray) -> FloatArray:
+    turned = np.column_stack([directions, np.ones(len(directions))]) @ R.T
+    return turned[:, :2] / turned[:, 2:]
+
+
+class RectifiedCamera:
+    """The rectified images of two calibrated cameras: a `StereoCamera`."""
+
+    def __init__(self, eyes: StereoEyes, rig: StereoRig) -> None:
+        """Compute the maps. Whether these are the cameras that were calibrated is seen when they are opened.
+
+        Raises:
+            CalibrationError: the calibrated eyes do not look the same way.
+        """
+        self._eyes, self._rig = eyes, rig
+        rectification = Rectification(rig)
+        self._calibration = rectification.calibration
+        self._maps = rectification.maps(0), rectification.maps(1)
+        self._open = False
+
+    @property
+    def calibration(self) -> StereoCalibration:
+        """The two pinholes that the images are those of."""
+        return self._calibration
+
+    def __enter__(self) -> Self:
+        """Open the cameras; CalibrationError when they are not the calibrated ones."""
+        self._eyes.__enter__()
+        try:
+            self._rig.require(self._eyes.image_size_px, self._eyes.serials)
+        except BaseException:
+            self._eyes.__exit__(None, None, None)
+            raise
+        if not all(self._rig.serials):
+            logging.getLogger(__name__).warning("the calibration does not say which cameras it is of: taken as these")
+        self._open = True
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._open = False
+        self._eyes.__exit__(kind, error, trace)
+
+    def read(self, timeout_s: float) -> StereoFrame | None:
+        """The next frame, rectified; None when none came within `timeout_s`."""
+        if not self._open:
+            raise SourceError("the camera is not open")
+        frame = self._eyes.read(timeout_s)
+        if frame is None:
+            return None
+        left, right = (self._rectified(image, eye) for eye, image in enumerate((frame.left, frame.right)))
+        return StereoFrame(frame.t, left, right, frame.t_sigma)
+
+    def _rectified(self, image: ImageArray, eye: int) -> ImageArray:
+        if image.shape[1::-1] != self._rig.image_size_px:
+            raise SourceError(
+                f"an image of {image.shape[1]}x{image.shape[0]}, calibrated was "
+                f"{self._rig.image_size_px[0]}x{self._rig.image_size_px[1]}. Set that size"
+            )
+        return cv2.remap(image, *self._maps[eye], cv2.INTER_LINEAR)  # pyright: ignore

@@ -1,0 +1,149 @@
+"""What a calibration tells of two cameras."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import cv2
+import numpy as np
+
+from interfaces.errors import BodyschemaError
+from interfaces.records import FloatArray, frozen_array
+
+from .lens import DISTORTION_NAMES, Lens, Model
+
+_POSE_NAMES = ("rx_rad", "ry_rad", "rz_rad", "tx_m", "ty_m", "tz_m")
+
+
+class CalibrationError(BodyschemaError):
+    """Cameras could not be calibrated, or a calibration does not belong to these cameras."""
+
+
+@dataclass(frozen=True)
+class Made:
+    """How a calibration was made.
+
+    Attributes:
+        date: ISO 8601 in UTC.
+        board: what was shown.
+        views: how many pairs of images it was made of.
+        left_out: how many were left out as outliers.
+        reprojection_px: RMS distance per image coordinate of the corners from where they should be, in the fit [px].
+        held_out_px: the same in views that were not fitted [px].
+        scale_sigma: 1-sigma of the board's size, as a share of it; it is in the covariance too.
+    """
+
+    date: str
+    board: str
+    views: int
+    left_out: int
+    reprojection_px: float
+    held_out_px: float
+    scale_sigma: float
+
+
+@dataclass(frozen=True, eq=False)
+class StereoRig:
+    """Two lenses, where the right eye is against the left one, and how sure all that is.
+
+    A point x in the left eye's frame (x right, y down, z forward) is at R x + t in the right one's.
+
+    Attributes:
+        left, right: the lenses, of one model.
+        rotation_rad: rotation vector of R, shape (3,) [rad].
+        translation_m: t, shape (3,) [m].
+        image_size_px: width and height of both eyes' images.
+        serials: what tells the left and the right device from all others; "" where it was not known.
+        covariance: of `vector`, shape (p, p).
+        made: how it was made.
+    """
+
+    left: Lens
+    right: Lens
+    rotation_rad: FloatArray
+    translation_m: FloatArray
+    image_size_px: tuple[int, int]
+    serials: tuple[str, str]
+    covariance: FloatArray
+    made: Made
+
+    def __post_init__(self) -> None:
+        for name in ("rotation_rad", "translation_m", "covariance"):
+            object.__setattr__(self, name, frozen_array(getattr(self, name)))
+
+    @property
+    def model(self) -> Model:
+        """The lenses' model."""
+        return self.left.model
+
+    @property
+    def vector(self) -> FloatArray:
+        """All parameters: left lens, right lens, rotation vector [rad], translation [m]."""
+        return np.concatenate([self.left.vector, self.right.vector, self.rotation_rad, self.translation_m])
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters in `vector`."""
+        return parameter_names(self.model)
+
+    @property
+    def sigma(self) -> FloatArray:
+        """1-sigma of `vector`."""
+        return np.sqrt(np.diag(self.covariance))
+
+    @cached_property
+    def R_right_left(self) -> FloatArray:
+        """Turns directions of the left eye's frame into the right one's, shape (3, 3)."""
+        return frozen_array(cv2.Rodrigues(self.rotation_rad)[0])
+
+    @property
+    def baseline_m(self) -> float:
+        """Distance of the eyes [m]."""
+        return float(np.linalg.norm(self.translation_m))
+
+    @property
+    def baseline_sigma_m(self) -> float:
+        """Its 1-sigma [m]."""
+        along = self.translation_m / self.baseline_m
+        return float(np.sqrt(along @ self.covariance[-3:, -3:] @ along))
+
+    def with_vector(self, vector: FloatArray) -> StereoRig:
+        """The rig with other parameters, all else the same."""
+        left, right, rotation, translation = split(self.model, vector)
+        return StereoRig(
+            left, right, rotation, translation, self.image_size_px, self.serials, self.covariance, self.made
+        )
+
+    def require(self, image_size_px: tuple[int, int], serials: tuple[str, str]) -> None:
+        """CalibrationError when these cameras are not the calibrated ones. A serial that is not known fits all."""
+        if image_size_px != self.image_size_px:
+            is_, was = ("x".join(map(str, size)) for size in (image_size_px, self.image_size_px))
+            raise CalibrationError(
+                f"the cameras give images of {is_}, they were calibrated with {was}. Set that size, or calibrate "
+                "again: `bodyschema calibrate cameras`"
+            )
+        if all(self.serials) and serials == self.serials[::-1] and serials != self.serials:
+            raise CalibrationError(
+                f"left and right are exchanged: {serials[0]} is the right camera of this calibration. Exchange "
+                "left and right where the cameras are configured"
+            )
+        for eye, serial, known in zip(("left", "right"), serials, self.serials, strict=True):
+            if known and serial and serial != known:
+                raise CalibrationError(
+                    f"the {eye} camera is {serial}, calibrated was {known}: this is the calibration of another pair. "
+                    "Name its own file, or calibrate: `bodyschema calibrate cameras`"
+                )
+
+
+def parameter_names(model: Model) -> tuple[str, ...]:
+    """Names of the parameters of a rig whose lenses are of this model."""
+    lens = ("fx_px", "fy_px", "cx_px", "cy_px", *DISTORTION_NAMES[model])
+    return (*(f"left.{name}" for name in lens), *(f"right.{name}" for name in lens), *_POSE_NAMES)
+
+
+def split(model: Model, vector: FloatArray) -> tuple[Lens, Lens, FloatArray, FloatArray]:
+    """Left lens, right lens, rotation vector [rad] and translation [m] of a vector of all parameters."""
+    n = 4 + len(DISTORTION_NAMES[model])
+    left, right = Lens.from_vector(model, vector[:n]), Lens.from_vector(model, vector[n : 2 * n])
+    return left, right, vector[2 * n : 2 * n + 3], vector[2 * n + 3 :]

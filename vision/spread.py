@@ -1,0 +1,26 @@
+"""What the uncertainty of a calibration makes of what is computed with it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from interfaces.records import FloatArray
+
+from .rig import StereoRig
+
+_STEP = 1e-3  # of a parameter's sigma
+
+
+def covariance_of(rig: StereoRig, figures: Callable[[StereoRig], FloatArray]) -> FloatArray:
+    """Covariance (m, m) of the figures (m,) that a function makes of a rig, to first order."""
+    vector, sigma = rig.vector, rig.sigma
+    slopes = []
+    for k, step in enumerate(_STEP * sigma):
+        forward, backward = (
+            figures(rig.with_vector(vector + sign * step * np.eye(len(vector))[k])) for sign in (1, -1)
+        )
+        slopes.append((forward - backward) / (2.0 * step))
+    J = np.array(slopes)
+    return J.T @ rig.covariance @ J

@@ -1,0 +1,58 @@
+"""The marker as a rigid body: where on it which tag is."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from interfaces.errors import ConfigError
+from interfaces.records import FloatArray, frozen_array
+
+from .tag_config import ClusterConfig, PlacedTag, TagConfig
+
+# Corners of a tag of side 1 in its own frame (x right, y up, z out of it): as `TagImage` has them.
+_CORNERS = np.array([[-0.5, 0.5, 0.0], [0.5, 0.5, 0.0], [0.5, -0.5, 0.0], [-0.5, -0.5, 0.0]])
+
+
+class TagBody:
+    """Tags on a rigid body.
+
+    Attributes:
+        corners: by a tag's number, its corners in the body's frame (4, 3) [m].
+    """
+
+    def __init__(self, tags: Mapping[int, FloatArray]) -> None:
+        self.corners: Mapping[int, FloatArray] = MappingProxyType({i: frozen_array(c) for i, c in tags.items()})
+
+    @classmethod
+    def single(cls, config: TagConfig) -> TagBody:
+        """One tag, whose frame is the body's."""
+        return cls({config.id: config.side_m * _CORNERS})
+
+    @classmethod
+    def cluster(cls, config: ClusterConfig, tag: TagConfig) -> TagBody:
+        """The tags of a cluster.
+
+        Raises:
+            ConfigError: it has none, or the same one twice.
+        """
+        if not config.tags:
+            raise ConfigError(
+                "[vision.cluster] has no tags",
+                remedy="Add a table [[vision.cluster.tags]] with id, xyz and rpy for each",
+            )
+        ids = [placed.id for placed in config.tags]
+        twice = sorted({i for i in ids if ids.count(i) > 1})
+        if twice:
+            raise ConfigError(
+                f"[vision.cluster] has the tag {twice[0]} twice", remedy="Print another number on one of them"
+            )
+        return cls({placed.id: _placed(placed, tag.side_m) for placed in config.tags})
+
+
+def _placed(placed: PlacedTag, side_m: float) -> FloatArray:
+    turn = Rotation.from_euler("xyz", placed.rpy).as_matrix()
+    return (placed.side_m or side_m) * _CORNERS @ turn.T + np.array(placed.xyz)

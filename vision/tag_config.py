@@ -1,0 +1,67 @@
+"""The tables [vision.tag] and [vision.cluster] of robot.toml."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import msgspec
+from msgspec import Meta
+
+Positive = Annotated[float, Meta(gt=0)]
+# Of six by six modules: what is between the black borders. All are in every OpenCV from 4.11 on.
+Dictionary = Literal[
+    "apriltag_36h11", "aruco_6x6_50", "aruco_6x6_100", "aruco_6x6_250", "aruco_6x6_1000", "aruco_mip_36h12"
+]
+Vector = tuple[float, float, float]
+
+
+class TagConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The table [vision.tag]: the tag, or what all tags of a cluster have in common, and when a find is doubtful.
+
+    Attributes:
+        dictionary: which tags there are.
+        id: number of the tag, where it is one.
+        side_m: side of its black square as printed [m]: measure it.
+        min_side_px: a shorter side is too small to be measured [px].
+        min_contrast: least difference of white and black [grey levels].
+        min_visible: share of each edge that has to be straight.
+        max_edge_px: an edge whose points scatter more is covered by something, or blurred by motion [px].
+        epipolar_px: largest difference of the eyes' rows [px], on top of the noise ...
+        epipolar_sigmas: ... which counts this many times.
+        size_tolerance: largest part by which the printed size may contradict the stereo depth, on top of its noise.
+        max_reprojection: largest misfit of the corners to the marker's shape, in units of their own sigma (RMS).
+    """
+
+    dictionary: Dictionary = "apriltag_36h11"
+    id: Annotated[int, Meta(ge=0)] = 0
+    side_m: Positive = 0.04
+    min_side_px: Annotated[float, Meta(ge=12)] = 20.0
+    min_contrast: Annotated[float, Meta(ge=10)] = 40.0
+    min_visible: Annotated[float, Meta(ge=0.5, le=1)] = 0.7
+    max_edge_px: Positive = 0.35
+    epipolar_px: Annotated[float, Meta(ge=0)] = 0.5
+    epipolar_sigmas: Annotated[float, Meta(ge=0)] = 4.0
+    size_tolerance: Annotated[float, Meta(ge=0)] = 0.03
+    max_reprojection: Positive = 4.0
+
+
+class PlacedTag(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """One of [[vision.cluster.tags]]: a tag on the marker.
+
+    Attributes:
+        id: its number.
+        xyz: its centre in the marker's frame [m].
+        rpy: how its frame (x right, y up, z out of it) is turned in the marker's [rad], URDF convention.
+        side_m: side of its black square [m]; where it is not that of [vision.tag].
+    """
+
+    id: Annotated[int, Meta(ge=0)]
+    xyz: Vector = (0.0, 0.0, 0.0)
+    rpy: Vector = (0.0, 0.0, 0.0)
+    side_m: Positive | None = None
+
+
+class ClusterConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The table [vision.cluster]: several tags on one rigid body."""
+
+    tags: tuple[PlacedTag, ...] = ()

@@ -1,0 +1,243 @@
+"""Follows a tag, or a rigid cluster of tags, through rectified stereo images: position and orientation."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Iterable, Sequence
+
+import cv2
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from interfaces.camera import StereoCalibration
+from interfaces.errors import ConfigError
+from interfaces.records import FloatArray, ImageArray, MarkerFix, MarkerMiss, Reason, StereoFrame, frozen_array
+
+from .images import check_calibration, check_images
+from .pose import Pose, PoseEstimator, Sighting, fitted_motion, mirrored
+from .tag_body import TagBody
+from .tag_config import Dictionary, TagConfig
+from .tag_image import TagImage, measure_tag
+from .triangulate import triangulate
+
+_log = logging.getLogger(__name__)
+
+# OpenCV's numbers of the dictionaries.
+DICTIONARIES: dict[Dictionary, int] = {
+    "apriltag_36h11": cv2.aruco.DICT_APRILTAG_36h11,
+    "aruco_6x6_50": cv2.aruco.DICT_6X6_50,
+    "aruco_6x6_100": cv2.aruco.DICT_6X6_100,
+    "aruco_6x6_250": cv2.aruco.DICT_6X6_250,
+    "aruco_6x6_1000": cv2.aruco.DICT_6X6_1000,
+    "aruco_mip_36h12": cv2.aruco.DICT_ARUCO_MIP_36h12,
+}
+# Around the corners of the last frame: so many times their extent, and pixels more.
+_REGION_SHARE, _REGION_PX = 0.6, 30
+# After a longer pause the last fix predicts nothing [s].
+_LONGEST_PAUSE_S = 0.5
+# Two poses this much apart [rad] are two; the worse one has to be so much less likely (difference of squares).
+_TWO_POSES_RAD, _CLEARLY_WORSE = 0.05, 12.0
+# The most telling reason, where all tags were refused.
+_TELLING = (Reason.AMBIGUOUS, Reason.EPIPOLAR, Reason.OCCLUDED, Reason.AT_BORDER, Reason.NO_MARKER)
+
+Seen = dict[int, TagImage | Reason]
+
+
+class TagTracker:
+    """Finds one marker made of tags in rectified stereo images.
+
+    Near where the last frame had it, else in the whole images. Whatever the images show, `track` answers with a fix or
+    a reason.
+    """
+
+    def __init__(self, calibration: StereoCalibration, body: TagBody, config: TagConfig | None = None) -> None:
+        """Prepare for images of `calibration`.
+
+        Raises:
+            ConfigError: that describes no stereo pair, or a tag's number is not in the dictionary.
+        """
+        check_calibration(calibration)
+        self.calibration, self.body, self.config = calibration, body, config or TagConfig()
+        dictionary = cv2.aruco.getPredefinedDictionary(DICTIONARIES[self.config.dictionary])
+        most = len(dictionary.bytesList)
+        for id in body.corners:
+            if id >= most:
+                raise ConfigError(
+                    f"there is no tag {id} in {self.config.dictionary}", remedy=f"Its numbers go from 0 to {most - 1}"
+                )
+        parameters = cv2.aruco.DetectorParameters()
+        parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_NONE  # `measure_tag` does better
+        self._detector = cv2.aruco.ArucoDetector(dictionary, parameters)
+        self._whole = (0, 0, *calibration.image_size_px)
+        self._last: tuple[float, list[FloatArray]] | None = None
+
+    def track(self, frame: StereoFrame) -> MarkerFix | MarkerMiss:
+        """The marker in `frame`, in the left optical frame, or why there is none.
+
+        Raises:
+            SourceError: the images are not uint8 BGR of the calibration's size.
+        """
+        check_images(frame, self.calibration)
+        greys = [np.asarray(cv2.cvtColor(eye, cv2.COLOR_BGR2GRAY), np.uint8) for eye in (frame.left, frame.right)]
+        found: Pose | Reason = Reason.NO_MARKER
+        regions = self._predicted(frame.t)
+        if regions is not None:
+            found = self._look(frame.t, greys, regions)
+        if not isinstance(found, Pose):
+            found = self._look(frame.t, greys, [self._whole, self._whole])
+        if isinstance(found, Reason):
+            if self._last is not None:
+                _log.debug("marker lost at %.3f s: %s", frame.t, found)
+            self._last = None
+            return MarkerMiss(frame.t, found)
+        return self._fix(frame.t, found)
+
+    def forget(self) -> None:
+        """Look for the marker in the whole images next time."""
+        self._last = None
+
+    def _fix(self, t: float, pose: Pose) -> MarkerFix:
+        ul, vl, ur, vr = self.calibration.project(pose.x).tolist()
+        turn = Rotation.from_matrix(pose.rotation).as_quat(canonical=True)
+        cov, cov_R = frozen_array(pose.cov[3:, 3:]), frozen_array(pose.cov[:3, :3])
+        return MarkerFix(t, frozen_array(pose.x), cov, (ul, vl, ur, vr), R=frozen_array(turn), cov_R=cov_R)
+
+    def _look(
+        self, t: float, greys: Sequence[ImageArray], regions: Sequence[tuple[int, int, int, int]]
+    ) -> Pose | Reason:
+        left, right = (self._tags(grey, region) for grey, region in zip(greys, regions, strict=True))
+        seen = [{id: tag for id, tag in eye.items() if isinstance(tag, TagImage)} for eye in (left, right)]
+        if not seen[0] or not seen[1]:
+            return _why(eye for eye, tags in zip((left, right), seen, strict=True) if not tags)
+        both = sorted(seen[0].keys() & seen[1].keys())
+        if not both:
+            return Reason.OCCLUDED
+        apart = {id for id in both if not self._rows_agree(seen[0][id], seen[1][id])}
+        if apart.issuperset(both):
+            return Reason.EPIPOLAR
+        seen = [{id: tag for id, tag in eye.items() if id not in apart} for eye in seen]
+        found = self._pose(seen)
+        if isinstance(found, Pose):
+            self._last = t, [np.concatenate([tag.corners_px for tag in eye.values()]) for eye in seen]
+        return found
+
+    def _tags(self, grey: ImageArray, region: tuple[int, int, int, int]) -> Seen:
+        """The marker's tags in a region (left, top, right, bottom) of one eye, or why they are none."""
+        x0, y0, x1, y1 = region
+        corners, ids, _ = self._detector.detectMarkers(np.ascontiguousarray(grey[y0:y1, x0:x1]))
+        tags: Seen = {}
+        for quad, id in zip(corners, _numbers(ids), strict=True):
+            if id not in self.body.corners:
+                continue
+            if id in tags:
+                tags[id] = Reason.AMBIGUOUS
+                continue
+            rough = np.asarray(quad, dtype=np.float64).reshape(4, 2) + np.array([x0, y0])
+            tags[id] = measure_tag(grey, id, rough, self.config)
+        return tags
+
+    def _rows_agree(self, left: TagImage, right: TagImage) -> bool:
+        """Whether the rows of a tag's corners differ by no more than noise, and its disparity is positive."""
+        apart = left.corners_px - right.corners_px
+        rows = np.arange(1, 8, 2)
+        cov = (left.cov_px + right.cov_px)[np.ix_(rows, rows)]
+        sigma = math.sqrt(float(cov.mean()) + 2.0 * self.calibration.pixel_sigma**2)
+        allowed = self.config.epipolar_px + self.config.epipolar_sigmas * sigma
+        return abs(float(apart[:, 1].mean())) <= allowed and bool((apart[:, 0] > 0.0).all())
+
+    def _pose(self, seen: list[dict[int, TagImage]]) -> Pose | Reason:
+        """The one likely pose; a tag that contradicts the others is left out once."""
+        found = self._likely(seen)
+        if isinstance(found, Pose) or found is not Reason.REPROJECTION or len(seen[0].keys() | seen[1].keys()) < 3:
+            return found
+        outcomes = []
+        for id in sorted(seen[0].keys() | seen[1].keys()):
+            others = [{key: tag for key, tag in eye.items() if key != id} for eye in seen]
+            if others[0].keys() & others[1].keys():
+                outcomes.append(self._likely(others))
+        poses = [outcome for outcome in outcomes if isinstance(outcome, Pose)]
+        return min(poses, key=lambda pose: pose.squares) if poses else found
+
+    def _likely(self, seen: list[dict[int, TagImage]]) -> Pose | Reason:
+        sightings = [
+            Sighting(self.body.corners[id], tag.corners_px, tag.cov_px, right=bool(eye))
+            for eye, tags in enumerate(seen)
+            for id, tag in tags.items()
+        ]
+        estimator = PoseEstimator(self.calibration, sightings)
+        poses = self._minima(estimator, seen)
+        if not poses:
+            return Reason.EPIPOLAR
+        best = poses[0]
+        grown, sigma = estimator.scale(best)
+        if abs(grown) > self.config.size_tolerance + 4.0 * sigma:
+            return Reason.SIZE_MISMATCH
+        freedom = 8 * len(sightings) - 6
+        misfit = best.squares / freedom
+        if misfit > self.config.max_reprojection**2:
+            return Reason.REPROJECTION
+        if len(poses) > 1 and (poses[1].squares - best.squares) / max(misfit, 1.0) < _CLEARLY_WORSE:
+            return Reason.AMBIGUOUS
+        # What the claimed noise does not explain is taken for more noise.
+        return Pose(best.rotation, best.x, best.cov * max(misfit, 1.0), best.squares, best.by_sighting)
+
+    def _minima(self, estimator: PoseEstimator, seen: list[dict[int, TagImage]]) -> list[Pose]:
+        """The different poses that squares are least at, the most likely first."""
+        poses: list[Pose] = []
+        for rotation, x in self._starts(seen):
+            for turn in (rotation, self._mirrored(rotation, x, seen)):
+                pose = estimator.refine(turn, x)
+                if pose is not None and all(_apart(pose, other) > _TWO_POSES_RAD for other in poses):
+                    poses.append(pose)
+        return sorted(poses, key=lambda pose: pose.squares)
+
+    def _starts(self, seen: list[dict[int, TagImage]]) -> list[tuple[FloatArray, FloatArray]]:
+        """A first pose from all corners that both eyes see."""
+        body, points = [], []
+        for id in sorted(seen[0].keys() & seen[1].keys()):
+            pixels = np.hstack([seen[0][id].corners_px, seen[1][id].corners_px])
+            for corner, centres in zip(self.body.corners[id], pixels, strict=True):
+                located = triangulate(self.calibration, centres, np.ones(4))
+                if located is not None:
+                    body.append(corner)
+                    points.append(located[0])
+        return [fitted_motion(np.array(body), np.array(points))] if len(points) >= 3 else []
+
+    def _mirrored(self, rotation: FloatArray, x: FloatArray, seen: list[dict[int, TagImage]]) -> FloatArray:
+        """The rotation that looks nearly the same, where one plane is seen; of a body with depth there is none."""
+        ids = seen[0].keys() | seen[1].keys()
+        if len(ids) > 1:
+            return rotation
+        corners = self.body.corners[next(iter(ids))]
+        edges = np.column_stack([corners[1] - corners[0], corners[0] - corners[3], np.zeros(3)])
+        edges[:, :2] /= np.linalg.norm(edges[:, :2], axis=0)
+        edges[:, 2] = np.cross(edges[:, 0], edges[:, 1])
+        return mirrored(rotation @ edges, x + rotation @ corners.mean(axis=0)) @ edges.T
+
+    def _predicted(self, t: float) -> list[tuple[int, int, int, int]] | None:
+        if self._last is None or not 0 < t - self._last[0] <= _LONGEST_PAUSE_S:
+            return None
+        width, height = self.calibration.image_size_px
+        regions = []
+        for corners in self._last[1]:
+            low, high = corners.min(axis=0), corners.max(axis=0)
+            room = _REGION_SHARE * (high - low).max() + _REGION_PX
+            low, high = np.floor(low - room).astype(int), np.ceil(high + room).astype(int)
+            regions.append((max(low[0], 0), max(low[1], 0), min(high[0], width), min(high[1], height)))
+        return regions
+
+
+def _why(eyes: Iterable[Seen]) -> Reason:
+    """Why eyes without a measured tag have none: of what was refused there, the most telling reason."""
+    reasons = {reason for eye in eyes for reason in eye.values()}
+    return next((reason for reason in _TELLING if reason in reasons), Reason.NO_MARKER)
+
+
+def _numbers(ids: object) -> list[int]:
+    """The tags' numbers as OpenCV tells them: an array (n, 1), or None."""
+    return [] if ids is None else [int(id) for id in np.ravel(np.asarray(ids))]
+
+
+def _apart(one: Pose, other: Pose) -> float:
+    return float(Rotation.from_matrix(one.rotation.T @ other.rotation).magnitude())

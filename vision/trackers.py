@@ -1,0 +1,26 @@
+"""The tracker for the marker that [vision] names."""
+
+from __future__ import annotations
+
+from interfaces.camera import StereoCalibration
+
+from .config import VisionConfig
+from .tag_body import TagBody
+from .tag_tracker import TagTracker
+from .tracked_camera import MarkerTracker
+from .tracker import StereoTracker
+
+
+def tracker_of(calibration: StereoCalibration, config: VisionConfig) -> MarkerTracker:
+    """A tracker for rectified images of `calibration`.
+
+    Raises:
+        ConfigError: that describes no stereo pair, or the marker cannot be.
+    """
+    match config.marker:
+        case "ball" | "bright_ball":
+            return StereoTracker(calibration, config)
+        case "tag":
+            return TagTracker(calibration, TagBody.single(config.tag), config.tag)
+        case "cluster":
+            return TagTracker(calibration, TagBody.cluster(config.cluster, config.tag), config.tag)
