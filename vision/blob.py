@@ -25,8 +25,8 @@ _STRONG_SHARES = (0.5, 0.7)
 _MOST_UNEVEN = 0.3
 # A pixel is over-exposed from here [grey levels]; a ball with more than this share of them cannot be measured.
 _WHITE, _MOST_WHITE = 250, 0.35
-# A round patch with more than this part of a disc's radius may be another ball.
-_RIVAL_RADIUS = 0.6
+# Centre of a patch that could not be measured: 1-sigma as a part of its radius.
+_ROUGH_SIGMA = 0.1
 # Pixels around a patch that the outline may reach into.
 _APRON_PX = 12
 
@@ -91,15 +91,6 @@ class Disc:
         return float(np.linalg.norm(self.centre_px - other.centre_px)) < max(self.radius_px, other.radius_px)
 
 
-def is_rival(patch: Patch, discs: list[Disc]) -> bool:
-    """Whether a patch that was refused may be another ball than the `discs`: round, beside them, not much smaller."""
-    return (
-        patch.fill >= _WHOLE_DISC_FILL
-        and any(patch.radius_px > _RIVAL_RADIUS * disc.radius_px for disc in discs)
-        and not any(np.linalg.norm(patch.centre_px - disc.centre_px) < disc.radius_px for disc in discs)
-    )
-
-
 def find_patches(image: ImageArray, region: Region, gate: Gate, config: VisionConfig) -> list[Patch]:
     """Patches of the marker's colour in `region` of a BGR image, the most disc-like first."""
     pixels = region.crop(image)
@@ -135,6 +126,14 @@ def measure(image: ImageArray, patch: Patch, eye: Pinhole, gate: Gate, config: V
     if (centre_px - reach < 0).any() or (centre_px + reach > (width - 1, height - 1)).any():
         return Reason.AT_BORDER
     return Disc(centre_px, outline.radius_px, outline.cov_px, _level(image, centre_px, outline.radius_px, gate))
+
+
+def roughly(image: ImageArray, patch: Patch, gate: Gate) -> Disc | None:
+    """The ball that a patch may be though it could not be measured; None when it is not round."""
+    if patch.fill < _WHOLE_DISC_FILL:
+        return None
+    cov_px = (_ROUGH_SIGMA * patch.radius_px) ** 2 * np.eye(2)
+    return Disc(patch.centre_px, patch.radius_px, cov_px, _level(image, patch.centre_px, patch.radius_px, gate))
 
 
 def _is_whole(outline: Outline, config: VisionConfig) -> bool:

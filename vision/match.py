@@ -38,6 +38,16 @@ class StereoMatcher:
         # The check that the best pair failed at.
         return Reason.SIZE_MISMATCH if Reason.SIZE_MISMATCH in outcomes else Reason.EPIPOLAR
 
+    def has_rival(self, found: Location, left: Sequence[Disc], right: Sequence[Disc]) -> bool:
+        """Whether another pair of discs than the one `found`, measured or rough, may be a marker too."""
+        others = [
+            [disc for disc in discs if np.linalg.norm(disc.centre_px - centre_px) > disc.radius_px]
+            for discs, centre_px in ((left, found.centres_px[:2]), (right, found.centres_px[2:]))
+        ]
+        outcomes = (self._check(one, other) for one, other in product(*others))
+        fitting = [outcome for outcome in outcomes if isinstance(outcome, Location)]
+        return len(_without_reflections([found, *fitting])) > 1
+
     def _check(self, left: Disc, right: Disc) -> Location | Reason:
         location = locate(self._calibration, self._config.radius_m, left, right)
         if location is None:

@@ -10,7 +10,7 @@ import numpy as np
 from interfaces.camera import StereoCalibration
 from interfaces.records import FloatArray, ImageArray, MarkerFix, MarkerMiss, Reason, StereoFrame, frozen_array
 
-from .blob import Disc, Patch, Region, find_patches, is_rival, measure
+from .blob import Disc, Region, find_patches, measure, roughly
 from .colour import gate_of
 from .config import VisionConfig
 from .images import check_calibration, check_images
@@ -101,32 +101,33 @@ class StereoTracker:
         self._gate.reset()
 
     def _look(self, frame: StereoFrame, regions: tuple[Region, Region]) -> Location | Reason:
-        left, left_rivals = self._discs(frame.left, regions[0])
+        left, left_rough = self._discs(frame.left, regions[0])
         if isinstance(left, Reason):
             return left
-        right, right_rivals = self._discs(frame.right, regions[1])
+        right, right_rough = self._discs(frame.right, regions[1])
         if isinstance(right, Reason):
             return right
         found = self._matcher.match(left, right)
-        # Without a track nothing tells the marker from a round thing of its colour that could not be measured.
-        if self._last is None and left_rivals and right_rivals and isinstance(found, Location):
+        # The marker may be the one of two that could not be measured in both eyes.
+        if isinstance(found, Location) and self._matcher.has_rival(found, left + left_rough, right + right_rough):
             return Reason.AMBIGUOUS
         return found
 
-    def _discs(self, image: ImageArray, region: Region) -> tuple[list[Disc] | Reason, bool]:
-        """The discs in one eye; when there is none, why the most disc-like patch is none. And whether a patch that is
-        as round as a ball and not much smaller than a disc was refused."""
+    def _discs(self, image: ImageArray, region: Region) -> tuple[list[Disc] | Reason, list[Disc]]:
+        """The discs in one eye; when there is none, why the most disc-like patch is none. And what is round, but could
+        not be measured."""
         discs: list[Disc] = []
-        refused: list[Patch] = []
+        rough: list[Disc] = []
         reason: Reason | None = None
         for patch in find_patches(image, region, self._gate, self.config):
             outcome = measure(image, patch, self._eye, self._gate, self.config)
             if isinstance(outcome, Reason):
                 reason = reason or outcome
-                refused.append(patch)
+                thing = roughly(image, patch, self._gate)
+                rough += [thing] if thing else []
             elif not any(outcome.is_same_as(disc) for disc in discs):
                 discs.append(outcome)
-        return discs or reason or Reason.NO_MARKER, any(is_rival(patch, discs) for patch in refused)
+        return discs or reason or Reason.NO_MARKER, rough
 
     def _predicted_regions(self, t: float) -> tuple[Region, Region] | None:
         track = self._track
