@@ -11,6 +11,7 @@ anti-aliased edge counts by its coverage.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import combinations
 from typing import cast
 
 import cv2
@@ -42,6 +43,9 @@ _EDGE_SIGMA_PX = 0.06
 _UNEVEN_PX = 0.4
 # Residuals beyond this are no longer edge noise [px], whatever the spread is.
 _LEAST_GATE_PX, _LARGEST_GATE_PX, _GATE_SIGMAS = 0.8, 2.0, 3.5
+# The outline in so many arcs, of which any three may tell the circle.
+_ARCS = 10
+_TRIPLES = np.array(list(combinations(range(_ARCS), 3)))
 # The waves that tell the covariance go up to this one, or up to radius / _WAVE_RADIUS_PX if that is more.
 _LEAST_WAVES, _WAVE_RADIUS_PX = 4, 3.0
 # Lens and interpolation smooth along the outline too, which takes power from the quicker waves (1-sigma) [px].
@@ -205,7 +209,7 @@ def _fit_circle(edges: _Edges, centre_px: FloatArray, shape: FloatArray) -> Outl
     """Least squares for the centre's shift and the radius; points too far off are left out in turn."""
     design = np.stack([np.cos(edges.angles), np.sin(edges.angles), np.ones_like(edges.angles)], axis=1)
     told = edges.weight > 0
-    weight = edges.weight
+    weight = _agreeing(design, edges)
     solution, normal, residual, used = np.zeros(3), np.eye(3), edges.distance_px, weight
     for _ in range(3):
         if np.count_nonzero(weight) < len(weight) // 2:
@@ -229,6 +233,29 @@ def _fit_circle(edges: _Edges, centre_px: FloatArray, shape: FloatArray) -> Outl
         visible=1.0 - float(np.mean(hidden)),
         uneven=float(np.mean(edges.uneven)),
     )
+
+
+def _agreeing(design: FloatArray, edges: _Edges) -> FloatArray:
+    """The weights of the points, shape (n,); 0 for those far from the circle that most of them agree on.
+
+    Rousseeuw's least median of squares, over circles through the means of three arcs. What hides the ball does so in
+    arcs, up to nearly half of the outline, and all of them pull inwards: least squares would go along.
+    """
+    told = np.flatnonzero(edges.weight > 0)
+    if len(told) < 2 * _ARCS:
+        return edges.weight
+    arcs = np.array_split(told, _ARCS)
+    means = np.array([[*design[arc].mean(axis=0), edges.distance_px[arc].mean()] for arc in arcs])[_TRIPLES]
+    circles = np.linalg.solve(means[..., :3] + 1e-9 * np.eye(3), means[..., 3:])[..., 0]
+    off = np.abs(edges.distance_px[told] - circles @ design[told].T)
+    middle = len(told) // 2
+    spread = np.partition(off, middle, axis=1)[:, middle]
+    best = int(np.argmin(spread))
+    gate = min(max(_GATE_SIGMAS * 1.4826 * float(spread[best]), _LEAST_GATE_PX), _LARGEST_GATE_PX)
+    weight = np.zeros(len(edges.weight))
+    near = told[off[best] < gate]
+    weight[near] = edges.weight[near]
+    return weight
 
 
 def _noise_density(angles: FloatArray, residual: FloatArray, radius_px: float) -> float:
