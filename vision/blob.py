@@ -23,6 +23,8 @@ _WHOLE_DISC_FILL = 0.8
 _STRONG_SHARES = (0.5, 0.7)
 # A part of the ball or of a brick has an edge on some sides only; on the others its surroundings are as colourful.
 _MOST_UNEVEN = 0.3
+# Where more of the outline than this leaves the ellipse, something covers the ball.
+_MOST_OFF = 0.15
 # A pixel is over-exposed from here [grey levels]; a ball with more than this share of them cannot be measured.
 _WHITE, _MOST_WHITE = 250, 0.35
 # Centre of a patch that could not be measured: 1-sigma as a part of its radius.
@@ -141,6 +143,7 @@ def _is_whole(outline: Outline, config: VisionConfig) -> bool:
     return (
         outline.visible >= config.min_visible
         and outline.uneven <= _MOST_UNEVEN
+        and outline.off <= _MOST_OFF
         and sigma_px <= config.max_centre_sigma_px
     )
 

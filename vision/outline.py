@@ -43,6 +43,9 @@ _EDGE_SIGMA_PX = 0.06
 _UNEVEN_PX = 0.4
 # Residuals beyond this are no longer edge noise [px], whatever the spread is.
 _LEAST_GATE_PX, _LARGEST_GATE_PX, _GATE_SIGMAS = 0.8, 2.0, 3.5
+# An arc of this part of the outline, of so many rays to both sides at least, whose mean is farther off than this [px]
+# is not the ball's edge.
+_ARC, _LEAST_HALF_ARC, _OFF_PX = 0.1, 3, 0.35
 # The outline in so many arcs, of which any three may tell the circle.
 _ARCS = 10
 _TRIPLES = np.array(list(combinations(range(_ARCS), 3)))
@@ -66,6 +69,7 @@ class Outline:
         cov_px: covariance of the centre, shape (2, 2) [px²].
         visible: share of the outline that nothing hides.
         uneven: share of the outline at which the background is too uneven to tell.
+        off: share of the fit's weights where the outline leaves the ellipse in whole arcs.
     """
 
     centre_px: FloatArray
@@ -73,6 +77,7 @@ class Outline:
     cov_px: FloatArray
     visible: float
     uneven: float
+    off: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -232,7 +237,25 @@ def _fit_circle(edges: _Edges, centre_px: FloatArray, shape: FloatArray) -> Outl
         cov_px=density * (shape @ np.linalg.inv(normal)[:2, :2] @ shape) + _FLOOR_PX**2 * np.eye(2),
         visible=1.0 - float(np.mean(hidden)),
         uneven=float(np.mean(edges.uneven)),
+        off=_share_off(edges.weight, residual),
     )
+
+
+def _share_off(weight: FloatArray, residual: FloatArray) -> float:
+    """Share of the weights (n,) where the residuals (n,) [px], averaged over an arc, are no edge noise.
+
+    Noise and aliased pixels change from ray to ray; what covers a part of the ball moves the edge in a whole arc.
+    """
+    half = max(_LEAST_HALF_ARC, round(len(weight) * _ARC / 2))
+    clipped = weight * np.clip(residual, -_LARGEST_GATE_PX, _LARGEST_GATE_PX)
+    moved, among = _arc_sums(clipped, half), _arc_sums(weight, half)
+    return float(weight @ (np.abs(moved) > _OFF_PX * among) / weight.sum())
+
+
+def _arc_sums(values: FloatArray, half: int) -> FloatArray:
+    """Sums of each of `values` (n,) and its `half` neighbours on both sides, along the closed axis."""
+    sums = np.concatenate([[0.0], np.cumsum(np.concatenate([values[-half:], values, values[:half]]))])
+    return sums[2 * half + 1 :] - sums[: -2 * half - 1]
 
 
 def _agreeing(design: FloatArray, edges: _Edges) -> FloatArray:
