@@ -7,6 +7,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from interfaces.errors import BodyschemaError
 from interfaces.records import FloatArray, ImageArray
@@ -128,8 +129,8 @@ def _mean_hue_deg(pixels: ImageArray) -> float:
     return float(np.rad2deg(np.angle(np.exp(1j * angles).mean()))) % 360.0
 
 
-def _apart_deg(hue_deg: FloatArray, other_deg: float) -> FloatArray:
-    return np.abs((hue_deg - other_deg + 180.0) % 360.0 - 180.0)
+def _apart_deg(hue_deg: NDArray[np.floating], other_deg: float) -> FloatArray:
+    return np.abs((hue_deg - other_deg + 180.0) % 360.0 - 180.0).astype(np.float64)
 
 
 def _band(pixels: ImageArray) -> HueBand:

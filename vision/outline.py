@@ -48,6 +48,8 @@ _LEAST_GATE_PX, _LARGEST_GATE_PX, _GATE_SIGMAS = 0.8, 2.0, 3.5
 _ARC, _LEAST_HALF_ARC, _OFF_PX = 0.1, 3, 0.35
 # The outline in so many arcs, of which any three may tell the circle.
 _ARCS = 10
+# About so many points are enough to tell which circle most agree on.
+_ENOUGH = 60
 _TRIPLES = np.array(list(combinations(range(_ARCS), 3)))
 # The waves that tell the covariance go up to this one, or up to radius / _WAVE_RADIUS_PX if that is more.
 _LEAST_WAVES, _WAVE_RADIUS_PX = 4, 3.0
@@ -269,16 +271,14 @@ def _agreeing(design: FloatArray, edges: _Edges) -> FloatArray:
         return edges.weight
     arcs = np.array_split(told, _ARCS)
     means = np.array([[*design[arc].mean(axis=0), edges.distance_px[arc].mean()] for arc in arcs])[_TRIPLES]
+    told = told[:: max(1, len(told) // _ENOUGH)]
     circles = np.linalg.solve(means[..., :3] + 1e-9 * np.eye(3), means[..., 3:])[..., 0]
     off = np.abs(edges.distance_px[told] - circles @ design[told].T)
     middle = len(told) // 2
     spread = np.partition(off, middle, axis=1)[:, middle]
     best = int(np.argmin(spread))
     gate = min(max(_GATE_SIGMAS * 1.4826 * float(spread[best]), _LEAST_GATE_PX), _LARGEST_GATE_PX)
-    weight = np.zeros(len(edges.weight))
-    near = told[off[best] < gate]
-    weight[near] = edges.weight[near]
-    return weight
+    return np.where(np.abs(edges.distance_px - design @ circles[best]) < gate, edges.weight, 0.0)
 
 
 def _noise_density(angles: FloatArray, residual: FloatArray, radius_px: float) -> float:
