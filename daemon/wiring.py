@@ -217,7 +217,7 @@ def _simulated(config: Config) -> Iterator[Sources]:
 def _simulation_settings(config: Config) -> SimConfig:
     """The table [sim], with the tags that [vision] looks for in the hand unless [sim.camera] names others."""
     sim, vision = config.tables.sim, config.tables.vision
-    if vision.marker == "ball" or sim.camera.tags:
+    if vision.marker in ("ball", "bright_ball") or sim.camera.tags:
         return sim
     from vision.tag_tracker import DICTIONARIES
 

@@ -25,6 +25,8 @@ class Reason(StrEnum):
     NO_MARKER = "no_marker"  # nothing of the marker's colour, or too few pixels
     AT_BORDER = "at_border"  # the marker touches the image border
     OCCLUDED = "occluded"  # its outline is not a whole disc
+    SATURATED = "saturated"  # too much of it is over-exposed
+    REFLECTION = "reflection"  # a dimmer copy of the marker, or one at a place that it cannot have
     EPIPOLAR = "epipolar"  # the two eyes' rows disagree
     SIZE_MISMATCH = "size_mismatch"  # the two eyes' radii, or radius and depth, disagree
     AMBIGUOUS = "ambiguous"  # more than one candidate fits

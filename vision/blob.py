@@ -10,7 +10,7 @@ import numpy as np
 
 from interfaces.records import FloatArray, ImageArray, Reason
 
-from .colour import ColourGate
+from .colour import Gate
 from .config import VisionConfig
 from .outline import Outline, fit_outline
 from .sphere import Pinhole
@@ -23,6 +23,12 @@ _WHOLE_DISC_FILL = 0.8
 _STRONG_SHARES = (0.5, 0.7)
 # A part of the ball or of a brick has an edge on some sides only; on the others its surroundings are as colourful.
 _MOST_UNEVEN = 0.3
+# Where more of the outline than this leaves the ellipse, something covers the ball.
+_MOST_OFF = 0.15
+# A pixel is over-exposed from here [grey levels]; a ball with more than this share of them cannot be measured.
+_WHITE, _MOST_WHITE = 250, 0.35
+# Centre of a patch that could not be measured: 1-sigma as a part of its radius.
+_ROUGH_SIGMA = 0.1
 # Pixels around a patch that the outline may reach into.
 _APRON_PX = 12
 
@@ -74,18 +80,20 @@ class Disc:
         centre_px: centre of its ellipse, shape (2,) [px].
         radius_px: radius of the circle of the same area [px].
         cov_px: covariance of the centre, shape (2, 2) [px²].
+        level: how bright the marker's colour is on it [grey levels].
     """
 
     centre_px: FloatArray
     radius_px: float
     cov_px: FloatArray
+    level: float
 
     def is_same_as(self, other: Disc) -> bool:
         """Whether two discs, of overlapping patches, show the same ball."""
         return float(np.linalg.norm(self.centre_px - other.centre_px)) < max(self.radius_px, other.radius_px)
 
 
-def find_patches(image: ImageArray, region: Region, gate: ColourGate, config: VisionConfig) -> list[Patch]:
+def find_patches(image: ImageArray, region: Region, gate: Gate, config: VisionConfig) -> list[Patch]:
     """Patches of the marker's colour in `region` of a BGR image, the most disc-like first."""
     pixels = region.crop(image)
     patches = _patches(gate.mask(pixels), region, config)
@@ -95,11 +103,13 @@ def find_patches(image: ImageArray, region: Region, gate: ColourGate, config: Vi
     return sorted(patches, key=lambda patch: -patch.fill)[: config.max_candidates]
 
 
-def measure(image: ImageArray, patch: Patch, eye: Pinhole, gate: ColourGate, config: VisionConfig) -> Disc | Reason:
+def measure(image: ImageArray, patch: Patch, eye: Pinhole, gate: Gate, config: VisionConfig) -> Disc | Reason:
     """The ball's image at `patch`, or why it is none."""
     height, width = image.shape[:2]
     if not _clear_of_border(patch.box, config.border_margin_px, (width, height)):
         return Reason.AT_BORDER
+    if config.marker != "bright_ball" and _washed_out(image, patch):
+        return Reason.SATURATED
     if patch.fill < _LEAST_FILL:
         return Reason.OCCLUDED
     around = patch.box.grown(_APRON_PX, (width, height))
@@ -117,7 +127,15 @@ def measure(image: ImageArray, patch: Patch, eye: Pinhole, gate: ColourGate, con
     reach = outline.radius_px + config.border_margin_px
     if (centre_px - reach < 0).any() or (centre_px + reach > (width - 1, height - 1)).any():
         return Reason.AT_BORDER
-    return Disc(centre_px, outline.radius_px, outline.cov_px)
+    return Disc(centre_px, outline.radius_px, outline.cov_px, _level(image, centre_px, outline.radius_px, gate))
+
+
+def roughly(image: ImageArray, patch: Patch, gate: Gate) -> Disc | None:
+    """The ball that a patch may be though it could not be measured; None when it is not round."""
+    if patch.fill < _WHOLE_DISC_FILL:
+        return None
+    cov_px = (_ROUGH_SIGMA * patch.radius_px) ** 2 * np.eye(2)
+    return Disc(patch.centre_px, patch.radius_px, cov_px, _level(image, patch.centre_px, patch.radius_px, gate))
 
 
 def _is_whole(outline: Outline, config: VisionConfig) -> bool:
@@ -125,8 +143,21 @@ def _is_whole(outline: Outline, config: VisionConfig) -> bool:
     return (
         outline.visible >= config.min_visible
         and outline.uneven <= _MOST_UNEVEN
+        and outline.off <= _MOST_OFF
         and sigma_px <= config.max_centre_sigma_px
     )
+
+
+def _level(image: ImageArray, centre_px: FloatArray, radius_px: float, gate: Gate) -> float:
+    """Mean amount of the marker's colour in the square inside the disc."""
+    first, last = (np.rint(centre_px + side * 0.6 * radius_px).astype(int) for side in (-1, 1))
+    return float(gate.amount(image[first[1] : last[1] + 1, first[0] : last[0] + 1]).mean())
+
+
+def _washed_out(image: ImageArray, patch: Patch) -> bool:
+    """Whether much of the ball is white in all channels: neither its colour nor its shading can be told there."""
+    pixels = patch.box.crop(image)
+    return float(np.mean(pixels.min(axis=2) >= _WHITE)) > _MOST_WHITE * np.pi / 4
 
 
 def _clear_of_border(box: Region, margin_px: float, size: tuple[int, int]) -> bool:
@@ -165,7 +196,7 @@ def _patch(mask: ImageArray, stats: np.ndarray, region: Region) -> Patch | None:
     return Patch(whole, corner + np.array([x, y]), radius, fill)
 
 
-def _brighter_parts(image: ImageArray, patch: Patch, gate: ColourGate, config: VisionConfig) -> list[Patch]:
+def _brighter_parts(image: ImageArray, patch: Patch, gate: Gate, config: VisionConfig) -> list[Patch]:
     """What is left of a patch when only pixels with much of its strongest colour count: the ball before brick."""
     pixels = patch.box.crop(image)
     amount = gate.amount(pixels)

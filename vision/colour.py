@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import cast
+from typing import Protocol, cast
 
 import cv2
 import numpy as np
@@ -10,15 +10,78 @@ from numpy.typing import NDArray
 
 from interfaces.records import ImageArray
 
-from .config import HueBand
+from .config import HueBand, VisionConfig
 
 Float32Array = NDArray[np.float32]
 
 
+# How much of the way to the ball's present colour the band goes at a fix, and how far in all (of its half-width).
+_FOLLOWED, _FARTHEST = 0.05, 0.5
+# Limits of saturation and brightness stay at this part of what the ball shows.
+_ROOM = 0.6
+
+
+class Gate(Protocol):
+    """What tells the marker's pixels from all others."""
+
+    @property
+    def shading_sigma(self) -> float:
+        """How much the marker's brightness at its limb may differ from that a little inside (1-sigma, relative)."""
+        ...
+
+    def mask(self, image: ImageArray) -> ImageArray:
+        """255 where a BGR image (height, width, 3) may show the marker, else 0; shape (height, width)."""
+        ...
+
+    def amount(self, image: ImageArray | Float32Array) -> Float32Array:
+        """How much of the marker's light each pixel of a BGR image (..., 3) has, shape (...), in grey levels."""
+        ...
+
+    def follow(self, pixels: ImageArray) -> None:
+        """Learn from BGR pixels (height, width, 3) of the middle of a ball that was accepted."""
+        ...
+
+    def reset(self) -> None:
+        """Forget what was learnt."""
+        ...
+
+
 class ColourGate:
-    """Tells pixels of one band of hues from all others."""
+    """Tells pixels of one band of hues from all others.
+
+    The band follows the ball's colour through changing light: slowly, only by pixels of accepted fixes, and never
+    farther from where it began than `_FARTHEST` says, so that it cannot walk off to another thing.
+    """
+
+    shading_sigma = 0.3
 
     def __init__(self, band: HueBand) -> None:
+        self._first = self._band = band
+        self._use(band)
+
+    def follow(self, pixels: ImageArray) -> None:
+        """Learn from BGR pixels (height, width, 3) of the middle of a ball that was accepted."""
+        hsv = cv2.cvtColor(pixels, cv2.COLOR_BGR2HSV).reshape(-1, 3).astype(np.float64)
+        off_deg = (2.0 * hsv[:, 0] - self._band.hue_deg + 180.0) % 360.0 - 180.0
+        first, rate = self._first, _FOLLOWED
+        drift_deg = (self._band.hue_deg - first.hue_deg + 180.0) % 360.0 - 180.0 + rate * float(np.median(off_deg))
+        most_deg = _FARTHEST * first.half_width_deg
+        saturation, value = (float(np.quantile(hsv[:, channel], 0.1)) / 255.0 for channel in (1, 2))
+        self._use(
+            HueBand(
+                (first.hue_deg + min(max(drift_deg, -most_deg), most_deg)) % 360.0,
+                first.half_width_deg,
+                _followed(self._band.min_saturation, _ROOM * saturation, first.min_saturation),
+                _followed(self._band.min_value, _ROOM * value, first.min_value),
+            )
+        )
+
+    def reset(self) -> None:
+        """Begin again with the band of the configuration."""
+        self._use(self._first)
+
+    def _use(self, band: HueBand) -> None:
+        self._band = band
         self._ranges = _hsv_ranges(band)
         self._weights_bgr = _chroma_weights(band.hue_deg)
 
@@ -37,6 +100,45 @@ class ColourGate:
         nothing, and a pixel that the marker covers by half has half of it.
         """
         return image.astype(np.float32, copy=False) @ self._weights_bgr
+
+
+class BrightGate:
+    """Tells what is brighter than all around it, of whatever colour: a lamp, a white ball, a retro-reflective one."""
+
+    # Its brightness is all that tells it.
+    shading_sigma = 0.1
+
+    def __init__(self, min_brightness: float) -> None:
+        """Pixels from `min_brightness` on count, where 1 is white."""
+        self._first = self._lowest = 255.0 * min_brightness
+
+    def mask(self, image: ImageArray) -> ImageArray:
+        """255 where a BGR image (height, width, 3) is bright, else 0; shape (height, width)."""
+        grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+        return cast(ImageArray, cv2.threshold(grey, self._lowest, 255, cv2.THRESH_BINARY)[1])
+
+    def follow(self, pixels: ImageArray) -> None:
+        """Take half of the ball's brightness for the limit, between half of the configured one and that."""
+        seen = float(np.median(cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY)))
+        self._lowest = _followed(self._lowest, _ROOM * seen, self._first)
+
+    def reset(self) -> None:
+        """Begin again with the configured brightness."""
+        self._lowest = self._first
+
+    def amount(self, image: ImageArray | Float32Array) -> Float32Array:
+        """The brightness of each pixel of a BGR image (..., 3), shape (...), in grey levels."""
+        return image.astype(np.float32, copy=False) @ np.full(3, 1 / 3, np.float32)
+
+
+def gate_of(config: VisionConfig) -> Gate:
+    """What tells the ball that `config` describes."""
+    return BrightGate(config.min_brightness) if config.marker == "bright_ball" else ColourGate(config.band)
+
+
+def _followed(limit: float, wanted: float, first: float) -> float:
+    """A step of `limit` towards `wanted`, between half of the `first` one and that."""
+    return min(max(limit + _FOLLOWED * (wanted - limit), 0.5 * first), first)
 
 
 def _hsv_ranges(band: HueBand) -> list[tuple[ImageArray, ImageArray]]:

@@ -14,6 +14,7 @@ Positive = Annotated[float, Meta(gt=0)]
 Ratio = Annotated[float, Meta(gt=1)]
 Fraction = Annotated[float, Meta(ge=0, le=1)]
 
+MarkerKind = Literal["ball", "bright_ball", "tag", "cluster"]
 ColourName = Literal["red", "orange", "yellow", "green", "cyan", "blue", "magenta"]
 
 
@@ -48,9 +49,10 @@ class VisionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The table [vision]: what the marker looks like, and when a find is doubtful.
 
     Attributes:
-        marker: what is looked for: a ball, one tag ([vision.tag]), or a rigid cluster of tags ([vision.cluster]). The
-            other keys of this table are a ball's.
+        marker: what is looked for: a coloured ball, a ball that is brighter than all around it, one tag ([vision.tag]),
+            or a rigid cluster of tags ([vision.cluster]). The other keys of this table are a ball's.
         colour: a name, or a band of hues as the table [vision.colour].
+        min_brightness: of a bright ball, where 1 is the brightest that the camera can tell.
         radius_m: radius of the marker ball [m].
         min_pixels: a patch of the marker's colour smaller than this is no candidate [px²].
         border_margin_px: how far the ball's outline has to stay from the image border [px].
@@ -60,15 +62,17 @@ class VisionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         epipolar_sigmas: ... which counts this many times.
         eye_size_ratio: largest ratio of the sizes the two eyes claim for the ball.
         depth_size_ratio: largest ratio between the radius seen and the one expected at the triangulated depth.
+        max_speed_m_s: faster than this the marker does not move; what is farther off is something else [m/s].
         max_candidates: at most this many patches per eye are looked at closely, the most disc-like first.
         cameras: where images come from; without it there are none.
         tag: the tag, or what the tags of a cluster have in common.
         cluster: where on the marker which tag is.
     """
 
-    marker: Literal["ball", "tag", "cluster"] = "ball"
+    marker: MarkerKind = "ball"
     colour: ColourName | HueBand = "red"
     radius_m: Positive = 0.020
+    min_brightness: Annotated[float, Meta(gt=0, le=1)] = 0.6
     min_pixels: Annotated[int, Meta(ge=12)] = 30
     border_margin_px: Annotated[float, Meta(ge=0)] = 3.0
     min_visible: Annotated[float, Meta(ge=0.5, le=1)] = 0.85
@@ -77,6 +81,7 @@ class VisionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     epipolar_sigmas: Annotated[float, Meta(ge=0)] = 4.0
     eye_size_ratio: Ratio = 1.2
     depth_size_ratio: Ratio = 1.3
+    max_speed_m_s: Positive = 3.0
     max_candidates: Annotated[int, Meta(ge=1)] = 12
     cameras: CamerasConfig | None = None
     tag: TagConfig = TagConfig()

@@ -16,6 +16,9 @@ from .config import VisionConfig
 from .sphere import Pinhole
 from .triangulate import Location, locate
 
+# A mirror gives back less than this of the light, and its copy stands farther off.
+_MIRRORED_LIGHT = 0.8
+
 
 class StereoMatcher:
     """Checks pairs of discs against the geometry of two eyes and one ball of known size."""
@@ -27,13 +30,23 @@ class StereoMatcher:
     def match(self, left: Sequence[Disc], right: Sequence[Disc]) -> Location | Reason:
         """The one pair that fits, or why there is none; both sequences hold at least one disc."""
         outcomes = [self._check(one, other) for one, other in product(left, right)]
-        found = [outcome for outcome in outcomes if isinstance(outcome, Location)]
+        found = _without_reflections([outcome for outcome in outcomes if isinstance(outcome, Location)])
         if len(found) == 1:
             return found[0]
         if found:
             return Reason.AMBIGUOUS
         # The check that the best pair failed at.
         return Reason.SIZE_MISMATCH if Reason.SIZE_MISMATCH in outcomes else Reason.EPIPOLAR
+
+    def has_rival(self, found: Location, left: Sequence[Disc], right: Sequence[Disc]) -> bool:
+        """Whether another pair of discs than the one `found`, measured or rough, may be a marker too."""
+        others = [
+            [disc for disc in discs if np.linalg.norm(disc.centre_px - centre_px) > disc.radius_px]
+            for discs, centre_px in ((left, found.centres_px[:2]), (right, found.centres_px[2:]))
+        ]
+        outcomes = (self._check(one, other) for one, other in product(*others))
+        fitting = [outcome for outcome in outcomes if isinstance(outcome, Location)]
+        return len(_without_reflections([found, *fitting])) > 1
 
     def _check(self, left: Disc, right: Disc) -> Location | Reason:
         location = locate(self._calibration, self._config.radius_m, left, right)
@@ -56,3 +69,16 @@ class StereoMatcher:
         between_eyes = max(ratios) / min(ratios)
         against_depth = max(*ratios, 1.0 / min(ratios))
         return between_eyes <= self._config.eye_size_ratio and against_depth <= self._config.depth_size_ratio
+
+
+def _without_reflections(found: list[Location]) -> list[Location]:
+    """All but the dimmer, farther copies that a mirror or a window makes of the nearest and brightest one."""
+    if len(found) < 2:
+        return found
+    first = max(found, key=lambda one: one.level)
+    return [one for one in found if not is_reflection_of(one, first.level, float(np.linalg.norm(first.x)))]
+
+
+def is_reflection_of(one: Location, level: float, distance_m: float) -> bool:
+    """Whether `one` may be the mirrored copy of a marker of `level` [grey levels] at `distance_m` [m]."""
+    return one.level < _MIRRORED_LIGHT * level and float(np.linalg.norm(one.x)) > distance_m

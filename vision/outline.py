@@ -11,6 +11,7 @@ anti-aliased edge counts by its coverage.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import combinations
 from typing import cast
 
 import cv2
@@ -19,7 +20,7 @@ from numpy.typing import NDArray
 
 from interfaces.records import FloatArray
 
-from .colour import ColourGate, Float32Array
+from .colour import Float32Array, Gate
 
 BoolArray = NDArray[np.bool_]
 
@@ -30,9 +31,7 @@ _SETTLED_PX = 0.3
 _RING_STEP_PX = 0.5
 _BACKGROUND_PX = 2.0
 _INNER_COLUMNS = 6
-# How much the brightness at the limb may differ from the one a little inside (1-sigma, relative) ...
-_SHADING_SIGMA = 0.3
-# ... and how much any channel may, apart from that (1-sigma, grey levels).
+# How much any channel at the limb may differ from the one a little inside, brightness apart (1-sigma, grey levels).
 _CHANNEL_SIGMA = 4.0
 # A ray tells the edge where ball and background are this many of these sigmas apart.
 _LEAST_SEPARATION = 3.0
@@ -44,6 +43,14 @@ _EDGE_SIGMA_PX = 0.06
 _UNEVEN_PX = 0.4
 # Residuals beyond this are no longer edge noise [px], whatever the spread is.
 _LEAST_GATE_PX, _LARGEST_GATE_PX, _GATE_SIGMAS = 0.8, 2.0, 3.5
+# An arc of this part of the outline, of so many rays to both sides at least, whose mean is farther off than this [px]
+# is not the ball's edge.
+_ARC, _LEAST_HALF_ARC, _OFF_PX = 0.1, 3, 0.35
+# The outline in so many arcs, of which any three may tell the circle.
+_ARCS = 10
+# About so many points are enough to tell which circle most agree on.
+_ENOUGH = 60
+_TRIPLES = np.array(list(combinations(range(_ARCS), 3)))
 # The waves that tell the covariance go up to this one, or up to radius / _WAVE_RADIUS_PX if that is more.
 _LEAST_WAVES, _WAVE_RADIUS_PX = 4, 3.0
 # Lens and interpolation smooth along the outline too, which takes power from the quicker waves (1-sigma) [px].
@@ -64,6 +71,7 @@ class Outline:
         cov_px: covariance of the centre, shape (2, 2) [px²].
         visible: share of the outline that nothing hides.
         uneven: share of the outline at which the background is too uneven to tell.
+        off: share of the fit's weights where the outline leaves the ellipse in whole arcs.
     """
 
     centre_px: FloatArray
@@ -71,6 +79,7 @@ class Outline:
     cov_px: FloatArray
     visible: float
     uneven: float
+    off: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,7 +102,7 @@ class _Edges:
 
 
 def fit_outline(
-    image: Float32Array, gate: ColourGate, centre_px: FloatArray, radius_px: float, shape: FloatArray
+    image: Float32Array, gate: Gate, centre_px: FloatArray, radius_px: float, shape: FloatArray
 ) -> Outline | None:
     """Refine a rough circle to the outline of the ball; None when there is no outline near it.
 
@@ -120,7 +129,7 @@ def fit_outline(
 
 
 def _find_edges(
-    image: Float32Array, gate: ColourGate, centre_px: FloatArray, radius_px: float, shape: FloatArray, half_px: float
+    image: Float32Array, gate: Gate, centre_px: FloatArray, radius_px: float, shape: FloatArray, half_px: float
 ) -> _Edges | None:
     count = int(np.clip(round(2 * np.pi * radius_px), 24, 400))
     angles: FloatArray = np.linspace(0.0, 2 * np.pi, count, endpoint=False)
@@ -138,7 +147,7 @@ def _find_edges(
     level = np.maximum(_mean_of_three(gate.amount(inside[:, -2:]).mean(axis=1)), 0.0)
     covered = level < _LEAST_LEVEL * _median(level)
     background = _mean_of_three(outside.mean(axis=1))
-    towards, separation = _discriminant(level, colour, background)
+    towards, separation = _discriminant(level, colour, background, gate.shading_sigma)
     told = (separation > _LEAST_SEPARATION**2) & ~covered
     scale = 1.0 / np.where(told, separation, 1.0)
     # The share of ball in each sample: 1 on the ball, 0 on the background.
@@ -159,7 +168,7 @@ def _sample(
     return cast(Float32Array, samples)
 
 
-def _ball_colour(inside: Float32Array, gate: ColourGate) -> FloatArray | None:
+def _ball_colour(inside: Float32Array, gate: Gate) -> FloatArray | None:
     """The ball's colour (3,) per unit of its amount; the median leaves highlights out."""
     samples = inside.reshape(-1, 3)
     amount = gate.amount(samples)
@@ -169,7 +178,9 @@ def _ball_colour(inside: Float32Array, gate: ColourGate) -> FloatArray | None:
     return np.median(samples[coloured] / amount[coloured, None], axis=0).astype(np.float64)
 
 
-def _discriminant(level: FloatArray, colour: FloatArray, background: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _discriminant(
+    level: FloatArray, colour: FloatArray, background: FloatArray, shading_sigma: float
+) -> tuple[FloatArray, FloatArray]:
     """Fisher's linear discriminant between ball and background, ray by ray.
 
     The ball is `level · colour`, with a covariance of (σ_s · level)² along `colour` and of σ_c² in all channels.
@@ -182,7 +193,7 @@ def _discriminant(level: FloatArray, colour: FloatArray, background: FloatArray)
         The direction in colour space (n, 3), and the squared separation along it (n,) in sigmas.
     """
     apart = level[:, None] * colour - background
-    along = (_SHADING_SIGMA * level) ** 2
+    along = (shading_sigma * level) ** 2
     # Inverse of σ_c² I + along · colour colourᵀ by Sherman and Morrison.
     share = along * (apart @ colour) / (_CHANNEL_SIGMA**2 + along * (colour @ colour))
     direction = (apart - share[:, None] * colour) / _CHANNEL_SIGMA**2
@@ -205,7 +216,7 @@ def _fit_circle(edges: _Edges, centre_px: FloatArray, shape: FloatArray) -> Outl
     """Least squares for the centre's shift and the radius; points too far off are left out in turn."""
     design = np.stack([np.cos(edges.angles), np.sin(edges.angles), np.ones_like(edges.angles)], axis=1)
     told = edges.weight > 0
-    weight = edges.weight
+    weight = _agreeing(design, edges)
     solution, normal, residual, used = np.zeros(3), np.eye(3), edges.distance_px, weight
     for _ in range(3):
         if np.count_nonzero(weight) < len(weight) // 2:
@@ -228,7 +239,46 @@ def _fit_circle(edges: _Edges, centre_px: FloatArray, shape: FloatArray) -> Outl
         cov_px=density * (shape @ np.linalg.inv(normal)[:2, :2] @ shape) + _FLOOR_PX**2 * np.eye(2),
         visible=1.0 - float(np.mean(hidden)),
         uneven=float(np.mean(edges.uneven)),
+        off=_share_off(edges.weight, residual),
     )
+
+
+def _share_off(weight: FloatArray, residual: FloatArray) -> float:
+    """Share of the weights (n,) where the residuals (n,) [px], averaged over an arc, are no edge noise.
+
+    Noise and aliased pixels change from ray to ray; what covers a part of the ball moves the edge in a whole arc.
+    """
+    half = max(_LEAST_HALF_ARC, round(len(weight) * _ARC / 2))
+    clipped = weight * np.clip(residual, -_LARGEST_GATE_PX, _LARGEST_GATE_PX)
+    moved, among = _arc_sums(clipped, half), _arc_sums(weight, half)
+    return float(weight @ (np.abs(moved) > _OFF_PX * among) / weight.sum())
+
+
+def _arc_sums(values: FloatArray, half: int) -> FloatArray:
+    """Sums of each of `values` (n,) and its `half` neighbours on both sides, along the closed axis."""
+    sums = np.concatenate([[0.0], np.cumsum(np.concatenate([values[-half:], values, values[:half]]))])
+    return sums[2 * half + 1 :] - sums[: -2 * half - 1]
+
+
+def _agreeing(design: FloatArray, edges: _Edges) -> FloatArray:
+    """The weights of the points, shape (n,); 0 for those far from the circle that most of them agree on.
+
+    Rousseeuw's least median of squares, over circles through the means of three arcs. What hides the ball does so in
+    arcs, up to nearly half of the outline, and all of them pull inwards: least squares would go along.
+    """
+    told = np.flatnonzero(edges.weight > 0)
+    if len(told) < 2 * _ARCS:
+        return edges.weight
+    arcs = np.array_split(told, _ARCS)
+    means = np.array([[*design[arc].mean(axis=0), edges.distance_px[arc].mean()] for arc in arcs])[_TRIPLES]
+    told = told[:: max(1, len(told) // _ENOUGH)]
+    circles = np.linalg.solve(means[..., :3] + 1e-9 * np.eye(3), means[..., 3:])[..., 0]
+    off = np.abs(edges.distance_px[told] - circles @ design[told].T)
+    middle = len(told) // 2
+    spread = np.partition(off, middle, axis=1)[:, middle]
+    best = int(np.argmin(spread))
+    gate = min(max(_GATE_SIGMAS * 1.4826 * float(spread[best]), _LEAST_GATE_PX), _LARGEST_GATE_PX)
+    return np.where(np.abs(edges.distance_px - design @ circles[best]) < gate, edges.weight, 0.0)
 
 
 def _noise_density(angles: FloatArray, residual: FloatArray, radius_px: float) -> float:

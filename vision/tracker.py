@@ -10,11 +10,11 @@ import numpy as np
 from interfaces.camera import StereoCalibration
 from interfaces.records import FloatArray, ImageArray, MarkerFix, MarkerMiss, Reason, StereoFrame, frozen_array
 
-from .blob import Disc, Region, find_patches, measure
-from .colour import ColourGate
+from .blob import Disc, Region, find_patches, measure, roughly
+from .colour import gate_of
 from .config import VisionConfig
 from .images import check_calibration, check_images
-from .match import StereoMatcher
+from .match import StereoMatcher, is_reflection_of
 from .sphere import Pinhole
 from .triangulate import Location
 
@@ -24,6 +24,12 @@ _log = logging.getLogger(__name__)
 _REGION_RADII, _REGION_PX, _REGION_STEPS = 1.6, 14.0, 0.7
 # After a longer pause the last fixes predict nothing [s].
 _LONGEST_PAUSE_S = 0.5
+# So long after the last fix the marker is expected within reach of it [s], if it moved on for no longer than this [s];
+# the reach is so many radii larger.
+_LONGEST_MEMORY_S, _FAIR_PAUSE_S, _JUMP_RADII = 0.9, 0.1, 2.0
+
+# Fixes between two looks at the ball's colour.
+_COLOUR_EVERY = 5
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,6 +40,15 @@ class _Track:
     centres_px: FloatArray
     velocity_px_s: FloatArray
     radius_px: float
+
+
+@dataclass(frozen=True, slots=True)
+class _Last:
+    """The last fix: time [s], place (3,) [m], level of its colour [grey levels]."""
+
+    t: float
+    x: FloatArray
+    level: float
 
 
 class StereoTracker:
@@ -48,12 +63,14 @@ class StereoTracker:
         check_calibration(calibration)
         self.calibration = calibration
         self.config = config or VisionConfig()
-        self._gate = ColourGate(self.config.band)
+        self._gate = gate_of(self.config)
         self._eye = Pinhole(calibration.focal_px, calibration.principal_point_px)
         self._matcher = StereoMatcher(calibration, self.config)
         width, height = calibration.image_size_px
         self._whole = Region(0, 0, width, height)
         self._track: _Track | None = None
+        self._last: _Last | None = None
+        self._fixes = 0
 
     def track(self, frame: StereoFrame) -> MarkerFix | MarkerMiss:
         """The marker in `frame`, in the left optical frame, or why there is none.
@@ -66,39 +83,51 @@ class StereoTracker:
         found = self._look(frame, regions) if regions else None
         if not isinstance(found, Location):
             found = self._look(frame, (self._whole, self._whole))
+        if isinstance(found, Location):
+            found = self._doubt(frame.t, found) or found
         if isinstance(found, Reason):
             if self._track is not None:
                 _log.debug("marker lost at %.3f s: %s", frame.t, found)
             self._track = None
             return MarkerMiss(frame.t, found)
         self._remember(frame.t, found)
+        self._follow_colour(frame, found)
         ul, vl, ur, vr = (float(value) for value in found.centres_px)
         return MarkerFix(frame.t, frozen_array(found.x), frozen_array(found.cov), (ul, vl, ur, vr))
 
     def forget(self) -> None:
         """Look for the marker in the whole images next time."""
-        self._track = None
+        self._track = self._last = None
+        self._gate.reset()
 
     def _look(self, frame: StereoFrame, regions: tuple[Region, Region]) -> Location | Reason:
-        left = self._discs(frame.left, regions[0])
+        left, left_rough = self._discs(frame.left, regions[0])
         if isinstance(left, Reason):
             return left
-        right = self._discs(frame.right, regions[1])
+        right, right_rough = self._discs(frame.right, regions[1])
         if isinstance(right, Reason):
             return right
-        return self._matcher.match(left, right)
+        found = self._matcher.match(left, right)
+        # The marker may be the one of two that could not be measured in both eyes.
+        if isinstance(found, Location) and self._matcher.has_rival(found, left + left_rough, right + right_rough):
+            return Reason.AMBIGUOUS
+        return found
 
-    def _discs(self, image: ImageArray, region: Region) -> list[Disc] | Reason:
-        """The discs in one eye; when there is none, why the most disc-like patch is none."""
+    def _discs(self, image: ImageArray, region: Region) -> tuple[list[Disc] | Reason, list[Disc]]:
+        """The discs in one eye; when there is none, why the most disc-like patch is none. And what is round, but could
+        not be measured."""
         discs: list[Disc] = []
+        rough: list[Disc] = []
         reason: Reason | None = None
         for patch in find_patches(image, region, self._gate, self.config):
             outcome = measure(image, patch, self._eye, self._gate, self.config)
             if isinstance(outcome, Reason):
                 reason = reason or outcome
+                thing = roughly(image, patch, self._gate)
+                rough += [thing] if thing else []
             elif not any(outcome.is_same_as(disc) for disc in discs):
                 discs.append(outcome)
-        return discs or reason or Reason.NO_MARKER
+        return discs or reason or Reason.NO_MARKER, rough
 
     def _predicted_regions(self, t: float) -> tuple[Region, Region] | None:
         track = self._track
@@ -115,9 +144,32 @@ class StereoTracker:
         high = np.clip(np.ceil(centre_px + half_px) + 1, 0, (width, height)).astype(int)
         return Region(*low.tolist(), *high.tolist()) if (high > low).all() else None
 
+    def _doubt(self, t: float, found: Location) -> Reason | None:
+        """Why what was found in the images cannot be the marker that was seen a moment ago."""
+        last = self._last
+        if last is None or not 0 <= t - last.t <= _LONGEST_MEMORY_S:
+            return None
+        away_m = float(np.linalg.norm(found.x - last.x))
+        if away_m <= _JUMP_RADII * self.config.radius_m + self.config.max_speed_m_s * min(t - last.t, _FAIR_PAUSE_S):
+            return None
+        if is_reflection_of(found, last.level, float(np.linalg.norm(last.x))):
+            return Reason.REFLECTION
+        return Reason.IMPLAUSIBLE_SPEED
+
     def _remember(self, t: float, found: Location) -> None:
         velocity = np.zeros(4)
         if self._track is not None and 0 < t - self._track.t <= _LONGEST_PAUSE_S:
             velocity = (found.centres_px - self._track.centres_px) / (t - self._track.t)
         radius_px = self.calibration.focal_px * self.config.radius_m / float(found.x[2])
+        self._last = _Last(t, found.x, found.level)
         self._track = _Track(t, found.centres_px, velocity, radius_px)
+
+    def _follow_colour(self, frame: StereoFrame, found: Location) -> None:
+        """Show the colours' gate the middle of the ball in the left image, now and then."""
+        self._fixes += 1
+        if self._fixes % _COLOUR_EVERY:
+            return
+        half = max(1.0, 0.5 * self.calibration.focal_px * self.config.radius_m / float(found.x[2]))
+        middle = self._region(found.centres_px[:2], half)
+        if middle is not None:
+            self._gate.follow(middle.crop(frame.left))

@@ -18,7 +18,7 @@ def tracker_of(calibration: StereoCalibration, config: VisionConfig) -> MarkerTr
         ConfigError: that describes no stereo pair, or the marker cannot be.
     """
     match config.marker:
-        case "ball":
+        case "ball" | "bright_ball":
             return StereoTracker(calibration, config)
         case "tag":
             return TagTracker(calibration, TagBody.single(config.tag), config.tag)

@@ -22,12 +22,14 @@ class Location:
         cov: covariance of x, shape (3, 3) [m²].
         centres_px: image of its centre as (ul, vl, ur, vr), shape (4,) [px].
         variances_px: variances of `centres_px`, shape (4,) [px²].
+        level: how bright the marker's colour is on it, mean of the eyes [grey levels].
     """
 
     x: FloatArray
     cov: FloatArray
     centres_px: FloatArray
     variances_px: FloatArray
+    level: float
 
 
 def triangulate(
@@ -73,7 +75,7 @@ def locate(calibration: StereoCalibration, radius_m: float, left: Disc, right: D
     distances = [max(1.1, float(np.linalg.norm(x)) / radius_m) for x in (point[0], point[0] - to_right_eye)]
     centres = _centres(eye, left, right, distances)
     point = triangulate(calibration, centres, variances)
-    return None if point is None else Location(*point, centres, variances)
+    return None if point is None else Location(*point, centres, variances, (left.level + right.level) / 2)
 
 
 def _centres(eye: Pinhole, left: Disc, right: Disc, distances_over_radius: list[float]) -> FloatArray:

@@ -26,6 +26,9 @@ SMALL = StereoCalibration(
     focal_px=600.0, principal_point_px=(159.5, 119.5), baseline_m=0.06, image_size_px=(320, 240), pixel_sigma=1e-6
 )
 
+# Places of a moving ball that make up its blurred image.
+_INSTANTS = 9
+
 
 @dataclass(frozen=True)
 class Look:
@@ -36,7 +39,11 @@ class Look:
         light: direction to the light in the eye's frame (x right, y down, z forward), any length.
         samples: rays per pixel and direction; 1 gives hard, aliased edges.
         blur_px: 1-sigma of the lens blur [px].
-        noise_sd: 1-sigma of each channel [grey levels].
+        noise_sd: 1-sigma of each channel [grey levels] in the dark ...
+        shot: ... and the variance that each grey level of light adds [grey levels].
+        jpeg: quality of the compression that the camera applies, 4:2:0 as most do; None for none.
+        moved_m: how far the ball goes while the shutter is open, (x, y, z) [m]; it is at its place half-way.
+        distortion: lens distortion that rectification left over: radial, relative at the image's corner.
         wall: an even grey behind the ball instead of clutter.
     """
 
@@ -50,6 +57,10 @@ class Look:
     samples: int = 4
     blur_px: float = 0.7
     noise_sd: float = 3.0
+    shot: float = 0.0
+    jpeg: int | None = None
+    moved_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    distortion: float = 0.0
     wall: float | None = None
 
 
@@ -130,18 +141,28 @@ def paint_ball(
     picture: FloatArray, x_eye: FloatArray, radius_m: float, look: Look, calibration: StereoCalibration
 ) -> FloatArray:
     """`picture` with the ball before it; both RGB of 0..1, shape (height, width, 3)."""
+    moved = np.array(look.moved_m)
+    instants = np.linspace(-0.5, 0.5, _INSTANTS) if moved.any() else np.zeros(1)
+    rows, columns = _neighbourhood(x_eye, radius_m, calibration, 2.0 + _reach_px(x_eye, moved, look, calibration))
     painted = picture.copy()
-    rows, columns = _neighbourhood(x_eye, radius_m, calibration, 1.0)
     window = painted[rows, columns]
     if window.size:
         n = look.samples
         sub = (np.arange(n) + 0.5) / n - 0.5
         u = (np.arange(columns.start, columns.stop)[:, None] + sub).ravel()
         v = (np.arange(rows.start, rows.stop)[:, None] + sub).ravel()
+        rays = _rays(u, v, calibration, look.distortion)
         behind = np.repeat(np.repeat(window, n, axis=0), n, axis=1)
-        shown = _lit(_rays(u, v, calibration), x_eye, radius_m, look, behind)
+        shown = sum(_lit(rays, x_eye + at * moved, radius_m, look, behind.copy()) for at in instants) / len(instants)
         window[:] = shown.reshape(len(v) // n, n, len(u) // n, n, 3).mean(axis=(1, 3))
     return painted
+
+
+def _reach_px(x_eye: FloatArray, moved: FloatArray, look: Look, calibration: StereoCalibration) -> float:
+    """How far from its undistorted, resting image the ball may show [px]."""
+    return float(np.abs(moved).max() * calibration.focal_px / x_eye[2]) + abs(look.distortion) * max(
+        calibration.image_size_px
+    )
 
 
 def _neighbourhood(
@@ -157,12 +178,22 @@ def _neighbourhood(
 
 
 def take(picture: FloatArray, look: Look, rng: np.random.Generator) -> ImageArray:
-    """What the camera makes of a picture: lens blur, exposure, noise, eight bits, BGR."""
+    """What the camera makes of a picture: lens blur, exposure, noise of light and sensor, eight bits, JPEG; BGR."""
     grey_levels = 255.0 * look.exposure * picture[..., ::-1]
     if look.blur_px > 0:
         grey_levels = cv2.GaussianBlur(grey_levels, (0, 0), look.blur_px)
-    noise = rng.standard_normal(grey_levels.shape, dtype=np.float32) * look.noise_sd
-    return np.clip(np.rint(grey_levels + noise), 0, 255).astype(np.uint8)
+    sigma = np.sqrt(look.noise_sd**2 + look.shot * grey_levels) if look.shot else look.noise_sd
+    noise = rng.standard_normal(grey_levels.shape, dtype=np.float32) * sigma
+    image = np.clip(np.rint(grey_levels + noise), 0, 255).astype(np.uint8)
+    if look.jpeg is None:
+        return image
+    settings = [
+        cv2.IMWRITE_JPEG_QUALITY,
+        look.jpeg,
+        cv2.IMWRITE_JPEG_SAMPLING_FACTOR,
+        cv2.IMWRITE_JPEG_SAMPLING_FACTOR_420,
+    ]
+    return np.asarray(cv2.imdecode(cv2.imencode(".jpg", image, settings)[1], cv2.IMREAD_COLOR), dtype=np.uint8)
 
 
 def random_light(rng: np.random.Generator, look: Look) -> Look:
@@ -177,10 +208,12 @@ def random_light(rng: np.random.Generator, look: Look) -> Look:
     )
 
 
-def _rays(u: FloatArray, v: FloatArray, calibration: StereoCalibration) -> FloatArray:
+def _rays(u: FloatArray, v: FloatArray, calibration: StereoCalibration, distortion: float) -> FloatArray:
     cx, cy = calibration.principal_point_px
     grid_u, grid_v = np.meshgrid((u - cx) / calibration.focal_px, (v - cy) / calibration.focal_px)
-    rays = np.stack([grid_u, grid_v, np.ones_like(grid_u)], axis=-1)
+    corner = (cx**2 + cy**2) / calibration.focal_px**2
+    bent = 1.0 + distortion * (grid_u**2 + grid_v**2) / corner
+    rays = np.stack([grid_u * bent, grid_v * bent, np.ones_like(grid_u)], axis=-1)
     return rays / np.sqrt(np.einsum("vuc,vuc->vu", rays, rays))[..., None]
 
 

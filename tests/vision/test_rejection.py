@@ -203,3 +203,34 @@ def test_the_largest_ball_that_both_eyes_hold_is_found():
     ball = Ball((0.06, 0.0, 0.2))
     tracker = StereoTracker(VGA)
     assert sigmas_off(tracker.track(stage(ball, calibration=VGA)), ball) < FAR_SIGMAS
+
+
+def test_a_ball_that_is_mostly_white_is_saturated():
+    flooded = Look(specular=30.0, shininess=1.5, noise_sd=2.0)
+    assert reason(answer(BALL, look=flooded)) in (Reason.SATURATED, Reason.NO_MARKER)
+
+
+def test_a_dimmer_copy_farther_off_is_no_second_marker():
+    mirrored = Ball((-0.02, -0.03, 1.0), rgb=(0.45, 0.04, 0.04))
+    assert sigmas_off(answer(BALL, mirrored), BALL) < FAR_SIGMAS
+
+
+def test_the_mirrored_copy_of_a_ball_that_got_hidden_is_a_reflection():
+    tracker = StereoTracker(SMALL)
+    tracker.track(stage(BALL))
+    mirrored = Ball((-0.1, -0.1, 1.3), rgb=(0.45, 0.04, 0.04))
+    assert reason(tracker.track(stage(mirrored, t=0.1))) is Reason.REFLECTION
+
+
+def test_a_twin_out_of_reach_is_not_taken_for_a_ball_that_got_hidden():
+    tracker = StereoTracker(SMALL)
+    tracker.track(stage(BALL))
+    twin = Ball((-0.1, -0.1, 1.3))
+    assert reason(tracker.track(stage(twin, t=0.1))) is Reason.IMPLAUSIBLE_SPEED
+
+
+def test_a_second_after_the_last_fix_the_marker_may_be_anywhere():
+    tracker = StereoTracker(SMALL)
+    tracker.track(stage(BALL))
+    elsewhere = Ball((-0.1, -0.1, 1.3))
+    assert sigmas_off(tracker.track(stage(elsewhere, t=1.2)), elsewhere) < FAR_SIGMAS

@@ -1,0 +1,146 @@
+"""The colour of a ball, learnt from images: from one that it is shown in, or from its own motion."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from interfaces.errors import BodyschemaError
+from interfaces.records import FloatArray, ImageArray
+
+from .config import HueBand
+
+# Around a click the colour is taken from this radius first; the ball is all that joins it with nearly the same [px].
+_SEED_PX = 3
+# Pixels nearer to grey or black than this have no hue to speak of (parts of 255).
+_LEAST_SATURATION, _LEAST_VALUE = 64, 40
+# The band holds this share of the ball's pixels on either side, and so much more for other light [°].
+_SHARE, _MARGIN_DEG = 0.02, 6.0
+_NARROWEST_DEG, _WIDEST_DEG = 10.0, 40.0
+# In other light the ball may have this part of the saturation and of the brightness that it has here.
+_DIMMER_SATURATION, _DIMMER_VALUE = 0.6, 0.35
+# Pixels that changed by this much between frames have moved [grey levels]; a ball has at least so many of them.
+_CHANGED, _LEAST_PIXELS = 25, 30
+_HUES_OF_A_CLICK_DEG = 25.0
+
+
+class ColourUnlearnt(BodyschemaError):
+    """The images do not show a ball of one colour where it was looked for."""
+
+    def __init__(self, what: str, *, remedy: str = "") -> None:
+        super().__init__(f"{what}{f'. {remedy}' if remedy else ''}")
+
+
+def colour_at(image: ImageArray, u: float, v: float) -> HueBand:
+    """The band of hues of the ball that covers the pixel (u, v) of a BGR image (height, width, 3).
+
+    Raises:
+        ColourUnlearnt: the pixel is outside the image, or what is there is grey, black or white.
+    """
+    height, width = image.shape[:2]
+    column, row = round(u), round(v)
+    if not (0 <= column < width and 0 <= row < height):
+        raise ColourUnlearnt(f"({u:g}, {v:g}) is outside the image of {width}x{height} pixels")
+    hsv = cv2.cvtColor(image, cv2.COLOR_BGR2HSV)
+    near = hsv[max(row - _SEED_PX, 0) : row + _SEED_PX + 1, max(column - _SEED_PX, 0) : column + _SEED_PX + 1]
+    seed = _colourful(near.reshape(-1, 3))
+    if len(seed) < near.shape[0] * near.shape[1] // 2:
+        raise ColourUnlearnt(
+            f"at ({u:g}, {v:g}) there is no colour, only grey, black or white",
+            remedy='Click on the middle of the ball, beside its highlight. A ball without colour is a "bright_ball"',
+        )
+    middle = _mean_hue_deg(seed)
+    alike = (_apart_deg(hsv[..., 0] * 2.0, middle) < _HUES_OF_A_CLICK_DEG) & _is_colourful(hsv)
+    _, labels = cv2.connectedComponents(alike.astype(np.uint8), connectivity=4)
+    label = labels[row, column]
+    pixels = hsv[labels == label] if label else seed
+    return _band(_colourful(pixels))
+
+
+def colour_of_the_moving(images: Iterable[ImageArray]) -> HueBand:
+    """The band of hues of the one colourful thing that moves through BGR images of a camera that stands still.
+
+    The hand that moves it has a hue too, but skin is paler than a marker: each pixel counts by its saturation.
+
+    Raises:
+        ColourUnlearnt: fewer than three images, or nothing colourful moves.
+    """
+    frames = list(images)
+    if len(frames) < 3:
+        raise ColourUnlearnt(f"there are {len(frames)} images; a motion needs three or more of them")
+    behind = np.median(np.stack(frames[:: max(1, len(frames) // 15)]), axis=0).astype(np.uint8)
+    moved = [_colourful(_moving_pixels(frame, behind)) for frame in frames]
+    pixels = np.concatenate(moved)
+    if len(pixels) < _LEAST_PIXELS * len(frames):
+        raise ColourUnlearnt(
+            "nothing colourful moves in these images", remedy="Move the ball across the view, and keep the camera still"
+        )
+    weight = (pixels[:, 1].astype(np.float64) / 255.0) ** 4
+    counts = np.bincount(pixels[:, 0], weights=weight, minlength=180)
+    smooth = np.convolve(np.concatenate([counts[-5:], counts, counts[:5]]), np.hanning(11), mode="valid")
+    peak_deg = 2.0 * int(np.argmax(smooth))
+    return _band(pixels[_apart_deg(pixels[:, 0] * 2.0, peak_deg) < _HUES_OF_A_CLICK_DEG])
+
+
+def read_images(files: Sequence[Path]) -> list[ImageArray]:
+    """BGR images of `files`; ColourUnlearnt for one that is no image or has another size than the first."""
+    images: list[ImageArray] = []
+    for file in files:
+        image = cv2.imread(str(file), cv2.IMREAD_COLOR)
+        if image is None:
+            raise ColourUnlearnt(f"{file} is no image that can be read")
+        images.append(np.asarray(image, dtype=np.uint8))
+        if image.shape != images[0].shape:
+            raise ColourUnlearnt(f"{file} has another size than {files[0]}", remedy="Give images of one camera")
+    return images
+
+
+def colour_table(band: HueBand) -> str:
+    """The table [vision.colour] of robot.toml."""
+    return (
+        "[vision.colour]\n"
+        f"hue_deg = {band.hue_deg:.1f}\n"
+        f"half_width_deg = {band.half_width_deg:.1f}\n"
+        f"min_saturation = {band.min_saturation:.2f}\n"
+        f"min_value = {band.min_value:.2f}\n"
+    )
+
+
+def _moving_pixels(frame: ImageArray, behind: ImageArray) -> ImageArray:
+    changed = (cv2.absdiff(frame, behind).max(axis=2) > _CHANGED).astype(np.uint8)
+    changed = cv2.morphologyEx(changed, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+    return cv2.cvtColor(frame, cv2.COLOR_BGR2HSV)[changed > 0].astype(np.uint8)
+
+
+def _is_colourful(hsv: np.ndarray) -> np.ndarray:
+    return (hsv[..., 1] >= _LEAST_SATURATION) & (hsv[..., 2] >= _LEAST_VALUE)
+
+
+def _colourful(pixels: np.ndarray) -> ImageArray:
+    return pixels[_is_colourful(pixels)]
+
+
+def _mean_hue_deg(pixels: ImageArray) -> float:
+    angles = np.deg2rad(pixels[:, 0] * 2.0)
+    return float(np.rad2deg(np.angle(np.exp(1j * angles).mean()))) % 360.0
+
+
+def _apart_deg(hue_deg: NDArray[np.floating], other_deg: float) -> FloatArray:
+    return np.abs((hue_deg - other_deg + 180.0) % 360.0 - 180.0).astype(np.float64)
+
+
+def _band(pixels: ImageArray) -> HueBand:
+    """The band around the pixels' hues (n, 3 of HSV), with room for other light."""
+    middle = _mean_hue_deg(pixels)
+    reach = float(np.quantile(_apart_deg(pixels[:, 0] * 2.0, middle), 1.0 - 2 * _SHARE)) + _MARGIN_DEG
+    saturation, value = (float(np.quantile(pixels[:, channel], 2 * _SHARE)) / 255.0 for channel in (1, 2))
+    return HueBand(
+        hue_deg=round(middle, 1) % 360.0,
+        half_width_deg=round(float(np.clip(reach, _NARROWEST_DEG, _WIDEST_DEG)), 1),
+        min_saturation=round(_DIMMER_SATURATION * saturation, 2),
+        min_value=round(_DIMMER_VALUE * value, 2),
+    )
