@@ -140,7 +140,8 @@ def information(x: FloatArray, look: Look, pictures: list[FloatArray], calibrati
 
         def light(at: FloatArray, eye: int = eye, picture: FloatArray = picture) -> FloatArray:
             painted = paint_ball(picture, in_eyes(at, calibration)[eye], RADIUS_M, fine, calibration)
-            return cv2.GaussianBlur(255.0 * look.exposure * painted, (0, 0), look.blur_px)
+            blurred = cv2.GaussianBlur(255.0 * look.exposure * painted, (0, 0), look.blur_px)
+            return np.asarray(blurred, dtype=np.float64)
 
         middle = light(x)
         slopes = [(light(x + step) - light(x - step)) / (2 * step.sum()) for step in steps]
@@ -162,7 +163,7 @@ def against_the_bound(name: str, look: Look, frames: int, bounds: int, seed: int
         eyes = zip(pictures, in_eyes(x, AT_ONE_METRE), strict=True)
         images = [take(paint_ball(picture, x_eye, RADIUS_M, lit, AT_ONE_METRE), lit, rng) for picture, x_eye in eyes]
         tracker.forget()
-        answer = tracker.track(StereoFrame(float(number), *images))
+        answer = tracker.track(StereoFrame(float(number), images[0], images[1]))
         if isinstance(answer, MarkerFix):
             errors.append(answer.x - x)
             sigmas.append(np.sqrt(np.diag(answer.cov)))

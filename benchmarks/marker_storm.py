@@ -63,7 +63,8 @@ def draw_scene(rng: np.random.Generator, kind: str) -> Scene:
         rgb = ((0.08, 0.7, 0.1), (0.1, 0.15, 0.8), (0.8, 0.75, 0.1))[int(rng.integers(3))]
     elif kind in ("mirror", "hidden"):
         other = start * float(rng.uniform(1.5, 2.0)) + np.array([0.0, -0.05, 0.0])
-        rgb = tuple(float(rng.uniform(0.4, 0.7)) * level for level in look.ball_rgb)
+        red, green, blue = (float(rng.uniform(0.4, 0.7)) * level for level in look.ball_rgb)
+        rgb = (red, green, blue)
     pictures = clutter(rng, SMALL.image_size_px), clutter(rng, SMALL.image_size_px)
     return Scene(kind, start, step, look, pictures, other, radius_m, rgb, float(rng.uniform(0, 2 * np.pi)))
 

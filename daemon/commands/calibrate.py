@@ -10,12 +10,14 @@ from cyclopts import Parameter
 from cyclopts.validators import Number
 
 from daemon.commands.calibrate_cameras import cameras, check
+from daemon.commands.latency import latency
 from daemon.commands.options import SourceRobotFile, flag, robot_file
 
 # Without a help of its own its page shows what `arm` says, beside the commands.
 calibrate = cyclopts.App(name="calibrate")
 calibrate.command(cameras, sort_key=1)
 calibrate.command(check, sort_key=2)
+calibrate.command(latency, sort_key=3)
 
 
 @calibrate.default
@@ -116,6 +118,3 @@ def arm(
             markup=False,
             soft_wrap=True,
         )
-
-
-calibrate.command("daemon.commands.latency:latency", name="latency")
