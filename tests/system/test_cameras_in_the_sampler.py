@@ -45,18 +45,27 @@ def angles(t: float) -> FloatArray:
     return MIDDLE + SWING * (swing @ [0.6, 0.4])
 
 
+def limb(x: FloatArray, radius_m: float) -> FloatArray:
+    """Where rays from the origin touch a sphere at x (3,) [m], points (n, 3) of a circle."""
+    shrunk = 1.0 - radius_m**2 / float(x @ x)
+    across = np.linalg.svd(x[None])[2][1:]
+    turns = np.linspace(0.0, 2.0 * math.pi, 180, endpoint=False)
+    return shrunk * x + radius_m * math.sqrt(shrunk) * np.stack([np.cos(turns), np.sin(turns)], axis=1) @ across
+
+
 def drawn(config: Config, q: FloatArray) -> tuple[np.ndarray, np.ndarray]:
     """What the two eyes see of the marker ball."""
     calibration = config.robot.calibration
     assert calibration is not None
     x = config.robot.chain.positions(q[None])[0]
     width, height = calibration.image_size_px
-    radius_px = calibration.focal_px * config.tables.vision.radius_m / x[2]
     eyes = []
-    for centre_px in calibration.project(x).reshape(2, 2):
+    for eye in range(2):
+        seen = limb(x - [eye * calibration.baseline_m, 0.0, 0.0], config.tables.vision.radius_m)
+        outline_px = calibration.focal_px * seen[:, :2] / seen[:, 2:] + calibration.principal_point_px
         image = np.full((2 * height, 2 * width, 3), 128, np.uint8)
-        centre = np.round(16 * (2 * centre_px + 0.5)).astype(int).tolist()
-        cv2.circle(image, centre, round(16 * 2 * radius_px), (30, 30, 220), -1, cv2.LINE_AA, 4)
+        corners = np.round(16 * (2 * outline_px + 0.5)).astype(np.int32)
+        cv2.fillPoly(image, [corners], (30, 30, 220), cv2.LINE_AA, 4)
         eyes.append(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA))
     return eyes[0], eyes[1]
 
@@ -111,7 +120,7 @@ def told(bus: Bus, process: subprocess.Popen[bytes], log: Path) -> SamplerStatus
 def until(status: Callable[[], SamplerStatus], holds: Callable[[SamplerStatus], bool]) -> SamplerStatus:
     limit = time.monotonic() + LIMIT_S
     while not holds(said := status()):
-        assert time.monotonic() < limit, said
+        assert time.monotonic() < limit, (said.rejected, said)
         time.sleep(0.05)
     return said
 
