@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -42,12 +42,14 @@ class Explanation:
         apart: with what has no name taken away; None where there is nothing of the kind.
         worth: how probable they are together, in nats that count only beside those of others.
         size: how much what has no name adds to what the causes alone can say (RMS), in units of the stated noise.
+        promise: what the best single way without a name is worth beside the causes, to first order [nats].
     """
 
     fit: Fit
     apart: Apart | None
     worth: float
     size: float = 0.0
+    promise: float = -np.inf
 
     @property
     def beside(self) -> Fit:
@@ -74,12 +76,12 @@ def explain(
     best = _with_unknown(found, unknowns, search)
     inexact = max(_OF_THE_CAUSES * whole, _OF_THE_WAY * _length(found, changed_by_the_way(found)))
     if best.apart is not None and (best.size < inexact or not unknowns.predicts(best.apart, found)):
-        best = Explanation(found, None, best.worth)
+        best = replace(best, apart=None, size=0.0)
     # Where the causes explain by far the most, they are not given up for what explains the rest.
     is_rest = best.size < _REST * whole
     margin = _MARGIN if is_rest else 0.0
     # So much may a way be worth beside fewer causes at most: to first order it explains no more than beside them all.
-    hope = found.log_likelihood + unknowns.nearest(found)[0][1] if best.apart is None else np.inf
+    hope = found.log_likelihood + best.promise if best.apart is None else np.inf
     looked_at = {named(found.causes)}
     for fit in [*path[:_FIRST], *path[_FIRST:][-_LAST:]]:
         causes = named(fit.causes)
@@ -122,19 +124,21 @@ def _length(fit: Fit, change: FloatArray) -> float:
 
 def _with_unknown(fit: Fit, unknowns: Unknowns, search: Search) -> Explanation:
     apart: Apart | None = None
+    promise = -np.inf
     while not fit.is_exact and (apart is None or len(apart.chosen) < _MOST_UNKNOWNS):
         here, chosen = (fit, ()) if apart is None else (apart.fit, apart.chosen)
         near = unknowns.nearest(here, chosen)
         way, more = near[0]
+        promise = more if apart is None else promise
         if more < NAMED or (more < _BEYOND_DOUBT and unknowns.agreed(here, chosen, way) < 0.0):
             break
         tried = [unknowns.apart(fit, (*chosen, way), apart) for way, _ in near]
         apart = max(tried, key=lambda one: one.fit.log_likelihood - unknowns.cost(one))
     names = _names(fit, search)
     if apart is None:
-        return Explanation(fit, None, fit.log_likelihood - names)
+        return Explanation(fit, None, fit.log_likelihood - names, promise=promise)
     worth = apart.fit.log_likelihood - names - unknowns.cost(apart)
-    return Explanation(fit, apart, worth, _length(fit, apart.predicted - fit.run.measured))
+    return Explanation(fit, apart, worth, _length(fit, apart.predicted - fit.run.measured), promise)
 
 
 def _names(fit: Fit, search: Search) -> float:

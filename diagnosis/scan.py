@@ -115,7 +115,7 @@ class Scan:
         alone = toward / lengths
         apart = 1.0 - np.square(shared)
         squares = np.square(alone)[:, None] + np.square(alone) - 2.0 * shared * np.outer(alone, alone)
-        usable = np.outer(told, told) & (apart > _TOLD_APART) & ~np.eye(len(singles), dtype=bool)
+        usable = np.outer(told, told) & (apart > _TOLD_APART)
         explained = np.where(usable, squares / np.maximum(apart, _TOLD_APART), 0.0)
         one, other = np.unravel_index(int(np.argmax(explained)), explained.shape)
         if explained[one, other] <= 0.0:
