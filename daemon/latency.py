@@ -8,7 +8,6 @@ smooth function.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -112,25 +111,6 @@ def latency_of(wiggle: Wiggle, chain: RigidChain) -> Latency:
     return Latency(lag, sigma_s, len(fit.x), residual_m, speed)
 
 
-def latency_by_speed(wiggle: Wiggle, chain: RigidChain) -> float:
-    """The latency by speeds alone [s]: the shift at which those of `chain`'s marker and of the seen one correlate best.
-
-    Coarser than `latency_of`, for comparison: the drawn arm's speed is not the real one's, and noise is differentiated.
-    """
-    t = wiggle.t_marker[(wiggle.t_marker - LATEST_S >= wiggle.t_joints[0])]
-    x = wiggle.x[-len(t) :]
-    middle, half = 0.5 * (t[1:] + t[:-1]), 0.5 * float(np.median(np.diff(t)))
-    seen = np.linalg.norm(np.diff(x, axis=0), axis=1) / np.diff(t)
-
-    def mismatch(lag: float) -> float:
-        ends = [chain.positions(wiggle.angles(middle - lag + side)) for side in (half, -half)]
-        return -float(np.corrcoef(np.linalg.norm(ends[0] - ends[1], axis=1), seen)[0, 1])
-
-    grid = np.arange(EARLIEST_S, LATEST_S, STEP_S)
-    best = grid[int(np.argmin([mismatch(lag) for lag in grid]))]
-    return _lowest(mismatch, (best - STEP_S, best + STEP_S))
-
-
 @dataclass(frozen=True)
 class _Fit:
     """The smooth function's terms, and the positions to be explained: those whose angles are known at every lag."""
@@ -192,11 +172,10 @@ class _Fit:
 
 
 def _minimum(fit: _Fit, near_s: float, keep: NDArray[np.bool_] | slice = slice(None)) -> float:
-    return _lowest(lambda lag: fit.cost(lag, keep), (near_s - 2 * STEP_S, near_s + 2 * STEP_S))
-
-
-def _lowest(cost: Callable[[float], float], span: tuple[float, float]) -> float:
-    found: Any = minimize_scalar(cost, bounds=span, method="bounded", options={"xatol": 1e-6})
+    span = near_s - 2 * STEP_S, near_s + 2 * STEP_S
+    found: Any = minimize_scalar(
+        lambda lag: fit.cost(lag, keep), bounds=span, method="bounded", options={"xatol": 1e-6}
+    )
     return float(found.x)
 
 

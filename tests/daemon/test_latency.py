@@ -6,11 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.optimize import minimize_scalar
 
-from daemon.latency import LatencyError, Wiggle, latency_by_speed, latency_of
+from daemon.latency import EARLIEST_S, LATEST_S, STEP_S, LatencyError, Wiggle, latency_of
 from daemon.wiggling import read_wiggle, wiggle_of, write_wiggle
 from interfaces.errors import RecordingError
 from interfaces.robot import RobotDescription
+from kbmaps import RigidChain
 
 ARM = RobotDescription.load(Path(__file__).parents[2] / "examples" / "desk_arm" / "robot.toml")
 TICK_RAD = 2 * np.pi / 4096
@@ -34,6 +36,25 @@ def wiggle(seed: int, latency_s: float, noise_mm: float = 0.5, joints: int = 4, 
     x = real.positions(q(t_marker - latency_s) + np.radians(rng.normal(0, 3, 4)))
     noise = rng.normal(0, 1e-3 * noise_mm, x.shape) * [0.7, 0.7, 2.0]
     return Wiggle(t_joints, np.round(q(t_joints) / TICK_RAD) * TICK_RAD, t_marker, x + noise)
+
+
+def latency_by_speed(wiggle: Wiggle, chain: RigidChain) -> float:
+    """The latency by speeds alone [s]: the shift at which those of `chain`'s marker and of the seen one correlate best.
+
+    For comparison: the drawn arm's speed is not the real one's, and noise is differentiated.
+    """
+    t = wiggle.t_marker[(wiggle.t_marker - LATEST_S >= wiggle.t_joints[0])]
+    x = wiggle.x[-len(t) :]
+    middle, half = 0.5 * (t[1:] + t[:-1]), 0.5 * float(np.median(np.diff(t)))
+    seen = np.linalg.norm(np.diff(x, axis=0), axis=1) / np.diff(t)
+
+    def mismatch(lag: float) -> float:
+        ends = [chain.positions(wiggle.angles(middle - lag + side)) for side in (half, -half)]
+        return -float(np.corrcoef(np.linalg.norm(ends[0] - ends[1], axis=1), seen)[0, 1])
+
+    grid = np.arange(EARLIEST_S, LATEST_S, STEP_S)
+    best = grid[int(np.argmin([mismatch(lag) for lag in grid]))]
+    return float(minimize_scalar(mismatch, bounds=(best - STEP_S, best + STEP_S), method="bounded").x)
 
 
 @pytest.mark.parametrize("latency_s", [0.0, 0.033, 0.12])
