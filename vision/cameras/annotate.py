@@ -10,7 +10,7 @@ import numpy as np
 from interfaces.camera import StereoCalibration
 from interfaces.records import FloatArray, ImageArray, MarkerFix, MarkerMiss, Reason, StereoFrame
 from vision.blob import Region, find_patches, measure
-from vision.colour import ColourGate
+from vision.colour import gate_of
 from vision.config import VisionConfig
 from vision.sphere import Pinhole
 
@@ -22,7 +22,11 @@ MAGNIFIED = 10  # the difference of the rows, which is a fraction of a pixel
 WORDS = {
     Reason.NO_MARKER: "no marker",
     Reason.AT_BORDER: "at the border",
-    Reason.OCCLUDED: "no whole disc",
+    Reason.OCCLUDED: "not all to be seen",
+    Reason.SATURATED: "over-exposed",
+    Reason.REFLECTION: "a reflection",
+    Reason.REPROJECTION: "not the marker's shape",
+    Reason.IMPLAUSIBLE_SPEED: "too far from the last place",
     Reason.EPIPOLAR: "rows differ",
     Reason.SIZE_MISMATCH: "sizes differ",
     Reason.AMBIGUOUS: "more than one fits",
@@ -48,13 +52,16 @@ class Annotator:
 
     def __init__(self, calibration: StereoCalibration, config: VisionConfig) -> None:
         self._calibration, self._config = calibration, config
-        self._gate = ColourGate(config.band)
+        self._gate = gate_of(config)
+        self._is_ball = config.marker in ("ball", "bright_ball")
         self._eye = Pinhole(calibration.focal_px, calibration.principal_point_px)
         width, height = calibration.image_size_px
         self._whole = Region(0, 0, width, height)
 
     def sights(self, image: ImageArray) -> list[Sight]:
-        """Everything of the marker's colour in one eye's image, whether it is the marker or not."""
+        """Everything that tells a ball in one eye's image, whether it is the marker or not; nothing where it is tags."""
+        if not self._is_ball:
+            return []
         found = []
         for patch in find_patches(image, self._whole, self._gate, self._config):
             outcome = measure(image, patch, self._eye, self._gate, self._config)
@@ -89,18 +96,19 @@ class Annotator:
             _write(image, WORDS.get(sight.reason, sight.reason.replace("_", " ")), at, RED)
 
     def _draw_fix(self, eyes: list[ImageArray], fix: MarkerFix) -> None:
-        """The ball as it would be seen at the fix, and its row in the other eye."""
-        radius_px = self._calibration.focal_px * self._config.radius_m / float(fix.x[2])
+        """The marker as it would be seen at the fix, and its row in the other eye."""
+        radius_px = self._calibration.focal_px * self._config.radius_m / float(fix.x[2]) if self._is_ball else 0.0
         if fix.centres_px is None:
             return
         ul, vl, ur, vr = fix.centres_px
         for image, own, other in ((eyes[0], (ul, vl), vr), (eyes[1], (ur, vr), vl)):
-            _circle(image, own, radius_px, GREEN)
+            if self._is_ball:
+                _circle(image, own, radius_px, GREEN)
             cv2.drawMarker(image, (round(own[0]), round(own[1])), GREEN, cv2.MARKER_CROSS, 9)
             _row(image, other, YELLOW)
             # Where the other eye's row is, the distance magnified so that it can be seen.
             end = own[1] + MAGNIFIED * (other - own[1])
-            at = round(own[0] + 2 * radius_px)
+            at = round(own[0] + 2 * radius_px) + 6
             cv2.line(image, (at, round(own[1])), (at, round(end)), RED, 2)
 
     def _headline(self, frame: StereoFrame, seen: MarkerFix | MarkerMiss) -> str:
