@@ -37,11 +37,10 @@ def test_what_is_marked_is_of_the_marker_that_is_looked_for(config, bgr, seen) -
     assert len(Annotator(CAMERAS, config).sights(disc(bgr))) == seen
 
 
-def test_a_tag_gets_no_circle_of_a_ball() -> None:
+@pytest.mark.parametrize(("marker", "circled"), [("tag", False), ("ball", True)])
+def test_a_ball_is_circled_and_a_tag_is_not(marker, circled) -> None:
     grey = np.full((240, 320, 3), 40, dtype=np.uint8)
     fix = MarkerFix(t=0.0, x=np.array([0.0, 0.0, 0.5]), cov=1e-8 * np.eye(3), centres_px=(160.0, 120.0, 100.0, 120.0))
-    radius = round(700.0 * VisionConfig().radius_m / 0.5) + 2
-    for marker, circled in (("tag", False), ("ball", True)):
-        drawn = Annotator(CAMERAS, VisionConfig(marker=marker)).drawn(StereoFrame(0.0, grey, grey), fix)
-        above = drawn[AT[1] - radius - 1 : AT[1] - radius + 2, AT[0]]
-        assert bool((above != 40).any()) == circled
+    above = AT[1] - round(700.0 * VisionConfig().radius_m / 0.5) - 2
+    drawn = Annotator(CAMERAS, VisionConfig(marker=marker)).drawn(StereoFrame(0.0, grey, grey), fix)
+    assert bool((drawn[above - 1 : above + 2, AT[0]] != 40).any()) == circled

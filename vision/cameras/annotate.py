@@ -59,7 +59,7 @@ class Annotator:
         self._whole = Region(0, 0, width, height)
 
     def sights(self, image: ImageArray) -> list[Sight]:
-        """Everything that tells a ball in one eye's image, whether it is the marker or not; nothing where it is tags."""
+        """Everything that looks like the ball in one eye's image, the marker or not; nothing where it is tags."""
         if not self._is_ball:
             return []
         found = []
