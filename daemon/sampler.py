@@ -359,7 +359,7 @@ class Sampler:
             said.append(f"{self._bad_readings} encoder readings were not finite and were not used")
         if self._disk_free() < LOW_DISK_BYTES:
             said.append(f"the disk of {self._store.file} is nearly full")
-        return said
+        return list(dict.fromkeys(said))  # servos tell what their drives say, too
 
     def _silences(self) -> list[str]:
         now = self._wall.now()

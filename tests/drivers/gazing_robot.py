@@ -12,6 +12,7 @@ from daemon.wiring import demonstration_model
 from drivers.bench.faults import Planned
 from drivers.bench.virtual_port import VirtualClock
 from drivers.dynamixel.bench.chain import Chain
+from drivers.dynamixel.bench.driven_shaft import DrivenShaft
 from drivers.dynamixel.bench.servo import Servo
 from drivers.dynamixel.config import BusConfig, DynamixelConfig, ServoConfig
 from drivers.dynamixel.gaze import Gaze
@@ -37,24 +38,6 @@ def nobody(payload: bytes) -> bytes:
     raise BusError("nobody answers")
 
 
-class HeadShaft:
-    """A joint of the head: its servo turns it where it holds it, else it stays."""
-
-    def __init__(self, q: float) -> None:
-        self.servo: Servo | None = None
-        self.jammed = False
-        self._q, self._t = q, 0.0
-
-    def __call__(self, t: float) -> float:
-        if self.servo is not None and t > self._t:
-            t0, self._t = self._t, t
-            goal = self.servo.held_at(t)
-            if goal is not None and not self.jammed:
-                most = HEAD_SPEED * (t - t0)
-                self._q += min(max(goal - self._q, -most), most)
-        return self._q
-
-
 class GazingRobot:
     """A driver with gaze over the bench, in virtual time; `truth` is the arm as it really is."""
 
@@ -67,7 +50,7 @@ class GazingRobot:
         start = MIDDLE[None].copy()
         for _ in range(20):
             start[:, :2] = pointing.clipped(start[:, :2] + pointing.step(start, robot.chain.positions))
-        self.heads = [HeadShaft(float(q)) for q in start[0, :2]]
+        self.heads = [DrivenShaft(float(q), HEAD_SPEED) for q in start[0, :2]]
         begin = self.clock.now()
         arm = [
             lambda t, k=k: float(MIDDLE[k] + SWING[k] * math.sin(PACE[k] * max(t - begin, 0.0))) for k in range(2, 7)

@@ -158,7 +158,7 @@ def test_a_head_with_a_homing_offset_is_refused() -> None:
 
 def test_a_head_that_was_turned_round_stays_where_it_is() -> None:
     robot = GazingRobot()
-    robot.heads[0]._q += 2 * math.pi
+    robot.heads[0].turn_by_hand(2 * math.pi)
     robot.chain.servo(1)["torque"] = 0
     with robot.joints:
         before = robot.heads[0](robot.clock.now())
@@ -169,7 +169,7 @@ def test_a_head_that_was_turned_round_stays_where_it_is() -> None:
 
 def test_asked_off_and_on_at_once_the_head_stays_where_it_is() -> None:
     robot = GazingRobot()
-    robot.heads[0]._q += 2 * math.pi
+    robot.heads[0].turn_by_hand(2 * math.pi)
     with robot.joints:
         robot.switch_on()
         before = robot.heads[0](robot.clock.now())

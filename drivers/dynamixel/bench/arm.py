@@ -12,6 +12,7 @@ from drivers.dynamixel.config import DynamixelConfig, ServoConfig
 from drivers.dynamixel.models import baud_value
 
 from .chain import Chain
+from .driven_shaft import DrivenShaft
 from .faults import swapped
 from .servo import Servo
 
@@ -22,7 +23,10 @@ OTHER_BAUD = {57600: 1_000_000}  # any other rate: 57600
 
 
 class DynamixelArm(ServoArm[Servo, DynamixelConfig]):
-    """Dynamixel servos as they are configured; see `ServoArm`."""
+    """Dynamixel servos as they are configured; see `ServoArm`.
+
+    Joints of the gaze stand where they would be at the beginning, and go where their servos turn them.
+    """
 
     kinds, errors = KINDS, ERRORS
 
@@ -30,10 +34,21 @@ class DynamixelArm(ServoArm[Servo, DynamixelConfig]):
         baud = self._config.buses[self._config.bus_of(entry)].baud
         booted_s = self._now() - self._rng.uniform(1, 9)
         model, delay_s = self._config.model_of(entry), self._return_delay_s
-        return Servo(model, entry.id, angle, baud=baud, return_delay_s=delay_s, booted_s=booted_s)
+        gaze = self._config.gaze
+        driven = DrivenShaft(angle(self._now())) if gaze is not None and entry.joint in gaze.joints else None
+        servo = Servo(model, entry.id, driven or angle, baud=baud, return_delay_s=delay_s, booted_s=booted_s)
+        if driven is not None:
+            driven.servo = servo
+        return servo
 
     def _chain(self, servos: Sequence[Servo], faults: Faults) -> Chain:
         return Chain(servos, faults)
+
+    def _begin(self, kind: str, joint: str) -> None:
+        servo = self.servo(joint)
+        if kind == "torque":
+            servo["goal"] = servo.position(self._now())  # it holds where it is
+        super()._begin(kind, joint)
 
     def _change_rate(self, servo: Servo) -> None:
         servo["baud"] = baud_value(servo.model.layout, OTHER_BAUD.get(servo.baud, 57600))

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
 import mmap
 import os
 import shutil
 import struct
 import subprocess
-from collections.abc import Sequence
+import threading
+import time
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -126,6 +129,72 @@ class ShimCamera:
 
     def _place(self, name: str) -> int:
         return HEADER.size + CONTROL.size * self._places[name]
+
+
+class LiveCamera(ShimCamera):
+    """A camera whose images are drawn while it runs, each `latency_s` before its time stamp.
+
+    What is not drawn in time is shown as it was in the beginning, without anything in it.
+
+    Attributes:
+        drawn: how many images were in time.
+    """
+
+    SLOTS = 8
+
+    def __init__(
+        self,
+        file: Path,
+        blank: np.ndarray,
+        draw: Callable[[float], np.ndarray],
+        *,
+        fps: float,
+        latency_s: float,
+        settled_s: float = 0.02,
+    ) -> None:
+        """Write the file.
+
+        Args:
+            draw: the image of a time of CLOCK_MONOTONIC.
+            latency_s: shorter than SLOTS / 2 frames.
+            settled_s: so long after its time an image is drawn, when all is known that belongs to that time.
+        """
+        super().__init__(file, [blank] * self.SLOTS, fps=fps, fourcc="YUYV")
+        self._blank, self._draw, self._fps = _encoded(blank, "YUYV"), draw, fps
+        self._latency_s, self._settled_s = latency_s, settled_s
+        self.drawn = 0
+        self._ending = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="live camera")
+
+    def __enter__(self) -> Self:
+        super().__enter__()
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._ending.set()
+        self._thread.join()
+        super().__exit__(kind, error, trace)
+
+    def _run(self) -> None:
+        number = math.ceil((time.monotonic() + self._latency_s) * self._fps)
+        while not self._ending.is_set():
+            taken_s = number / self._fps - self._latency_s
+            if self._ending.wait(max(taken_s + self._settled_s - time.monotonic(), 0.0)):
+                return
+            self._put(number + self.SLOTS // 2, self._blank)
+            if time.monotonic() < number / self._fps:
+                frame = _encoded(self._draw(taken_s), "YUYV")
+                if time.monotonic() < number / self._fps:
+                    self._put(number, frame)
+                    self.drawn += 1
+            number += 1
+
+    def _put(self, number: int, frame: bytes) -> None:
+        at, _ = PLACE.unpack_from(self._memory, FRAMES_AT + PLACE.size * (number % self.SLOTS))
+        self._memory[at : at + len(frame)] = frame
 
 
 def _encoded(image: np.ndarray, fourcc: str) -> bytes:

@@ -1,0 +1,59 @@
+"""A shaft that its servo turns, as the joints of a head are."""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_right
+from collections import deque
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from .servo import Servo
+
+FASTEST_RAD_S = math.radians(180.0)  # about what a servo of the X series does without a load
+KEPT = 1024  # moves that are remembered: seconds, at the rate at which a driver reads
+
+
+class DrivenShaft:
+    """The angle of a servo's shaft: it goes where the servo holds it, and stays where nothing does.
+
+    Attributes:
+        servo: that turns it; None: nobody does.
+        jammed: it is held fast, whatever the servo does.
+    """
+
+    def __init__(self, angle: float, fastest_rad_s: float = FASTEST_RAD_S) -> None:
+        """At `angle` [rad] from the beginning, 0 in the middle of the servo's range."""
+        self.servo: Servo | None = None
+        self.jammed = False
+        self._fastest = fastest_rad_s
+        self._moves = deque([(-math.inf, angle)], maxlen=KEPT)
+
+    def __call__(self, t: float) -> float:
+        """Where it is at `t` [s], or was, as far back as it remembers [rad]."""
+        moved_s, angle = self._moves[-1]
+        if t <= moved_s:
+            return self._before(t)
+        self._moves.append((t, angle))  # a servo that stops asks where it is
+        goal = None if self.servo is None or self.jammed else self.servo.held_at(t)
+        if goal is not None and math.isfinite(moved_s):
+            most = self._fastest * (t - moved_s)
+            angle += min(max(goal - angle, -most), most)
+            self._moves[-1] = (t, angle)
+        return angle
+
+    def turn_by_hand(self, angle: float) -> None:
+        """Somebody turns it by `angle` [rad]."""
+        moved_s, before = self._moves[-1]
+        self._moves.append((moved_s, before + angle))
+
+    def _before(self, t: float) -> float:
+        moves = tuple(self._moves)
+        place = bisect_right(moves, t, key=lambda move: move[0])
+        if place == 0:
+            return moves[0][1]
+        t0, angle0 = moves[place - 1]
+        if place == len(moves) or not math.isfinite(t0):
+            return angle0
+        t1, angle1 = moves[place]
+        return angle0 + (angle1 - angle0) * (t - t0) / (t1 - t0)

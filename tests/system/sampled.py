@@ -1,0 +1,130 @@
+"""A sampler process over servos of the bench, what its cameras see, and what it says."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from daemon.bench_wiring import Motion, bench_robot_file, open_bench
+from daemon.bus import Bus
+from daemon.command_names import CommandName
+from daemon.config import Config
+from daemon.keys import Keys
+from daemon.status import SamplerStatus
+from daemon.store import PairReader
+from daemon.wire import CommandReply, CommandRequest, decode, encode
+from drivers.bench.dry_run import DryRun
+from interfaces.errors import BodyschemaError
+from interfaces.records import FloatArray, Pair
+
+LIMIT_S = 90.0
+
+
+def limb(x: FloatArray, radius_m: float) -> FloatArray:
+    """Where rays from the origin touch a sphere at x (3,) [m], points (n, 3) of a circle."""
+    shrunk = 1.0 - radius_m**2 / float(x @ x)
+    across = np.linalg.svd(x[None])[2][1:]
+    turns = np.linspace(0.0, 2.0 * math.pi, 180, endpoint=False)
+    return shrunk * x + radius_m * math.sqrt(shrunk) * np.stack([np.cos(turns), np.sin(turns)], axis=1) @ across
+
+
+def drawn(config: Config, q: FloatArray) -> tuple[np.ndarray, np.ndarray]:
+    """What the two eyes see of the marker ball."""
+    return eyes_at(config, config.robot.chain.positions(q[None])[0])
+
+
+def eyes_at(config: Config, x: FloatArray) -> tuple[np.ndarray, np.ndarray]:
+    """What the two eyes see of the marker ball at x (3,) [m] in front of the left one."""
+    calibration = config.robot.calibration
+    assert calibration is not None
+    width, height = calibration.image_size_px
+    eyes = []
+    for eye in range(2):
+        seen = limb(x - [eye * calibration.baseline_m, 0.0, 0.0], config.tables.vision.radius_m)
+        outline_px = calibration.focal_px * seen[:, :2] / seen[:, 2:] + calibration.principal_point_px
+        image = np.full((2 * height, 2 * width, 3), 128, np.uint8)
+        corners = np.round(16 * (2 * outline_px + 0.5)).astype(np.int32)
+        cv2.fillPoly(image, [corners], (30, 30, 220), cv2.LINE_AA, 4)
+        eyes.append(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA))
+    return eyes[0], eyes[1]
+
+
+@contextlib.contextmanager
+def on_the_bench(config: Config, folder: Path, angle: Callable[[float], FloatArray]) -> Iterator[tuple[Config, DryRun]]:
+    """The same arm with its servos on a bench, moving as `angle` says; and that bench."""
+    motion = {name: lambda t, j=j: float(angle(t)[j]) for j, name in enumerate(config.robot.joints)}
+    bench = open_bench(config, folder / "bus", Motion(motion, "test"), return_delay_s=0.0, seed=0)
+    file = bench_robot_file(config, bench, folder / "bus")
+    with bench:
+        yield Config.load(file, {}), bench
+
+
+class SamplerProcess:
+    """`bodyschema sampler`, begun."""
+
+    def __init__(self, config: Config, bus: Bus, process: subprocess.Popen[bytes], log: Path) -> None:
+        self.process, self._bus, self._log = process, bus, log
+        self._keys = Keys(config.robot.name)
+
+    def status(self) -> SamplerStatus:
+        """What it says of itself; waits until it does."""
+        return decode(self._answer(lambda: self._bus.ask_one(self._keys.status("sampler"))), SamplerStatus)
+
+    def command(self, name: CommandName) -> str:
+        """As `bodyschema command`; what it says."""
+        reply = self._bus.ask_one(self._keys.command("sampler"), encode(CommandRequest(name)))
+        return decode(reply, CommandReply).message
+
+    def said(self) -> str:
+        """On its terminal, so far."""
+        return self._log.read_text()
+
+    def _answer(self, ask: Callable[[], bytes]) -> bytes:
+        until = time.monotonic() + LIMIT_S
+        while True:
+            try:
+                return ask()
+            except BodyschemaError:
+                assert self.process.poll() is None, self.said()
+                assert time.monotonic() < until
+
+
+@contextlib.contextmanager
+def sampling(config: Config, environment: dict[str, str] | None = None) -> Iterator[SamplerProcess]:
+    """A sampler process."""
+    command = [sys.executable, "-m", "daemon", "sampler", "--robot", str(config.file)]
+    log = config.file.with_suffix(".log")
+    with log.open("w") as errors:
+        process = subprocess.Popen(command, env=environment, stderr=errors)
+    try:
+        with Bus(connect=config.tables.zenoh.sampler) as bus:
+            yield SamplerProcess(config, bus, process, log)
+        if process.poll() is None:
+            process.send_signal(signal.SIGTERM)
+            assert process.wait(LIMIT_S) == 0
+    finally:
+        process.kill()
+        process.wait()
+
+
+def until(sampler: SamplerProcess, holds: Callable[[SamplerStatus], bool]) -> SamplerStatus:
+    """Its status, when that holds."""
+    limit = time.monotonic() + LIMIT_S
+    while not holds(said := sampler.status()):
+        assert time.monotonic() < limit, (said.rejected, said)
+        time.sleep(0.05)
+    return said
+
+
+def pairs_of(config: Config) -> list[Pair]:
+    with PairReader(config.store_file) as reader:
+        return list(reader.read())

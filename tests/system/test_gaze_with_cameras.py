@@ -1,0 +1,269 @@
+"""`bodyschema sampler` with gaze: a head of two servos on the bench, which carries cameras below OpenCV."""
+
+from __future__ import annotations
+
+import math
+import shutil
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+from sampled import SamplerProcess, drawn, on_the_bench, pairs_of, sampling, until
+from v4l2_cameras import LiveCamera, preloaded
+
+from daemon.config import Config
+from daemon.wiring import demonstration_model
+from drivers.bench.dry_run import DryRun
+from interfaces.pointing import Pointing
+from interfaces.records import FloatArray, Pair
+from interfaces.robot import RobotDescription
+
+pytestmark = pytest.mark.timeout(240)
+HEAD = [0, 1]
+DIRECTIONS = [1, -1, 1, 1, 1, 1, 1]  # of the servos
+MIDDLE = np.radians([0.0, 20.0, 35.0, -15.0, 0.0, 80.0, 0.0])
+SWING = np.radians([0.0, 0.0, 12.0, 12.0, 35.0, 0.0, 0.0])
+PACE = np.array([0.0, 0.0, 1.3, 1.0, 1.5, 1.0, 1.0])
+WATCHED_S, FOUND_S = 4.2, 1.0  # once to and fro; the head has found the hand
+EVERY_S = 0.05
+SPEED_DEG_S, YAW_DEG = 60.0, (-30.0, 40.0)
+FPS, LATENCY_S = 15.0, 0.15  # the images of a busy machine are drawn late
+GREY = np.full((480, 1280, 3), 128, np.uint8)
+OVERLOAD = 0x20
+TABLES = f"""
+[drivers.dynamixel]
+rate_hz = 60
+
+[drivers.dynamixel.buses.arm]
+port = "bus"
+latency_ms = 100
+
+[drivers.dynamixel.gaze]
+joints = ["neck_yaw", "neck_pitch"]
+max_speed_deg_s = {SPEED_DEG_S}
+limits_deg = {{{{ neck_yaw = [{YAW_DEG[0]}, {YAW_DEG[1]}] }}}}
+heartbeat_ms = 2000
+
+[vision]
+radius_m = 0.025
+
+[vision.cameras]
+latency_s = {LATENCY_S}
+latency_sigma_s = 0.001
+
+[vision.cameras.side_by_side]
+device = "{{device}}"
+image_size_px = [640, 480]
+fps = {FPS}
+fourcc = "YUYV"
+
+[daemon]
+any_step = true
+state_dir = "state"
+
+[zenoh]
+sampler = "{{sampler}}"
+learner = "{{learner}}"
+"""
+SERVO = """
+[[drivers.dynamixel.servos]]
+joint = "{joint}"
+id = {id}
+model = "XM430-W350"
+direction = {direction}
+"""
+
+
+def looking_at_the_hand(robot: RobotDescription) -> FloatArray:
+    """The pose in which the arm waits, its head turned so that the cameras see the hand."""
+    assert robot.calibration is not None
+    pointing = Pointing(robot.calibration, HEAD, robot.lower[HEAD], robot.upper[HEAD])
+    q = MIDDLE[None].copy()
+    for _ in range(20):
+        q[:, HEAD] = pointing.clipped(q[:, HEAD] + pointing.step(q, robot.chain.positions))
+    return q[0]
+
+
+class Guided:
+    """A hand that guides the arm, once it begins; the head is nobody's."""
+
+    def __init__(self, start: FloatArray) -> None:
+        self.start, self.begin_s = start, math.inf
+
+    def __call__(self, t: float) -> FloatArray:
+        return self.start + SWING * np.sin(PACE * max(t - self.begin_s, 0.0))
+
+
+@dataclass(frozen=True)
+class Watched:
+    """What was so for a while.
+
+    Attributes:
+        q: where the joints were every 50 ms, shape (n, d) [rad].
+        torque: of each servo; all that it was.
+        pairs: that were made meanwhile.
+        health: what the sampler said in the end.
+    """
+
+    q: FloatArray
+    torque: set[tuple[int, ...]]
+    pairs: list[Pair]
+    health: list[str]
+
+
+@dataclass(frozen=True)
+class Episode:
+    """A sampler from its start to its end: first without gaze, then with it, then a servo of the head failed.
+
+    Attributes:
+        torque_again: after it was asked for once more. torque_at_exit: after SIGTERM.
+    """
+
+    robot: RobotDescription
+    without: Watched
+    gazing: Watched
+    failed: Watched
+    torque_again: tuple[int, ...]
+    torque_at_exit: tuple[int, ...]
+
+
+class Stage:
+    """An arm with a head on the bench, and the cameras that the head carries."""
+
+    def __init__(self, config: Config, bench: DryRun, guided: Guided) -> None:
+        self.config, self._bench, self._guided = config, bench, guided
+        self.head = [bench.arm.servo(joint) for joint in config.robot.joints[:2]]
+
+    def q(self, t: float) -> FloatArray:
+        """Where the joints were [rad] (d,)."""
+        q = self._guided(t)
+        q[HEAD] = [way * servo.angle(t) for way, servo in zip(DIRECTIONS, self.head, strict=False)]
+        return q
+
+    def seen(self, t: float) -> np.ndarray:
+        """What the cameras see, side by side."""
+        return np.hstack(drawn(self.config, self.q(t)))
+
+    @property
+    def torque(self) -> tuple[int, ...]:
+        """Of each servo."""
+        return tuple(self._bench.arm.servo(joint)["torque"] for joint in self.config.robot.joints)
+
+    def watch(self, sampler: SamplerProcess, seconds: float) -> Watched:
+        """Look on for so long."""
+        begin, first, torque = time.monotonic(), len(pairs_of(self.config)), set()
+        while time.monotonic() < begin + seconds + 0.1:
+            torque.add(self.torque)
+            time.sleep(0.02)
+        q = np.array([self.q(t) for t in np.arange(begin, begin + seconds, EVERY_S)])
+        return Watched(q, torque, pairs_of(self.config)[first:], sampler.status().health)
+
+
+def write_robot(folder: Path, free_endpoint: Callable[[], str], device: Path) -> Config:
+    """The demonstration's upper body, of servos, with gaze and a camera."""
+    shutil.copytree(demonstration_model().parent, folder, dirs_exist_ok=True)
+    toml = folder / "robot.toml"
+    servos = [
+        SERVO.format(joint=joint, id=id, direction=way)
+        for id, (joint, way) in enumerate(zip(Config.load(toml, {}).robot.joints, DIRECTIONS, strict=True), 1)
+    ]
+    tables = TABLES.format(device=device, sampler=free_endpoint(), learner=free_endpoint())
+    toml.write_text(toml.read_text() + tables + "".join(servos))
+    return Config.load(toml, {})
+
+
+@pytest.fixture(scope="module")
+def episode(library, tmp_path_factory, free_endpoint) -> Episode:
+    folder = tmp_path_factory.mktemp("gaze")
+    device = folder / "dev" / "usb-Stereo_1234-video-index0"
+    config = write_robot(folder, free_endpoint, device)
+    guided = Guided(looking_at_the_hand(config.robot))
+    with on_the_bench(config, folder, guided) as (benched, bench):
+        stage = Stage(benched, bench, guided)
+        with (
+            LiveCamera(device, GREY, stage.seen, fps=FPS, latency_s=LATENCY_S),
+            sampling(benched, preloaded(library)) as sampler,
+        ):
+            until(sampler, lambda said: said.pairs >= 1)
+            guided.begin_s = time.monotonic()
+            without = stage.watch(sampler, WATCHED_S)
+            sampler.command("gaze_on")
+            stage.watch(sampler, FOUND_S)
+            gazing = stage.watch(sampler, WATCHED_S)
+            stage.head[1].fail(OVERLOAD)
+            until(sampler, lambda said: any("gaze ended" in text for text in said.health))
+            failed = stage.watch(sampler, 0.5)
+            stage.head[1].reboot(time.monotonic())
+            sampler.command("gaze_on")
+            again = stage.torque
+        return Episode(config.robot, without, gazing, failed, again, stage.torque)
+
+
+def in_view(robot: RobotDescription, q: FloatArray) -> np.ndarray:
+    """At which of q (n, d) both eyes have the marker's centre in their images (n,)."""
+    calibration = robot.calibration
+    assert calibration is not None
+    x, eyes = robot.chain.positions(q), [[0.0, 0.0], [calibration.baseline_m, 0.0]]
+    pixels = [(x[:, :2] - eye) / x[:, 2:] * calibration.focal_px + calibration.principal_point_px for eye in eyes]
+    return np.all([((p >= 0) & (p < calibration.image_size_px)).all(axis=1) for p in pixels], axis=0)
+
+
+def with_the_head_still(episode: Episode, q: FloatArray) -> FloatArray:
+    """q (n, d), the head where it stood before the gaze began."""
+    q = q.copy()
+    q[:, HEAD] = episode.without.q[0, HEAD]
+    return q
+
+
+def test_the_hand_stays_in_both_images_where_it_would_have_left_them(episode) -> None:
+    q = episode.gazing.q
+    assert in_view(episode.robot, q).all()
+    assert in_view(episode.robot, with_the_head_still(episode, q)).mean() < 0.8
+
+
+def test_pairs_are_made_where_a_head_that_stands_still_sees_nothing(episode) -> None:
+    q = np.array([pair.q for pair in episode.gazing.pairs])
+    unseen = ~in_view(episode.robot, with_the_head_still(episode, q))
+    assert unseen.sum() >= 5
+    assert in_view(episode.robot, np.array([pair.q for pair in episode.without.pairs])).all()
+
+
+def test_pairs_agree_with_the_arm_while_the_head_turns(episode) -> None:
+    pairs = episode.gazing.pairs
+    error = episode.robot.chain.positions(np.array([pair.q for pair in pairs])) - [pair.x for pair in pairs]
+    assert np.sqrt(np.mean(error**2)) < 2e-3
+
+
+def test_the_head_stands_still_without_torque_until_a_person_asks(episode) -> None:
+    assert np.ptp(episode.without.q[:, HEAD], axis=0).max() < 1e-9
+    assert episode.without.torque == {(0, 0, 0, 0, 0, 0, 0)}
+
+
+def test_only_the_head_has_torque(episode) -> None:
+    assert episode.gazing.torque == {(1, 1, 0, 0, 0, 0, 0)}
+
+
+def test_the_head_keeps_its_speed(episode) -> None:
+    span = round(0.5 / EVERY_S)
+    turned = episode.gazing.q[span:, HEAD] - episode.gazing.q[:-span, HEAD]
+    assert np.degrees(np.abs(turned)).max() < 1.2 * SPEED_DEG_S * span * EVERY_S
+
+
+def test_the_head_keeps_its_range_and_comes_to_its_end(episode) -> None:
+    yaw = np.degrees(episode.gazing.q[:, 0])
+    assert YAW_DEG[0] - 0.2 <= yaw.min() < YAW_DEG[0] + 1.0
+    assert yaw.max() <= YAW_DEG[1] + 0.2
+
+
+def test_a_fault_of_the_head_ends_it_with_torque_off_and_is_told_once(episode) -> None:
+    assert episode.failed.torque == {(0, 0, 0, 0, 0, 0, 0)}
+    assert np.ptp(episode.failed.q[:, HEAD], axis=0).max() < 1e-9
+    assert sum("gaze ended, torque off" in text for text in episode.failed.health) == 1
+
+
+def test_asked_again_it_begins_again_and_a_signal_ends_it_with_torque_off(episode) -> None:
+    assert episode.torque_again == (1, 1, 0, 0, 0, 0, 0)
+    assert episode.torque_at_exit == (0, 0, 0, 0, 0, 0, 0)
