@@ -28,6 +28,7 @@ TEMPERATURE_EVERY_S = 0.5  # one servo in turn
 MOVED_RAD = math.radians(3.0)
 STILL_RAD = math.radians(0.5)
 STILL_S = 1.0
+BEYOND = 0.01  # [rad or m]: a stop that gives, an encoder's resolution
 SEEN_M = 0.01  # a marker that moved less shows no sign
 WORDS = (("forward", "back"), ("left", "right"), ("up", "down"))  # REP 103: x, y, z
 
@@ -194,7 +195,7 @@ class JointsWatch:
             high=high,
             lower=lower,
             upper=upper,
-            within_limits=lower <= low and high <= upper,
+            within_limits=lower - BEYOND <= low and high <= upper + BEYOND,
         )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -61,7 +62,7 @@ class Watching:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise ConfigError(f"cannot be made: {error.strerror}", file=folder, remedy="Give another --out") from error
-        numbers = iter(range(1, 10**9))
+        numbers = itertools.count(1)
         return cls(
             pictures,
             lambda jpeg: _write(folder / f"{next(numbers):06}.jpg", jpeg),

@@ -66,10 +66,7 @@ class Solving:
         Args:
             turns: their orientations, quaternions (n, 4), NaN where a pair has none; None where no pair has any.
         """
-        if turns is None:
-            self._solver.learn(q, x)
-        else:
-            self._solver.learn(q, x, turns)
+        self._solver.learn(q, x, turns)
         self._fed = fed
 
     def ask(self) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import ClassVar, Literal
 
@@ -13,7 +13,7 @@ from drivers.servos.model import Model
 from interfaces.errors import ConfigError
 from interfaces.toml_file import line_of
 
-from .models import BY_NAME
+from .models import BY_NAME, UNSUPPORTED
 from .powered_config import GazeConfig, ZeroForceConfig
 
 __all__ = ["Baud", "BusConfig", "DynamixelConfig", "ServoConfig"]
@@ -49,6 +49,7 @@ class DynamixelConfig(ServosConfig[BusConfig], frozen=True, forbid_unknown_field
 
     table: ClassVar[str] = "drivers.dynamixel"
     models: ClassVar[Mapping[str, Model]] = BY_NAME
+    unsupported: ClassVar[Collection[str]] = tuple(UNSUPPORTED.values())
 
     zero_force: ZeroForceConfig | None = None
     gaze: GazeConfig | None = None

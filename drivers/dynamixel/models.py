@@ -14,7 +14,7 @@ from typing import Literal
 
 from drivers.servos.model import Layout, Model, Register
 
-__all__ = ["BY_NAME", "BY_NUMBER", "MODELS", "Layout", "Model", "Register"]
+__all__ = ["BY_NAME", "BY_NUMBER", "MODELS", "UNSUPPORTED", "Layout", "Model", "Register"]
 
 Series = Literal["X", "P", "MX", "AX"]
 
@@ -151,6 +151,8 @@ MODELS: tuple[Model, ...] = (
 )
 BY_NAME: Mapping[str, Model] = MappingProxyType({model.name: model for model in MODELS})
 BY_NUMBER: Mapping[int, Model] = MappingProxyType({model.number: model for model in MODELS})
+# e-Manual, XL-320: ID at 3, torque at 24, position at 37, 2 bytes. It has no clock and no block that tells all at once.
+UNSUPPORTED: Mapping[int, str] = MappingProxyType({350: "XL-320"})
 
 # Register values of the baud rate [bit/s].
 BAUDS2 = (9600, 57600, 115200, 1_000_000, 2_000_000, 3_000_000, 4_000_000, 4_500_000)

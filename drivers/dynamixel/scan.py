@@ -8,7 +8,7 @@ from drivers.servos.scan import HOST_S, IDS, Kind, PingScanner, heard
 from interfaces.protocols import Clock
 
 from .bus import Bus
-from .models import BY_NUMBER, HARDWARE_ERRORS
+from .models import BY_NUMBER, HARDWARE_ERRORS, UNSUPPORTED
 from .packets import BROADCAST, PACKETS2, Version
 
 LIKELY_FIRST = (1_000_000, 57_600, 2_000_000, 115_200, 3_000_000, 4_000_000, 9_600)
@@ -26,6 +26,7 @@ def _kind(version: Version) -> Kind:
         models={number: model for number, model in BY_NUMBER.items() if model.protocol == version},
         errors=HARDWARE_ERRORS,
         bus=Bus,
+        unsupported=UNSUPPORTED if version == 2 else {},
         mute=f"answers PING but no READ: set its Status Return Level ({register}) to 2",
     )
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, ClassVar, Generic, Literal, Protocol, TypeVar
 
@@ -13,7 +13,7 @@ from interfaces.errors import ConfigError
 from interfaces.suggest import did_you_mean
 from interfaces.toml_file import line_in_entry, line_of
 
-from .model import Model
+from .model import Model, no_driver
 
 Positive = Annotated[float, Meta(gt=0)]
 NonNegative = Annotated[float, Meta(ge=0)]
@@ -73,6 +73,7 @@ class ServosConfig(msgspec.Struct, Generic[BusT], frozen=True, forbid_unknown_fi
 
     table: ClassVar[str]
     models: ClassVar[Mapping[str, Model]]
+    unsupported: ClassVar[Collection[str]] = ()
 
     buses: dict[str, BusT]
     servos: Annotated[tuple[ServoConfig, ...], Meta(min_length=1)]
@@ -111,7 +112,7 @@ class ServosConfig(msgspec.Struct, Generic[BusT], frozen=True, forbid_unknown_fi
             if servo.joint in seen_joints:
                 yield place, f"a second servo for the joint {servo.joint!r}", "joint", "Give each joint one"
             if servo.model not in self.models:
-                yield place, f"unknown model {servo.model!r}", "model", did_you_mean(servo.model, self.models)
+                yield place, f"unknown model {servo.model!r}", "model", self._other_model(servo.model)
             if servo.bus is None and len(self.buses) != 1:
                 yield place, "which bus?", "joint", f"Give bus, one of: {', '.join(self.buses)}"
             if servo.bus is not None and servo.bus not in self.buses:
@@ -121,3 +122,10 @@ class ServosConfig(msgspec.Struct, Generic[BusT], frozen=True, forbid_unknown_fi
                 yield place, f"the ID {servo.id} is given twice on one bus", "id", "Give each servo an ID of its own"
             seen_joints.add(servo.joint)
             seen_ids.add(key)
+
+    def _other_model(self, name: str) -> str:
+        for known in self.unsupported:
+            if name.replace("-", "").upper() == known.replace("-", "").upper():
+                said = no_driver(known)
+                return said[0].upper() + said[1:]
+        return did_you_mean(name, self.models)

@@ -107,3 +107,8 @@ class Model:
     def protocol(self) -> int:
         """The version of its make's protocol that it speaks."""
         return self.layout.protocol
+
+
+def no_driver(name: str) -> str:
+    """What to say of a model that is known, and that no driver reads."""
+    return f"no driver reads an {name}: its control table is not that of other servos. Take another model"

@@ -9,7 +9,7 @@ from drivers.scan import FoundServo, ScannedPort
 from interfaces.protocols import Clock
 
 from .bus import BITS_PER_BYTE, SLOWEST_DELAY_S, Bus, Exchange, Request, Trouble
-from .model import Model, Register
+from .model import Model, Register, no_driver
 from .packets import Garbled, Packets, Status
 
 IDS = range(253)
@@ -32,6 +32,7 @@ class Kind:
         errors: what each bit of the hardware error means, and what to do.
         bus: a bus of its protocols.
         mute: what is wrong with a servo that answers PING but no READ.
+        unsupported: names by number of models that no driver reads, since their control table is another one.
     """
 
     name: str
@@ -41,6 +42,7 @@ class Kind:
     errors: Mapping[int, str] = field(repr=False)
     bus: type[Bus]
     mute: str
+    unsupported: Mapping[int, str] = field(default_factory=dict[int, str], repr=False)
 
     @property
     def packets(self) -> Packets:
@@ -157,6 +159,9 @@ class PingScanner:
         if head.trouble is not None:
             return replace(servo, is_double=True, troubles=(DOUBLE,))
         identity = self._identity(head.answers[0].status.data, id)
+        unsupported = kind.unsupported.get(int.from_bytes(head.answers[0].status.data[:2], "little"))
+        if unsupported is not None:
+            return replace(servo, model=unsupported, troubles=(no_driver(unsupported),))
         if identity is None:
             return replace(servo, troubles=(UNKNOWN,))
         kind, model = identity.kind, identity.model

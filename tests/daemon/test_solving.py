@@ -26,7 +26,7 @@ class ScriptedSolver:
     def start(self, task: Task) -> None:
         self.told.append(("start", task.number))
 
-    def learn(self, q: FloatArray, x: FloatArray) -> None:
+    def learn(self, q: FloatArray, x: FloatArray, turns: FloatArray | None = None) -> None:
         self.told.append(("learn", len(q)))
 
     def solve(self) -> None:

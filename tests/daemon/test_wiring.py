@@ -103,6 +103,7 @@ def test_servos_without_a_camera_make_no_pairs(tmp_path) -> None:
         ("id = 2", "id = 1", "the ID 1 is given twice on one bus"),
         ("id = 2", "id = 300", "drivers.dynamixel.servos.id: expected `int` <= 252"),
         ('"MX-28"', '"MX28"', "unknown model 'MX28'. Did you mean 'MX-28'"),
+        ('"MX-28"', '"XL320"', "unknown model 'XL320'. No driver reads an XL-320"),
         ("id = 2", 'id = 2\nbus = "leg"', "unknown bus 'leg'"),
         ("id = 2", "id = 2\nzero = 1", "unknown key 'zero' in .*Known are: .*zero_ticks"),
     ],

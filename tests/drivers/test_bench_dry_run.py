@@ -10,6 +10,7 @@ from random import Random
 from tempfile import TemporaryDirectory
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -21,6 +22,7 @@ from drivers.bench.through_driver import Behind, ThroughDriver
 from drivers.dynamixel.bench.arm import KINDS, DynamixelArm
 from drivers.dynamixel.config import BusConfig, DynamixelConfig, ServoConfig
 from drivers.dynamixel.joints import DynamixelJoints
+from drivers.dynamixel.powered_config import GazeConfig
 from drivers.feetech.bench.arm import KINDS as FEETECH_KINDS
 from drivers.feetech.bench.arm import FeetechArm
 from drivers.feetech.config import BusConfig as FeetechBus
@@ -182,6 +184,43 @@ def test_a_board_that_lost_its_power_says_so(tmp_path) -> None:
 
 def test_a_bench_without_faults_has_no_events(tmp_path) -> None:
     assert list(standing(tmp_path, "Dynamixel").events()) == []
+
+
+# --- a head
+
+
+GAZING = msgspec.structs.replace(CONFIG, gaze=GazeConfig(joints=("waist", "shoulder")))
+
+
+def turning(*faults: str) -> DynamixelArm:
+    """An arm whose joints all move with time, but for those that its servos turn."""
+    asked = [AskedFault.parsed(fault, JOINTS, KINDS) for fault in faults]
+    return DynamixelArm(GAZING, dict.fromkeys(JOINTS, lambda t: 0.1 * t), faults=asked, now=lambda: 2.0)
+
+
+def test_joints_of_the_gaze_stand_still_until_their_servos_turn_them() -> None:
+    arm = turning()
+    waist, elbow = arm.servo("waist"), arm.servo("elbow")
+    assert waist.angle(5.0) == pytest.approx(0.2)
+    assert elbow.angle(5.0) - elbow.angle(4.0) == pytest.approx(0.1)
+    waist["torque"], waist["goal"] = 1, waist.position(5.0) + 100
+    assert waist.angle(5.01) < 0.2 + 100 * TICK
+    assert waist.angle(6.0) == pytest.approx(0.2 + 100 * TICK, abs=TICK)
+
+
+def test_a_head_that_has_torque_from_the_beginning_stays_where_it_is() -> None:
+    shoulder = turning("torque@shoulder").servo("shoulder")  # counts against the joint
+    before = shoulder.angle(3.0)
+    assert shoulder.angle(9.0) == pytest.approx(before, abs=TICK)
+
+
+def test_a_turned_shaft_knows_where_it_was() -> None:
+    waist = turning().servo("waist")
+    waist.angle(3.0)
+    waist["torque"], waist["goal"] = 1, waist.position(3.0) + 50
+    waist.angle(4.0)
+    assert waist.angle(3.5) == pytest.approx(0.2 + 25 * TICK, abs=TICK)
+    assert waist.angle(2.5) == pytest.approx(0.2)
 
 
 # --- what is asked for

@@ -13,7 +13,7 @@ from drivers.bench.device import Faults, OnlyAnswers, Reply, no_faults
 from drivers.bench.pty_shell import PtyShell
 from drivers.bench.virtual_port import VirtualClock, VirtualPort
 from drivers.dynamixel.bench.chain import Chain
-from drivers.dynamixel.bench.frames import Code, instructions_in
+from drivers.dynamixel.bench.frames import Code, Error, instructions_in
 from drivers.dynamixel.bench.servo import Servo
 from drivers.dynamixel.models import BY_NAME
 from drivers.dynamixel.scan import LIKELY_FIRST
@@ -178,6 +178,20 @@ def test_a_servo_that_answers_no_read_is_told_with_its_register() -> None:
     silent = servo("XM430-W350", 3)
     silent["status_return"] = 0
     assert "Status Return Level (68)" in found(silent)[0].troubles[0]
+
+
+class XL320(Servo):
+    """A servo whose control table begins as an XL-320's does: number, firmware, ID, baud rate, return delay."""
+
+    def read(self, address: int, size: int, t: float) -> tuple[Error, bytes]:
+        table = (350).to_bytes(2, "little") + bytes((29, self.id, 3, 250, 0, 0, 0xFF, 0x03)) + bytes(43)
+        return (Error.NONE, table[address : address + size]) if address + size <= len(table) else (Error.ACCESS, b"")
+
+
+def test_an_xl_320_is_named_and_told_to_have_no_driver() -> None:
+    told = found(XL320(BY_NAME["XL330-M288"], 5, lambda _: 0.0), servo("XL330-M288", 6), bauds=[1_000_000])
+    assert [(s.id, s.model) for s in told] == [(5, "XL-320"), (6, "XL330-M288")]
+    assert told[0].troubles[0].startswith("no driver reads an XL-320")
 
 
 def test_a_scan_writes_to_nobody() -> None:

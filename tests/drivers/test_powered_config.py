@@ -9,7 +9,7 @@ import msgspec
 import pytest
 
 from drivers.config import DriversConfig
-from drivers.dynamixel.models import BY_NAME
+from drivers.dynamixel.models import BY_NAME, MODELS
 from drivers.dynamixel.torque_constants import TORQUE_AT_CURRENT, torque_constant
 from interfaces.errors import ConfigError
 
@@ -61,9 +61,9 @@ def test_a_servo_without_current_control_is_refused_by_its_joint(model) -> None:
 
 
 def test_an_unknown_torque_constant_has_to_be_given() -> None:
-    with pytest.raises(ConfigError, match=r"the torque constant of a MX-64\(2.0\) is not known"):
-        check(floating(), model="MX-64(2.0)")
-    check(floating(more="torque_constant = 1.46"), model="MX-64(2.0)")
+    with pytest.raises(ConfigError, match=r"the torque constant of a XW540-H260 is not known"):
+        check(floating(), model="XW540-H260")
+    check(floating(more="torque_constant = 3.7"), model="XW540-H260")
 
 
 @pytest.mark.parametrize(
@@ -105,6 +105,11 @@ def test_the_watchdog_is_no_shorter_than_the_heartbeat(heartbeat_ms, watchdog) -
     assert config is not None
     assert config.zero_force is not None
     assert config.zero_force.watchdog == watchdog
+
+
+def test_one_model_with_current_control_has_no_torque_constant() -> None:
+    able = {model.name for model in MODELS if model.protocol == 2 and model.current_unit is not None}
+    assert able - set(TORQUE_AT_CURRENT) == {"XW540-H260"}  # docs/hardware.md says so
 
 
 def test_each_torque_constant_is_of_a_servo_with_current_control() -> None:
