@@ -13,15 +13,18 @@ from interfaces.errors import ConfigError
 
 FILE = Path("etc/udev/rules.d/60-bodyschema.rules")
 ROOT = Path("/")
-# Vendor and product of USB adapters that servos come with, and of boards that read encoders.
+# Vendor and product of USB adapters that servos come with, and of boards that read encoders. docs/hardware.md says by
+# what each was confirmed.
 ADAPTERS = (
     ("0403", "6014", "FTDI FT232H: U2D2"),
     ("0403", "6001", "FTDI FT232R: USB2Dynamixel and many others"),
-    ("1a86", "7523", "WCH CH340: Feetech's and Waveshare's adapters"),
-    ("1a86", "55d3", "WCH CH343: Waveshare's bus servo adapter"),
-    ("2f5d", "2202", "OpenCM and OpenRB of ROBOTIS"),
-    ("10c4", "ea60", "Silicon Labs CP210x: many ESP32 boards"),
+    ("2f5d", "2202", "ROBOTIS OpenRB-150"),
+    ("fff1", "ff48", "ROBOTIS OpenCM 9.04"),
+    ("0483", "5740", "STM32 with USB of its own: ROBOTIS OpenCR and others"),
+    ("1a86", "7523", "WCH CH340: Feetech's FE-URT-1, older ones of Waveshare's, many Arduinos"),
+    ("1a86", "55d3", "WCH CH343: Waveshare's bus servo adapter, boards of SO-100 and SO-101"),
     ("1a86", "55d4", "WCH CH9102: many ESP32 boards"),
+    ("10c4", "ea60", "Silicon Labs CP210x: many ESP32 boards"),
     ("303a", "1001", "ESP32 with USB of its own"),
     ("2341", "0043", "Arduino Uno"),
 )
