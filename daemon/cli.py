@@ -8,6 +8,7 @@ from importlib.metadata import version
 
 import cyclopts
 
+from daemon.remedies import as_typed
 from daemon.signals import end_with_parent
 from interfaces.errors import BodyschemaError
 
@@ -78,7 +79,7 @@ def main() -> None:
     try:
         command_line(arguments[0] if arguments else None)(arguments)
     except BodyschemaError as error:
-        print(f"bodyschema: {error}", file=sys.stderr)  # noqa: T201
+        print(f"bodyschema: {as_typed(str(error))}", file=sys.stderr)  # noqa: T201
         sys.exit(1)
     except KeyboardInterrupt:
         sys.exit(130)

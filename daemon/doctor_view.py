@@ -8,6 +8,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from .remedies import as_typed
 from .servo_wiring import Check
 
 MARKS = {"ok": Text("✓", "green"), "warning": Text("!", "yellow"), "wrong": Text("✗", "red")}
@@ -21,10 +22,10 @@ def show(console: Console, checks: Sequence[Check]) -> None:
         line.add_column(no_wrap=True)
         line.add_column(no_wrap=True, min_width=13)
         line.add_column(overflow="fold")
-        line.add_row(MARKS[check.state], Text(check.subject), Text(check.said))
+        line.add_row(MARKS[check.state], Text(check.subject), Text(as_typed(check.said)))
         console.print(line)
         if check.mend:  # not wrapped by us, so that it can be copied
-            console.print(Text(f"{INDENT}{check.mend}", "bold"), soft_wrap=True)
+            console.print(Text(f"{INDENT}{as_typed(check.mend)}", "bold"), soft_wrap=True)
     console.print(_sum(checks))
 
 

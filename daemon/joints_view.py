@@ -10,6 +10,7 @@ from rich.table import Table
 from rich.text import Text
 
 from .joints_watch import JointState, Seen
+from .remedies import as_typed
 from .screen import bar
 
 HINT = "Move one joint at a time. It went the other way? Then set direction = -1 for it."
@@ -27,8 +28,8 @@ def screen(seen: Seen) -> RenderableType:
     lines = [Text(seen.moved, "cyan")] if seen.moved else []
     lines += [Text(HINT, "dim")]
     lines += [Text(_beyond(joint), "yellow") for joint in seen.joints if not joint.within_limits]
-    lines += [Text(complaint, "yellow") for complaint in seen.health]
-    lines += [Text(seen.trouble, "red")] if seen.trouble else []
+    lines += [Text(as_typed(complaint), "yellow") for complaint in seen.health]
+    lines += [Text(as_typed(seen.trouble), "red")] if seen.trouble else []
     return Group(table, *lines)
 
 

@@ -8,11 +8,21 @@ import sys
 from collections.abc import Mapping
 from typing import TextIO
 
+from .remedies import as_typed
+
 # sd-daemon(3): the journal reads a line's priority from its head.
 _PRIORITIES = ((logging.ERROR, 3), (logging.WARNING, 4), (logging.INFO, 6))
 
 
-class JournalFormatter(logging.Formatter):
+class PlainFormatter(logging.Formatter):
+    """Commands in the lines are as who started this has to type them."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """The record."""
+        return as_typed(super().format(record))
+
+
+class JournalFormatter(PlainFormatter):
     """Lines with a priority like `<4>` at the head of each and without a time: the journal has its own."""
 
     def format(self, record: logging.LogRecord) -> str:
@@ -27,7 +37,7 @@ def set_up(*, verbose: bool = False, environment: Mapping[str, str] = os.environ
     if "JOURNAL_STREAM" in environment:
         handler.setFormatter(JournalFormatter("%(name)s: %(message)s"))
     else:
-        handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)-7s %(name)s: %(message)s", "%H:%M:%S"))
+        handler.setFormatter(PlainFormatter("%(asctime)s %(levelname)-7s %(name)s: %(message)s", "%H:%M:%S"))
     root = logging.getLogger()
     root.handlers[:] = [handler]
     root.setLevel(logging.DEBUG if verbose else logging.INFO)

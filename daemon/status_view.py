@@ -19,6 +19,7 @@ from .bus import Bus
 from .config import Config
 from .findings_view import calibration_table, outlook_lines
 from .keys import Keys
+from .remedies import as_typed
 from .screen import coverage_table, degrees, mm, rejected
 from .servos_view import servos_table
 from .status import BusStatus, LearnerStatus, OrientationStatus, SamplerStatus
@@ -109,7 +110,7 @@ def screen(seen: Seen, config: Config) -> RenderableType:
 
 def _absent(process: str, endpoint: str) -> list[RenderableType]:
     said = f"does not answer on {endpoint}. Start it with `bodyschema {process}`, or both with `bodyschema run`."
-    return [Text.assemble((process, "bold"), " ", (said, "yellow"))]
+    return [Text.assemble((process, "bold"), " ", (as_typed(said), "yellow"))]
 
 
 def _sampler(status: SamplerStatus) -> list[RenderableType]:
@@ -175,7 +176,7 @@ def _head(process: str, status: SamplerStatus | LearnerStatus) -> Text:
 
 
 def _health(sentences: list[str]) -> list[RenderableType]:
-    return [Text(f"! {sentence}", style="yellow") for sentence in sentences]
+    return [Text(f"! {as_typed(sentence)}", style="yellow") for sentence in sentences]
 
 
 def _duration(seconds: float) -> str:

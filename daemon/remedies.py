@@ -1,0 +1,51 @@
+"""Commands in messages, as who gave --robot has to type them."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import sys
+from collections.abc import Sequence
+
+OPTION = "--robot"
+# The others take no robot.toml, or write one.
+WITH_ROBOT = frozenset(
+    {
+        *("bench", "command", "doctor", "ik", "joints", "learner", "predict", "record", "run", "sampler", "scan"),
+        *("servos", "status", "watch cameras", "config check", "config show", "calibrate latency"),
+    }
+)
+_QUOTED = re.compile(r"`bodyschema ([^`]+)`")
+_LINE = re.compile(r"^bodyschema ([^#\n]+?)(?=\s*(?:#|$))")
+
+
+def given_robot(arguments: Sequence[str]) -> str | None:
+    """What a command line gave as --robot; None where it left it to the environment or the folder."""
+    for place, argument in enumerate(arguments):
+        name, equals, value = argument.partition("=")
+        if name == OPTION:
+            return value if equals else next(iter(arguments[place + 1 :]), None)
+    return None
+
+
+def as_typed(text: str, arguments: Sequence[str] | None = None) -> str:
+    """`text`, each of our commands in it, in backticks or as a whole line, with the --robot of this command line.
+
+    Args:
+        arguments: of the command line; by default of this process.
+    """
+    robot = given_robot(sys.argv[1:] if arguments is None else arguments)
+    if robot is None:
+        return text
+    text = _QUOTED.sub(lambda found: f"`bodyschema {_for(robot, found[1])}`", text)
+    return _LINE.sub(lambda found: f"bodyschema {_for(robot, found[1])}", text)
+
+
+def _for(robot: str, command: str) -> str:
+    words, file = command.split(" "), shlex.quote(robot)
+    if OPTION in words:
+        place = words.index(OPTION) + 1
+        return " ".join([*words[:place], file, *words[place + 1 :]])
+    if words[0] in WITH_ROBOT or " ".join(words[:2]) in WITH_ROBOT:
+        return f"{command} {OPTION} {file}"
+    return command
