@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import msgspec
 
-from .servo_wiring import require_servos
+from .servo_wiring import known_models, require_servos
 
 if TYPE_CHECKING:
     from .config import Config
@@ -58,7 +58,8 @@ class JointFinding:
     """What was found in the place of a servo of robot.toml.
 
     Attributes:
-        state: "ok", "missing", "wrong model", "another rate", "another port" or "double".
+        state: "ok", "missing", "wrong model", "not known" (it does not tell what it is), "another rate", "another port" or
+            "double".
         mend: what to do; empty where it is ok.
         servo: what answered; None when nothing did.
     """
@@ -131,12 +132,21 @@ def _place(found: Sequence[Servo], id: int, model: str, port: str, baud: int) ->
         return "ok", "", right[0]
     if here and here[0].baud != baud:
         return "another rate", f"give the servo {baud:,} bit/s, or set baud = {here[0].baud} in robot.toml", here[0]
+    if here and here[0].model is None:
+        return "not known", "it does not tell its model: mend what is said of it", here[0]
     if here:
-        return "wrong model", f'set model = "{here[0].model}" in robot.toml, or give the servo another ID', here[0]
+        return "wrong model", _for_model(here[0].model, model), here[0]
     elsewhere = [servo for servo in found if servo.id == id and servo.model == model]
     if elsewhere:
         return "another port", f'set port = "{elsewhere[0].port}" in robot.toml', elsewhere[0]
     return "missing", "look at its supply and cable, and those of the one before it", None
+
+
+def _for_model(found: str | None, wanted: str) -> str:
+    """What to do where there is a servo of another model."""
+    if found in known_models():
+        return f'set model = "{found}" in robot.toml, or give the servo another ID'
+    return f"it is a {found}, which no driver reads: put a {wanted} in its place, or give it another ID"
 
 
 def as_json(report: ScanReport) -> str:

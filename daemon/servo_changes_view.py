@@ -48,7 +48,7 @@ def settings_table(servo: FittedServo, values: Sequence[tuple[Setting, int]]) ->
     for setting, value in values:
         bounds = ", ".join(setting.words) or f"{setting.lowest} … {setting.highest}"
         table.add_row(setting.name, str(setting.register.address), setting.shown(value), bounds)
-    head = f"{servo.joint}: ID {servo.id}, {servo.model.name}, firmware {servo.firmware}, on {servo.bus}"
+    head = f"{servo.joint}: ID {servo.id}, {servo.model.name}, firmware {servo.version}, on {servo.bus}"
     return Group(Text(head, style="bold"), table)
 
 

@@ -83,7 +83,8 @@ class Gaze(PoweredJoints):
         if self._read(servo, "homing_offset") != 0:
             raise RequestError(
                 f"joint {servo.joint!r} (ID {servo.id}) has a Homing Offset: it may turn when its watchdog stops it. "
-                f"Give zero_ticks in robot.toml, and type: `bodyschema servos set homing_offset=0 --joint {servo.joint}`"
+                "Give zero_ticks in robot.toml, and type: "
+                f"`bodyschema servos set homing_offset=0 --joint {servo.joint}`"
             )
         # With torque on, the position is within one turn (e-Manual, Present Position).
         turn, middle = servo.model.ticks_per_turn or 0, servo.model.zero_ticks

@@ -27,7 +27,7 @@ def _kind(version: Version) -> Kind:
         errors=HARDWARE_ERRORS,
         bus=Bus,
         unsupported=UNSUPPORTED if version == 2 else {},
-        mute=f"answers PING but no READ: set its Status Return Level ({register}) to 2",
+        mute=f"answers PING but no READ: set its Status Return Level ({register}) to 2; if it is 2, mend the cable",
     )
 
 

@@ -51,6 +51,11 @@ class FittedServo:
     had_torque: bool = False
 
     @property
+    def version(self) -> str:
+        """Its firmware, as its maker writes it."""
+        return ".".join(map(str, self.model.layout["firmware"].bytes(self.firmware)))
+
+    @property
     def label(self) -> str:
         """Its number, for messages."""
         return f"ID {self.id}"

@@ -121,8 +121,9 @@ def test_what_each_servo_is_set_to_is_on_record() -> None:
     arm = FeetechArm()
     arm.chain.servo(1)["homing_offset"] = -17
     with arm.joints:
-        kept = arm.joints.record[0]
+        kept, version = arm.joints.record[0], arm.joints.servos[0].version
     assert (kept["model"], kept["firmware"], kept["homing_offset_ticks"]) == ("STS3215", 0x030A, -17)
+    assert version == "3.10"
 
 
 # --- who is there
