@@ -319,6 +319,8 @@ class Sampler:
         return GazeLoop(robot, head, HandModel(robot, predict, self._wall))
 
     def _power(self, name: str, *, on: bool) -> str:
+        if self._simulation is not None:
+            raise RequestError(f"{name} is of a real arm: in the simulation the head follows the hand by itself")
         if name not in self._powered:
             raise RequestError(f"{name} is not configured: docs/hardware.md shows its table [drivers.dynamixel.{name}]")
         said = asked(self._powered[name], on=on)

@@ -88,6 +88,12 @@ def test_what_is_not_configured_is_refused(config) -> None:
         command(bus, "gaze_on")
 
 
+def test_in_the_simulation_nothing_has_torque_to_be_asked_for(config) -> None:
+    simulated = replace(sources(config, Powered()), simulation=object())
+    with running(config, simulated) as bus, pytest.raises(RequestError, match="gaze is of a real arm"):
+        command(bus, "gaze_on")
+
+
 def test_its_complaints_are_in_the_status(config) -> None:
     drive = Powered()
     drive.complaints = ("zero_force ended, torque off: it is too hot",)

@@ -39,13 +39,13 @@ rate_hz = 60
 
 [drivers.dynamixel.buses.arm]
 port = "bus"
-latency_ms = 100
+latency_ms = 400
 
 [drivers.dynamixel.gaze]
 joints = ["neck_yaw", "neck_pitch"]
 max_speed_deg_s = {SPEED_DEG_S}
 limits_deg = {{{{ neck_yaw = [{YAW_DEG[0]}, {YAW_DEG[1]}] }}}}
-heartbeat_ms = 2000
+heartbeat_ms = 2500
 
 [vision]
 radius_m = 0.025
