@@ -58,8 +58,8 @@ class JointFinding:
     """What was found in the place of a servo of robot.toml.
 
     Attributes:
-        state: "ok", "missing", "wrong model", "not known" (it does not tell what it is), "another rate", "another port" or
-            "double".
+        state: "ok", "missing", "wrong model", "not known" (it does not tell what it is), "another rate", "another
+            port" or "double".
         mend: what to do; empty where it is ok.
         servo: what answered; None when nothing did.
     """
