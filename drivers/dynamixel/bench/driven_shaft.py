@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from .servo import Servo
 
 FASTEST_RAD_S = math.radians(180.0)  # about what a servo of the X series does without a load
-KEPT = 1024  # moves that are remembered: seconds, at the rate at which a driver reads
+KEPT = 1024  # moves that are remembered: about a second, at the rate at which a driver reads
 
 
 class DrivenShaft:
