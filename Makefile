@@ -8,7 +8,7 @@ export OPENBLAS_NUM_THREADS ?= 1
 PEERS_BUDGET_S ?= 240
 GOALS_BUDGET_S ?= 3600
 
-.PHONY: help setup demo test check soak bench peers goals lock wheel clean
+.PHONY: help setup demo test check docs soak bench peers goals lock wheel clean
 
 help:           ## Show this list
 	@grep -E '^[a-z]+: .*##|^[a-z]+:  *##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 10
@@ -36,6 +36,9 @@ check: setup    ## Lint: ruff, pyright, import-linter
 	@$(BIN)/pyright
 	@$(BIN)/lint-imports
 
+docs: setup     ## The docs as a site, into site/; look at it with: python -m http.server -d site
+	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
+
 soak: setup     ## The long tests: many seeds, many kills
 	@$(BIN)/python -m pytest -m soak --timeout 3600
 
@@ -51,7 +54,7 @@ goals: setup    ## What was to be reached beside what is; goes on where the last
 
 lock:           ## Renew requirements.lock from pyproject.toml
 	@$(BIN)/python -m pip install --disable-pip-version-check --quiet uv
-	@$(BIN)/uv pip compile --quiet --upgrade --python-version 3.11 --extra sim --extra export --extra bench --extra dev \
+	@$(BIN)/uv pip compile --quiet --upgrade --python-version 3.11 --extra sim --extra export --extra bench --extra docs --extra dev \
 		--generate-hashes --no-emit-index-url --no-annotate --no-header pyproject.toml -o requirements.lock
 
 wheel: setup    ## Build the wheel into dist/

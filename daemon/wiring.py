@@ -17,6 +17,7 @@ from drivers.serial_lines.config import SerialLinesConfig
 from drivers.serial_lines.joints import SerialLineJoints
 from interfaces.clock import SystemClock
 from interfaces.errors import ConfigError
+from interfaces.plugins import PluginConfig, load
 from interfaces.protocols import Clock, JointSource
 from kbmaps import RigidChain
 
@@ -32,7 +33,7 @@ if TYPE_CHECKING:
     from sim_backend.config import SimConfig, SimTag
     from vision.config import VisionConfig
 
-Hardware = DynamixelConfig | FeetechConfig | SerialLinesConfig | Ros2Config
+Hardware = DynamixelConfig | FeetechConfig | SerialLinesConfig | Ros2Config | PluginConfig
 
 
 @contextmanager
@@ -101,6 +102,8 @@ def driver_of(hardware: Hardware, config: Config, clock: Clock, *, last_pose: li
             return SerialLineJoints(hardware, joints, clock, limits=limits, last_pose=last_pose)
         case Ros2Config():
             return _ros2_joints(config, hardware, clock)
+        case PluginConfig():
+            return load("bodyschema.drivers", hardware.name)(joints, hardware.settings, clock)
 
 
 def _ros2_joints(config: Config, robot: Ros2Config, clock: Clock) -> Ros2Joints:
@@ -217,7 +220,7 @@ def _simulated(config: Config) -> Iterator[Sources]:
 def _simulation_settings(config: Config) -> SimConfig:
     """The table [sim], with the tags that [vision] looks for in the hand unless [sim.camera] names others."""
     sim, vision = config.tables.sim, config.tables.vision
-    if vision.marker in ("ball", "bright_ball") or sim.camera.tags:
+    if vision.marker not in ("tag", "cluster") or sim.camera.tags:
         return sim
     from vision.tag_tracker import DICTIONARIES
 

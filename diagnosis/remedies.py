@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from effects import corrected_file
+from effects import KINDS, corrected_file
 from effects.simulation import transforms
 from interfaces.records import FloatArray
 from interfaces.robot import RobotDescription
@@ -63,7 +63,7 @@ class _Workshop:
 
     def remedy(self, cause: Cause) -> str:
         numbers = {name: interval.value for name, interval in cause.parameters.items()}
-        return _BY_EFFECT[cause.effect](self, cause, numbers)
+        return _BY_EFFECT.get(cause.effect, _Workshop.of_a_plugin)(self, cause, numbers)
 
     def offset(self, cause: Cause, numbers: Mapping[str, float]) -> str:
         move = "move the origin of joint {} by as much along" if self._slides(cause) else _TURN_ORIGIN
@@ -191,6 +191,10 @@ class _Workshop:
             f"Let camera and arm warm up for {_duration(wait)} before recording: {100 * _OVER:.0f} % of the drift is "
             "left then."
         )
+
+    def of_a_plugin(self, cause: Cause, _: Mapping[str, float]) -> str:
+        encoder = KINDS[cause.effect].encoder
+        return "" if encoder is None else encoder.remedy(f"joint {cause.where}")
 
     def outliers(self, _: Cause, numbers: Mapping[str, float]) -> str:
         return (

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from effects import KINDS
 from effects.unexplained import PLACE
 
 from .numbers import told_values
@@ -89,8 +90,11 @@ def finding(name: str, where: str | None, source: str | None, numbers: dict[str,
             return f"images are stamped {1e3 * numbers['latency_s']:.3g} ms late"
         case "thermal_drift":
             return f"what is measured drifts by {shift} with a time constant of {numbers['time_constant_s']:.0f} s"
-        case _:
+        case "outliers":
             return f"{100 * numbers['share']:.2g} % of the fixes are not the marker"
+        case _:
+            encoder = KINDS[name].encoder
+            return name if encoder is None else encoder.finding(at, numbers)
 
 
 def sentence(verdict: Verdict, causes: Sequence[Cause], rms: Errors, gain: Gain) -> str:

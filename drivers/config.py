@@ -10,6 +10,7 @@ import msgspec
 from msgspec import Meta
 
 from interfaces.errors import ConfigError
+from interfaces.plugins import PluginConfig
 from interfaces.toml_file import line_of
 
 from .dynamixel.config import DynamixelConfig
@@ -21,7 +22,13 @@ NonNegative = Annotated[float, Meta(ge=0)]
 Positive = Annotated[float, Meta(gt=0)]
 
 
-HARDWARE = {"dynamixel": "servos", "feetech": "servos", "serial_lines": "encoders", "ros2": "ROS 2"}
+HARDWARE = {
+    "dynamixel": "servos",
+    "feetech": "servos",
+    "serial_lines": "encoders",
+    "ros2": "ROS 2",
+    "plugin": "a plugin",
+}
 
 
 class DriversConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -36,6 +43,7 @@ class DriversConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         feetech: the joints are Feetech servos.
         serial_lines: the joints have encoders of their own, on a microcontroller.
         ros2: the joints are those of a ROS 2 robot.
+        plugin: a driver of another package reads them.
     """
 
     recording: str | None = None
@@ -45,11 +53,12 @@ class DriversConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     feetech: FeetechConfig | None = None
     serial_lines: SerialLinesConfig | None = None
     ros2: Ros2Config | None = None
+    plugin: PluginConfig | None = None
 
     @property
-    def hardware(self) -> DynamixelConfig | FeetechConfig | SerialLinesConfig | Ros2Config | None:
+    def hardware(self) -> DynamixelConfig | FeetechConfig | SerialLinesConfig | Ros2Config | PluginConfig | None:
         """What the joints are read from, if there is something."""
-        return self.dynamixel or self.feetech or self.serial_lines or self.ros2
+        return self.dynamixel or self.feetech or self.serial_lines or self.ros2 or self.plugin
 
     def check(self, joints: Sequence[str], file: Path, text: str) -> None:
         """ConfigError when two things give the joints, or one that does not fit `joints`."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import ClassVar
@@ -57,6 +57,15 @@ class EncoderEffect(ABC):
     def correction(self, motion: Motion, place: Place, values: FloatArray) -> FloatArray:
         """True angle minus reading (n,) [rad, m]."""
         return self.columns(motion, place, values) @ values
+
+    def finding(self, at: str, numbers: Mapping[str, float]) -> str:
+        """What is wrong, in a clause, where no sentence is known for it. `at` names the joint."""
+        amounts = ", ".join(f"{name} = {value:.3g}" for name, value in numbers.items())
+        return f"{at} has {self.name.replace('_', ' ')} ({amounts})"
+
+    def remedy(self, at: str) -> str:
+        """What to do about it, where nothing is known for it."""
+        return f"See what could cause it at {at}; extended.toml takes it into account"
 
 
 class JointOffset(EncoderEffect):

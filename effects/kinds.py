@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from typing import Literal
+
+from interfaces.plugins import installed
 
 from .encoder import ENCODER_EFFECTS, EncoderEffect
 from .parameter import Parameter
@@ -72,10 +75,26 @@ def _of_encoder(effect: EncoderEffect) -> Kind:
     )
 
 
+def _of_plugins() -> list[EncoderEffect]:
+    """The effects of other packages; those of the table keep their names. One that cannot be loaded is left out."""
+    names = {effect.name for effect in ENCODER_EFFECTS}
+    found: list[EncoderEffect] = []
+    for entry in installed("bodyschema.effects"):
+        try:
+            effect = entry.load()()
+        except Exception as error:
+            warnings.warn(f"the effect {entry.value} of another package is left out: {error}", stacklevel=2)
+            continue
+        if effect.name not in names:
+            found.append(effect)
+            names.add(effect.name)
+    return found
+
+
 KINDS: dict[str, Kind] = {
     kind.name: kind
     for kind in (
-        *(_of_encoder(effect) for effect in ENCODER_EFFECTS),
+        *(_of_encoder(effect) for effect in (*ENCODER_EFFECTS, *_of_plugins())),
         Kind(
             "joint_compliance",
             "structure",

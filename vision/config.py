@@ -7,6 +7,8 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
+from interfaces.plugins import PluginConfig
+
 from .cameras.config import CamerasConfig
 from .tag_config import ClusterConfig, TagConfig
 
@@ -14,7 +16,7 @@ Positive = Annotated[float, Meta(gt=0)]
 Ratio = Annotated[float, Meta(gt=1)]
 Fraction = Annotated[float, Meta(ge=0, le=1)]
 
-MarkerKind = Literal["ball", "bright_ball", "tag", "cluster"]
+MarkerKind = Literal["ball", "bright_ball", "tag", "cluster", "plugin"]
 ColourName = Literal["red", "orange", "yellow", "green", "cyan", "blue", "magenta"]
 
 
@@ -50,7 +52,8 @@ class VisionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     Attributes:
         marker: what is looked for: a coloured ball, a ball that is brighter than all around it, one tag ([vision.tag]),
-            or a rigid cluster of tags ([vision.cluster]). The other keys of this table are a ball's.
+            a rigid cluster of tags ([vision.cluster]), or what a tracker of another package finds ([vision.plugin]).
+            The other keys of this table are a ball's.
         colour: a name, or a band of hues as the table [vision.colour].
         min_brightness: of a bright ball, where 1 is the brightest that the camera can tell.
         radius_m: radius of the marker ball [m].
@@ -67,6 +70,7 @@ class VisionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         cameras: where images come from; without it there are none.
         tag: the tag, or what the tags of a cluster have in common.
         cluster: where on the marker which tag is.
+        plugin: the tracker of another package.
     """
 
     marker: MarkerKind = "ball"
@@ -86,6 +90,7 @@ class VisionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     cameras: CamerasConfig | None = None
     tag: TagConfig = TagConfig()
     cluster: ClusterConfig = ClusterConfig()
+    plugin: PluginConfig | None = None
 
     @property
     def band(self) -> HueBand:

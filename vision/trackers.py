@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from interfaces.camera import StereoCalibration
+from interfaces.errors import ConfigError
+from interfaces.plugins import load
 
 from .config import VisionConfig
 from .tag_body import TagBody
@@ -24,3 +26,7 @@ def tracker_of(calibration: StereoCalibration, config: VisionConfig) -> MarkerTr
             return TagTracker(calibration, TagBody.single(config.tag), config.tag)
         case "cluster":
             return TagTracker(calibration, TagBody.cluster(config.cluster, config.tag), config.tag)
+        case "plugin":
+            if config.plugin is None:
+                raise ConfigError('[vision] marker = "plugin" names none', remedy="Add [vision.plugin] with its name")
+            return load("bodyschema.trackers", config.plugin.name)(calibration, config.plugin.settings)

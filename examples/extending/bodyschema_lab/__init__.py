@@ -1,0 +1,1 @@
+"""What one laboratory adds to bodyschema: a driver, a tracker and an effect."""

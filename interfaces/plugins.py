@@ -1,0 +1,68 @@
+"""Drivers, trackers and effects of other packages that are installed here, found by their entry points.
+
+A robot.toml names one; it can name nothing that somebody with the right to install did not install.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
+from typing import Any, Literal
+
+import msgspec
+
+from .errors import ConfigError
+from .suggest import did_you_mean
+from .toml_file import line_of
+
+Group = Literal["bodyschema.drivers", "bodyschema.trackers", "bodyschema.effects"]
+
+
+class PluginConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The table [drivers.plugin] or [vision.plugin].
+
+    Attributes:
+        name: of the entry point.
+        settings: handed to it as they are.
+    """
+
+    name: str
+    settings: dict[str, Any] = {}
+
+    def check(self, _: Sequence[str], file: Path, text: str) -> None:
+        """ConfigError when no installed package has such a driver."""
+        try:
+            _entry("bodyschema.drivers", self.name)
+        except ConfigError as error:
+            line = line_of(text, ("drivers", "plugin"))
+            raise ConfigError(error.what, file=file, line=line, remedy=error.remedy) from None
+
+
+def load(group: Group, name: str) -> Any:
+    """What the entry point `name` of `group` names.
+
+    Raises:
+        ConfigError: no installed package has it, or it cannot be imported.
+    """
+    try:
+        return _entry(group, name).load()
+    except (ImportError, AttributeError) as error:
+        raise ConfigError(
+            f"the plugin {name!r} cannot be loaded: {error}", remedy="Mend or reinstall the package that it is in"
+        ) from error
+
+
+def installed(group: Group) -> tuple[EntryPoint, ...]:
+    """What the packages that are installed here offer."""
+    return tuple(entry_points(group=group))
+
+
+def _entry(group: Group, name: str) -> EntryPoint:
+    offered = {entry.name: entry for entry in installed(group)}
+    if name not in offered:
+        remedy = (
+            did_you_mean(name, offered) if offered else f"Install a package with an entry point in the group {group!r}"
+        )
+        raise ConfigError(f"no installed package has a plugin {name!r} of {group}", remedy=remedy)
+    return offered[name]
