@@ -18,14 +18,16 @@ from sim_backend import SimConfig, SimWorld, model_file
 
 ROOT = Path(__file__).resolve().parents[2]
 HOLD_OPEN = """
-import sys
+import select, sys
 from interfaces.robot import RobotDescription
 from sim_backend import SimConfig, SimWorld, model_file
 try:
     with SimWorld(RobotDescription.load(model_file("upper_body")), SimConfig()) as world, world.joints, world.camera:
         world.camera.read(20.0)
         print(world.renderer_process.pid, flush=True)
-        sys.stdin.read()
+        # A signal that comes just before a call blocks does not end it: Python looks for signals in between only.
+        while not select.select([sys.stdin], [], [], 0.05)[0]:
+            pass
 except KeyboardInterrupt:
     pass
 """
