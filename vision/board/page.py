@@ -76,7 +76,7 @@ def page(board: Board, paper: str = "A4") -> Page:
     width, height = (1e3 * side for side in board.size_m)
     x = _MARGIN_MM + 0.5 * (size[0] - width - 2 * _MARGIN_MM - _RULER_MM)
     y = _MARGIN_MM + 0.5 * (size[1] - height - 2 * _MARGIN_MM - _RULER_MM)
-    rulers = (_ruler_length(width), _ruler_length(height))
+    rulers = rulers_mm(board)
     below, beside = y + height + 0.35 * _RULER_MM, x + width + 0.35 * _RULER_MM
     lines = [*_ruler(x, below, rulers[0], upright=False), *_ruler(beside, y, rulers[1], upright=True)]
     texts = (
@@ -89,6 +89,12 @@ def page(board: Board, paper: str = "A4") -> Page:
         Text(beside + 7.0, y + rulers[1], f"{rulers[1]:g} mm", turned=True),
     )
     return Page(size, (x, y), rulers, (*_squares(board, x, y), *_markers(board, x, y), *lines), texts)
+
+
+def rulers_mm(board: Board) -> tuple[float, float]:
+    """Lengths of the rulers on a board's page, across and upright."""
+    width, height = (_ruler_length(1e3 * side) for side in board.size_m)
+    return width, height
 
 
 def _sheet(board: Board, paper: str) -> tuple[float, float]:
