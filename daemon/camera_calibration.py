@@ -15,19 +15,19 @@ from interfaces.errors import ConfigError
 from vision.board import Board
 from vision.board.board import Pattern
 from vision.board.page import page as board_page
-from vision.board.page import rulers_mm
-from vision.board.pdf import pdf
-from vision.board.svg import svg
 from vision.calibration.calibrate import Asked, Calibrated, ModelChoice, calibrate
 from vision.calibration.check import Check, check
 from vision.calibration.gather import Gathered, gathered, require_any
 from vision.calibration.images import ImagePair, PairFiles, pair_files, read_pairs, write_pair
 from vision.calibration.report import page as report_page
+from vision.printing.sheet import rulers_mm
 from vision.rectified import Rectification
 from vision.rig import CalibrationError, StereoRig
 from vision.rig_file import read_rig, write_rig
 from vision.spread import covariance_of
 from vision.triangulated import triangulated
+
+from .pages import write_page
 
 REPORT = "report.html"
 NORMAL_95 = 1.96
@@ -160,7 +160,8 @@ def as_printed(drawn: Board, ruler_mm: float | None) -> Board:
     """
     if ruler_mm is None:
         return drawn
-    length = rulers_mm(drawn)[0]
+    width, height = drawn.size_m
+    length = rulers_mm((1e3 * width, 1e3 * height))[0]
     scale = ruler_mm / length
     if not 0.5 < scale < 2.0:
         raise ConfigError(
@@ -176,15 +177,8 @@ def write_board(board: Board, paper: str, out: Path) -> tuple[float, float]:
     Raises:
         ConfigError: it does not fit, the ending is neither, or the file cannot be written.
     """
-    writers = {".pdf": pdf, ".svg": svg}
-    writer = writers.get(out.suffix.lower())
-    if writer is None:
-        raise ConfigError(f"{out}: neither .pdf nor .svg", remedy="Name a file that ends so")
     page = board_page(board, paper)
-    try:
-        out.write_bytes(writer(page))
-    except OSError as error:
-        raise ConfigError(f"cannot be written: {error.strerror}", file=out, remedy="Name another folder") from error
+    write_page(page, out)
     return page.rulers_mm
 
 

@@ -17,8 +17,7 @@ from interfaces.errors import ConfigError
 from interfaces.records import FloatArray, ImageArray
 from vision.board import Board, BoardDetector, Corners, NotFound
 from vision.board.page import page
-from vision.board.pdf import pdf
-from vision.board.svg import svg
+from vision.printing import pdf, svg
 
 PX_A_MM = 4
 BOARDS = [Board(), Board(7, 5, 0.025, dictionary="6X6_250"), Board(10, 7, 0.020, pattern="chessboard")]
@@ -63,7 +62,7 @@ def test_squares_on_the_page_are_of_the_size_that_was_asked_for(board, write, re
     image = rasterised(*read(write(drawn)))
     found = BoardDetector(board).find(cv2.GaussianBlur(image, (0, 0), 1.0))
     assert isinstance(found, Corners), found
-    mm = (found.px + 0.5) / PX_A_MM - np.array(drawn.board_mm)
+    mm = (found.px + 0.5) / PX_A_MM - np.array(drawn.drawing_mm)
     np.testing.assert_allclose(mm, 1e3 * board.corners_m[:, :2], atol=0.1)
 
 
@@ -87,7 +86,7 @@ def test_nothing_on_the_page_is_nearer_to_its_edge_than_printers_print() -> None
 
 def test_the_board_is_opencvs_own() -> None:
     mine = rasterised(*from_pdf(pdf(page(BOARD))))
-    x, y = (round(each * PX_A_MM) for each in page(BOARD).board_mm)
+    x, y = (round(each * PX_A_MM) for each in page(BOARD).drawing_mm)
     wide, high = (round(1e3 * each * PX_A_MM) for each in BOARD.size_m)
     theirs = BOARD.opencv().generateImage((wide, high), marginSize=0)
     assert np.mean(mine[y : y + high, x : x + wide] != theirs) < 0.01
