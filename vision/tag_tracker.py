@@ -11,27 +11,20 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from interfaces.camera import StereoCalibration
-from interfaces.errors import ConfigError
 from interfaces.records import FloatArray, ImageArray, MarkerFix, MarkerMiss, Reason, StereoFrame, frozen_array
 
 from .images import check_calibration, check_images
 from .pose import Pose, PoseEstimator, Sighting, fitted_motion, mirrored
 from .tag_body import TagBody
-from .tag_config import Dictionary, TagConfig
+from .tag_config import TagConfig
+from .tag_dictionary import require_tag, tags_of
 from .tag_image import TagImage, measure_tag
 from .triangulate import triangulate
 
 _log = logging.getLogger(__name__)
 
-# OpenCV's numbers of the dictionaries.
-DICTIONARIES: dict[Dictionary, int] = {
-    "apriltag_36h11": cv2.aruco.DICT_APRILTAG_36h11,
-    "aruco_6x6_50": cv2.aruco.DICT_6X6_50,
-    "aruco_6x6_100": cv2.aruco.DICT_6X6_100,
-    "aruco_6x6_250": cv2.aruco.DICT_6X6_250,
-    "aruco_6x6_1000": cv2.aruco.DICT_6X6_1000,
-    "aruco_mip_36h12": cv2.aruco.DICT_ARUCO_MIP_36h12,
-}
+# Squares are two where their corners are on the mean so far apart, as a share of the perimeter.
+_APART_SHARE = 0.03
 # Around the corners of the last frame: so many times their extent, and pixels more.
 _REGION_SHARE, _REGION_PX = 0.6, 30
 # After a longer pause the last fix predicts nothing [s].
@@ -59,16 +52,13 @@ class TagTracker:
         """
         check_calibration(calibration)
         self.calibration, self.body, self.config = calibration, body, config or TagConfig()
-        dictionary = cv2.aruco.getPredefinedDictionary(DICTIONARIES[self.config.dictionary])
-        most = len(dictionary.bytesList)
         for id in body.corners:
-            if id >= most:
-                raise ConfigError(
-                    f"there is no tag {id} in {self.config.dictionary}", remedy=f"Its numbers go from 0 to {most - 1}"
-                )
+            require_tag(self.config.dictionary, id)
         parameters = cv2.aruco.DetectorParameters()
         parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_NONE  # `measure_tag` does better
-        self._detector = cv2.aruco.ArucoDetector(dictionary, parameters)
+        # Else a tag's paper, one module wider all around, is taken for the same square, and the tag is not found.
+        parameters.minMarkerDistanceRate = _APART_SHARE
+        self._detector = cv2.aruco.ArucoDetector(tags_of(self.config.dictionary), parameters)
         self._whole = (0, 0, *calibration.image_size_px)
         self._last: tuple[float, list[FloatArray]] | None = None
 

@@ -4,25 +4,86 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import cyclopts
 from cyclopts import Parameter
+from cyclopts.validators import Number
 
 from daemon.commands.options import flag
 
 marker = cyclopts.App(
     name="marker",
-    help="""What the marker looks like.
+    help="""The marker: a page of tags to print, where they are on what was built, or a ball's colour.
 
-    Needs: images of the camera, taken in the light and at the exposure of later.
+    Needs: a printer for tags; for a ball images in the light and at the exposure of later.
 
-    Next: `bodyschema marker learn`.
+    Next: `bodyschema marker print`, or `bodyschema marker learn`.
     """,
 )
 
 
-@marker.command
+@marker.command(name="print", sort_key=1)
+def print_tags(
+    *,
+    shape: Annotated[
+        Literal["tags", "plate", "cube"],
+        Parameter(help="Single tags to cut apart; a plate, flat or folded between its columns; a cube to fold."),
+    ] = "tags",
+    ids: Annotated[
+        str | None,
+        Parameter(help="Numbers of the tags, as in 0-5,9, row by row; else from 0 on.", show_default=False),
+    ] = None,
+    family: Annotated[
+        Literal[
+            "apriltag_36h11", "aruco_6x6_50", "aruco_6x6_100", "aruco_6x6_250", "aruco_6x6_1000", "aruco_mip_36h12"
+        ],
+        Parameter(help="Which tags."),
+    ] = "apriltag_36h11",
+    side_mm: Annotated[
+        float, Parameter(help="Side of a tag's black square [mm].", validator=Number(gte=5, lte=500))
+    ] = 40.0,
+    columns: Annotated[int, Parameter(help="Of a plate.", validator=Number(gte=1, lte=20))] = 2,
+    rows: Annotated[int, Parameter(help="Of a plate.", validator=Number(gte=1, lte=20))] = 1,
+    fold_deg: Annotated[
+        float, Parameter(help="By how much each column of a plate is folded away from the one before [°].")
+    ] = 0.0,
+    ruler_mm: Annotated[
+        float | None,
+        Parameter(
+            help="What the line below measures on the print [mm]; the tables are then of that size.",
+            validator=Number(gt=0),
+            show_default=False,
+        ),
+    ] = None,
+    paper: Annotated[str, Parameter(help="A4, A3, A2, A1, A0, letter, legal or tabloid.")] = "A4",
+    out: Annotated[Path, Parameter(help="The file to write, .pdf or .svg.")] = Path("tags.pdf"),
+) -> None:
+    """Write a page with tags in true size, and print their tables for robot.toml.
+
+    Solid lines are to cut along, dashed ones to fold along. Print it at 100 % ("actual size") and measure the two
+    rulers. Paper alone is not rigid: glue the sheet around a block, or onto a plate, with faces as wide as is said. The
+    tables say where the tags are if it was folded as drawn; `bodyschema marker cluster` measures where they are.
+
+    Needs: a printer.
+
+    Next: put what was printed into robot.toml; `bodyschema marker cluster` for what was glued by hand.
+    """
+    from rich.console import Console
+
+    from daemon.tag_pages import Tags, as_printed, face_mm, tables, write_tags
+
+    drawn = Tags(shape, ids, family, side_mm, columns, rows, fold_deg)
+    across, upright = write_tags(drawn, paper, out)
+    tags = drawn if ruler_mm is None else as_printed(drawn, across, ruler_mm)
+    said = f"{out} written. Print it at 100 %, then measure: the line below is {across:g} mm, the other {upright:g} mm."
+    if drawn.body is not None:
+        said += f" Each face is {face_mm(tags):g} mm wide."
+    Console(stderr=True, highlight=False).print(said, markup=False, soft_wrap=True)
+    sys.stdout.write(tables(tags))
+
+
+@marker.command(sort_key=3)
 def learn(
     *images: Annotated[Path, Parameter(help="Image files of one camera; with --auto in the order of time.")],
     at: Annotated[

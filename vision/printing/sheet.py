@@ -28,6 +28,8 @@ _RULER_MM = 14.0
 AROUND_MM = 2 * MARGIN_MM + _RULER_MM
 LINE_MM = 0.2
 _TEXT_MM = 3.0
+# Helvetica's letters are half as wide as high, on the mean.
+_LETTER = 0.52
 
 
 @dataclass(frozen=True)
@@ -99,11 +101,18 @@ def page(
     rulers = rulers_mm(size_mm)
     below, beside = y + height + 0.35 * _RULER_MM, x + width + 0.35 * _RULER_MM
     lines = [*_ruler(x, below, rulers[0], upright=False), *_ruler(beside, y, rulers[1], upright=True)]
-    said = f"{name}. Print at 100 %, then measure: this line is {rulers[0]:g} mm, the upright one {rulers[1]:g} mm."
-    words = (Text(x, below + 7.0, said), Text(beside + 7.0, y + rulers[1], f"{rulers[1]:g} mm", turned=True))
+    told = f"Print at 100 %, then measure: this line is {rulers[0]:g} mm, the upright one {rulers[1]:g} mm."
+    words = [_line(said, x, below + 7.0 + k * 4.0, sheet[0]) for k, said in enumerate((told, name))]
+    words.append(Text(beside + 7.0, y + rulers[1], f"{rulers[1]:g} mm", turned=True))
     moved = [Rectangle(x + r.x_mm, y + r.y_mm, r.width_mm, r.height_mm) for r in rectangles]
     written = [replace(text, x_mm=x + text.x_mm, y_mm=y + text.y_mm) for text in texts]
     return Page(sheet, (x, y), rulers, (*moved, *lines), (*written, *words))
+
+
+def _line(text: str, x: float, y: float, sheet_mm: float) -> Text:
+    """A line of text that begins at x, or further left where it would leave the sheet."""
+    longest = _LETTER * _TEXT_MM * len(text)
+    return Text(max(min(x, sheet_mm - MARGIN_MM - longest), MARGIN_MM), y, text)
 
 
 def rulers_mm(size_mm: tuple[float, float]) -> tuple[float, float]:
