@@ -51,17 +51,22 @@ class Tags:
         """The tags' numbers; ConfigError where they cannot be read, or one is there twice."""
         if self.ids is None:
             return list(range(1 if self.body is None else len(self.body.faces)))
-        found: list[int] = []
-        for part in self.ids.split(","):
-            run = _RUN.fullmatch(part.strip())
-            if run is None:
-                raise ConfigError(f"--ids {self.ids} is not as in 0-5,9", remedy="Give numbers, or runs of them")
-            found += range(int(run[1]), int(run[2] or run[1]) + 1)[: _MOST_TAGS + 1]
-        if len(found) > _MOST_TAGS:
-            raise ConfigError(f"--ids {self.ids} are more than {_MOST_TAGS}", remedy="Print them on several pages")
-        if len(set(found)) < len(found) or not found:
-            raise ConfigError(f"--ids {self.ids} has a tag twice, or none", remedy="No number may be there twice")
-        return found
+        return numbers_of(self.ids)
+
+
+def numbers_of(ids: str) -> list[int]:
+    """Tags' numbers as in 0-5,9; ConfigError where they cannot be read, or one is there twice."""
+    found: list[int] = []
+    for part in ids.split(","):
+        run = _RUN.fullmatch(part.strip())
+        if run is None:
+            raise ConfigError(f"--ids {ids} is not as in 0-5,9", remedy="Give numbers, or runs of them")
+        found += range(int(run[1]), int(run[2] or run[1]) + 1)[: _MOST_TAGS + 1]
+    if len(found) > _MOST_TAGS:
+        raise ConfigError(f"--ids {ids} are more than {_MOST_TAGS}", remedy="Print them on several pages")
+    if len(set(found)) < len(found) or not found:
+        raise ConfigError(f"--ids {ids} has a tag twice, or none", remedy="No number may be there twice")
+    return found
 
 
 def write_tags(tags: Tags, paper: str, out: Path) -> tuple[float, float]:

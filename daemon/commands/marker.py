@@ -10,6 +10,7 @@ import cyclopts
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
+from daemon.commands.board_options import BY_NAME, EyeFiles
 from daemon.commands.options import flag
 
 marker = cyclopts.App(
@@ -23,6 +24,12 @@ marker = cyclopts.App(
 )
 
 
+Family = Annotated[
+    Literal["apriltag_36h11", "aruco_6x6_50", "aruco_6x6_100", "aruco_6x6_250", "aruco_6x6_1000", "aruco_mip_36h12"],
+    Parameter(help="Which tags."),
+]
+
+
 @marker.command(name="print", sort_key=1)
 def print_tags(
     *,
@@ -34,12 +41,7 @@ def print_tags(
         str | None,
         Parameter(help="Numbers of the tags, as in 0-5,9, row by row; else from 0 on.", show_default=False),
     ] = None,
-    family: Annotated[
-        Literal[
-            "apriltag_36h11", "aruco_6x6_50", "aruco_6x6_100", "aruco_6x6_250", "aruco_6x6_1000", "aruco_mip_36h12"
-        ],
-        Parameter(help="Which tags."),
-    ] = "apriltag_36h11",
+    family: Family = "apriltag_36h11",
     side_mm: Annotated[
         float, Parameter(help="Side of a tag's black square [mm].", validator=Number(gte=5, lte=500))
     ] = 40.0,
@@ -81,6 +83,46 @@ def print_tags(
         said += f" Each face is {face_mm(tags):g} mm wide."
     Console(stderr=True, highlight=False).print(said, markup=False, soft_wrap=True)
     sys.stdout.write(tables(tags))
+
+
+@marker.command(sort_key=2)
+def cluster(
+    images: Annotated[Path, Parameter(help="Folder with the images: left01.png and right01.png, or left/ and right/.")],
+    /,
+    *,
+    side_mm: Annotated[float, Parameter(help="Side of the black squares as measured [mm].", validator=Number(gt=0))],
+    calibration: Annotated[Path, Parameter(help="The calibration of the cameras.")] = Path("cameras.toml"),
+    files: EyeFiles = BY_NAME,
+    ids: Annotated[
+        str | None, Parameter(help="Numbers of its tags, as in 0-5,9; else all that are seen.", show_default=False)
+    ] = None,
+    family: Family = "apriltag_36h11",
+    as_json: Annotated[bool, flag("Print the figures as JSON.", name="--json")] = False,
+) -> None:
+    """Measure where the tags of a cluster are on it, from images, and print its tables for robot.toml.
+
+    About 20 pairs of images, the cluster turned from one to the next so that every two neighbours are seen together
+    some time. All tags are of one side. Their places and all poses are fitted together; the frame of the marker is that
+    of the tag with the lowest number. What does not fit one rigid body is left out and named.
+
+    Needs: cameras.toml, and images of those cameras; no hardware.
+
+    Next: put what was printed into robot.toml; `bodyschema watch cameras`.
+    """
+    from rich.console import Console
+
+    from daemon.cluster_wiring import Wanted, figures, measured, said, tables
+    from daemon.tag_pages import numbers_of
+    from daemon.wire import encode
+
+    progress = Console(stderr=True, highlight=False, soft_wrap=True)
+    wanted = Wanted(family, 1e-3 * side_mm, None if ids is None else tuple(numbers_of(ids)))
+    found = measured(files.of(images), calibration, wanted, lambda text: progress.print(text, markup=False))
+    if as_json:
+        sys.stdout.write(encode(figures(found)).decode() + "\n")
+        return
+    progress.print(said(found), markup=False)
+    sys.stdout.write(tables(found, wanted))
 
 
 @marker.command(sort_key=3)
