@@ -11,7 +11,7 @@ from cyclopts import Parameter
 from cyclopts.validators import Number
 
 from daemon.commands.board_options import BY_NAME, EyeFiles
-from daemon.commands.options import flag
+from daemon.commands.options import HERE, RobotFile, flag
 
 marker = cyclopts.App(
     name="marker",
@@ -133,19 +133,37 @@ def learn(
         Parameter(help="Column and row of a pixel in the middle of the ball, in the first image [px]."),
     ] = None,
     auto: Annotated[bool, flag("Learn the colour of what moves; the camera stands still.")] = False,
+    robot: RobotFile = HERE,
+    seconds: Annotated[
+        float, Parameter(help="Without IMAGES: how long the ball is moved [s].", validator=Number(gte=1, lte=120))
+    ] = 5.0,
 ) -> None:
     """Learn a ball's colour from images, and print the table [vision.colour] for robot.toml.
 
     Either --at: the ball is all that has the colour of that pixel and joins it. Or --auto: three images or more, in
-    which the ball moves; the most colourful thing that moves is taken.
+    which the ball moves; the most colourful thing that moves is taken. With --auto and no images the robot's own
+    cameras look on while you move the ball.
 
-    Needs: image files, no hardware.
+    Needs: image files, no hardware; or robot.toml with cameras, and no sampler that runs.
 
     Next: put what was printed into robot.toml, in the place of `colour = ...`.
     """
     from daemon.marker_wiring import learnt_colour_table
     from interfaces.errors import BodyschemaError
 
-    if not images or auto == (at is not None):
-        raise BodyschemaError("give image files, and either --at COLUMN ROW or --auto")
-    sys.stdout.write(learnt_colour_table(images, at))
+    if auto == (at is not None) or (not images and not auto):
+        raise BodyschemaError("give image files and --at COLUMN ROW, or --auto; the robot's own cameras need --auto")
+    sys.stdout.write(learnt_colour_table(images, at) if images else _learnt_live(robot, seconds))
+
+
+def _learnt_live(robot: Path, seconds: float) -> str:
+    from rich.console import Console
+
+    from daemon.camera_wiring import open_eyes
+    from daemon.config import Config
+    from daemon.marker_wiring import moving_colour_table
+    from interfaces.clock import SystemClock
+
+    clock, console = SystemClock(), Console(stderr=True, highlight=False, soft_wrap=True)
+    eyes = open_eyes(Config.load(robot), clock)
+    return moving_colour_table(eyes, clock, seconds, lambda text: console.print(text, markup=False))
