@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import msgspec
@@ -12,22 +12,22 @@ import numpy as np
 
 from interfaces.clock import SystemClock
 from interfaces.errors import ConfigError
-from interfaces.protocols import StereoEyes
 from vision.board import Board
 from vision.board.board import Pattern
 from vision.board.page import page as board_page
-from vision.board.pdf import pdf
-from vision.board.svg import svg
 from vision.calibration.calibrate import Asked, Calibrated, ModelChoice, calibrate
 from vision.calibration.check import Check, check
-from vision.calibration.gather import Gathered, gathered, gathered_live, require_any
-from vision.calibration.images import PairFiles, pair_files, read_pairs
+from vision.calibration.gather import Gathered, gathered, require_any
+from vision.calibration.images import ImagePair, PairFiles, pair_files, read_pairs, write_pair
 from vision.calibration.report import page as report_page
+from vision.printing.sheet import rulers_mm
 from vision.rectified import Rectification
 from vision.rig import CalibrationError, StereoRig
 from vision.rig_file import read_rig, write_rig
 from vision.spread import covariance_of
 from vision.triangulated import triangulated
+
+from .pages import write_page
 
 REPORT = "report.html"
 NORMAL_95 = 1.96
@@ -137,14 +137,11 @@ def board_of(
     marker_mm: float | None = None,
     dictionary: str | None = None,
     pattern: Pattern = "charuco",
-    ruler_mm: float | None = None,
-    paper: str = "A4",
 ) -> Board:
     """The board that options describe.
 
     Args:
         squares: as in 8x6.
-        ruler_mm: what the page's longer ruler measures on the print; scales squares and markers.
 
     Raises:
         ConfigError: there is no such board.
@@ -152,18 +149,26 @@ def board_of(
     read = _SQUARES.fullmatch(squares.strip())
     if read is None:
         raise ConfigError(f"--squares {squares} is not as in 8x6", remedy="Give columns x rows, of squares")
-    columns, rows = int(read[1]), int(read[2])
-    drawn = Board(columns, rows, 1e-3 * square_mm, _metres(marker_mm), dictionary, pattern)
+    return Board(int(read[1]), int(read[2]), 1e-3 * square_mm, _metres(marker_mm), dictionary, pattern)
+
+
+def as_printed(drawn: Board, ruler_mm: float | None) -> Board:
+    """The board in the size in which its page's longer ruler measures `ruler_mm`.
+
+    Raises:
+        ConfigError: that is another line.
+    """
     if ruler_mm is None:
         return drawn
-    length = board_page(drawn, paper).rulers_mm[0]
+    width, height = drawn.size_m
+    length = rulers_mm((1e3 * width, 1e3 * height))[0]
     scale = ruler_mm / length
     if not 0.5 < scale < 2.0:
         raise ConfigError(
             f"--ruler-mm {ruler_mm:g}: the ruler across of this page is {length:g} mm as drawn",
             remedy="Measure the line below the board, from the outer edge of its first tick to that of its last",
         )
-    return Board(columns, rows, scale * drawn.square_m, scale * drawn.marker_side_m, dictionary, pattern)
+    return replace(drawn, square_m=scale * drawn.square_m, marker_m=scale * drawn.marker_side_m)
 
 
 def write_board(board: Board, paper: str, out: Path) -> tuple[float, float]:
@@ -172,15 +177,8 @@ def write_board(board: Board, paper: str, out: Path) -> tuple[float, float]:
     Raises:
         ConfigError: it does not fit, the ending is neither, or the file cannot be written.
     """
-    writers = {".pdf": pdf, ".svg": svg}
-    writer = writers.get(out.suffix.lower())
-    if writer is None:
-        raise ConfigError(f"{out}: neither .pdf nor .svg", remedy="Name a file that ends so")
     page = board_page(board, paper)
-    try:
-        out.write_bytes(writer(page))
-    except OSError as error:
-        raise ConfigError(f"cannot be written: {error.strerror}", file=out, remedy="Name another folder") from error
+    write_page(page, out)
     return page.rulers_mm
 
 
@@ -195,22 +193,6 @@ def from_images(images: Images, board: Board, tell: Tell) -> Gathered:
     found = gathered(read_pairs(files, side_by_side=images.side_by_side), board, tell)
     require_any(found)
     return found
-
-
-def from_cameras(eyes: StereoEyes, board: Board, tell: Tell) -> tuple[Gathered, tuple[str, str]]:
-    """Views from two cameras, with guidance until nothing is missing; and the cameras' serials.
-
-    Args:
-        eyes: cameras that are not open; they are closed again.
-
-    Raises:
-        CalibrationError: nothing usable was seen.
-        SourceError: a camera cannot be opened, or went away.
-    """
-    with eyes:
-        found = gathered_live(eyes, board, tell)
-        require_any(found)
-        return found, eyes.serials
 
 
 @dataclass(frozen=True)
@@ -234,6 +216,21 @@ def calibrated(found: Gathered, wanted: Wanted, tell: Tell) -> Calibrated:
         baseline_m=_metres(wanted.baseline_mm),
     )
     return calibrate(found.views, found.board, asked, tell)
+
+
+def of_cameras(wanted: Wanted) -> Callable[[Gathered, tuple[str, str], Tell], Calibrated]:
+    """As `calibrated`, of cameras whose serials are known; those that are wanted come first."""
+
+    def of(found: Gathered, serials: tuple[str, str], tell: Tell) -> Calibrated:
+        left, right = (own or told for own, told in zip(wanted.serials, serials, strict=True))
+        return calibrated(found, replace(wanted, serials=(left, right)), tell)
+
+    return of
+
+
+def kept_in(folder: Path | None) -> Callable[[ImagePair, int], None]:
+    """A function that writes the images of a view into a folder, where there is one."""
+    return lambda pair, number: None if folder is None else write_pair(pair, folder, number)
 
 
 def write_calibrated_cameras(result: Calibrated, found: Gathered, out: Path) -> Path:
@@ -282,12 +279,13 @@ def checked(file: Path, images: Images, board: Board) -> tuple[CheckFile, str]:
         found = gathered(read_pairs([pair], side_by_side=images.side_by_side), board)
         rig.require(found.image_size_px, rig.serials)
         if found.views and found.views[0].is_stereo:
-            return _check_figures(check(rig, found.views[0], board)), pair.name
+            return check_figures(check(rig, found.views[0], board)), pair.name
     require_any(gathered(read_pairs(files, side_by_side=images.side_by_side), board))
     raise CalibrationError("no pair of images shows the board to both eyes. Hold it into the middle of both images")
 
 
-def _check_figures(found: Check) -> CheckFile:
+def check_figures(found: Check) -> CheckFile:
+    """A check in figures."""
     return CheckFile(
         holds=found.holds,
         wrong=list(found.wrong),

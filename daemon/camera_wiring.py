@@ -6,6 +6,7 @@ import os
 from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
+from pathlib import Path
 from time import monotonic
 
 from drivers.checks import Check, holders
@@ -53,6 +54,17 @@ def open_eyes(config: Config, clock: Clock) -> LiveEyes | Film:
         ConfigError: it has none.
     """
     return eyes_of(require_cameras(config), config.file.parent, clock)
+
+
+def calibration_file(config: Config) -> Path:
+    """The calibration that robot.toml names; else where one is written, beside it."""
+    cameras = require_cameras(config)
+    return config.file.parent / (cameras.calibration or "cameras.toml")
+
+
+def names_calibration(config: Config) -> bool:
+    """Whether robot.toml names a calibration."""
+    return require_cameras(config).calibration is not None
 
 
 def camera_of(config: Config, eyes: LiveEyes | Film) -> StereoCamera:

@@ -26,7 +26,7 @@ COMMANDS = {
     "doctor": "Ports, servos, disk, clock, zenoh: what to mend, and how.",
     "install": "Rules of this machine: install udev, for serial ports.",
     "robot": "robot new: a robot.toml for the servos that were found.",
-    "marker": "marker learn: a ball's colour from images, for robot.toml.",
+    "marker": "Tags to print, a cluster measured, a ball's colour learnt.",
     "joints": "Angles live while you move the arm: signs, ranges, health.",
     "watch": "watch cameras: what they see, in a browser or as files.",
     "servos": "What servos keep without power: show, set, zero, undo.",

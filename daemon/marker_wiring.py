@@ -1,9 +1,19 @@
-"""A ball's colour, learnt from image files, as the table of robot.toml."""
+"""A ball's colour, learnt from image files or the robot's own cameras, as the table of robot.toml."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
+
+from interfaces.errors import SourceEnded
+from interfaces.protocols import Clock, StereoEyes
+from interfaces.records import ImageArray
+
+from .reopen import Reopening
+
+READ_S = 0.2
+_IMAGES = 20  # of the time that is looked on
 
 
 def learnt_colour_table(images: Sequence[Path], at: tuple[float, float] | None) -> str:
@@ -16,3 +26,31 @@ def learnt_colour_table(images: Sequence[Path], at: tuple[float, float] | None) 
 
     shown = read_images(images)
     return colour_table(colour_of_the_moving(shown) if at is None else colour_at(shown[0], *at))
+
+
+def moving_colour_table(eyes: StereoEyes, clock: Clock, seconds: float, tell: Callable[[str], None]) -> str:
+    """The table [vision.colour] of the ball that moves before the left eye during so long [s].
+
+    Args:
+        eyes: cameras that are not open; they are closed again.
+        tell: is told what to do, and what is wrong with the cameras.
+
+    Raises:
+        ColourUnlearnt: nothing colourful moved.
+        SourceError: the cameras cannot be opened.
+    """
+    from vision.colour_model import colour_of_the_moving, colour_table
+
+    shown: list[ImageArray] = []
+    source = Reopening(eyes, "the cameras", clock)
+    with source, suppress(SourceEnded):
+        began, next_t = clock.now(), -float("inf")
+        tell(f"move the ball across the view for {seconds:g} s; keep the cameras still")
+        while clock.now() - began < seconds:
+            frame = source.read(READ_S)
+            if frame is not None and frame.t >= next_t:
+                next_t = frame.t + seconds / _IMAGES
+                shown.append(frame.left)
+            elif source.trouble is not None:
+                tell(source.trouble)
+    return colour_table(colour_of_the_moving(shown))

@@ -29,6 +29,7 @@ class Readable(Source, Protocol[R_co]):
 class Reopening(Generic[R_co]):
     """Reads a source; when it is lost says so once, and tries to open it again, less and less often.
 
+    A source that is there and not the right one (other cameras, another servo) is told of once more, and waited for.
     It is back when something was read: a device that can be opened and not be read is not.
 
     The first opening has to succeed: what fails at the start needs a person.
@@ -52,6 +53,7 @@ class Reopening(Generic[R_co]):
         self._wait_s = FIRST_WAIT_S
         self._next_try = 0.0
         self._is_open = False
+        self._refused = ""
         self.trouble: str | None = None
         self.losses = 0
 
@@ -77,7 +79,7 @@ class Reopening(Generic[R_co]):
             return None
         if seen is not None and self.trouble is not None:
             log.info("%s are back", self._name)
-            self.trouble, self._wait_s = None, FIRST_WAIT_S
+            self.trouble, self._wait_s, self._refused = None, FIRST_WAIT_S, ""
         return seen
 
     def _try_again(self, timeout_s: float) -> bool:
@@ -99,8 +101,15 @@ class Reopening(Generic[R_co]):
             self.losses += 1
         else:
             self._wait_s = min(2 * self._wait_s, LONGEST_WAIT_S)
+            self._tell_refusal(error)
         self._is_open = False
         said = error.brief if isinstance(error, SourceLost) else error
         self.trouble = f"{self._name} are lost ({said}); trying to open them again"
         soon_s = error.retry_s if isinstance(error, SourceLost) else None
         self._next_try = self._wall.now() + (self._wait_s if soon_s is None else soon_s)
+
+    def _tell_refusal(self, error: SourceError) -> None:
+        """Log what has to be mended by a person, each thing once."""
+        if not isinstance(error, SourceLost) and str(error) != self._refused:
+            self._refused = str(error)
+            log.warning("%s cannot be taken again: %s; trying on", self._name, error)

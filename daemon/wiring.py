@@ -222,7 +222,7 @@ def _simulation_settings(config: Config) -> SimConfig:
     sim, vision = config.tables.sim, config.tables.vision
     if vision.marker not in ("tag", "cluster") or sim.camera.tags:
         return sim
-    from vision.tag_tracker import DICTIONARIES
+    from vision.tag_dictionary import DICTIONARIES
 
     number = DICTIONARIES[vision.tag.dictionary]
     camera = msgspec.structs.replace(sim.camera, tags=_tags(vision), tag_dictionary=number)

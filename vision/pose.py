@@ -82,10 +82,10 @@ class PoseEstimator:
             normal = jacobian.T @ jacobian
             scale = np.diag(normal)
             change = np.linalg.solve(normal + damping * np.diag(scale), jacobian.T @ residuals)
-            turned = Rotation.from_rotvec(change[:3]).as_matrix() @ rotation
-            tried = self._linearised(turned, x + change[3:])
+            turn = Rotation.from_rotvec(change[:3]).as_matrix() @ rotation
+            tried = self._linearised(turn, x + change[3:])
             if tried is not None and tried[0] @ tried[0] <= residuals @ residuals:
-                rotation, x, now, damping = turned, x + change[3:], tried, damping / 10.0
+                rotation, x, now, damping = turn, x + change[3:], tried, damping / 10.0
                 if float(change @ (scale * change)) < _CONVERGED:
                     break
             elif (damping := damping * 10.0) > _MOST_DAMPING:
@@ -111,7 +111,9 @@ class PoseEstimator:
     def _moved(self, eye: Sighting, pose: Pose) -> FloatArray:
         """What the pixels of an eye do when the body grows (k, 2)."""
         arms = eye.points @ pose.rotation.T
-        return (self._projection(arms + self._in_eye(pose.x, eye)) @ arms[..., None])[..., 0]
+        return (projection_slopes(self._calibration.focal_px, arms + self._in_eye(pose.x, eye)) @ arms[..., None])[
+            ..., 0
+        ]
 
     def _all_of(self, right: bool) -> Sighting:
         """What one eye sees of all points."""
@@ -121,20 +123,10 @@ class PoseEstimator:
 
     def _root(self, sighting: Sighting) -> FloatArray:
         """What makes residuals independent and of sigma 1."""
-        shared = np.tile(np.eye(2), (len(sighting.points), 1))
-        cov = sighting.cov_px + self._calibration.pixel_sigma**2 * shared @ shared.T
-        return np.asarray(np.linalg.inv(np.linalg.cholesky(cov)), dtype=np.float64)
+        return whitening(sighting.cov_px, self._calibration.pixel_sigma)
 
     def _in_eye(self, x: FloatArray, sighting: Sighting) -> FloatArray:
         return x - np.array([self._calibration.baseline_m, 0.0, 0.0]) if sighting.right else x
-
-    def _projection(self, points: FloatArray) -> FloatArray:
-        """Derivative (k, 2, 3) [px/m] of the pixels of points (k, 3) in an eye's frame."""
-        rows = np.zeros((len(points), 2, 3))
-        scale = self._calibration.focal_px / points[:, 2]
-        rows[:, 0, 0] = rows[:, 1, 1] = scale
-        rows[:, :, 2] = -scale[:, None] * points[:, :2] / points[:, 2:]
-        return rows
 
     def _linearised(self, rotation: FloatArray, x: FloatArray) -> tuple[FloatArray, FloatArray] | None:
         """Residuals and their derivative by turn and place, in units of sigma."""
@@ -144,10 +136,10 @@ class PoseEstimator:
             points = arms + self._in_eye(x, eye)
             if (points[:, 2] <= 0.0).any():
                 return None
-            projection = self._projection(points)
-            turned = projection @ _turned(arms)
+            projection = projection_slopes(self._calibration.focal_px, points)
+            by_turn = projection @ turned(arms)
             residuals.append(root @ (eye.pixels - self._seen(points)).ravel())
-            jacobians.append(root @ np.concatenate([turned, projection], axis=2).reshape(-1, 6))
+            jacobians.append(root @ np.concatenate([by_turn, projection], axis=2).reshape(-1, 6))
         return np.concatenate(residuals), np.concatenate(jacobians)
 
     def _seen(self, points: FloatArray) -> FloatArray:
@@ -164,7 +156,28 @@ class PoseEstimator:
         return Pose(rotation, x, cov, float(residuals @ residuals), parts)
 
 
-def _turned(arms: FloatArray) -> FloatArray:
+def projection_slopes(focal_px: float, points: FloatArray) -> FloatArray:
+    """Derivative (k, 2, 3) [px/m] of the pixels of points (k, 3) in an eye's frame."""
+    rows = np.zeros((len(points), 2, 3))
+    scale = focal_px / points[:, 2]
+    rows[:, 0, 0] = rows[:, 1, 1] = scale
+    rows[:, :, 2] = -scale[:, None] * points[:, :2] / points[:, 2:]
+    return rows
+
+
+def whitening(cov_px: FloatArray, pixel_sigma: float) -> FloatArray:
+    """What makes the residuals of an eye's pixels, u and v by turns, independent and of sigma 1.
+
+    Args:
+        cov_px: their own covariance (2k, 2k) [px²].
+        pixel_sigma: of a shift of each coordinate that they all share [px].
+    """
+    shared = np.tile(np.eye(2), (len(cov_px) // 2, 1))
+    cov = cov_px + pixel_sigma**2 * shared @ shared.T
+    return np.asarray(np.linalg.inv(np.linalg.cholesky(cov)), dtype=np.float64)
+
+
+def turned(arms: FloatArray) -> FloatArray:
     """What a turn ω does to arms (k, 3): matrices (k, 3, 3) with ω × arm = −[arm]× ω."""
     matrices = np.zeros((len(arms), 3, 3))
     x, y, z = arms.T

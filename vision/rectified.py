@@ -151,7 +151,7 @@ class RectifiedCamera:
         return self._calibration
 
     def __enter__(self) -> Self:
-        """Open the cameras; CalibrationError when they are not the calibrated ones."""
+        """Open the cameras; OtherCameras, a SourceError, when they are not the calibrated ones."""
         self._eyes.__enter__()
         try:
             self._rig.require(self._eyes.image_size_px, self._eyes.serials)

@@ -8,7 +8,7 @@ from functools import cached_property
 import cv2
 import numpy as np
 
-from interfaces.errors import BodyschemaError
+from interfaces.errors import BodyschemaError, SourceError
 from interfaces.records import FloatArray, frozen_array
 
 from .lens import DISTORTION_NAMES, Lens, Model
@@ -18,6 +18,10 @@ _POSE_NAMES = ("rx_rad", "ry_rad", "rz_rad", "tx_m", "ty_m", "tz_m")
 
 class CalibrationError(BodyschemaError):
     """Cameras could not be calibrated, or a calibration does not belong to these cameras."""
+
+
+class OtherCameras(CalibrationError, SourceError):
+    """The cameras are not the calibrated ones: as a source they fail until the right ones are plugged in."""
 
 
 @dataclass(frozen=True)
@@ -116,21 +120,21 @@ class StereoRig:
         )
 
     def require(self, image_size_px: tuple[int, int], serials: tuple[str, str]) -> None:
-        """CalibrationError when these cameras are not the calibrated ones. A serial that is not known fits all."""
+        """OtherCameras when these cameras are not the calibrated ones. A serial that is not known fits all."""
         if image_size_px != self.image_size_px:
             is_, was = ("x".join(map(str, size)) for size in (image_size_px, self.image_size_px))
-            raise CalibrationError(
+            raise OtherCameras(
                 f"the cameras give images of {is_}, they were calibrated with {was}. Set that size, or calibrate "
                 "again: `bodyschema calibrate cameras`"
             )
         if all(self.serials) and serials == self.serials[::-1] and serials != self.serials:
-            raise CalibrationError(
+            raise OtherCameras(
                 f"left and right are exchanged: {serials[0]} is the right camera of this calibration. Exchange "
                 "left and right where the cameras are configured"
             )
         for eye, serial, known in zip(("left", "right"), serials, self.serials, strict=True):
             if known and serial and serial != known:
-                raise CalibrationError(
+                raise OtherCameras(
                     f"the {eye} camera is {serial}, calibrated was {known}: this is the calibration of another pair. "
                     "Name its own file, or calibrate: `bodyschema calibrate cameras`"
                 )

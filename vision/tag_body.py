@@ -14,7 +14,7 @@ from interfaces.records import FloatArray, frozen_array
 from .tag_config import ClusterConfig, PlacedTag, TagConfig
 
 # Corners of a tag of side 1 in its own frame (x right, y up, z out of it): as `TagImage` has them.
-_CORNERS = np.array([[-0.5, 0.5, 0.0], [0.5, 0.5, 0.0], [0.5, -0.5, 0.0], [-0.5, -0.5, 0.0]])
+TAG_CORNERS = np.array([[-0.5, 0.5, 0.0], [0.5, 0.5, 0.0], [0.5, -0.5, 0.0], [-0.5, -0.5, 0.0]])
 
 
 class TagBody:
@@ -30,7 +30,7 @@ class TagBody:
     @classmethod
     def single(cls, config: TagConfig) -> TagBody:
         """One tag, whose frame is the body's."""
-        return cls({config.id: config.side_m * _CORNERS})
+        return cls({config.id: config.side_m * TAG_CORNERS})
 
     @classmethod
     def cluster(cls, config: ClusterConfig, tag: TagConfig) -> TagBody:
@@ -55,4 +55,4 @@ class TagBody:
 
 def _placed(placed: PlacedTag, side_m: float) -> FloatArray:
     turn = Rotation.from_euler("xyz", placed.rpy).as_matrix()
-    return (placed.side_m or side_m) * _CORNERS @ turn.T + np.array(placed.xyz)
+    return (placed.side_m or side_m) * TAG_CORNERS @ turn.T + np.array(placed.xyz)

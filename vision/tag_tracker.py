@@ -11,27 +11,19 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from interfaces.camera import StereoCalibration
-from interfaces.errors import ConfigError
 from interfaces.records import FloatArray, ImageArray, MarkerFix, MarkerMiss, Reason, StereoFrame, frozen_array
 
 from .images import check_calibration, check_images
 from .pose import Pose, PoseEstimator, Sighting, fitted_motion, mirrored
 from .tag_body import TagBody
-from .tag_config import Dictionary, TagConfig
-from .tag_image import TagImage, measure_tag
+from .tag_config import TagConfig
+from .tag_dictionary import require_tag
+from .tag_finder import Seen, TagFinder
+from .tag_image import TagImage
 from .triangulate import triangulate
 
 _log = logging.getLogger(__name__)
 
-# OpenCV's numbers of the dictionaries.
-DICTIONARIES: dict[Dictionary, int] = {
-    "apriltag_36h11": cv2.aruco.DICT_APRILTAG_36h11,
-    "aruco_6x6_50": cv2.aruco.DICT_6X6_50,
-    "aruco_6x6_100": cv2.aruco.DICT_6X6_100,
-    "aruco_6x6_250": cv2.aruco.DICT_6X6_250,
-    "aruco_6x6_1000": cv2.aruco.DICT_6X6_1000,
-    "aruco_mip_36h12": cv2.aruco.DICT_ARUCO_MIP_36h12,
-}
 # Around the corners of the last frame: so many times their extent, and pixels more.
 _REGION_SHARE, _REGION_PX = 0.6, 30
 # After a longer pause the last fix predicts nothing [s].
@@ -40,8 +32,6 @@ _LONGEST_PAUSE_S = 0.5
 _TWO_POSES_RAD, _CLEARLY_WORSE = 0.05, 12.0
 # The most telling reason, where all tags were refused.
 _TELLING = (Reason.AMBIGUOUS, Reason.EPIPOLAR, Reason.OCCLUDED, Reason.AT_BORDER, Reason.NO_MARKER)
-
-Seen = dict[int, TagImage | Reason]
 
 
 class TagTracker:
@@ -59,16 +49,9 @@ class TagTracker:
         """
         check_calibration(calibration)
         self.calibration, self.body, self.config = calibration, body, config or TagConfig()
-        dictionary = cv2.aruco.getPredefinedDictionary(DICTIONARIES[self.config.dictionary])
-        most = len(dictionary.bytesList)
         for id in body.corners:
-            if id >= most:
-                raise ConfigError(
-                    f"there is no tag {id} in {self.config.dictionary}", remedy=f"Its numbers go from 0 to {most - 1}"
-                )
-        parameters = cv2.aruco.DetectorParameters()
-        parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_NONE  # `measure_tag` does better
-        self._detector = cv2.aruco.ArucoDetector(dictionary, parameters)
+            require_tag(self.config.dictionary, id)
+        self._finder = TagFinder(self.config, body.corners)
         self._whole = (0, 0, *calibration.image_size_px)
         self._last: tuple[float, list[FloatArray]] | None = None
 
@@ -106,7 +89,7 @@ class TagTracker:
     def _look(
         self, t: float, greys: Sequence[ImageArray], regions: Sequence[tuple[int, int, int, int]]
     ) -> Pose | Reason:
-        left, right = (self._tags(grey, region) for grey, region in zip(greys, regions, strict=True))
+        left, right = (self._finder.find(grey, region) for grey, region in zip(greys, regions, strict=True))
         seen = [{id: tag for id, tag in eye.items() if isinstance(tag, TagImage)} for eye in (left, right)]
         if not seen[0] or not seen[1]:
             return _why(eye for eye, tags in zip((left, right), seen, strict=True) if not tags)
@@ -121,21 +104,6 @@ class TagTracker:
         if isinstance(found, Pose):
             self._last = t, [np.concatenate([tag.corners_px for tag in eye.values()]) for eye in seen]
         return found
-
-    def _tags(self, grey: ImageArray, region: tuple[int, int, int, int]) -> Seen:
-        """The marker's tags in a region (left, top, right, bottom) of one eye, or why they are none."""
-        x0, y0, x1, y1 = region
-        corners, ids, _ = self._detector.detectMarkers(np.ascontiguousarray(grey[y0:y1, x0:x1]))
-        tags: Seen = {}
-        for quad, id in zip(corners, _numbers(ids), strict=True):
-            if id not in self.body.corners:
-                continue
-            if id in tags:
-                tags[id] = Reason.AMBIGUOUS
-                continue
-            rough = np.asarray(quad, dtype=np.float64).reshape(4, 2) + np.array([x0, y0])
-            tags[id] = measure_tag(grey, id, rough, self.config)
-        return tags
 
     def _rows_agree(self, left: TagImage, right: TagImage) -> bool:
         """Whether the rows of a tag's corners differ by no more than noise, and its disparity is positive."""
@@ -232,11 +200,6 @@ def _why(eyes: Iterable[Seen]) -> Reason:
     """Why eyes without a measured tag have none: of what was refused there, the most telling reason."""
     reasons = {reason for eye in eyes for reason in eye.values()}
     return next((reason for reason in _TELLING if reason in reasons), Reason.NO_MARKER)
-
-
-def _numbers(ids: object) -> list[int]:
-    """The tags' numbers as OpenCV tells them: an array (n, 1), or None."""
-    return [] if ids is None else [int(id) for id in np.ravel(np.asarray(ids))]
 
 
 def _apart(one: Pose, other: Pose) -> float:

@@ -6,18 +6,13 @@ from pathlib import Path
 from typing import Annotated
 
 from cyclopts import Parameter
-from cyclopts.validators import Number
 
-from daemon.commands.options import BoardDictionary, BoardMarkerMm, BoardPattern, BoardSquares
+from daemon.commands.board_options import AS_DRAWN, DrawnBoard
 
 
 def board(
     *,
-    squares: BoardSquares = "8x6",
-    square_mm: Annotated[float, Parameter(help="Side of a square [mm].", validator=Number(gt=0))] = 30.0,
-    marker_mm: BoardMarkerMm = None,
-    dictionary: BoardDictionary = None,
-    pattern: BoardPattern = "charuco",
+    drawn: DrawnBoard = AS_DRAWN,
     paper: Annotated[str, Parameter(help="A4, A3, A2, A1, A0, letter, legal or tabloid.")] = "A4",
     out: Annotated[Path, Parameter(help="The file to write, .pdf or .svg.")] = Path("board.pdf"),
 ) -> None:
@@ -32,9 +27,9 @@ def board(
     """
     from rich.console import Console
 
-    from daemon.camera_calibration import board_of, write_board
+    from daemon.camera_calibration import write_board
 
-    made = board_of(squares, square_mm, marker_mm=marker_mm, dictionary=dictionary, pattern=pattern)
+    made = drawn.board()
     across, upright = write_board(made, paper, out)
     Console(highlight=False).print(
         f"{out} written: {made.name}. Print it at 100 %, then measure: the line below the board is {across:g} mm, the "

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 from cyclopts import Parameter
-from cyclopts.validators import Number
 
 HERE = Path("robot.toml")
 VARIABLE = "BODYSCHEMA_ROBOT"
@@ -36,28 +35,3 @@ def robot_file(given: Path | None, source: Path | None) -> Path:
     if source is not None and (beside := source.parent / HERE).exists():
         return beside
     return Path(os.environ.get(VARIABLE, HERE))
-
-
-BoardSquares = Annotated[str, Parameter(help="Columns and rows of the board's squares, as in 8x6.")]
-BoardMarkerMm = Annotated[
-    float | None, Parameter(help="Side of a marker [mm]; else 0.75 of a square.", show_default=False)
-]
-BoardDictionary = Annotated[
-    str | None,
-    Parameter(help="The markers' dictionary, as in 5X5_100; else the smallest of 4x4 bits.", show_default=False),
-]
-BoardPattern = Annotated[
-    Literal["charuco", "chessboard"], Parameter(help="`chessboard` has no markers; all of it has to be in view.")
-]
-EyeImages = Annotated[Path, Parameter(help="Folder with the images: left01.png and right01.png, or left/ and right/.")]
-LeftImages = Annotated[str | None, Parameter(help="Pattern of the left eye's files in it, as in cam0_*.png.")]
-RightImages = Annotated[str | None, Parameter(help="Pattern of the right eye's.")]
-SideBySide = Annotated[bool, flag("Each image shows both eyes, the left one in its left half.")]
-RulerMm = Annotated[
-    float | None,
-    Parameter(
-        help="What the line below the board measures on the print [mm]; else it is what it says.",
-        validator=Number(gt=0),
-        show_default=False,
-    ),
-]

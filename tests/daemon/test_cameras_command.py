@@ -11,12 +11,11 @@ import msgspec
 import numpy as np
 import pytest
 from board_renderer import Photographer, Printed, Taken
-from shown_board import BOARD, Eyes, photographed
+from shown_board import photographed
 
-from daemon.camera_calibration import CamerasFile, CheckFile, from_cameras
+from daemon.camera_calibration import CamerasFile, CheckFile
 from daemon.cli import app
 from interfaces.errors import ConfigError
-from interfaces.records import StereoFrame
 from vision.rig import CalibrationError
 from vision.rig_file import read_rig
 
@@ -133,15 +132,6 @@ def test_the_ruler_on_the_print_scales_the_baseline(folder, tmp_path, capsys) ->
     found = msgspec.json.decode(capsys.readouterr().out, type=CamerasFile)
     assert found.baseline_mm == pytest.approx(970 * read_rig(folder / "cameras.toml").baseline_m, rel=1e-6)
     assert (len(found.parameters), len(found.held_out_by_model_px)) == (24, 1)
-
-
-def test_views_from_cameras_come_with_their_serials_and_the_cameras_are_closed() -> None:
-    pair = photographed()[1][4]
-    eyes = Eyes([StereoFrame(t, pair.left, pair.right) for t in (0.0, 0.1)])
-    said: list[str] = []
-    found, serials = from_cameras(eyes, BOARD, said.append)
-    assert (len(found.views), serials, eyes.is_open) == (1, ("A1", "B2"), False)
-    assert said[-1].startswith("1 views, ")
 
 
 @pytest.mark.parametrize("ending", ["pdf", "svg"])

@@ -2,12 +2,16 @@ from __future__ import annotations
 
 import logging
 
+import numpy as np
 import pytest
+from board_renderer import webcams
 from scripted_sources import Scripted
+from shown_board import SIZE, known_rig
 
 from daemon.reopen import Reopening
 from interfaces.errors import SourceError, SourceLost
-from interfaces.records import JointReading, frozen_array
+from interfaces.records import JointReading, StereoFrame, frozen_array
+from vision.rectified import RectifiedCamera
 
 READING = JointReading(1.0, frozen_array([0.0]))
 
@@ -123,3 +127,53 @@ def test_a_source_that_can_be_looked_for_cheaply_is_opened_again_sooner() -> Non
     with Reopening(script, "the encoders", clock, clock.sleep) as source:
         read_until_reading(source)
     assert clock.t == pytest.approx(100.0 + 21 * 0.2)
+
+
+# --- other cameras are plugged in
+
+
+class Exchanged:
+    """Eyes that are lost after one frame; what is plugged in then, at each opening: serials and image size."""
+
+    def __init__(self, plugged: list[tuple[tuple[str, str], tuple[int, int]]]) -> None:
+        self._plugged, self._frames = iter(plugged), 0
+        self.serials, self.image_size_px = ("", ""), SIZE
+        self.closed = 0
+
+    def __enter__(self):
+        self.serials, self.image_size_px = next(self._plugged)
+        return self
+
+    def __exit__(self, *_) -> None:
+        self.closed += 1
+
+    def read(self, timeout_s: float) -> StereoFrame:
+        self._frames += 1
+        if self._frames == 2:
+            raise SourceLost("unplugged")
+        image = np.zeros((self.image_size_px[1], self.image_size_px[0], 3), np.uint8)
+        return StereoFrame(float(self._frames), image, image)
+
+
+@pytest.mark.parametrize(
+    ("other", "said"),
+    [
+        ((("A1", "C3"), SIZE), "the right camera is C3, calibrated was B2"),
+        ((("B2", "A1"), SIZE), "left and right are exchanged"),
+        ((("A1", "B2"), (320, 240)), "the cameras give images of 320x240, they were calibrated with 640x480"),
+    ],
+    ids=["another_serial", "exchanged", "another_size"],
+)
+def test_other_cameras_are_told_of_and_the_calibrated_ones_waited_for(other, said, caplog) -> None:
+    right = (("A1", "B2"), SIZE)
+    eyes = Exchanged([right, other, other, right])
+    camera = RectifiedCamera(eyes, known_rig(webcams(np.random.default_rng(6))))
+    clock, troubles = SteppedClock(), set()
+    with Reopening(camera, "the cameras", clock, clock.sleep) as source, caplog.at_level(logging.WARNING):
+        assert source.read(0.1) is not None
+        while source.read(0.25) is None:
+            troubles.add(source.trouble)
+        assert source.trouble is None
+    assert any(f"the cameras are lost ({said}" in trouble for trouble in troubles)
+    assert [said in record.message for record in caplog.records] == [False, True]
+    assert eyes.closed == 4

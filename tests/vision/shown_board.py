@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cache
 
 import numpy as np
@@ -9,8 +10,8 @@ from board_renderer import Photographer, Printed, Taken, TrueRig, poses, webcams
 from scipy.spatial.transform import Rotation
 
 from interfaces.errors import SourceEnded
-from interfaces.records import FloatArray, StereoFrame
-from vision.board import Board, Corners
+from interfaces.records import FloatArray, ImageArray, StereoFrame
+from vision.board import Board, Corners, NotFound
 from vision.calibration.images import ImagePair
 from vision.calibration.view import View
 from vision.lens import Model
@@ -72,6 +73,27 @@ def photographed(
     return rig, tuple(ImagePair(f"{k:02d}", f.left, f.right) for k, f in enumerate(frames)), shown
 
 
+def shot(number: int, t: float | None = None) -> StereoFrame:
+    """Images that show nothing but which one they are: `KnownCorners` tells what would be seen in them."""
+    marked = np.zeros((SIZE[1], SIZE[0], 3), np.uint8)
+    marked[0, 0, :2] = divmod(number, 256)
+    right = marked.copy()
+    right[0, 0, 2] = 1
+    return StereoFrame(0.1 * number if t is None else t, marked, right)
+
+
+class KnownCorners:
+    """A detector of what views have, by the numbers of `shot`."""
+
+    def __init__(self, views: Sequence[View]) -> None:
+        self._views = views
+
+    def find(self, image: ImageArray) -> Corners | NotFound:
+        high, low, right = image[0, 0].tolist()
+        view = self._views[256 * high + low]
+        return (view.right if right else view.left) or NotFound("not_found", "no board")
+
+
 class Eyes:
     """Cameras that give the frames they were made with."""
 
@@ -79,6 +101,7 @@ class Eyes:
         self.frames, self.serials = iter(frames), serials
         self.image_size_px = (frames[0].left.shape[1], frames[0].left.shape[0])
         self.is_open = False
+        self.health = ()
 
     def __enter__(self):
         self.is_open = True

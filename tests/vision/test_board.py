@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
-from xml.etree import ElementTree
 
 import cv2
 import numpy as np
 import pytest
 from board_renderer import Photographer, Printed, Taken, webcams
+from printed_page import PX_A_MM, from_pdf, from_svg, rasterised
 from scipy.spatial.transform import Rotation
 from shown_board import BOARD, photographed
 
@@ -17,43 +17,12 @@ from interfaces.errors import ConfigError
 from interfaces.records import FloatArray, ImageArray
 from vision.board import Board, BoardDetector, Corners, NotFound
 from vision.board.page import page
-from vision.board.pdf import pdf
-from vision.board.svg import svg
+from vision.printing import pdf, svg
 
-PX_A_MM = 4
 BOARDS = [Board(), Board(7, 5, 0.025, dictionary="6X6_250"), Board(10, 7, 0.020, pattern="chessboard")]
 
 
 # --- the page, read back from the files' own numbers
-
-
-def from_pdf(data: bytes) -> tuple[tuple[float, float], FloatArray]:
-    """The sheet and its black rectangles (x, y, width, height) from its upper left corner [mm]."""
-    mm = 25.4 / 72
-    text = data.decode("latin-1")
-    box = re.search(r"MediaBox\[0 0 ([\d.]+) ([\d.]+)\]", text)
-    sheet = float(box[1]) * mm, float(box[2]) * mm
-    found = np.array(re.findall(r"^([-\d.]+) ([-\d.]+) ([\d.]+) ([\d.]+) re$", text, re.MULTILINE), dtype=float) * mm
-    found[:, 1] = sheet[1] - found[:, 1] - found[:, 3]
-    return sheet, found
-
-
-def from_svg(data: bytes) -> tuple[tuple[float, float], FloatArray]:
-    root = ElementTree.fromstring(data)
-    assert root.attrib["viewBox"].split()[2:] == [root.attrib[side].removesuffix("mm") for side in ("width", "height")]
-    rects = root.findall("{http://www.w3.org/2000/svg}g/{http://www.w3.org/2000/svg}rect")
-    return (
-        (float(root.attrib["width"].removesuffix("mm")), float(root.attrib["height"].removesuffix("mm"))),
-        np.array([[float(rect.attrib[name]) for name in ("x", "y", "width", "height")] for rect in rects]),
-    )
-
-
-def rasterised(sheet: tuple[float, float], black: FloatArray) -> ImageArray:
-    """The page as an image, at `PX_A_MM`; pixel k covers k to k + 1."""
-    image = np.full((round(sheet[1] * PX_A_MM), round(sheet[0] * PX_A_MM)), 255, np.uint8)
-    for x, y, w, h in black * PX_A_MM:
-        image[round(y) : round(y + h), round(x) : round(x + w)] = 0
-    return image
 
 
 @pytest.mark.parametrize("board", BOARDS, ids=lambda board: board.name)
@@ -63,7 +32,7 @@ def test_squares_on_the_page_are_of_the_size_that_was_asked_for(board, write, re
     image = rasterised(*read(write(drawn)))
     found = BoardDetector(board).find(cv2.GaussianBlur(image, (0, 0), 1.0))
     assert isinstance(found, Corners), found
-    mm = (found.px + 0.5) / PX_A_MM - np.array(drawn.board_mm)
+    mm = (found.px + 0.5) / PX_A_MM - np.array(drawn.drawing_mm)
     np.testing.assert_allclose(mm, 1e3 * board.corners_m[:, :2], atol=0.1)
 
 
@@ -87,7 +56,7 @@ def test_nothing_on_the_page_is_nearer_to_its_edge_than_printers_print() -> None
 
 def test_the_board_is_opencvs_own() -> None:
     mine = rasterised(*from_pdf(pdf(page(BOARD))))
-    x, y = (round(each * PX_A_MM) for each in page(BOARD).board_mm)
+    x, y = (round(each * PX_A_MM) for each in page(BOARD).drawing_mm)
     wide, high = (round(1e3 * each * PX_A_MM) for each in BOARD.size_m)
     theirs = BOARD.opencv().generateImage((wide, high), marginSize=0)
     assert np.mean(mine[y : y + high, x : x + wide] != theirs) < 0.01

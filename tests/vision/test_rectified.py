@@ -8,14 +8,13 @@ import numpy as np
 import pytest
 from board_renderer import Photographer, Printed, Taken, webcams
 from scipy.spatial.transform import Rotation
-from shown_board import BOARD, SIZE, Eyes, corner_views, known_rig, photographed
+from shown_board import BOARD, SIZE, Eyes, corner_views, known_rig
 
 from interfaces.errors import SourceError
 from interfaces.records import StereoFrame
 from vision.board import BoardDetector, Corners
 from vision.calibration.calibrate import Asked, calibrate
 from vision.calibration.check import check
-from vision.calibration.gather import gathered, gathered_live
 from vision.calibration.view import View
 from vision.rectified import Rectification, RectifiedCamera
 from vision.rig import CalibrationError, StereoRig
@@ -129,29 +128,3 @@ def test_too_little_of_the_board_is_said(calibrated) -> None:
     rig, view = calibrated
     with pytest.raises(CalibrationError, match="both eyes see 0 corners"):
         check(rig, replace(view, right=None), BOARD)
-
-
-# --- live
-
-
-def test_live_views_are_taken_when_still_and_new_until_nothing_is_missing() -> None:
-    pairs = photographed()[1][:5]
-    frames, t = [], 0.0
-    for pair in pairs:
-        for _ in range(2):
-            frames.append(StereoFrame(t, pair.left, pair.right))
-            t += 0.1
-    said: list[str] = []
-    with Eyes(frames) as eyes:
-        found = gathered_live(eyes, BOARD, said.append)
-    stereo = [view for view in gathered(pairs, BOARD).views if view.is_stereo]
-    assert len(found.views) == len(stereo)
-    assert said[0].startswith("0 views, 0%. Next: tilt the board's right edge away")
-    assert said[-1].startswith(f"{len(stereo)} views")
-
-
-def test_a_moving_board_is_not_taken() -> None:
-    pairs = photographed()[1][:4]
-    frames = [StereoFrame(0.1 * k, pair.left, pair.right) for k, pair in enumerate(pairs)]
-    with Eyes(frames) as eyes:
-        assert gathered_live(eyes, BOARD, lambda _: None).views == []

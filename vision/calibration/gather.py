@@ -1,14 +1,12 @@
-"""Views of the board: from images, or live with guidance about what is still missing."""
+"""Views of the board, and gathering them from images."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
+from typing import Protocol
 
-import numpy as np
-
-from interfaces.errors import SourceEnded
-from interfaces.protocols import StereoEyes
+from interfaces.records import ImageArray
 from vision.board import Board, BoardDetector, Corners, NotFound
 from vision.rig import CalibrationError
 
@@ -16,8 +14,11 @@ from .guidance import Coverage
 from .images import ImagePair, require_equal_sizes
 from .view import EYES, Eye, View
 
-_STILL_PX = 1.0  # between two frames; the median of all corners
-_NEW_SHARE = 0.06  # of the image's width; how far corners have to be from those of every view that was taken
+
+class Detector(Protocol):
+    """Finds one board; see `vision.board.BoardDetector`."""
+
+    def find(self, image: ImageArray) -> Corners | NotFound: ...
 
 
 @dataclass(frozen=True)
@@ -65,88 +66,31 @@ def gathered(pairs: Iterable[ImagePair], board: Board, tell: Callable[[str], Non
     detector = BoardDetector(board)
     found = Gathered(board)
     for pair in pairs:
-        view = _looked_at(pair, detector, found, tell)
+        view, unusable = looked_at(pair, detector)
+        found.image_size_px = pair.size_px
+        found.unusable += unusable
+        for each in unusable:
+            tell(f"{each.name}, {each.eye}: {each.fault.text}")
         if view.left is not None or view.right is not None:
             found.add(view, pair)
     return found
 
 
-def gathered_live(
-    eyes: StereoEyes, board: Board, tell: Callable[[str], None], *, longest_s: float = 600.0, timeout_s: float = 0.2
-) -> Gathered:
-    """Views from two cameras, until nothing is missing; `tell` is told what to show next.
-
-    A view is taken when both eyes see the board, it has been still for two frames, and no view like it was taken.
-
-    Args:
-        eyes: open cameras.
-        longest_s: when to stop though something is missing, by the time of the frames [s].
+def looked_at(pair: ImagePair, detector: Detector) -> tuple[View, tuple[Unusable, ...]]:
+    """The board's corners in a pair of images, and why an eye has none.
 
     Raises:
-        SourceLost: a camera went away.
+        CalibrationError: the two eyes' images are of different sizes.
     """
-    detector = BoardDetector(board)
-    found = Gathered(board, eyes.image_size_px)
-    before: View | None = None
-    began: float | None = None
-    missing = found.coverage().missing()
-    tell(_wish(found, missing))
-    while missing:
-        try:
-            frame = eyes.read(timeout_s)
-        except SourceEnded:
-            break
-        if frame is None:
-            continue
-        began = frame.t if began is None else began
-        if frame.t - began > longest_s:
-            break
-        pair = ImagePair(f"view {len(found.views) + 1}", frame.left, frame.right)
-        found.unusable.clear()
-        view = _looked_at(pair, detector, found, tell)
-        if view.is_stereo and before is not None and _is_still(view, before) and _is_new(view, found):
-            found.add(view, pair)
-            missing = found.coverage().missing()
-            tell(_wish(found, missing))
-        before = view
-    found.unusable.clear()
-    return found
-
-
-def _wish(found: Gathered, missing: list[str]) -> str:
-    done = f"{len(found.views)} views, {found.coverage().progress:.0%}"
-    return f"{done}. Next: {missing[0]}" if missing else f"{done}. Nothing is missing"
-
-
-def _looked_at(pair: ImagePair, detector: BoardDetector, found: Gathered, tell: Callable[[str], None]) -> View:
     require_equal_sizes(pair.name, pair.left, pair.right)
-    found.image_size_px = (pair.left.shape[1], pair.left.shape[0])
     seen: list[Corners | None] = []
+    unusable: list[Unusable] = []
     for eye, image in zip(EYES, (pair.left, pair.right), strict=True):
         corners = detector.find(image)
         if isinstance(corners, NotFound):
-            found.unusable.append(Unusable(pair.name, eye, corners))
-            tell(f"{pair.name}, {eye}: {corners.text}")
+            unusable.append(Unusable(pair.name, eye, corners))
         seen.append(None if isinstance(corners, NotFound) else corners)
-    return View(pair.name, *seen)
-
-
-def _is_still(view: View, before: View) -> bool:
-    return all(_apart_px(view, before, eye) < _STILL_PX for eye in EYES)
-
-
-def _is_new(view: View, found: Gathered) -> bool:
-    least = _NEW_SHARE * found.image_size_px[0]
-    return all(max(_apart_px(view, other, eye) for eye in EYES) > least for other in found.views)
-
-
-def _apart_px(one: View, other: View, eye: Eye) -> float:
-    """Median distance of the corners that both views have; infinite where they have none."""
-    a, b = one.eye(eye), other.eye(eye)
-    if a is None or b is None:
-        return np.inf
-    _, here, there = np.intersect1d(a.numbers, b.numbers, return_indices=True)
-    return float(np.median(np.linalg.norm(a.px[here] - b.px[there], axis=1))) if len(here) else np.inf
+    return View(pair.name, *seen), tuple(unusable)
 
 
 def require_any(found: Gathered) -> None:

@@ -20,9 +20,9 @@ GRID = (3, 3)
 _ROWS, _COLUMNS = ("upper", "middle", "lower"), ("left", "middle", "right")
 # Before anything is calibrated a webcam's usual focal length is taken, as a share of the image's width.
 _USUAL_FOCAL = 0.9
-_CORNERS_A_CELL = 8
+CORNERS_A_CELL = 8
 _TILT_DEG = 15.0
-_TILTED_EACH_WAY = 2
+TILTED_EACH_WAY = 2
 _NEAR, _FAR = 0.55, 0.40  # the board's extent as a share of the image's
 WANTED_VIEWS = 20
 
@@ -56,7 +56,7 @@ class Coverage:
 
     def covered(self, eye: Eye) -> NDArray[np.bool_]:
         """Which cells of an eye's image have enough corners, shape (3, 3)."""
-        return self.cells[EYES.index(eye)] >= _CORNERS_A_CELL
+        return self.cells[EYES.index(eye)] >= CORNERS_A_CELL
 
     @property
     def largest_tilts_deg(self) -> FloatArray:
@@ -70,21 +70,37 @@ class Coverage:
     @property
     def progress(self) -> float:
         """How much of what is wanted is there, 0 to 1."""
-        wanted = len(self._all_tilts()) + 2 * GRID[0] * GRID[1] + 2 + WANTED_VIEWS
+        wanted = len(self.tilted()) + 2 * GRID[0] * GRID[1] + 2 + WANTED_VIEWS
         lacking = len(self._tilts_missing()) + len(self._cells_missing()) + len(self._distances_missing())
         return 1.0 - (lacking + max(WANTED_VIEWS - self.stereo_views, 0)) / wanted
 
-    def _all_tilts(self) -> list[tuple[str, NDArray[np.bool_]]]:
+    def tilted(self) -> dict[str, int]:
+        """How many views have each edge of the board farther away than the opposite one."""
         about_upright, about_level = self.tilts_deg[:, 0], self.tilts_deg[:, 1]
-        return [
-            ("tilt the board's right edge away from the cameras, by 30°", about_upright > _TILT_DEG),
-            ("tilt the board's left edge away from the cameras, by 30°", about_upright < -_TILT_DEG),
-            ("tilt the board's lower edge away from the cameras, by 30°", about_level > _TILT_DEG),
-            ("tilt the board's upper edge away from the cameras, by 30°", about_level < -_TILT_DEG),
-        ]
+        ways = {
+            "right": about_upright > _TILT_DEG,
+            "left": about_upright < -_TILT_DEG,
+            "lower": about_level > _TILT_DEG,
+            "upper": about_level < -_TILT_DEG,
+        }
+        return {edge: int(np.count_nonzero(tilted)) for edge, tilted in ways.items()}
+
+    @property
+    def has_near(self) -> bool:
+        """Whether a view has the board near."""
+        return bool(np.any(self.extents > _NEAR))
+
+    @property
+    def has_far(self) -> bool:
+        """Whether a view has it far away."""
+        return bool(np.any(self.extents < _FAR))
 
     def _tilts_missing(self) -> list[str]:
-        return [text for text, tilted in self._all_tilts() if np.count_nonzero(tilted) < _TILTED_EACH_WAY]
+        return [
+            f"tilt the board's {edge} edge away from the cameras, by 30°"
+            for edge, count in self.tilted().items()
+            if count < TILTED_EACH_WAY
+        ]
 
     def _cells_missing(self) -> list[str]:
         return [
@@ -95,9 +111,9 @@ class Coverage:
 
     def _distances_missing(self) -> list[str]:
         texts = []
-        if not np.any(self.extents > _NEAR):
+        if not self.has_near:
             texts.append("bring the board nearer, until it fills more than half of the image")
-        if not np.any(self.extents < _FAR):
+        if not self.has_far:
             texts.append("take the board further away, until it fills a third of the image")
         return texts
 

@@ -35,6 +35,11 @@ class ImagePair:
     left: ImageArray
     right: ImageArray
 
+    @property
+    def size_px(self) -> tuple[int, int]:
+        """Width and height of each."""
+        return self.left.shape[1], self.left.shape[0]
+
 
 def pair_files(folder: Path, left: str | None, right: str | None, *, side_by_side: bool) -> list[PairFiles]:
     """Which files of a folder belong together, in the order of their names.
@@ -135,3 +140,14 @@ def _read(file: Path) -> ImageArray:
     if image is None:
         raise CalibrationError(f"{file}: no image that can be read. Remove the file, or take it anew")
     return np.asarray(image, dtype=np.uint8)
+
+
+def write_pair(pair: ImagePair, folder: Path, number: int) -> None:
+    """Write a pair as left01.png and right01.png, as `pair_files` reads them; CalibrationError where it cannot be."""
+    for eye, image in (("left", pair.left), ("right", pair.right)):
+        file = folder / f"{eye}{number:02d}.png"
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            file.write_bytes(cv2.imencode(file.suffix, image)[1].tobytes())
+        except OSError as error:
+            raise CalibrationError(f"{file} cannot be written: {error.strerror}") from error

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from .page import Page, Rectangle, Text
+from .sheet import Page, Rectangle, Text
 
 POINT_MM = 25.4 / 72.0
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from xml.sax.saxutils import escape
 
-from .page import Page, Text
+from .sheet import Page, Text
 
 
 def svg(page: Page) -> bytes:

@@ -1,0 +1,140 @@
+"""Measuring a cluster of tags from images: what is read, and what is said."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import msgspec
+import numpy as np
+
+from interfaces.records import ImageArray
+from vision.calibration.images import read_pairs
+from vision.cluster.measure import ClusterView, MeasuredCluster, measure_cluster
+from vision.cluster.tables import cluster_tables
+from vision.rectified import Rectification
+from vision.rig import CalibrationError
+from vision.rig_file import read_rig
+from vision.tag_config import Dictionary, TagConfig
+from vision.tag_dictionary import tags_of
+from vision.tag_finder import TagFinder
+from vision.tag_image import TagImage
+
+from .camera_calibration import Images
+
+_MOST_GROWN, _SIGMAS = 0.01, 4.0
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """Which tags: of a dictionary, all or those of some numbers, with black squares of a side [m]."""
+
+    dictionary: Dictionary
+    side_m: float
+    ids: tuple[int, ...] | None = None
+
+
+class TagFigures(msgspec.Struct):
+    """A tag, 1-sigma of its place [mm] and of its turn [°], and how many views show it."""
+
+    id: int
+    xyz_mm: tuple[float, float, float]
+    rpy_deg: tuple[float, float, float]
+    xyz_sigma_mm: tuple[float, float, float]
+    turn_sigma_deg: tuple[float, float, float]
+    views: int
+
+
+class ClusterFile(msgspec.Struct):
+    """What `bodyschema marker cluster --json` prints."""
+
+    views: int
+    misfit: float
+    grown_percent: float
+    grown_sigma_percent: float
+    left_out: list[tuple[str, int]]
+    tags: list[TagFigures]
+
+
+def measured(images: Images, calibration: Path, wanted: Wanted, tell: Callable[[str], None]) -> MeasuredCluster:
+    """Where the tags are that images of calibrated cameras show.
+
+    Raises:
+        ConfigError: the calibration is damaged.
+        CalibrationError: images or tags are not what is needed; or the squares are not of that side.
+    """
+    rig, files = read_rig(calibration), images.files()
+    rectification = Rectification(rig)
+    maps = rectification.maps(0), rectification.maps(1)
+    config = TagConfig(dictionary=wanted.dictionary, side_m=wanted.side_m)
+    finder = TagFinder(config, wanted.ids or range(len(tags_of(wanted.dictionary).bytesList)))
+    tell(f"looking for tags in {len(files)} pairs of images")
+    views: list[ClusterView] = []
+    for pair in read_pairs(files, side_by_side=images.side_by_side):
+        rig.require(pair.size_px, rig.serials)
+        eyes = [_tags(finder, image, maps[eye]) for eye, image in enumerate((pair.left, pair.right))]
+        views.append(ClusterView(pair.name, *eyes))
+    found = measure_cluster(views, rectification.calibration, wanted.side_m)
+    if abs(found.grown) > _MOST_GROWN + _SIGMAS * found.grown_sigma:
+        raise CalibrationError(
+            f"the black squares seem to be {1e3 * wanted.side_m * (1.0 + found.grown):.2f} mm wide, not "
+            f"{1e3 * wanted.side_m:g}. Measure one and give --side-mm; or is this the calibration of other cameras?"
+        )
+    return found
+
+
+def _tags(finder: TagFinder, image: ImageArray, maps: tuple[ImageArray, ImageArray]) -> dict[int, TagImage]:
+    rectified = cv2.remap(image, *maps, cv2.INTER_LINEAR)
+    seen = finder.find(np.asarray(cv2.cvtColor(rectified, cv2.COLOR_BGR2GRAY), dtype=np.uint8))
+    return {id: tag for id, tag in seen.items() if isinstance(tag, TagImage)}
+
+
+def tables(found: MeasuredCluster, wanted: Wanted) -> str:
+    """The tables of robot.toml, with the uncertainty of each tag."""
+    notes = [
+        "the marker's frame"
+        if k == 0
+        else f"1 sigma {1e3 * float(tag.xyz_sigma_m.max()):.3f} mm, {np.degrees(float(tag.turn_sigma_rad.max())):.3f}°"
+        for k, tag in enumerate(found.tags)
+    ]
+    return cluster_tables(wanted.dictionary, wanted.side_m, [tag.placed for tag in found.tags], notes)
+
+
+def figures(found: MeasuredCluster) -> ClusterFile:
+    """A measured cluster in figures."""
+    return ClusterFile(
+        views=found.views,
+        misfit=found.misfit,
+        grown_percent=100.0 * found.grown,
+        grown_sigma_percent=100.0 * found.grown_sigma,
+        left_out=list(found.left_out),
+        tags=[
+            TagFigures(
+                id=tag.placed.id,
+                xyz_mm=_scaled(tag.placed.xyz, 1e3),
+                rpy_deg=_scaled(tag.placed.rpy, np.degrees(1.0)),
+                xyz_sigma_mm=_scaled(tag.xyz_sigma_m, 1e3),
+                turn_sigma_deg=_scaled(tag.turn_sigma_rad, np.degrees(1.0)),
+                views=tag.views,
+            )
+            for tag in found.tags
+        ],
+    )
+
+
+def _scaled(values: object, by: float) -> tuple[float, float, float]:
+    x, y, z = (by * np.asarray(values, dtype=np.float64)).tolist()
+    return x, y, z
+
+
+def said(found: MeasuredCluster) -> str:
+    """The fit in a sentence or two."""
+    text = (
+        f"{len(found.tags)} tags in {found.views} pairs of images; what is left is {found.misfit:.2f} times what the "
+        f"corners claim. Squares seem {100.0 * found.grown:+.2f} ± {100.0 * found.grown_sigma:.2f} % larger than told."
+    )
+    if found.left_out:
+        text += f" Left out: {', '.join(f'tag {id} in {name}' for name, id in found.left_out)}."
+    return text

@@ -1,0 +1,25 @@
+"""Pages to print, written as files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from interfaces.errors import ConfigError
+from vision.printing import Page, pdf, svg
+
+_WRITERS = {".pdf": pdf, ".svg": svg}
+
+
+def write_page(page: Page, out: Path) -> None:
+    """Write a page as PDF or SVG.
+
+    Raises:
+        ConfigError: the ending is neither, or the file cannot be written.
+    """
+    writer = _WRITERS.get(out.suffix.lower())
+    if writer is None:
+        raise ConfigError(f"{out}: neither .pdf nor .svg", remedy="Name a file that ends so")
+    try:
+        out.write_bytes(writer(page))
+    except OSError as error:
+        raise ConfigError(f"cannot be written: {error.strerror}", file=out, remedy="Name another folder") from error

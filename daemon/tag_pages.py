@@ -1,0 +1,108 @@
+"""Pages of tags, and the tables of robot.toml that belong to them."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+from interfaces.errors import ConfigError
+from vision.cluster.page import FACE_SIDES, shape_page, tags_page
+from vision.cluster.shapes import Shape, cube, plate
+from vision.cluster.tables import cluster_tables, tag_tables
+from vision.tag_config import Dictionary
+
+from .pages import write_page
+
+ShapeName = Literal["tags", "plate", "cube"]
+_RUN = re.compile(r"(\d+)(?:-(\d+))?")
+_MOST_TAGS = 100
+
+
+@dataclass(frozen=True)
+class Tags:
+    """What is to be printed.
+
+    Attributes:
+        shape: single tags, or one body of them.
+        ids: numbers of the tags as in 0-5,9; None: from 0 on, as many as the shape has.
+        side_mm: of the black squares.
+        columns, rows, fold_deg: of a plate.
+    """
+
+    shape: ShapeName = "tags"
+    ids: str | None = None
+    dictionary: Dictionary = "apriltag_36h11"
+    side_mm: float = 40.0
+    columns: int = 2
+    rows: int = 1
+    fold_deg: float = 0.0
+
+    @property
+    def body(self) -> Shape | None:
+        """What is folded of them; None where they are cut apart."""
+        if self.shape == "tags":
+            return None
+        return cube() if self.shape == "cube" else plate(self.columns, self.rows, self.fold_deg)
+
+    @property
+    def numbers(self) -> list[int]:
+        """The tags' numbers; ConfigError where they cannot be read, or one is there twice."""
+        if self.ids is None:
+            return list(range(1 if self.body is None else len(self.body.faces)))
+        return numbers_of(self.ids)
+
+
+def numbers_of(ids: str) -> list[int]:
+    """Tags' numbers as in 0-5,9; ConfigError where they cannot be read, or one is there twice."""
+    found: list[int] = []
+    for part in ids.split(","):
+        run = _RUN.fullmatch(part.strip())
+        if run is None:
+            raise ConfigError(f"--ids {ids} is not as in 0-5,9", remedy="Give numbers, or runs of them")
+        found += range(int(run[1]), int(run[2] or run[1]) + 1)[: _MOST_TAGS + 1]
+    if len(found) > _MOST_TAGS:
+        raise ConfigError(f"--ids {ids} are more than {_MOST_TAGS}", remedy="Print them on several pages")
+    if len(set(found)) < len(found) or not found:
+        raise ConfigError(f"--ids {ids} has a tag twice, or none", remedy="No number may be there twice")
+    return found
+
+
+def write_tags(tags: Tags, paper: str, out: Path) -> tuple[float, float]:
+    """Write the page as PDF or SVG; the lengths of its rulers, across and upright [mm].
+
+    Raises:
+        ConfigError: there are no such tags, they do not fit, or the file cannot be written.
+    """
+    body, ids = tags.body, tags.numbers
+    if body is None:
+        page = tags_page(ids, tags.dictionary, tags.side_mm, paper)
+    else:
+        page = shape_page(body, ids, tags.dictionary, tags.side_mm, paper)
+    write_page(page, out)
+    return page.rulers_mm
+
+
+def face_mm(tags: Tags) -> float:
+    """Width of a face, from cut or fold to cut or fold [mm]."""
+    return FACE_SIDES * tags.side_mm
+
+
+def tables(tags: Tags) -> str:
+    """The tables of robot.toml, for the shape as drawn; of single tags those of the first one."""
+    body, side_m = tags.body, 1e-3 * tags.side_mm
+    if body is None:
+        return tag_tables(tags.dictionary, side_m, tags.numbers[0])
+    return cluster_tables(tags.dictionary, side_m, body.placed(tags.numbers, 1e-3 * face_mm(tags)))
+
+
+def as_printed(tags: Tags, drawn_mm: float, measured_mm: float) -> Tags:
+    """The tags in the size in which a ruler of `drawn_mm` measures `measured_mm`; ConfigError for another line."""
+    scale = measured_mm / drawn_mm
+    if not 0.5 < scale < 2.0:
+        raise ConfigError(
+            f"--ruler-mm {measured_mm:g}: the ruler across of this page is {drawn_mm:g} mm as drawn",
+            remedy="Measure the line below the drawing, from the outer edge of its first tick to that of its last",
+        )
+    return replace(tags, side_mm=scale * tags.side_mm)

@@ -1,0 +1,276 @@
+"""Calibrating and checking the robot's own cameras while a person moves the board."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from io import StringIO
+from pathlib import Path
+
+import cv2
+import msgspec
+import numpy as np
+import pytest
+from board_renderer import webcams
+from rich.console import Console
+from shown_board import BOARD, SIZE, KnownCorners, corner_views, known_rig, photographed, shot
+from small_arm import write_small_arm
+
+from daemon.camera_calibration import CheckFile, Wanted, kept_in, of_cameras
+from daemon.cli import app
+from daemon.live_calibration import LiveCalibration, Shown, checked_live
+from daemon.live_calibration_view import Lines, guidance_on, screen
+from interfaces.clock import SystemClock
+from interfaces.errors import ConfigError, SourceEnded, SourceLost
+from interfaces.records import StereoFrame
+from vision.calibration.calibrate import Calibrated
+from vision.calibration.gather import Gathered
+from vision.calibration.images import pair_files
+from vision.calibration.live import LiveViews
+from vision.calibration.view import View
+from vision.rig import CalibrationError
+from vision.rig_file import read_rig, write_rig
+
+RIGHT = ("A1", "B2")
+
+
+class PluggedEyes:
+    """Eyes that follow a script of frames and losses; `serials` are those of each opening, the last one stays."""
+
+    def __init__(self, script: Iterable[StereoFrame | SourceLost], serials: Iterable[tuple[str, str]] = (RIGHT,)):
+        self._script, self._plugged = list(script), list(serials)
+        self.serials, self.image_size_px = self._plugged[0], SIZE
+        self.health: tuple[str, ...] = ()
+        self.opened, self.is_open = 0, False
+
+    def __enter__(self):
+        self.serials = self._plugged[min(self.opened, len(self._plugged) - 1)]
+        self.opened, self.is_open = self.opened + 1, True
+        return self
+
+    def __exit__(self, *_) -> None:
+        self.is_open = False
+
+    def read(self, timeout_s: float) -> StereoFrame:
+        if not self._script:
+            raise SourceEnded("through")
+        step = self._script.pop(0)
+        if isinstance(step, SourceLost):
+            raise step
+        return step
+
+
+@pytest.fixture(scope="module")
+def views() -> list[View]:
+    """Views of all kinds: of a person who did what was asked."""
+    rng = np.random.default_rng(21)
+    return corner_views(webcams(rng), rng, 30)
+
+
+@pytest.fixture
+def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("daemon.reopen.FIRST_WAIT_S", 0.0)
+
+
+def held(views: list[View], places: Iterable[int] | None = None) -> tuple[LiveViews, list[StereoFrame]]:
+    """Each view held for two frames."""
+    shown = [k for k in (range(len(views)) if places is None else places) for _ in range(2)]
+    return LiveViews(BOARD, KnownCorners(views)), [shot(k, 0.1 * n) for n, k in enumerate(shown)]
+
+
+def fitted(found: Gathered, serials: tuple[str, str], tell: Callable[[str], None]) -> Calibrated:
+    return of_cameras(Wanted(model="pinhole"))(found, serials, tell)
+
+
+def live(eyes: PluggedEyes, views: LiveViews, made=fitted, show=lambda _: None, **given) -> LiveCalibration:
+    return LiveCalibration(eyes, views, made, show, SystemClock(), **given)
+
+
+def test_it_ends_by_itself_when_nothing_is_missing(views) -> None:
+    seen, frames = held(views)
+    eyes = PluggedEyes(frames)
+    found, result = live(eyes, seen).run()
+    assert found.coverage().missing() == []
+    assert len(found.views) < len(views)
+    assert (result.rig.serials, eyes.is_open) == (RIGHT, False)
+
+
+def test_serials_that_are_given_come_before_those_of_the_cameras(views) -> None:
+    seen, frames = held(views)
+    found, _ = live(PluggedEyes(frames), seen).run()
+    assert of_cameras(Wanted(("L", ""), "pinhole"))(found, RIGHT, lambda _: None).rig.serials == ("L", "B2")
+
+
+def test_a_refusal_is_shown_and_views_are_taken_on(views) -> None:
+    shown: list[Shown] = []
+    tries: list[int] = []
+
+    def strict(found: Gathered, serials, tell) -> Calibrated:
+        tries.append(len(found.views))
+        if len(tries) == 1:
+            raise CalibrationError("the left focal length is known to 2 % only")
+        return fitted(found, serials, tell)
+
+    seen, frames = held(views)
+    live(PluggedEyes(frames), seen, strict, shown.append).run()
+    assert tries[1] == tries[0] + 4
+    assert any(each.refusal == "the left focal length is known to 2 % only" for each in shown)
+
+
+def test_stopping_makes_the_calibration_of_what_there_is(views) -> None:
+    seen, frames = held(views)
+    eyes = PluggedEyes(frames)
+
+    def show(shown: Shown) -> None:
+        if shown.views == 10:
+            calibration.stop()
+
+    calibration = live(eyes, seen, show=show)
+    found, result = calibration.run()
+    assert (len(found.views), result.rig.made.views) == (10, 10)
+
+
+def test_stopping_too_early_says_what_is_missing(views) -> None:
+    seen, frames = held(views, range(3))
+    with pytest.raises(CalibrationError, match="too few views: both eyes saw the board in 3, at least 8"):
+        live(PluggedEyes(frames), seen).run()
+
+
+def test_cameras_that_saw_no_board_say_so() -> None:
+    seen, frames = held([View("nothing", None, None)])
+    with pytest.raises(CalibrationError, match="there are no images"):
+        live(PluggedEyes(frames), seen).run()
+
+
+def test_views_survive_cameras_that_are_unplugged_on_the_way(views, impatient) -> None:
+    shown: list[Shown] = []
+    seen, frames = held(views, range(10))
+    eyes = PluggedEyes([*frames[:9], SourceLost("the left camera is gone"), *frames[9:]])
+    found, _ = live(eyes, seen, show=shown.append).run()
+    # The board was seen once before the loss and once after it: these two are not held against each other.
+    assert (len(found.views), eyes.opened) == (9, 2)
+    assert any("the cameras are lost (the left camera is gone)" in text for each in shown for text in each.trouble)
+
+
+def test_other_cameras_that_are_plugged_in_on_the_way_are_refused(views, impatient) -> None:
+    shown: list[Shown] = []
+    seen, frames = held(views, range(10))
+    eyes = PluggedEyes([*frames[:8], SourceLost("unplugged"), *frames[8:]], [RIGHT, ("A1", "C3"), RIGHT])
+    found, result = live(eyes, seen, show=shown.append).run()
+    assert (len(found.views), eyes.opened, result.rig.serials) == (10, 3, RIGHT)
+    assert any("A1 and C3 with 640x480 pixels, the views are of A1 and B2" in "".join(each.trouble) for each in shown)
+
+
+def test_the_images_of_every_view_are_kept(views, tmp_path) -> None:
+    seen, frames = held(views, range(9))
+    live(PluggedEyes(frames), seen, keep=kept_in(tmp_path / "kept")).run()
+    assert len(pair_files(tmp_path / "kept", None, None, side_by_side=False)) == 9
+
+
+# --- what is shown
+
+
+def shown_of(views: list[View], frames: int) -> Shown:
+    seen, shots = held(views)
+    look = [seen.look(shot) for shot in shots[:frames]][-1]
+    return Shown(seen.coverage, len(seen.found.views), look)
+
+
+def text_of(shown: Shown, width: int = 80) -> str:
+    console = Console(width=width, record=True, file=StringIO())
+    console.print(screen(shown, BOARD.name))
+    return console.export_text()
+
+
+def test_the_screen_says_what_to_show_next_and_what_was_seen(views) -> None:
+    text = text_of(shown_of(views, 2))
+    assert "Next: tilt the board's" in text
+    assert "Now:  taken: view 1" in text
+    assert text.count("○") > 2
+
+
+def test_the_screen_fits_a_terminal_of_80_columns(views) -> None:
+    shown = shown_of(views, 11)
+    assert max(map(len, text_of(shown).splitlines())) <= 80
+    assert len(text_of(shown).splitlines()) < 24
+
+
+def test_lines_tell_each_view_and_do_not_repeat_themselves(views) -> None:
+    said: list[str] = []
+    lines = Lines(said.append, SystemClock())
+    shown = shown_of(views, 2)
+    moving = shown_of(views, 3)
+    for each in (shown, moving, moving, moving):
+        lines(each)
+    assert said[0].startswith("taken: view 1. 1 views, ")
+    assert said[1:] == ["hold it still"]
+
+
+def test_where_there_is_no_terminal_lines_are_printed(views, capsys) -> None:
+    with guidance_on(Console(stderr=True), BOARD.name, SystemClock()) as show:
+        show(shown_of(views, 2))
+    assert capsys.readouterr().err.startswith("taken: view 1. 1 views")
+
+
+# --- the check
+
+
+def test_the_check_waits_until_the_board_is_held_still(views, tmp_path) -> None:
+    rig = known_rig(webcams(np.random.default_rng(21)))
+    write_rig(rig, tmp_path / "cameras.toml")
+    nothing = View("nothing", None, None)
+    seen = LiveViews(BOARD, KnownCorners([nothing, views[0], views[1]]))
+    eyes = PluggedEyes([shot(k, 0.1 * n) for n, k in enumerate((0, 1, 2, 2))])
+    found = checked_live(eyes, tmp_path / "cameras.toml", seen, lambda _: None, SystemClock(), 60.0)
+    assert (found.holds, eyes.is_open) == (True, False)
+
+
+def test_the_check_of_other_cameras_is_refused(views, tmp_path) -> None:
+    write_rig(known_rig(webcams(np.random.default_rng(21))), tmp_path / "cameras.toml")
+    seen, frames = held(views)
+    with pytest.raises(CalibrationError, match="this is the calibration of another pair"):
+        checked_live(
+            PluggedEyes(frames, [("A1", "C3")]), tmp_path / "cameras.toml", seen, lambda _: None, SystemClock(), 60.0
+        )
+
+
+def test_the_check_says_why_no_look_came(views, tmp_path) -> None:
+    write_rig(known_rig(webcams(np.random.default_rng(21))), tmp_path / "cameras.toml")
+    seen, frames = held([View("nothing", None, None)])
+    with pytest.raises(CalibrationError, match=r"held still \(left: no board; right: no board\)"):
+        checked_live(PluggedEyes(frames), tmp_path / "cameras.toml", seen, lambda _: None, SystemClock(), 60.0)
+
+
+# --- from the command line, the cameras being images in a folder
+
+
+@pytest.fixture(scope="module")
+def robot(tmp_path_factory) -> Path:
+    """A robot whose cameras show the board, each view for two frames."""
+    folder = tmp_path_factory.mktemp("robot")
+    for k, pair in enumerate(photographed()[1][:9]):
+        for eye, image in (("left", pair.left), ("right", pair.right)):
+            cv2.imwrite(str(folder / f"{eye}{2 * k:02d}.png"), image)
+            (folder / f"{eye}{2 * k + 1:02d}.png").symlink_to(folder / f"{eye}{2 * k:02d}.png")
+    cameras = '[vision.cameras.images]\nleft = "left*.png"\nright = "right*.png"\nfps = 10.0\nspeed = 0.0\n'
+    return write_small_arm(folder, cameras)
+
+
+def called(*arguments: object) -> None:
+    app([*map(str, arguments)], exit_on_error=False, result_action="return_value")
+
+
+def test_the_robots_own_cameras_are_calibrated_and_checked(robot, capsys) -> None:
+    called("calibrate", "cameras", "--robot", robot, "--lens", "pinhole", "--save", robot.parent / "views")
+    said = capsys.readouterr()
+    rig, truth = read_rig(robot.parent / "cameras.toml"), photographed()[0]
+    assert abs(rig.baseline_m - truth.baseline_m) < 2.5 * rig.baseline_sigma_m
+    assert 'In [vision.cameras] write\ncalibration = "cameras.toml"' in said.out
+    assert "Next: tilt the board's" in said.err
+    assert len(list((robot.parent / "views").glob("left*.png"))) == rig.made.views + rig.made.left_out
+    called("calibrate", "check", "--robot", robot, "--json")
+    assert msgspec.json.decode(capsys.readouterr().out, type=CheckFile).holds
+
+
+def test_a_robot_without_cameras_is_refused(tmp_path) -> None:
+    with pytest.raises(ConfigError, match="no cameras are configured"):
+        called("calibrate", "cameras", "--robot", write_small_arm(tmp_path))

@@ -1,0 +1,161 @@
+"""Where tags are on a cluster, measured from images that show several at once."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import cv2
+import msgspec
+import numpy as np
+import pytest
+from ball_renderer import Look
+from scipy.spatial.transform import Rotation
+from tag_renderer import Sheet, photograph
+
+from daemon.cli import app
+from daemon.cluster_wiring import ClusterFile
+from interfaces.camera import StereoCalibration
+from interfaces.records import FloatArray
+from vision.cluster.measure import ClusterView, MeasuredCluster, measure_cluster
+from vision.lens import Lens
+from vision.rig import CalibrationError, Made, StereoRig, parameter_names
+from vision.rig_file import write_rig
+from vision.tag_image import TagImage
+
+EYES = StereoCalibration(600.0, (319.5, 239.5), 0.12, (640, 480), 0.0)
+SIDE_M = 0.04
+NOISE_PX = 0.03
+SQUARE = np.array([[-0.5, 0.5, 0.0], [0.5, 0.5, 0.0], [0.5, -0.5, 0.0], [-0.5, -0.5, 0.0]])
+
+Places = dict[int, tuple[FloatArray, FloatArray]]
+
+
+def built(rng: np.random.Generator) -> Places:
+    """A cube of tags that were glued on by hand: each turned and shifted by a little, the first one too."""
+    faces = [np.eye(3), *(Rotation.from_euler("xyz", turn, degrees=True).as_matrix() for turn in TURNS)]
+    turned = [face @ Rotation.from_rotvec(rng.normal(0.0, 0.03, 3)).as_matrix() for face in faces]
+    places = [0.03 * face[:, 2] + rng.normal(0, 1e-3, 3) for face in faces]
+    return dict(zip((3, 4, 7, 8, 9), zip(turned, places, strict=True), strict=True))
+
+
+TURNS = ([0, 90, 0], [0, -90, 0], [90, 0, 0], [-90, 0, 0])
+
+
+def poses(rng: np.random.Generator, count: int) -> list[tuple[FloatArray, FloatArray]]:
+    """The cluster turned by 35° to 65° to all sides in turn, about 0.5 m ahead."""
+    ways = np.linspace(0.0, 2.0 * np.pi, count, endpoint=False) + 0.4
+    turns = [rng.uniform(0.6, 1.1) * np.array([np.cos(way), np.sin(way), 0.0]) for way in ways]
+    facing = np.diag([1.0, -1.0, -1.0])
+    low, high = [0.0, -0.05, 0.4], [0.1, 0.05, 0.55]
+    return [(Rotation.from_rotvec(turn).as_matrix() @ facing, rng.uniform(low, high)) for turn in turns]
+
+
+def looked(places: Places, rng: np.random.Generator, count: int = 20) -> list[ClusterView]:
+    """Exact corners and noise, of the tags that face an eye by 70° or less."""
+    views = []
+    for k, (turn, x) in enumerate(poses(rng, count)):
+        eyes = []
+        for eye in (np.zeros(3), np.array([EYES.baseline_m, 0.0, 0.0])):
+            tags = {}
+            for id, (rotation, place) in places.items():
+                corners = (SIDE_M * SQUARE @ rotation.T + place) @ turn.T + x - eye
+                sight = corners.mean(axis=0)
+                if -(turn @ rotation[:, 2]) @ sight < 0.35 * np.linalg.norm(sight):
+                    continue
+                px = EYES.focal_px * corners[:, :2] / corners[:, 2:] + EYES.principal_point_px
+                tags[id] = TagImage(id, px + rng.normal(0.0, NOISE_PX, px.shape), NOISE_PX**2 * np.eye(8))
+            eyes.append(tags)
+        views.append(ClusterView(f"{k:02d}", *eyes))
+    return views
+
+
+def errors(found: MeasuredCluster, places: Places) -> tuple[FloatArray, FloatArray]:
+    """Of place [m] and turn [rad] of each tag but the first, in the first one's frame, (n, 3) each."""
+    first = min(places)
+    R, x = places[first]
+    off, turns = [], []
+    for tag in found.tags[1:]:
+        rotation, place = places[tag.placed.id]
+        off.append(np.array(tag.placed.xyz) - R.T @ (place - x))
+        measured = Rotation.from_euler("xyz", tag.placed.rpy)
+        turns.append((measured * Rotation.from_matrix(R.T @ rotation).inv()).as_rotvec())
+    return np.array(off), np.array(turns)
+
+
+def test_tags_are_found_where_they_were_glued_and_the_intervals_cover() -> None:
+    off, claimed = [], []
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        places = built(rng)
+        found = measure_cluster(looked(places, rng), EYES, SIDE_M)
+        assert [tag.placed.id for tag in found.tags] == [3, 4, 7, 8, 9]
+        off.append(np.hstack(errors(found, places)))
+        claimed.append([[*tag.xyz_sigma_m, *tag.turn_sigma_rad] for tag in found.tags[1:]])
+    ratio = np.abs(np.concatenate(off)) / np.concatenate(claimed)
+    assert 0.58 < np.mean(ratio < 1.0) < 0.78
+    assert np.mean(ratio < 2.0) > 0.90
+    assert np.abs(np.concatenate(off)[:, :3]).max() < 3e-4
+
+
+def test_a_tag_that_moved_in_one_view_is_left_out_and_named() -> None:
+    rng = np.random.default_rng(1)
+    places = built(rng)
+    views = looked(places, rng)
+    k = next(k for k, view in enumerate(views) if len(view.left.keys() & view.right.keys()) > 2)
+    id = max(views[k].left)
+    wrong = replace(views[k].left[id], corners_px=views[k].left[id].corners_px + 3.0)
+    views[k] = replace(views[k], left={**views[k].left, id: wrong})
+    found = measure_cluster(views, EYES, SIDE_M)
+    assert found.left_out == ((f"{k:02d}", id),)
+    assert np.abs(errors(found, places)[0]).max() < 4e-4
+
+
+def test_squares_of_another_size_than_told_are_noticed() -> None:
+    rng = np.random.default_rng(2)
+    found = measure_cluster(looked(built(rng), rng), EYES, 0.97 * SIDE_M)
+    assert found.grown == pytest.approx(0.03, abs=max(4 * found.grown_sigma, 0.004))
+
+
+def test_tags_that_are_never_seen_together_are_named() -> None:
+    rng = np.random.default_rng(3)
+    views = [only(view, [3, 4] if k % 2 else [7, 8]) for k, view in enumerate(looked(built(rng), rng, 60))]
+    with pytest.raises(CalibrationError, match="no pair of images shows tags 7, 8 to both eyes together"):
+        measure_cluster(views, EYES, SIDE_M)
+
+
+def only(view: ClusterView, ids: Sequence[int]) -> ClusterView:
+    left, right = ({id: tag for id, tag in eye.items() if id in ids} for eye in (view.left, view.right))
+    return ClusterView(view.name, left, right)
+
+
+def test_views_of_single_tags_are_too_few() -> None:
+    rng = np.random.default_rng(4)
+    with pytest.raises(CalibrationError, match="0 of 20 pairs of images show two tags or more"):
+        measure_cluster([only(view, [3]) for view in looked(built(rng), rng)], EYES, SIDE_M)
+
+
+def test_rendered_images_of_a_cluster_become_its_tables(tmp_path, capsys) -> None:
+    rng = np.random.default_rng(5)
+    places = built(rng)
+    lens = Lens("pinhole", (600.0, 600.0), (319.5, 239.5), (0.0,) * 5)
+    made = Made("2026-01-01T00:00:00Z", "none", 20, 0, 0.02, 0.02, 0.0)
+    n = len(parameter_names("pinhole"))
+    rig = StereoRig(lens, lens, np.zeros(3), np.array([-0.12, 0.0, 0.0]), (640, 480), ("", ""), 1e-10 * np.eye(n), made)
+    write_rig(rig, tmp_path / "cameras.toml")
+    for k, (turn, x) in enumerate(poses(rng, 5)):
+        sheets = [Sheet(id, turn @ rotation, turn @ place + x, SIDE_M) for id, (rotation, place) in places.items()]
+        frame = photograph(sheets, EYES, Look(wall=0.4, samples=2), rng)
+        cv2.imwrite(str(tmp_path / f"left{k}.png"), frame.left)
+        cv2.imwrite(str(tmp_path / f"right{k}.png"), frame.right)
+    words = ["marker", "cluster", str(tmp_path), "--side-mm", "40", "--calibration", str(tmp_path / "cameras.toml")]
+    app([*words, "--json"], exit_on_error=False, result_action="return_value")
+    found = msgspec.json.decode(capsys.readouterr().out, type=ClusterFile)
+    R, x = places[3]
+    for tag in found.tags:
+        truth = 1e3 * R.T @ (places[tag.id][1] - x)
+        assert np.abs(np.array(tag.xyz_mm) - truth).max() < 0.8
+    app(words, exit_on_error=False, result_action="return_value")
+    assert "id = 3  # the marker's frame" in capsys.readouterr().out
+    with pytest.raises(CalibrationError, match=r"the black squares seem to be .* mm wide, not 38"):
+        app([*words[:3], "--side-mm", "38", *words[5:]], exit_on_error=False, result_action="return_value")

@@ -1,0 +1,126 @@
+"""Views of the board from cameras that send images now: taken by themselves when the board is still and new."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+
+from interfaces.records import StereoFrame
+from vision.board import Board, BoardDetector
+
+from .gather import Detector, Gathered, Unusable, looked_at
+from .guidance import CORNERS_A_CELL, cell_counts, rough_tilt_deg
+from .images import ImagePair
+from .view import EYES, Eye, View, all_px
+
+_STILL_PX = 1.0  # between two frames; the median of all corners
+# What makes a view another one: how far its corners are from theirs, as a share of the image's width, or the tilt.
+_NEW_SHARE, _NEW_TILT_DEG = 0.06, 10.0
+
+
+class Outcome(StrEnum):
+    """What became of a pair of images."""
+
+    TAKEN = "taken"
+    MOVING = "moving"
+    KNOWN = "known"
+    UNSEEN = "unseen"
+
+
+@dataclass(frozen=True)
+class Look:
+    """One pair of images.
+
+    Attributes:
+        outcome: what became of it: taken as a view, the board moved, it is where it was in a view that was taken, or an
+            eye does not see it and the other one shows nothing new.
+        view: the corners in it.
+        unusable: the eyes that do not see the board, and why.
+        pair: the images.
+    """
+
+    outcome: Outcome
+    view: View
+    unusable: tuple[Unusable, ...]
+    pair: ImagePair
+
+
+class LiveViews:
+    """Looks at one pair of images after the other.
+
+    A view is taken when both eyes see the board, it has been still for two frames, and no view like it was taken. One
+    eye's is taken alone where it shows the board in a part of the image in which it was not yet.
+
+    Attributes:
+        found: the views that were taken, and their images.
+        coverage: what they cover.
+    """
+
+    def __init__(self, board: Board, detector: Detector | None = None) -> None:
+        """Nothing was seen yet."""
+        self.found = Gathered(board)
+        self.coverage = self.found.coverage()
+        self._detector = BoardDetector(board) if detector is None else detector
+        self._tilts: list[tuple[float, float]] = []
+        self._before: View | None = None
+
+    def look(self, frame: StereoFrame) -> Look:
+        """Look at the next pair, and take it where it is of use.
+
+        Raises:
+            CalibrationError: the two eyes' images are of different sizes.
+        """
+        pair = ImagePair(f"view {len(self.found.views) + 1}", frame.left, frame.right)
+        view, unusable = looked_at(pair, self._detector)
+        self.found.image_size_px = pair.size_px
+        outcome = self._outcome(view)
+        if outcome is Outcome.TAKEN:
+            self.found.add(view, pair)
+            self.coverage = self.found.coverage()
+            self._tilts.append(self._tilt(view))
+        self._before = view
+        return Look(outcome, view, unusable, pair)
+
+    def forget(self) -> None:
+        """The next pair does not follow the last one: cameras were away."""
+        self._before = None
+
+    def _outcome(self, view: View) -> Outcome:
+        seeing: list[Eye] = [eye for eye in EYES if view.eye(eye) is not None]
+        if not view.is_stereo and not any(self._fills(view, eye) for eye in seeing):
+            return Outcome.UNSEEN
+        if not self._is_new(view, seeing):
+            return Outcome.KNOWN
+        before = self._before
+        if before is None or any(_apart_px(view, before, eye) >= _STILL_PX for eye in seeing):
+            return Outcome.MOVING
+        return Outcome.TAKEN
+
+    def _fills(self, view: View, eye: Eye) -> bool:
+        """Whether an eye sees the board in a part of its image in which it was not yet."""
+        shown = cell_counts(all_px([view], eye), self.found.image_size_px) >= CORNERS_A_CELL
+        return bool((shown & ~self.coverage.covered(eye)).any())
+
+    def _is_new(self, view: View, seeing: Sequence[Eye]) -> bool:
+        least, tilt = _NEW_SHARE * self.found.image_size_px[0], self._tilt(view)
+        return all(
+            any(_apart_px(view, other, eye) > least for eye in seeing) or math.dist(tilt, its) > _NEW_TILT_DEG
+            for other, its in zip(self.found.views, self._tilts, strict=True)
+        )
+
+    def _tilt(self, view: View) -> tuple[float, float]:
+        corners = next(corners for corners in (view.left, view.right) if corners is not None)
+        return rough_tilt_deg(corners, self.found.board, self.found.image_size_px)
+
+
+def _apart_px(one: View, other: View, eye: Eye) -> float:
+    """Median distance of the corners that both views have; infinite where they have none."""
+    a, b = one.eye(eye), other.eye(eye)
+    if a is None or b is None:
+        return np.inf
+    _, here, there = np.intersect1d(a.numbers, b.numbers, return_indices=True)
+    return float(np.median(np.linalg.norm(a.px[here] - b.px[there], axis=1))) if len(here) else np.inf

@@ -1,0 +1,316 @@
+"""Where the tags of a cluster are on it, from images that show several at once: one least-squares problem of all."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import block_diag
+from scipy.spatial.transform import Rotation
+
+from interfaces.camera import StereoCalibration
+from interfaces.records import FloatArray
+from vision.pose import fitted_motion, projection_slopes, turned, whitening
+from vision.rig import CalibrationError
+from vision.tag_body import TAG_CORNERS
+from vision.tag_config import PlacedTag
+from vision.tag_image import TagImage
+from vision.triangulate import triangulate
+
+from .shapes import rpy_of
+
+_STEPS, _CONVERGED = 60, 1e-9
+_FIRST_DAMPING, _MOST_DAMPING = 1e-4, 1e8
+# A tag in a view whose corners are this many sigmas off (RMS) is none: covered, bent, or another of its number.
+_MOST_OFF = 6.0
+_LEAST_VIEWS = 3
+
+Motion = tuple[FloatArray, FloatArray]  # rotation (3, 3) and place (3,) [m]
+
+
+@dataclass(frozen=True)
+class ClusterView:
+    """The tags that each eye sees in one pair of rectified images, by their numbers."""
+
+    name: str
+    left: Mapping[int, TagImage]
+    right: Mapping[int, TagImage]
+
+    @property
+    def ids(self) -> set[int]:
+        """Numbers of all tags that are seen."""
+        return self.left.keys() | self.right.keys()
+
+
+@dataclass(frozen=True)
+class MeasuredTag:
+    """A tag on the cluster, in the frame of the first one.
+
+    Attributes:
+        placed: where it is.
+        xyz_sigma_m, turn_sigma_rad: 1-sigma of its place along the axes, and of its turn about them, each (3,).
+        views: how many show it.
+    """
+
+    placed: PlacedTag
+    xyz_sigma_m: FloatArray
+    turn_sigma_rad: FloatArray
+    views: int
+
+
+@dataclass(frozen=True)
+class MeasuredCluster:
+    """A measured cluster.
+
+    Attributes:
+        tags: in the order of their numbers, the first one at the origin.
+        views: how many pairs of images it was made of.
+        misfit: RMS of what is left, in units of the corners' own sigmas.
+        left_out: names of views, and numbers of the tags in them that did not fit.
+        grown, grown_sigma: by how much the printed squares seem larger than told, as a share, and its 1-sigma.
+    """
+
+    tags: tuple[MeasuredTag, ...]
+    views: int
+    misfit: float
+    left_out: tuple[tuple[str, int], ...]
+    grown: float
+    grown_sigma: float
+
+
+def measure_cluster(views: Sequence[ClusterView], calibration: StereoCalibration, side_m: float) -> MeasuredCluster:
+    """Where the tags are, from rectified views.
+
+    Args:
+        side_m: side of all black squares [m].
+
+    Raises:
+        CalibrationError: too few views show two tags and more, or some tags were never seen together with the others.
+    """
+    usable = [view for view in views if len(view.ids) >= 2 and view.left.keys() & view.right.keys()]
+    if len(usable) < _LEAST_VIEWS:
+        raise CalibrationError(
+            f"{len(usable)} of {len(views)} pairs of images show two tags or more to both eyes, at least "
+            f"{_LEAST_VIEWS} are needed, 20 are good. Turn the cluster slowly, all its edges towards the cameras"
+        )
+    left_out: list[tuple[str, int]] = []
+    while True:
+        problem = _Problem(usable, calibration, side_m * TAG_CORNERS)
+        problem.solve()
+        worst = problem.worst()
+        if worst is None:
+            return problem.result(left_out)
+        left_out.append(worst)
+        usable = [_without(view, worst) for view in usable]
+        usable = [view for view in usable if len(view.ids) >= 2 and view.left.keys() & view.right.keys()]
+        if len(usable) < _LEAST_VIEWS:
+            raise CalibrationError(
+                "the tags do not fit one rigid body: their places differ from view to view. Is the cluster stiff, "
+                f"--side-mm right, and no number there twice? First did not fit: tag {left_out[0][1]} in "
+                f"{left_out[0][0]}"
+            )
+
+
+def _without(view: ClusterView, worst: tuple[str, int]) -> ClusterView:
+    if view.name != worst[0]:
+        return view
+    left, right = ({id: tag for id, tag in eye.items() if id != worst[1]} for eye in (view.left, view.right))
+    return ClusterView(view.name, left, right)
+
+
+@dataclass(frozen=True)
+class _Block:
+    """What one eye sees in one view.
+
+    Attributes:
+        view: its number. eye: (3,), where the eye is in the left one's frame [m]. root: makes residuals independent.
+    """
+
+    view: int
+    eye: FloatArray
+    ids: tuple[int, ...]
+    pixels: FloatArray
+    root: FloatArray
+
+
+class _Problem:
+    """All poses: of the cluster in the views, and of the tags on it. The first tag's frame is the cluster's."""
+
+    def __init__(self, views: Sequence[ClusterView], calibration: StereoCalibration, corners: FloatArray) -> None:
+        self._views, self._calibration, self._corners = list(views), calibration, corners
+        self.ids = sorted(set[int]().union(*(view.ids for view in views)))
+        self._blocks = [
+            self._block(k, tags, calibration.baseline_m * right)
+            for k, view in enumerate(views)
+            for right, tags in enumerate((view.left, view.right))
+            if tags
+        ]
+        located = [self._located(view) for view in views]
+        self._tags = self._first_tags(
+            [{id: fitted_motion(corners, seen) for id, seen in each.items()} for each in located]
+        )
+        self._bodies = [self._first_body(each) for each in located]
+
+    def _block(self, view: int, tags: Mapping[int, TagImage], x: float) -> _Block:
+        ids = tuple(sorted(tags))
+        pixels = np.concatenate([tags[id].corners_px for id in ids])
+        own = np.asarray(block_diag(*(tags[id].cov_px for id in ids)))
+        return _Block(view, np.array([x, 0.0, 0.0]), ids, pixels, whitening(own, self._calibration.pixel_sigma))
+
+    # --- where it begins
+
+    def _located(self, view: ClusterView) -> dict[int, FloatArray]:
+        """The corners (4, 3) [m] of each tag that both eyes see."""
+        found: dict[int, FloatArray] = {}
+        for id in sorted(view.left.keys() & view.right.keys()):
+            px = np.hstack([view.left[id].corners_px, view.right[id].corners_px])
+            corners = [triangulate(self._calibration, each, np.ones(4)) for each in px]
+            whole = [each[0] for each in corners if each is not None]
+            if len(whole) == len(px):
+                found[id] = np.array(whole)
+        return found
+
+    def _first_tags(self, alone: Sequence[Mapping[int, Motion]]) -> dict[int, Motion]:
+        """Tags in the first one's frame, from tag to tag through views that show both."""
+        known: dict[int, Motion] = {self.ids[0]: (np.eye(3), np.zeros(3))}
+        while len(known) < len(self.ids):
+            # The tag that most views show together with one that is known.
+            counts = {
+                (a, b): sum(a in poses and b in poses for poses in alone)
+                for a in known
+                for b in self.ids
+                if b not in known
+            }
+            a, b = max(counts, key=lambda pair: counts[pair])
+            if not counts[a, b]:
+                lost = ", ".join(str(id) for id in self.ids if id not in known)
+                raise CalibrationError(
+                    f"no pair of images shows tags {lost} to both eyes together with tags "
+                    f"{', '.join(map(str, sorted(known)))}. Take images across those edges"
+                )
+            between = [_after(_inverse(poses[a]), poses[b]) for poses in alone if a in poses and b in poses]
+            known[b] = _after(known[a], _middle(between))
+        return known
+
+    def _first_body(self, located: Mapping[int, FloatArray]) -> Motion:
+        if not located:
+            raise CalibrationError("a view in which no tag's corners can be located by both eyes")
+        body = [self._corners @ self._tags[id][0].T + self._tags[id][1] for id in located]
+        return fitted_motion(np.concatenate(body), np.concatenate(list(located.values())))
+
+    # --- the joint problem
+
+    @property
+    def _columns(self) -> dict[int, int]:
+        """First column of each tag that is not the first."""
+        return {id: 6 * k for k, id in enumerate(self.ids[1:])}
+
+    def solve(self) -> None:
+        """Levenberg-Marquardt on all turns and places."""
+        damping = _FIRST_DAMPING
+        residuals, J, _ = self._linearised()
+        for _ in range(_STEPS):
+            normal = J.T @ J
+            scale = np.diag(normal)
+            change = np.linalg.solve(normal + damping * np.diag(scale), J.T @ residuals)
+            before = self._tags, self._bodies
+            self._move(np.asarray(change, dtype=np.float64))
+            tried = self._linearised()
+            if tried[0] @ tried[0] <= residuals @ residuals:
+                gained = residuals @ residuals - tried[0] @ tried[0]
+                (residuals, J, _), damping = tried, max(damping / 10.0, 1e-12)
+                if gained <= _CONVERGED * (residuals @ residuals):
+                    break
+            else:
+                self._tags, self._bodies = before
+                damping *= 10.0
+                if damping > _MOST_DAMPING:
+                    break
+
+    def _move(self, step: FloatArray) -> None:
+        def moved(motion: Motion, by: FloatArray) -> Motion:
+            return Rotation.from_rotvec(by[:3]).as_matrix() @ motion[0], motion[1] + by[3:]
+
+        at = self._columns
+        self._tags = {id: moved(m, step[at[id] : at[id] + 6]) if id in at else m for id, m in self._tags.items()}
+        first = 6 * len(at)
+        self._bodies = [moved(m, step[first + 6 * k : first + 6 * k + 6]) for k, m in enumerate(self._bodies)]
+
+    def _linearised(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Residuals in sigmas, their derivative by all turns and places, and by the size of the squares."""
+        at, first = self._columns, 6 * (len(self.ids) - 1)
+        width = first + 6 * len(self._views)
+        residuals: list[FloatArray] = []
+        slopes: list[FloatArray] = []
+        growths: list[FloatArray] = []
+        for block in self._blocks:
+            turn, x = self._bodies[block.view]
+            J = np.zeros((len(block.pixels), 2, width))
+            seen = np.zeros_like(block.pixels)
+            grown = np.zeros((len(block.pixels), 2))
+            for k, id in enumerate(block.ids):
+                rows = slice(4 * k, 4 * k + 4)
+                on_tag = self._corners @ self._tags[id][0].T
+                arms = (on_tag + self._tags[id][1]) @ turn.T
+                points = arms + x - block.eye
+                slope = projection_slopes(self._calibration.focal_px, points)
+                seen[rows] = self._calibration.focal_px * points[:, :2] / points[:, 2:]
+                body = first + 6 * block.view
+                J[rows, :, body : body + 3], J[rows, :, body + 3 : body + 6] = slope @ turned(arms), slope
+                if id in at:
+                    J[rows, :, at[id] : at[id] + 3] = slope @ turn @ turned(on_tag)
+                    J[rows, :, at[id] + 3 : at[id] + 6] = slope @ turn
+                grown[rows] = (slope @ (on_tag @ turn.T)[..., None])[..., 0]
+            off = block.pixels - seen - np.array(self._calibration.principal_point_px)
+            residuals.append(block.root @ off.ravel())
+            slopes.append(block.root @ J.reshape(-1, width))
+            growths.append(block.root @ grown.ravel())
+        return np.concatenate(residuals), np.concatenate(slopes), np.concatenate(growths)
+
+    # --- what comes out
+
+    def worst(self) -> tuple[str, int] | None:
+        """Name of the view and number of the tag in it that fits worst, where that is too bad."""
+        residuals = self._linearised()[0]
+        squares: dict[tuple[str, int], list[FloatArray]] = {}
+        place = 0
+        for block in self._blocks:
+            for id in block.ids:
+                squares.setdefault((self._views[block.view].name, id), []).append(residuals[place : place + 8] ** 2)
+                place += 8
+        off = {key: float(np.sqrt(np.mean(np.concatenate(each)))) for key, each in squares.items()}
+        key = max(off, key=lambda each: off[each])
+        usual = float(np.median(list(off.values())))
+        return key if off[key] > _MOST_OFF * max(usual, 1.0) else None
+
+    def result(self, left_out: Sequence[tuple[str, int]]) -> MeasuredCluster:
+        """The solution with its uncertainty: what the claimed noise does not explain is taken for more noise."""
+        residuals, J, grown = self._linearised()
+        misfit = float(residuals @ residuals) / max(len(residuals) - J.shape[1], 1)
+        cov = np.linalg.inv(J.T @ J) * max(misfit, 1.0)
+        full = np.column_stack([J, grown])
+        inverse = np.linalg.inv(full.T @ full)
+        at, tags = self._columns, []
+        for id in self.ids:
+            rotation, xyz = self._tags[id]
+            sigma = np.sqrt(np.diag(cov)[at[id] : at[id] + 6]) if id in at else np.zeros(6)
+            placed = PlacedTag(id=id, xyz=(float(xyz[0]), float(xyz[1]), float(xyz[2])), rpy=rpy_of(rotation))
+            tags.append(MeasuredTag(placed, sigma[3:], sigma[:3], sum(id in view.ids for view in self._views)))
+        size = float((inverse @ full.T @ residuals)[-1]), float(np.sqrt(inverse[-1, -1] * max(misfit, 1.0)))
+        return MeasuredCluster(tuple(tags), len(self._views), float(np.sqrt(misfit)), tuple(left_out), *size)
+
+
+def _after(outer: Motion, inner: Motion) -> Motion:
+    return outer[0] @ inner[0], outer[0] @ inner[1] + outer[1]
+
+
+def _inverse(motion: Motion) -> Motion:
+    return motion[0].T, -motion[0].T @ motion[1]
+
+
+def _middle(motions: Sequence[Motion]) -> Motion:
+    """The one that most of the others agree with."""
+    turns = [Rotation.from_matrix(rotation) for rotation, _ in motions]
+    apart = [np.median([(turn * other.inv()).magnitude() for other in turns]) for turn in turns]
+    return motions[int(np.argmin(apart))]

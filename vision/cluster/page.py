@@ -1,0 +1,110 @@
+"""The page of tags: with lines to cut along, and to fold along where they make one body."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from interfaces.errors import ConfigError
+from vision.printing.sheet import AROUND_MM, LINE_MM, Page, Rectangle, Text, page, pattern, sheets
+from vision.tag_config import Dictionary
+from vision.tag_dictionary import tag_modules
+from vision.tag_image import MODULES
+
+from .shapes import Cell, Shape
+
+# A tag's face is this many of its sides wide: a white margin of a module all around, and a little for the scissors.
+FACE_SIDES = 1.0 + 2.5 / MODULES
+_DASH_MM = 2.0
+# Between single tags, with room for their numbers.
+_GAP_MM = 6.0
+_NUMBER_MM = 3.0
+
+
+def shape_page(shape: Shape, ids: Sequence[int], dictionary: Dictionary, side_mm: float, paper: str) -> Page:
+    """A shape to cut out and fold, with tags of these numbers row by row.
+
+    Raises:
+        ConfigError: as many faces there are not, no such tag or paper, or it does not fit.
+    """
+    width = FACE_SIDES * side_mm
+    placed = shape.placed(ids, 1e-3 * width)
+    black = [
+        each
+        for tag, face in zip(placed, shape.faces, strict=True)
+        for each in _tag(dictionary, tag.id, face.cell[0] * width, face.cell[1] * width, side_mm)
+    ]
+    black += [line for cell, other in shape.cuts for line in _between(cell, other, width, dashed=False)]
+    black += [line for cell, other in shape.folds for line in _between(cell, other, width, dashed=True)]
+    columns, rows = shape.size
+    name = f"{shape.name[0].upper()}{shape.name[1:]}, {dictionary} {_listed(ids)}, black squares of {side_mm:g} mm"
+    made = page((columns * width, rows * width), paper, name, black)
+    if made is None:
+        room = max(min((w - AROUND_MM) / columns, (h - AROUND_MM) / rows) for w, h in sheets(paper)) / FACE_SIDES
+        raise _too_large(f"{shape.name} with tags of {side_mm:g} mm", paper, room)
+    return made
+
+
+def tags_page(ids: Sequence[int], dictionary: Dictionary, side_mm: float, paper: str) -> Page:
+    """Single tags to cut apart, each with its number below.
+
+    Raises:
+        ConfigError: no such tag or paper, or they do not fit.
+    """
+    width = FACE_SIDES * side_mm
+    pitch = width + _GAP_MM
+    _, (room, _) = sheets(paper)
+    columns = min(len(ids), math.floor((room - AROUND_MM + _GAP_MM) / pitch))
+    if columns < 1:
+        raise _too_large(f"a tag of {side_mm:g} mm", paper, (room - AROUND_MM) / FACE_SIDES)
+    black: list[Rectangle] = []
+    numbers: list[Text] = []
+    for place, id in enumerate(ids):
+        row, column = divmod(place, columns)
+        x, y = column * pitch, row * pitch
+        black += [*_tag(dictionary, id, x, y, side_mm), *_outline(x, y, width)]
+        numbers.append(Text(x, y + width + _NUMBER_MM + 0.5, f"{dictionary} {id}, {side_mm:g} mm", size_mm=_NUMBER_MM))
+    rows = math.ceil(len(ids) / columns)
+    name = f"{dictionary} {_listed(ids)}, black squares of {side_mm:g} mm"
+    made = page((columns * pitch - _GAP_MM, rows * pitch), paper, name, black, numbers)
+    if made is None:
+        raise ConfigError(f"{len(ids)} tags of {side_mm:g} mm do not fit on {paper}", remedy="Print them on two pages")
+    return made
+
+
+def _too_large(what: str, paper: str, room_mm: float) -> ConfigError:
+    return ConfigError(
+        f"{what} does not fit on {paper}",
+        remedy=f"There is room for tags of {math.floor(room_mm):g} mm; or take larger paper",
+    )
+
+
+def _tag(dictionary: Dictionary, id: int, x: float, y: float, side: float) -> list[Rectangle]:
+    inset = 0.5 * (FACE_SIDES - 1.0) * side
+    return pattern(tag_modules(dictionary, id), x + inset, y + inset, side)
+
+
+def _outline(x: float, y: float, width: float) -> list[Rectangle]:
+    long = width + LINE_MM
+    near, far = -0.5 * LINE_MM, width - 0.5 * LINE_MM
+    level = [Rectangle(x + near, y + at, long, LINE_MM) for at in (near, far)]
+    return [*level, *(Rectangle(x + at, y + near, LINE_MM, long) for at in (near, far))]
+
+
+def _between(cell: Cell, other: Cell, width: float, *, dashed: bool) -> list[Rectangle]:
+    """The line between two neighbouring cells, the middle of which is on the edge."""
+    column, row = max(cell[0], other[0]), max(cell[1], other[1])
+    x, y = column * width, row * width
+    count = math.floor(width / (2 * _DASH_MM)) if dashed else 1
+    pieces = [((2 * k + 0.5) * _DASH_MM, _DASH_MM) for k in range(count)] if dashed else [(0.0, width)]
+    if cell[0] != other[0]:
+        return [Rectangle(x - 0.5 * LINE_MM, y + at, LINE_MM, long) for at, long in pieces]
+    return [Rectangle(x + at, y - 0.5 * LINE_MM, long, LINE_MM) for at, long in pieces]
+
+
+def _listed(ids: Sequence[int]) -> str:
+    first, last = ids[0], ids[-1]
+    if len(ids) == 1:
+        return f"{first}"
+    run = list(ids) == list(range(first, last + 1))
+    return f"{first} to {last}" if run else ", ".join(map(str, ids))

@@ -1,0 +1,34 @@
+"""A cluster as the tables of robot.toml."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from vision.tag_config import Dictionary, PlacedTag, Vector
+
+
+def cluster_tables(dictionary: Dictionary, side_m: float, tags: Sequence[PlacedTag], notes: Sequence[str] = ()) -> str:
+    """The tables [vision], [vision.tag] and [[vision.cluster.tags]].
+
+    Args:
+        notes: what is said of each tag, behind its number.
+    """
+    lines = ["[vision]", 'marker = "cluster"', "", *_tag_table(dictionary, side_m)]
+    for k, tag in enumerate(tags):
+        note = f"  # {notes[k]}" if notes and notes[k] else ""
+        lines += ["", "[[vision.cluster.tags]]", f"id = {tag.id}{note}"]
+        lines += [f"xyz = {_list(tag.xyz)}", f"rpy = {_list(tag.rpy)}"]
+    return "\n".join(lines) + "\n"
+
+
+def tag_tables(dictionary: Dictionary, side_m: float, id: int) -> str:
+    """The tables [vision] and [vision.tag] of a single tag."""
+    return "\n".join(["[vision]", 'marker = "tag"', "", *_tag_table(dictionary, side_m), f"id = {id}"]) + "\n"
+
+
+def _tag_table(dictionary: Dictionary, side_m: float) -> list[str]:
+    return ["[vision.tag]", f'dictionary = "{dictionary}"', f"side_m = {side_m:.6g}"]
+
+
+def _list(values: Vector) -> str:
+    return "[" + ", ".join(f"{value:.6f}" for value in values) + "]"

@@ -1,0 +1,154 @@
+"""A sheet of paper, in millimetres: black rectangles, and two rulers to check the print against."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+from interfaces.errors import ConfigError
+from interfaces.records import FloatArray
+
+PAPERS_MM = {
+    "A4": (210.0, 297.0),
+    "A3": (297.0, 420.0),
+    "A2": (420.0, 594.0),
+    "A1": (594.0, 841.0),
+    "A0": (841.0, 1189.0),
+    "letter": (215.9, 279.4),
+    "legal": (215.9, 355.6),
+    "tabloid": (279.4, 431.8),
+}
+# Most printers leave about 5 mm of the sheet white.
+MARGIN_MM = 7.0
+# What the rulers and the line of text need below and beside the drawing.
+_RULER_MM = 14.0
+# Of the sheet's sides, what the drawing does not get.
+AROUND_MM = 2 * MARGIN_MM + _RULER_MM
+LINE_MM = 0.2
+_TEXT_MM = 3.0
+# Helvetica's letters are half as wide as high, on the mean.
+_LETTER = 0.52
+
+
+@dataclass(frozen=True)
+class Rectangle:
+    """A black rectangle; x to the right and y down from the sheet's upper left corner [mm]."""
+
+    x_mm: float
+    y_mm: float
+    width_mm: float
+    height_mm: float
+
+
+@dataclass(frozen=True)
+class Text:
+    """A line of text that begins at x with its base line at y [mm]; `turned` runs upwards."""
+
+    x_mm: float
+    y_mm: float
+    text: str
+    turned: bool = False
+    size_mm: float = _TEXT_MM
+
+
+@dataclass(frozen=True)
+class Page:
+    """A sheet with what is black on it.
+
+    Attributes:
+        size_mm: width and height of the sheet.
+        drawing_mm: where the drawing's upper left corner is.
+        rulers_mm: lengths of the rulers, across and upright.
+    """
+
+    size_mm: tuple[float, float]
+    drawing_mm: tuple[float, float]
+    rulers_mm: tuple[float, float]
+    rectangles: tuple[Rectangle, ...]
+    texts: tuple[Text, ...]
+
+
+def sheets(paper: str) -> tuple[tuple[float, float], tuple[float, float]]:
+    """A paper's sizes across and upright [mm]; ConfigError where there is no such paper."""
+    known = {name.lower(): size for name, size in PAPERS_MM.items()}
+    if paper.lower() not in known:
+        raise ConfigError(f"there is no paper {paper!r}", remedy=f"Take one of {', '.join(PAPERS_MM)}")
+    short, long = known[paper.lower()]
+    return (long, short), (short, long)
+
+
+def page(
+    size_mm: tuple[float, float], paper: str, name: str, rectangles: Sequence[Rectangle], texts: Sequence[Text] = ()
+) -> Page | None:
+    """A drawing with its rulers on a sheet, upright or across, whichever leaves more room; None where it does not fit.
+
+    Args:
+        size_mm: width and height of the drawing.
+        name: what it is; stands below the ruler.
+        rectangles, texts: the drawing, from its upper left corner.
+
+    Raises:
+        ConfigError: no such paper.
+    """
+    width, height = size_mm
+    fitting = [each for each in sheets(paper) if each[0] >= width + AROUND_MM and each[1] >= height + AROUND_MM]
+    if not fitting:
+        return None
+    sheet = max(fitting, key=lambda each: min(each[0] - width, each[1] - height))
+    x, y = (MARGIN_MM + 0.5 * (side - own - AROUND_MM) for side, own in zip(sheet, size_mm, strict=True))
+    rulers = rulers_mm(size_mm)
+    below, beside = y + height + 0.35 * _RULER_MM, x + width + 0.35 * _RULER_MM
+    lines = [*_ruler(x, below, rulers[0], upright=False), *_ruler(beside, y, rulers[1], upright=True)]
+    told = f"Print at 100 %, then measure: this line is {rulers[0]:g} mm, the upright one {rulers[1]:g} mm."
+    words = [_line(said, x, below + 7.0 + k * 4.0, sheet[0]) for k, said in enumerate((told, name))]
+    words.append(Text(beside + 7.0, y + rulers[1], f"{rulers[1]:g} mm", turned=True))
+    moved = [Rectangle(x + r.x_mm, y + r.y_mm, r.width_mm, r.height_mm) for r in rectangles]
+    written = [replace(text, x_mm=x + text.x_mm, y_mm=y + text.y_mm) for text in texts]
+    return Page(sheet, (x, y), rulers, (*moved, *lines), (*written, *words))
+
+
+def _line(text: str, x: float, y: float, sheet_mm: float) -> Text:
+    """A line of text that begins at x, or further left where it would leave the sheet."""
+    longest = _LETTER * _TEXT_MM * len(text)
+    return Text(max(min(x, sheet_mm - MARGIN_MM - longest), MARGIN_MM), y, text)
+
+
+def rulers_mm(size_mm: tuple[float, float]) -> tuple[float, float]:
+    """Lengths of the rulers beside a drawing of this size, across and upright."""
+    width, height = (_ruler_length(side) for side in size_mm)
+    return width, height
+
+
+def pattern(white: FloatArray, x_mm: float, y_mm: float, side_mm: float) -> list[Rectangle]:
+    """The black cells of a square pattern (cells, cells), 1 white and 0 black, with its upper left corner at (x, y)."""
+    cell = side_mm / len(white)
+    return [
+        Rectangle(x_mm + first * cell, y_mm + row * cell, (last - first) * cell, cell)
+        for row, cells in enumerate(white.tolist())
+        for first, last in _black_runs(cells)
+    ]
+
+
+def _ruler_length(room_mm: float) -> float:
+    """As long as the board has room for, in tens of millimetres; below that, in millimetres."""
+    return 10.0 * math.floor(room_mm / 10.0 + 1e-9) or math.floor(room_mm)
+
+
+def _black_runs(cells: list[float]) -> list[tuple[int, int]]:
+    """Neighbouring black cells are one rectangle: viewers draw hairs between two."""
+    edges = [
+        k for k in range(len(cells) + 1) if (0 < k < len(cells) and cells[k] != cells[k - 1]) or k in (0, len(cells))
+    ]
+    return [(a, b) for a, b in pairwise(edges) if cells[a] == 0]
+
+
+def _ruler(x: float, y: float, length: float, *, upright: bool) -> list[Rectangle]:
+    """A line with a tick at each centimetre; the outer edges of its end ticks are `length` apart."""
+    ticks = [min(max(10.0 * k - 0.5 * LINE_MM, 0.0), length - LINE_MM) for k in range(int(length / 10.0) + 1)]
+    ticks[-1] = length - LINE_MM
+    if upright:
+        line = Rectangle(x + 1.5, y, LINE_MM, length)
+        return [line, *(Rectangle(x, y + at, 3.0, LINE_MM) for at in ticks)]
+    return [Rectangle(x, y + 1.5, length, LINE_MM), *(Rectangle(x + at, y, LINE_MM, 3.0) for at in ticks)]

@@ -1,0 +1,46 @@
+"""The tags that there are."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+
+from interfaces.errors import ConfigError
+from interfaces.records import FloatArray
+
+from .tag_config import Dictionary
+from .tag_image import MODULES
+
+# OpenCV's numbers of the dictionaries.
+DICTIONARIES: dict[Dictionary, int] = {
+    "apriltag_36h11": cv2.aruco.DICT_APRILTAG_36h11,
+    "aruco_6x6_50": cv2.aruco.DICT_6X6_50,
+    "aruco_6x6_100": cv2.aruco.DICT_6X6_100,
+    "aruco_6x6_250": cv2.aruco.DICT_6X6_250,
+    "aruco_6x6_1000": cv2.aruco.DICT_6X6_1000,
+    "aruco_mip_36h12": cv2.aruco.DICT_ARUCO_MIP_36h12,
+}
+
+
+def tags_of(name: Dictionary) -> Any:
+    """OpenCV's dictionary of that name."""
+    return cv2.aruco.getPredefinedDictionary(DICTIONARIES[name])
+
+
+def require_tag(name: Dictionary, id: int) -> None:
+    """ConfigError where the dictionary has no tag of that number."""
+    most = len(tags_of(name).bytesList)
+    if not 0 <= id < most:
+        raise ConfigError(f"there is no tag {id} in {name}", remedy=f"Its numbers go from 0 to {most - 1}")
+
+
+def tag_modules(name: Dictionary, id: int) -> FloatArray:
+    """A tag's modules with its black border, rows from the top, shape (8, 8), 1 white and 0 black.
+
+    Raises:
+        ConfigError: there is no such tag.
+    """
+    require_tag(name, id)
+    return np.asarray(cv2.aruco.generateImageMarker(tags_of(name), id, int(MODULES)) > 127, dtype=np.float64)

@@ -1,0 +1,53 @@
+"""Finds tags in one image, and measures their corners."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+
+import cv2
+import numpy as np
+
+from interfaces.records import ImageArray, Reason
+
+from .tag_config import TagConfig
+from .tag_dictionary import tags_of
+from .tag_image import TagImage, measure_tag
+
+# Squares are two where their corners are on the mean so far apart, as a share of the perimeter.
+_APART_SHARE = 0.03
+
+Region = tuple[int, int, int, int]
+Seen = dict[int, TagImage | Reason]
+
+
+class TagFinder:
+    """Finds the tags of some numbers."""
+
+    def __init__(self, config: TagConfig, ids: Collection[int]) -> None:
+        """Prepare OpenCV's detector of the dictionary."""
+        self._config, self._ids = config, ids
+        parameters = cv2.aruco.DetectorParameters()
+        parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_NONE  # `measure_tag` does better
+        # Else a tag's paper, one module wider all around, is taken for the same square, and the tag is not found.
+        parameters.minMarkerDistanceRate = _APART_SHARE
+        self._detector = cv2.aruco.ArucoDetector(tags_of(config.dictionary), parameters)
+
+    def find(self, grey: ImageArray, region: Region | None = None) -> Seen:
+        """The tags in a region (left, top, right, bottom) of one eye's grey image, or why they are none."""
+        x0, y0, x1, y1 = region or (0, 0, grey.shape[1], grey.shape[0])
+        corners, ids, _ = self._detector.detectMarkers(np.ascontiguousarray(grey[y0:y1, x0:x1]))
+        tags: Seen = {}
+        for quad, id in zip(corners, _numbers(ids), strict=True):
+            if id not in self._ids:
+                continue
+            if id in tags:
+                tags[id] = Reason.AMBIGUOUS
+                continue
+            rough = np.asarray(quad, dtype=np.float64).reshape(4, 2) + np.array([x0, y0])
+            tags[id] = measure_tag(grey, id, rough, self._config)
+        return tags
+
+
+def _numbers(ids: object) -> list[int]:
+    """The tags' numbers as OpenCV tells them: an array (n, 1), or None."""
+    return [] if ids is None else [int(id) for id in np.ravel(np.asarray(ids))]
