@@ -10,17 +10,17 @@ anti-aliased edge counts by its coverage.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
-from typing import cast
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from interfaces.records import FloatArray
 
 from .colour import Float32Array, Gate
+from .limb_fit import fit_limb
+from .polar import ball_colour, mean_of_three, median, ray_angles, sample
 
 BoolArray = NDArray[np.bool_]
 
@@ -56,7 +56,9 @@ _LEAST_WAVES, _WAVE_RADIUS_PX = 4, 3.0
 # Lens and interpolation smooth along the outline too, which takes power from the quicker waves (1-sigma) [px].
 _SMOOTHING_PX = 1.0
 # What is left when all noise has averaged out [px].
-_FLOOR_PX = 0.005
+_FLOOR_PX = 0.002
+# Coverage and limb have to agree to so many of their sigmas.
+_LARGEST_CONTRADICTION = 8.0
 # Below this, relative to the cubed trace, the outline points do not determine centre and radius.
 _LEAST_DETERMINANT = 1e-5
 
@@ -125,28 +127,40 @@ def fit_outline(
         centre_px, radius_px = outline.centre_px, outline.radius_px
         if half <= _WINDOWS_PX[-1] and moved_px < _SETTLED_PX:
             break
-    return outline
+    return None if outline is None else _refined(image, gate, outline, shape)
+
+
+def _refined(image: Float32Array, gate: Gate, rough: Outline, shape: FloatArray) -> Outline | None:
+    """`rough` with the centre, radius and covariance that the limb tells; None when the two contradict each other."""
+    fitted = fit_limb(image, gate, rough.centre_px, rough.radius_px, shape)
+    if fitted is None:
+        return None
+    centre_px, radius_px, cov_px = fitted
+    cov_px = cov_px + _FLOOR_PX**2 * np.eye(2)
+    moved_px = centre_px - rough.centre_px
+    if moved_px @ np.linalg.solve(cov_px + rough.cov_px, moved_px) > _LARGEST_CONTRADICTION**2:
+        return None
+    return replace(rough, centre_px=centre_px, radius_px=radius_px, cov_px=cov_px)
 
 
 def _find_edges(
     image: Float32Array, gate: Gate, centre_px: FloatArray, radius_px: float, shape: FloatArray, half_px: float
 ) -> _Edges | None:
-    count = int(np.clip(round(2 * np.pi * radius_px), 24, 400))
-    angles: FloatArray = np.linspace(0.0, 2 * np.pi, count, endpoint=False)
+    angles = ray_angles(radius_px)
     cells = max(2, round(2 * half_px / _RING_STEP_PX))
     step = 2 * half_px / cells
     inner = np.linspace(0.3 * radius_px, radius_px - half_px, _INNER_COLUMNS)
     ring = radius_px - half_px + (np.arange(cells) + 0.5) * step
     outer = radius_px + half_px + (np.arange(round(_BACKGROUND_PX / _RING_STEP_PX)) + 0.5) * _RING_STEP_PX
-    samples = _sample(image, centre_px, angles, np.concatenate([inner, ring, outer]).astype(np.float64), shape)
+    samples = sample(image, centre_px, angles, np.concatenate([inner, ring, outer]).astype(np.float64), shape)
     inside, outside = samples[:, : len(inner)], samples[:, len(inner) + cells :]
 
-    colour = _ball_colour(inside, gate)
+    colour = ball_colour(inside, gate)
     if colour is None:
         return None
-    level = np.maximum(_mean_of_three(gate.amount(inside[:, -2:]).mean(axis=1)), 0.0)
-    covered = level < _LEAST_LEVEL * _median(level)
-    background = _mean_of_three(outside.mean(axis=1))
+    level = np.maximum(mean_of_three(gate.amount(inside[:, -2:]).mean(axis=1)), 0.0)
+    covered = level < _LEAST_LEVEL * median(level)
+    background = mean_of_three(outside.mean(axis=1))
     towards, separation = _discriminant(level, colour, background, gate.shading_sigma)
     told = (separation > _LEAST_SEPARATION**2) & ~covered
     scale = 1.0 / np.where(told, separation, 1.0)
@@ -156,26 +170,6 @@ def _find_edges(
     unevenness_px = half_px * np.sqrt(np.mean(share[:, cells:] ** 2, axis=1))
     weight = told / (1.0 + (unevenness_px / _EDGE_SIGMA_PX) ** 2)
     return _Edges(angles, distance, weight, covered, ~told | (unevenness_px > _UNEVEN_PX))
-
-
-def _sample(
-    image: Float32Array, centre_px: FloatArray, angles: FloatArray, radii: FloatArray, shape: FloatArray
-) -> Float32Array:
-    """`image` at every angle (rows) and radius (columns) of the ellipse's own polar coordinates."""
-    directions = np.stack([np.cos(angles), np.sin(angles)], axis=1) @ shape
-    at = (centre_px + directions[:, None, :] * radii[:, None]).astype(np.float32)
-    samples = cv2.remap(image, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return cast(Float32Array, samples)
-
-
-def _ball_colour(inside: Float32Array, gate: Gate) -> FloatArray | None:
-    """The ball's colour (3,) per unit of its amount; the median leaves highlights out."""
-    samples = inside.reshape(-1, 3)
-    amount = gate.amount(samples)
-    coloured = amount > 1.0
-    if np.count_nonzero(coloured) < len(amount) // 2:
-        return None
-    return np.median(samples[coloured] / amount[coloured, None], axis=0).astype(np.float64)
 
 
 def _discriminant(
@@ -200,18 +194,6 @@ def _discriminant(
     return direction, np.einsum("nc,nc->n", direction, apart)
 
 
-def _mean_of_three(values: NDArray[np.floating]) -> FloatArray:
-    """Mean over three neighbours along the closed first axis."""
-    wrapped = np.concatenate([values[-1:], values, values[:1]]).astype(np.float64)
-    return (wrapped[:-2] + wrapped[1:-1] + wrapped[2:]) / 3.0
-
-
-def _median(values: FloatArray) -> float:
-    """The upper median; NumPy's own costs ten times as much for the few values here."""
-    middle = len(values) // 2
-    return float(np.partition(values, middle)[middle])
-
-
 def _fit_circle(edges: _Edges, centre_px: FloatArray, shape: FloatArray) -> Outline | None:
     """Least squares for the centre's shift and the radius; points too far off are left out in turn."""
     design = np.stack([np.cos(edges.angles), np.sin(edges.angles), np.ones_like(edges.angles)], axis=1)
@@ -226,7 +208,7 @@ def _fit_circle(edges: _Edges, centre_px: FloatArray, shape: FloatArray) -> Outl
             return None
         solution = np.linalg.solve(normal, design.T @ (weight * edges.distance_px))
         residual = edges.distance_px - design @ solution
-        spread = 1.4826 * _median(np.abs(residual[told]))
+        spread = 1.4826 * median(np.abs(residual[told]))
         gate = min(max(_GATE_SIGMAS * spread, _LEAST_GATE_PX), _LARGEST_GATE_PX)
         used, weight = weight, np.where(np.abs(residual) < gate, edges.weight, 0.0)
     if solution[2] <= 0:
