@@ -16,7 +16,7 @@ from interfaces.records import FloatArray
 
 from .colour import Float32Array, Gate
 from .limb_filters import STEP_PX, Filters, filters, places
-from .polar import ball_colour, mean_of_three, ray_angles, sample
+from .polar import ball_colour, mean_of_three, median, ray_angles, sample
 
 # Samples on the ball that tell its colour and the noise, from this part of its radius on.
 _INNER_COLUMNS, _INNER_PART = 4, 0.3
@@ -25,7 +25,9 @@ _LEAST_NOISE, _EVEN_RAYS = 1.0, 0.3
 # Beyond so many blurs the ball no longer shows.
 _BEYOND_BLURS = 2.0
 # No ray tells its edge better than this, and one that tells it worse tells nothing [px].
-_BEST_SIGMA_PX, _WORST_SIGMA_PX = 0.02, 0.5
+_BEST_SIGMA_PX, _WORST_SIGMA_PX = 0.03, 0.5
+# An edge that is sharper than this [px] after interpolation was not anti-aliased: it is off by the more, the sharper.
+_SHARP_PX, _ALIASED = 0.52, 1.7
 # The blur changes by this factor at most from one look to the next.
 _LARGEST_WIDENING = 1.5
 
@@ -88,10 +90,11 @@ def _filtered(angles: FloatArray, rays: FloatArray, both: tuple[Filters, Filters
             widening_information += float(np.sum(contrast**2 * inverse))
     told = information > _WORST_SIGMA_PX**-2
     information[~told] = 1.0
+    best_sigma_px = _BEST_SIGMA_PX + _ALIASED * max(0.0, _SHARP_PX - blur_px)
     return Limb(
         angles,
         np.where(told, moved / information, 0.0),
-        told / (1.0 / information + _BEST_SIGMA_PX**2),
+        told / (1.0 / information + best_sigma_px**2),
         blur_px * min(max(1.0 + widening / widening_information / blur_px, 1 / _LARGEST_WIDENING), _LARGEST_WIDENING),
     )
 
@@ -113,7 +116,7 @@ def _own_colour_first(colour: FloatArray) -> FloatArray:
     if np.linalg.norm(grey) < 0.1:
         grey = np.array([1.0, 0.0, 0.0]) - own[0] * own
     grey /= np.linalg.norm(grey)
-    return np.column_stack([own, grey, np.cross(own, grey)])
+    return np.column_stack([own, grey, np.cross(own, grey)]).astype(np.float64)
 
 
 def _noise(inside: Float32Array, beyond: Float32Array) -> float:
@@ -122,7 +125,7 @@ def _noise(inside: Float32Array, beyond: Float32Array) -> float:
     Of neighbours on the ball, across its colour, shape (n, columns, 2); and, as light brings noise with it, along the
     rays of the most even part of what is beyond, shape (n, columns, 3).
     """
-    on_ball = 1.4826 * float(np.median(np.abs(np.diff(inside, axis=0)))) / math.sqrt(2.0)
+    on_ball = 1.4826 * median(np.abs(np.diff(inside, axis=0)).ravel()) / math.sqrt(2.0)
     apart = round(1.0 / STEP_PX)
     rough = mean_of_three(((beyond[:, apart:] - beyond[:, :-apart]) ** 2).mean(axis=(1, 2)))
     return max(_LEAST_NOISE, on_ball, math.sqrt(0.5 * float(np.quantile(rough, _EVEN_RAYS))))

@@ -63,7 +63,7 @@ def places(radius_px: float, blur_px: float) -> FloatArray:
     wider = max(1.0, blur_px / USUAL_BLUR_PX)
     inside = min(round(_INSIDE_PX * wider / STEP_PX), max(3, round(0.9 * radius_px / (2 * STEP_PX))))
     outside = round(_OUTSIDE_PX * wider / STEP_PX)
-    return (np.arange(-inside, outside) + 0.5) * STEP_PX
+    return np.arange(-inside + 0.5, outside) * STEP_PX
 
 
 def filters(radius_px: float, blur_px: float) -> tuple[Filters, Filters]:
@@ -97,11 +97,11 @@ def _filters(at: tuple[float, ...], radius_px: float, blur_px: float, own_colour
     rows: list[tuple[FloatArray | float, ...]] = []
     for roughness in _ROUGHNESS:
         background = _FREE + _SLOPE * np.outer(t, t) + roughness**2 * walk
-        cov = known + np.outer(beyond, beyond) * background
+        cov: FloatArray = (known + np.outer(beyond, beyond) * background).astype(np.float64)
         shift, shift_variance = _best_filter(cov + _BLUR * np.outer(wider, wider), slope)
         widening, widening_variance = _best_filter(cov + _FREE * np.outer(slope, slope), wider)
         cov += _BLUR * np.outer(wider, wider) + _FREE * np.outer(slope, slope)
-        precision = np.linalg.inv(cov)
+        precision: FloatArray = np.linalg.inv(cov).astype(np.float64)
         contrast = (level * ball - _FREE * beyond) @ precision
         log_determinant = float(np.linalg.slogdet(cov)[1])
         rows.append((precision, log_determinant, shift, shift_variance, contrast, widening, widening_variance))
@@ -110,7 +110,7 @@ def _filters(at: tuple[float, ...], radius_px: float, blur_px: float, own_colour
 
 def _best_filter(cov: FloatArray, signal: FloatArray) -> tuple[FloatArray, float]:
     """The unbiased linear filter (m,) of least variance for how much of `signal` (m,) there is, and that variance."""
-    weighted = np.linalg.solve(cov, signal)
+    weighted: FloatArray = np.linalg.solve(cov, signal).astype(np.float64)
     variance = 1.0 / float(signal @ weighted)
     return weighted * variance, variance
 

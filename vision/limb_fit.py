@@ -1,10 +1,9 @@
-"""The ellipse through a ball's limb, and how sure it is.
-
-Errors of the edge are not independent from ray to ray: neighbours share pixels and background. A shift of the centre is
-the wave that goes once round the outline. The fit has removed it, and the next ones tell its size.
-"""
+"""The ellipse through a ball's limb, and how sure it is."""
 
 from __future__ import annotations
+
+import math
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -14,83 +13,117 @@ from .colour import Float32Array, Gate
 from .limb import Limb, find_limb
 from .limb_filters import USUAL_BLUR_PX
 from .polar import median
+from .waves import Waves, waves
 
 # The limb is looked for so often at most, and is found when a look moved it and its blur less than this [px].
 _LOOKS, _SETTLED_PX, _SETTLED_BLUR_PX = 4, 0.02, 0.05
 # Blurs that are looked for [px].
-_SHARPEST_PX, _WIDEST_PX = 0.45, 3.0
+_SHARPEST_PX, _WIDEST_PX = 0.4, 3.0
 # Student's degrees of freedom of an edge's error: how little what is far off counts. Beyond this nothing counts [px].
 _FREEDOM, _FARTHEST_PX, _ROUNDS = 4.0, 1.0, 3
+# Below this, relative to the cubed trace, the limb does not determine centre and radius.
+_LEAST_DETERMINANT = 1e-6
 # A ray's samples share pixels with each other and with its neighbours': variance of even backgrounds, that the filters
 # take for 1; and how many waves that knowledge is worth.
-_SHARED_PIXELS, _WORTH = 1.7, 2.0
-# The waves that tell the covariance go up to this one, or up to radius / _WAVE_RADIUS_PX if that is more.
-_LEAST_WAVES, _WAVE_RADIUS_PX = 4, 3.0
-# Lens and interpolation smooth along the outline too, which takes power from the quicker waves (1-sigma) [px].
-_SMOOTHING_PX = 1.0
+_SHARED_PIXELS, _WORTH = 1.5, 3.0
+# Where whole arcs are farther off than so many times the variance that their samples leave open, what was fitted is no
+# ball's limb alone: something covers it, or the background goes along with it.
+_LARGEST_DENSITY = 8.0
+# What a lens leaves of its distortion makes a limb oval, by this part of its radius at most, but fits all around.
+_MOST_OVAL, _CLEAN_DENSITY = 0.015, 3.0
+
+
+@dataclass(frozen=True, slots=True)
+class Circle:
+    """The circle whose image under the ellipse's shape is the limb.
+
+    Attributes:
+        centre_px: shape (2,) [px].
+        radius_px: [px].
+        cov_px: covariance of the centre, shape (2, 2) [px²].
+        radius_sigma_px: 1-sigma of the radius [px].
+    """
+
+    centre_px: FloatArray
+    radius_px: float
+    cov_px: FloatArray
+    radius_sigma_px: float
+
+
+@dataclass(frozen=True, slots=True)
+class _Fit:
+    """Shift (2,) and growth [px] of the circle, the inverse normal matrix (3, 3) [px²], and what the waves tell."""
+
+    shift_px: FloatArray
+    growth_px: float
+    inverse: FloatArray
+    waves: Waves
 
 
 def fit_limb(
     image: Float32Array, gate: Gate, centre_px: FloatArray, radius_px: float, shape: FloatArray
-) -> tuple[FloatArray, float, FloatArray] | None:
-    """Centre (2,) [px], radius [px] and covariance of the centre (2, 2) [px²] of the ellipse through the limb.
+) -> Circle | None:
+    """The ellipse through the limb near the outline given, which is right to half a pixel or so.
 
-    None when nothing like a ball's limb is near the outline given, which is right to half a pixel or so.
+    None when nothing there is like a ball's limb, or not all around.
     """
-    blur_px, cov_px = USUAL_BLUR_PX, np.eye(2)
+    blur_px = USUAL_BLUR_PX
+    fit: _Fit | None = None
     for _ in range(_LOOKS):
         limb = find_limb(image, gate, centre_px, radius_px, shape, blur_px)
-        fitted = None if limb is None else _fit(limb, radius_px)
-        if limb is None or fitted is None:
+        fit = None if limb is None else _fit(limb, radius_px)
+        if limb is None or fit is None:
             return None
-        (*shift, wider), cov_px = fitted
-        centre_px, radius_px = centre_px + shape @ np.array(shift), radius_px + wider
+        centre_px, radius_px = centre_px + shape @ fit.shift_px, radius_px + fit.growth_px
         last_blur_px, blur_px = blur_px, min(max(limb.blur_px, _SHARPEST_PX), _WIDEST_PX)
-        if max(np.hypot(*shift), abs(wider)) < _SETTLED_PX and abs(blur_px - last_blur_px) < _SETTLED_BLUR_PX:
+        moved_px = max(float(np.linalg.norm(fit.shift_px)), abs(fit.growth_px))
+        if moved_px < _SETTLED_PX and abs(blur_px - last_blur_px) < _SETTLED_BLUR_PX:
             break
+    if fit is None or fit.waves.slow > _LARGEST_DENSITY:
+        return None
+    # What the waves show less than the pixels' noise alone makes is chance.
+    seen, count = fit.waves.once_round(), fit.waves.count
+    cov = max(seen, (count * seen + _WORTH * _SHARED_PIXELS) / (count + _WORTH)) * fit.inverse
     # A blurred disc's edge, where it is steepest, is nearer to the centre than the disc's.
-    return centre_px, radius_px + blur_px**2 / (2.0 * radius_px), shape @ cov_px @ shape
+    radius_px += blur_px**2 / (2.0 * radius_px)
+    return Circle(centre_px, radius_px, shape @ cov[:2, :2] @ shape, math.sqrt(cov[2, 2]))
 
 
-def _fit(limb: Limb, radius_px: float) -> tuple[FloatArray, FloatArray] | None:
-    """Shift (2,) and growth of the circle [px], shape (3,), and the shift's covariance (2, 2) [px²]."""
+def _fit(limb: Limb, radius_px: float) -> _Fit | None:
+    """The circle through the limb; an oval one where no circle fits, but that does all around."""
+    fit = _least_squares(limb, radius_px, oval=False)
+    if fit is None or fit.waves.slow <= _LARGEST_DENSITY:
+        return fit
+    other = _least_squares(limb, radius_px, oval=True)
+    return other if other is not None and other.waves.slow < _CLEAN_DENSITY else fit
+
+
+def _least_squares(limb: Limb, radius_px: float, *, oval: bool) -> _Fit | None:
+    """Weighted least squares; what is far off counts little."""
     design = np.stack([np.cos(limb.angles), np.sin(limb.angles), np.ones_like(limb.angles)], axis=1)
+    if oval:
+        design = np.column_stack([design, np.cos(2.0 * limb.angles), np.sin(2.0 * limb.angles)])
     told = limb.weight > 0
     if np.count_nonzero(told) < len(told) // 2:
         return None
-    used, solution, residual, normal = limb.weight, np.zeros(3), limb.offset_px, np.eye(3)
-    weight = used
+    weight = used = limb.weight
+    solution: FloatArray = np.zeros(3)
+    inverse: FloatArray = np.eye(3)
+    residual = limb.offset_px
     for _ in range(_ROUNDS):
         used = weight
         normal = (design * used[:, None]).T @ design
-        if not np.count_nonzero(used) > len(told) // 2 or np.linalg.cond(normal) > 1e5:
+        if np.count_nonzero(used) < len(told) // 2:
             return None
-        solution = np.linalg.solve(normal, design.T @ (used * limb.offset_px))
+        if np.linalg.det(normal) < _LEAST_DETERMINANT * np.trace(normal) ** len(normal):
+            return None
+        inverse = np.linalg.inv(normal).astype(np.float64)
+        solution = inverse @ (design.T @ (used * limb.offset_px))
         residual = limb.offset_px - design @ solution
         square = residual**2 * limb.weight
         usual = max(1.0, 1.4826**2 * median(square[told]))
         weight = np.where(np.abs(residual) < _FARTHEST_PX, limb.weight / (1.0 + square / usual / _FREEDOM), 0.0)
-    density = _noise_density(limb.angles, np.sqrt(used) * residual, radius_px)
-    return solution, density * np.linalg.inv(normal)[:2, :2]
-
-
-def _noise_density(angles: FloatArray, residual: FloatArray, radius_px: float) -> float:
-    """Variance of the residuals (n,), in units of their own, in the wave that goes once round the outline.
-
-    Pixel noise gives all waves the same power; what is behind the ball disturbs whole arcs and makes the slow ones
-    larger. So their excess over the quick ones counts once more.
-    """
-    last_slow = max(_LEAST_WAVES, round(radius_px / _WAVE_RADIUS_PX))
-    last_quick = max(last_slow + 1, min(2 * last_slow, round(radius_px)))
-    harmonics = np.arange(2, last_quick + 1)
-    waves = np.exp(-1j * harmonics[:, None] * angles) @ residual
-    power = np.abs(waves) ** 2 * np.exp((harmonics * _SMOOTHING_PX / radius_px) ** 2) / np.count_nonzero(residual)
-    is_slow = harmonics <= last_slow
-    share = harmonics[is_slow] ** -2.0 / np.sum(harmonics[is_slow] ** -2.0)
-    slow, quick = float(share @ power[is_slow]), float(np.mean(power[~is_slow]))
-    seen = slow + max(0.0, slow - quick)
-    # Student's t with two degrees of freedom per wave: 1-sigma of a spread that is itself estimated.
-    student = 1.0 + 0.25 * float(share @ share)
-    # What the waves show less than the pixels' noise alone makes is chance.
-    waves_seen = 1.0 / float(share @ share)
-    return student**2 * max(seen, (waves_seen * seen + _WORTH * _SHARED_PIXELS) / (waves_seen + _WORTH))
+    if np.abs(solution[3:]).max(initial=0.0) > _MOST_OVAL * radius_px:
+        return None
+    around = waves(limb.angles, np.sqrt(used) * residual, radius_px, first=3 if oval else 2)
+    return _Fit(solution[:2], float(solution[2]), inverse[:3, :3], around)

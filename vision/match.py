@@ -60,13 +60,15 @@ class StereoMatcher:
 
     def _sizes_fit(self, location: Location, left: Disc, right: Disc) -> bool:
         baseline = np.array([self._calibration.baseline_m, 0.0, 0.0])
-        ratios = []
+        ratios: list[float] = []
         for disc, x_eye in ((left, location.x), (right, location.x - baseline)):
             expected = self._eye.outline(x_eye, self._config.radius_m)
             if expected is None:
                 return False
             ratios.append(disc.radius_px / expected.radius_px)
-        between_eyes = max(ratios) / min(ratios)
+        # How far apart noise may bring the two, besides.
+        sigma = math.hypot(*(disc.radius_sigma_px / disc.radius_px for disc in (left, right)))
+        between_eyes = max(ratios) / min(ratios) / (1.0 + self._config.epipolar_sigmas * sigma)
         against_depth = max(*ratios, 1.0 / min(ratios))
         return between_eyes <= self._config.eye_size_ratio and against_depth <= self._config.depth_size_ratio
 

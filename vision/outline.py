@@ -10,6 +10,7 @@ anti-aliased edge counts by its coverage.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from itertools import combinations
 
@@ -21,6 +22,7 @@ from interfaces.records import FloatArray
 from .colour import Float32Array, Gate
 from .limb_fit import fit_limb
 from .polar import ball_colour, mean_of_three, median, ray_angles, sample
+from .waves import waves
 
 BoolArray = NDArray[np.bool_]
 
@@ -51,10 +53,6 @@ _ARCS = 10
 # About so many points are enough to tell which circle most agree on.
 _ENOUGH = 60
 _TRIPLES = np.array(list(combinations(range(_ARCS), 3)))
-# The waves that tell the covariance go up to this one, or up to radius / _WAVE_RADIUS_PX if that is more.
-_LEAST_WAVES, _WAVE_RADIUS_PX = 4, 3.0
-# Lens and interpolation smooth along the outline too, which takes power from the quicker waves (1-sigma) [px].
-_SMOOTHING_PX = 1.0
 # What is left when all noise has averaged out [px].
 _FLOOR_PX = 0.002
 # Coverage and limb have to agree to so many of their sigmas.
@@ -71,6 +69,7 @@ class Outline:
         centre_px: centre of the ellipse, shape (2,) [px].
         radius_px: radius of the circle of the same area [px].
         cov_px: covariance of the centre, shape (2, 2) [px²].
+        radius_sigma_px: 1-sigma of the radius [px].
         visible: share of the outline that nothing hides.
         uneven: share of the outline at which the background is too uneven to tell.
         off: share of the fit's weights where the outline leaves the ellipse in whole arcs.
@@ -79,6 +78,7 @@ class Outline:
     centre_px: FloatArray
     radius_px: float
     cov_px: FloatArray
+    radius_sigma_px: float
     visible: float
     uneven: float
     off: float
@@ -135,12 +135,17 @@ def _refined(image: Float32Array, gate: Gate, rough: Outline, shape: FloatArray)
     fitted = fit_limb(image, gate, rough.centre_px, rough.radius_px, shape)
     if fitted is None:
         return None
-    centre_px, radius_px, cov_px = fitted
-    cov_px = cov_px + _FLOOR_PX**2 * np.eye(2)
-    moved_px = centre_px - rough.centre_px
+    cov_px = fitted.cov_px + _FLOOR_PX**2 * np.eye(2)
+    moved_px = fitted.centre_px - rough.centre_px
     if moved_px @ np.linalg.solve(cov_px + rough.cov_px, moved_px) > _LARGEST_CONTRADICTION**2:
         return None
-    return replace(rough, centre_px=centre_px, radius_px=radius_px, cov_px=cov_px)
+    return replace(
+        rough,
+        centre_px=fitted.centre_px,
+        radius_px=fitted.radius_px,
+        cov_px=cov_px,
+        radius_sigma_px=fitted.radius_sigma_px,
+    )
 
 
 def _find_edges(
@@ -213,12 +218,14 @@ def _fit_circle(edges: _Edges, centre_px: FloatArray, shape: FloatArray) -> Outl
         used, weight = weight, np.where(np.abs(residual) < gate, edges.weight, 0.0)
     if solution[2] <= 0:
         return None
-    density = _noise_density(edges.angles, np.sqrt(used) * residual, float(solution[2]))
+    density = waves(edges.angles, np.sqrt(used) * residual, float(solution[2])).once_round()
+    inverse = density * np.linalg.inv(normal)
     hidden = edges.covered | ((weight == 0) & ~edges.uneven)
     return Outline(
         centre_px=centre_px + shape @ solution[:2],
         radius_px=float(solution[2]),
-        cov_px=density * (shape @ np.linalg.inv(normal)[:2, :2] @ shape) + _FLOOR_PX**2 * np.eye(2),
+        cov_px=shape @ inverse[:2, :2] @ shape + _FLOOR_PX**2 * np.eye(2),
+        radius_sigma_px=math.sqrt(inverse[2, 2]),
         visible=1.0 - float(np.mean(hidden)),
         uneven=float(np.mean(edges.uneven)),
         off=_share_off(edges.weight, residual),
@@ -261,24 +268,3 @@ def _agreeing(design: FloatArray, edges: _Edges) -> FloatArray:
     best = int(np.argmin(spread))
     gate = min(max(_GATE_SIGMAS * 1.4826 * float(spread[best]), _LEAST_GATE_PX), _LARGEST_GATE_PX)
     return np.where(np.abs(edges.distance_px - design @ circles[best]) < gate, edges.weight, 0.0)
-
-
-def _noise_density(angles: FloatArray, residual: FloatArray, radius_px: float) -> float:
-    """Variance [px²] of one outline point in the slow waves round the outline, of which the centre's error is one.
-
-    Neighbouring outline points share pixels and background, so their variance alone would claim too little. A
-    shift of the centre is the wave that goes once round. It was fitted away, and the next ones tell its size, the
-    nearer the better. Pixel noise gives all waves the same power; what is behind the ball disturbs whole arcs and
-    makes the slow ones larger. So their excess over the quick ones counts once more.
-    """
-    last_slow = max(_LEAST_WAVES, round(radius_px / _WAVE_RADIUS_PX))
-    last_quick = max(last_slow + 1, min(2 * last_slow, round(radius_px)))
-    harmonics = np.arange(2, last_quick + 1)
-    waves = np.exp(-1j * harmonics[:, None] * angles) @ residual
-    power = np.abs(waves) ** 2 * np.exp((harmonics * _SMOOTHING_PX / radius_px) ** 2) / np.count_nonzero(residual)
-    is_slow = harmonics <= last_slow
-    share = harmonics[is_slow] ** -2.0 / np.sum(harmonics[is_slow] ** -2.0)
-    slow, quick = float(share @ power[is_slow]), float(np.mean(power[~is_slow]))
-    # Student's t with two degrees of freedom per wave: 1-sigma of a spread that is itself estimated.
-    student = 1.0 + 0.25 * float(share @ share)
-    return student**2 * (slow + max(0.0, slow - quick))

@@ -36,7 +36,9 @@ def ball_colour(inside: Float32Array, gate: Gate) -> FloatArray | None:
     coloured = amount > 1.0
     if np.count_nonzero(coloured) < len(amount) // 2:
         return None
-    return np.median(samples[coloured] / amount[coloured, None], axis=0).astype(np.float64)
+    relative = samples[coloured] / amount[coloured, None]
+    middle = len(relative) // 2
+    return np.partition(relative, middle, axis=0)[middle].astype(np.float64)
 
 
 def mean_of_three(values: NDArray[np.floating]) -> FloatArray:
@@ -45,7 +47,7 @@ def mean_of_three(values: NDArray[np.floating]) -> FloatArray:
     return (wrapped[:-2] + wrapped[1:-1] + wrapped[2:]) / 3.0
 
 
-def median(values: FloatArray) -> float:
+def median(values: NDArray[np.floating]) -> float:
     """The upper median; NumPy's own costs ten times as much for the few values here."""
     middle = len(values) // 2
     return float(np.partition(values, middle)[middle])

@@ -1,0 +1,58 @@
+"""Errors round an outline, as waves: how large is the one that moves the centre?
+
+Neighbouring points of an outline share pixels and background, so their variance alone would claim too little. A shift
+of the centre is the wave that goes once round. The fit has removed it, and the next ones tell its size, the nearer the
+better.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from interfaces.records import FloatArray
+
+# The slow waves are so many, or up to the one of radius / _WAVE_RADIUS_PX if that is more.
+_LEAST_WAVES, _WAVE_RADIUS_PX = 3, 3.0
+# Lens and interpolation smooth along the outline too, which takes power from the quicker waves (1-sigma) [px].
+_SMOOTHING_PX = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Waves:
+    """Variances per point, in the square of the residuals' unit.
+
+    Attributes:
+        slow: in the slowest waves that the fit left in.
+        quick: in those that are quicker.
+        count: how many waves the slow ones are worth.
+    """
+
+    slow: float
+    quick: float
+    count: float
+
+    def once_round(self) -> float:
+        """Variance in the wave that goes once round.
+
+        Pixel noise gives all waves the same power; what is behind the ball disturbs whole arcs and makes the slow ones
+        larger. So their excess over the quick ones counts once more.
+        """
+        # Student's t with two degrees of freedom per wave: 1-sigma of a spread that is itself estimated.
+        return (1.0 + 0.25 / self.count) ** 2 * (self.slow + max(0.0, self.slow - self.quick))
+
+
+def waves(angles: FloatArray, residual: FloatArray, radius_px: float, first: int = 2) -> Waves:
+    """The waves in the residuals (n,) of an outline's points in the directions (n,) [rad]; 0 where there is none.
+
+    `first` is the slowest wave that the fit left in.
+    """
+    last_slow = max(first + _LEAST_WAVES - 1, round(radius_px / _WAVE_RADIUS_PX))
+    last_quick = max(last_slow + 1, min(2 * last_slow, round(radius_px)))
+    harmonics = np.arange(first, last_quick + 1)
+    parts = np.exp(-1j * harmonics[:, None] * angles) @ residual
+    power = np.abs(parts) ** 2 * np.exp((harmonics * _SMOOTHING_PX / radius_px) ** 2) / np.count_nonzero(residual)
+    is_slow = harmonics <= last_slow
+    share = harmonics[is_slow] ** -2.0 / np.sum(harmonics[is_slow] ** -2.0)
+    return Waves(float(share @ power[is_slow]), float(np.mean(power[~is_slow])), 1.0 / float(share @ share))
