@@ -26,8 +26,6 @@ _LEAST_NOISE, _EVEN_RAYS = 1.0, 0.3
 _BEYOND_BLURS = 2.0
 # No ray tells its edge better than this, and one that tells it worse tells nothing [px].
 _BEST_SIGMA_PX, _WORST_SIGMA_PX = 0.03, 0.5
-# An edge that is sharper than this [px] after interpolation was not anti-aliased: it is off by the more, the sharper.
-_SHARP_PX, _ALIASED = 0.52, 1.7
 # The blur changes by this factor at most from one look to the next.
 _LARGEST_WIDENING = 1.5
 
@@ -90,11 +88,10 @@ def _filtered(angles: FloatArray, rays: FloatArray, both: tuple[Filters, Filters
             widening_information += float(np.sum(contrast**2 * inverse))
     told = information > _WORST_SIGMA_PX**-2
     information[~told] = 1.0
-    best_sigma_px = _BEST_SIGMA_PX + _ALIASED * max(0.0, _SHARP_PX - blur_px)
     return Limb(
         angles,
         np.where(told, moved / information, 0.0),
-        told / (1.0 / information + best_sigma_px**2),
+        told / (1.0 / information + _BEST_SIGMA_PX**2),
         blur_px * min(max(1.0 + widening / widening_information / blur_px, 1 / _LARGEST_WIDENING), _LARGEST_WIDENING),
     )
 

@@ -19,16 +19,18 @@ from .waves import Waves, waves
 _LOOKS, _SETTLED_PX, _SETTLED_BLUR_PX = 4, 0.02, 0.05
 # Blurs that are looked for [px].
 _SHARPEST_PX, _WIDEST_PX = 0.4, 3.0
+# An edge sharper than this after interpolation [px] was not anti-aliased: coverage tells more than its place does.
+_ALIASED_PX = 0.55
 # Student's degrees of freedom of an edge's error: how little what is far off counts. Beyond this nothing counts [px].
 _FREEDOM, _FARTHEST_PX, _ROUNDS = 4.0, 1.0, 3
 # Below this, relative to the cubed trace, the limb does not determine centre and radius.
 _LEAST_DETERMINANT = 1e-6
 # A ray's samples share pixels with each other and with its neighbours': variance of even backgrounds, that the filters
 # take for 1; and how many waves that knowledge is worth.
-_SHARED_PIXELS, _WORTH = 1.5, 3.0
+_SHARED_PIXELS, _WORTH = 1.3, 3.0
 # Where whole arcs are farther off than so many times the variance that their samples leave open, what was fitted is no
 # ball's limb alone: something covers it, or the background goes along with it.
-_LARGEST_DENSITY = 8.0
+_LARGEST_DENSITY, _ROUGH = 20.0, 0.6
 # What a lens leaves of its distortion makes a limb oval, by this part of its radius at most, but fits all around.
 _MOST_OVAL, _CLEAN_DENSITY = 0.015, 3.0
 
@@ -42,12 +44,14 @@ class Circle:
         radius_px: [px].
         cov_px: covariance of the centre, shape (2, 2) [px²].
         radius_sigma_px: 1-sigma of the radius [px].
+        aliased: whether the image was not anti-aliased, so that all this is worth little.
     """
 
     centre_px: FloatArray
     radius_px: float
     cov_px: FloatArray
     radius_sigma_px: float
+    aliased: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,23 +83,29 @@ def fit_limb(
         moved_px = max(float(np.linalg.norm(fit.shift_px)), abs(fit.growth_px))
         if moved_px < _SETTLED_PX and abs(blur_px - last_blur_px) < _SETTLED_BLUR_PX:
             break
-    if fit is None or fit.waves.slow > _LARGEST_DENSITY:
+    aliased = blur_px < _ALIASED_PX
+    if fit is None or (_is_torn(fit.waves) and not aliased):
         return None
     # What the waves show less than the pixels' noise alone makes is chance.
     seen, count = fit.waves.once_round(), fit.waves.count
     cov = max(seen, (count * seen + _WORTH * _SHARED_PIXELS) / (count + _WORTH)) * fit.inverse
     # A blurred disc's edge, where it is steepest, is nearer to the centre than the disc's.
     radius_px += blur_px**2 / (2.0 * radius_px)
-    return Circle(centre_px, radius_px, shape @ cov[:2, :2] @ shape, math.sqrt(cov[2, 2]))
+    return Circle(centre_px, radius_px, shape @ cov[:2, :2] @ shape, math.sqrt(cov[2, 2]), aliased)
 
 
 def _fit(limb: Limb, radius_px: float) -> _Fit | None:
     """The circle through the limb; an oval one where no circle fits, but that does all around."""
     fit = _least_squares(limb, radius_px, oval=False)
-    if fit is None or fit.waves.slow <= _LARGEST_DENSITY:
+    if fit is None or not _is_torn(fit.waves):
         return fit
     other = _least_squares(limb, radius_px, oval=True)
     return other if other is not None and other.waves.slow < _CLEAN_DENSITY else fit
+
+
+def _is_torn(around: Waves) -> bool:
+    """Whether whole arcs are off; errors that change from ray to ray, as aliased pixels make them, tear nothing."""
+    return around.slow > max(_LARGEST_DENSITY, _ROUGH * around.quick)
 
 
 def _least_squares(limb: Limb, radius_px: float, *, oval: bool) -> _Fit | None:

@@ -57,6 +57,8 @@ _TRIPLES = np.array(list(combinations(range(_ARCS), 3)))
 _FLOOR_PX = 0.002
 # Coverage and limb have to agree to so many of their sigmas.
 _LARGEST_CONTRADICTION = 8.0
+# What they disagree by is claimed as uncertainty, to this part.
+_DISTRUST = 0.2
 # Below this, relative to the cubed trace, the outline points do not determine centre and radius.
 _LEAST_DETERMINANT = 1e-5
 
@@ -135,8 +137,10 @@ def _refined(image: Float32Array, gate: Gate, rough: Outline, shape: FloatArray)
     fitted = fit_limb(image, gate, rough.centre_px, rough.radius_px, shape)
     if fitted is None:
         return None
-    cov_px = fitted.cov_px + _FLOOR_PX**2 * np.eye(2)
+    if fitted.aliased:
+        return rough
     moved_px = fitted.centre_px - rough.centre_px
+    cov_px = fitted.cov_px + _FLOOR_PX**2 * np.eye(2) + _DISTRUST**2 * np.outer(moved_px, moved_px)
     if moved_px @ np.linalg.solve(cov_px + rough.cov_px, moved_px) > _LARGEST_CONTRADICTION**2:
         return None
     return replace(
