@@ -61,6 +61,11 @@ class Explanation:
         """What has no name."""
         return () if self.apart is None else self.apart.chosen
 
+    @property
+    def is_specific(self) -> bool:
+        """Whether all that has no name is as specific as what has one."""
+        return all(way.family.is_specific for way in self.unknown)
+
 
 def explain(
     found: Fit, tried: Iterable[Fit], unknowns: Unknowns, search: Search, tell: Callable[[str], None]
@@ -91,7 +96,8 @@ def explain(
         if hope - _names(fit, search) < best.worth - (_AS_GOOD if best.unknown else 0.0):
             continue
         other = _with_unknown(fit, unknowns, search)
-        better = other.worth > best.worth + (margin if best.fit is found else 0.0) or _is_as_good(other, best)
+        clearly = margin if best.fit is found and not other.is_specific else 0.0
+        better = other.worth > best.worth + clearly or _is_as_good(other, best)
         if other.apart is not None and better and unknowns.predicts(other.apart, found):
             best = other
     if best.unknown:
