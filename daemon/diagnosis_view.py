@@ -10,7 +10,7 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
-from diagnosis.numbers import chance, mm, named, numbers_of, percent, place, share, telling
+from diagnosis.numbers import chance, mm, numbers_of, percent, place, rival_named, share, telling
 from diagnosis.result import Cause, DiagnosisFile, Errors, Indistinguishable, Verdict
 from diagnosis.words import beside_geometry, modelled
 
@@ -88,7 +88,7 @@ def rival_lines(cause: Cause) -> list[str]:
 
 
 def _rival(cause: Cause, rival: Indistinguishable) -> str:
-    instead = f"{place(cause)} may be {named(rival.effect, rival.where, rival.source)} ({percent(rival.probability)})"
+    instead = f"{place(cause)} may be {rival_named(rival)} ({percent(rival.probability)})"
     if rival.by == "any_motion":
         return f"{instead}; no motion tells them apart."
     return f"{instead}; another motion can tell."

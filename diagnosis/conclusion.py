@@ -112,6 +112,8 @@ def _causes(diagnosis: Diagnosis) -> tuple[Cause, ...]:
 def _named(rival: Rival) -> Indistinguishable:
     effect = rival.effect
     by = "any_motion" if rival.is_same_anywhere else "this_motion"
+    if effect is None:
+        return Indistinguishable("unexplained", None, None, by, rival.probability, rival.described)
     return Indistinguishable(effect.name, effect.where, effect.source, by, rival.probability)
 
 

@@ -209,7 +209,7 @@ def diagnose(
     unknowns, blocks = Unknowns(start), blocks or Blocks.cut(len(recording))
     explanation = explain(extended, search.path, unknowns, search, tell)
     tell("asking what else it could be")
-    stands = standings(explanation.beside, search, blocks, seed)
+    stands = standings(explanation.beside, search, blocks, seed, None if explanation.unknown else unknowns)
     while explanation.unknown and any(standing.probability < _HALF for standing in stands):
         weakest = int(np.argmin([standing.probability for standing in stands]))
         fewer = without_one(explanation, explanation.fit.causes[weakest], unknowns, search)

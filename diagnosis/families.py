@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from itertools import combinations_with_replacement
+from itertools import combinations_with_replacement, product
 from typing import Literal
 
 import numpy as np
@@ -107,12 +107,12 @@ def _giving(run: Simulated, k: int) -> list[Family]:
     """What carries a joint gives under the arm's weight: in any way, or by springs along and about axes."""
     what = f"what carries {run.simulation.robot.joints[k]} gives under the arm's weight"
     found = [Family(what, "body", None, (), False, _link(k), loads) for loads in (_moments(k), _wrenches(k))]
-    for T in (np.eye(4), *run.simulation.gravity.in_supports(k)):
+    supports = run.simulation.gravity.in_supports(k)
+    for T in (np.eye(4), *supports):
+        found.append(Family(what, "body", None, (), False, _link_about(k, T), _own_loads(k, T), ties=np.eye(6)))
+    for T, ties in product(supports if run.simulation.bears_weight else (), (_TILT, _TILT_AND_SINK)):
         moves, loads = _link_about(k, T), _own_loads(k, T)
-        found.append(Family(what, "body", None, (), False, moves, loads, ties=np.eye(6)))
-        if run.simulation.bears_weight:
-            alike = (Family(what, "body", None, (), False, moves, loads, ties, True) for ties in (_TILT, _TILT_AND_SINK))
-            found += alike
+        found.append(Family(what, "body", None, (), False, moves, loads, ties, is_specific=True))
     return found
 
 

@@ -28,8 +28,10 @@ class Indistinguishable(msgspec.Struct, frozen=True):
     """What a cause cannot be told from.
 
     Attributes:
+        effect: its name; "unexplained" where it has none.
         by: "this_motion" where another motion would tell them apart, "any_motion" where none would.
         probability: that it is this one.
+        what: in words, where it has no name.
     """
 
     effect: str
@@ -37,6 +39,7 @@ class Indistinguishable(msgspec.Struct, frozen=True):
     source: str | None
     by: Literal["this_motion", "any_motion"]
     probability: float
+    what: str = ""
 
 
 class Cause(msgspec.Struct, frozen=True):

@@ -21,7 +21,7 @@ from .observations import Observations
 from .search import nats
 
 # What has no name has to be so much more probable than what has one, and what is as specific as that [nats].
-_NO_NAME, _SPECIFIC = 8.0, 6.0
+_NO_NAME, SPECIFIC = 8.0, 5.0
 # What one of its numbers costs [nats].
 _NUMBER = 2.0
 # Directions of a family's columns of which less is left, as a share of the strongest and of the whole, tell nothing.
@@ -128,7 +128,7 @@ class Unknowns:
 
     def beside(self, fit: Fit, others: Sequence[Way] = ()) -> tuple[FloatArray, FloatArray]:
         """An orthonormal basis (3 n, r) of what `fit` and some ways can change, and what they leave (3 n,)."""
-        basis = fit.orthogonal.reshape(fit.left.size, -1)
+        basis = basis_of(fit)
         for way in others:
             basis = np.concatenate([basis, self._fresh(fit, basis, way)], axis=1)
         left = fit.left.ravel()
@@ -163,9 +163,23 @@ class Unknowns:
         ranked = [one for one in ranked[:_NEAREST] if one[0] > _NEAR * ranked[0][0] or one is ranked[0]]
         return [(way if part is None else way.along(part), worth) for worth, way, part in ranked]
 
+    def specific(self, fit: Fit, least: float) -> list[Way]:
+        """The ways as specific as an effect with a name that explain most beside a fit, the most first.
+
+        Args:
+            least: twice the log-likelihood that they have to bring, to first order.
+        """
+        basis, left = basis_of(fit), fit.left.ravel() / fit.noise.sigma
+        ranked = [
+            (float(np.square(self._fresh(fit, basis, way).T @ left).sum()), k)
+            for k, way in enumerate(self._ways)
+            if way.family.is_specific
+        ]
+        return [self._ways[k] for gain, k in sorted(ranked, reverse=True)[:_NEAREST] if gain >= least]
+
     def _doubt_of(self, way: Way) -> float:
         """What having looked for it among all others costs [nats]."""
-        return self._doubt + (_SPECIFIC if way.family.is_specific else _NO_NAME)
+        return self._doubt + (SPECIFIC if way.family.is_specific else _NO_NAME)
 
     def apart(self, fit: Fit, chosen: Sequence[Way], start: Apart | None = None) -> Apart:
         """The causes of a fit and ways to differ, fitted in turn to what the others leave.
@@ -207,7 +221,7 @@ class Unknowns:
     def _beside(self, apart: Apart) -> tuple[FloatArray, FloatArray]:
         """Squared lengths (r,) of what ways change beside the causes, and by which of their numbers (p, r)."""
         fit = apart.fit
-        basis = fit.orthogonal.reshape(fit.left.size, -1)
+        basis = basis_of(fit)
         return _directions(np.concatenate([way.columns for way in apart.chosen], axis=1), fit, basis)[1:]
 
     def predicts(self, apart: Apart, alone: Fit) -> bool:
@@ -231,7 +245,7 @@ class Unknowns:
     def _step(self, here: Apart) -> tuple[FloatArray, ...]:
         """The numbers of families that explain most of what the causes leave and are not larger than they can be."""
         fit, counts = here.fit, [len(number) for number in here.numbers]
-        basis = fit.orthogonal.reshape(fit.left.size, -1)
+        basis = basis_of(fit)
         weights = np.repeat(fit.root_weights[:, 0], 3)[:, None]
         columns = np.concatenate([way.columns for way in here.chosen], axis=1) * weights
         columns = columns - basis @ (basis.T @ columns)
@@ -269,6 +283,11 @@ class Unknowns:
         """An orthonormal basis (3 n, r) of what a way changes beside a basis."""
         columns, values, mix = _directions(way.columns, fit, basis)
         return columns @ (mix / np.sqrt(values))
+
+
+def basis_of(fit: Fit) -> FloatArray:
+    """An orthonormal basis (3 n, r) of what the amounts of a fit can change."""
+    return fit.orthogonal.reshape(fit.left.size, -1)
 
 
 def _directions(columns: FloatArray, fit: Fit, basis: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -166,5 +166,4 @@ def evidence(standing: Standing) -> str:
     if not standing.rivals:
         return f"{text}; nothing else comes near."
     rival = standing.rivals[0]
-    place = "" if rival.effect.where is None else f" at {rival.effect.where}"
-    return f"{text}; the nearest rival is {rival.effect.name}{place} ({100 * rival.probability:.0f} %)."
+    return f"{text}; the nearest rival: {rival.described} ({100 * rival.probability:.0f} %)."
