@@ -151,8 +151,12 @@ def _rejected(diagnosis: DiagnosisFile) -> Table:
     table.add_column("effect", overflow="fold")
     table.add_column("would gain", justify="right", no_wrap=True)
     table.add_column("p-value", justify="right", no_wrap=True)
-    for row in diagnosis.rejected[:NEAREST]:
-        table.add_row(Text(place(row)), f"{row.held_out_gain_percent:+.2f} %", chance(row.p_value))
+    shown = diagnosis.rejected[:NEAREST]
+    if any(row.why for row in shown):
+        table.add_column("and yet", overflow="fold")
+    for row in shown:
+        why = [row.why] if any(other.why for other in shown) else []
+        table.add_row(Text(place(row)), f"{row.held_out_gain_percent:+.2f} %", chance(row.p_value), *why)
     return table
 
 

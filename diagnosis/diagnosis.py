@@ -59,6 +59,7 @@ class Diagnosis:
         left: what no effect fits.
         blocks: of time, by which rows were held out.
         seed: of the resampling.
+        ended_early: whether the search for causes ended at its longest, so that there may be more.
     """
 
     hypotheses: Hypotheses
@@ -70,6 +71,7 @@ class Diagnosis:
     left: Leftover
     blocks: Blocks
     seed: int
+    ended_early: bool = False
 
     @property
     def causes(self) -> tuple[Effect, ...]:
@@ -82,6 +84,13 @@ class Diagnosis:
         fits = {"nominal": self.nominal, "aligned": self.aligned, "geometry": self.geometry}
         errors = {name: held_out_errors(fit, self.blocks) for name, fit in fits.items()}
         return errors | {"extended": self._extended_errors(self.extended)}
+
+    @cached_property
+    def with_names_alone(self) -> FloatArray | None:
+        """Distances (n,) [m] with the causes and no model of what has no name; None where there is no such model."""
+        if self.left.model is None or self.left.model.stored is None:
+            return None
+        return np.linalg.norm(held_out_errors(self.aligned.with_causes(self.causes), self.blocks), axis=1)
 
     def _extended_errors(self, fit: Fit) -> FloatArray:
         """Measured minus predicted (n, 3) [m] on rows that causes and smooth model have not seen."""
@@ -228,6 +237,7 @@ def diagnose(
         left=left,
         blocks=blocks,
         seed=seed,
+        ended_early=search.ended_early,
     )
 
 

@@ -68,6 +68,4 @@ class Nameless:
     def columns(self, motion: Motion) -> FloatArray:
         """Derivatives (n, 3, p) [m] of it by the amounts of the causes and by its own numbers."""
         run, (way,) = self.apart.fit.simulation.run(motion), self.apart.chosen
-        return np.concatenate(
-            [amount_columns(run, self.apart.fit.simulation.effects), way.family.columns(run)], axis=2
-        )
+        return np.concatenate([amount_columns(run, self.apart.fit.simulation.effects), way.family.columns(run)], axis=2)

@@ -68,6 +68,7 @@ class Rejected(msgspec.Struct, frozen=True):
     Attributes:
         held_out_gain_percent: what it would bring on top of the causes.
         p_value: of no gain at all, for all hypotheses that were tried together.
+        why: it is no cause although chance hardly brings so much about; nothing where chance may.
     """
 
     effect: str
@@ -75,6 +76,7 @@ class Rejected(msgspec.Struct, frozen=True):
     source: str | None
     held_out_gain_percent: float
     p_value: float
+    why: str = ""
 
 
 class Alike(msgspec.Struct, frozen=True):
