@@ -204,8 +204,8 @@ class _Columns:
     def changed(self) -> set[_Columns]:
         """All in which one joint more or all count the other way, two are exchanged, or positions are mirrored."""
         joints = range(len(self.order))
-        turned = {replace(self, signs=_replaced(self.signs, {k: -self.signs[k]})) for k in joints}
-        exchanged = {
+        turned: set[_Columns] = {replace(self, signs=_replaced(self.signs, {k: -self.signs[k]})) for k in joints}
+        exchanged: set[_Columns] = {
             replace(
                 self,
                 order=_replaced(self.order, {j: self.order[k], k: self.order[j]}),
@@ -213,7 +213,7 @@ class _Columns:
             )
             for j, k in itertools.combinations(joints, 2)
         }
-        as_a_whole = {
+        as_a_whole: set[_Columns] = {
             replace(self, signs=tuple(-sign for sign in self.signs)),
             replace(self, mirrored=not self.mirrored),
         }

@@ -128,7 +128,7 @@ def sentence(verdict: Verdict, causes: Sequence[Cause], rms: Errors, gain: Gain,
         alone = replace(gain, held_out_percent=100.0 * (1.0 - named_mm / max(rms.aligned, 1e-12)))
         figures = f"{rms.aligned:.3g} mm → {named_mm:.3g} mm → {rms.extended:.3g} mm on data not used in the fit"
         return (
-            f"{head}: {what} {_share(alone)}, with a smooth model of what has no name {_share(gain)} "
+            f"{head}: {what} {_share(alone)}, and {_share(gain)} with a smooth model of what has no name "
             f"({figures}){ends[verdict]}"
         )
     if gain.held_out_percent <= 0.0:
@@ -165,7 +165,8 @@ def modelled(left: Unexplained) -> str:
         over = "the marker's place" if left.model_joints == PLACE else f"the readings of {', '.join(left.model_joints)}"
         told.append(f"extended.toml has a smooth model of it over {over}, as good as the recording is dense.")
     elif left.what:
-        told.append("extended.toml has no model of it.")
+        why = "" if left.not_in_model else ": none is right on pairs that it was not fitted to. More pairs may tell one"
+        told.append(f"extended.toml has no model of it{why}.")
     if left.not_in_model:
         told.append(
             f"What changes with time is in no such model: {'; '.join(left.not_in_model)}. Another recording will "

@@ -78,7 +78,8 @@ def _rival(rival: Indistinguishable) -> str:
 def hypotheses(rejected: Sequence[Rejected]) -> str:
     """What was looked for and is not there, the nearest first, the rest folded away."""
     rows = [
-        f"<tr><td>{escape(place(row))}<td>{row.held_out_gain_percent:+.2f} %<td>{chance(row.p_value)}<td>{escape(row.why)}</tr>"
+        f"<tr><td>{escape(place(row))}<td>{row.held_out_gain_percent:+.2f} %<td>{chance(row.p_value)}"
+        f"<td>{escape(row.why)}</tr>"
         for row in rejected
     ]
     heads = ("Not there", "would gain, held out", "p-value, corrected", "and yet")
