@@ -8,7 +8,8 @@ from effects import Effect
 from interfaces.records import FloatArray
 
 from .advice import advice
-from .diagnosis import Diagnosis
+from .contact import before_contact
+from .diagnosis import MOST_DOUBTFUL, Diagnosis
 from .result import (
     Alike,
     Cause,
@@ -211,10 +212,18 @@ def _why_not(diagnosis: Diagnosis, candidate: Candidate, tried: int) -> str:
 
 
 def _limitations(diagnosis: Diagnosis) -> tuple[str, ...]:
-    told = diagnosis.hypotheses.limitations
-    if not diagnosis.ended_early:
-        return told
-    return (*told, f"The search ended at its longest, with {len(diagnosis.causes)} causes: there may be more of them.")
+    told = list(diagnosis.hypotheses.limitations)
+    unknown_side = before_contact(diagnosis.extended).mean()
+    if unknown_side > MOST_DOUBTFUL:
+        joints = ", ".join(str(cause.where) for cause in diagnosis.causes if cause.name == "backlash")
+        told.append(
+            f"At {100.0 * unknown_side:.0f} % of the pairs nobody knows on which side of its play {joints} stands: "
+            "few runs cross it. What seems to jump or to change with time there may be that. Record longer runs, "
+            "and move the joint to and fro in each."
+        )
+    if diagnosis.ended_early:
+        told.append(f"The search ended at its longest, with {len(diagnosis.causes)} causes: there may be more of them.")
+    return tuple(told)
 
 
 def _alike(diagnosis: Diagnosis) -> tuple[Alike, ...]:

@@ -38,7 +38,7 @@ _MOSTLY = 0.8
 # How far off, in units of what depends on the way between two readings, is farther than that way can explain.
 _BY_SO_MUCH = 4.0
 # Where more rows than this are doubtful, leaving them out costs more than they do harm.
-_MOST_DOUBTFUL = 0.25
+MOST_DOUBTFUL = 0.25
 # Beside what has no name a cause stays named only if it is more probable than not.
 _HALF = 0.5
 # Of the instrument's noise, another size than that is taken up (in logarithms).
@@ -208,7 +208,7 @@ def diagnose(
     search = Search(hypotheses.effects, tell)
     extended = search.run(start)
     factor, unknown_side = instrument_factor(extended), before_contact(extended)
-    doubtful = unknown_side if unknown_side.mean() <= _MOST_DOUBTFUL else np.zeros_like(unknown_side)
+    doubtful = unknown_side if unknown_side.mean() <= MOST_DOUBTFUL else np.zeros_like(unknown_side)
     if abs(np.log(factor)) > _SAME_NOISE or doubtful.any():
         observations = observations.with_factor(factor).without(doubtful)
         start = aligned(observations, simulation)
