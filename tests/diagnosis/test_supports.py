@@ -6,9 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from planted_cases import ELBOW, SHOULDER, SIGMA_M, measured, seen, walk
+from planted_cases import DESK_ARM, ELBOW, SHOULDER, SIGMA_M, measured, seen, walk
 from scipy.spatial.transform import Rotation
-from walked import DESK_ARM
 
 from diagnosis.conclusion import conclusion
 from diagnosis.diagnosis import diagnose
