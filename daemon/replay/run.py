@@ -161,7 +161,7 @@ def _doubt(job: Job, before: FloatArray) -> str | None:
     left_m = np.linalg.norm(before - held_out.x, axis=1)
     if not is_far_off(robot, left_m, job.sigma_m, share=FAR_OFF_AS_DRAWN):
         return None
-    return f"So far apart is no arm from its drawing. {mixed_up(robot, job.learnt_rows) or OTHER_CAUSES}."
+    return f"So far apart is no arm from its drawing. {mixed_up(robot, job.learnt_rows, job.sigma_m) or OTHER_CAUSES}."
 
 
 class _Live:
