@@ -35,6 +35,7 @@ COMMANDS = {
     "sampler": "Only the sampler: encoders and cameras in, pairs out.",
     "learner": "Only the learner: pairs in, answers out. On any machine.",
     "status": "What both processes do and found, and if it is enough.",
+    "view": "A page: errors, where to move next, residuals, buttons.",
     "predict": "Ask where the marker is at given joint angles.",
     "ik": "Ask for joint angles that bring the marker to a position.",
     "command": "Pause, resume, tell of a changed tool, reset, checkpoint.",
