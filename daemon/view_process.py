@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
+import logging
+import os
+import subprocess
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
 
+from daemon.signals import with_parent
 from interfaces.errors import ConfigError
 
+log = logging.getLogger(__name__)
+
+END_LIMIT_S = 5.0
 PORT = 8420
 NEEDED = ("starlette", "uvicorn")
 
@@ -21,3 +30,25 @@ def require_extra() -> None:
 def view_command(robot_file: Path) -> list[str]:
     """The command line that shows this robot's page."""
     return [sys.executable, "-m", "daemon", "view", "--robot", str(robot_file)]
+
+
+@contextmanager
+def shown(robot_file: Path) -> Iterator[None]:
+    """The page beside this process, from here to the end of the with statement.
+
+    What becomes of the page is no matter of life for whoever is shown: a port that is taken is a line in the log.
+    """
+    process = subprocess.Popen(
+        view_command(robot_file), stdin=subprocess.DEVNULL, env=os.environ | with_parent(), process_group=0
+    )
+    try:
+        yield
+    finally:
+        process.terminate()
+        try:
+            code = process.wait(END_LIMIT_S)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            code = process.wait()
+        if code > 0:
+            log.warning("the page had ended with exit code %d; its message is above", code)

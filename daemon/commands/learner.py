@@ -15,6 +15,7 @@ def learner(
     *,
     robot: RobotFile = HERE,
     state_dir: Annotated[Path | None, Parameter(help="Where the checkpoint lives; else as robot.toml says.")] = None,
+    view: Annotated[bool, flag("Show the page of `bodyschema view` too, as a process of its own.")] = False,
     verbose: Annotated[bool, flag("Log more.")] = False,
 ) -> None:
     """Learn the robot's kinematics and answer queries. Ends with SIGTERM or Ctrl-C.
@@ -27,10 +28,13 @@ def learner(
     """
     # Before numpy is loaded: its threads would fight with each other and with the answers for the cores.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    from contextlib import ExitStack
+
     from daemon import logs
     from daemon.config import Config
     from daemon.learner import run_learner
     from daemon.signals import on_termination
+    from daemon.view_process import require_extra, shown
     from interfaces.clock import SystemClock
 
     logs.set_up(verbose=verbose)
@@ -38,8 +42,13 @@ def learner(
     config.require_learnable()
     if state_dir is not None:
         config = config.with_state_dir(state_dir)
+    if view:
+        require_extra()
     ending = Ending()
-    with on_termination(ending.begin):
+    with ExitStack() as stack:
+        if view:
+            stack.enter_context(shown(robot))
+        stack.enter_context(on_termination(ending.begin))
         run_learner(config, SystemClock(), lambda: ending.begun)
 
 
