@@ -141,9 +141,11 @@ async def _events(hub: Hub) -> AsyncIterator[bytes]:
     """Server-sent events: each new document under its topic, until the hub is closed."""
     with hub.following() as follower:
         yield f"retry: {RETRY_MS}\n\n".encode()
-        while not hub.closed:
+        while True:
             news = await follower.take(HEARTBEAT_S)
             if not news:
                 yield b": still here\n\n"
             for topic, document in news.items():
                 yield b"event: %s\ndata: %s\n\n" % (topic.encode(), document)
+            if hub.closed:
+                return

@@ -27,8 +27,9 @@ class Series:
         predict_s: float | None,
     ) -> None:
         """The figures at one time, as in `SeriesDocument`; not every one is kept."""
+        is_kept = self._offered % self._stride == 0
         self._offered += 1
-        if self._offered % self._stride:
+        if not is_kept:
             return
         self._rows.append((t, error_m, claimed_m, pairs_per_s, predict_s))
         if len(self._rows) > LARGEST_SERIES:

@@ -48,8 +48,8 @@ class Chart {
   }
 
   size() {
-    const legend = this.key.includes("bare") ? 0 : 34;
-    return { width: this.place.clientWidth, height: this.place.clientHeight - legend };
+    const height = Number(getComputedStyle(this.place).getPropertyValue("--height"));
+    return { width: this.place.clientWidth, height };
   }
 
   fit() {
@@ -153,7 +153,7 @@ export class LatencyChart {
 
   update(state) {
     const { t = [], predict_s: took = [] } = state.series ?? {};
-    this.chart.show([t, took], "bare");
+    this.chart.show([t, took]);
     const answered = took.filter((value) => value !== null).sort((a, b) => a - b);
     if (!answered.length) return;
     const at = (share) => answered[Math.min(answered.length - 1, Math.floor(share * answered.length))];

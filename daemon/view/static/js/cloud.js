@@ -95,7 +95,7 @@ export class Cloud {
     const { x, residual, segment } = this.document;
     const [low, high] = box(x);
     const size = Math.hypot(...high.map((value, k) => value - low[k])) || 1;
-    const factor = (1.15 * this.view.zoom * Math.min(width, height)) / size;
+    const factor = (0.98 * this.view.zoom * Math.min(width, height)) / size;
     const middle = low.map((value, k) => (value + high[k]) / 2);
     const project = this.projection(middle, factor, width, height);
     this.frame(pen, project, low, high);

@@ -86,7 +86,7 @@ export function segments({ segments: found }) {
   const newest = [...(found ?? [])].reverse();
   const most = Math.max(1, ...newest.map((segment) => segment.pairs));
   const rows = newest.map((segment, k) => {
-    const made = row(String(segment.segment), `${segment.complete ? "" : "≥ "}${whole(segment.pairs)}`, barCell(segment.pairs / most), span(segment.lasted_s), clock(Date.parse(segment.utc) / 1e3));
+    const made = row(String(segment.segment), `${segment.complete ? "" : "≥ "}${whole(segment.pairs)}`, barCell(segment.pairs / most), segment.pairs > 1 ? span(segment.lasted_s) : "–", clock(Date.parse(segment.utc) / 1e3));
     if (k === 0) made.className = "now";
     return made;
   });
