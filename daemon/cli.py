@@ -40,7 +40,7 @@ COMMANDS = {
     "ik": "Ask for joint angles that bring the marker to a position.",
     "command": "Pause, resume, tell of a changed tool, reset, checkpoint.",
     "record": "Copy the running sampler's pairs into a file.",
-    "export": "Turn a store or a recording into CSV, Parquet or MCAP.",
+    "export": "A store or a recording into CSV, Parquet, MCAP or Rerun.",
 }
 
 

@@ -27,22 +27,16 @@ def require_extra() -> None:
         raise ConfigError("the page needs the extra `view`", remedy="Install it: `pip install 'bodyschema[view]'`")
 
 
-def view_command(robot_file: Path) -> list[str]:
-    """The command line that shows this robot's page."""
-    return [sys.executable, "-m", "daemon", "view", "--robot", str(robot_file)]
-
-
 @contextmanager
-def shown(robot_file: Path) -> Iterator[None]:
+def shown(robot_file: Path, port: int = PORT) -> Iterator[subprocess.Popen[bytes]]:
     """The page beside this process, from here to the end of the with statement.
 
     What becomes of the page is no matter of life for whoever is shown: a port that is taken is a line in the log.
     """
-    process = subprocess.Popen(
-        view_command(robot_file), stdin=subprocess.DEVNULL, env=os.environ | with_parent(), process_group=0
-    )
+    command = [sys.executable, "-m", "daemon", "view", "--robot", str(robot_file), "--port", str(port)]
+    process = subprocess.Popen(command, stdin=subprocess.DEVNULL, env=os.environ | with_parent(), process_group=0)
     try:
-        yield
+        yield process
     finally:
         process.terminate()
         try:

@@ -28,7 +28,7 @@ def learner(
     """
     # Before numpy is loaded: its threads would fight with each other and with the answers for the cores.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    from contextlib import ExitStack
+    from contextlib import nullcontext
 
     from daemon import logs
     from daemon.config import Config
@@ -37,18 +37,15 @@ def learner(
     from daemon.view_process import require_extra, shown
     from interfaces.clock import SystemClock
 
+    if view:
+        require_extra()
     logs.set_up(verbose=verbose)
     config = Config.load(robot)
     config.require_learnable()
     if state_dir is not None:
         config = config.with_state_dir(state_dir)
-    if view:
-        require_extra()
     ending = Ending()
-    with ExitStack() as stack:
-        if view:
-            stack.enter_context(shown(robot))
-        stack.enter_context(on_termination(ending.begin))
+    with shown(robot) if view else nullcontext(), on_termination(ending.begin):
         run_learner(config, SystemClock(), lambda: ending.begun)
 
 

@@ -25,25 +25,26 @@ def run(
 
     Next: in another terminal, `bodyschema status --watch`, `bodyschema view` and `bodyschema predict`.
     """
+    from contextlib import nullcontext
+
     from daemon import logs
     from daemon.config import Config
     from daemon.signals import on_termination
     from daemon.supervise import Child, Supervisor
-    from daemon.view_process import require_extra, view_command
+    from daemon.view_process import require_extra, shown
     from daemon.wiring import check_sources
 
+    if view:
+        require_extra()
     logs.set_up(verbose=verbose)
     config = Config.load(robot)
     config.require_learnable()
     check_sources(config, sim=sim)
-    if view:
-        require_extra()
     options = ["--robot", str(robot), *(["--state-dir", str(state_dir)] if state_dir else [])]
     options += ["--verbose"] if verbose else []
     python = [sys.executable, "-m", "daemon"]
     sampler = Child("sampler", [*python, "sampler", *options, *(["--sim"] if sim else [])])
     learner = Child("learner", [*python, "learner", *options])
-    page = [Child("view", view_command(robot))] if view else []
-    supervisor = Supervisor([sampler, learner, *page])
-    with on_termination(supervisor.stop):
+    supervisor = Supervisor([sampler, learner])
+    with shown(robot) if view else nullcontext(), on_termination(supervisor.stop):
         supervisor.run()

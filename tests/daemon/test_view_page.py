@@ -98,7 +98,8 @@ def test_this_machine_s_names_are_served_on_any_port_so_that_a_tunnel_works(ask,
     ("method", "address"), [("POST", "/api/command"), ("POST", "/api/diagnosis"), ("DELETE", "/api/diagnosis")]
 )
 @pytest.mark.parametrize(
-    "origin", ["http://evil.example", "null", "https://127.0.0.1:8420", "http://127.0.0.1:9999", "http://localhost:8420"]
+    "origin",
+    ["http://evil.example", "null", "https://127.0.0.1:8420", "http://127.0.0.1:9999", "http://localhost:8420"],
 )
 def test_another_page_s_button_does_nothing(ask, processes, method: str, address: str, origin: str) -> None:
     assert ask(method, address, {"Origin": origin}, json=PAUSE).status_code == 403
@@ -236,7 +237,8 @@ def test_what_did_not_change_is_not_sent_again(hub) -> None:
 
 
 PAGE = (STATIC / "index.html").read_text(encoding="utf-8")
-OURS = sorted(file for file in STATIC.rglob("*") if file.suffix in (".js", ".css", ".html") and "vendor" not in file.parts)
+KINDS = (".html", ".css", ".js")
+OURS = sorted(file for file in STATIC.rglob("*") if file.suffix in KINDS and "vendor" not in file.parts)
 
 
 def test_the_page_has_every_element_that_its_scripts_ask_for() -> None:

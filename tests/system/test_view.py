@@ -195,7 +195,8 @@ def test_nothing_is_wider_than_the_screen_and_all_text_can_be_read(browser, addr
 CONTRASTS = """() => {
   const numbers = (color) => color.match(/[\\d.]+/g).map(Number);
   const light = (color) => {
-    const [r, g, b] = numbers(color).slice(0, 3).map((c) => (c /= 255) <= 0.04045 ? c / 12.92 : ((c + 0.055) / 1.055) ** 2.4);
+    const linear = (c) => (c <= 0.04045 ? c / 12.92 : ((c + 0.055) / 1.055) ** 2.4);
+    const [r, g, b] = numbers(color).slice(0, 3).map((c) => linear(c / 255));
     return 0.2126 * r + 0.7152 * g + 0.0722 * b;
   };
   const ground = (e) => {
@@ -210,7 +211,7 @@ CONTRASTS = """() => {
     const own = [...e.childNodes].some((n) => n.nodeType === 3 && n.data.trim());
     if (!own || !e.checkVisibility() || e.disabled || e.closest("svg")) continue;
     const [a, b] = [light(getComputedStyle(e).color), light(ground(e))].sort((x, y) => y - x);
-    if ((a + 0.05) / (b + 0.05) < 4.5) poor.push(`${e.tagName} ${e.id || e.className} ${e.textContent.trim().slice(0, 30)}`);
+    if ((a + 0.05) / (b + 0.05) < 4.5) poor.push(`${e.tagName} ${e.id || e.className}: ${e.textContent}`);
   }
   return poor;
 }"""
