@@ -66,6 +66,7 @@ def serve(config: Config, port: int, ready: Callable[[str], None]) -> None:
                 access_log=False,
                 log_config=None,
                 server_header=False,
+                proxy_headers=False,
                 limit_concurrency=MOST_CONNECTIONS,
                 timeout_graceful_shutdown=END_LIMIT_S,
             )

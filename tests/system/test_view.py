@@ -37,18 +37,25 @@ pytestmark = [
 SIZES = {"desktop": {"width": 1280, "height": 900}, "phone": {"width": 360, "height": 740}}
 
 
-@contextmanager
-def page_server(robot: Path) -> Iterator[str]:
-    """`bodyschema view`; its address."""
-    command = [sys.executable, "-m", "daemon", "view", "--robot", str(robot), "--port", "0"]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
-    try:
-        assert process.stdout is not None
-        yield re.findall(r"http://\S+", process.stdout.readline())[0]
-    finally:
-        process.terminate()
-        assert process.wait(30) == 0
-        process.stdout.close()
+class PageServer:
+    """`bodyschema view` on a port of its own, which can be ended and started again."""
+
+    def __init__(self, robot: Path, port: str) -> None:
+        self._command = [sys.executable, "-m", "daemon", "view", "--robot", str(robot), "--port", port]
+        self.address = f"http://127.0.0.1:{port}/"
+        self.start()
+
+    def start(self) -> None:
+        """Return when a browser may ask."""
+        self._process = subprocess.Popen(self._command, stdout=subprocess.PIPE, text=True)
+        assert self._process.stdout is not None
+        assert self._process.stdout.readline() == f"look at {self.address}\n"
+
+    def end(self) -> None:
+        """By SIGTERM, in order, whoever looks."""
+        self._process.terminate()
+        assert self._process.wait(60) == 0
+        self._process.communicate()
 
 
 @pytest.fixture(scope="module")
@@ -62,9 +69,15 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Scene]:
 
 
 @pytest.fixture(scope="module")
-def address(scene: Scene) -> Iterator[str]:
-    with page_server(scene.robot_file) as address:
-        yield address
+def server(scene: Scene, free_endpoint) -> Iterator[PageServer]:
+    server = PageServer(scene.robot_file, free_endpoint().rpartition(":")[2])
+    yield server
+    server.end()
+
+
+@pytest.fixture(scope="module")
+def address(server: PageServer) -> str:
+    return server.address
 
 
 @pytest.fixture(scope="module")
@@ -152,6 +165,15 @@ def test_a_changed_tool_is_asked_for_twice_and_then_marked(page) -> None:
     says(page, "#versions", "new tool")
 
 
+def test_a_diagnosis_is_begun_and_stopped_by_buttons(page) -> None:
+    page.click("#diagnose")
+    says(page, "#diagnosis", r"Diagnosis of the newest [\d,]+ pairs")
+    expect(page.locator("#diagnose")).to_be_disabled()
+    page.click("#diagnosis-stop")
+    says(page, "#diagnosis", "The diagnosis was stopped")
+    expect(page.locator("#diagnose")).to_be_enabled()
+
+
 def test_a_learner_that_is_silent_is_named_and_the_page_goes_on_when_it_is_back(page, scene: Scene) -> None:
     says(page, "#pill-learner", "learning")
     learner = child_of("learner", scene.robot_file)
@@ -217,21 +239,15 @@ CONTRASTS = """() => {
 }"""
 
 
-def test_a_page_s_server_that_ends_is_named_and_comes_back_by_itself(browser, scene: Scene) -> None:
-    with page_server(scene.robot_file) as address:
-        context = browser.new_context()
-        page = context.new_page()
-        page.goto(address)
-        says(page, "#pill-learner", "learning")
+def test_a_page_s_server_that_ends_is_named_and_comes_back_by_itself(browser, server: PageServer) -> None:
+    context = browser.new_context()
+    page = context.new_page()
+    page.goto(server.address)
+    says(page, "#pill-learner", "learning")
+    server.end()
     says(page, "#notices", "The page's server does not answer")
     expect(page.locator("#pause")).to_be_disabled()
-    port = address.rstrip("/").rpartition(":")[2]
-    command = [sys.executable, "-m", "daemon", "view", "--robot", str(scene.robot_file), "--port", port]
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
-    try:
-        expect(page.locator("#pause")).to_be_enabled(timeout=LIMIT_MS)
-        expect(page.locator("#notices")).not_to_contain_text("does not answer", timeout=LIMIT_MS)
-    finally:
-        context.close()
-        process.terminate()
-        process.wait(30)
+    server.start()
+    expect(page.locator("#pause")).to_be_enabled(timeout=LIMIT_MS)
+    expect(page.locator("#notices")).not_to_contain_text("server does not answer", timeout=LIMIT_MS)
+    context.close()
