@@ -139,7 +139,7 @@ export class ErrorChart {
     return {
       series,
       scales: { x: { time }, y: { distr: 3 } },
-      axes: [time ? { ...axis(undefined, times), space: 90 } : axis("pairs learnt"), { ...axis("mm", millimetres), size: 58 }],
+      axes: [time ? { ...axis(undefined, times), space: 70 } : axis("pairs learnt"), { ...axis("mm", millimetres), size: 58 }],
       cursor: { drag: { x: true, y: false } },
       plugins: [marks(() => this.changes.map((change) => (time ? change.t : change.pairs)))],
     };
@@ -164,7 +164,7 @@ export class LatencyChart {
     return {
       series: [{}, line("prediction", "--line", milliseconds)],
       scales: { x: { time: true }, y: { range: (_, least, most) => [0, Math.max(1.15 * (most ?? 0), 2e-3)] } },
-      axes: [{ ...axis(undefined, times), space: 90 }, { ...axis("ms", millimetres), size: 58 }],
+      axes: [{ ...axis(undefined, times), space: 70 }, { ...axis("ms", millimetres), size: 58 }],
       legend: { show: false },
       cursor: { drag: { x: false, y: false } },
     };
