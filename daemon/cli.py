@@ -35,11 +35,12 @@ COMMANDS = {
     "sampler": "Only the sampler: encoders and cameras in, pairs out.",
     "learner": "Only the learner: pairs in, answers out. On any machine.",
     "status": "What both processes do and found, and if it is enough.",
+    "view": "A page: errors, where to move next, residuals, buttons.",
     "predict": "Ask where the marker is at given joint angles.",
     "ik": "Ask for joint angles that bring the marker to a position.",
     "command": "Pause, resume, tell of a changed tool, reset, checkpoint.",
     "record": "Copy the running sampler's pairs into a file.",
-    "export": "Turn a store or a recording into CSV, Parquet or MCAP.",
+    "export": "A store or a recording into CSV, Parquet, MCAP or Rerun.",
 }
 
 

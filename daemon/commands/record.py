@@ -12,7 +12,7 @@ from daemon.commands.options import HERE, RobotFile, flag
 
 
 def record(
-    out: Annotated[Path, Parameter(help="The file to write; its ending .csv, .parquet or .mcap says the format.")],
+    out: Annotated[Path, Parameter(help="The file; its ending .csv, .parquet, .mcap or .rrd says the format.")],
     /,
     *,
     robot: RobotFile = HERE,
