@@ -34,6 +34,7 @@ COMMANDS = {
     "run": "Start sampler and learner, and keep them running.",
     "sampler": "Only the sampler: encoders and cameras in, pairs out.",
     "learner": "Only the learner: pairs in, answers out. On any machine.",
+    "router": "Where machines meet: TLS, and who may do what.",
     "status": "What both processes do and found, and if it is enough.",
     "predict": "Ask where the marker is at given joint angles.",
     "ik": "Ask for joint angles that bring the marker to a position.",

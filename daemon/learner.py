@@ -311,7 +311,7 @@ def run_learner(config: Config, clock: Clock, stopping: Callable[[], bool]) -> N
     """
     sys.setswitchinterval(SWITCH_INTERVAL_S)
     endpoints = config.tables.zenoh
-    with SolverProcess() as solver, Bus(listen=endpoints.learner, connect=endpoints.sampler) as bus:
+    with SolverProcess() as solver, Bus(listen=endpoints.learner, settings=config.zenoh_settings("learner")) as bus:
         learner = Learner(config, solver, bus, clock)
         publish = bus.publisher(Keys(config.robot.name).status("learner"))
         gc.collect()
