@@ -88,8 +88,8 @@ class Reception(Generic[T]):
                 )
             if asking.size + size > limits.waiting_bytes:
                 raise RequestError(
-                    f"queries of {_named(source)} with {asking.size:,} bytes wait already; {limits.waiting_bytes:,} are "
-                    "the most; wait for an answer before asking more"
+                    f"{asking.size:,} bytes of queries of {_named(source)} wait already, and {limits.waiting_bytes:,} "
+                    "are the most; wait for an answer before asking more"
                 )
             if self._size + size > EVERYBODYS * limits.waiting_bytes:
                 raise RequestError(
