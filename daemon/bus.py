@@ -37,6 +37,7 @@ PLAIN = ("zenoh/", "text/")
 RETRY_MS = {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 2}
 # What is put together from fragments: the largest model with its orientation for a client, pairs for a process.
 LARGEST_REPLY_BYTES, LARGEST_MESSAGE_BYTES = 2**26, 2**23
+LONGEST_ERROR = 2000  # characters
 REFUSALS = 1000  # that wait to be told; beyond them a query ends without an answer
 
 
@@ -315,7 +316,8 @@ def _encodings(query: zenoh.Query) -> tuple[str, str]:
 
 def _reply_error(query: zenoh.Query, text: str) -> None:
     _, encoding = _encodings(query)
-    query.reply_err(encode(ErrorReply(text), encoding), encoding=zenoh.Encoding(encoding))
+    shortened = text if len(text) <= LONGEST_ERROR else f"{text[:LONGEST_ERROR]}..."  # it may quote the request
+    query.reply_err(encode(ErrorReply(shortened), encoding), encoding=zenoh.Encoding(encoding))
 
 
 def _source(query: zenoh.Query) -> str:

@@ -9,6 +9,7 @@ from typing import TextIO
 
 import numpy as np
 
+from .limited import read_at_most
 from .recording_columns import Fault, Table, check_finite, check_header, check_width
 from .records import FloatArray
 
@@ -24,9 +25,8 @@ def read_csv_table(file: Path, joints: tuple[str, ...]) -> Table:
         Fault: something is wrong with the text; rows count from 0 below the header.
         OSError: the file cannot be read.
     """
-    with file.open("rb") as stream:
-        data = stream.read(MOST_BYTES + 1)
-    if len(data) > MOST_BYTES:
+    data = read_at_most(file, MOST_BYTES)
+    if data is None:
         raise Fault("the file is larger than 1 GiB", remedy="Cut it, or write it as Parquet")
     text = _decoded(data)
     if not text.strip():

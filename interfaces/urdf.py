@@ -16,6 +16,7 @@ import numpy as np
 from kbmaps import RigidChain
 
 from .errors import RobotError
+from .limited import read_at_most
 from .records import FloatArray, frozen_array
 from .suggest import did_you_mean
 
@@ -302,13 +303,13 @@ def _parse(file: Path) -> Any:
     from lxml import etree  # pyright: ignore[reportAttributeAccessIssue]
 
     try:
-        if file.stat().st_size > LARGEST_FILE_BYTES:
-            raise RobotError("the URDF is larger than 16 MiB", file=file, remedy="Keep meshes in files of their own")
-        data = file.read_bytes()
+        data = read_at_most(file, LARGEST_FILE_BYTES)
     except OSError as error:
         raise RobotError(
             f"cannot read the URDF: {error.strerror}", file=file, remedy="Mend [robot] urdf, or --urdf"
         ) from error
+    if data is None:
+        raise RobotError("the URDF is larger than 16 MiB", file=file, remedy="Keep meshes in files of their own")
     parser = etree.XMLParser(resolve_entities=False, no_network=True, load_dtd=False, huge_tree=False)
     try:
         root = etree.fromstring(data, parser)
