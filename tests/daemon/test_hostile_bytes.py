@@ -209,6 +209,7 @@ def test_a_mangled_file_is_read_or_refused(tmp_path: Path, data: st.DataObject) 
 
 
 @pytest.mark.soak
+@pytest.mark.timeout(3600)
 @long
 @given(st.data())
 def test_thousands_of_mangled_files_are_read_or_refused(tmp_path: Path, data: st.DataObject) -> None:

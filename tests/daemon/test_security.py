@@ -110,7 +110,13 @@ def site(pki: Path, tmp_path_factory, free_endpoint) -> Iterator[Site]:
         sampler.token(KEYS.alive("sampler"))
         learner.token(KEYS.alive("learner"))
         assert alive.wait(LIMIT_S)
-        yield Site(pki, endpoint, sampler, learner, heard, publish)
+        found = Site(pki, endpoint, sampler, learner, heard, publish)
+        operator, until = found.as_somebody("bert"), time.monotonic() + LIMIT_S
+        while len(answered(operator, QUESTIONS | STATES | COMMANDS)) < len(QUESTIONS | STATES | COMMANDS):
+            assert time.monotonic() < until
+        while not (learner.ask(KEYS.pairs) and sampler.ask(KEYS.predict)):
+            assert time.monotonic() < until
+        yield found
 
 
 def drained(queue: Queue[bytes]) -> list[bytes]:
@@ -273,7 +279,9 @@ def two(pki: Path, tmp_path: Path, free_endpoint) -> Iterator[tuple[Config, Queu
         publish = sampler.publisher(KEYS.pair)
         sampler.token(KEYS.alive("sampler"))
         assert alive.wait(LIMIT_S)
-        assert sampler.ask_one(KEYS.predict) == b"there"
+        until = time.monotonic() + LIMIT_S
+        while not sampler.ask(KEYS.predict):
+            assert time.monotonic() < until
         publish(b"a pair")
         yield configs["learner"], heard
 
@@ -365,6 +373,17 @@ OWN = TLS + 'certificate = "anna.pem"\nkey = "anna.key"\n'
 def test_half_a_protection_is_refused(pki: Path, tmp_path: Path, tables: str, said: str) -> None:
     with pytest.raises(ConfigError, match=said):
         write_robot(tmp_path, tables, pki)
+
+
+def test_one_says_who_one_is_for_once_as_the_page_shows(pki: Path, tmp_path: Path) -> None:
+    shown = re.search(r"`(BODYSCHEMA_ZENOH_TLS)='(.*?)' bodyschema command", PAGE.read_text())
+    assert shown is not None
+    variable, value = shown.groups()
+    robot = write_robot(tmp_path, '[zenoh]\nrouter = "tls/hub.lan:7450"\n' + OWN, pki).file
+    route = Config.load(robot, {variable: value}).route("learner")
+    assert route.endpoints == ("tcp/127.0.0.1:7448", "tls/hub.lan:7450")
+    assert route.identity is not None
+    assert route.identity.certificate == tmp_path / "bert.pem"
 
 
 def test_a_key_that_everybody_can_read_is_refused(pki: Path, tmp_path: Path) -> None:
