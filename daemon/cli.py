@@ -34,6 +34,7 @@ COMMANDS = {
     "run": "Start sampler and learner, and keep them running.",
     "sampler": "Only the sampler: encoders and cameras in, pairs out.",
     "learner": "Only the learner: pairs in, answers out. On any machine.",
+    "router": "Where machines meet: TLS, and who may do what.",
     "status": "What both processes do and found, and if it is enough.",
     "view": "A page: errors, where to move next, residuals, buttons.",
     "predict": "Ask where the marker is at given joint angles.",

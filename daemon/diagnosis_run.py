@@ -108,7 +108,7 @@ def measured(config: Config, file: Path | None, *, live: bool) -> Source:
         raise RequestError("name a recording, or give --live for the running sampler's pairs: one of the two")
     joints = config.robot.joints
     if file is None:
-        with client(config.tables.zenoh.sampler) as bus:
+        with client(config.route("sampler")) as bus:
             recording, name = _history(History(bus, config.robot, 1), joints), f"the sampler of {config.robot.name}"
     else:
         recording, name = recordings.opened(file, joints), file.name

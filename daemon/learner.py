@@ -43,6 +43,8 @@ HISTORY_LIMIT_S = 5.0
 IDLE_S = 0.02
 SOLVE_WHEN_IDLE_S = 0.5
 BACKGROUND_NICENESS = 10
+# What a checkpoint raises whose checksum is right and whose parts are not.
+DOES_NOT_FIT = (ArithmeticError, LookupError, TypeError, ValueError)
 # Python hands the interpreter from thread to thread this often at least; its own 5 ms would be a query's delay.
 SWITCH_INTERVAL_S = 2e-4
 
@@ -188,9 +190,10 @@ class Learner:
             if state is None:
                 return
             self._learning.restore(state)
-        except (CheckpointError, StateError, KBMapsError) as error:
+        except (CheckpointError, StateError, KBMapsError, *DOES_NOT_FIT) as error:
             aside = set_aside(file)
-            self._set_aside = f"{error}. It was kept as {aside}; the learner learns again from the sampler's history"
+            said = f"the checkpoint's parts do not fit: {error!r}" if isinstance(error, DOES_NOT_FIT) else str(error)
+            self._set_aside = f"{said}. It was kept as {aside}; the learner learns again from the sampler's history"
             log.error("%s", self._set_aside)
             self._learning = Learning(self._nominal, self._settings, self._solver)
         else:
@@ -311,7 +314,7 @@ def run_learner(config: Config, clock: Clock, stopping: Callable[[], bool]) -> N
     """
     sys.setswitchinterval(SWITCH_INTERVAL_S)
     endpoints = config.tables.zenoh
-    with SolverProcess() as solver, Bus(listen=endpoints.learner, connect=endpoints.sampler) as bus:
+    with SolverProcess() as solver, Bus(listen=endpoints.learner, settings=config.zenoh_settings("learner")) as bus:
         learner = Learner(config, solver, bus, clock)
         publish = bus.publisher(Keys(config.robot.name).status("learner"))
         gc.collect()

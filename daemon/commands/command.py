@@ -48,7 +48,7 @@ def command(
     if process == "learner" and name in SAMPLERS and name not in BOTHS:
         raise RequestError(f"{name} is a command of the sampler: drop --to")
     config = Config.load(robot)
-    with client(getattr(config.tables.zenoh, process)) as bus:
+    with client(config.route(process)) as bus:
         reply = bus.ask_one(Keys(config.robot.name).command(process), encode(CommandRequest(name)))
     done = decode(reply, CommandReply)
     Console(highlight=False, soft_wrap=True).print(f"{process}: {done.message}", markup=False)

@@ -43,7 +43,7 @@ def record(
     config = Config.load(robot)
     console = Console(highlight=False, soft_wrap=True)
     joints = config.robot.joints
-    with client(config.tables.zenoh.sampler) as bus:
+    with client(config.route("sampler")) as bus:
         history = History(bus, config.robot, from_seq)
         if follow:
             ending = Ending()

@@ -43,7 +43,7 @@ def sampler(
         config = config.with_state_dir(state_dir)
     with (  # the store comes last: what goes wrong before leaves no trace
         open_sources(config, sim=sim) as sources,
-        Bus(listen=config.tables.zenoh.sampler) as bus,
+        Bus(listen=config.tables.zenoh.sampler, settings=config.zenoh_settings("sampler")) as bus,
         PairStore(config.store_file, session_of(config, SystemClock())) as store,
     ):
         process = Sampler(config, sources, bus, store, exit_at_end=exit_at_end)

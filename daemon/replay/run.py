@@ -237,6 +237,7 @@ def _running(job: Job) -> Iterator[_Live]:
     environment = {
         **override("zenoh", "sampler", sampler_endpoint),
         **override("zenoh", "learner", learner_endpoint),
+        **override("zenoh", "router", ""),  # the live robot's is no concern of this one
         **override("drivers", "recording", str(fed.resolve())),
         **{name: text for key, value in job.drivers.items() for name, text in override("drivers", key, value).items()},
         **override("daemon", "any_step", job.any_step),
