@@ -5,6 +5,10 @@ where a C compiler was there on installation: `kernels_in_use()` tells; BODYSCHE
 """
 
 from kbmaps.autocorrelation import shared_by
+from kbmaps.changes.detector import ChangeDetector, Suspicion
+from kbmaps.changes.kinds import ChangeKind, any_change, change_kinds
+from kbmaps.changes.naming import Explanation, explanations
+from kbmaps.changes.shared_noise import SharedNoise
 from kbmaps.chains.align import Alignment, align
 from kbmaps.chains.belief import ChainBelief
 from kbmaps.chains.chain import RigidChain
@@ -70,6 +74,8 @@ __all__ = [
     "ChainPosterior",
     "ChainReport",
     "ChainTolerances",
+    "ChangeDetector",
+    "ChangeKind",
     "Contest",
     "CoreFamily",
     "CorePrior",
@@ -78,6 +84,7 @@ __all__ = [
     "ExactLearner",
     "ExactSolution",
     "ExpectedError",
+    "Explanation",
     "ExperimentDesign",
     "Forecast",
     "Interval",
@@ -107,19 +114,24 @@ __all__ = [
     "Rung",
     "SettingError",
     "ShapeError",
+    "SharedNoise",
     "SingularAlphaError",
     "StepSize",
     "StructuredLearner",
     "SupportSet",
+    "Suspicion",
     "TensorLearner",
     "TensorPosterior",
     "TensorSettings",
     "TensorTrain",
     "ToolLayer",
     "align",
+    "any_change",
     "blockwise_precision",
     "candidate_motions",
+    "change_kinds",
     "expected_gain",
+    "explanations",
     "find_chain",
     "fitted_orientation",
     "follow_a_path",
