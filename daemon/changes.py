@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 
-from .learning.change import CAMERA, JOINT, TOOL, ChangeRecord, KindOfChange
+from .learning.change import JOINT, ChangeRecord, KindOfChange
 from .status import Change
 
 log = logging.getLogger(__name__)
@@ -50,7 +50,7 @@ class Changes:
             probabilities={
                 self._of(kind): round(kind.probability, 3) for kind in change.kinds if kind.probability > _TOLD
             },
-            alike=self._alike(change) if change.found else [],
+            alike=None if change.named is None else change.alike(change.named),
             moved_m=change.moved_m,
             can_roll_back=can_roll_back,
         )
@@ -69,11 +69,3 @@ class Changes:
 
     def _of(self, kind: KindOfChange) -> str:
         return kind.name if kind.joint is None else f"{JOINT} {self._joints[kind.joint]}"
-
-    def _alike(self, change: ChangeRecord) -> list[str]:
-        """The last joint's zero moves the marker on the hand, the first one's turns all that the camera sees."""
-        named = change.named
-        if named is None or named.joint is None:
-            return []
-        alike = {0: CAMERA, len(self._joints) - 1: TOOL}
-        return [alike[named.joint]] if named.joint in alike else []

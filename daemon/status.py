@@ -191,7 +191,7 @@ class Change(msgspec.Struct, frozen=True, kw_only=True):
         found: in the pairs; else it was told.
         kind: `tool`, `camera`, `joint NAME` (its zero), `other` or `undecided`.
         probabilities: by kind, those above 1 %.
-        alike: other kinds that no motion tells from this one.
+        alike: the kind that no motion tells from this one; null where there is none.
         moved_m: by how much it moved the marker at the pairs since, root mean square [m]; null where nobody knows.
         can_roll_back: whether the model before it is kept.
     """
@@ -203,7 +203,7 @@ class Change(msgspec.Struct, frozen=True, kw_only=True):
     found: bool
     kind: str
     probabilities: dict[str, float]
-    alike: list[str]
+    alike: str | None
     moved_m: float | None
     can_roll_back: bool
 

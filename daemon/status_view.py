@@ -169,8 +169,8 @@ def _change(status: LearnerStatus) -> Iterator[str]:
     yield f"{change.kind} {when}{moved} ({'found' if change.found else 'told'}); {since}"
     if change.kind == UNDECIDED:
         yield ", ".join(f"{kind} {share:.0%}" for kind, share in change.probabilities.items())
-    elif change.alike:
-        yield f"or {' or '.join(change.alike)}: no motion tells them apart"
+    elif change.alike is not None:
+        yield f"or {change.alike}: no motion tells them apart"
 
 
 def _facts() -> Table:

@@ -47,9 +47,19 @@ class ChangeRecord(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def named(self) -> KindOfChange | None:
-        """What it is; None while that is not decided."""
+        """What it is; None while that is not decided. What no motion tells from it counts with it."""
         best = self.kinds[0]
-        return best if best.probability >= NAMED else None
+        alike = sum(kind.probability for kind in self.kinds if kind.name == self.alike(best))
+        return best if best.probability + alike >= NAMED else None
+
+    def alike(self, kind: KindOfChange) -> str | None:
+        """The kind that no motion tells from this one.
+
+        The last joint's zero moves the marker on the hand, the first one's turns all that the camera sees.
+        """
+        joints = [each.joint for each in self.kinds if each.joint is not None]
+        ends = {} if not joints else {0: CAMERA, max(joints): TOOL}
+        return None if kind.joint is None else ends.get(kind.joint)
 
     @classmethod
     def told(cls, last_seq: int) -> ChangeRecord:

@@ -19,8 +19,8 @@ FEWEST_KNOWN = 100
 SHORTEST_TRIAL, LONGEST_TRIAL = 50, 1000
 # So many of the pairs that a model knows show its noise.
 LOOKED_BACK = 500
-# Of so many errors that were none of a fit the noise is known.
-_FEWEST_SURPRISES = 50
+# So many of the newest errors of pairs that a model did not know show how far these lie from it.
+SHOWN = 3000
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +107,11 @@ class _Watched:
 
 
 class Watch:
-    """Holds the pairs since a reference against it, and renews the reference while nothing changes."""
+    """Holds the pairs since a reference against it, and renews the reference while nothing changes.
+
+    How far pairs that a model does not know lie from it is seen from such pairs alone: fitted to its own ones, a chain
+    that is wrong looks right. So the first reference is tried out before it can raise an alarm.
+    """
 
     def __init__(self) -> None:
         self._reference: Reference | None = None
@@ -116,11 +120,17 @@ class Watch:
         self._pairs: list[_Watched] = []
         self._detector: ChangeDetector | None = None
         self._suspicion: Suspicion | None = None
+        self._shown = np.empty((0, 3))
 
     @property
     def ready(self) -> bool:
-        """Whether there is a model that pairs are held against."""
-        return self._detector is not None
+        """Whether there is a model that pairs are held against, and it was tried out."""
+        return self._detector is not None and len(self._shown) > 0
+
+    @property
+    def detector(self) -> ChangeDetector | None:
+        """What holds the pairs against the present reference; None before there is one."""
+        return self._detector
 
     @property
     def alarmed(self) -> bool:
@@ -144,7 +154,7 @@ class Watch:
             return
         self._next, self._next_at = reference, self._asked_at
         if self._reference is None:
-            self._renew(reference.noise())
+            self._renew()
 
     def add(self, pair: Pair, *, kept: bool) -> None:
         """One more pair, learnt or, not `kept`, doubted."""
@@ -153,13 +163,16 @@ class Watch:
         if self._detector is None:
             return
         self._feed(self._pairs[-1:])
-        if self._detector.due:
+        if not self.ready:
+            if self._reference is not None and len(self._pairs) >= _trial(self._reference.known):
+                self._show()
+                self._hold(self._reference)
+        elif self._detector.due:
             self._suspicion = self._detector.suspicion()
         tried = len(self._pairs) - self._next_at
-        if self._next is not None and not self.alarmed and tried >= _trial(self._next.known):
-            surprises = self._detector.surprises[-max(tried, _FEWEST_SURPRISES) :]
-            noise = self._next.noise()
-            self._renew(noise.at_least(SharedNoise.of(surprises)) if len(surprises) >= _FEWEST_SURPRISES else noise)
+        if self._next is not None and self.ready and not self.alarmed and tried >= _trial(self._next.known):
+            self._show()
+            self._renew()
 
     def noticed(self, run: int = 0) -> Noticed | None:
         """The change that the pairs show; None: they do not, or there is nothing to hold them against.
@@ -168,7 +181,7 @@ class Watch:
             run: so many of the last pairs have shown it in another way: it began there if not before.
         """
         reference, detector = self._reference, self._detector
-        if reference is None or detector is None or not (self.alarmed or run):
+        if reference is None or detector is None or not self.ready or not (self.alarmed or run):
             return None
         suspicion = detector.suspicion()
         earliest, latest = suspicion.interval()
@@ -192,18 +205,26 @@ class Watch:
             np.array([each.turn for each in pairs]),
         )
 
-    def _renew(self, noise: SharedNoise) -> None:
+    def _show(self) -> None:
+        """The pairs have shown how far they lie from a model that does not know them."""
+        if self._detector is not None:
+            self._shown = np.concatenate([self._shown, self._detector.surprises])[-SHOWN:]
+
+    def _renew(self) -> None:
         """The next reference takes its place."""
-        if self._next is None:
-            return
-        self._reference, self._next = self._next, None
-        reference, self._pairs = self._reference, self._pairs[self._next_at :]
-        self._asked_at = max(self._asked_at - self._next_at, 0)
+        if self._next is not None:
+            self._pairs = self._pairs[self._next_at :]
+            self._asked_at, self._next_at = max(self._asked_at - self._next_at, 0), 0
+            self._reference, self._next = self._next, None
+            self._hold(self._reference)
+
+    def _hold(self, reference: Reference) -> None:
+        """Hold all pairs against this reference, with the noise that was shown."""
+        noise = SharedNoise.of(self._shown) if len(self._shown) else reference.noise()
         variances = reference.errors(reference.q, reference.x, reference.variance)[1]
         noise_m = float(np.sqrt(noise.single * variances.mean()))
         distance_m = float(np.linalg.norm(reference.x, axis=1).mean())
-        self._detector = ChangeDetector(reference.belief, noise, noise_m, distance_m)
-        self._suspicion = None
+        self._detector, self._suspicion = ChangeDetector(reference.belief, noise, noise_m, distance_m), None
         self._feed(self._pairs)
 
     def _feed(self, pairs: list[_Watched]) -> None:

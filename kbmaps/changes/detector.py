@@ -15,7 +15,7 @@ from kbmaps.changes.shared_noise import SharedNoise
 from kbmaps.chains.belief import ChainBelief
 
 # On average at least so many pairs lie between two false alarms, as far as the model's claims are true.
-PAIRS_BETWEEN_FALSE_ALARMS = 200_000.0
+PAIRS_BETWEEN_FALSE_ALARMS = 100_000.0
 # No single pair counts for more than one that lies so many sigmas away: it may be an outlier.
 CLIPPED_SIGMAS = 4.0
 # So many of the newest pairs tell whether the noise has grown.
@@ -116,7 +116,10 @@ class ChangeDetector:
 
     @property
     def surprises(self) -> FloatArray:
-        """Whitened errors (n, 3) of all pairs, each against what was expected after those before it."""
+        """Whitened errors (n, 3) of all pairs, each against what was expected after those before it.
+
+        They are in units of the noise: what was not known of the model is taken out.
+        """
         return np.array(self._surprises).reshape(-1, 3)
 
     def add(self, q: FloatArray, errors: FloatArray, variances: FloatArray) -> None:
@@ -142,9 +145,9 @@ class ChangeDetector:
         off = error - expected
         off = off * min(1.0, CLIPPED_SIGMAS * spread / max(float(np.linalg.norm(off)), 1e-300))
         if self._surprises:
-            apart = float(np.square(off - self._surprises[-1]).mean()) / 2.0
+            apart = float(np.square(off * math.sqrt(self._noise.single) / spread - self._surprises[-1]).mean()) / 2.0
             self._differences = [*self._differences[1 - _RECENT :], apart]
-        self._surprises.append(off)
+        self._surprises.append(off * math.sqrt(self._noise.single) / spread)
         error = expected + off
         self._strange = float(np.linalg.norm(off)) > STRANGE_SIGMAS * spread
         self._onsets.add(known.T @ changed, changed.T @ changed, changed.T @ error)
@@ -158,14 +161,22 @@ class ChangeDetector:
         late = self.pairs - self._looked_at >= LOOK_EVERY
         return self.pairs > self._looked_at and (late or self._strange or self._log_odds > LOOK_CLOSELY)
 
-    def suspicion(self) -> Suspicion:
-        """How probable a change is after the pairs so far, at least one."""
+    def sums(self) -> tuple[IntArray, FloatArray, FloatArray]:
+        """What the pairs since each onset (m,) say of all that may change, in metres of the marker's way.
+
+        Returns:
+            The onsets, and the information (m, c, c) and score (m, c) of changes in the order of the kinds.
+        """
         onsets, crossed, information, score = self._onsets.since()
         noise = self._grown_noise()
         variances = noise.of_runs(self.pairs - onsets)
         explained = crossed.transpose(0, 2, 1) @ (self._posterior @ crossed) / noise.longest
         information = (information - explained) / variances[:, None, None]
-        score = (score - np.matvec(crossed.transpose(0, 2, 1), self._mean)) / variances[:, None]
+        return onsets, information, (score - np.matvec(crossed.transpose(0, 2, 1), self._mean)) / variances[:, None]
+
+    def suspicion(self) -> Suspicion:
+        """How probable a change is after the pairs so far, at least one."""
+        onsets, information, score = self.sums()
         terms = np.stack(
             [log_ratios(information[:, at, at], score[:, at], self._sizes) for at in self._places], axis=1
         )

@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import ndtr, stdtrit  # pyright: ignore[reportMissingTypeStubs, reportUnknownVariableType]
 
 from kbmaps.arrays import FloatArray, frozen
 
@@ -13,8 +14,13 @@ from kbmaps.arrays import FloatArray, frozen
 USUALLY_SHARED = 10
 # Sums over longer lags than this, or than this share of the series, would be more noise than sum.
 _LONGEST_LAG, _LONGEST_LAG_SHARE = 200, 0.125
-# The noise may be larger than it seems by so many of its standard errors.
-_CAREFUL = 1.5
+# Neighbours share something where their products are so many standard errors above 0.
+_CLEARLY = 2.0
+# A Gaussian coordinate is so far out once in as many pairs as lie between false alarms [sigmas]: there the estimated
+# variance has to hold.
+_TAIL_SIGMAS = 4.5
+# A fit takes at most this share of what neighbours share.
+_MOST_TAKEN = 0.8
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,26 +61,25 @@ class SharedNoise:
         """That of residuals (n, 3), n at least 2, in their order, as large as it may well be.
 
         n Var(mean of n) = γ_0 + 2 Σ_{k<n} (1 − k/n) γ_k with the autocovariances γ, for as long as pairs of
-        neighbouring lags stay clearly positive (Geyer 1992, initial positive sequence).
+        neighbouring lags stay positive (Geyer 1992, initial positive sequence). A variance of ν independent parts makes
+        a Gaussian a Student variable, which is far out more often: the variances are raised by as much.
 
         Args:
             used: how many numbers were fitted to the residuals.
         """
         n = len(residuals)
         square = float(np.square(residuals).mean()) * 3 * n / max(3 * n - used, n)
-        longest = min(int(n * _LONGEST_LAG_SHARE), _LONGEST_LAG) // 2 * 2
-        lags = [float((residuals[k:] * residuals[:-k]).sum()) / (3 * (n - k)) for k in range(1, longest + 1)]
-        pairs = np.array(lags).reshape(-1, 2).sum(axis=1)
-        chance = square * math.sqrt(2.0 / (3.0 * n))
-        ends = np.flatnonzero(pairs <= chance)
-        kept = np.array(lags)[: 2 * (int(ends[0]) if len(ends) else len(pairs))]
+        kept = _autocovariances(residuals, _CLEARLY * square * math.sqrt(2.0 / (3.0 * n)))
         lengths = np.arange(1, len(kept) + 2)
         shares = np.maximum(1.0 - np.arange(1, len(kept) + 1) / lengths[:, None], 0.0)
         variances = square + 2.0 * shares @ kept
-        # Where neighbours share, the series has fewer independent parts, and its variances are known less well.
         together = np.maximum(variances / square, 1.0)
-        careful = 1.0 + _CAREFUL * np.sqrt(2.0 * together * (1.0 + 2.0 * len(kept) / n) / (3.0 * n))
-        return cls(np.maximum.accumulate(variances * careful))
+        if len(kept):
+            # What neighbours share has fewer independent parts, of which a fit takes more: new pairs show more of it.
+            taken = min(used * float(together[-1]) / (3.0 * n), _MOST_TAKEN)
+            alone = max(square - max(float(kept[0]), 0.0), 0.0)
+            variances = alone + (variances - alone) / (1.0 - taken)
+        return cls(np.maximum.accumulate(variances * _raised(3.0 * n / together)))
 
     def at_least(self, other: SharedNoise) -> SharedNoise:
         """The larger of both."""
@@ -84,3 +89,21 @@ class SharedNoise:
     def times(self, factor: float) -> SharedNoise:
         """With all variances multiplied."""
         return SharedNoise(factor * self.variances)
+
+
+def _autocovariances(residuals: FloatArray, chance: float) -> FloatArray:
+    """Those of residuals (n, 3) at lags 1, 2, ... for as long as neighbours clearly share something, perhaps none."""
+    n = len(residuals)
+    longest = min(int(n * _LONGEST_LAG_SHARE), _LONGEST_LAG) // 2 * 2
+    lags = np.array([float(np.vdot(residuals[k:], residuals[:-k])) / (3 * (n - k)) for k in range(1, longest + 1)])
+    pairs = lags.reshape(-1, 2).sum(axis=1)
+    if not len(pairs) or pairs[0] <= chance:
+        return np.empty(0)
+    ends = np.flatnonzero(pairs <= 0.0)
+    return lags[: 2 * (int(ends[0]) if len(ends) else len(pairs))]
+
+
+def _raised(parts: FloatArray) -> FloatArray:
+    """By how much variances of so many independent parts have to be raised."""
+    tail = float(ndtr(-_TAIL_SIGMAS))
+    return np.square(stdtrit(np.maximum(parts, 3.0), 1.0 - tail) / _TAIL_SIGMAS)
