@@ -1,7 +1,7 @@
 """Changes while running: `python -m benchmarks.changes [--quiet] [--seeds N] [--joints 6 7] [--sigmas 1 5 20]`.
 
 The learner's watch over guided walks in steps of 1 to 3 degrees, as the sampler takes them. It holds the pairs against a
-chain of 400 pairs; the arm changes 220 to 280 pairs later. By case: after how many pairs the change is noticed (mean, 95th
+chain of 1,000 pairs (--known); the arm changes 520 to 580 pairs later. By case: after how many pairs the change is noticed (mean, 95th
 percentile, share within 30), against two CUSUMs that know its size and direction and have one false alarm in 50,000
 pairs by theory (Siegmund 1985): one that knows the arm to the last digit too, and one that has the same model. Then the
 share that is named rightly, wrongly or not at all 100 and 300 pairs after the change.
@@ -37,9 +37,9 @@ from daemon.learning.watch import LOOKED_BACK, Reference, Watch
 from interfaces.records import FloatArray, Pair, frozen_array
 from kbmaps import ChainBelief, ChainParameters, ChainTolerances, learning_bases
 
-# A chain of so many pairs is tried out on half as many more. Within so many of its pairs the change comes, and is to be
+# After half as many pairs as the chain knows, on which it is tried out, the change comes within so many, and is to be
 # noticed within so many.
-KNOWN, CHANGED_AT, LONGEST = 400, (220, 280), 600
+KNOWN, CHANGED_WITHIN, LONGEST = 1000, (20, 80), 600
 STEPS_DEG = (1.0, 3.0)
 TOLERANCES = ChainTolerances(
     axes=math.radians(3.0),
@@ -148,27 +148,27 @@ def cusum_threshold(information: float) -> float:
     return float(brentq(surplus, -beyond, 60.0)) if surplus(0.0) < 0.0 else 0.0
 
 
-def outcome(case: Case, joints: int, sigma: float, seed: int) -> Outcome:
+def outcome(case: Case, joints: int, sigma: float, seed: int, known_pairs: int) -> Outcome:
     rng = np.random.default_rng([seed, joints, round(1e4 * sigma), CASES.index(case)])
     arm = rough_arm(joints, rng, TOLERANCES)
-    at = int(rng.integers(*CHANGED_AT))
-    q = walk(joints, KNOWN + at + LONGEST, rng)
+    at = known_pairs // 2 + int(rng.integers(*CHANGED_WITHIN))
+    q = walk(joints, known_pairs + at + LONGEST, rng)
     x = arm.measured(q, sigma, rng)
     after, theta, joint = changed(arm, case, rng)
-    moved = after.positions(q[KNOWN + at :]) - arm.positions(q[KNOWN + at :])
-    x[KNOWN + at :] += moved
-    known = reference(arm, q[:KNOWN], x[:KNOWN], sigma)
+    moved = after.positions(q[known_pairs + at :]) - arm.positions(q[known_pairs + at :])
+    x[known_pairs + at :] += moved
+    known = reference(arm, q[:known_pairs], x[:known_pairs], sigma)
     watch = Watch()
     watch.asked()
     watch.offer(known)
-    ratios = ((x - arm.positions(q))[KNOWN + at :] * moved).sum(axis=1) - 0.5 * np.square(moved).sum(axis=1)
+    ratios = ((x - arm.positions(q))[known_pairs + at :] * moved).sum(axis=1) - 0.5 * np.square(moved).sum(axis=1)
     information = 0.5 * float(np.square(moved).sum(axis=1).mean()) / sigma**2
     threshold = cusum_threshold(information)
     optimal = delay_of(cusum(ratios / sigma**2), threshold)
     with_model, delay, early, named = math.inf, math.inf, False, []
     origin = None
     for k in range(at + LONGEST):
-        watch.add(pair_of(k, q[KNOWN + k], x[KNOWN + k], sigma), kept=True)
+        watch.add(pair_of(k, q[known_pairs + k], x[known_pairs + k], sigma), kept=True)
         since = k - at + 1
         if since > 0 and math.isinf(with_model) and best_known(watch, theta, case, joint) > threshold:
             with_model = since
@@ -177,9 +177,9 @@ def outcome(case: Case, joints: int, sigma: float, seed: int) -> Outcome:
             noticed = watch.noticed()
             if early or noticed is None:
                 break
-            origin = Origin(noticed, KnownArm(known.belief, TOLERANCES)), KNOWN + noticed.first
+            origin = Origin(noticed, KnownArm(known.belief, TOLERANCES)), known_pairs + noticed.first
         if origin is not None and since in NAMED_AFTER:
-            found = origin[0].explain(q[origin[1] : KNOWN + k + 1], x[origin[1] : KNOWN + k + 1])
+            found = origin[0].explain(q[origin[1] : known_pairs + k + 1], x[origin[1] : known_pairs + k + 1])
             named.append(verdict(found[0].kind.name, found[0].kind.joint, found[0].probability, case, joint))
         if origin is not None and since >= NAMED_AFTER[-1] and not math.isinf(with_model):
             break
@@ -294,6 +294,7 @@ def main() -> None:
     parser.add_argument("--pairs", type=int, default=5000, help="of a quiet walk")
     parser.add_argument("--joints", type=int, nargs="+", default=[6, 7])
     parser.add_argument("--sigmas", type=float, nargs="+", default=[1.0, 5.0, 20.0], help="[mm]")
+    parser.add_argument("--known", type=int, default=KNOWN, help="pairs that the chain knows")
     parser.add_argument("--only", default="", help="a part of the case's name")
     arguments = parser.parse_args()
     if arguments.quiet:
@@ -307,7 +308,7 @@ def main() -> None:
             )
             for case in CASES:
                 if arguments.only in case.name:
-                    found = [outcome(case, joints, 1e-3 * sigma, seed) for seed in seeds_of(arguments)]
+                    found = [outcome(case, joints, 1e-3 * sigma, seed, arguments.known) for seed in seeds_of(arguments)]
                     print(row(case, found), flush=True)
 
 

@@ -194,7 +194,7 @@ class Watch:
             reference,
             detector.kinds,
             float(np.sqrt(detector.noise.single * variance)),
-            detector.noise.longest / detector.noise.single,
+            detector.noise.whole / detector.noise.single,
             first,
             earliest,
             latest,

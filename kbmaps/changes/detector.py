@@ -151,7 +151,7 @@ class ChangeDetector:
         error = expected + off
         self._strange = float(np.linalg.norm(off)) > STRANGE_SIGMAS * spread
         self._onsets.add(known.T @ changed, changed.T @ changed, changed.T @ error)
-        step = np.linalg.solve(covariance + self._noise.longest * np.eye(3), gain.T)
+        step = np.linalg.solve(covariance + self._noise.whole * np.eye(3), gain.T)
         self._mean = self._mean + off @ step
         self._posterior = self._posterior - gain @ step
 
@@ -170,7 +170,7 @@ class ChangeDetector:
         onsets, crossed, information, score = self._onsets.since()
         noise = self._grown_noise()
         variances = noise.of_runs(self.pairs - onsets)
-        explained = crossed.transpose(0, 2, 1) @ (self._posterior @ crossed) / noise.longest
+        explained = crossed.transpose(0, 2, 1) @ (self._posterior @ crossed) / noise.whole
         information = (information - explained) / variances[:, None, None]
         return onsets, information, (score - np.matvec(crossed.transpose(0, 2, 1), self._mean)) / variances[:, None]
 

@@ -19,6 +19,8 @@ _CLEARLY = 2.0
 # A Gaussian coordinate is so far out once in as many pairs as lie between false alarms [sigmas]: there the estimated
 # variance has to hold.
 _TAIL_SIGMAS = 4.5
+# Longer runs than that are as such.
+_LONGEST_RUN = 1000
 # A fit takes at most this share of what neighbours share.
 _MOST_TAKEN = 0.8
 
@@ -29,9 +31,13 @@ class SharedNoise:
 
     Attributes:
         variances: n times the variance of the mean of n neighbours, for n = 1, 2, ... (m,); constant from there on.
+            A model that errs may err alike all along a walk: a change has to be larger than that, however many pairs
+            show it.
+        whole: the same of all pairs of a long walk, where such errors are of all signs.
     """
 
     variances: FloatArray
+    whole: float
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "variances", frozen(self.variances))
@@ -41,11 +47,6 @@ class SharedNoise:
         """Variance of one residual."""
         return float(self.variances[0])
 
-    @property
-    def longest(self) -> float:
-        """n times the variance of the mean of n neighbours, for large n."""
-        return float(self.variances[-1])
-
     def of_runs(self, lengths: FloatArray) -> FloatArray:
         """n times the variance of the mean of n neighbours, for these n (m,)."""
         return self.variances[np.minimum(lengths.astype(np.intp), len(self.variances)) - 1]
@@ -53,8 +54,8 @@ class SharedNoise:
     @classmethod
     def claimed(cls, share: float) -> SharedNoise:
         """That of residuals of unit variance, of which this share is a model's error and so shared by neighbours."""
-        lengths = np.arange(1, USUALLY_SHARED + 1)
-        return cls(1.0 + share * (lengths - 1.0))
+        alike = 1.0 + share * np.arange(_LONGEST_RUN if share > 0.0 else 1)
+        return cls(alike, 1.0 + share * (USUALLY_SHARED - 1))
 
     @classmethod
     def of(cls, residuals: FloatArray, used: float = 0.0) -> SharedNoise:
@@ -79,16 +80,22 @@ class SharedNoise:
             taken = min(used * float(together[-1]) / (3.0 * n), _MOST_TAKEN)
             alone = max(square - max(float(kept[0]), 0.0), 0.0)
             variances = alone + (variances - alone) / (1.0 - taken)
-        return cls(np.maximum.accumulate(variances * _raised(3.0 * n / together)))
+        variances = np.maximum.accumulate(variances * _raised(3.0 * n / together))
+        whole = float(variances[-1])
+        if len(kept):
+            longer = np.append(variances, np.full(max(_LONGEST_RUN - len(variances), 0), whole))
+            variances = np.maximum(longer, square + max(float(kept[0]), 0.0) * np.arange(len(longer)))
+        return cls(variances, whole)
 
     def at_least(self, other: SharedNoise) -> SharedNoise:
         """The larger of both."""
         lengths = np.arange(1.0, max(len(self.variances), len(other.variances)) + 1)
-        return SharedNoise(np.maximum(self.of_runs(lengths), other.of_runs(lengths)))
+        variances = np.maximum(self.of_runs(lengths), other.of_runs(lengths))
+        return SharedNoise(variances, max(self.whole, other.whole))
 
     def times(self, factor: float) -> SharedNoise:
         """With all variances multiplied."""
-        return SharedNoise(factor * self.variances)
+        return SharedNoise(factor * self.variances, factor * self.whole)
 
 
 def _autocovariances(residuals: FloatArray, chance: float) -> FloatArray:
