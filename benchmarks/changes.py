@@ -1,13 +1,14 @@
 """Changes while running: `python -m benchmarks.changes [--quiet] [--seeds N] [--joints 6 7] [--sigmas 1 5 20]`.
 
-The learner's watch over guided walks in steps of 1 to 3 degrees, as the sampler takes them. It holds the pairs against a
-chain of 1,000 pairs (--known); the arm changes 520 to 580 pairs later. By case: after how many pairs the change is noticed (mean, 95th
-percentile, share within 30), against two CUSUMs that know its size and direction and have one false alarm in 50,000
-pairs by theory (Siegmund 1985): one that knows the arm to the last digit too, and one that has the same model. Then the
-share that is named rightly, wrongly or not at all 100 and 300 pairs after the change.
+The learner's watch over guided walks in steps of 1 to 3 degrees, as the sampler takes them. It holds the pairs against
+a chain of 1,000 pairs (--known); the arm changes 520 to 580 pairs later. By case: after how many pairs the change is
+noticed (mean, 95th percentile, share within 30), against two CUSUMs that know its size and direction and have one false
+alarm in 50,000 pairs by theory (Siegmund 1985): one that knows the arm to the last digit too, and one that has the same
+model and, like it, counts no pair beyond four sigmas (so it is of no use for large changes). Then the share that is
+named rightly and wrongly 100 and 300 pairs after the change.
 
-With --quiet: walks without a change, with 1 % gross outliers, of arms that are rigid and of arms that are not; the false
-alarms among them.
+With --quiet: walks without a change, with 1 % gross outliers, of arms that are rigid and of arms that are not, with
+nothing but a chain to follow them; the false alarms among them.
 """
 
 from __future__ import annotations
@@ -276,8 +277,8 @@ def print_quiet(arguments: argparse.Namespace) -> None:
                 alarms = [quiet(joints, 1e-3 * sigma, seed, arguments.pairs, bent=bent) for seed in seeds_of(arguments)]
                 pairs, cpu = arguments.pairs * len(alarms), time.process_time() - began
                 print(
-                    f"{'not rigid' if bent else 'rigid':9s} d = {joints}, sigma {sigma:g} mm: {sum(alarms)} false alarms "
-                    f"in {pairs} pairs; {1e3 * cpu / pairs:.2f} ms a pair",
+                    f"{'not rigid' if bent else 'rigid':9s} d = {joints}, sigma {sigma:g} mm: {sum(alarms)} false "
+                    f"alarms in {pairs} pairs; {1e3 * cpu / pairs:.2f} ms a pair",
                     flush=True,
                 )
 
@@ -303,8 +304,8 @@ def main() -> None:
     for joints in arguments.joints:
         for sigma in arguments.sigmas:
             print(
-                f"d = {joints}, sigma {sigma:g} mm: delay mean, 95 %, within {IN_TIME}; CUSUM knowing the arm, with the "
-                "same model; ratios to both; named right/wrong after 100 and 300 pairs"
+                f"d = {joints}, sigma {sigma:g} mm: delay mean, 95 %, within {IN_TIME}; CUSUM knowing the arm, with "
+                "the same model; ratios to both; named right/wrong after 100 and 300 pairs"
             )
             for case in CASES:
                 if arguments.only in case.name:

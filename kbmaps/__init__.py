@@ -5,10 +5,6 @@ where a C compiler was there on installation: `kernels_in_use()` tells; BODYSCHE
 """
 
 from kbmaps.autocorrelation import shared_by
-from kbmaps.changes.detector import ChangeDetector, Suspicion
-from kbmaps.changes.kinds import ChangeKind, any_change, change_kinds
-from kbmaps.changes.naming import Explanation, explanations
-from kbmaps.changes.shared_noise import SharedNoise
 from kbmaps.chains.align import Alignment, align
 from kbmaps.chains.belief import ChainBelief
 from kbmaps.chains.chain import RigidChain
@@ -20,6 +16,10 @@ from kbmaps.chains.rigid_learner import RigidLearner
 from kbmaps.chains.rigid_recursive import RecursiveRigidLearner
 from kbmaps.chains.search import find_chain
 from kbmaps.chains.tool_layer import ToolLayer
+from kbmaps.changes.detector import ChangeDetector, Suspicion
+from kbmaps.changes.kinds import ChangeKind, any_change, change_kinds
+from kbmaps.changes.naming import Explanation, explanations
+from kbmaps.changes.shared_noise import SharedNoise
 from kbmaps.contest import Contest
 from kbmaps.errors import (
     BasisError,
@@ -84,8 +84,8 @@ __all__ = [
     "ExactLearner",
     "ExactSolution",
     "ExpectedError",
-    "Explanation",
     "ExperimentDesign",
+    "Explanation",
     "Forecast",
     "Interval",
     "InverseKinematics",

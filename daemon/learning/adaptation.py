@@ -17,7 +17,7 @@ from .watch import Noticed
 
 # A kind less probable than this need not be forgotten for a change that is not named yet.
 IMPROBABLE = 0.02
-# What changed may be anywhere within so many times its most probable change (1-sigma), and this times the noise at least.
+# What changed may be anywhere within so many times its most probable change (1-sigma), and so many noises.
 WIDER, LEAST_NOISES = 3.0, 3.0
 # Runs of neighbours that are left out in turn to hold the new model against the old one.
 FOLDS = 4

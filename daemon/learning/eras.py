@@ -208,9 +208,7 @@ class Eras:
             self._origin = None
         return other
 
-    def _begin_adapted(
-        self, era: Era, adapted: Adapted, q: FloatArray, x: FloatArray, turns: FloatArray
-    ) -> None:
+    def _begin_adapted(self, era: Era, adapted: Adapted, q: FloatArray, x: FloatArray, turns: FloatArray) -> None:
         """The era of what was learnt before, but for what changed, and of pairs q (n, d), x (n, 3) since then."""
         belongs = sound(np.linalg.norm(x - adapted.prior.predict(q), axis=1), self.claims.noise_m)
         self.fitting.rest(adapted.belief.chain)

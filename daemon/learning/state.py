@@ -16,7 +16,6 @@ from .claims import ClaimsState
 from .members import PRIOR
 from .orientation import OrientationState
 
-
 # Names of the arrays of the state before a change begin with this.
 BEFORE = "before/"
 

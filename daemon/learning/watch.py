@@ -75,7 +75,8 @@ class Noticed:
         kinds: what may have changed.
         noise_m: 1-sigma of a coordinate of one measurement around the model [m].
         shared: how many neighbours say as much as one would.
-        first: the most probable first pair since the change, of those watched; earliest, latest: 95 % of the probability.
+        first: the most probable first pair since the change, of those watched.
+        earliest, latest: between which it is, with 95 % probability.
         seqs: sequence numbers of the watched pairs (n,).
         kept: which of them (n,) were learnt, and not doubted.
         q, x: the watched pairs, (n, d) [rad] and (n, 3) [m].

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from kbmaps.arrays import FloatArray, IntArray
+from kbmaps.chains.belief import ChainBelief
 from kbmaps.changes.kinds import ChangeKind, change_kinds
 from kbmaps.changes.mixture import SIZES, log_ratios
 from kbmaps.changes.onsets import Onsets
 from kbmaps.changes.shared_noise import SharedNoise
-from kbmaps.chains.belief import ChainBelief
 
 # On average at least so many pairs lie between two false alarms, as far as the model's claims are true.
 PAIRS_BETWEEN_FALSE_ALARMS = 100_000.0
@@ -21,8 +21,8 @@ CLIPPED_SIGMAS = 4.0
 # So many of the newest pairs tell whether the noise has grown.
 _RECENT = 50
 _CLEARLY = 3.0
-# While nothing is strange, it is enough to look every so many pairs: after a pair beyond so many sigmas, or when a change
-# is so probable, each pair counts.
+# While nothing is strange, it is enough to look every so many pairs: after a pair beyond so many sigmas, or when a
+# change is so probable, each pair counts.
 LOOK_EVERY, STRANGE_SIGMAS, LOOK_CLOSELY = 5, 3.0, 4.0
 
 
@@ -54,7 +54,9 @@ class Suspicion:
         tail = 0.5 * (1.0 - probability)
         low, high = np.searchsorted(np.cumsum(self.shares), [tail, 1.0 - tail]).clip(max=len(self.onsets) - 1)
         # Onsets that are no longer kept lie before the next one that is.
-        return int(self.onsets[low]), int(self.onsets[min(high + 1, len(self.onsets) - 1)] - (high + 1 < len(self.onsets)))
+        return int(self.onsets[low]), int(
+            self.onsets[min(high + 1, len(self.onsets) - 1)] - (high + 1 < len(self.onsets))
+        )
 
 
 class ChangeDetector:
@@ -169,7 +171,7 @@ class ChangeDetector:
         """
         onsets, crossed, information, score = self._onsets.since()
         noise = self._grown_noise()
-        variances = noise.of_runs(self.pairs - onsets)
+        variances = noise.of_runs((self.pairs - onsets).astype(np.float64))
         explained = crossed.transpose(0, 2, 1) @ (self._posterior @ crossed) / noise.whole
         information = (information - explained) / variances[:, None, None]
         return onsets, information, (score - np.matvec(crossed.transpose(0, 2, 1), self._mean)) / variances[:, None]
@@ -177,9 +179,7 @@ class ChangeDetector:
     def suspicion(self) -> Suspicion:
         """How probable a change is after the pairs so far, at least one."""
         onsets, information, score = self.sums()
-        terms = np.stack(
-            [log_ratios(information[:, at, at], score[:, at], self._sizes) for at in self._places], axis=1
-        )
+        terms = np.stack([log_ratios(information[:, at, at], score[:, at], self._sizes) for at in self._places], axis=1)
         terms += self._log_shares + np.log(self._onsets.weights)[:, None]
         log_odds = float(np.logaddexp.reduce(terms, axis=None))
         shares = np.exp(terms - log_odds)
@@ -192,4 +192,3 @@ class ChangeDetector:
             return self._noise
         chance = 1.0 + _CLEARLY * math.sqrt(1.0 / _RECENT)
         return self._noise.times(max(1.0, float(np.mean(self._differences)) / (self._noise.single * chance)))
-

@@ -12,7 +12,7 @@ from kbmaps.chains.parameters import ChainParameters
 
 TOOL, CAMERA, JOINT, OTHER = "tool", "camera", "joint", "other"
 # What explains a change as well as one part does although everything may have changed, is seldom what happened.
-_OTHER_SHARE = 0.01
+_OTHER_SHARE = 0.001
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 
 from kbmaps.arrays import FloatArray
+from kbmaps.chains.belief import ChainBelief
 from kbmaps.changes.kinds import OTHER, ChangeKind
 from kbmaps.changes.mixture import SIZES
-from kbmaps.chains.belief import ChainBelief
 
 # A pair farther than this from what a kind predicts is an outlier to it, and costs no more than that [sigmas].
 OUTLIER_SIGMAS = 4.8
@@ -124,9 +125,9 @@ def _fit(
         # Beyond the limit less and less, at last not at all: at first it is wide, since nothing is fitted yet.
         wide = limit if step >= _STEPS // 2 else max(limit, 3.0 * float(np.median(far)))
         weights = counted * (far <= wide)
-        normal = np.einsum("n,nij,nik->jk", weights, design, design) + np.diag(prior)
-        slope = np.einsum("n,nij,ni->j", weights, design, off) - prior * numbers
-        numbers = numbers + np.linalg.solve(normal, slope)
+        normal = _squared(design, weights) + np.diag(prior)
+        slope = (design * weights[:, None, None]).reshape(-1, len(prior)).T @ off.ravel() - prior * numbers
+        numbers = numbers + cast(FloatArray, np.linalg.solve(normal, slope))
     return _described(before, to_change, known, numbers, q, x, noise_m, counted)
 
 
@@ -144,13 +145,19 @@ def _described(
     design = (jacobian @ to_change) / noise_m
     squares = np.square((x - predicted) / noise_m).sum(axis=1)
     weights = counted * (squares <= OUTLIER_SIGMAS**2)
-    normal = np.einsum("n,nij,nik->jk", weights, design, design)
+    normal = _squared(design, weights)
     of_known = normal[:known, :known] + np.eye(known)
     crossed = normal[:known, known:]
-    information = normal[known:, known:] - crossed.T @ np.linalg.solve(of_known, crossed)
+    information = normal[known:, known:] - crossed.T @ cast(FloatArray, np.linalg.solve(of_known, crossed))
     cost = 0.5 * counted * float(np.minimum(squares, OUTLIER_SIGMAS**2).sum())
     cost += 0.5 * float(numbers[:known] @ numbers[:known])
     _, log_det = np.linalg.slogdet(of_known)
     unchanged = before.parameters.positions(before.mean + to_change[:, :known] @ numbers[:known], q)
     moved_m = float(np.sqrt(np.square(predicted - unchanged).sum(axis=1).mean()))
     return _Fit(cost, 0.5 * float(log_det), information, numbers[known:], moved_m)
+
+
+def _squared(design: FloatArray, weights: FloatArray) -> FloatArray:
+    """Σ_n w_n D_nᵀ D_n (k, k) of derivatives D (n, 3, k) and weights (n,)."""
+    rows = design.reshape(-1, design.shape[2])
+    return (rows * np.repeat(weights, design.shape[1])[:, None]).T @ rows

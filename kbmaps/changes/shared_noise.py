@@ -54,7 +54,7 @@ class SharedNoise:
     @classmethod
     def claimed(cls, share: float) -> SharedNoise:
         """That of residuals of unit variance, of which this share is a model's error and so shared by neighbours."""
-        alike = 1.0 + share * np.arange(_LONGEST_RUN if share > 0.0 else 1)
+        alike = 1.0 + share * np.arange(_LONGEST_RUN if share > 0.0 else 1, dtype=np.float64)
         return cls(alike, 1.0 + share * (USUALLY_SHARED - 1))
 
     @classmethod

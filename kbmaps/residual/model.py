@@ -186,7 +186,7 @@ class ResidualModel:
         return replace(widened, features=ResidualFeatures(parameters, scaling))
 
     def widened(self, columns: IntArray, std: FloatArray) -> Self:
-        """The same arm but for some parameters of the chain that were changed, by `std` (k,) [rad, m] (1-sigma of each).
+        """The same arm but for some parameters of the chain that were changed, by `std` (k,) [rad, m] (1-sigma).
 
         Args:
             columns: which (k,).

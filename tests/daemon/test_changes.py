@@ -84,6 +84,7 @@ def test_the_zeros_at_both_ends_are_like_another_camera_and_another_tool(
 
 def test_what_no_motion_tells_apart_is_named_together() -> None:
     record = msgspec.structs.replace(
-        UNDECIDED, kinds=[KindOfChange("joint", 2, 0.6), KindOfChange("tool", None, 0.39), KindOfChange("joint", 0, 0.0)]
+        UNDECIDED,
+        kinds=[KindOfChange("joint", 2, 0.6), KindOfChange("tool", None, 0.39), KindOfChange("joint", 0, 0.0)],
     )
     assert record.named == KindOfChange("joint", 2, 0.6)

@@ -20,13 +20,13 @@ from daemon.sampler import Sampler
 from daemon.session import session_of
 from daemon.status import (
     ChainCalibration,
+    Change,
     JointRange,
     JointZero,
     LearnerStatus,
     LearntFigure,
     Outlook,
     SamplerStatus,
-    Change,
 )
 from daemon.status_view import Seen, Watcher, as_json, screen
 from daemon.store import PairStore
