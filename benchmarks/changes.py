@@ -24,7 +24,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import brentq
 
 from benchmarks.first_pairs import REACH
 from benchmarks.rough_arm import RoughArm, rough_arm
@@ -143,10 +142,10 @@ def cusum_threshold(information: float) -> float:
     """
     beyond = 1.166 * math.sqrt(2.0 * information)
 
-    def surplus(threshold: float) -> float:
-        return math.exp(threshold + beyond) - 1.0 - threshold - beyond - PAIRS_BETWEEN_FALSE_ALARMS * information
-
-    return float(brentq(surplus, -beyond, 60.0)) if surplus(0.0) < 0.0 else 0.0
+    threshold = 1.0
+    for _ in range(100):  # a contraction: its slope is below 1 where false alarms are rare
+        threshold = math.log(PAIRS_BETWEEN_FALSE_ALARMS * information + 1.0 + threshold + beyond) - beyond
+    return max(threshold, 0.0)
 
 
 def outcome(case: Case, joints: int, sigma: float, seed: int, known_pairs: int) -> Outcome:
