@@ -14,6 +14,7 @@ CommandName = Literal[
     "gaze_off",
     "reset_to_prior",
     "tool_changed",
+    "rollback",
     "checkpoint",
 ]
 BOTHS: tuple[CommandName, ...] = ("pause", "resume")

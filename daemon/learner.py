@@ -18,6 +18,7 @@ from importlib.metadata import version
 
 from daemon.answers import Answers
 from daemon.bus import Bus, Request
+from daemon.changes import Changes
 from daemon.checkpoint import CheckpointError, read_checkpoint, set_aside, write_checkpoint
 from daemon.config import Config
 from daemon.expected import ExpectedMarker
@@ -28,7 +29,6 @@ from daemon.learning import Learning, NominalModel, StateError
 from daemon.learning.solver import LARGEST_NET
 from daemon.solver_process import SolverLostError, SolverProcess
 from daemon.status import LearnerStatus
-from daemon.tool_changes import ToolChanges
 from daemon.wire import OCTETS, CommandReply, CommandRequest, PairsReply, decode, encode
 from daemon.wiring import open_marker_topic
 from interfaces.errors import RequestError
@@ -69,7 +69,7 @@ class Learner:
         self._checkpointed_pairs = self._learning.counters.pairs
         self._checkpoint_problem: str | None = None
         self._checkpoint_lock = threading.Lock()
-        self._tool_changes = ToolChanges(self._learning.counters)
+        self._changes = Changes(self._robot.joints, self._learning.change)
         self._rested_with: int | None = None
         self._stop = threading.Event()
         self._failure: Exception | None = None
@@ -155,7 +155,7 @@ class Learner:
             refused=counters.refused,
             doubted=counters.doubted,
             changes=counters.changes,
-            last_change=self._tool_changes.last,
+            last_change=self._changes.status(self._learning.change, can_roll_back=self._learning.can_roll_back),
             at_rest=at_rest,
             checkpoint_age_s=None if written is None else now - written,
             uptime_s=now - self._started_at,
@@ -227,6 +227,7 @@ class Learner:
             "resume": self._resume,
             "reset_to_prior": self._reset_to_prior,
             "tool_changed": self._tool_changed,
+            "rollback": self._rollback,
             "checkpoint": self._checkpoint_now,
         }
         if command not in carried_out:
@@ -249,7 +250,7 @@ class Learner:
         with self._feed.lock:
             foreign = self._feed.foreign_store
             self._learning.reset_to_prior(forget_store=foreign is not None)
-            self._tool_changes.forget(self._learning.counters)
+            self._changes.note(None)
             self._feed.restart()
         self._feed.wake()
         self.checkpoint()
@@ -260,9 +261,18 @@ class Learner:
     def _tool_changed(self) -> str:
         with self._feed.lock:
             self._learning.tool_changed()
-            self._tool_changes.note(self._learning.counters, found=False)
+            self._changes.note(self._learning.change)
         self.checkpoint()
         return "pairs with the old tool no longer count; what they taught is where learning starts again"
+
+    def _rollback(self) -> str:
+        with self._feed.lock:
+            undone = self._learning.change
+            self._learning.rollback()
+            self._changes.note(self._learning.change, rolled_back=True)
+        self.checkpoint()
+        since = "the last change" if undone is None else f"pair {undone.first_seq}"
+        return f"the model before {since} answers again; pairs since then do not count"
 
     def _checkpoint_now(self) -> str:
         self.checkpoint()
@@ -280,7 +290,7 @@ class Learner:
         while not self._stop.is_set():
             self._feed.step(IDLE_S)
             with self._feed.lock:
-                self._tool_changes.note(self._learning.counters, found=True)
+                self._changes.note(self._learning.change)
 
     def _work_in_background(self) -> None:
         with contextlib.suppress(OSError):  # niceness is a courtesy: without it answers are a little later

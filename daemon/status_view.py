@@ -16,6 +16,7 @@ from rich.text import Text
 from interfaces.errors import BusError, RequestError
 
 from .bus import Bus
+from .changes import UNDECIDED
 from .config import Config
 from .findings_view import calibration_table, outlook_lines
 from .identity import Route
@@ -145,7 +146,8 @@ def _learner(status: LearnerStatus) -> list[RenderableType]:
     if status.orientation is not None:
         facts.add_row("orientation", _orientation(status.orientation))
     if status.changes:
-        facts.add_row("tool", _tool_change(status))
+        for name, line in zip(("change", ""), _change(status), strict=False):
+            facts.add_row(name, line)
     for name, line in zip(("enough?", ""), outlook_lines(status.outlook), strict=False):
         facts.add_row(name, line)
     facts.add_row("answering", f"{status.answering}, model {status.model or 'none yet'}")
@@ -157,11 +159,20 @@ def _elsewhere(status: LearnerStatus) -> str:
     return "" if status.outlook is None else f", {mm(status.outlook.anywhere_m)} over all joints' ranges"
 
 
-def _tool_change(status: LearnerStatus) -> str:
+def _change(status: LearnerStatus) -> Iterator[str]:
     since, change = f"{status.pairs_since_change} pairs since", status.last_change
     if change is None:
-        return f"changed {status.changes} time{'' if status.changes == 1 else 's'}; {since}"
-    return f"changed at pair {change.first_seq} ({'found' if change.found else 'told'}); {since}"
+        yield f"changed {status.changes} time{'' if status.changes == 1 else 's'}; {since}"
+        return
+    when = f"at pair {change.first_seq}"
+    if change.earliest_seq < change.latest_seq:
+        when += f" ({change.earliest_seq} to {change.latest_seq})"
+    moved = "" if change.moved_m is None else f", marker moved by {mm(change.moved_m)}"
+    yield f"{change.kind} {when}{moved} ({'found' if change.found else 'told'}); {since}"
+    if change.kind == UNDECIDED:
+        yield ", ".join(f"{kind} {share:.0%}" for kind, share in change.probabilities.items())
+    elif change.alike is not None:
+        yield f"or {change.alike}: no motion tells them apart"
 
 
 def _facts() -> Table:

@@ -27,7 +27,8 @@ def command(
     `pause` and `resume` accepting pairs (or, with --to learner, learning); `zero_force_on` lets the servos bear the
     arm, `gaze_on` turns the head to the hand, `..._off` switches their torque off; `accept_turns` when a joint lost its
     turn count while its bus was away, and stands where the message says: the turn nearest to where it was is taken;
-    `tool_changed` when another tool is in the hand; `reset_to_prior` forgets what was learnt, not the stored pairs;
+    `tool_changed` when another tool is in the hand; `rollback` goes back to the model before the last change;
+    `reset_to_prior` forgets what was learnt, not the stored pairs;
     `checkpoint` writes the learner's state now.
 
     Needs: that process running (`bodyschema run`).
