@@ -30,24 +30,17 @@ def learner(
     from daemon import logs
     from daemon.config import Config
     from daemon.learner import run_learner
-    from daemon.signals import on_termination
+    from daemon.notify import Notifier
+    from daemon.signals import Wishes, on_termination
     from interfaces.clock import SystemClock
 
     logs.set_up(verbose=verbose)
+    notifier = Notifier.of_environment()
     config = Config.load(robot)
     config.require_learnable()
     if state_dir is not None:
         config = config.with_state_dir(state_dir)
-    ending = Ending()
-    with on_termination(ending.begin):
-        run_learner(config, SystemClock(), lambda: ending.begun)
-
-
-class Ending:
-    """Whether somebody has asked the process to end."""
-
-    begun = False
-
-    def begin(self) -> None:
-        """Ask it to end."""
-        self.begun = True
+    wishes = Wishes()
+    # In a terminal SIGHUP says that it was closed.
+    with on_termination(wishes.end, reload=wishes.reload if notifier.is_heard else None):
+        run_learner(config, SystemClock(), wishes, notifier)

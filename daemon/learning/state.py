@@ -28,6 +28,7 @@ class Counters(msgspec.Struct, kw_only=True):
         since_change: pairs since the tool was last changed, or since the beginning.
         changes: tool changes that were told or found.
         doubted: pairs that looked like gross outliers.
+        missed: pairs that the sampler no longer kept when they were asked for.
     """
 
     store: str | None = None
@@ -39,6 +40,7 @@ class Counters(msgspec.Struct, kw_only=True):
     gaps_recovered: int = 0
     changes: int = 0
     doubted: int = 0
+    missed: int = 0
 
 
 class LearningHeader(msgspec.Struct, kw_only=True):

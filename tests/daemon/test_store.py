@@ -14,8 +14,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from daemon.store import APPLICATION_ID, PairReader, PairStore, Session
+from daemon.store import PairReader, PairStore, Session
 from daemon.store_rows import pair_of, row_of
+from daemon.store_schema import APPLICATION_ID
 from interfaces.errors import StoreError
 from interfaces.records import MarkerFix, Pair, frozen_array
 
