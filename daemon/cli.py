@@ -40,6 +40,8 @@ COMMANDS = {
     "command": "Pause, resume, tell of a changed tool, reset, checkpoint.",
     "record": "Copy the running sampler's pairs into a file.",
     "export": "Turn a store or a recording into CSV, Parquet or MCAP.",
+    "backup": "Pairs, checkpoint and description in one file, while running.",
+    "restore": "Put a backup back, verified; overwrites nothing unasked.",
 }
 
 

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -179,7 +180,7 @@ def test_a_sampler_that_is_told_to_read_robot_toml_again_loses_no_frame(config: 
     assert "in force now: daemon.segment_gap_s = 7.0" in log_of(config).read_text()
     with PairReader(config.store_file) as store:
         t = [pair.t for pair in store.read()]
-    assert max(b - a for a, b in zip(t, t[1:], strict=False)) < 1.5 / 60  # every frame of the recording's 60 a second
+    assert max(b - a for a, b in pairwise(t)) < 1.5 / 60  # every frame of the recording's 60 a second
 
 
 def test_a_sampler_goes_on_when_robot_toml_is_wrong(config: Config, systemd: Systemd) -> None:
