@@ -31,6 +31,7 @@ def file(tmp_path: Path) -> Path:
 @pytest.fixture
 def store(file: Path) -> Iterator[PairStore]:
     with PairStore(file, SESSION) as store:
+        store._connection.execute("PRAGMA synchronous = OFF")  # nothing here is about power cuts
         yield store
 
 
