@@ -97,9 +97,9 @@ class Sampler:
         self._cameras, self._calibration = sources.cameras, sources.calibration
         self._gaze = None if sources.head is None else self._gaze_loop(sources.head)
         self._simulation, self._source_clock = sources.simulation, sources.clock
-        self._joints = Reopening(sources.joints, "the encoders", self._wall)
+        self._joints = Reopening(sources.joints, "the encoders", self._wall, forbidden=self._service.forbidden)
         self._encoders, self._devices = sources.joints, DeviceWatch(sources.joints, store, self._wall)
-        self._marker = Reopening(sources.marker, "the cameras", self._wall)
+        self._marker = Reopening(sources.marker, "the cameras", self._wall, forbidden=self._service.forbidden)
         rules, prismatic = config.tables.daemon, config.robot.chain.prismatic
         self._buffer = JointBuffer(prismatic, rules.max_reading_gap_s, live=sources.live, kept_s=AROUND_S)
         self._gate = Gate(rules, prismatic, store.last())

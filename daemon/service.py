@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
+import os
 import threading
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 
 from interfaces.protocols import Clock
 
@@ -11,6 +13,7 @@ from .notify import Notifier
 
 # systemd waits for so many times longer than the time between two signs of life.
 SIGNS_PER_WATCHDOG = 4
+SETTLED_S = 3.0  # a device that was plugged in gets its group a moment after its name
 
 
 class Service:
@@ -20,12 +23,23 @@ class Service:
     that one loop which hangs, whichever it is, starves it.
     """
 
-    def __init__(self, notifier: Notifier, loops: Collection[str], clock: Clock) -> None:
+    def __init__(
+        self,
+        notifier: Notifier,
+        loops: Collection[str],
+        clock: Clock,
+        *,
+        devices: Sequence[str] = (),
+        may_open: Callable[[str], bool] = lambda device: os.access(device, os.R_OK | os.W_OK),
+    ) -> None:
         """Not ready yet.
 
         Args:
             loops: names of the loops that have to come round.
+            devices: what the service was allowed when it was started; access(2) knows of that, too.
         """
+        self._devices = devices if notifier.is_heard else ()
+        self._may_open, self._forbidden_since = may_open, math.inf
         self._notifier, self._clock = notifier, clock
         self._loops = set(loops)
         self._round: set[str] = set()
@@ -58,6 +72,17 @@ class Service:
         if not self._ready:
             self._ready = True
             self._notifier.ready()
+
+    def forbidden(self) -> str | None:
+        """A device that is there and has not been this service's to open for a while; None where there is none.
+
+        systemd resolves the names of devices when it starts a service. One that comes back under another number is
+        the service's after a new start.
+        """
+        found = next((name for name in self._devices if os.path.exists(name) and not self._may_open(name)), None)
+        now = self._clock.now()
+        self._forbidden_since = math.inf if found is None else min(self._forbidden_since, now)
+        return found if now - self._forbidden_since >= SETTLED_S else None
 
     def reloading(self) -> None:
         """The configuration is read again, until `reloaded`."""

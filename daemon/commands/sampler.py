@@ -36,6 +36,7 @@ def sampler(
     from daemon.session import session_of
     from daemon.signals import on_termination
     from daemon.store import PairStore
+    from daemon.units import devices_of
     from daemon.wiring import open_sources
     from interfaces.clock import SystemClock
 
@@ -49,7 +50,7 @@ def sampler(
         Bus(listen=config.tables.zenoh.sampler) as bus,
         PairStore(config.store_file, session_of(config, SystemClock())) as store,
     ):
-        service = Service(notifier, LOOPS, SystemClock())
+        service = Service(notifier, LOOPS, SystemClock(), devices=devices_of(config))
         process = Sampler(config, sources, bus, store, exit_at_end=exit_at_end, service=service)
         # In a terminal SIGHUP says that it was closed.
         with on_termination(process.stop, reload=process.reload if notifier.is_heard else None):

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from daemon.notify import Notifier
-from daemon.service import SIGNS_PER_WATCHDOG, Service, with_health
+from daemon.service import SETTLED_S, SIGNS_PER_WATCHDOG, Service, with_health
 from interfaces.clock import SystemClock
 
 WATCHDOG_S = 8.0
@@ -154,3 +154,70 @@ def test_a_systemd_that_is_gone_is_logged_once_and_ends_nothing(tmp_path, caplog
     assert [record.getMessage() for record in caplog.records] == [
         "systemd cannot be told READY: No such file or directory"
     ]
+
+
+# --- devices that come back under another number
+
+
+class Permissions:
+    """Whether systemd lets the service open its devices."""
+
+    granted = True
+
+    def __call__(self, device: str) -> bool:
+        return self.granted
+
+
+@pytest.fixture
+def plugged(tmp_path: Path) -> Path:
+    device = tmp_path / "ttyUSB1"
+    device.touch()
+    return device
+
+
+@pytest.fixture
+def permissions() -> Permissions:
+    return Permissions()
+
+
+@pytest.fixture
+def owner(systemd: Heard, clock: HandClock, plugged: Path, permissions: Permissions) -> Service:
+    notifier = Notifier(systemd.socket.getsockname())
+    return Service(notifier, LOOPS, clock, devices=[str(plugged)], may_open=permissions)
+
+
+def test_a_device_that_may_be_opened_is_not_forbidden(owner) -> None:
+    assert owner.forbidden() is None
+
+
+def test_a_device_that_may_not_be_opened_for_long_is_forbidden(owner, clock, permissions, plugged) -> None:
+    permissions.granted = False
+    assert owner.forbidden() is None  # its group may come yet
+    clock.time += SETTLED_S
+    assert owner.forbidden() == str(plugged)
+
+
+def test_a_device_that_gets_its_group_late_is_not_forbidden(owner, clock, permissions) -> None:
+    permissions.granted = False
+    owner.forbidden()
+    clock.time += SETTLED_S
+    permissions.granted = True
+    assert owner.forbidden() is None
+    permissions.granted = False
+    assert owner.forbidden() is None
+
+
+def test_a_device_that_is_not_there_is_waited_for(owner, clock, permissions, plugged) -> None:
+    plugged.unlink()
+    permissions.granted = False
+    owner.forbidden()
+    clock.time += 1000.0
+    assert owner.forbidden() is None
+
+
+def test_outside_of_systemd_nothing_is_forbidden(clock, plugged, permissions) -> None:
+    permissions.granted = False
+    process = Service(Notifier(), LOOPS, clock, devices=[str(plugged)], may_open=permissions)
+    process.forbidden()
+    clock.time += 1000.0
+    assert process.forbidden() is None
