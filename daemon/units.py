@@ -68,7 +68,7 @@ NotifyAccess=main
 ExecStart={command} {process}
 ExecReload=/bin/kill -HUP $MAINPID
 # Fed by the loops that work, so that one which hangs starves it; the abort leaves every thread's place in the journal.
-WatchdogSec=30
+WatchdogSec={watchdog_s}
 WatchdogSignal=SIGABRT
 TimeoutStartSec=90
 TimeoutStopSec=30
@@ -88,6 +88,8 @@ IPAddressAllow=localhost
 [Install]
 WantedBy=multi-user.target
 """
+# Longer than the slowest round of any loop: the learner's background work took 6 s with twelve joints on a busy machine.
+_WATCHDOG_S = {"sampler": 30, "learner": 60}
 _READY = {
     "sampler": "encoders and cameras are read, the store is open and zenoh answers",
     "learner": "the checkpoint is read and zenoh answers",
@@ -134,6 +136,7 @@ def template(process: str, installed: Installed) -> str:
         own=OWN,
         ready=_READY[process],
         command=" ".join(map(_quoted, installed.command)),
+        watchdog_s=_WATCHDOG_S[process],
         restart=restart,
         devices=_DEVICES[process],
         sandbox=_SANDBOX,
