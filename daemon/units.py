@@ -88,7 +88,7 @@ IPAddressAllow=localhost
 [Install]
 WantedBy=multi-user.target
 """
-# Longer than the slowest round of any loop: the learner's background work took 6 s with twelve joints on a busy machine.
+# Longer than any loop's slowest round: the learner's background work took 6 s with twelve joints on a busy machine.
 _WATCHDOG_S = {"sampler": 30, "learner": 60}
 _READY = {
     "sampler": "encoders and cameras are read, the store is open and zenoh answers",
