@@ -56,6 +56,10 @@ class DaemonConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         max_time_error_deg: joints that move farther than this while the time of a frame is uncertain (1-sigma, and
             what lies between the two eyes' images) are too fast for a pair.
         segment_gap_s: a pause between pairs longer than this starts a new segment.
+        keep_days: pairs older than this are deleted; without it none is for its age.
+        keep_mb: so much of the store's file is used, in 10^6 bytes; the oldest pairs beyond it are deleted. Without it
+            the disk is the limit.
+        keep_newest: so many of the newest pairs are kept whatever their age and size.
     """
 
     state_dir: str | None = None
@@ -67,6 +71,9 @@ class DaemonConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     max_marker_speed_m_s: Positive = 3.0
     max_time_error_deg: Positive = 0.2
     segment_gap_s: Positive = 1.0
+    keep_days: Positive | None = None
+    keep_mb: Positive | None = None
+    keep_newest: Count = 20_000
 
 
 # A larger radius is one of another unit [m].
@@ -121,12 +128,14 @@ class Config:
 
     Attributes:
         simulation: the robot with the effects that the file adds to it.
+        given_state_dir: the place for store and checkpoint that the command line gave, if it gave one.
     """
 
     file: Path
     robot: RobotDescription
     tables: Tables
     simulation: Simulation
+    given_state_dir: Path | None = None
 
     @classmethod
     def load(cls, file: Path, environment: Mapping[str, str] = os.environ) -> Config:
@@ -183,7 +192,16 @@ class Config:
     def with_state_dir(self, folder: Path) -> Config:
         """The same with another place for store and checkpoint, relative to the working directory."""
         daemon = msgspec.structs.replace(self.tables.daemon, state_dir=str(folder.absolute()))
-        return replace(self, tables=msgspec.structs.replace(self.tables, daemon=daemon))
+        return replace(self.with_tables(msgspec.structs.replace(self.tables, daemon=daemon)), given_state_dir=folder)
+
+    def with_tables(self, tables: Tables) -> Config:
+        """The same with other settings."""
+        return replace(self, tables=tables)
+
+    def reread(self) -> Config:
+        """What the file says now, under the same command line; ConfigError as by `load`."""
+        again = Config.load(self.file)
+        return again if self.given_state_dir is None else again.with_state_dir(self.given_state_dir)
 
     def route(self, process: str) -> Route:
         """Where a client finds `sampler` or `learner`, and as whom."""

@@ -27,11 +27,15 @@ from daemon.findings import Findings
 from daemon.keys import Keys
 from daemon.learning import Learning, NominalModel, StateError
 from daemon.learning.solver import LARGEST_NET
+from daemon.notify import Notifier
+from daemon.reload import reload
+from daemon.service import Service, with_health
+from daemon.signals import Wishes
 from daemon.solver_process import SolverLostError, SolverProcess
 from daemon.status import LearnerStatus
 from daemon.wire import OCTETS, CommandReply, CommandRequest, PairsReply, decode, encode
 from daemon.wiring import open_marker_topic
-from interfaces.errors import RequestError
+from interfaces.errors import BodyschemaError, RequestError
 from interfaces.protocols import Clock
 from kbmaps import KBMapsError
 
@@ -45,6 +49,10 @@ SOLVE_WHEN_IDLE_S = 0.5
 BACKGROUND_NICENESS = 10
 # What a checkpoint raises whose checksum is right and whose parts are not.
 DOES_NOT_FIT = (ArithmeticError, LookupError, TypeError, ValueError)
+# What has to come round for the learner to be alive.
+LOOPS = ("learning", "background", "status")
+TABLES = ("robot", "camera", "zenoh", "daemon", "drivers", "learner", "effects", "unexplained")
+CHANGEABLE = {("learner", "checkpoint_every_s")}
 # Python hands the interpreter from thread to thread this often at least; its own 5 ms would be a query's delay.
 SWITCH_INTERVAL_S = 2e-4
 
@@ -52,15 +60,18 @@ SWITCH_INTERVAL_S = 2e-4
 class Learner:
     """One robot's learner with its answers, its checkpoint and its state of health."""
 
-    def __init__(self, config: Config, solver: SolverProcess, bus: Bus, clock: Clock) -> None:
+    def __init__(
+        self, config: Config, solver: SolverProcess, bus: Bus, clock: Clock, service: Service | None = None
+    ) -> None:
         self._config, self._solver, self._bus, self._clock = config, solver, bus, clock
+        self._service = Service.nobodys(clock) if service is None else service
         self._settings, self._robot = config.tables.learner, config.robot
         self._keys = Keys(config.robot.name)
         self._nominal = NominalModel.extended_by(config.simulation)
         self._learning = Learning(self._nominal, self._settings, solver)
         self._set_aside: str | None = None
         self._restore()
-        self._feed = PairFeed(self._learning, self._history, clock)
+        self._feed = PairFeed(self._learning, self._history, clock, lambda: self._service.beat("learning"))
         self._findings = Findings(self._learning, config.robot, clock)
         self._answers = Answers(self._learning, config.robot, clock)
         self._sampler_alive = False
@@ -108,6 +119,7 @@ class Learner:
         """
         if self._failure is not None:
             raise self._failure
+        self._service.beat("status")
         waited_s = self._clock.now() - (self._checkpointed_at or self._started_at)
         new = self._learning.counters.pairs != self._checkpointed_pairs
         if new and waited_s >= self._settings.checkpoint_every_s:
@@ -161,6 +173,7 @@ class Learner:
             uptime_s=now - self._started_at,
             health=list(self._health()),
             orientation=self._learning.orientation_status(),
+            missed=counters.missed,
             version=version("bodyschema"),
         )
 
@@ -229,6 +242,7 @@ class Learner:
             "tool_changed": self._tool_changed,
             "rollback": self._rollback,
             "checkpoint": self._checkpoint_now,
+            "reload": self.reload,
         }
         if command not in carried_out:
             raise RequestError(
@@ -280,6 +294,16 @@ class Learner:
             raise CheckpointError(self._checkpoint_problem)
         return f"written to {self._config.checkpoint_file}"
 
+    def reload(self) -> str:
+        """Read robot.toml again; what came of it.
+
+        Raises:
+            ConfigError: it is wrong; nothing changed.
+        """
+        found = reload(self._config, TABLES, CHANGEABLE)
+        self._config, self._settings = found.config, found.config.tables.learner
+        return found.message("learner")
+
     def _guarded(self, loop: Callable[[], None]) -> None:
         try:
             loop()
@@ -288,6 +312,7 @@ class Learner:
 
     def _learn_pairs(self) -> None:
         while not self._stop.is_set():
+            self._service.beat("learning")
             self._feed.step(IDLE_S)
             with self._feed.lock:
                 self._changes.note(self._learning.change)
@@ -297,6 +322,7 @@ class Learner:
             os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), BACKGROUND_NICENESS)
         idle_since = self._clock.now()
         while not self._stop.is_set():
+            self._service.beat("background")
             try:
                 self._findings.renew()
                 worked = self._learning.work()
@@ -315,26 +341,53 @@ class Learner:
                 self._learning.solve_soon()
 
 
-def run_learner(config: Config, clock: Clock, stopping: Callable[[], bool]) -> None:
-    """Learn and answer until `stopping()`.
+def run_learner(config: Config, clock: Clock, wishes: Wishes, notifier: Notifier) -> None:
+    """Learn and answer until `wishes` has an end.
+
+    Args:
+        notifier: is told when all is up, that `LOOPS` work, and how the learner is.
 
     Raises:
         BusError: the learner's port is in use.
         CheckpointError: an unusable checkpoint cannot be moved aside.
     """
     sys.setswitchinterval(SWITCH_INTERVAL_S)
-    endpoints = config.tables.zenoh
+    endpoints, service = config.tables.zenoh, Service(notifier, LOOPS, clock)
     with SolverProcess() as solver, Bus(listen=endpoints.learner, settings=config.zenoh_settings("learner")) as bus:
-        learner = Learner(config, solver, bus, clock)
+        learner = Learner(config, solver, bus, clock, service)
         publish = bus.publisher(Keys(config.robot.name).status("learner"))
         gc.collect()
         gc.freeze()  # what start-up left behind need not be looked through again
         with learner.serving():
             log.info("the learner of %s answers on %s", config.robot.name, endpoints.learner)
+            service.ready()
             published_at = clock.now() - STATUS_EVERY_S
-            while not stopping():
+            while not wishes.ending:
                 if clock.now() - published_at >= STATUS_EVERY_S:
                     published_at = clock.now()
-                    publish(encode(learner.status()))
+                    status = learner.status()
+                    publish(encode(status))
+                    service.tell(status_line(status))
+                if wishes.reloading:
+                    wishes.reloading = False
+                    _reload(learner, service)
                 learner.tick()
                 time.sleep(TICK_S)
+            service.stopping()
+
+
+def status_line(status: LearnerStatus) -> str:
+    """How the learner is, in a line."""
+    claimed = "" if status.claimed_error_m is None else f", {1e3 * status.claimed_error_m:.1f} mm claimed"
+    return with_health(f"{status.state}, {status.pairs} pairs, {status.answering} answers{claimed}", status.health)
+
+
+def _reload(learner: Learner, service: Service) -> None:
+    """Whoever asked by a signal reads the log."""
+    service.reloading()
+    try:
+        log.info("robot.toml was read again: %s", learner.reload())
+    except BodyschemaError as error:
+        log.error("robot.toml was read again and is not followed: %s", error)
+    finally:
+        service.reloaded()

@@ -234,6 +234,7 @@ class LearnerStatus(msgspec.Struct, frozen=True, kw_only=True):
         checkpoint_age_s: time since the last checkpoint, or null before any.
         health: sentences about what is wrong; empty when all is well.
         orientation: null where no pair with the present tool said how the marker is turned.
+        missed: pairs that the sampler no longer kept when this learner asked for them.
     """
 
     robot: str
@@ -262,4 +263,5 @@ class LearnerStatus(msgspec.Struct, frozen=True, kw_only=True):
     health: list[str]
     version: str
     orientation: OrientationStatus | None = None
+    missed: int = 0
     schema: int = SCHEMA

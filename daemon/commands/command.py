@@ -18,18 +18,18 @@ def command(
     *,
     to: Annotated[
         Process | None,
-        Parameter(help="Who is to do it; else who knows the command, and for pause and resume the sampler."),
+        Parameter(help="Who is to do it; else who knows the command, and for pause, resume and reload the sampler."),
     ] = None,
     robot: RobotFile = HERE,
 ) -> None:
     """Tell a running process to do something.
 
-    `pause` and `resume` accepting pairs (or, with --to learner, learning); `zero_force_on` lets the servos bear the
-    arm, `gaze_on` turns the head to the hand, `..._off` switches their torque off; `accept_turns` when a joint lost its
-    turn count while its bus was away, and stands where the message says: the turn nearest to where it was is taken;
-    `tool_changed` when another tool is in the hand; `rollback` goes back to the model before the last change;
-    `reset_to_prior` forgets what was learnt, not the stored pairs;
-    `checkpoint` writes the learner's state now.
+    `pause` and `resume` accepting pairs (or, with --to learner, learning); `reload` reads robot.toml again and says
+    what of it needs a new start; `zero_force_on` lets the servos bear the arm, `gaze_on` turns the head to the hand,
+    `..._off` switches their torque off; `accept_turns` when a joint lost its turn count while its bus was away, and
+    stands where the message says: the turn nearest to where it was is taken; `tool_changed` when another tool is in the
+    hand; `rollback` goes back to the model before the last change; `reset_to_prior` forgets what was learnt, not the
+    stored pairs; `checkpoint` writes the learner's state now.
 
     Needs: that process running (`bodyschema run`).
 

@@ -33,27 +33,21 @@ def learner(
     from daemon import logs
     from daemon.config import Config
     from daemon.learner import run_learner
-    from daemon.signals import on_termination
+    from daemon.notify import Notifier
+    from daemon.signals import Wishes, on_termination
     from daemon.view_process import require_extra, shown
     from interfaces.clock import SystemClock
 
     if view:
         require_extra()
     logs.set_up(verbose=verbose)
+    notifier = Notifier.of_environment()
     config = Config.load(robot)
     config.require_learnable()
     if state_dir is not None:
         config = config.with_state_dir(state_dir)
-    ending = Ending()
-    with shown(robot) if view else nullcontext(), on_termination(ending.begin):
-        run_learner(config, SystemClock(), lambda: ending.begun)
-
-
-class Ending:
-    """Whether somebody has asked the process to end."""
-
-    begun = False
-
-    def begin(self) -> None:
-        """Ask it to end."""
-        self.begun = True
+    wishes = Wishes()
+    # In a terminal SIGHUP says that it was closed.
+    reload = wishes.reload if notifier.is_heard else None
+    with shown(robot) if view else nullcontext(), on_termination(wishes.end, reload=reload):
+        run_learner(config, SystemClock(), wishes, notifier)

@@ -26,15 +26,14 @@ def router(
     Next: `router` and `[zenoh.tls]` in each machine's robot.toml; `bodyschema doctor` there.
     """
     from daemon import logs
-    from daemon.commands.learner import Ending
     from daemon.router import RouterConfig, run_router
-    from daemon.signals import on_termination
+    from daemon.signals import Wishes, on_termination
 
     config = RouterConfig.load(file)
     if zenohd:
         print(config.as_zenohd())  # noqa: T201
         return
     logs.set_up(verbose=verbose)
-    ending = Ending()
-    with on_termination(ending.begin):
-        run_router(config, lambda: ending.begun)
+    wishes = Wishes()
+    with on_termination(wishes.end):
+        run_router(config, lambda: wishes.ending)

@@ -195,6 +195,11 @@ class Learning:
         with self._lock:
             self._counters.gaps_recovered += pairs
 
+    def missed(self, pairs: int) -> None:
+        """Count pairs that nobody keeps any more."""
+        with self._lock:
+            self._counters.missed += pairs
+
     def tool_changed(self) -> None:
         """From now on another tool: pairs so far no longer count, what they taught is where learning starts again."""
         with self._lock:

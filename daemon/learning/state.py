@@ -32,6 +32,7 @@ class Counters(msgspec.Struct, kw_only=True):
         since_change: pairs since the last change, or since the beginning.
         changes: changes of the tool, or of something else, that were told or found.
         doubted: pairs that looked like gross outliers.
+        missed: pairs that the sampler no longer kept when they were asked for.
     """
 
     store: str | None = None
@@ -43,6 +44,7 @@ class Counters(msgspec.Struct, kw_only=True):
     gaps_recovered: int = 0
     changes: int = 0
     doubted: int = 0
+    missed: int = 0
 
 
 class LearningHeader(msgspec.Struct, kw_only=True):
