@@ -27,6 +27,9 @@ class JointBuffer:
     Both sides come in strictly increasing time. Readings before the frame that was asked for last are forgotten.
     When the buffer is full `put` waits for room, because a recording can be read faster than its frames are stored;
     of live encoders it forgets the oldest, because who reads them may bear the arm and can wait for nobody.
+
+    Attributes:
+        max_gap_s: readings around a frame may be this far apart [s].
     """
 
     def __init__(
@@ -48,7 +51,7 @@ class JointBuffer:
             kept_s: readings of so long before the frame are not forgotten yet [s].
         """
         self._prismatic = prismatic
-        self._max_gap_s = max_gap_s
+        self.max_gap_s = max_gap_s
         self._capacity = capacity
         self._live, self._kept_s = live, kept_s
         self._readings: deque[JointReading] = deque(maxlen=capacity if live else None)
@@ -107,7 +110,7 @@ class JointBuffer:
             before, after = self._around(t)
         if before.t == t:
             return before.q
-        if after.t - before.t > self._max_gap_s + ROUNDING_S:
+        if after.t - before.t > self.max_gap_s + ROUNDING_S:
             return Reason.STALE
         fraction = (t - before.t) / (after.t - before.t)
         return frozen_array(before.q + fraction * joint_difference(after.q, before.q, self._prismatic))

@@ -5,10 +5,13 @@ A Python callback that is never undeclared keeps the process from exiting, so ev
 
 from __future__ import annotations
 
+import contextlib
 import json
 import logging
+import queue
 import socket
-from collections.abc import Callable, Iterator
+import threading
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from types import TracebackType
@@ -19,6 +22,8 @@ import zenoh.ext
 
 from interfaces.errors import BodyschemaError, BusError, RequestError
 
+from .identity import Route
+from .reception import Reception
 from .wire import JSON, MSGPACK, ErrorReply, decode, encode
 
 log = logging.getLogger(__name__)
@@ -30,6 +35,10 @@ OPEN_TIMEOUT_S = 5.0
 # What clients call a payload when nobody told them: taken for JSON.
 PLAIN = ("zenoh/", "text/")
 RETRY_MS = {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 2}
+# What is put together from fragments: the largest model with its orientation for a client, pairs for a process.
+LARGEST_REPLY_BYTES, LARGEST_MESSAGE_BYTES = 2**26, 2**23
+LONGEST_ERROR = 2000  # characters
+REFUSALS = 1000  # that wait to be told; beyond them a query ends without an answer
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,20 +73,26 @@ class Bus:
         self,
         *,
         listen: str | None = None,
-        connect: str | None = None,
+        connect: str | Route | None = None,
         client: bool = False,
+        settings: Mapping[str, Any] | None = None,
         open_timeout_s: float = OPEN_TIMEOUT_S,
     ) -> None:
         """A session that listens on `listen` and, when there is somebody, talks to `connect`.
 
         Args:
             client: connect at once or fail; otherwise go on trying in the background.
+            settings: more of zenoh's configuration, as `Config.zenoh_settings` has it for a process.
             open_timeout_s: how long who takes the connection may need to speak zenoh.
         """
-        self._listen, self._connect, self._client = listen, connect, client
+        self._listen, self._client, self._settings = listen, client, dict(settings or {})
+        self._route = Route((connect,)) if isinstance(connect, str) else connect
         self._open_timeout_s = open_timeout_s
         self._session: zenoh.Session | None = None
         self._declared: list[object] = []  # a token that nobody holds is undeclared
+        self._receptions: list[Reception[zenoh.Query]] = []
+        self._threads: list[threading.Thread] = []
+        self._refusals: queue.Queue[tuple[zenoh.Query, str] | None] = queue.Queue(REFUSALS)
 
     def __enter__(self) -> Self:
         try:
@@ -93,6 +108,7 @@ class Bus:
             self._session.close()
             self._session = None
             self._declared.clear()
+            self._end_threads()
 
     def publisher(self, key: str, *, cache: int = 0) -> Callable[[bytes], None]:
         """A function that publishes JSON under `key`; with `cache`, late subscribers can ask for the last so many."""
@@ -126,11 +142,21 @@ class Bus:
             encoding: of the answers; None: the one that the request has.
         """
 
-        def receive(query: zenoh.Query) -> None:
-            with query:
-                self._reply(key, query, handler, encoding)
+        reception: Reception[zenoh.Query] = Reception()
 
-        self._declared.append(self._open.declare_queryable(key, receive, complete=True))
+        def receive(query: zenoh.Query) -> None:
+            try:
+                reception.admit(_source(query), 0 if query.payload is None else len(query.payload), query)
+            except RequestError as error:
+                self._refuse_soon(query, str(error))
+
+        if not self._threads:
+            self._start(self._refuse)
+        self._receptions.append(reception)
+        self._start(lambda: self._answer(key, reception, handler, encoding))
+        # In zenoh's own thread, which only puts the query where it waits.
+        received = zenoh.handlers.Callback(receive, indirect=False)
+        self._declared.append(self._open.declare_queryable(key, received, complete=True))
 
     def token(self, key: str) -> None:
         """Be alive under `key` until the session ends."""
@@ -153,7 +179,9 @@ class Bus:
 
     def ask(self, key: str, payload: bytes = b"", *, encoding: str = JSON, timeout_s: float = 5.0) -> list[Reply]:
         """All replies to a query; none when nobody answers under `key`."""
-        replies = self._open.get(key, payload=payload, encoding=zenoh.Encoding(encoding), timeout=timeout_s)
+        source = zenoh.SourceInfo(self._open.id, 0)
+        said = zenoh.Encoding(encoding)
+        replies = self._open.get(key, payload=payload, encoding=said, timeout=timeout_s, source_info=source)
         return [_taken_apart(reply) for reply in replies]
 
     def ask_one(self, key: str, payload: bytes = b"", *, encoding: str = JSON, timeout_s: float = 5.0) -> bytes:
@@ -166,6 +194,11 @@ class Bus:
         replies = self.ask(key, payload, encoding=encoding, timeout_s=timeout_s)
         if not replies:
             process = "sampler" if key.split("/")[-1].startswith(("sampler", "pairs", "simulation")) else "learner"
+            if self._route is not None and self._route.secured:
+                raise BusError(
+                    f"nobody answers under {key}: the {process} does not run, or your certificate or name has no role "
+                    "that may ask this (docs/security.md)"
+                )
             raise BusError(
                 f"nobody answers under {key}. Is the {process} running? Start it with `bodyschema {process}`"
             )
@@ -187,27 +220,22 @@ class Bus:
             "scouting/gossip/enabled": False,
             "listen/endpoints": [self._listen] if self._listen else [],
             "scouting/delay": FIRST_TRY_MS,
-            "connect/endpoints": [self._connect] if self._connect else [],
+            "connect/endpoints": list(self._route.endpoints) if self._route else [],
             "connect/retry": RETRY_MS,
             "timestamping/enabled": True,
             "transport/link/tx/lease": LEASE_MS,
+            "transport/link/rx/max_message_size": LARGEST_REPLY_BYTES if self._client else LARGEST_MESSAGE_BYTES,
             "transport/unicast/open_timeout": round(1e3 * self._open_timeout_s),
         }
-        for key, value in settings.items():
+        if self._route is not None and self._route.identity is not None:
+            settings |= self._route.identity.settings()
+        for key, value in (settings | self._settings).items():
             config.insert_json5(key, json.dumps(value))
         return config
 
     def _explain(self, message: str) -> str:
-        if self._client and _accepts(self._connect or ""):
-            return (
-                f"somebody listens on {self._connect} but does not answer: it is stopped, very busy, or no bodyschema. "
-                "`ps` shows what it is"
-            )
-        if self._client:
-            return (
-                f"nobody listens on {self._connect}. Start the daemon with `bodyschema run`, "
-                "or mend the table [zenoh] of robot.toml"
-            )
+        if self._client and self._route is not None:
+            return _unreached(self._route)
         if "in use" in message:
             return (
                 f"the port of {self._listen} is in use. Stop the other bodyschema, "
@@ -215,37 +243,115 @@ class Bus:
             )
         return f"cannot open zenoh on {self._listen}: {message.split(' at /')[0]}. Mend the table [zenoh] of robot.toml"
 
+    def _start(self, work: Callable[[], None]) -> None:
+        thread = threading.Thread(target=work, name="answers")
+        self._threads.append(thread)
+        thread.start()
+
+    def _end_threads(self) -> None:
+        """After the session was closed: nothing comes any more."""
+        for reception in self._receptions:
+            reception.close()
+        if self._threads:
+            self._refusals.put(None)
+        for thread in self._threads:
+            thread.join()
+        self._receptions.clear()
+        self._threads.clear()
+
+    def _refuse_soon(self, query: zenoh.Query, why: str) -> None:
+        try:
+            self._refusals.put_nowait((query, why))
+        except queue.Full:
+            query.drop()
+
+    def _refuse(self) -> None:
+        """Tell those who ask too much; in a thread of its own, for one who does not listen keeps it waiting."""
+        while (refused := self._refusals.get()) is not None:
+            with contextlib.suppress(zenoh.ZError), refused[0]:  # an ended session answers nobody
+                _reply_error(*refused)
+            del refused  # a query that is held is not yet answered
+
+    def _answer(
+        self,
+        key: str,
+        reception: Reception[zenoh.Query],
+        handler: Callable[[Request], bytes],
+        encoding: str | None,
+    ) -> None:
+        while (taken := reception.take()) is not None:
+            query, refused = taken
+            with contextlib.suppress(zenoh.ZError), query:  # an ended session answers nobody
+                if refused is None:
+                    self._reply(key, query, handler, encoding)
+                else:
+                    _reply_error(query, str(refused))
+            del query, taken  # a query that is held is not yet answered
+
     def _reply(
         self, key: str, query: zenoh.Query, handler: Callable[[Request], bytes], answer_encoding: str | None
     ) -> None:
-        asked = str(query.encoding) if query.encoding is not None else JSON
-        encoding = MSGPACK if asked.startswith(MSGPACK) else JSON
+        asked, encoding = _encodings(query)
         if not asked.startswith((JSON, MSGPACK, *PLAIN)):
-            said = f"the encoding {asked} is unknown; known are {JSON} and {MSGPACK}"
-            query.reply_err(encode(ErrorReply(said), encoding), encoding=zenoh.Encoding(encoding))
+            _reply_error(query, f"the encoding {asked} is unknown; known are {JSON} and {MSGPACK}")
             return
         payload = query.payload.to_bytes() if query.payload is not None else b""
         parameters = dict(_parameters(str(query.parameters)))
         try:
             answer = handler(Request(parameters, payload, encoding))
         except BodyschemaError as error:
-            query.reply_err(encode(ErrorReply(str(error)), encoding), encoding=zenoh.Encoding(encoding))
+            _reply_error(query, str(error))
         except Exception as error:
             log.exception("a query under %s failed", key)
-            text = f"internal error, please report it: {type(error).__name__}: {error}"
-            query.reply_err(encode(ErrorReply(text), encoding), encoding=zenoh.Encoding(encoding))
+            _reply_error(query, f"internal error, please report it: {type(error).__name__}: {error}")
         else:
             query.reply(key, answer, encoding=zenoh.Encoding(answer_encoding or encoding))
 
 
+def _encodings(query: zenoh.Query) -> tuple[str, str]:
+    """What the query's encoding is called, and which of ours an answer has."""
+    asked = str(query.encoding) if query.encoding is not None else JSON
+    return asked, MSGPACK if asked.startswith(MSGPACK) else JSON
+
+
+def _reply_error(query: zenoh.Query, text: str) -> None:
+    _, encoding = _encodings(query)
+    shortened = text if len(text) <= LONGEST_ERROR else f"{text[:LONGEST_ERROR]}..."  # it may quote the request
+    query.reply_err(encode(ErrorReply(shortened), encoding), encoding=zenoh.Encoding(encoding))
+
+
+def _source(query: zenoh.Query) -> str:
+    """Which session asks, where it says so."""
+    return "" if query.source_info is None else str(query.source_info.source_id.zid)
+
+
+def _unreached(route: Route) -> str:
+    """Why none of a route's endpoints could be reached."""
+    last = route.endpoints[-1]
+    if not _accepts(last):
+        return (
+            f"nobody listens on {route}. Start the daemon with `bodyschema run`, "
+            "or mend the table [zenoh] of robot.toml"
+        )
+    if route.secured:
+        return (
+            f"{last} is there, but the connection was refused: your certificate or password is not accepted there, "
+            "or its certificate is not for that name or not of your authority. docs/security.md shows how to look"
+        )
+    return (
+        f"somebody listens on {last} but does not answer: it is stopped, very busy, or no bodyschema. "
+        "`ps` shows what it is"
+    )
+
+
 @contextmanager
-def client(endpoint: str, open_timeout_s: float = OPEN_TIMEOUT_S) -> Iterator[Bus]:
-    """A short-lived session to the process that listens on `endpoint`; BusError when there is none."""
-    with Bus(connect=endpoint, client=True, open_timeout_s=open_timeout_s) as bus:
+def client(route: str | Route, open_timeout_s: float = OPEN_TIMEOUT_S) -> Iterator[Bus]:
+    """A short-lived session to a process; BusError when there is none."""
+    with Bus(connect=route, client=True, open_timeout_s=open_timeout_s) as bus:
         yield bus
 
 
-def is_alive(endpoint: str, token: str, *, open_timeout_s: float = OPEN_TIMEOUT_S) -> bool:
+def is_alive(endpoint: str | Route, token: str, *, open_timeout_s: float = OPEN_TIMEOUT_S) -> bool:
     """Whether somebody listens on `endpoint` and has declared the liveliness token."""
     try:
         with client(endpoint, open_timeout_s) as bus:
@@ -278,7 +384,7 @@ def _accepts(endpoint: str) -> bool:
     """Whether a connection to a TCP endpoint is taken, be it by a process that never answers."""
     protocol, _, address = endpoint.partition("/")
     host, _, port = address.rpartition(":")
-    if protocol != "tcp" or not port.isdigit():
+    if protocol not in ("tcp", "tls") or not port.isdigit():
         return False
     try:
         with socket.create_connection((host.strip("[]"), int(port)), ACCEPT_LIMIT_S):

@@ -143,11 +143,12 @@ def _doubt(calibration: Calibration) -> str | None:
     """Why the chain is not this arm's; None where it may be."""
     robot, recording, learner = calibration.robot, calibration.recording, calibration.learner
     left = np.linalg.norm(learner.predict(recording.q) - recording.x, axis=1)
-    if not is_far_off(robot, left, learner.report().noise if calibration.noise_told else None):
+    sigma_m = learner.report().noise if calibration.noise_told else None
+    if not is_far_off(robot, left, sigma_m):
         return None
     return (
         f"The learnt arm misses half of the pairs by over {1e3 * float(np.median(left)):.3g} mm, as none does that "
-        f"is like the drawn one. {mixed_up(robot, recording) or OTHER_CAUSES}."
+        f"is like the drawn one. {mixed_up(robot, recording, sigma_m) or OTHER_CAUSES}."
     )
 
 

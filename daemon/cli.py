@@ -24,7 +24,7 @@ COMMANDS = {
     "reproduce": "Run the paper's experiments again, its figures beside ours.",
     "scan": "Which servos are there: all ports, rates and protocols.",
     "doctor": "Ports, servos, disk, clock, zenoh: what to mend, and how.",
-    "install": "Rules of this machine: install udev, for serial ports.",
+    "install": "On this machine: services for systemd, rules for ports.",
     "robot": "robot new: a robot.toml for the servos that were found.",
     "marker": "Tags to print, a cluster measured, a ball's colour learnt.",
     "joints": "Angles live while you move the arm: signs, ranges, health.",
@@ -34,12 +34,16 @@ COMMANDS = {
     "run": "Start sampler and learner, and keep them running.",
     "sampler": "Only the sampler: encoders and cameras in, pairs out.",
     "learner": "Only the learner: pairs in, answers out. On any machine.",
+    "router": "Where machines meet: TLS, and who may do what.",
     "status": "What both processes do and found, and if it is enough.",
+    "view": "A page: errors, where to move next, residuals, buttons.",
     "predict": "Ask where the marker is at given joint angles.",
     "ik": "Ask for joint angles that bring the marker to a position.",
     "command": "Pause, resume, tell of a changed tool, reset, checkpoint.",
     "record": "Copy the running sampler's pairs into a file.",
-    "export": "Turn a store or a recording into CSV, Parquet or MCAP.",
+    "export": "A store or a recording into CSV, Parquet, MCAP or Rerun.",
+    "backup": "Pairs, checkpoint and description in one file, while running.",
+    "restore": "Put a backup back, verified; overwrites nothing unasked.",
 }
 
 

@@ -7,6 +7,7 @@ from typing import Literal
 CommandName = Literal[
     "pause",
     "resume",
+    "reload",
     "accept_turns",
     "zero_force_on",
     "zero_force_off",
@@ -14,7 +15,8 @@ CommandName = Literal[
     "gaze_off",
     "reset_to_prior",
     "tool_changed",
+    "rollback",
     "checkpoint",
 ]
-BOTHS: tuple[CommandName, ...] = ("pause", "resume")
+BOTHS: tuple[CommandName, ...] = ("pause", "resume", "reload")
 SAMPLERS: tuple[CommandName, ...] = (*BOTHS, "accept_turns", "zero_force_on", "zero_force_off", "gaze_on", "gaze_off")

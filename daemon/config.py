@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 import os
-import re
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -28,24 +27,17 @@ from interfaces.toml_file import convert, line_of, read_toml
 from sim_backend.config import SimConfig
 from vision.config import VisionConfig
 
+from .identity import Route
+from .zenoh_config import ZenohConfig
+
 NonNegative = Annotated[float, Meta(ge=0)]
 Positive = Annotated[float, Meta(gt=0)]
 Count = Annotated[int, Meta(ge=1)]
 
 ENVIRONMENT = "BODYSCHEMA_"
-# Sockets in the file system have no port.
-ENDPOINT = re.compile(r"(tcp|udp|tls|quic|ws)/.+:[0-9]+|unixsock-stream/.+")
-
 # Control points of a map that the learner keeps up with: 12 joints that turn. Learning and replaying a pair take 25 ms
 # there, with 13 joints 57 ms, and from a camera pairs come every 33 ms.
 LARGEST_MAP = 3**12
-
-
-class ZenohConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The table [zenoh]: where the two processes listen."""
-
-    sampler: str = "tcp/127.0.0.1:7447"
-    learner: str = "tcp/127.0.0.1:7448"
 
 
 class DaemonConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -64,6 +56,10 @@ class DaemonConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         max_time_error_deg: joints that move farther than this while the time of a frame is uncertain (1-sigma, and
             what lies between the two eyes' images) are too fast for a pair.
         segment_gap_s: a pause between pairs longer than this starts a new segment.
+        keep_days: pairs older than this are deleted; without it none is for its age.
+        keep_mb: so much of the store's file is used, in 10^6 bytes; the oldest pairs beyond it are deleted. Without it
+            the disk is the limit.
+        keep_newest: so many of the newest pairs are kept whatever their age and size.
     """
 
     state_dir: str | None = None
@@ -75,6 +71,9 @@ class DaemonConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     max_marker_speed_m_s: Positive = 3.0
     max_time_error_deg: Positive = 0.2
     segment_gap_s: Positive = 1.0
+    keep_days: Positive | None = None
+    keep_mb: Positive | None = None
+    keep_newest: Count = 20_000
 
 
 # A larger radius is one of another unit [m].
@@ -129,12 +128,14 @@ class Config:
 
     Attributes:
         simulation: the robot with the effects that the file adds to it.
+        given_state_dir: the place for store and checkpoint that the command line gave, if it gave one.
     """
 
     file: Path
     robot: RobotDescription
     tables: Tables
     simulation: Simulation
+    given_state_dir: Path | None = None
 
     @classmethod
     def load(cls, file: Path, environment: Mapping[str, str] = os.environ) -> Config:
@@ -156,7 +157,7 @@ class Config:
         if tables.daemon.min_step_deg >= tables.daemon.max_step_deg:
             line = line_of(text, ("daemon", "min_step_deg"))
             raise ConfigError("min_step_deg is not below max_step_deg", file=file, line=line)
-        _check_endpoints(tables.zenoh, file, text)
+        tables.zenoh.check(file, text)
         tables.drivers.check(robot.joints, file, text)
         _check_router(tables, file, text)
         if tables.vision.cameras is not None:
@@ -191,7 +192,24 @@ class Config:
     def with_state_dir(self, folder: Path) -> Config:
         """The same with another place for store and checkpoint, relative to the working directory."""
         daemon = msgspec.structs.replace(self.tables.daemon, state_dir=str(folder.absolute()))
-        return replace(self, tables=msgspec.structs.replace(self.tables, daemon=daemon))
+        return replace(self.with_tables(msgspec.structs.replace(self.tables, daemon=daemon)), given_state_dir=folder)
+
+    def with_tables(self, tables: Tables) -> Config:
+        """The same with other settings."""
+        return replace(self, tables=tables)
+
+    def reread(self) -> Config:
+        """What the file says now, under the same command line; ConfigError as by `load`."""
+        again = Config.load(self.file)
+        return again if self.given_state_dir is None else again.with_state_dir(self.given_state_dir)
+
+    def route(self, process: str) -> Route:
+        """Where a client finds `sampler` or `learner`, and as whom."""
+        return self.tables.zenoh.route(process, self.file.parent)
+
+    def zenoh_settings(self, process: str) -> dict[str, Any]:
+        """What zenoh is told in `sampler` or `learner`: whom to connect to, as whom, and who may do what."""
+        return self.tables.zenoh.settings_of(process, self.robot.name, self.file.parent)
 
     @property
     def state_dir(self) -> Path:
@@ -214,16 +232,6 @@ class Config:
 def state_home() -> Path:
     """The folder of all robots' states."""
     return Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state") / "bodyschema"
-
-
-def _check_endpoints(zenoh: ZenohConfig, file: Path, text: str) -> None:
-    for name, endpoint in msgspec.structs.asdict(zenoh).items():
-        if not ENDPOINT.fullmatch(endpoint):
-            line, remedy = line_of(text, ("zenoh", name)), "Write one like tcp/127.0.0.1:7447"
-            raise ConfigError(f"zenoh.{name}: {endpoint!r} is no endpoint", file=file, line=line, remedy=remedy)
-    if zenoh.sampler == zenoh.learner:
-        line = line_of(text, ("zenoh", "learner"))
-        raise ConfigError("sampler and learner have the same endpoint", file=file, line=line, remedy="Give two")
 
 
 def _check_router(tables: Tables, file: Path, text: str) -> None:

@@ -50,6 +50,10 @@ class DeviceWatch:
         self._kept: Sequence[Device] = ()
         self.changes: list[str] = []
 
+    def note_again(self) -> None:
+        """A new session has begun: it has a record of its own."""
+        self._kept = ()
+
     def look(self) -> bool:
         """Keep the record when it is new; True when pairs from now on are others than those before."""
         record = () if self._joints is None else self._joints.record

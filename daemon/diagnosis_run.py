@@ -108,7 +108,7 @@ def measured(config: Config, file: Path | None, *, live: bool) -> Source:
         raise RequestError("name a recording, or give --live for the running sampler's pairs: one of the two")
     joints = config.robot.joints
     if file is None:
-        with client(config.tables.zenoh.sampler) as bus:
+        with client(config.route("sampler")) as bus:
             recording, name = _history(History(bus, config.robot, 1), joints), f"the sampler of {config.robot.name}"
     else:
         recording, name = recordings.opened(file, joints), file.name
@@ -196,12 +196,12 @@ def _require_columns(robot: RobotDescription, recording: Recording, name: str) -
         raise DiagnosisError(f"{name}: the simulation cannot be laid on the pairs: {error}") from error
     if not is_far_off(robot, np.linalg.norm(drawn - recording.x, axis=1), _told_sigma(recording), SUSPECT):
         return
-    if (changed := mixed_up(robot, recording)) is not None:
+    if (changed := mixed_up(robot, recording, _told_sigma(recording))) is not None:
         raise DiagnosisError(f"{name}: the columns of the joints seem to be mixed up. {changed}. Mend that first")
 
 
 def _asked(robot: RobotDescription, recording: Recording) -> str:
-    changed = mixed_up(robot, recording)
+    changed = mixed_up(robot, recording, _told_sigma(recording))
     return ELSE if changed is None else f"{changed}."
 
 

@@ -10,7 +10,7 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
-from diagnosis.numbers import chance, mm, named, numbers_of, percent, place, share, telling
+from diagnosis.numbers import chance, mm, numbers_of, percent, place, rival_named, share, telling
 from diagnosis.result import Cause, DiagnosisFile, Errors, Indistinguishable, Verdict
 from diagnosis.words import beside_geometry, modelled
 
@@ -88,7 +88,7 @@ def rival_lines(cause: Cause) -> list[str]:
 
 
 def _rival(cause: Cause, rival: Indistinguishable) -> str:
-    instead = f"{place(cause)} may be {named(rival.effect, rival.where, rival.source)} ({percent(rival.probability)})"
+    instead = f"{place(cause)} may be {rival_named(rival)} ({percent(rival.probability)})"
     if rival.by == "any_motion":
         return f"{instead}; no motion tells them apart."
     return f"{instead}; another motion can tell."
@@ -151,8 +151,12 @@ def _rejected(diagnosis: DiagnosisFile) -> Table:
     table.add_column("effect", overflow="fold")
     table.add_column("would gain", justify="right", no_wrap=True)
     table.add_column("p-value", justify="right", no_wrap=True)
-    for row in diagnosis.rejected[:NEAREST]:
-        table.add_row(Text(place(row)), f"{row.held_out_gain_percent:+.2f} %", chance(row.p_value))
+    shown = diagnosis.rejected[:NEAREST]
+    if any(row.why for row in shown):
+        table.add_column("and yet", overflow="fold")
+    for row in shown:
+        why = [row.why] if any(other.why for other in shown) else []
+        table.add_row(Text(place(row)), f"{row.held_out_gain_percent:+.2f} %", chance(row.p_value), *why)
     return table
 
 

@@ -13,11 +13,12 @@ from pathlib import Path
 
 import msgspec
 
-from interfaces.errors import BodyschemaError
+from interfaces.errors import BodyschemaError, BusError
 
 from .bus import Bus, is_alive
 from .camera_wiring import camera_checks, cameras_of
 from .config import Config
+from .identity import Route
 from .keys import Keys
 from .servo_wiring import (
     Check,
@@ -32,6 +33,7 @@ from .servo_wiring import (
 )
 from .status import SamplerStatus
 from .wire import decode
+from .zenoh_config import PROCESSES
 
 LOW_DISK_BYTES = 200 * 2**20  # the sampler warns below this
 LITTLE_DISK_BYTES = 2**30
@@ -90,10 +92,10 @@ def _description(config: Config) -> Iterator[Check]:
 
 def _cameras(config: Config) -> Iterator[Check]:
     """What the cameras send; while the sampler runs it has them, and tells."""
-    if not is_alive(config.tables.zenoh.sampler, Keys(config.robot.name).alive("sampler"), open_timeout_s=OPEN_S):
+    if not is_alive(config.route("sampler"), Keys(config.robot.name).alive("sampler"), open_timeout_s=OPEN_S):
         yield from camera_checks(config)
         return
-    with Bus(connect=config.tables.zenoh.sampler, client=True) as bus:
+    with Bus(connect=config.route("sampler"), client=True) as bus:
         status = decode(bus.ask_one(Keys(config.robot.name).status("sampler")), SamplerStatus)
     yield Check("cameras", "ok", f"the running sampler takes {status.frames_per_s:.1f} stereo frames/s")
 
@@ -111,16 +113,16 @@ def _on_the_ports(config: Config, look: Callable[[Config], Iterator[Check]]) -> 
 def _samplers(config: Config) -> list[int]:
     """Those who have a port open and are the sampler, which answers."""
     pids = [holder.pid for holder in other_holders(config) if SAMPLER.search(holder.command)]
-    endpoint, token = config.tables.zenoh.sampler, Keys(config.robot.name).alive("sampler")
-    return pids if pids and is_alive(endpoint, token, open_timeout_s=OPEN_S) else []
+    route, token = config.route("sampler"), Keys(config.robot.name).alive("sampler")
+    return pids if pids and is_alive(route, token, open_timeout_s=OPEN_S) else []
 
 
 def _of_the_sampler(config: Config) -> Iterator[Check]:
-    endpoint, keys = config.tables.zenoh.sampler, Keys(config.robot.name)
-    if not is_alive(endpoint, keys.alive("sampler"), open_timeout_s=OPEN_S):
+    route, keys = config.route("sampler"), Keys(config.robot.name)
+    if not is_alive(route, keys.alive("sampler"), open_timeout_s=OPEN_S):
         yield Check("servos", "warning", "not looked at: another program has the port")
         return
-    with Bus(connect=endpoint, client=True) as bus:
+    with Bus(connect=route, client=True) as bus:
         status = decode(bus.ask_one(keys.status("sampler")), SamplerStatus)
     yield Check("rate", "ok", f"the running sampler takes {status.readings_per_s:.0f} readings/s")
     for complaint in status.health:
@@ -165,16 +167,32 @@ def _is_synchronised() -> bool | None:
 
 
 def _zenoh(config: Config) -> Iterator[Check]:
-    keys = Keys(config.robot.name)
-    for process, endpoint in msgspec.structs.asdict(config.tables.zenoh).items():
-        yield zenoh_check(process, endpoint, keys.alive(process))
+    keys, zenoh = Keys(config.robot.name), config.tables.zenoh
+    identity = zenoh.identity(config.file.parent)
+    for process in PROCESSES:
+        yield zenoh_check(process, Route((zenoh.endpoint(process),), identity), keys.alive(process))
+    if zenoh.router:
+        yield router_check(Route((zenoh.router,), identity))
 
 
-def zenoh_check(process: str, endpoint: str, token: str) -> Check:
+def router_check(route: Route) -> Check:
+    """Whether the router takes our connection."""
+    try:
+        with Bus(connect=route, client=True, open_timeout_s=OPEN_S):
+            return Check("zenoh", "ok", f"the router {route} takes our connection")
+    except BusError as error:
+        first, _, rest = str(error).partition(". ")
+        return Check(
+            "zenoh", "wrong", f"{first}: nobody on other machines sees this robot", rest or "see the router's log"
+        )
+
+
+def zenoh_check(process: str, route: Route, token: str) -> Check:
     """Whether the process answers; if not, whether its place is free."""
+    endpoint = str(route)
     if not _is_listening(endpoint):
         return Check("zenoh", "ok", f"the {process} does not run; {endpoint} is free for it")
-    if is_alive(endpoint, token, open_timeout_s=OPEN_S):
+    if is_alive(route, token, open_timeout_s=OPEN_S):
         return Check("zenoh", "ok", f"the {process} answers on {endpoint}")
     port = endpoint.rpartition(":")[2]
     said = f"somebody else listens on {endpoint}, where the {process} should"
@@ -185,7 +203,7 @@ def _is_listening(endpoint: str) -> bool:
     """Whether somebody takes connections there; also True where that cannot be tried."""
     protocol, _, address = endpoint.partition("/")
     host, _, port = address.rpartition(":")
-    if protocol != "tcp":
+    if protocol not in ("tcp", "tls"):
         return True
     try:
         with socket.create_connection((host.strip("[]"), int(port)), CONNECT_S):

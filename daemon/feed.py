@@ -30,14 +30,17 @@ class PairFeed:
         lock: held while pairs are being learnt; whoever resets the learner takes it.
     """
 
-    def __init__(self, learning: Learning, history: History, clock: Clock) -> None:
+    def __init__(
+        self, learning: Learning, history: History, clock: Clock, beat: Callable[[], None] = lambda: None
+    ) -> None:
         """Go on after the pairs that `learning` has.
 
         Args:
             history: stored pairs from a sequence number on, as many as fit into a reply; BusError when nobody answers.
+            beat: is called with each pair that was learnt, and each time that history was asked.
         """
         self.lock = threading.Lock()
-        self._learning, self._history, self._clock = learning, history, clock
+        self._learning, self._history, self._clock, self._beat = learning, history, clock, beat
         self._joints = learning.nominal.joints
         self._waiting: queue.Queue[bytes | None] = queue.Queue(WAITING)
         # Set by any thread: something was not put into the queue. The rest is `step`'s own.
@@ -128,6 +131,7 @@ class PairFeed:
     def _catch_up(self) -> None:
         """Ask for all pairs after the last one, page by page."""
         while not self._paused:
+            self._beat()
             begin = self._cursor + 1
             try:
                 reply = self._history(begin)
@@ -153,14 +157,29 @@ class PairFeed:
             self._foreign, self._behind = reply.store, False
             return True
         self._problem = self._foreign = None
+        self._skip_gone(reply)
         before = self._cursor
         for message in reply.pairs:
+            self._beat()
             if message.seq == self._cursor + 1:
                 self._learnt(message)
                 self._store, self._cursor = reply.store, message.seq
         self._learning.recovered(self._cursor - before)
         self._behind = self._cursor < reply.last_seq and self._cursor > before
         return not self._behind
+
+    def _skip_gone(self, reply: PairsReply) -> None:
+        """Go on with the oldest pair that is left where those before it are no longer kept."""
+        gone = reply.pairs[0].seq - self._cursor - 1 if reply.pairs else 0
+        if gone > 0:
+            log.warning(
+                "the sampler no longer keeps the pairs %d to %d ([daemon] keep_days, keep_mb); learning goes on with "
+                "the next",
+                self._cursor + 1,
+                self._cursor + gone,
+            )
+            self._learning.missed(gone)
+            self._store, self._cursor = reply.store, self._cursor + gone
 
     def _learnt(self, message: PairMessage) -> bool:
         try:

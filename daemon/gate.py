@@ -50,9 +50,8 @@ class Gate:
         Args:
             prismatic: which joints are prismatic, shape (d,).
         """
-        self._rules = rules
         self._prismatic = prismatic
-        self._degrees_per_unit = np.where(prismatic, 1 / rules.metres_per_degree, 180 / np.pi)
+        self.follow(rules)
         self._segment = 0 if last is None else last.segment
         self._q: FloatArray | None = None if last is None else last.q
         self._t: float | None = None
@@ -60,6 +59,11 @@ class Gate:
         self._believed: _Fix | None = None
         self._suspect: _Fix | None = None
         self._suspects = 0
+
+    def follow(self, rules: DaemonConfig) -> None:
+        """Go by these rules from now on; the segment goes on."""
+        self._rules = rules
+        self._degrees_per_unit = np.where(self._prismatic, 1 / rules.metres_per_degree, 180 / np.pi)
 
     @property
     def segment(self) -> int:

@@ -18,6 +18,7 @@ from importlib.metadata import version
 
 from daemon.answers import Answers
 from daemon.bus import Bus, Request
+from daemon.changes import Changes
 from daemon.checkpoint import CheckpointError, read_checkpoint, set_aside, write_checkpoint
 from daemon.config import Config
 from daemon.expected import ExpectedMarker
@@ -26,12 +27,15 @@ from daemon.findings import Findings
 from daemon.keys import Keys
 from daemon.learning import Learning, NominalModel, StateError
 from daemon.learning.solver import LARGEST_NET
+from daemon.notify import Notifier
+from daemon.reload import reload
+from daemon.service import Service, with_health
+from daemon.signals import Wishes
 from daemon.solver_process import SolverLostError, SolverProcess
 from daemon.status import LearnerStatus
-from daemon.tool_changes import ToolChanges
 from daemon.wire import OCTETS, CommandReply, CommandRequest, PairsReply, decode, encode
 from daemon.wiring import open_marker_topic
-from interfaces.errors import RequestError
+from interfaces.errors import BodyschemaError, RequestError
 from interfaces.protocols import Clock
 from kbmaps import KBMapsError
 
@@ -43,6 +47,12 @@ HISTORY_LIMIT_S = 5.0
 IDLE_S = 0.02
 SOLVE_WHEN_IDLE_S = 0.5
 BACKGROUND_NICENESS = 10
+# What a checkpoint raises whose checksum is right and whose parts are not.
+DOES_NOT_FIT = (ArithmeticError, LookupError, TypeError, ValueError)
+# What has to come round for the learner to be alive.
+LOOPS = ("learning", "background", "status")
+TABLES = ("robot", "camera", "zenoh", "daemon", "drivers", "learner", "effects", "unexplained")
+CHANGEABLE = {("learner", "checkpoint_every_s")}
 # Python hands the interpreter from thread to thread this often at least; its own 5 ms would be a query's delay.
 SWITCH_INTERVAL_S = 2e-4
 
@@ -50,15 +60,18 @@ SWITCH_INTERVAL_S = 2e-4
 class Learner:
     """One robot's learner with its answers, its checkpoint and its state of health."""
 
-    def __init__(self, config: Config, solver: SolverProcess, bus: Bus, clock: Clock) -> None:
+    def __init__(
+        self, config: Config, solver: SolverProcess, bus: Bus, clock: Clock, service: Service | None = None
+    ) -> None:
         self._config, self._solver, self._bus, self._clock = config, solver, bus, clock
+        self._service = Service.nobodys(clock) if service is None else service
         self._settings, self._robot = config.tables.learner, config.robot
         self._keys = Keys(config.robot.name)
         self._nominal = NominalModel.extended_by(config.simulation)
         self._learning = Learning(self._nominal, self._settings, solver)
         self._set_aside: str | None = None
         self._restore()
-        self._feed = PairFeed(self._learning, self._history, clock)
+        self._feed = PairFeed(self._learning, self._history, clock, lambda: self._service.beat("learning"))
         self._findings = Findings(self._learning, config.robot, clock)
         self._answers = Answers(self._learning, config.robot, clock)
         self._sampler_alive = False
@@ -67,7 +80,7 @@ class Learner:
         self._checkpointed_pairs = self._learning.counters.pairs
         self._checkpoint_problem: str | None = None
         self._checkpoint_lock = threading.Lock()
-        self._tool_changes = ToolChanges(self._learning.counters)
+        self._changes = Changes(self._robot.joints, self._learning.change)
         self._rested_with: int | None = None
         self._stop = threading.Event()
         self._failure: Exception | None = None
@@ -106,6 +119,7 @@ class Learner:
         """
         if self._failure is not None:
             raise self._failure
+        self._service.beat("status")
         waited_s = self._clock.now() - (self._checkpointed_at or self._started_at)
         new = self._learning.counters.pairs != self._checkpointed_pairs
         if new and waited_s >= self._settings.checkpoint_every_s:
@@ -153,12 +167,13 @@ class Learner:
             refused=counters.refused,
             doubted=counters.doubted,
             changes=counters.changes,
-            last_change=self._tool_changes.last,
+            last_change=self._changes.status(self._learning.change, can_roll_back=self._learning.can_roll_back),
             at_rest=at_rest,
             checkpoint_age_s=None if written is None else now - written,
             uptime_s=now - self._started_at,
             health=list(self._health()),
             orientation=self._learning.orientation_status(),
+            missed=counters.missed,
             version=version("bodyschema"),
         )
 
@@ -188,9 +203,10 @@ class Learner:
             if state is None:
                 return
             self._learning.restore(state)
-        except (CheckpointError, StateError, KBMapsError) as error:
+        except (CheckpointError, StateError, KBMapsError, *DOES_NOT_FIT) as error:
             aside = set_aside(file)
-            self._set_aside = f"{error}. It was kept as {aside}; the learner learns again from the sampler's history"
+            said = f"the checkpoint's parts do not fit: {error!r}" if isinstance(error, DOES_NOT_FIT) else str(error)
+            self._set_aside = f"{said}. It was kept as {aside}; the learner learns again from the sampler's history"
             log.error("%s", self._set_aside)
             self._learning = Learning(self._nominal, self._settings, self._solver)
         else:
@@ -224,7 +240,9 @@ class Learner:
             "resume": self._resume,
             "reset_to_prior": self._reset_to_prior,
             "tool_changed": self._tool_changed,
+            "rollback": self._rollback,
             "checkpoint": self._checkpoint_now,
+            "reload": self.reload,
         }
         if command not in carried_out:
             raise RequestError(
@@ -246,7 +264,7 @@ class Learner:
         with self._feed.lock:
             foreign = self._feed.foreign_store
             self._learning.reset_to_prior(forget_store=foreign is not None)
-            self._tool_changes.forget(self._learning.counters)
+            self._changes.note(None)
             self._feed.restart()
         self._feed.wake()
         self.checkpoint()
@@ -257,15 +275,34 @@ class Learner:
     def _tool_changed(self) -> str:
         with self._feed.lock:
             self._learning.tool_changed()
-            self._tool_changes.note(self._learning.counters, found=False)
+            self._changes.note(self._learning.change)
         self.checkpoint()
         return "pairs with the old tool no longer count; what they taught is where learning starts again"
+
+    def _rollback(self) -> str:
+        with self._feed.lock:
+            undone = self._learning.change
+            self._learning.rollback()
+            self._changes.note(self._learning.change, rolled_back=True)
+        self.checkpoint()
+        since = "the last change" if undone is None else f"pair {undone.first_seq}"
+        return f"the model before {since} answers again; pairs since then do not count"
 
     def _checkpoint_now(self) -> str:
         self.checkpoint()
         if self._checkpoint_problem is not None:
             raise CheckpointError(self._checkpoint_problem)
         return f"written to {self._config.checkpoint_file}"
+
+    def reload(self) -> str:
+        """Read robot.toml again; what came of it.
+
+        Raises:
+            ConfigError: it is wrong; nothing changed.
+        """
+        found = reload(self._config, TABLES, CHANGEABLE)
+        self._config, self._settings = found.config, found.config.tables.learner
+        return found.message("learner")
 
     def _guarded(self, loop: Callable[[], None]) -> None:
         try:
@@ -275,15 +312,17 @@ class Learner:
 
     def _learn_pairs(self) -> None:
         while not self._stop.is_set():
+            self._service.beat("learning")
             self._feed.step(IDLE_S)
             with self._feed.lock:
-                self._tool_changes.note(self._learning.counters, found=True)
+                self._changes.note(self._learning.change)
 
     def _work_in_background(self) -> None:
         with contextlib.suppress(OSError):  # niceness is a courtesy: without it answers are a little later
             os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), BACKGROUND_NICENESS)
         idle_since = self._clock.now()
         while not self._stop.is_set():
+            self._service.beat("background")
             try:
                 self._findings.renew()
                 worked = self._learning.work()
@@ -302,26 +341,53 @@ class Learner:
                 self._learning.solve_soon()
 
 
-def run_learner(config: Config, clock: Clock, stopping: Callable[[], bool]) -> None:
-    """Learn and answer until `stopping()`.
+def run_learner(config: Config, clock: Clock, wishes: Wishes, notifier: Notifier) -> None:
+    """Learn and answer until `wishes` has an end.
+
+    Args:
+        notifier: is told when all is up, that `LOOPS` work, and how the learner is.
 
     Raises:
         BusError: the learner's port is in use.
         CheckpointError: an unusable checkpoint cannot be moved aside.
     """
     sys.setswitchinterval(SWITCH_INTERVAL_S)
-    endpoints = config.tables.zenoh
-    with SolverProcess() as solver, Bus(listen=endpoints.learner, connect=endpoints.sampler) as bus:
-        learner = Learner(config, solver, bus, clock)
+    endpoints, service = config.tables.zenoh, Service(notifier, LOOPS, clock)
+    with SolverProcess() as solver, Bus(listen=endpoints.learner, settings=config.zenoh_settings("learner")) as bus:
+        learner = Learner(config, solver, bus, clock, service)
         publish = bus.publisher(Keys(config.robot.name).status("learner"))
         gc.collect()
         gc.freeze()  # what start-up left behind need not be looked through again
         with learner.serving():
             log.info("the learner of %s answers on %s", config.robot.name, endpoints.learner)
+            service.ready()
             published_at = clock.now() - STATUS_EVERY_S
-            while not stopping():
+            while not wishes.ending:
                 if clock.now() - published_at >= STATUS_EVERY_S:
                     published_at = clock.now()
-                    publish(encode(learner.status()))
+                    status = learner.status()
+                    publish(encode(status))
+                    service.tell(status_line(status))
+                if wishes.reloading:
+                    wishes.reloading = False
+                    _reload(learner, service)
                 learner.tick()
                 time.sleep(TICK_S)
+            service.stopping()
+
+
+def status_line(status: LearnerStatus) -> str:
+    """How the learner is, in a line."""
+    claimed = "" if status.claimed_error_m is None else f", {1e3 * status.claimed_error_m:.1f} mm claimed"
+    return with_health(f"{status.state}, {status.pairs} pairs, {status.answering} answers{claimed}", status.health)
+
+
+def _reload(learner: Learner, service: Service) -> None:
+    """Whoever asked by a signal reads the log."""
+    service.reloading()
+    try:
+        log.info("robot.toml was read again: %s", learner.reload())
+    except BodyschemaError as error:
+        log.error("robot.toml was read again and is not followed: %s", error)
+    finally:
+        service.reloaded()

@@ -2,16 +2,25 @@
 
 from __future__ import annotations
 
+import faulthandler
 import logging
 import os
+import re
 import sys
-from collections.abc import Mapping
+import time
+from collections import OrderedDict
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import TextIO
 
 from .remedies import as_typed
 
 # sd-daemon(3): the journal reads a line's priority from its head.
 _PRIORITIES = ((logging.ERROR, 3), (logging.WARNING, 4), (logging.INFO, 6))
+REPEATED_S = 60.0
+OFTEN = 20  # what differs in its numbers alone may be said so often in that time
+REMEMBERED = 256
+_NUMBER = re.compile(r"\d+")
 
 
 class PlainFormatter(logging.Formatter):
@@ -23,21 +32,96 @@ class PlainFormatter(logging.Formatter):
 
 
 class JournalFormatter(PlainFormatter):
-    """Lines with a priority like `<4>` at the head of each and without a time: the journal has its own."""
+    """One line an event, with a priority like `<4>` at its head and without a time: the journal has its own."""
 
     def format(self, record: logging.LogRecord) -> str:
-        """The record, every line of it with its priority."""
+        """The record; where it has several lines, as in a traceback, they stand side by side."""
         priority = next((number for level, number in _PRIORITIES if record.levelno >= level), 7)
-        return "\n".join(f"<{priority}>{line}" for line in super().format(record).splitlines())
+        lines = (line.strip() for line in super().format(record).splitlines())
+        return f"<{priority}>{' | '.join(line for line in lines if line)}"
+
+
+@dataclass(slots=True)
+class _Said:
+    since: float
+    most: int
+    count: int = 0
+
+
+class JournalHandler(logging.StreamHandler[TextIO]):
+    """Keeps back what was just said: the same words within `REPEATED_S`, or `OFTEN` times the same but for numbers.
+
+    How often that was is told when the time is over and anything is logged, and at the end.
+    """
+
+    def __init__(self, stream: TextIO, now: Callable[[], float] = time.monotonic) -> None:
+        """Nothing was said yet."""
+        super().__init__(stream)
+        self.setFormatter(JournalFormatter("%(name)s: %(message)s"))
+        self._now = now
+        self._said: OrderedDict[tuple[str, int, str], _Said] = OrderedDict()
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Write the record, unless it was just said."""
+        self._forget_before(self._now() - REPEATED_S)
+        if self._is_new(record):
+            super().emit(record)
+
+    def close(self) -> None:
+        """Tell what was kept back so far."""
+        self._forget_before(self._now())
+        super().close()
+
+    def _is_new(self, record: logging.LogRecord) -> bool:
+        text = record.getMessage()
+        alike = _NUMBER.sub("#", text)
+        if alike != text and (record.name, record.levelno, text) not in self._said:
+            said = self._entry(record, alike)
+            said.count += 1
+            if said.count > OFTEN:
+                return False
+        said = self._entry(record, text)
+        said.count += 1
+        return said.count == 1
+
+    def _entry(self, record: logging.LogRecord, text: str) -> _Said:
+        key = (record.name, record.levelno, text)
+        if key not in self._said and len(self._said) >= REMEMBERED:
+            self._forget(next(iter(self._said)))
+        self._said.setdefault(key, _Said(self._now(), OFTEN if text != record.getMessage() else 1))
+        self._said.move_to_end(key)
+        return self._said[key]
+
+    def _forget_before(self, moment: float) -> None:
+        for key in [key for key, said in self._said.items() if said.since <= moment]:
+            self._forget(key)
+
+    def _forget(self, key: tuple[str, int, str]) -> None:
+        name, level, text = key
+        said = self._said.pop(key)
+        if said.count > said.most:
+            again = f"{said.count - said.most} more times in {self._now() - said.since:.0f} s: {text}"
+            super().emit(logging.LogRecord(name, level, "", 0, again, None, None))
 
 
 def set_up(*, verbose: bool = False, environment: Mapping[str, str] = os.environ, stream: TextIO | None = None) -> None:
-    """Send the log to `stream` (stderr): with priorities under systemd (JOURNAL_STREAM), else with times."""
-    handler = logging.StreamHandler(stream if stream is not None else sys.stderr)
-    if "JOURNAL_STREAM" in environment:
-        handler.setFormatter(JournalFormatter("%(name)s: %(message)s"))
+    """Send the log to `stream` (stderr): under systemd with priorities and without repeats, else with times."""
+    out = sys.stderr if stream is None else stream
+    if is_journal(out, environment):
+        handler = JournalHandler(out)
+        faulthandler.enable(out)  # what each thread was at when the watchdog ends the process
     else:
+        handler = logging.StreamHandler(out)
         handler.setFormatter(PlainFormatter("%(asctime)s %(levelname)-7s %(name)s: %(message)s", "%H:%M:%S"))
     root = logging.getLogger()
     root.handlers[:] = [handler]
     root.setLevel(logging.DEBUG if verbose else logging.INFO)
+
+
+def is_journal(stream: TextIO, environment: Mapping[str, str]) -> bool:
+    """Whether `stream` ends in the journal. The variable alone does not tell: a desktop's terminals inherit it."""
+    try:
+        status = os.fstat(stream.fileno())
+    except OSError:
+        return False
+    return environment.get("JOURNAL_STREAM") == f"{status.st_dev}:{status.st_ino}"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -48,6 +48,11 @@ OTHER_CAUSES = (
     "zero off by a quarter turn? Where the measurements are that noisy, say so with --sigma-mm"
 )
 _UNITS_PER_METRE = (("millimetres", 1e3), ("centimetres", 1e2))
+_UNITS_PER_SECOND = (("milliseconds", 1e3), ("microseconds", 1e6), ("nanoseconds", 1e9))
+# An arm that is guided, or goes from pose to pose, is never so slow in the middle [rad/s]; it is about so fast.
+SLOWEST, USUAL = 0.005, 0.3
+# So far on a slide counts as one radian [m]; so many moves there must be to judge by.
+A_RADIAN_M, FEWEST_MOVES = 0.1, 20
 
 
 def reach_m(robot: RobotDescription) -> float:
@@ -78,8 +83,15 @@ def require_units(robot: RobotDescription, recording: Recording, file: Path) -> 
         file: what the recording is of.
 
     Raises:
-        RecordingError: angles far beyond the limits, or positions farther apart than the arm reaches.
+        RecordingError: angles far beyond the limits, positions farther apart than the arm reaches, or times in which
+            an arm hardly moves.
     """
+    _require_radians(robot, recording, file)
+    _require_metres(robot, recording, file)
+    _require_seconds(robot, recording, file)
+
+
+def _require_radians(robot: RobotDescription, recording: Recording, file: Path) -> None:
     beyond = beyond_limits(robot, recording.q, BEYOND_LIMITS_RAD).mean(axis=0)
     beyond[robot.chain.prismatic] = 0.0
     if beyond.max() > MANY:
@@ -91,6 +103,9 @@ def require_units(robot: RobotDescription, recording: Recording, file: Path) -> 
             file=file,
             remedy="Give angles in radians: multiply by π/180",
         )
+
+
+def _require_metres(robot: RobotDescription, recording: Recording, file: Path) -> None:
     spread, reach = _spread(recording.x), reach_m(robot)
     if spread > FARTHEST * reach:
         drawn = _spread(robot.chain.positions(recording.q))
@@ -100,6 +115,27 @@ def require_units(robot: RobotDescription, recording: Recording, file: Path) -> 
             f"these look like {name}",
             file=file,
             remedy=f"Give positions in metres: divide by {factor:g}",
+        )
+
+
+def _require_seconds(robot: RobotDescription, recording: Recording, file: Path) -> None:
+    if recording.t is None:
+        return
+    moves = np.diff(recording.q, axis=0) / np.where(robot.chain.prismatic, A_RADIAN_M, 1.0)
+    gaps, steps = np.diff(recording.t), np.linalg.norm(moves, axis=1)
+    inside = (gaps > 0.0) & (steps > 0.0)
+    if recording.segment is not None and np.diff(recording.segment).any():
+        inside &= np.diff(recording.segment) == 0
+    if inside.sum() < FEWEST_MOVES:
+        return
+    gap, speed = float(np.median(gaps[inside])), float(np.median(steps[inside] / gaps[inside]))
+    if speed < SLOWEST:
+        name, factor = min(_UNITS_PER_SECOND, key=lambda unit: abs(math.log(speed * unit[1] / USUAL)))
+        raise RecordingError(
+            f"the times t are {gap:.4g} apart in the middle, in which the joints move by "
+            f"{math.degrees(speed * gap):.2g}°: these look like {name}",
+            file=file,
+            remedy=f"Give times in seconds: divide by {factor:g}",
         )
 
 
@@ -114,65 +150,84 @@ def is_far_off(robot: RobotDescription, left_m: FloatArray, sigma_m: float | Non
     return float(np.median(left_m)) > max(share * reach_m(robot), noise)
 
 
-def mixed_up(robot: RobotDescription, recording: Recording) -> str | None:
-    """Which columns to exchange or to count the other way for a much better fit, as a sentence; None if none are.
+def mixed_up(robot: RobotDescription, recording: Recording, sigma_m: float | None = None) -> str | None:
+    """How else to read the columns for a much better fit, as a sentence; None where that is not the matter.
 
-    Many ways to read the columns are tried with the drawn arm in its best place, the best of them with a learnt one.
+    Columns may be exchanged, joints may count the other way, and positions may be mirrored, several of it together.
+    Many ways to read them are tried with the drawn arm in its best place, the best of them with a learnt one.
+
+    Args:
+        sigma_m: 1-sigma of a coordinate that was told [m].
     """
     some = recording.rows(np.unique(np.linspace(0, len(recording) - 1, JUDGED_ROWS).astype(np.intp)))
     as_it_is = _Columns(tuple(range(len(robot.joints))), (1,) * len(robot.joints))
-    changed = as_it_is.changed()
-    twice = {way for once in _ranked(robot.chain, some, changed)[:FITTED] for way in once.changed()}
-    likely = _ranked(robot.chain, some, (changed | twice) - {as_it_is})[:FITTED]
+    likely = _likely(robot.chain, some, as_it_is)
     fitted = {columns: _left_by_a_learnt_chain(robot, some, columns) for columns in (as_it_is, *likely)}
-    best = min(fitted, key=lambda columns: fitted[columns])
+    least_m = min(fitted.values())
     # A joint whose sign hardly shows is left as it is.
-    for fewer in sorted(best.changed(), key=lambda columns: columns.order):
-        if fewer.changes < best.changes:
-            left_m = fitted[fewer] = _left_by_a_learnt_chain(robot, some, fewer)
-            best = fewer if left_m < AS_GOOD * fitted[best] else best
-    if MUCH_BETTER * fitted[best] > fitted[as_it_is]:
+    for columns in [columns for columns in fitted if fitted[columns] < AS_GOOD * least_m]:
+        for fewer in (fewer for fewer in columns.changed() - fitted.keys() if fewer.changes < columns.changes):
+            fitted[fewer] = _left_by_a_learnt_chain(robot, some, fewer)
+    good = [columns for columns in fitted if fitted[columns] < AS_GOOD * least_m]
+    best = min(good, key=lambda columns: (columns.changes, fitted[columns], columns.order, columns.signs))
+    if MUCH_BETTER * fitted[best] > fitted[as_it_is] or is_far_off(robot, np.array(fitted[best]), sigma_m):
         return None
+    # All joints of an arm that is its own mirror image may count the other way, or its positions be mirrored.
+    also = [columns for columns in good if columns.mirrored != best.mirrored]
+    either = [best, *sorted(also, key=lambda columns: columns.changes)[:1]]
     return (
-        f"{best.said(robot.joints)}, the pairs would fit to {1e3 * fitted[best]:.3g} mm instead of "
-        f"{1e3 * fitted[as_it_is]:.3g} mm"
+        f"W{' or '.join(columns.said(robot.joints) for columns in either)[1:]}, the pairs would fit to "
+        f"{1e3 * fitted[best]:.3g} mm instead of {1e3 * fitted[as_it_is]:.3g} mm"
     )
 
 
 @dataclass(frozen=True, slots=True)
 class _Columns:
-    """A way to read the joints' columns: which one is whose, and which way it counts.
+    """A way to read the columns: which one is whose joint's, and which way it counts.
 
     Attributes:
         order: place of the column of each joint.
         signs: 1 or -1 for each joint.
+        mirrored: whether one of x, y, z counts the other way; which one is a matter of where the cameras stand.
     """
 
     order: tuple[int, ...]
     signs: tuple[int, ...]
+    mirrored: bool = False
 
     def of(self, q: FloatArray) -> FloatArray:
         return q[:, self.order] * np.array(self.signs, dtype=np.float64)
 
+    def positions(self, x: FloatArray) -> FloatArray:
+        return x * [-1.0, 1.0, 1.0] if self.mirrored else x
+
     def changed(self) -> set[_Columns]:
-        """All in which one joint more counts the other way, or two are exchanged."""
+        """All in which one joint more or all count the other way, two are exchanged, or positions are mirrored."""
         joints = range(len(self.order))
-        turned = {_Columns(self.order, _replaced(self.signs, {k: -self.signs[k]})) for k in joints}
-        return turned | {
-            _Columns(
-                _replaced(self.order, {j: self.order[k], k: self.order[j]}),
-                _replaced(self.signs, {j: self.signs[k], k: self.signs[j]}),
+        turned: set[_Columns] = {replace(self, signs=_replaced(self.signs, {k: -self.signs[k]})) for k in joints}
+        exchanged: set[_Columns] = {
+            replace(
+                self,
+                order=_replaced(self.order, {j: self.order[k], k: self.order[j]}),
+                signs=_replaced(self.signs, {j: self.signs[k], k: self.signs[j]}),
             )
             for j, k in itertools.combinations(joints, 2)
         }
+        as_a_whole: set[_Columns] = {
+            replace(self, signs=tuple(-sign for sign in self.signs)),
+            replace(self, mirrored=not self.mirrored),
+        }
+        return turned | exchanged | as_a_whole
 
     @property
     def changes(self) -> int:
-        """How many columns are not in their place, or count the other way."""
-        return sum(k != column for k, column in enumerate(self.order)) + sum(sign < 0 for sign in self.signs)
+        """How many columns are not in their place, or count the other way; as one where it is all of them."""
+        turned = self.signs.count(-1)
+        moved = sum(k != column for k, column in enumerate(self.order))
+        return moved + (turned if turned < len(self.signs) else 1) + self.mirrored
 
     def said(self, joints: tuple[str, ...]) -> str:
-        return f"With {' and '.join(self._changes(joints))}"
+        return f"with {' and '.join(self._changes(joints))}"
 
     def _changes(self, joints: tuple[str, ...]) -> Iterator[str]:
         moved = [k for k, column in enumerate(self.order) if column != k]
@@ -181,32 +236,47 @@ class _Columns:
         elif moved:
             yield f"the columns in the order {', '.join(joints[k] for k in self.order)}"
         other = [joint for joint, sign in zip(joints, self.signs, strict=True) if sign < 0]
-        if other:
+        if other and len(other) == len(joints):
+            yield "all joints counting the other way"
+        elif other:
             yield f"{' and '.join(other)} counting the other way"
+        if self.mirrored:
+            yield "the positions mirrored (a left-handed frame: one of x, y, z counting the other way)"
+
+
+def _likely(chain: RigidChain, recording: Recording, as_it_is: _Columns) -> list[_Columns]:
+    """The ways that fit best with the drawn chain anywhere, change by change from those that fitted best before."""
+    left_m: dict[_Columns, float] = {}
+    best = [as_it_is]
+    for _ in range(len(as_it_is.order) + 1):
+        for columns in {columns for way in best for columns in way.changed()} - left_m.keys():
+            left_m[columns] = _left_in_best_place(chain, recording, columns)
+        others = left_m.keys() - {as_it_is}
+        before, best = best, sorted(others, key=lambda columns: (left_m[columns], columns.changes, columns.order))
+        best = best[:FITTED]
+        if best == before:
+            break
+    return best
 
 
 def _replaced(values: tuple[int, ...], changes: dict[int, int]) -> tuple[int, ...]:
     return tuple(changes.get(k, value) for k, value in enumerate(values))
 
 
-def _ranked(chain: RigidChain, recording: Recording, ways: set[_Columns]) -> list[_Columns]:
-    """The best fitting first, with the drawn chain anywhere."""
-    return sorted(ways, key=lambda columns: (_left_in_best_place(chain, recording, columns), columns.order))
-
-
 def _left_in_best_place(chain: RigidChain, recording: Recording, columns: _Columns) -> float:
-    drawn = chain.positions(columns.of(recording.q))
-    return float(Rotation.align_vectors(recording.x - recording.x.mean(axis=0), drawn - drawn.mean(axis=0))[1])
+    drawn, x = chain.positions(columns.of(recording.q)), columns.positions(recording.x)
+    return float(Rotation.align_vectors(x - x.mean(axis=0), drawn - drawn.mean(axis=0))[1])
 
 
 def _left_by_a_learnt_chain(robot: RobotDescription, recording: Recording, columns: _Columns) -> float:
     """Middle distance of the pairs from a chain that was learnt from them [m]."""
-    q = columns.of(recording.q)
-    known = {"pose_known": robot.camera.pose_known, "marker_known": robot.robot.marker_known}
+    q, x = columns.of(recording.q), columns.positions(recording.x)
+    pose_known = robot.camera.pose_known and not columns.mirrored
     try:
-        learner = RigidLearner(align(robot.chain, q, recording.x, **known).chain, _ROUGH)
-        learner.learn(q, recording.x)
-        return float(np.median(np.linalg.norm(learner.predict(q) - recording.x, axis=1)))
+        aligned = align(robot.chain, q, x, pose_known=pose_known, marker_known=robot.robot.marker_known)
+        learner = RigidLearner(aligned.chain, _ROUGH)
+        learner.learn(q, x)
+        return float(np.median(np.linalg.norm(learner.predict(q) - x, axis=1)))
     except KBMapsError:
         return math.inf
 

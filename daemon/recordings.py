@@ -15,17 +15,19 @@ from interfaces.recording import CSV, PARQUET, Recording, joints_in
 from interfaces.records import Pair
 
 from .mcap_export import write_mcap
+from .rerun_export import write_rerun
 from .store import Devices, PairReader
 
 log = logging.getLogger(__name__)
 
-MCAP, URDF = ".mcap", ".urdf"
+MCAP, RERUN, URDF = ".mcap", ".rrd", ".urdf"
 STORE_ENDINGS = (".sqlite", ".sqlite3", ".db")
 
 _WRITERS: dict[str, Callable[[Recording, Path, Sequence[Devices]], None]] = {
     CSV: lambda recording, file, _: recording.write_csv(file),
     PARQUET: lambda recording, file, _: recording.write_parquet(file),
     MCAP: write_mcap,
+    RERUN: write_rerun,
 }
 
 
@@ -144,7 +146,7 @@ def write(recording: Recording, out: Path, devices: Sequence[Devices] = ()) -> N
         devices: what the joints were read with, which only MCAP has a place for.
 
     Raises:
-        RecordingError: it cannot be written, or the extra `export` is not installed.
+        RecordingError: it cannot be written, or an extra that the format needs is not installed.
     """
     part = out.with_name(f".{out.stem}.part{out.suffix}")
     try:

@@ -12,7 +12,7 @@ OPTION = "--robot"
 WITH_ROBOT = frozenset(
     {
         *("bench", "command", "doctor", "ik", "joints", "learner", "predict", "record", "run", "sampler", "scan"),
-        *("servos", "status", "watch cameras", "config check", "config show", "calibrate latency"),
+        *("servos", "status", "watch cameras", "backup", "config check", "config show", "calibrate latency"),
     }
 )
 _QUOTED = re.compile(r"`bodyschema ([^`]+)`")

@@ -40,14 +40,21 @@ class Reopening(Generic[R_co]):
     """
 
     def __init__(
-        self, source: Readable[R_co], name: str, wall: Clock, sleep: Callable[[float], None] = time.sleep
+        self,
+        source: Readable[R_co],
+        name: str,
+        wall: Clock,
+        sleep: Callable[[float], None] = time.sleep,
+        forbidden: Callable[[], str | None] = lambda: None,
     ) -> None:
         """Nothing is opened yet.
 
         Args:
             name: what messages call the source.
             wall: the clock for the waiting times.
+            forbidden: a device that this process will never be allowed to open, or None.
         """
+        self._forbidden = forbidden
         self._source, self._name, self._wall, self._sleep = source, name, wall, sleep
         self._opened = ExitStack()
         self._wait_s = FIRST_WAIT_S
@@ -68,7 +75,11 @@ class Reopening(Generic[R_co]):
         self._opened.close()
 
     def read(self, timeout_s: float) -> R_co | None:
-        """As the source's `read`; None also while the source is lost."""
+        """As the source's `read`; None also while the source is lost.
+
+        Raises:
+            SourceError: it came back as what only a new process may open.
+        """
         if not self._is_open and not self._try_again(timeout_s):
             return None
         try:
@@ -91,7 +102,12 @@ class Reopening(Generic[R_co]):
             self._opened.enter_context(self._source)
         except SourceError as error:
             self._lost(error)
-            return False
+            device = self._forbidden()
+            if device is None:
+                return False
+            raise SourceError(
+                f"{device} came back as another device, which only a new start of this process may open ({error})"
+            ) from error
         self._is_open = True
         return True
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import math
-import shutil
 import threading
 import time
 from contextlib import ExitStack
@@ -14,7 +13,7 @@ from importlib.metadata import version
 import numpy as np
 
 from interfaces.clock import SystemClock
-from interfaces.errors import ConfigError, RequestError, SourceEnded, StoreError
+from interfaces.errors import ConfigError, RequestError, SourceEnded
 from interfaces.protocols import Clock
 from interfaces.records import FloatArray, JointReading, MarkerFix, MarkerMiss, Pair, Reason
 
@@ -28,11 +27,14 @@ from .history import answer_pairs
 from .keys import Keys
 from .powered import asked
 from .reopen import Reopening
-from .servo_status import AsksForTurns, buses_of, complaints_of, servos_of
+from .sampler_rules import SamplerRules
+from .service import Service, with_health
+from .servo_status import accept_turns, buses_of, complaints_of, servos_of
 from .simulation import answer_simulation
 from .sources import Head, Sources
 from .status import SamplerStatus
 from .store import PairStore
+from .store_file import disk_free
 from .tally import Tally
 from .wire import CommandReply, CommandRequest, decode, encode, pair_to_wire
 
@@ -47,6 +49,8 @@ SILENT_AFTER_S = 2.0  # a source that has said nothing for so long is reported
 ZERO_FORCE = "zero_force"  # that [robot] hold says, and the drive is called
 PAIR_CACHE = 1000
 LOW_DISK_BYTES = 200 * 2**20
+# What has to come round for the sampler to be alive.
+LOOPS = ("encoders", "frames")
 
 
 class Sampler:
@@ -64,12 +68,14 @@ class Sampler:
         *,
         exit_at_end: bool = False,
         wall: Clock | None = None,
+        service: Service | None = None,
     ) -> None:
         """A sampler over an open bus and an open store; the sources are opened by `run`.
 
         Args:
             exit_at_end: return from `run` when the sources are through, instead of going on to serve the history.
             wall: the machine's clock, for rates and UTC; all other times are the sources'.
+            service: is told when all is up, that `LOOPS` work, and how the sampler is.
 
         Raises:
             ConfigError: the encoders' joints are not robot.toml's.
@@ -83,6 +89,7 @@ class Sampler:
             )
         self._config, self._bus, self._store, self._exit_at_end = config, bus, store, exit_at_end
         self._wall = SystemClock() if wall is None else wall
+        self._service = Service.nobodys(self._wall) if service is None else service
         self._keys = Keys(config.robot.name)
         self._powered = {drive.name: drive for drive in sources.powered}
         held = config.robot.robot.hold == "zero_force"
@@ -90,9 +97,9 @@ class Sampler:
         self._cameras, self._calibration = sources.cameras, sources.calibration
         self._gaze = None if sources.head is None else self._gaze_loop(sources.head)
         self._simulation, self._source_clock = sources.simulation, sources.clock
-        self._joints = Reopening(sources.joints, "the encoders", self._wall)
+        self._joints = Reopening(sources.joints, "the encoders", self._wall, forbidden=self._service.forbidden)
         self._encoders, self._devices = sources.joints, DeviceWatch(sources.joints, store, self._wall)
-        self._marker = Reopening(sources.marker, "the cameras", self._wall)
+        self._marker = Reopening(sources.marker, "the cameras", self._wall, forbidden=self._service.forbidden)
         rules, prismatic = config.tables.daemon, config.robot.chain.prismatic
         self._buffer = JointBuffer(prismatic, rules.max_reading_gap_s, live=sources.live, kept_s=AROUND_S)
         self._gate = Gate(rules, prismatic, store.last())
@@ -100,9 +107,12 @@ class Sampler:
         self._seq = store.reader.last_seq()
         self._publish = bus.publisher(self._keys.pair, cache=PAIR_CACHE)
         self._publish_status = bus.publisher(self._keys.status("sampler"))
-        self._stopping = False
+        self._stopping = self._reloading = False
         # Whoever has been told of a pause can rely on it: no pair comes after the answer.
         self._deciding = threading.Lock()
+        self._rules = SamplerRules(
+            config, store, self._devices, self._wall, gate=self._gate, buffer=self._buffer, deciding=self._deciding
+        )
         self._paused = False
         self._resumed_at = -math.inf
         self._ended = False
@@ -115,6 +125,10 @@ class Sampler:
         """Let `run` come to its end. Only sets a flag: a signal handler may call it."""
         self._stopping = True
 
+    def reload(self) -> None:
+        """Let `run` read robot.toml again. Only sets a flag: a signal handler may call it."""
+        self._reloading = True
+
     def run(self) -> None:
         """Sample until `stop`, or with `exit_at_end` until the sources are through.
 
@@ -122,7 +136,9 @@ class Sampler:
             StoreError: a pair could not be stored; it was not published either, and none came after it.
             SourceError: a source could not be opened at the start.
         """
+        self._service.tell("opening encoders and cameras")
         with ExitStack() as stack:
+            stack.callback(self._service.stopping)
             stack.enter_context(self._joints)
             stack.enter_context(self._marker)
             self._devices.look()
@@ -160,7 +176,7 @@ class Sampler:
             pairs_per_s=tally.pairs_per_s,
             rejected=tally.rejected,
             coverage=tally.coverage,
-            disk_free_bytes=self._disk_free(),
+            disk_free_bytes=disk_free(self._store.file),
             health=self._health(),
             servos=servos_of(self._encoders),
             buses=buses_of(self._encoders),
@@ -190,6 +206,8 @@ class Sampler:
                 continue
             self._last_frame = self._wall.now()
             self._tally.frames += 1
+            if self._tally.readings:
+                self._service.ready()
             reason = self._take(seen)
             if reason is not None:
                 self._tally.reject(reason)
@@ -199,6 +217,7 @@ class Sampler:
         if self._stopping:
             return
         self._ended = True
+        self._service.ready()
         log.info("the sources are through; %d pairs are in the store", self._seq)
         self._tell()
         while not (self._stopping or self._exit_at_end):
@@ -258,12 +277,14 @@ class Sampler:
     def _read_encoders(self) -> None:
         try:
             while not self._stopping:
+                self._service.beat("encoders")
                 reading = self._joints.read(READ_TIMEOUT_S)
                 if reading is not None:
                     self._take_reading(reading)
                 elif self._joints.trouble is not None:
                     self._buffer.silence()
         except SourceEnded:
+            self._service.leave("encoders")
             self._buffer.silence()
         except Exception as error:
             log.exception("the encoders' thread failed")
@@ -284,10 +305,12 @@ class Sampler:
     def _obey(self, request: Request) -> bytes:
         command = decode(request.payload, CommandRequest, request.encoding).command
         if command == "accept_turns":
-            return encode(CommandReply(command, self._accept_turns()), request.encoding)
+            return encode(CommandReply(command, accept_turns(self._encoders)), request.encoding)
         name, _, way = command.rpartition("_")
         if way in ("on", "off"):
             return encode(CommandReply(command, self._power(name, on=way == "on")), request.encoding)
+        if command == "reload":
+            return encode(CommandReply(command, self._rules.reload()), request.encoding)
         if command not in ("pause", "resume"):
             raise RequestError(
                 f"the sampler has nothing to do with {command}. Send it to {self._keys.command('learner')}"
@@ -300,14 +323,6 @@ class Sampler:
         message = "no pairs are accepted until resume" if self._paused else "pairs are accepted, in a new segment"
         log.info("%s: %s", command, message)
         return encode(CommandReply(command, message), request.encoding)
-
-    def _accept_turns(self) -> str:
-        encoders = self._encoders
-        if not isinstance(encoders, AsksForTurns) or not encoders.asks_for_turns:
-            raise RequestError("no joint has lost its turn count: there is nothing to accept")
-        encoders.accept_turns()
-        log.info("accept_turns: the turns nearest to where the joints were are taken")
-        return "the turns nearest to where the joints were are taken; pairs go on in a new segment"
 
     def _gaze_loop(self, head: Head) -> GazeLoop:
         def predict(payload: bytes) -> bytes:
@@ -328,13 +343,21 @@ class Sampler:
         return said
 
     def _tell_when_due(self) -> None:
+        self._service.beat("frames")
+        if self._reloading:
+            self._reloading = False
+            self._rules.reload_aside(self._service)
         self._tally.tick()
         if self._wall.now() >= self._next_status:
+            self._rules.trim()
             self._tell()
 
     def _tell(self) -> None:
         self._next_status = self._wall.now() + STATUS_EVERY_S
-        self._publish_status(encode(self.status()))
+        status = self.status()
+        self._publish_status(encode(status))
+        line = f"{status.state}, {status.pairs} pairs, {status.pairs_per_s:.1f}/s"
+        self._service.tell(with_health(line, status.health))
 
     def _state(self) -> str:
         if self._failure is not None:
@@ -359,7 +382,7 @@ class Sampler:
             )
         if self._bad_readings:
             said.append(f"{self._bad_readings} encoder readings were not finite and were not used")
-        if self._disk_free() < LOW_DISK_BYTES:
+        if disk_free(self._store.file) < LOW_DISK_BYTES:
             said.append(f"the disk of {self._store.file} is nearly full")
         return list(dict.fromkeys(said))  # servos tell what their drives say, too
 
@@ -374,9 +397,3 @@ class Sampler:
             for name, trouble, since in silent
             if trouble is None and now - since > SILENT_AFTER_S
         ]
-
-    def _disk_free(self) -> int:
-        try:
-            return shutil.disk_usage(self._store.file.parent).free
-        except OSError as error:
-            raise StoreError(f"the directory of {self._store.file} is gone: {error.strerror}") from error

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from typing import Protocol, runtime_checkable
 
+from interfaces.errors import RequestError
 from interfaces.protocols import JointSource
 
 from .status import BusStatus, ServoStatus
+
+log = logging.getLogger(__name__)
 
 
 class ServoHealth(Protocol):
@@ -115,3 +119,16 @@ def _bus(bus: BusHealth) -> BusStatus:
     failed = sum(bus.troubles.values())
     answered = 1.0 - failed / bus.exchanges if bus.exchanges else 0.0
     return BusStatus(bus.exchanges, round(answered, 5), dict(bus.troubles))
+
+
+def accept_turns(encoders: object) -> str:
+    """Let encoders that lost their turn count take the turns nearest to where they were; what they did.
+
+    Raises:
+        RequestError: they lost none.
+    """
+    if not isinstance(encoders, AsksForTurns) or not encoders.asks_for_turns:
+        raise RequestError("no joint has lost its turn count: there is nothing to accept")
+    encoders.accept_turns()
+    log.info("accept_turns: the turns nearest to where the joints were are taken")
+    return "the turns nearest to where the joints were are taken; pairs go on in a new segment"

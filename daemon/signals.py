@@ -1,4 +1,4 @@
-"""SIGTERM and SIGINT as a request to come to an orderly end, and a parent's death as another."""
+"""SIGTERM and SIGINT as a request to come to an orderly end, SIGHUP as one to read robot.toml again."""
 
 from __future__ import annotations
 
@@ -29,18 +29,34 @@ def end_with_parent() -> None:
         sys.exit(1)
 
 
-@contextmanager
-def on_termination(stop: Callable[[], None]) -> Iterator[None]:
-    """Call `stop` when SIGTERM or SIGINT comes.
+class Wishes:
+    """What signals ask of a process: plain attributes, which a handler may set."""
 
-    `stop` runs between two instructions of the main thread, which may be holding any lock: it must only set a plain
+    ending = reloading = False
+
+    def end(self) -> None:
+        """Ask it to end."""
+        self.ending = True
+
+    def reload(self) -> None:
+        """Ask it to read robot.toml again."""
+        self.reloading = True
+
+
+@contextmanager
+def on_termination(stop: Callable[[], None], *, reload: Callable[[], None] | None = None) -> Iterator[None]:
+    """Call `stop` when SIGTERM or SIGINT comes, and `reload` when SIGHUP does.
+
+    Both run between two instructions of the main thread, which may be holding any lock: they must only set a plain
     attribute (`threading.Event.set` can wait for a lock that the interrupted thread holds).
     """
 
-    def handle(_number: int, _frame: object) -> None:
-        stop()
+    wanted = {signal.SIGTERM: stop, signal.SIGINT: stop} | ({} if reload is None else {signal.SIGHUP: reload})
 
-    before = {number: signal.signal(number, handle) for number in (signal.SIGTERM, signal.SIGINT)}
+    def handle(number: int, _frame: object) -> None:
+        wanted[signal.Signals(number)]()
+
+    before = {number: signal.signal(number, handle) for number in wanted}
     try:
         yield
     finally:

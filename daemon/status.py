@@ -181,11 +181,31 @@ class OrientationStatus(msgspec.Struct, frozen=True):
     claimed_rad: float | None
 
 
-class ToolChange(msgspec.Struct, frozen=True):
-    """The last change of the tool: sequence number of the first pair with it, and whether it was found, not told."""
+class Change(msgspec.Struct, frozen=True, kw_only=True):
+    """The last change of the tool, of the camera or of a joint's zero.
+
+    Attributes:
+        first_seq: sequence number of the most probable first pair after it.
+        earliest_seq, latest_seq: between which that pair is, with 95 % probability.
+        noticed_seq: the pair with which it was noticed; of a change that was told, the last one before it.
+        found: in the pairs; else it was told.
+        kind: `tool`, `camera`, `joint NAME` (its zero), `other` or `undecided`.
+        probabilities: by kind, those above 1 %.
+        alike: the kind that no motion tells from this one; null where there is none.
+        moved_m: by how much it moved the marker at the pairs since, root mean square [m]; null where nobody knows.
+        can_roll_back: whether the model before it is kept.
+    """
 
     first_seq: int
+    earliest_seq: int
+    latest_seq: int
+    noticed_seq: int
     found: bool
+    kind: str
+    probabilities: dict[str, float]
+    alike: str | None
+    moved_m: float | None
+    can_roll_back: bool
 
 
 class LearnerStatus(msgspec.Struct, frozen=True, kw_only=True):
@@ -197,7 +217,7 @@ class LearnerStatus(msgspec.Struct, frozen=True, kw_only=True):
         pairs: pairs learnt online, each once.
         last_seq: sequence number of the newest of them.
         replayed: replay steps since the start.
-        pairs_since_change: pairs since the tool was last changed, or since the beginning.
+        pairs_since_change: pairs since the last change, or since the beginning.
         answering: which model answers queries.
         prequential_m: recent mean distance between prediction and measurement, before learning [m], by model.
         claimed_error_m: the error [m] that the learner claims for predictions where data is.
@@ -208,12 +228,13 @@ class LearnerStatus(msgspec.Struct, frozen=True, kw_only=True):
         gaps_recovered: pairs that had to be fetched from the sampler's history.
         refused: pairs that could not be taken.
         doubted: pairs that looked like gross outliers and were learnt with care.
-        changes: tool changes that were told, or found in the pairs.
-        last_change: the last of them; null where there was none since the process started.
+        changes: changes that were told, or found in the pairs.
+        last_change: the last of them; null where there was none, or it was rolled back.
         at_rest: whether nothing is left to do with the pairs that came: to fit, to solve, to replay or to find out.
         checkpoint_age_s: time since the last checkpoint, or null before any.
         health: sentences about what is wrong; empty when all is well.
         orientation: null where no pair with the present tool said how the marker is turned.
+        missed: pairs that the sampler no longer kept when this learner asked for them.
     """
 
     robot: str
@@ -235,11 +256,12 @@ class LearnerStatus(msgspec.Struct, frozen=True, kw_only=True):
     refused: int
     doubted: int
     changes: int
-    last_change: ToolChange | None
+    last_change: Change | None
     at_rest: bool
     checkpoint_age_s: float | None
     uptime_s: float
     health: list[str]
     version: str
     orientation: OrientationStatus | None = None
+    missed: int = 0
     schema: int = SCHEMA

@@ -16,14 +16,17 @@ from rich.text import Text
 from interfaces.errors import BusError, RequestError
 
 from .bus import Bus
+from .changes import UNDECIDED
 from .config import Config
 from .findings_view import calibration_table, outlook_lines
+from .identity import Route
 from .keys import Keys
 from .remedies import as_typed
 from .screen import coverage_table, degrees, mm, rejected
 from .servos_view import servos_table
 from .status import BusStatus, LearnerStatus, OrientationStatus, SamplerStatus
 from .wire import decode
+from .zenoh_config import PROCESSES
 
 ANSWER_LIMIT_S = 2.0
 EVERY_S = 1.0
@@ -46,8 +49,8 @@ class Watcher:
     """Asks both processes for their states. Use as a context manager; the processes may come and go."""
 
     def __init__(self, config: Config) -> None:
-        zenoh, self._keys = config.tables.zenoh, Keys(config.robot.name)
-        self._endpoints = {"sampler": zenoh.sampler, "learner": zenoh.learner}
+        self._keys = Keys(config.robot.name)
+        self._routes = {process: config.route(process) for process in PROCESSES}
         self._sessions: dict[str, Bus] = {}
 
     def __enter__(self) -> Self:
@@ -76,7 +79,7 @@ class Watcher:
     def _ask(self, process: str) -> bytes | None:
         try:
             if process not in self._sessions:
-                self._sessions[process] = Bus(connect=self._endpoints[process], client=True).__enter__()
+                self._sessions[process] = Bus(connect=self._routes[process], client=True).__enter__()
             return self._sessions[process].ask_one(self._keys.status(process), timeout_s=ANSWER_LIMIT_S)
         except (BusError, RequestError):
             self._leave(process)
@@ -95,12 +98,12 @@ def as_json(seen: Seen) -> str:
 
 def screen(seen: Seen, config: Config) -> RenderableType:
     """Both states for a person; what a small terminal cuts off is the end of the joints' coverage."""
-    zenoh, chain = config.tables.zenoh, config.robot.chain
+    chain = config.robot.chain
     parts: list[RenderableType] = []
-    parts += _absent("sampler", zenoh.sampler) if seen.sampler is None else _sampler(seen.sampler)
+    parts += _absent("sampler", config.route("sampler")) if seen.sampler is None else _sampler(seen.sampler)
     parts.append(Text())
     slides = {name for name, slides in zip(config.robot.joints, chain.prismatic, strict=True) if slides}
-    parts += _absent("learner", zenoh.learner) if seen.learner is None else _learner(seen.learner)
+    parts += _absent("learner", config.route("learner")) if seen.learner is None else _learner(seen.learner)
     if seen.learner is not None and seen.learner.calibration is not None:
         parts += [Text(), calibration_table(seen.learner.calibration, slides)]
     if seen.sampler is not None and seen.sampler.coverage:
@@ -108,8 +111,8 @@ def screen(seen: Seen, config: Config) -> RenderableType:
     return Group(*parts)
 
 
-def _absent(process: str, endpoint: str) -> list[RenderableType]:
-    said = f"does not answer on {endpoint}. Start it with `bodyschema {process}`, or both with `bodyschema run`."
+def _absent(process: str, route: Route) -> list[RenderableType]:
+    said = f"does not answer on {route}. Start it with `bodyschema {process}`, or both with `bodyschema run`."
     return [Text.assemble((process, "bold"), " ", (as_typed(said), "yellow"))]
 
 
@@ -143,7 +146,8 @@ def _learner(status: LearnerStatus) -> list[RenderableType]:
     if status.orientation is not None:
         facts.add_row("orientation", _orientation(status.orientation))
     if status.changes:
-        facts.add_row("tool", _tool_change(status))
+        for name, line in zip(("change", ""), _change(status), strict=False):
+            facts.add_row(name, line)
     for name, line in zip(("enough?", ""), outlook_lines(status.outlook), strict=False):
         facts.add_row(name, line)
     facts.add_row("answering", f"{status.answering}, model {status.model or 'none yet'}")
@@ -155,11 +159,20 @@ def _elsewhere(status: LearnerStatus) -> str:
     return "" if status.outlook is None else f", {mm(status.outlook.anywhere_m)} over all joints' ranges"
 
 
-def _tool_change(status: LearnerStatus) -> str:
+def _change(status: LearnerStatus) -> Iterator[str]:
     since, change = f"{status.pairs_since_change} pairs since", status.last_change
     if change is None:
-        return f"changed {status.changes} time{'' if status.changes == 1 else 's'}; {since}"
-    return f"changed at pair {change.first_seq} ({'found' if change.found else 'told'}); {since}"
+        yield f"changed {status.changes} time{'' if status.changes == 1 else 's'}; {since}"
+        return
+    when = f"at pair {change.first_seq}"
+    if change.earliest_seq < change.latest_seq:
+        when += f" ({change.earliest_seq} to {change.latest_seq})"
+    moved = "" if change.moved_m is None else f", marker moved by {mm(change.moved_m)}"
+    yield f"{change.kind} {when}{moved} ({'found' if change.found else 'told'}); {since}"
+    if change.kind == UNDECIDED:
+        yield ", ".join(f"{kind} {share:.0%}" for kind, share in change.probabilities.items())
+    elif change.alike is not None:
+        yield f"or {change.alike}: no motion tells them apart"
 
 
 def _facts() -> Table:

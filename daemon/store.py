@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import sqlite3
 import uuid
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from threading import Lock
@@ -19,35 +17,10 @@ import msgspec
 from interfaces.errors import StoreError
 from interfaces.records import FloatArray, MarkerFix, Pair, frozen_array
 
-from .store_file import NOTHING_CHANGED, damaged, explained, lock
+from . import store_schema
+from .retention import Keep, delete_until
+from .store_file import NOTHING_CHANGED, explained, lock
 from .store_rows import COLUMNS, COLUMNS_BEFORE_ORIENTATION, pair_of, row_of
-
-SCHEMA_VERSION = 3
-APPLICATION_ID = 0x42534348  # "BSCH": how `file` and we tell a pair store from another SQLite file
-
-_TABLES = """
-CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID;
-CREATE TABLE sessions (
-    id INTEGER PRIMARY KEY, started_utc TEXT NOT NULL, robot_toml TEXT NOT NULL, urdf TEXT NOT NULL,
-    config TEXT NOT NULL, version TEXT NOT NULL, host TEXT NOT NULL
-);
-CREATE TABLE pairs (
-    seq INTEGER PRIMARY KEY, session INTEGER NOT NULL REFERENCES sessions, segment INTEGER NOT NULL,
-    t REAL NOT NULL, utc TEXT NOT NULL, q TEXT NOT NULL, x TEXT NOT NULL, cov TEXT NOT NULL, centres_px TEXT
-);
-"""
-# The statements that lead to each schema from the one before. Those of schema 2: what the joints were read with from
-# pair `from_seq` on. Of schema 3: how the marker is turned.
-_MIGRATIONS = {
-    2: """
-CREATE TABLE devices (
-    id INTEGER PRIMARY KEY, session INTEGER NOT NULL REFERENCES sessions, from_seq INTEGER NOT NULL, utc TEXT NOT NULL,
-    record TEXT NOT NULL
-)""",
-    3: """
-ALTER TABLE pairs ADD COLUMN R TEXT;
-ALTER TABLE pairs ADD COLUMN cov_R TEXT""",
-}
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,11 +78,11 @@ class PairReader:
         if not self.file.exists():
             raise StoreError(f"there is no store {self.file}. The sampler makes it: start it with `bodyschema sampler`")
         with explained(self.file):
-            self._connection = _connect(self.file, readonly=True)
+            self._connection = store_schema.connect(self.file, readonly=True)
             try:
-                _check_kind(self._connection, self.file)
-                meta = _meta(self._connection)
-                if _version(self._connection) < 3:
+                store_schema.check_kind(self._connection, self.file)
+                meta = store_schema.meta(self._connection)
+                if store_schema.version(self._connection) < 3:
                     self._columns = COLUMNS_BEFORE_ORIENTATION
             except BaseException:
                 self._close()
@@ -142,6 +115,10 @@ class PairReader:
     def last_seq(self) -> int:
         """Sequence number of the newest pair; 0 when there is none."""
         return self._rows("SELECT coalesce(max(seq), 0) FROM pairs", ())[0][0]
+
+    def first_seq(self) -> int:
+        """Sequence number of the oldest pair; 1 when there is none."""
+        return self._rows("SELECT coalesce(min(seq), 1) FROM pairs", ())[0][0]
 
     def joint_ranges(self) -> tuple[FloatArray, FloatArray] | None:
         """Smallest and largest joint angles over all pairs, each shape (d,) [rad or m]; None when there is none."""
@@ -212,12 +189,11 @@ class PairStore:
         Raises:
             StoreError: the disk is full or broken; the pair is not in the store.
         """
-        if self._connection is None:
-            raise StoreError(f"the store {self.file} is closed; use it in a with statement")
+        connection = self._require_open()
         measured = (fix.x, fix.cov, fix.centres_px, fix.R, fix.cov_R)
         pair = Pair(self.identity, self._seq + 1, segment, fix.t, utc, q, *measured)
-        with explained(self.file), _transaction(self._connection):
-            self._connection.execute(
+        with explained(self.file), store_schema.transaction(connection):
+            connection.execute(
                 f"INSERT INTO pairs (session, {COLUMNS}) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
                 (self._session_id, *row_of(pair)),
             )
@@ -230,15 +206,42 @@ class PairStore:
         Raises:
             StoreError: the disk is full or broken.
         """
-        if self._connection is None:
-            raise StoreError(f"the store {self.file} is closed; use it in a with statement")
-        with explained(self.file), _transaction(self._connection):
+        connection = self._require_open()
+        with explained(self.file), store_schema.transaction(connection):
             # What no pair was measured with tells nothing of the pairs.
-            self._connection.execute("DELETE FROM devices WHERE from_seq > ?", (self._seq,))
-            self._connection.execute(
+            connection.execute("DELETE FROM devices WHERE from_seq > ?", (self._seq,))
+            connection.execute(
                 "INSERT INTO devices (session, from_seq, utc, record) VALUES (?, ?, ?, ?)",
                 (self._session_id, self._seq + 1, utc, _json(record)),
             )
+
+    def go_on_with(self, session: Session) -> None:
+        """What the sampler works with from the next pair on.
+
+        Raises:
+            StoreError: the disk is full or broken.
+        """
+        connection = self._require_open()
+        self._session = session
+        with explained(self.file):
+            self._begin_session(connection)
+
+    def trim(self, keep: Keep, utc: str) -> int:
+        """Delete the oldest pairs that are not to be kept, a part of them at a time; how many were deleted.
+
+        Args:
+            utc: now.
+
+        Raises:
+            StoreError: the disk is full or broken.
+        """
+        connection = self._require_open()
+        with explained(self.file):
+            last = keep.last_to_delete(connection, utc)
+            if last is None:
+                return 0
+            with store_schema.transaction(connection):
+                return delete_until(connection, last)
 
     def read(self, from_seq: int = 1, to_seq: int | None = None, limit: int | None = None) -> list[Pair]:
         """As `PairReader.read`; from any thread."""
@@ -252,18 +255,23 @@ class PairStore:
         self._make_directory()
         self._lock_file = lock(self.file)
         with explained(self.file):
-            self._connection = _connect(self.file)
+            self._connection = store_schema.connect(self.file)
             if not self._connection.execute("SELECT count(*) FROM sqlite_schema").fetchone()[0]:
                 self._create(self._connection)
-            _check_kind(self._connection, self.file)
-            _check_health(self._connection, self.file)
-            _migrate(self._connection)
-            self._check_joints(tuple(msgspec.json.decode(_meta(self._connection)["joints"])))
+            store_schema.check_kind(self._connection, self.file)
+            store_schema.check_health(self._connection, self.file)
+            store_schema.migrate(self._connection)
+            self._check_joints(tuple(msgspec.json.decode(store_schema.meta(self._connection)["joints"])))
             self._connection.execute("PRAGMA journal_mode = WAL")
             self._connection.execute("PRAGMA synchronous = FULL")
-            self._session_id = self._begin_session(self._connection)
+            self._begin_session(self._connection)
         self.reader.__enter__()
         self._seq = self.reader.last_seq()
+
+    def _require_open(self) -> sqlite3.Connection:
+        if self._connection is None:
+            raise StoreError(f"the store {self.file} is closed; use it in a with statement")
+        return self._connection
 
     def _make_directory(self) -> None:
         try:
@@ -277,16 +285,16 @@ class PairStore:
     def _create(self, connection: sqlite3.Connection) -> None:
         meta = {"store": str(uuid.uuid4()), "created_utc": self._session.started_utc}
         meta["joints"] = msgspec.json.encode(self._session.joints).decode()
-        with _transaction(connection):
-            for statement in ";".join([_TABLES, *_MIGRATIONS.values()]).split(";"):
+        with store_schema.transaction(connection):
+            for statement in store_schema.TABLES:
                 connection.execute(statement)
             connection.executemany("INSERT INTO meta VALUES (?, ?)", meta.items())
-            connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
-            connection.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
+            connection.execute(f"PRAGMA application_id = {store_schema.APPLICATION_ID}")
+            connection.execute(f"PRAGMA user_version = {store_schema.SCHEMA_VERSION}")
 
-    def _begin_session(self, connection: sqlite3.Connection) -> int:
+    def _begin_session(self, connection: sqlite3.Connection) -> None:
         session = self._session
-        with _transaction(connection):
+        with store_schema.transaction(connection):
             newest = connection.execute("SELECT coalesce(max(seq), 0) FROM pairs").fetchone()[0]
             connection.execute("DELETE FROM devices WHERE from_seq > ?", (newest,))
             # A sampler that is started again and again without seeing a pair must not fill the disk.
@@ -297,7 +305,7 @@ class PairStore:
                 "INSERT INTO sessions (started_utc, robot_toml, urdf, config, version, host) VALUES (?, ?, ?, ?, ?, ?)",
                 (session.started_utc, session.robot_toml, session.urdf, session.config, session.version, session.host),
             )
-        return int(done.lastrowid or 0)
+        self._session_id = int(done.lastrowid or 0)
 
     def _check_joints(self, stored: tuple[str, ...]) -> None:
         if stored != self._session.joints:
@@ -315,64 +323,6 @@ class PairStore:
         if self._lock_file is not None:
             os.close(self._lock_file)
             self._lock_file = None
-
-
-def _connect(file: Path, *, readonly: bool = False) -> sqlite3.Connection:
-    uri = f"{file.absolute().as_uri()}?mode={'ro' if readonly else 'rwc'}"
-    return sqlite3.connect(uri, uri=True, isolation_level=None, check_same_thread=False)
-
-
-@contextmanager
-def _transaction(connection: sqlite3.Connection) -> Iterator[None]:
-    connection.execute("BEGIN IMMEDIATE")
-    try:
-        yield
-        connection.execute("COMMIT")
-    except BaseException:
-        with contextlib.suppress(sqlite3.Error):  # a full disk has rolled back already
-            connection.execute("ROLLBACK")
-        raise
-
-
-def _check_kind(connection: sqlite3.Connection, file: Path) -> None:
-    if connection.execute("PRAGMA application_id").fetchone()[0] != APPLICATION_ID:
-        raise StoreError(
-            f"{file} is not a pair store but another SQLite file. Move it away, or give another --state-dir. "
-            f"{NOTHING_CHANGED}"
-        )
-    version = _version(connection)
-    if version > SCHEMA_VERSION:
-        raise StoreError(
-            f"{file} was written by a newer bodyschema (schema {version}, this one knows {SCHEMA_VERSION}). "
-            f"Install the newer bodyschema, or give another --state-dir. {NOTHING_CHANGED}"
-        )
-
-
-def _version(connection: sqlite3.Connection) -> int:
-    return int(connection.execute("PRAGMA user_version").fetchone()[0])
-
-
-def _migrate(connection: sqlite3.Connection) -> None:
-    """Bring a store of an older version to this one; its pairs stay as they are."""
-    version = _version(connection)
-    if version < SCHEMA_VERSION:
-        with _transaction(connection):
-            for schema in range(version + 1, SCHEMA_VERSION + 1):
-                for statement in _MIGRATIONS[schema].split(";"):
-                    connection.execute(statement)
-            connection.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
-
-
-def _check_health(connection: sqlite3.Connection, file: Path) -> None:
-    found = connection.execute("PRAGMA quick_check(1)").fetchone()[0]
-    count, newest = connection.execute("SELECT count(*), coalesce(max(seq), 0) FROM pairs").fetchone()
-    if found != "ok" or count != newest:
-        what = found if found != "ok" else f"{newest - count} pairs are missing"
-        raise StoreError(damaged(file, what))
-
-
-def _meta(connection: sqlite3.Connection) -> dict[str, str]:
-    return dict(connection.execute("SELECT key, value FROM meta").fetchall())
 
 
 def _json(value: object) -> str:

@@ -56,6 +56,14 @@ def free_bytes(file: Path) -> int:
     return shutil.disk_usage(file.parent).free
 
 
+def disk_free(file: Path) -> int:
+    """Bytes that are free where the store is; StoreError when its directory is gone."""
+    try:
+        return free_bytes(file)
+    except OSError as error:
+        raise StoreError(f"the directory of {file} is gone: {error.strerror}") from error
+
+
 def lock(file: Path) -> int:
     """A lock on a file beside the store, which the process's end frees and which its children do not inherit."""
     lock_file = file.with_name(file.name + ".lock")

@@ -19,12 +19,14 @@ def advice(diagnosis: Diagnosis) -> tuple[str, ...]:
     told = []
     for cause, standing in zip(diagnosis.causes, diagnosis.standings, strict=True):
         for rival in standing.rivals:
-            if rival.is_same_anywhere:
-                told.append(
-                    f"No motion tells {describe(cause)} from {describe(rival.effect)}: mend whichever is easier."
-                )
-            else:
+            if not rival.is_same_anywhere:
                 told.append(_motion(diagnosis, cause, rival))
+            elif rival.effect is not None:
+                told.append(f"No motion tells {describe(cause)} from {rival.described}: mend whichever is easier.")
+            if rival.effect is None:
+                told.append(
+                    f"Watch whether {rival.described}: press on it, or record with a second marker on what carries it."
+                )
     if diagnosis.left.is_there:
         joints = [diagnosis.extended.simulation.robot.joints[k] for k in diagnosis.left.joints]
         where = f" Look at {', '.join(joints)} first." if joints else ""
@@ -40,12 +42,16 @@ def _reach(diagnosis: Diagnosis) -> str:
 def _motion(diagnosis: Diagnosis, cause: Effect, rival: Rival) -> str:
     """Which joint, moved through its whole range, tells two causes apart best."""
     robot, fit = diagnosis.extended.simulation.robot, diagnosis.extended
-    pair = f"{describe(cause)} from {describe(rival.effect)}"
-    apart = [apart_on(fit, rival.fit, widened(fit, [k])) for k in range(len(robot.joints))]
+    pair = f"{describe(cause)} from {rival.described}"
+    apart = [apart_on(fit, rival.instead, widened(fit, [k])) for k in range(len(robot.joints))]
     best = int(np.argmax(apart))
     if apart[best] >= _TELLS:
         low, high = max(robot.lower[best], -np.pi), min(robot.upper[best], np.pi)
         unit, scale = ("mm", 1e3) if robot.chain.prismatic[best] else ("°", 180.0 / np.pi)
         span = f"{low * scale:.0f}{unit} to {high * scale:.0f}{unit}"
         return f"To tell {pair}, move joint {robot.joints[best]} through its whole range ({span}) in another recording."
-    return f"To tell {pair}, record poses over the whole range of all joints, with stops and at different speeds."
+    poses = f"To tell {pair}, record poses over the whole range of all joints, with stops and at different speeds"
+    if rival.anywhere >= _TELLS:
+        return f"{poses}."
+    pairs = len(fit.observations) * _TELLS / rival.anywhere
+    return f"{poses}: about {float(f'{pairs:.1g}'):,.0f} of them, since the effect is small beside the noise."

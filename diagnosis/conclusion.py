@@ -8,7 +8,8 @@ from effects import Effect
 from interfaces.records import FloatArray
 
 from .advice import advice
-from .diagnosis import Diagnosis
+from .contact import before_contact
+from .diagnosis import MOST_DOUBTFUL, Diagnosis
 from .result import (
     Alike,
     Cause,
@@ -25,11 +26,14 @@ from .result import (
 )
 from .rivals import Rival, Standing
 from .scan import Candidate
+from .search import NAMED, nats
 from .words import evidence, sentence
 
 _HALF_WIDTH_95 = 1.959964
 # A cause that is less sure than this leaves the verdict open.
 SURE = 0.9
+# What chance brings about less often than this wants a word why it is no cause.
+_HARDLY_CHANCE = 1e-3
 
 
 def conclusion(diagnosis: Diagnosis) -> DiagnosisFile:
@@ -41,7 +45,7 @@ def conclusion(diagnosis: Diagnosis) -> DiagnosisFile:
     gain = Gain(percent, interval)
     return DiagnosisFile(
         verdict=verdict,
-        sentence=sentence(verdict, causes, rms, gain),
+        sentence=sentence(verdict, causes, rms, gain, _named_mm(diagnosis)),
         pairs=Pairs(len(diagnosis.markers), len(diagnosis.markers), diagnosis.outliers),
         rms_mm=rms,
         mean_mm=_mean_mm(diagnosis),
@@ -51,7 +55,7 @@ def conclusion(diagnosis: Diagnosis) -> DiagnosisFile:
         unexplained=_unexplained(diagnosis),
         stability=_stability(diagnosis),
         advice=advice(diagnosis),
-        limitations=diagnosis.hypotheses.limitations,
+        limitations=_limitations(diagnosis),
         alike=_alike(diagnosis),
     )
 
@@ -70,6 +74,11 @@ def _rms_mm(diagnosis: Diagnosis) -> Errors:
     figures = {name: 1e3 * float(np.sqrt(np.square(d[kept]).mean())) for name, d in diagnosis.held_out.items()}
     traces = np.trace(diagnosis.noise[kept], axis1=1, axis2=2)
     return Errors(**figures, noise_floor=1e3 * float(np.sqrt(traces.mean())))
+
+
+def _named_mm(diagnosis: Diagnosis) -> float | None:
+    alone = diagnosis.with_names_alone
+    return None if alone is None else 1e3 * float(np.sqrt(np.square(alone[diagnosis.markers]).mean()))
 
 
 def _mean_mm(diagnosis: Diagnosis) -> Errors:
@@ -112,6 +121,8 @@ def _causes(diagnosis: Diagnosis) -> tuple[Cause, ...]:
 def _named(rival: Rival) -> Indistinguishable:
     effect = rival.effect
     by = "any_motion" if rival.is_same_anywhere else "this_motion"
+    if effect is None:
+        return Indistinguishable("unexplained", None, None, by, rival.probability, rival.described)
     return Indistinguishable(effect.name, effect.where, effect.source, by, rival.probability)
 
 
@@ -179,11 +190,40 @@ def _derived(cause: Effect, covariance: FloatArray) -> dict[str, Interval]:
 
 def _rejected(diagnosis: Diagnosis) -> tuple[Rejected, ...]:
     tried = max(len(diagnosis.hypotheses.effects), 1)
-    rows = [
-        Rejected(c.effect.name, c.effect.where, c.effect.source, a.held_out_gain_percent, min(1.0, a.p_value * tried))
-        for c, a in diagnosis.rejected
-    ]
+    rows = []
+    for candidate, more in diagnosis.rejected:
+        chance = min(1.0, more.p_value * tried)
+        why = _why_not(diagnosis, candidate, tried) if chance < _HARDLY_CHANCE else ""
+        rows.append(Rejected(*candidate.effect.key, more.held_out_gain_percent, chance, why))
     return tuple(sorted(rows, key=lambda row: row.held_out_gain_percent, reverse=True))
+
+
+def _why_not(diagnosis: Diagnosis, candidate: Candidate, tried: int) -> str:
+    """Why a hypothesis is no cause although chance hardly brings about what it explains."""
+    if diagnosis.left.is_there:
+        return "what has no name shows in it"
+    if not candidate.effect.is_possible:
+        return "it would be negative"
+    if nats(candidate.gain, candidate.dof) - float(np.log(tried * candidate.trials)) < NAMED:
+        return "too little for its numbers"
+    if diagnosis.ended_early:
+        return "not reached"
+    return "no better with all refitted"
+
+
+def _limitations(diagnosis: Diagnosis) -> tuple[str, ...]:
+    told = list(diagnosis.hypotheses.limitations)
+    unknown_side = before_contact(diagnosis.extended).mean()
+    if unknown_side > MOST_DOUBTFUL:
+        joints = ", ".join(str(cause.where) for cause in diagnosis.causes if cause.name == "backlash")
+        told.append(
+            f"At {100.0 * unknown_side:.0f} % of the pairs nobody knows on which side of its play {joints} stands: "
+            "few runs cross it. What seems to jump or to change with time there may be that. Record longer runs, "
+            "and move the joint to and fro in each."
+        )
+    if diagnosis.ended_early:
+        told.append(f"The search ended at its longest, with {len(diagnosis.causes)} causes: there may be more of them.")
+    return tuple(told)
 
 
 def _alike(diagnosis: Diagnosis) -> tuple[Alike, ...]:

@@ -38,7 +38,7 @@ _MOSTLY = 0.8
 # How far off, in units of what depends on the way between two readings, is farther than that way can explain.
 _BY_SO_MUCH = 4.0
 # Where more rows than this are doubtful, leaving them out costs more than they do harm.
-_MOST_DOUBTFUL = 0.25
+MOST_DOUBTFUL = 0.25
 # Beside what has no name a cause stays named only if it is more probable than not.
 _HALF = 0.5
 # Of the instrument's noise, another size than that is taken up (in logarithms).
@@ -59,6 +59,7 @@ class Diagnosis:
         left: what no effect fits.
         blocks: of time, by which rows were held out.
         seed: of the resampling.
+        ended_early: whether the search for causes ended at its longest, so that there may be more.
     """
 
     hypotheses: Hypotheses
@@ -70,6 +71,7 @@ class Diagnosis:
     left: Leftover
     blocks: Blocks
     seed: int
+    ended_early: bool = False
 
     @property
     def causes(self) -> tuple[Effect, ...]:
@@ -82,6 +84,13 @@ class Diagnosis:
         fits = {"nominal": self.nominal, "aligned": self.aligned, "geometry": self.geometry}
         errors = {name: held_out_errors(fit, self.blocks) for name, fit in fits.items()}
         return errors | {"extended": self._extended_errors(self.extended)}
+
+    @cached_property
+    def with_names_alone(self) -> FloatArray | None:
+        """Distances (n,) [m] with the causes and no model of what has no name; None where there is no such model."""
+        if self.left.model is None or self.left.model.stored is None:
+            return None
+        return np.linalg.norm(held_out_errors(self.aligned.with_causes(self.causes), self.blocks), axis=1)
 
     def _extended_errors(self, fit: Fit) -> FloatArray:
         """Measured minus predicted (n, 3) [m] on rows that causes and smooth model have not seen."""
@@ -199,7 +208,7 @@ def diagnose(
     search = Search(hypotheses.effects, tell)
     extended = search.run(start)
     factor, unknown_side = instrument_factor(extended), before_contact(extended)
-    doubtful = unknown_side if unknown_side.mean() <= _MOST_DOUBTFUL else np.zeros_like(unknown_side)
+    doubtful = unknown_side if unknown_side.mean() <= MOST_DOUBTFUL else np.zeros_like(unknown_side)
     if abs(np.log(factor)) > _SAME_NOISE or doubtful.any():
         observations = observations.with_factor(factor).without(doubtful)
         start = aligned(observations, simulation)
@@ -209,7 +218,7 @@ def diagnose(
     unknowns, blocks = Unknowns(start), blocks or Blocks.cut(len(recording))
     explanation = explain(extended, search.path, unknowns, search, tell)
     tell("asking what else it could be")
-    stands = standings(explanation.beside, search, blocks, seed)
+    stands = standings(explanation.beside, search, blocks, seed, None if explanation.unknown else unknowns)
     while explanation.unknown and any(standing.probability < _HALF for standing in stands):
         weakest = int(np.argmin([standing.probability for standing in stands]))
         fewer = without_one(explanation, explanation.fit.causes[weakest], unknowns, search)
@@ -228,6 +237,7 @@ def diagnose(
         left=left,
         blocks=blocks,
         seed=seed,
+        ended_early=search.ended_early,
     )
 
 

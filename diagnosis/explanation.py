@@ -61,6 +61,11 @@ class Explanation:
         """What has no name."""
         return () if self.apart is None else self.apart.chosen
 
+    @property
+    def is_specific(self) -> bool:
+        """Whether all that has no name is as specific as what has one."""
+        return all(way.family.is_specific for way in self.unknown)
+
 
 def explain(
     found: Fit, tried: Iterable[Fit], unknowns: Unknowns, search: Search, tell: Callable[[str], None]
@@ -88,10 +93,11 @@ def explain(
         if causes in looked_at:
             continue
         looked_at.add(causes)
-        if hope - _names(fit, search) < best.worth - (_AS_GOOD if best.unknown else 0.0):
+        if hope - cost_of_names(fit.causes, search) < best.worth - (_AS_GOOD if best.unknown else 0.0):
             continue
         other = _with_unknown(fit, unknowns, search)
-        better = other.worth > best.worth + (margin if best.fit is found else 0.0) or _is_as_good(other, best)
+        clearly = margin if best.fit is found and not other.is_specific else 0.0
+        better = other.worth > best.worth + clearly or _is_as_good(other, best)
         if other.apart is not None and better and unknowns.predicts(other.apart, found):
             best = other
     if best.unknown:
@@ -134,16 +140,16 @@ def _with_unknown(fit: Fit, unknowns: Unknowns, search: Search) -> Explanation:
             break
         tried = [unknowns.apart(fit, (*chosen, way), apart) for way, _ in near]
         apart = max(tried, key=lambda one: one.fit.log_likelihood - unknowns.cost(one))
-    names = _names(fit, search)
+    names = cost_of_names(fit.causes, search)
     if apart is None:
         return Explanation(fit, None, fit.log_likelihood - names, promise=promise)
     worth = apart.fit.log_likelihood - names - unknowns.cost(apart)
     return Explanation(fit, apart, worth, _length(fit, apart.predicted - fit.run.measured), promise)
 
 
-def _names(fit: Fit, search: Search) -> float:
-    """What the causes of a fit cost where sets of causes are compared [nats]."""
-    return sum(_NUMBER * len(effect.amounts) + search.doubt_of(effect) for effect in fit.causes)
+def cost_of_names(causes: Iterable[Effect], search: Search) -> float:
+    """What causes cost where sets of causes are compared [nats]."""
+    return sum(_NUMBER * len(effect.amounts) + search.doubt_of(effect) for effect in causes)
 
 
 def _pruned(explanation: Explanation, unknowns: Unknowns, search: Search, *, rest: bool) -> Explanation:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from itertools import combinations_with_replacement
+from itertools import combinations_with_replacement, product
 from typing import Literal
 
 import numpy as np
@@ -18,6 +18,9 @@ _HARMONICS, _TIMES, _JOINT_TIMES = 5, 4, (8, 32, 96)
 _ROWS_A_WAVE = 10
 # Time constants of what warms up, as shares of the recording's time.
 _WARMING = (0.07, 0.2, 0.6)
+# One spring about all axes of a frame, and one along all of them beside it.
+_TILT = np.repeat([[0.0], [1.0]], 3, axis=0)
+_TILT_AND_SINK = np.repeat(np.eye(2), 3, axis=0)
 Columns = Callable[[Simulated], FloatArray]
 
 
@@ -33,7 +36,9 @@ class Family:
         over_time: whether it depends on time.
         moves: what moves, by one unit each (n, 3, a) [m].
         amounts: what it may depend on (n, b); each of the moves is any linear function of it.
-        paired: each of the moves is proportional to its own amount instead (b = a).
+        ties: each of the moves is proportional to its own amount instead (b = a), by factors that are these mixtures
+            (a, p) of the numbers; None for any function.
+        is_specific: whether it says as much of what is wrong as an effect with a name does.
     """
 
     what: str
@@ -43,13 +48,14 @@ class Family:
     over_time: bool
     moves: Columns
     amounts: Columns
-    paired: bool = False
+    ties: FloatArray | None = None
+    is_specific: bool = False
 
     def columns(self, run: Simulated) -> FloatArray:
-        """Derivatives (n, 3, p) of what is measured by its numbers [m], a b or where paired a."""
+        """Derivatives (n, 3, p) of what is measured by its numbers [m], a b where none are tied."""
         moves, amounts = self.moves(run), self.amounts(run)
-        if self.paired:
-            return moves * amounts[:, None, :]
+        if self.ties is not None:
+            return (moves * amounts[:, None, :]) @ self.ties
         return (moves[:, :, :, None] * amounts[:, None, None, :]).reshape(len(moves), 3, -1)
 
     def along(self, functions: FloatArray) -> Family:
@@ -59,8 +65,8 @@ class Family:
     def moved_by(self, run: Simulated, numbers: FloatArray) -> FloatArray:
         """By how much each of the moves is there (n, a) with these numbers (p,)."""
         amounts = self.amounts(run)
-        if self.paired:
-            return amounts * numbers
+        if self.ties is not None:
+            return amounts * (self.ties @ numbers)
         return amounts @ numbers.reshape(-1, amounts.shape[1]).T
 
 
@@ -85,11 +91,7 @@ def families(run: Simulated) -> list[Family]:
             what = f"the link before {names[k]} changes with time"
             found.append(Family(what, "body", k, (), True, link, _warming_or_any_of_time))
         if run.simulation.gravity.known:
-            what = f"what carries {names[k]} gives under the arm's weight"
-            for loads in (_moments(k), _wrenches(k)):
-                found.append(Family(what, "body", None, (), False, link, loads))
-            for T in (np.eye(4), run.simulation.gravity.in_carrier(k)):
-                found.append(Family(what, "body", None, (), False, _link_about(k, T), _own_loads(k, T), paired=True))
+            found += _giving(run, k)
     if timed:
         for what, moves in (("the tool changes with time", _tool), ("the camera moves with time", _camera)):
             found.append(Family(what, "body", None, (), True, moves, _warming_or_any_of_time))
@@ -98,6 +100,19 @@ def families(run: Simulated) -> list[Family]:
         found.append(Family(what, "place", None, (), False, _in_depth, _places_in_image(degree)))
         what = "an error that depends on where the marker is in the image"
         found.append(Family(what, "place", None, (), False, _anywhere, _places_in_image(degree)))
+    return found
+
+
+def _giving(run: Simulated, k: int) -> list[Family]:
+    """What carries a joint gives under the arm's weight: in any way, or by springs along and about axes."""
+    what = f"what carries {run.simulation.robot.joints[k]} gives under the arm's weight"
+    found = [Family(what, "body", None, (), False, _link(k), loads) for loads in (_moments(k), _wrenches(k))]
+    supports = run.simulation.gravity.in_supports(k)
+    for T in (np.eye(4), *supports):
+        found.append(Family(what, "body", None, (), False, _link_about(k, T), _own_loads(k, T), ties=np.eye(6)))
+    for T, ties in product(supports if run.simulation.bears_weight else (), (_TILT, _TILT_AND_SINK)):
+        moves, loads = _link_about(k, T), _own_loads(k, T)
+        found.append(Family(what, "body", None, (), False, moves, loads, ties, is_specific=True))
     return found
 
 

@@ -135,7 +135,7 @@ class Fit:
     @cached_property
     def run_columns(self) -> FloatArray:
         """Derivatives (n, 3, p) of what is measured by all amounts [m]."""
-        return _amount_columns(self.run, self.simulation.effects)
+        return amount_columns(self.run, self.simulation.effects)
 
     @cached_property
     def columns(self) -> FloatArray:
@@ -322,6 +322,7 @@ def _cost(causes: Sequence[Effect]) -> float:
     return float(total)
 
 
-def _amount_columns(run: Simulated, effects: Sequence[Effect]) -> FloatArray:
+def amount_columns(run: Simulated, effects: Sequence[Effect]) -> FloatArray:
+    """Derivatives (n, 3, p) of what is measured by the amounts of effects [m]."""
     parts = [run.columns(effect)[:, :, effect.amounts] for effect in effects]
     return np.concatenate(parts, axis=2) if parts else np.empty((len(run.motion), 3, 0))

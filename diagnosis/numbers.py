@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from .result import Cause, Interval, Rejected
+from .result import Cause, Indistinguishable, Interval, Rejected
 
 _DEG = math.degrees(1.0)
 # By the end of a number's name: its factor and unit. The first that fits is taken.
@@ -128,6 +128,11 @@ def named(effect: str, where: str | None, source: str | None) -> str:
     """As `place`."""
     at = "" if where is None else f" at {where}"
     return f"{effect}{at}{'' if source is None else f' from {source}'}"
+
+
+def rival_named(rival: Indistinguishable) -> str:
+    """What a cause may be as well: its name and place, or what it is where it has no name."""
+    return rival.what or named(rival.effect, rival.where, rival.source)
 
 
 def chance(p: float) -> str:

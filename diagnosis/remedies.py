@@ -14,7 +14,7 @@ from interfaces.records import FloatArray
 from interfaces.robot import RobotDescription
 from interfaces.rpy import rpy_of
 
-from .numbers import named
+from .numbers import named, rival_named
 from .result import Cause, DiagnosisFile
 
 _DEG = math.degrees(1.0)
@@ -48,7 +48,7 @@ def _if_sure(cause: Cause, remedy: str) -> str:
     open_ones = [rival for rival in cause.rivals if rival.by == "this_motion"]
     if cause.probability >= _SURE or not open_ones:
         return remedy
-    rivals = " or ".join(named(rival.effect, rival.where, rival.source) for rival in open_ones[:2])
+    rivals = " or ".join(rival_named(rival) for rival in open_ones[:2])
     return (
         f"If it is {named(cause.effect, cause.where, cause.source)} and not {rivals}: {remedy[0].lower()}{remedy[1:]}"
     )

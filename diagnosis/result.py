@@ -28,8 +28,10 @@ class Indistinguishable(msgspec.Struct, frozen=True):
     """What a cause cannot be told from.
 
     Attributes:
+        effect: its name; "unexplained" where it has none.
         by: "this_motion" where another motion would tell them apart, "any_motion" where none would.
         probability: that it is this one.
+        what: in words, where it has no name.
     """
 
     effect: str
@@ -37,6 +39,7 @@ class Indistinguishable(msgspec.Struct, frozen=True):
     source: str | None
     by: Literal["this_motion", "any_motion"]
     probability: float
+    what: str = ""
 
 
 class Cause(msgspec.Struct, frozen=True):
@@ -65,6 +68,7 @@ class Rejected(msgspec.Struct, frozen=True):
     Attributes:
         held_out_gain_percent: what it would bring on top of the causes.
         p_value: of no gain at all, for all hypotheses that were tried together.
+        why: it is no cause although chance hardly brings so much about; nothing where chance may.
     """
 
     effect: str
@@ -72,6 +76,7 @@ class Rejected(msgspec.Struct, frozen=True):
     source: str | None
     held_out_gain_percent: float
     p_value: float
+    why: str = ""
 
 
 class Alike(msgspec.Struct, frozen=True):

@@ -11,20 +11,27 @@ from numpy.typing import NDArray
 from effects import Effect, Motion
 from interfaces.records import FloatArray
 
-from .fit import Fit
+from .fit import Fit, amount_columns
 from .held_out import Blocks
+from .nameless import Nameless
 from .scan import Candidate
-from .search import Search, nats
+from .search import Search, describe, nats
 from .stability import Instead, named_again
+from .unknown import Unknowns
 
 # Signals that differ by less than this, twice the log-likelihood that the right one is expected to gain, are one.
 SAME = 6.0
+# What any motion leaves of a cause's signal, as a share of its chi-square, when a rival that no motion tells from it is
+# in its place: the rest of linear steps.
+_SAME_SHARE = 1e-3
 # A rival less probable than this is none.
 PROBABLE = 0.02
 # What explains a smaller share of what a cause explains is none either.
 _COMES_NEAR = 0.7
-# Poses of the motion over the whole range of the joints, which stands for any motion.
-_POSES = 400
+_Other = tuple[Fit | Nameless, Effect | None, str]
+# Poses of the motion over the whole range of the joints, which stands for any motion, and by how much the logarithms
+# of the times between them scatter there.
+_POSES, _UNEVEN = 400, 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,18 +39,22 @@ class Rival:
     """What could be there in the place of a cause.
 
     Attributes:
-        fit: with it in the place of the cause.
-        effect: with the numbers with which it does best.
+        instead: the causes with it in the place of the cause.
+        effect: with the numbers with which it does best; None where it has no name.
+        described: in a few words.
         probability: given that one of the rivals is there.
         difference: twice the log-likelihood that this motion is expected to tell them apart by.
         anywhere: the same for as many poses over the whole range of the joints.
+        signal: what the cause itself brings there.
     """
 
-    fit: Fit
-    effect: Effect
+    instead: Fit | Nameless
+    effect: Effect | None
+    described: str
     probability: float
     difference: float
     anywhere: float
+    signal: float
 
     @property
     def is_same_here(self) -> bool:
@@ -53,7 +64,7 @@ class Rival:
     @property
     def is_same_anywhere(self) -> bool:
         """Whether no motion does."""
-        return self.anywhere < SAME
+        return self.anywhere < _SAME_SHARE * self.signal
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,12 +90,18 @@ class Standing:
     again: NDArray[np.bool_]
 
 
-def standings(fit: Fit, search: Search, blocks: Blocks, seed: int) -> list[Standing]:
-    """One for each cause of a fit."""
-    return [_standing(fit, cause, search, blocks, seed) for cause in fit.causes]
+def standings(fit: Fit, search: Search, blocks: Blocks, seed: int, unknowns: Unknowns | None = None) -> list[Standing]:
+    """One for each cause of a fit.
+
+    Args:
+        unknowns: what has no name and may be a cause as well.
+    """
+    return [_standing(fit, cause, search, blocks, seed, unknowns) for cause in fit.causes]
 
 
-def _standing(fit: Fit, cause: Effect, search: Search, blocks: Blocks, seed: int) -> Standing:
+def _standing(
+    fit: Fit, cause: Effect, search: Search, blocks: Blocks, seed: int, unknowns: Unknowns | None
+) -> Standing:
     beside = search.beside(fit, cause)
     without = beside.without
     gain = 2.0 * (fit.log_likelihood - without.log_likelihood)
@@ -99,11 +116,20 @@ def _standing(fit: Fit, cause: Effect, search: Search, blocks: Blocks, seed: int
         doubt = float(np.log(max(candidate.trials / max(itself.trials, 1), 1e-3)))
         tried.append((Instead(rival, candidate.dof - itself.dof, doubt), candidate.effect))
     behind = [nats(2.0 * (one.fit.log_likelihood - fit.log_likelihood), one.dof) - one.doubt for one, _ in tried]
+    others: list[_Other] = [_as_fitted(one.fit, effect) for one, effect in tried]
+    if unknowns is not None:
+        near = unknowns.specific(without, _COMES_NEAR * itself.gain)
+        aparts = [unknowns.apart(without, (way,)) for way in near]
+        if (nameless := Nameless.in_place_of(cause, fit, aparts, unknowns, search)) is not None:
+            others.append((nameless, None, nameless.what))
+            behind.append(nameless.behind)
     odds = np.exp(np.clip([0.0, -worth, *behind], -500.0, 50.0))
     shares = odds / odds.sum()
+    wide = widened(fit, range(fit.observations.motion.q.shape[1]), uneven=_UNEVEN)
+    signal = apart_on(fit, without, wide)
     rivals = [
-        Rival(one.fit, _as_fitted(one.fit, effect), float(share), _difference(fit, one.fit), _anywhere(fit, one.fit))
-        for (one, effect), share in zip(tried, shares[2:], strict=True)
+        Rival(other, effect, told, float(share), _difference(fit, other), apart_on(fit, other, wide), signal)
+        for (other, effect, told), share in zip(others, shares[2:], strict=True)
         if share >= PROBABLE
     ]
     same = sum(rival.probability for rival in rivals if rival.is_same_anywhere)
@@ -119,23 +145,24 @@ def _standing(fit: Fit, cause: Effect, search: Search, blocks: Blocks, seed: int
     )
 
 
-def _as_fitted(fit: Fit, effect: Effect) -> Effect:
-    return next(cause for cause in fit.causes if cause.identity == effect.identity)
+def _as_fitted(fit: Fit, effect: Effect) -> _Other:
+    cause = next(cause for cause in fit.causes if cause.identity == effect.identity)
+    return fit, cause, describe(cause)
 
 
-def _difference(one: Fit, other: Fit) -> float:
+def _difference(one: Fit, other: Fit | Nameless) -> float:
     """Twice the log-likelihood by which the predictions of two fits differ over their observations."""
-    apart = one.observations.whitened((one.run.measured - other.run.measured)[:, :, None])[:, :, 0]
+    predicted = other.run.measured if isinstance(other, Fit) else other.predicted
+    apart = one.observations.whitened((one.run.measured - predicted)[:, :, None])[:, :, 0]
     return float((one.noise.weights[:, None] * np.square(apart)).sum() / one.noise.sigma**2)
 
 
-def _anywhere(one: Fit, other: Fit) -> float:
-    """The same for poses over the whole range of the joints, with what may be fitted to them refitted."""
-    return apart_on(one, other, widened(one, range(one.observations.motion.q.shape[1])))
+def widened(fit: Fit, joints: Iterable[int], uneven: float = 0.0) -> Motion:
+    """Some rows of a fit's motion over the same time, with some joints anywhere in their range, in runs of two.
 
-
-def widened(fit: Fit, joints: Iterable[int]) -> Motion:
-    """Some rows of a fit's motion, with some joints anywhere in their range, each pose followed by one nearby."""
+    Args:
+        uneven: by how much the logarithms of the times between rows scatter.
+    """
     robot, motion = fit.simulation.robot, fit.observations.motion
     rng = np.random.default_rng(0)
     n = len(motion)
@@ -144,23 +171,30 @@ def widened(fit: Fit, joints: Iterable[int]) -> Motion:
     for k in joints:
         q[:, k] = rng.uniform(max(robot.lower[k], -np.pi), min(robot.upper[k], np.pi), len(rows))
     clock = motion.clock
-    return Motion(q, np.linspace(clock[0], clock[-1], len(rows)), np.arange(len(rows)) // 2)
+    gaps = np.cumsum(np.exp(uneven * rng.normal(size=len(rows))))
+    shares = (gaps - gaps[0]) / max(gaps[-1] - gaps[0], 1e-9)
+    return Motion(q, clock[0] + shares * (clock[-1] - clock[0]), np.arange(len(rows)) // 2)
 
 
-def apart_on(one: Fit, other: Fit, motion: Motion) -> float:
+def apart_on(one: Fit, other: Fit | Nameless, motion: Motion) -> float:
     """Twice the log-likelihood by which two fits differ on a motion as long as theirs, the other refitted to it."""
-    apart = one.simulation.positions(motion) - other.simulation.positions(motion)
-    left = _beside(apart, other, motion)
+    there = other.simulation.positions(motion) if isinstance(other, Fit) else other.positions(motion)
+    left = _beside(one.simulation.positions(motion) - there, _columns(other, motion))
     scale = float(np.median(np.linalg.det(one.observations.whitening))) ** (1.0 / 3.0)
     share = len(one.observations) / len(motion)
     return float(np.square(left * scale).sum() / one.noise.sigma**2 * share)
 
 
-def _beside(apart: FloatArray, fit: Fit, motion: Motion) -> FloatArray:
-    """What of `apart` (n, 3) the amounts of a fit cannot follow."""
-    run = fit.simulation.run(motion)
-    columns = [run.columns(effect)[:, :, effect.amounts] for effect in fit.simulation.effects]
-    flat = np.concatenate(columns, axis=2).reshape(apart.size, -1)
+def _columns(fit: Fit | Nameless, motion: Motion) -> FloatArray:
+    """Derivatives (n, 3, p) [m] of what is measured on a motion by the amounts of a fit."""
+    if isinstance(fit, Nameless):
+        return fit.columns(motion)
+    return amount_columns(fit.simulation.run(motion), fit.simulation.effects)
+
+
+def _beside(apart: FloatArray, columns: FloatArray) -> FloatArray:
+    """What of `apart` (n, 3) columns (n, 3, p) cannot follow."""
+    flat = columns.reshape(apart.size, -1)
     scales = np.linalg.norm(flat, axis=0)
     flat = flat / np.where(scales > 0.0, scales, 1.0)
     solved = np.linalg.lstsq(flat, apart.ravel(), rcond=1e-9)[0]

@@ -80,10 +80,14 @@ class Search:
         self._trials: dict[Key, int] = {}
         self._beside: tuple[Fit | None, dict[Identity, Beside]] = (None, {})
         self.path: list[Fit] = []
+        self.ended_early = False
 
     def run(self, start: Fit) -> Fit:
-        """The causes on top of what `start` has fitted."""
-        fit = start
+        """The causes on top of what `start` has fitted.
+
+        `ended_early` says afterwards whether the number of steps ended the search, and not that nothing was better.
+        """
+        fit, self.ended_early = start, False
         self._seen: set[Named] = set()
         self.path = [start]
         if start.causes:
@@ -100,6 +104,7 @@ class Search:
             self._seen.add(causes)
             fit = self._reviewed(better)
             self.path.append(fit)
+        self.ended_early = len(self.path) > _MOST_CAUSES or len(self._seen) >= _MOST_SETS
         return fit
 
     def _added(self, fit: Fit) -> tuple[Fit | None, float]:

@@ -20,8 +20,8 @@ from .low_rank import low_rank, numbers_of
 from .observations import Observations
 from .search import nats
 
-# What has no name has to be so much more probable than what has one [nats].
-_NO_NAME = 8.0
+# What has no name has to be so much more probable than what has one, and what is as specific as that [nats].
+_NO_NAME, SPECIFIC = 8.0, 5.0
 # What one of its numbers costs [nats].
 _NUMBER = 2.0
 # Directions of a family's columns of which less is left, as a share of the strongest and of the whole, tell nothing.
@@ -62,7 +62,7 @@ class Way:
     def of(cls, family: Family, start: Fit) -> Way:
         """The whole family."""
         whitened = start.observations.whitened(family.columns(start.run)).reshape(start.left.size, -1)
-        amounts = 1 if family.paired else family.amounts(start.run).shape[1]
+        amounts = 1 if family.ties is not None else family.amounts(start.run).shape[1]
         lengths = np.linalg.norm(whitened, axis=0).reshape(-1, amounts)
         of_moves = np.maximum(np.sqrt(np.square(lengths).mean(axis=1, keepdims=True)), 1e-100)
         of_amounts = np.maximum(np.sqrt(np.square(lengths / of_moves).mean(axis=0)), 1e-100)
@@ -124,11 +124,11 @@ class Unknowns:
         self._run = start.run
         self._ways = [Way.of(family, start) for family in families(start.run)]
         self.count = len(self._ways)
-        self._doubt = float(np.log(self.count)) + _NO_NAME
+        self._doubt = float(np.log(self.count))
 
     def beside(self, fit: Fit, others: Sequence[Way] = ()) -> tuple[FloatArray, FloatArray]:
         """An orthonormal basis (3 n, r) of what `fit` and some ways can change, and what they leave (3 n,)."""
-        basis = fit.orthogonal.reshape(fit.left.size, -1)
+        basis = basis_of(fit)
         for way in others:
             basis = np.concatenate([basis, self._fresh(fit, basis, way)], axis=1)
         left = fit.left.ravel()
@@ -149,18 +149,37 @@ class Unknowns:
             values, vectors = np.linalg.eigh(inner)
             told = (values > _TOLD * max(float(values.max()), 1e-12)) & (values > _LEFT)
             explained = float(np.square(vectors[:, told].T @ toward / np.sqrt(values[told])).sum())
-            most, numbers = _nats(explained, rss, rows), int(told.sum())
+            most, numbers = _nats(explained, rss, rows) - self._doubt_of(way), int(told.sum())
             ranked.append((most - _NUMBER * numbers, way, None))
-            for rank in _RANKS:
+            for rank in (rank for rank in _RANKS if rank < min(way.moves, way.amounts)):
                 fewer = numbers_of(way.moves, way.amounts, rank)
                 best = _NEAR * max(worth for worth, _, _ in ranked)
                 # A part explains no more than the whole.
-                if fewer < numbers and most - _NUMBER * fewer > max(best, self._doubt):
+                if fewer < numbers and most - _NUMBER * fewer > max(best, 0.0):
                     explained, functions = low_rank(inner, toward, way.amounts, rank)
-                    ranked.append((_nats(explained, rss, rows) - _NUMBER * fewer, way, functions))
+                    worth = _nats(explained, rss, rows) - self._doubt_of(way) - _NUMBER * fewer
+                    ranked.append((worth, way, functions))
         ranked.sort(key=lambda one: -one[0])
         ranked = [one for one in ranked[:_NEAREST] if one[0] > _NEAR * ranked[0][0] or one is ranked[0]]
-        return [(way if part is None else way.along(part), worth - self._doubt) for worth, way, part in ranked]
+        return [(way if part is None else way.along(part), worth) for worth, way, part in ranked]
+
+    def specific(self, fit: Fit, least: float) -> list[Way]:
+        """The ways as specific as an effect with a name that explain most beside a fit, the most first.
+
+        Args:
+            least: twice the log-likelihood that they have to bring, to first order.
+        """
+        basis, left = basis_of(fit), fit.left.ravel() / fit.noise.sigma
+        ranked = [
+            (float(np.square(self._fresh(fit, basis, way).T @ left).sum()), k)
+            for k, way in enumerate(self._ways)
+            if way.family.is_specific
+        ]
+        return [self._ways[k] for gain, k in sorted(ranked, reverse=True)[:_NEAREST] if gain >= least]
+
+    def _doubt_of(self, way: Way) -> float:
+        """What having looked for it among all others costs [nats]."""
+        return self._doubt + (SPECIFIC if way.family.is_specific else _NO_NAME)
 
     def apart(self, fit: Fit, chosen: Sequence[Way], start: Apart | None = None) -> Apart:
         """The causes of a fit and ways to differ, fitted in turn to what the others leave.
@@ -189,7 +208,7 @@ class Unknowns:
     def cost(self, apart: Apart) -> float:
         """What the ways and their numbers cost [nats]."""
         numbers = self._beside(apart)[0].shape[0] + apart.choice
-        return len(apart.chosen) * self._doubt + _NUMBER * numbers
+        return sum(self._doubt_of(way) for way in apart.chosen) + _NUMBER * numbers
 
     def told(self, apart: Apart) -> FloatArray:
         """What ways can change beside the causes (n, 3, r) [m], in directions that the data tell."""
@@ -202,7 +221,7 @@ class Unknowns:
     def _beside(self, apart: Apart) -> tuple[FloatArray, FloatArray]:
         """Squared lengths (r,) of what ways change beside the causes, and by which of their numbers (p, r)."""
         fit = apart.fit
-        basis = fit.orthogonal.reshape(fit.left.size, -1)
+        basis = basis_of(fit)
         return _directions(np.concatenate([way.columns for way in apart.chosen], axis=1), fit, basis)[1:]
 
     def predicts(self, apart: Apart, alone: Fit) -> bool:
@@ -226,7 +245,7 @@ class Unknowns:
     def _step(self, here: Apart) -> tuple[FloatArray, ...]:
         """The numbers of families that explain most of what the causes leave and are not larger than they can be."""
         fit, counts = here.fit, [len(number) for number in here.numbers]
-        basis = fit.orthogonal.reshape(fit.left.size, -1)
+        basis = basis_of(fit)
         weights = np.repeat(fit.root_weights[:, 0], 3)[:, None]
         columns = np.concatenate([way.columns for way in here.chosen], axis=1) * weights
         columns = columns - basis @ (basis.T @ columns)
@@ -258,12 +277,17 @@ class Unknowns:
         # The strongest of so many were chosen: each costs as one among all.
         gain = float(stats.chi2.isf(max(chance, 1e-290), len(strongest)))
         choice = len(strongest) * float(np.log(fresh.shape[1])) + _NUMBER * way.choice
-        return nats(gain, len(strongest)) - choice - self._doubt
+        return nats(gain, len(strongest)) - choice - self._doubt_of(way)
 
     def _fresh(self, fit: Fit, basis: FloatArray, way: Way) -> FloatArray:
         """An orthonormal basis (3 n, r) of what a way changes beside a basis."""
         columns, values, mix = _directions(way.columns, fit, basis)
         return columns @ (mix / np.sqrt(values))
+
+
+def basis_of(fit: Fit) -> FloatArray:
+    """An orthonormal basis (3 n, r) of what the amounts of a fit can change."""
+    return fit.orthogonal.reshape(fit.left.size, -1)
 
 
 def _directions(columns: FloatArray, fit: Fit, basis: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -277,4 +301,4 @@ def _directions(columns: FloatArray, fit: Fit, basis: FloatArray) -> tuple[Float
 
 def _nats(explained: float, rss: float, rows: float) -> float:
     """By how much the log-likelihood rises when so much of a sum of squares is explained."""
-    return -1.5 * rows * float(np.log1p(-min(explained / rss, 0.999999)))
+    return -1.5 * rows * float(np.log1p(-min(explained / max(rss, 1e-300), 0.999999)))

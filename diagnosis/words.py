@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from msgspec.structs import replace
 
 from effects import KINDS
 from effects.unexplained import PLACE
@@ -97,13 +98,18 @@ def finding(name: str, where: str | None, source: str | None, numbers: dict[str,
             return name if encoder is None else encoder.finding(at, numbers)
 
 
-def sentence(verdict: Verdict, causes: Sequence[Cause], rms: Errors, gain: Gain) -> str:
-    """The verdict in one sentence."""
+def sentence(verdict: Verdict, causes: Sequence[Cause], rms: Errors, gain: Gain, named_mm: float | None = None) -> str:
+    """The verdict in one sentence.
+
+    Args:
+        named_mm: RMS with the causes alone [mm], where there is a smooth model of what has no name beside them.
+    """
     figures = f"{rms.aligned:.3g} mm → {rms.extended:.3g} mm on data not used in the fit"
     if verdict == "nothing_found":
         return f"The simulation is right to within the noise: nothing found in {rms.aligned:.3g} mm of error"
     if not causes:
-        return "What is measured differs from the simulation in a way that none of the known effects explains"
+        told = "What is measured differs from the simulation in a way that none of the known effects explains"
+        return told if named_mm is None else f"{told}; a smooth model of it explains {_share(gain)} ({figures})"
     told = [finding(c.effect, c.where, c.source, told_values(c)) for c in causes]
     ordered = [text for _, text in sorted(zip(causes, told, strict=True), key=lambda p: -p[0].share_of_gain_percent)]
     if len(ordered) > _TOLD:
@@ -117,12 +123,22 @@ def sentence(verdict: Verdict, causes: Sequence[Cause], rms: Errors, gain: Gain)
         "undecided": ". Other causes would explain it nearly as well",
         "unexplained": ". Something is left that none of the known effects explains",
     }
-    explained = round(gain.held_out_percent)
+    what = "it explains" if len(ordered) == 1 else "together they explain"
+    if named_mm is not None:
+        alone = replace(gain, held_out_percent=100.0 * (1.0 - named_mm / max(rms.aligned, 1e-12)))
+        figures = f"{rms.aligned:.3g} mm → {named_mm:.3g} mm → {rms.extended:.3g} mm on data not used in the fit"
+        return (
+            f"{head}: {what} {_share(alone)}, and {_share(gain)} with a smooth model of what has no name "
+            f"({figures}){ends[verdict]}"
+        )
     if gain.held_out_percent <= 0.0:
         return f"{head}: this explains the pairs that were fitted and no others ({figures}){ends[verdict]}"
-    what = "it explains" if len(ordered) == 1 else "together they explain"
-    share = f"{explained} %" if explained > 0 else "less than 1 %"
-    return f"{head}: {what} {share} of the error ({figures}){ends[verdict]}"
+    return f"{head}: {what} {_share(gain)} ({figures}){ends[verdict]}"
+
+
+def _share(gain: Gain) -> str:
+    explained = round(gain.held_out_percent)
+    return f"{explained} % of the error" if explained > 0 else "less than 1 % of the error"
 
 
 def beside_geometry(rms: Errors, alike: Sequence[Alike]) -> list[str]:
@@ -149,7 +165,8 @@ def modelled(left: Unexplained) -> str:
         over = "the marker's place" if left.model_joints == PLACE else f"the readings of {', '.join(left.model_joints)}"
         told.append(f"extended.toml has a smooth model of it over {over}, as good as the recording is dense.")
     elif left.what:
-        told.append("extended.toml has no model of it.")
+        why = "" if left.not_in_model else ": none is right on pairs that it was not fitted to. More pairs may tell one"
+        told.append(f"extended.toml has no model of it{why}.")
     if left.not_in_model:
         told.append(
             f"What changes with time is in no such model: {'; '.join(left.not_in_model)}. Another recording will "
@@ -166,5 +183,4 @@ def evidence(standing: Standing) -> str:
     if not standing.rivals:
         return f"{text}; nothing else comes near."
     rival = standing.rivals[0]
-    place = "" if rival.effect.where is None else f" at {rival.effect.where}"
-    return f"{text}; the nearest rival is {rival.effect.name}{place} ({100 * rival.probability:.0f} %)."
+    return f"{text}; the nearest rival: {rival.described} ({100 * rival.probability:.0f} %)."

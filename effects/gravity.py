@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -39,7 +40,7 @@ class GravityLoad:
     """
 
     def __init__(self, robot: RobotDescription) -> None:
-        self._joints = robot.joints
+        self._robot = robot
         self._bodies = _bodies(robot)
         self._outwards = [k for k in self._order() if k is not None]
 
@@ -48,9 +49,18 @@ class GravityLoad:
         """Whether the URDF states any mass that a joint bears."""
         return any(body.mass_kg > 0.0 for k, body in self._bodies.items() if k is not None)
 
-    def in_carrier(self, k: int) -> FloatArray:
-        """Pose (4, 4) of a joint's frame in the link of the joint that carries it, or in the root link."""
-        return self._bodies[k].T_carrier_joint
+    def in_supports(self, k: int) -> list[FloatArray]:
+        """Poses (4, 4) of a joint's frame in the links that carry it as one: its parent link first, the farthest last.
+
+        The farthest is the link of the next joint that is read, or the root link. Frames that are the same are one.
+        """
+        robot = self._robot
+        joint, poses = robot.tree.joints[robot.joints[k]], list[FloatArray]()
+        for _, T in _borne(robot.tree, joint.parent, robot.joints, robot.robot.held_at):
+            pose = T @ joint.T_parent_joint
+            if not poses or not np.allclose(pose, poses[-1]):
+                poses.append(pose)
+        return poses
 
     def torques(self, q: FloatArray) -> FloatArray:
         """Torque of gravity about each joint, in the direction in which it counts [N·m, or N] (n, d), at q (n, d)."""
@@ -114,15 +124,26 @@ def _carried(
     tree: UrdfTree, link: str, joints: tuple[str, ...], held_at: dict[str, float]
 ) -> tuple[int | None, FloatArray]:
     """The read joint that carries `link`, None for the base, and the link's pose (4, 4) in that joint's child link."""
+    *_, (joint, T) = _borne(tree, link, joints, held_at)
+    return None if joint is None else joints.index(joint.name), T
+
+
+def _borne(
+    tree: UrdfTree, link: str, joints: tuple[str, ...], held_at: dict[str, float]
+) -> Iterator[tuple[UrdfJoint | None, FloatArray]]:
+    """The joint above `link` and the link's pose (4, 4) in itself, then the same of each link that bears it as one.
+
+    The last joint is one that is read, or None where the base bears the link.
+    """
     above = {joint.child: joint for joint in tree.joints.values()}
     T = np.eye(4)
-    while link in above:
-        joint = above[link]
-        if joint.name in joints:
-            return joints.index(joint.name), T
+    while True:
+        joint = above.get(link)
+        yield joint, T
+        if joint is None or joint.name in joints:
+            return
         T = standing(joint, False, held_at.get(joint.name, 0.0)) @ T
         link = joint.parent
-    return None, T
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,10 +9,13 @@ from typing import TextIO
 
 import numpy as np
 
-from .recording_columns import Fault, Table, check_finite, check_header
+from .limited import read_at_most
+from .recording_columns import Fault, Table, check_finite, check_header, check_width
 from .records import FloatArray
 
 FIRST_ROW_LINE = 2
+# Of a file, which is read as a whole, and of its first line.
+MOST_BYTES, MOST_HEADER_BYTES = 2**30, 2**20
 
 
 def read_csv_table(file: Path, joints: tuple[str, ...]) -> Table:
@@ -22,7 +25,10 @@ def read_csv_table(file: Path, joints: tuple[str, ...]) -> Table:
         Fault: something is wrong with the text; rows count from 0 below the header.
         OSError: the file cannot be read.
     """
-    text = _decoded(file.read_bytes())
+    data = read_at_most(file, MOST_BYTES)
+    if data is None:
+        raise Fault("the file is larger than 1 GiB", remedy="Cut it, or write it as Parquet")
+    text = _decoded(data)
     if not text.strip():
         raise Fault("the file is empty", remedy="A recording has a header line and at least one row")
     header, *lines = (line.removesuffix("\r") for line in text.split("\n"))
@@ -53,10 +59,12 @@ def csv_columns(file: Path) -> tuple[str, ...]:
         OSError: it cannot be read.
     """
     with file.open("rb") as stream:
-        header = _decoded(stream.readline()).rstrip("\r\n")
+        header = _decoded(stream.readline(MOST_HEADER_BYTES)).rstrip("\r\n")
     if not header.strip():
         raise Fault("the file is empty", remedy="A recording has a header line and at least one row")
-    return tuple(name.strip() for name in header.split(","))
+    names = tuple(name.strip() for name in header.split(","))
+    check_width(names)
+    return names
 
 
 def write_csv_rows(out: TextIO, rows: Iterable[Iterable[float]], integers: frozenset[int]) -> None:
@@ -80,6 +88,7 @@ def _decoded(data: bytes) -> str:
 
 
 def _check_header_line(names: tuple[str, ...], joints: tuple[str, ...]) -> None:
+    check_width(names)
     if len(names) == 1 and (";" in names[0] or "\t" in names[0]):
         raise Fault("the columns are not separated by commas", remedy="Save the recording with commas between columns")
     if all(_number(name) is not None for name in names):
@@ -89,38 +98,42 @@ def _check_header_line(names: tuple[str, ...], joints: tuple[str, ...]) -> None:
 
 def _numbers(lines: list[str], names: tuple[str, ...], whole: bool) -> FloatArray:
     """All rows at once; only when that fails are the fields looked at one by one."""
-    rows = [line.split(",") for line in lines]
     strict = all(line.isascii() and "_" not in line for line in lines)  # float() takes "1_0" and foreign digits
-    if strict and all(len(row) == len(names) for row in rows):
+    if strict and all(_width(line) == len(names) for line in lines):
+        fields = chain.from_iterable(line.split(",") for line in lines)
         try:
-            flat = np.fromiter(map(float, chain.from_iterable(rows)), dtype=np.float64, count=len(rows) * len(names))
+            flat = np.fromiter(map(float, fields), dtype=np.float64, count=len(lines) * len(names))
         except ValueError:
             pass
         else:
-            return flat.reshape(len(rows), len(names))
-    raise _first_wrong_field(rows, names, whole)
+            return flat.reshape(len(lines), len(names))
+    raise _first_wrong_field(lines, names, whole)
 
 
-def _first_wrong_field(rows: list[list[str]], names: tuple[str, ...], whole: bool) -> Fault:
-    for index, row in enumerate(rows):
-        if len(row) != len(names):
-            return _wrong_width(rows, index, names, whole)
-        for name, text in zip(names, row, strict=True):
+def _width(line: str) -> int:
+    """Fields of a line, which is not taken apart for it: a hostile one has millions."""
+    return line.count(",") + 1
+
+
+def _first_wrong_field(lines: list[str], names: tuple[str, ...], whole: bool) -> Fault:
+    for index, line in enumerate(lines):
+        if _width(line) != len(names):
+            return _wrong_width(lines, index, names, whole)
+        for name, text in zip(names, line.split(","), strict=True):
             if _number(text) is None:
                 what = "the field is empty" if not text.strip() else f"{_shortened(text)} is not a number"
                 return Fault(what, row=index, column=name, remedy="Write it like -0.5 or 1e-3, without quotes")
     raise AssertionError("every field is a number")
 
 
-def _wrong_width(rows: list[list[str]], index: int, names: tuple[str, ...], whole: bool) -> Fault:
-    row = rows[index]
-    if index == len(rows) - 1 and not whole:
+def _wrong_width(lines: list[str], index: int, names: tuple[str, ...], whole: bool) -> Fault:
+    width = _width(lines[index])
+    if index == len(lines) - 1 and not whole:
         return Fault("the last line is torn: the recording was cut off here", row=index, remedy="Delete this line")
-    if row == [""]:
+    if not lines[index]:
         return Fault("the line is empty", row=index, remedy="Delete the line")
-    fewer = len(row) < len(names)
-    what = f"{len(row)} field{'s' if len(row) > 1 else ''} where the header names {len(names)}"
-    column = names[len(row)] if fewer else None
+    what = f"{width} field{'s' if width > 1 else ''} where the header names {len(names)}"
+    column = names[width] if width < len(names) else None
     return Fault(what, row=index, column=column, remedy="Mend or delete the line")
 
 

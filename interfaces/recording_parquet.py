@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from .errors import RecordingError
-from .recording_columns import Fault, Table, check_finite, check_header
+from .recording_columns import MOST_NUMBERS, Fault, Table, check_finite, check_header, check_width
 
 INTEGER_COLUMNS = frozenset({"segment"})
 
@@ -25,12 +25,14 @@ def read_parquet_table(file: Path, joints: tuple[str, ...]) -> Table:
     """
     arrow, _ = _modules(file)
     with _opened(file) as parquet:
-        content = parquet.read()
-    names = tuple(content.column_names)
-    check_header(names, joints)
+        names = tuple(parquet.schema_arrow.names)
+        check_header(names, joints)
+        for name in names:
+            _check_kind(arrow, name, parquet.schema_arrow.field(name).type)
+        content = _read(arrow, parquet)
     if content.num_rows == 0:
         raise Fault("there are no rows", remedy="Record at least one pair")
-    values = np.column_stack([_column(arrow, name, content.column(name)) for name in names])
+    values = np.column_stack([_column(name, content.column(name)) for name in names])
     table = Table(names, values)
     check_finite(table)
     return table
@@ -39,7 +41,29 @@ def read_parquet_table(file: Path, joints: tuple[str, ...]) -> Table:
 def parquet_columns(file: Path) -> tuple[str, ...]:
     """The names of the columns of `file`; raises as `read_parquet_table`."""
     with _opened(file) as parquet:
-        return tuple(parquet.schema_arrow.names)
+        names = tuple(parquet.schema_arrow.names)
+    check_width(names)
+    return names
+
+
+def _read(arrow: Any, parquet: Any) -> Any:
+    """All columns; a Fault when there are more numbers than fit, be it that the file tells of fewer.
+
+    A file of some kilobytes can hold billions of equal numbers.
+    """
+    most = MOST_NUMBERS // len(parquet.schema_arrow)
+    _check_rows(parquet.metadata.num_rows, most)
+    batches, rows = [], 0
+    for batch in parquet.iter_batches():
+        rows += batch.num_rows
+        _check_rows(rows, most)
+        batches.append(batch)
+    return arrow.Table.from_batches(batches, parquet.schema_arrow)
+
+
+def _check_rows(rows: int, most: int) -> None:
+    if rows > most:
+        raise Fault(f"there are {rows:,} rows; of these columns at most {most:,} are read", remedy="Cut the recording")
 
 
 @contextmanager
@@ -72,10 +96,12 @@ def write_parquet_table(file: Path, table: Table) -> None:
         parquet.write_table(arrow.table(columns), stream)
 
 
-def _column(arrow: Any, name: str, column: Any) -> np.ndarray:
-    kind = column.type
+def _check_kind(arrow: Any, name: str, kind: Any) -> None:
     if not (arrow.types.is_floating(kind) or arrow.types.is_integer(kind)):
         raise Fault(f"the column holds {kind}, not numbers", column=name, remedy="Write it as double")
+
+
+def _column(name: str, column: Any) -> np.ndarray:
     if column.null_count:
         row = int(np.flatnonzero(column.is_null().to_numpy())[0])
         raise Fault("the value is missing", row=row, column=name, remedy="Mend or delete the row")

@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 import msgspec
 
 from .errors import ConfigError
+from .limited import read_at_most
 from .suggest import did_you_mean, hint_at, key_path, struct_in, with_choices
 
 T = TypeVar("T")
@@ -19,25 +20,43 @@ T = TypeVar("T")
 _UNKNOWN = re.compile(r"Object contains unknown field `(?P<field>[^`]*)`(?: - at `\$(?P<path>[^`]*)`)?")
 _HEADER = re.compile(r"\s*\[\[?([^\]]+)\]\]?")
 _KEY = re.compile(r"\s*([A-Za-z0-9_.\"'-]+)\s*=")
+_BETWEEN = re.compile("[,=]")
+MOST_BYTES, MOST_PARTS = 2**22, 100
 _PLACE = re.compile(r"(?P<what>.*?) - at `\$(?P<path>[^`]*)`$", re.DOTALL)
 
 
 def read_toml(file: Path) -> tuple[dict[str, Any], str]:
     """The tables of `file` and its text; ConfigError with the line when it cannot be read."""
     try:
-        data = file.read_bytes()
+        data = read_at_most(file, MOST_BYTES)
     except FileNotFoundError as error:
         raise ConfigError("there is no such file", file=file, remedy="`bodyschema config init` writes one") from error
     except IsADirectoryError as error:
         raise ConfigError("a folder, not a file", file=file, remedy="Name the robot.toml in it") from error
     except OSError as error:
         raise ConfigError(f"cannot be read: {error.strerror}", file=file, remedy="Mend its permissions") from error
+    if data is None:
+        raise ConfigError("larger than 4 MiB", file=file, remedy="Name a robot.toml")
     text = _decoded(data, file)
+    _check_keys(text, file)
     try:
         return tomllib.loads(text), text
     except tomllib.TOMLDecodeError as error:
         line = re.search(r"line (\d+)", str(error))
         raise ConfigError(f"not TOML: {error}", file=file, line=int(line[1]) if line else None) from error
+    except RecursionError as error:
+        raise ConfigError("not TOML: nested too deeply", file=file, remedy="Close the brackets") from error
+    except ValueError as error:  # a whole number of thousands of digits
+        raise ConfigError(f"not TOML: {error}", file=file, remedy="Shorten the number") from error
+
+
+def _check_keys(text: str, file: Path) -> None:
+    """ConfigError where a key has so many parts that reading it would take hours."""
+    for number, line in enumerate(text.split("\n"), 1):
+        if line.count(".") <= MOST_PARTS or line.lstrip().startswith("#"):
+            continue
+        if any(piece.count(".") > MOST_PARTS for piece in _BETWEEN.split(line)):
+            raise ConfigError(f"a key has more than {MOST_PARTS} parts", file=file, line=number, remedy="Delete it")
 
 
 def _not_finite(value: object, keys: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:

@@ -16,12 +16,14 @@ import numpy as np
 from kbmaps import RigidChain
 
 from .errors import RobotError
+from .limited import read_at_most
 from .records import FloatArray, frozen_array
 from .suggest import did_you_mean
 
 REVOLUTE = frozenset({"revolute", "continuous"})
 MOVING = REVOLUTE | {"prismatic"}
 LARGEST_FILE_BYTES = 16 * 2**20
+MOST_LINKS = 2000  # a humanoid with hands has some hundred
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,22 +119,39 @@ class UrdfTree:
         return joints
 
     def _check(self) -> None:
-        children = [joint.child for joint in self.joints.values()]
+        links, below = set(self.links), {link: list[str]() for link in self.links}
+        children: set[str] = set()
         for joint in self.joints.values():
             for link in (joint.parent, joint.child):
-                if link not in self.links:
+                if link not in links:
                     raise RobotError(
                         f"joint {joint.name!r} names the link {link!r}, which is not there", file=self.file
                     )
-            if children.count(joint.child) > 1:
+            if joint.child in children:
                 raise RobotError(f"link {joint.child!r} hangs on more than one joint", file=self.file)
+            children.add(joint.child)
+            below[joint.parent].append(joint.child)
         roots = [link for link in self.links if link not in children]
         if len(roots) != 1:
             raise RobotError(
-                f"the links do not form one tree (roots: {', '.join(roots) or 'none'})",
+                f"the links do not form one tree (roots: {_some(roots) or 'none'})",
                 file=self.file,
                 remedy="Every link but one needs a joint whose child it is",
             )
+        reached = list(roots)
+        for link in reached:  # grows on the way
+            reached += below[link]
+        ring = sorted(links.difference(reached))
+        if ring:
+            raise RobotError(
+                f"the links {_some(ring)} hang on each other in a ring",
+                file=self.file,
+                remedy="Every link but one needs a joint whose parent is nearer to the root",
+            )
+
+
+def _some(names: list[str]) -> str:
+    return ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")
 
 
 def chain_between(
@@ -284,13 +303,13 @@ def _parse(file: Path) -> Any:
     from lxml import etree  # pyright: ignore[reportAttributeAccessIssue]
 
     try:
-        if file.stat().st_size > LARGEST_FILE_BYTES:
-            raise RobotError("the URDF is larger than 16 MiB", file=file, remedy="Keep meshes in files of their own")
-        data = file.read_bytes()
+        data = read_at_most(file, LARGEST_FILE_BYTES)
     except OSError as error:
         raise RobotError(
             f"cannot read the URDF: {error.strerror}", file=file, remedy="Mend [robot] urdf, or --urdf"
         ) from error
+    if data is None:
+        raise RobotError("the URDF is larger than 16 MiB", file=file, remedy="Keep meshes in files of their own")
     parser = etree.XMLParser(resolve_entities=False, no_network=True, load_dtd=False, huge_tree=False)
     try:
         root = etree.fromstring(data, parser)
@@ -301,6 +320,8 @@ def _parse(file: Path) -> Any:
         raise RobotError("a URDF with a DOCTYPE is not accepted", file=file, line=1, remedy="Delete the DOCTYPE")
     if root.tag != "robot":
         raise RobotError(f"the root element is <{root.tag}>, not <robot>", file=file, line=root.sourceline)
+    if sum(1 for _ in root.iter("link", "joint")) > 2 * MOST_LINKS:
+        raise RobotError(f"the URDF has more than {MOST_LINKS:,} links", file=file, remedy="Keep the arm's alone")
     return _read_robot(data, file)
 
 

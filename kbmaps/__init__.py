@@ -16,6 +16,10 @@ from kbmaps.chains.rigid_learner import RigidLearner
 from kbmaps.chains.rigid_recursive import RecursiveRigidLearner
 from kbmaps.chains.search import find_chain
 from kbmaps.chains.tool_layer import ToolLayer
+from kbmaps.changes.detector import ChangeDetector, Suspicion
+from kbmaps.changes.kinds import ChangeKind, any_change, change_kinds
+from kbmaps.changes.naming import Explanation, explanations
+from kbmaps.changes.shared_noise import SharedNoise
 from kbmaps.contest import Contest
 from kbmaps.errors import (
     BasisError,
@@ -70,6 +74,8 @@ __all__ = [
     "ChainPosterior",
     "ChainReport",
     "ChainTolerances",
+    "ChangeDetector",
+    "ChangeKind",
     "Contest",
     "CoreFamily",
     "CorePrior",
@@ -79,6 +85,7 @@ __all__ = [
     "ExactSolution",
     "ExpectedError",
     "ExperimentDesign",
+    "Explanation",
     "Forecast",
     "Interval",
     "InverseKinematics",
@@ -107,19 +114,24 @@ __all__ = [
     "Rung",
     "SettingError",
     "ShapeError",
+    "SharedNoise",
     "SingularAlphaError",
     "StepSize",
     "StructuredLearner",
     "SupportSet",
+    "Suspicion",
     "TensorLearner",
     "TensorPosterior",
     "TensorSettings",
     "TensorTrain",
     "ToolLayer",
     "align",
+    "any_change",
     "blockwise_precision",
     "candidate_motions",
+    "change_kinds",
     "expected_gain",
+    "explanations",
     "find_chain",
     "fitted_orientation",
     "follow_a_path",

@@ -16,15 +16,17 @@ from .truth import TrueRobot
 
 # The link above the robot's root. It has no inertia, so that the world frame is the root's frame for pybullet too.
 WORLD_LINK = "bodyschema_world"
+MESHES = (".stl", ".obj", ".dae")
 
 
 def physics_urdf(truth: TrueRobot) -> str:
     """The URDF of `truth`: joint frames replaced by the true ones, joints that are not learnt locked.
 
-    Mesh files get absolute paths, links that state no inertia a small one.
+    Mesh files get absolute paths, links that state no inertia a small one. Textures are left out: no other file of the
+    machine's is read because a URDF names it.
 
     Raises:
-        RobotError: a mesh file is missing.
+        RobotError: a mesh file is missing, or is none.
     """
     file = truth.tree.file
     root = ElementTree.fromstring(file.read_bytes())  # `UrdfTree.load` has refused entities and the like
@@ -32,6 +34,9 @@ def physics_urdf(truth: TrueRobot) -> str:
         _set_joint(element, truth.tree.joints[element.attrib["name"]])
     for mesh in root.iter("mesh"):
         mesh.set("filename", str(_mesh_file(mesh.get("filename", ""), file)))
+    for material in root.iter("material"):
+        for texture in material.findall("texture"):
+            material.remove(texture)
     for link in root.iterfind("link"):
         if link.find("inertial") is None:
             link.append(_small_inertia())
@@ -74,6 +79,8 @@ def _mesh_file(name: str, urdf: Path) -> Path:
         candidates = [urdf.resolve().parent / name.removeprefix("file://")]
     for candidate in candidates:
         if candidate.is_file():
+            if candidate.resolve().suffix.lower() not in MESHES:
+                raise RobotError(f"the mesh {name!r} is none", file=urdf, remedy=f"Meshes end in {', '.join(MESHES)}")
             return candidate
     raise RobotError(
         f"the mesh {name!r} is missing",

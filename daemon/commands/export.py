@@ -12,19 +12,19 @@ from daemon.commands.options import HERE, RobotFile, flag
 
 def export(
     source: Annotated[Path, Parameter(help="A pair store (.sqlite) or a recording (.csv, .parquet).")],
-    out: Annotated[Path, Parameter(help="The file to write; its ending .csv, .parquet or .mcap says the format.")],
+    out: Annotated[Path, Parameter(help="The file; its ending .csv, .parquet, .mcap or .rrd says the format.")],
     /,
     *,
     robot: RobotFile = HERE,
     force: Annotated[bool, flag("Replace OUT when it is there.")] = False,
 ) -> None:
-    """Turn a store or a recording into CSV, Parquet or MCAP.
+    """Turn a store or a recording into CSV, Parquet, MCAP or a Rerun file.
 
     A store may be in use by a running sampler. MCAP opens in Foxglove: joints and positions under `/pair`, the marker
     under `/marker`, and as metadata what the joints were read with (servos, firmware, homing offsets).
 
     Needs: for a recording robot.toml, which names its joints; for Parquet and MCAP the extra `export`
-    (`pip install 'bodyschema[export]'`).
+    (`pip install 'bodyschema[export]'`), for .rrd the extra `rerun`.
 
     Next: `bodyschema replay` on a CSV or Parquet file.
     """

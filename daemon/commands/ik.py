@@ -53,7 +53,7 @@ def ik(
     config = Config.load(robot)
     if not all(map(math.isfinite, (x, y, z))):
         raise RequestError(f"{x:g}, {y:g}, {z:g} is no position: give three finite numbers in metres")
-    with client(config.tables.zenoh.learner) as bus:
+    with client(config.route("learner")) as bus:
         payload = bus.ask_one(Keys(config.robot.name).ik, encode(IkRequest((x, y, z), posture=posture)))
     reply = decode(payload, IkReply)
     if as_json:

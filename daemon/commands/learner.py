@@ -15,6 +15,7 @@ def learner(
     *,
     robot: RobotFile = HERE,
     state_dir: Annotated[Path | None, Parameter(help="Where the checkpoint lives; else as robot.toml says.")] = None,
+    view: Annotated[bool, flag("Show the page of `bodyschema view` too, as a process of its own.")] = False,
     verbose: Annotated[bool, flag("Log more.")] = False,
 ) -> None:
     """Learn the robot's kinematics and answer queries. Ends with SIGTERM or Ctrl-C.
@@ -27,27 +28,26 @@ def learner(
     """
     # Before numpy is loaded: its threads would fight with each other and with the answers for the cores.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    from contextlib import nullcontext
+
     from daemon import logs
     from daemon.config import Config
     from daemon.learner import run_learner
-    from daemon.signals import on_termination
+    from daemon.notify import Notifier
+    from daemon.signals import Wishes, on_termination
+    from daemon.view_process import require_extra, shown
     from interfaces.clock import SystemClock
 
+    if view:
+        require_extra()
     logs.set_up(verbose=verbose)
+    notifier = Notifier.of_environment()
     config = Config.load(robot)
     config.require_learnable()
     if state_dir is not None:
         config = config.with_state_dir(state_dir)
-    ending = Ending()
-    with on_termination(ending.begin):
-        run_learner(config, SystemClock(), lambda: ending.begun)
-
-
-class Ending:
-    """Whether somebody has asked the process to end."""
-
-    begun = False
-
-    def begin(self) -> None:
-        """Ask it to end."""
-        self.begun = True
+    wishes = Wishes()
+    # In a terminal SIGHUP says that it was closed.
+    reload = wishes.reload if notifier.is_heard else None
+    with shown(robot) if view else nullcontext(), on_termination(wishes.end, reload=reload):
+        run_learner(config, SystemClock(), wishes, notifier)

@@ -41,7 +41,7 @@ def predict(
 
     config = Config.load(robot)
     request = _request(q, config, deg)
-    with client(config.tables.zenoh.learner) as bus:
+    with client(config.route("learner")) as bus:
         payload = bus.ask_one(Keys(config.robot.name).predict, encode(request))
     if as_json:
         sys.stdout.write(payload.decode() + "\n")

@@ -12,7 +12,7 @@ from daemon.commands.options import HERE, RobotFile, flag
 
 
 def record(
-    out: Annotated[Path, Parameter(help="The file to write; its ending .csv, .parquet or .mcap says the format.")],
+    out: Annotated[Path, Parameter(help="The file; its ending .csv, .parquet, .mcap or .rrd says the format.")],
     /,
     *,
     robot: RobotFile = HERE,
@@ -34,22 +34,21 @@ def record(
 
     from daemon import recordings
     from daemon.bus import client
-    from daemon.commands.learner import Ending
     from daemon.config import Config
     from daemon.recorder import History, copy_history, follow_history
-    from daemon.signals import on_termination
+    from daemon.signals import Wishes, on_termination
 
     recordings.check_target(out, force=force)
     config = Config.load(robot)
     console = Console(highlight=False, soft_wrap=True)
     joints = config.robot.joints
-    with client(config.tables.zenoh.sampler) as bus:
+    with client(config.route("sampler")) as bus:
         history = History(bus, config.robot, from_seq)
         if follow:
-            ending = Ending()
-            with on_termination(ending.begin):
+            wishes = Wishes()
+            with on_termination(wishes.end):
                 console.print(f"writing pairs to {out} as they come; Ctrl-C ends it", markup=False)
-                count = follow_history(history, joints, out, lambda: ending.begun)
+                count = follow_history(history, joints, out, lambda: wishes.ending)
         else:
             count = copy_history(history, joints, out)
     last = f", the last has the number {history.next_seq - 1}" if count else "; no file was left"

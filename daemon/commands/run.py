@@ -16,20 +16,26 @@ def run(
     robot: RobotFile = HERE,
     sim: Annotated[bool, flag("The simulated robot in the place of the hardware.")] = False,
     state_dir: Annotated[Path | None, Parameter(help="Where state lives; else as robot.toml says.")] = None,
+    view: Annotated[bool, flag("Show the page of `bodyschema view` too.")] = False,
     verbose: Annotated[bool, flag("Log more.")] = False,
 ) -> None:
     """Start sampler and learner, each as a process of its own, and start again the one that dies. Ctrl-C ends both.
 
     Needs: robot.toml (`bodyschema config init`), and --sim or a recording named in its table [drivers].
 
-    Next: in another terminal, `bodyschema status --watch` and `bodyschema predict`.
+    Next: in another terminal, `bodyschema status --watch`, `bodyschema view` and `bodyschema predict`.
     """
+    from contextlib import nullcontext
+
     from daemon import logs
     from daemon.config import Config
     from daemon.signals import on_termination
     from daemon.supervise import Child, Supervisor
+    from daemon.view_process import require_extra, shown
     from daemon.wiring import check_sources
 
+    if view:
+        require_extra()
     logs.set_up(verbose=verbose)
     config = Config.load(robot)
     config.require_learnable()
@@ -40,5 +46,5 @@ def run(
     sampler = Child("sampler", [*python, "sampler", *options, *(["--sim"] if sim else [])])
     learner = Child("learner", [*python, "learner", *options])
     supervisor = Supervisor([sampler, learner])
-    with on_termination(supervisor.stop):
+    with shown(robot) if view else nullcontext(), on_termination(supervisor.stop):
         supervisor.run()

@@ -30,22 +30,28 @@ def sampler(
     from daemon import logs
     from daemon.bus import Bus
     from daemon.config import Config
-    from daemon.sampler import Sampler
+    from daemon.notify import Notifier
+    from daemon.sampler import LOOPS, Sampler
+    from daemon.service import Service
     from daemon.session import session_of
     from daemon.signals import on_termination
     from daemon.store import PairStore
+    from daemon.units import devices_of
     from daemon.wiring import open_sources
     from interfaces.clock import SystemClock
 
     logs.set_up(verbose=verbose)
+    notifier = Notifier.of_environment()
     config = Config.load(robot)
     if state_dir is not None:
         config = config.with_state_dir(state_dir)
     with (  # the store comes last: what goes wrong before leaves no trace
         open_sources(config, sim=sim) as sources,
-        Bus(listen=config.tables.zenoh.sampler) as bus,
+        Bus(listen=config.tables.zenoh.sampler, settings=config.zenoh_settings("sampler")) as bus,
         PairStore(config.store_file, session_of(config, SystemClock())) as store,
     ):
-        process = Sampler(config, sources, bus, store, exit_at_end=exit_at_end)
-        with on_termination(process.stop):
+        service = Service(notifier, LOOPS, SystemClock(), devices=devices_of(config))
+        process = Sampler(config, sources, bus, store, exit_at_end=exit_at_end, service=service)
+        # In a terminal SIGHUP says that it was closed.
+        with on_termination(process.stop, reload=process.reload if notifier.is_heard else None):
             process.run()

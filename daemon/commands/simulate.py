@@ -16,7 +16,8 @@ def simulate(
     like: Annotated[Path, Parameter(help="A recording (.csv, .parquet) or a pair store (.sqlite): the joint angles.")],
     robot: SourceRobotFile = None,
     out: Annotated[
-        Path | None, Parameter(help="The file to write (.csv, .parquet, .mcap); else CSV goes to standard output.")
+        Path | None,
+        Parameter(help="The file (.csv, .parquet, .mcap, .rrd); else CSV goes to standard output."),
     ] = None,
     noise: Annotated[bool, flag("Add the noise of the positions: as LIKE tells it, else as [camera] does.")] = False,
     seed: Annotated[int, Parameter(help="Of the noise.", validator=Number(gte=0))] = 0,

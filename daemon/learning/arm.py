@@ -4,6 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+from numpy.typing import NDArray
+
+from interfaces.records import FloatArray
 from kbmaps import ChainBelief, ChainTolerances, ResidualModel
 
 # How far another tool may hold the marker from where the last one did, and a marker whose place is not known from where
@@ -39,3 +43,8 @@ class KnownArm:
         """The same arm with a marker that is elsewhere on the hand."""
         residual = None if self.residual is None else self.residual.with_other_tool(OTHER_TOOL_M)
         return KnownArm(self.chain.with_other_tool(OTHER_TOOL_M), self.tolerances, residual)
+
+    def widened(self, columns: NDArray[np.intp], std: FloatArray) -> KnownArm:
+        """The same arm where some of the chain's parameters (k,) were changed, by `std` (k,) [rad, m] (1-sigma)."""
+        residual = None if self.residual is None else self.residual.widened(columns, std)
+        return KnownArm(self.chain.widened(columns, std), self.tolerances, residual)

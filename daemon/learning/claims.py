@@ -38,6 +38,11 @@ class Claim:
         left_open = sum((layer.variance(q) for layer in self.layers), np.zeros((len(q), 3)))
         return self.surprise**2 * (self.inside**2 + left_open)
 
+    def beyond_chain(self, q: FloatArray) -> FloatArray:
+        """The part of it that is no uncertainty of the chain's numbers at q (n, d) [rad], shape (n, 3) [m²]."""
+        open_layers = (layer.variance(q) for layer in self.layers if isinstance(layer, Layer) and layer.sigma > 0.0)
+        return self.inside**2 + sum(open_layers, np.zeros((len(q), 3)))
+
 
 class ClaimsState(msgspec.Struct, kw_only=True):
     """The part of the claims that is not arrays.

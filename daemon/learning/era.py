@@ -22,6 +22,8 @@ from .orientation import OrientationModel, Orientations
 from .orientation_solver import OrientationSolution
 from .solver import Solved, Task
 from .state import LearningHeader
+from .watch import LOOKED_BACK as KNOWN_PAIRS
+from .watch import Reference, Watch
 
 # So many of the learnt pairs say how well a model fits what it knows.
 LOOKED_BACK = 500
@@ -56,6 +58,7 @@ class Era:
         memory: the pairs with this tool.
         doubts: those that are doubted.
         orientations: how the marker is turned, where pairs say so.
+        watch: whether the pairs show a change.
         arm: as given, or with the last solutions where these stand for pairs that are no longer kept.
         answering: the model that answers.
         task_number: of the solver's present task.
@@ -68,6 +71,7 @@ class Era:
         self.memory = PairMemory(prior.joints, settings.replay_capacity)
         self.doubts = Doubts(prior.joints)
         self.orientations = Orientations(arm.chain.chain)
+        self.watch = Watch()
         self.arm = arm
         self.answering = self._answering_map = PRIOR
         self._claims, self._replays_per_pair = claims, settings.replays_per_pair
@@ -125,6 +129,7 @@ class Era:
         errors, limit = self.members.errors(pair.q, pair.x), self.limit_m(pair)
         if self.doubts.doubt(pair.q, pair.x, float(np.linalg.norm(errors[self.answering])), limit):
             self.members.learn(pair.q, errors[INSTANT], limit / DOUBT)  # a step no longer than any other
+            self.watch.add(pair, kept=False)
             return False
         delayed = None if self.members.delayed is None else pair.x - self.members.delayed.predict(pair.q)
         self._claims.predicted(pair.q, pair.x, errors, np.diag(pair.cov), delayed)
@@ -133,6 +138,7 @@ class Era:
         self._learn_turn(pair.q, pair.R, pair.cov_R)
         self._keep(pair.q, pair.x, pair.R)
         self._replays_due += self._replays_per_pair
+        self.watch.add(pair, kept=True)
         return True
 
     def learn_waiting(self, q: FloatArray, x: FloatArray, turns: FloatArray, belief: ChainBelief) -> None:
@@ -200,6 +206,7 @@ class Era:
         """The solver works on all pairs up to here."""
         self._claims.solution_asked()
         self.members.ask()
+        self.watch.asked()
 
     def take(self, solved: Solved, model: LearntModel, fed: int) -> None:
         """A solution of this era's task, for one of the models; the solver has `fed` pairs."""
@@ -210,6 +217,19 @@ class Era:
         self._claims.solution_taken(solved.name, errors, solved.belief, solved.wide, neighbours=neighbours)
         self._judge_late(solved.name, model, solved.pairs)
         self._choose()
+        if self.watch.wants_reference and solved.pairs == fed:
+            self._offer(fed)
+
+    def _offer(self, known: int) -> None:
+        """The model that answers, of `known` pairs, may be what later pairs are held against."""
+        belief, wide = self._claims.belief, self._claims.wide
+        if belief is None or wide is None:
+            return
+        q, x, _ = self.memory.since(known - KNOWN_PAIRS, KNOWN_PAIRS)
+        claim = self._claims.of(self.answering, self.model.predict)
+        variance = self._claims.errors[PRIOR].noise_variance
+        residual = self._claims.residual
+        self.watch.offer(Reference(self.model, self.map, belief, wide, residual, claim, known, q, x, variance))
 
     def take_orientation(self, solution: OrientationSolution) -> None:
         """A solution of this era's task for the orientations."""

@@ -1,17 +1,21 @@
-"""One era after another: what is learnt since the nominal model, with whatever tools."""
+"""One era after another: what is learnt since the nominal model, with whatever tools, cameras and zeros."""
 
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Iterator
 
+import msgspec
 import numpy as np
 
 from daemon.config import LearnerConfig
-from interfaces.records import Pair
-from kbmaps import ChainBelief, ChainTolerances, KBMap, RigidChain
+from interfaces.records import FloatArray, Pair
+from kbmaps import ChainBelief, ChainTolerances, Explanation, KBMap, RigidChain
 
+from .adaptation import Adapted, Origin
 from .arm import KnownArm
+from .change import NAMED_WITHIN, ChangeRecord, KindOfChange
 from .claims import Claims
 from .curve import Curve
 from .era import NET, Era
@@ -21,13 +25,20 @@ from .members import PRIOR
 from .memory import PairMemory
 from .nominal import PAIRS_TO_REFIT, NominalModel, chain_tolerances
 from .state import Counters, LearningHeader, LearningState, StateError
+from .watch import Noticed
 
 # RMS distance between a nominal model and reality that surprises nobody [m].
 EXPECTED_M = 0.1
 
 
+# What changed is looked at again when the pairs since then have grown by this factor.
+LOOK_AGAIN = 1.25
+# So many pairs can be held against each other without knowing them.
+FEWEST_TO_ADAPT = 3
+
+
 class Eras:
-    """Begins the first era when the frame is known, and another one with each tool.
+    """Begins the first era when the frame is known, and another one with each change.
 
     Args:
         nominal: where learning starts.
@@ -39,6 +50,7 @@ class Eras:
         claims: what its models are said to be wrong by. What they were in earlier eras counts.
         fitting: what is fitted as a whole.
         waiting: the pairs that wait for the first era.
+        change: the last change; None: there was none.
     """
 
     def __init__(self, nominal: NominalModel, settings: LearnerConfig, task_numbers: Iterator[int]) -> None:
@@ -48,6 +60,9 @@ class Eras:
         self.fitting = Fitting(nominal, chain_tolerances(settings))
         self.waiting = PairMemory(nominal.joints, settings.replay_capacity)
         self.present: Era | None = None
+        self.change: ChangeRecord | None = None
+        self._origin: Origin | None = None
+        self._look_at = self._adapt_at = 0
 
     @classmethod
     def at_nominal(cls, nominal: NominalModel, settings: LearnerConfig, task_numbers: Iterator[int]) -> Eras:
@@ -74,6 +89,7 @@ class Eras:
             )
         eras.fitting.restore(header.next_fit, header.first_fit, arrays)
         eras.claims.restore(header.claims, arrays)
+        eras.change = header.change
         if header.belief is None:
             eras.waiting.restore(arrays["q"], arrays["x"], header.kept_of, arrays.get("turns"))
         else:
@@ -94,6 +110,7 @@ class Eras:
             kept_of=self.memory.count,
             next_fit=self.fitting.due_at,
             first_fit=self.fitting.is_first,
+            change=self.change,
         )
         arrays = self.claims.arrays() | self.fitting.arrays() | {"q": q, "x": x}
         turns = self.memory.turns_since(0)
@@ -108,9 +125,20 @@ class Eras:
         """The pairs with the present tool."""
         return self.waiting if self.present is None else self.present.memory
 
+    def state_before(self, first: int, counters: Counters, curve: Curve) -> LearningState:
+        """What `restored` needs to go on as if the pairs learnt from number `first` of the present era had not come."""
+        state = self.state(counters, curve)
+        kept = self.memory.place_of(first)
+        arrays = {name: each[:kept] if name in ("q", "x", "turns") else each for name, each in state.arrays.items()}
+        if "doubted_q" in arrays:
+            arrays |= {name: arrays[name][:0] for name in ("doubted_q", "doubted_x")}
+        state.header.doubted_in_a_row, state.header.kept_of = 0, min(first, self.memory.count)
+        state.header.counters.since_change -= self.memory.count - state.header.kept_of
+        return LearningState(state.header, arrays)
+
     def change_tool(self, era: Era) -> None:
         """From now on another tool than in `era`; nothing is known of it."""
-        self.present = self._next(era, EXPECTED_M)
+        self.present, self._origin = self._next(era, EXPECTED_M), None
 
     def follow_change(self, era: Era, pair: Pair) -> bool:
         """Begin the era of another tool if the pairs that `era` doubted in a row are its first; `pair` is the last."""
@@ -121,7 +149,72 @@ class Eras:
         distances = np.linalg.norm(era.model.predict(q) - x, axis=1)
         self.present = self._next(era, max(float(np.median(distances)), EXPECTED_M), first_fit=len(q))
         self.present.begin_with(q, x)
+        first = pair.seq - len(q) + 1
+        self.change, self._origin = ChangeRecord.unnamed(first, pair.seq, self._nominal.joints), None
         return True
+
+    def noticed(self, era: Era, pair: Pair) -> Noticed | None:
+        """The change that the pairs of `era` show, `pair` the last of them; None: they show none."""
+        if not era.watch.ready:
+            return None
+        doubts = era.doubts
+        together = doubts.perhaps_changed and self._moved_together(era, era.limit_m(pair) / DOUBT)
+        noticed = era.watch.noticed(run=doubts.in_a_row if doubts.changed or together else 0)
+        return None if noticed is None or len(noticed.q) - noticed.first < FEWEST_TO_ADAPT else noticed
+
+    def adapt(self, era: Era, noticed: Noticed) -> bool:
+        """Begin the era after a change, if that predicts pairs since then better that it does not know."""
+        q, x = noticed.q[noticed.first :], noticed.x[noticed.first :]
+        if len(q) < self._adapt_at:
+            return False
+        origin = Origin(noticed, era.arm)
+        found = origin.explain(q, x)
+        self._adapt_at = self._look_at = int(LOOK_AGAIN * len(q)) + 1
+        if not origin.is_better(found, q, x):
+            return False
+        self._adapt_at = 0
+        seqs = (*noticed.seqs, noticed.seqs[-1] + 1)
+        self.change = ChangeRecord(
+            first_seq=noticed.seqs[noticed.first],
+            earliest_seq=seqs[noticed.earliest],
+            latest_seq=seqs[noticed.latest],
+            noticed_seq=noticed.seqs[-1],
+            found=True,
+            kinds=_described(found),
+            moved_m=found[0].moved_m,
+        )
+        self._begin_adapted(era, origin.adapt(found, q, x), q, x, noticed.turns[noticed.first :])
+        self._origin = origin
+        return True
+
+    @property
+    def looking(self) -> bool:
+        """Whether it is time to look again what it was that changed."""
+        return self._origin is not None and self.memory.count >= self._look_at
+
+    def look_again(self) -> bool:
+        """Name the change by all pairs since; whether what is forgotten of the arm is another part of it now."""
+        if self._origin is None or self.change is None or self.present is None:
+            return False
+        origin, was, (q, x) = self._origin, self.change.named, self.memory.all()
+        found = origin.explain(q, x)
+        self.change = msgspec.structs.replace(self.change, kinds=_described(found), moved_m=found[0].moved_m)
+        named = self.change.named
+        other = named is not None and (was is None or (was.name, was.joint) != (named.name, named.joint))
+        if other and self.memory.complete:
+            self._begin_adapted(self.present, origin.adapt(found, q, x), q, x, self.memory.turns_since(0))
+        self._look_at = int(LOOK_AGAIN * len(q)) + 1
+        if len(q) > NAMED_WITHIN:
+            self._origin = None
+        return other
+
+    def _begin_adapted(self, era: Era, adapted: Adapted, q: FloatArray, x: FloatArray, turns: FloatArray) -> None:
+        """The era of what was learnt before, but for what changed, and of pairs q (n, d), x (n, 3) since then."""
+        belongs = sound(np.linalg.norm(x - adapted.prior.predict(q), axis=1), self.claims.noise_m)
+        self.fitting.rest(adapted.belief.chain)
+        self.claims.change_tool(max(math.sqrt(3.0) * adapted.belief.noise, self.claims.noise_m), era.answering)
+        self.present = self._era(adapted.prior, adapted.arm)
+        self.present.learn_waiting(q[belongs], x[belongs], turns[belongs], adapted.belief)
 
     def fitted(self, fit: Fit | None, pairs: int) -> int:
         """Go on from what was fitted to the first `pairs` pairs; how many of them are doubted now."""
@@ -176,3 +269,7 @@ class Eras:
     @property
     def _tolerances(self) -> ChainTolerances:
         return self._nominal.tolerances(chain_tolerances(self._settings))
+
+
+def _described(found: list[Explanation]) -> list[KindOfChange]:
+    return [KindOfChange(each.kind.name, each.kind.joint, each.probability) for each in found]

@@ -64,6 +64,14 @@ class Fitting:
         """
         self._before, self._chain, self._due_at, self._is_first = before, hand, first_at, True
 
+    def rest(self, hand: RigidChain) -> None:
+        """From now on nothing is fitted as a whole.
+
+        Args:
+            hand: a chain that says how the hand is turned.
+        """
+        self._before, self._chain, self._due_at, self._is_first = None, hand, None, False
+
     def fit(self, q: FloatArray, x: FloatArray) -> Fit | None:
         """The prior that fits pairs q (n, d) [rad] and x (n, 3) [m] best; None when they do not determine it.
 

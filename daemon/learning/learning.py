@@ -14,9 +14,11 @@ import numpy as np
 
 from daemon.config import LearnerConfig
 from daemon.status import CurvePoint, OrientationStatus
+from interfaces.errors import RequestError
 from interfaces.records import Pair
 from kbmaps import ChainBelief
 
+from .change import ChangeRecord
 from .curve import Curve
 from .era import LOOKED_BACK, Era
 from .eras import Eras
@@ -50,6 +52,7 @@ class Learning:
         self._counters, self._curve = Counters(), Curve()
         self._learnt_at: float | None = None
         self._eras = self._at_nominal()
+        self._before: LearningState | None = None
         self._publish()
 
     @property
@@ -80,7 +83,7 @@ class Learning:
         """
         with self._lock:
             era, count = self._eras.present, self._eras.memory.count
-            if self._eras.fitting.due(count):
+            if self._eras.fitting.due(count) or self._eras.looking:
                 return False
             return era is None or (not era.owes_replays and self._solving.has_solved(era.task_number, count))
 
@@ -95,6 +98,17 @@ class Learning:
         """Mean prequential error [m] of the answering model over the pairs."""
         with self._lock:
             return self._curve.points
+
+    @property
+    def change(self) -> ChangeRecord | None:
+        """The last change that was told or found; None: there was none, or it was rolled back."""
+        with self._lock:
+            return self._eras.change
+
+    @property
+    def can_roll_back(self) -> bool:
+        """Whether the state before the last change is kept."""
+        return self._before is not None
 
     def prequential_m(self) -> dict[str, float]:
         """Recent mean distance between prediction and measurement, before learning [m], by model."""
@@ -181,15 +195,36 @@ class Learning:
         with self._lock:
             self._counters.gaps_recovered += pairs
 
+    def missed(self, pairs: int) -> None:
+        """Count pairs that nobody keeps any more."""
+        with self._lock:
+            self._counters.missed += pairs
+
     def tool_changed(self) -> None:
         """From now on another tool: pairs so far no longer count, what they taught is where learning starts again."""
         with self._lock:
-            self._counters.changes += 1
-            self._counters.since_change = 0
             if self._eras.present is None:
                 self._eras = self._at_nominal()
             else:
+                self._before = self._state_before(self._eras.memory.count)
                 self._eras.change_tool(self._eras.present)
+            self._eras.change = ChangeRecord.told(self._counters.last_seq)
+            self._counters.changes += 1
+            self._counters.since_change = 0
+            self._publish()
+
+    def rollback(self) -> None:
+        """Go on as if the last change had not been, and the pairs since then had not come.
+
+        Raises:
+            RequestError: there was no change, or learning began anew since; nothing is changed.
+        """
+        with self._lock:
+            if self._before is None:
+                raise RequestError("there was no change since learning began, so there is no older model to go back to")
+            since_change = self._before.header.counters.since_change
+            eras = Eras.restored(self._before, self._nominal, self._settings, self._task_numbers)
+            self._eras, self._before, self._counters.since_change = eras, self._before.before, since_change
             self._publish()
 
     def reset_to_prior(self, *, forget_store: bool = False) -> None:
@@ -199,7 +234,7 @@ class Learning:
                 self._counters = Counters(refused=self._counters.refused)
                 self._curve, self._learnt_at = Curve(), None
             self._counters.since_change = 0
-            self._eras = self._at_nominal()
+            self._eras, self._before = self._at_nominal(), None
             self._publish()
 
     def restart_solver(self) -> None:
@@ -215,12 +250,12 @@ class Learning:
 
     def work(self) -> bool:
         """One small piece of background work; False when there is none."""
-        return self._fit() or self._serve_solver() or self._replay()
+        return self._fit() or self._look_again() or self._serve_solver() or self._replay()
 
     def state(self) -> LearningState:
         """Everything needed to go on from here."""
         with self._lock:
-            return self._eras.state(self._counters, self._curve)
+            return self._eras.state(self._counters, self._curve).with_before(self._before)
 
     def restore(self, state: LearningState) -> None:
         """Go on from a state; the solver gets the kept pairs again in the background.
@@ -230,7 +265,7 @@ class Learning:
         """
         eras, header = Eras.restored(state, self._nominal, self._settings, self._task_numbers), state.header
         with self._lock:
-            self._eras, self._counters = eras, header.counters
+            self._eras, self._counters, self._before = eras, header.counters, state.before
             self._curve = Curve(header.curve, header.curve_stride)
             self._publish()
 
@@ -238,13 +273,41 @@ class Learning:
         return Eras.at_nominal(self._nominal, self._settings, self._task_numbers)
 
     def _learn_online(self, era: Era, pair: Pair) -> None:
-        if era.learn(pair):
+        learnt = era.learn(pair)
+        if learnt:
             self._curve.add(self._counters.pairs, self._eras.claims.errors[era.answering].mean_m or 0.0)
-            return
-        self._counters.doubted += 1
-        if self._eras.follow_change(era, pair):
+        else:
+            self._counters.doubted += 1
+        if self._followed(era, pair, learnt=learnt):
             self._counters.changes += 1
             self._counters.since_change = self._eras.memory.count
+
+    def _followed(self, era: Era, pair: Pair, *, learnt: bool) -> bool:
+        """Whether the pairs up to this one show a change, and another era has begun with it."""
+        noticed = self._eras.noticed(era, pair)
+        if noticed is None and (learnt or not era.doubts.perhaps_changed):
+            return False
+        since = 0 if noticed is None else sum(noticed.kept[noticed.first :])
+        before = self._state_before(era.memory.count - since)
+        followed = noticed is not None and self._eras.adapt(era, noticed)
+        if not (followed or (not learnt and self._eras.follow_change(era, pair))):
+            return False
+        self._before = before
+        return True
+
+    def _state_before(self, first: int) -> LearningState:
+        """The state without the present era's pairs from number `first` on."""
+        return self._eras.state_before(first, self._counters, self._curve)
+
+    def _look_again(self) -> bool:
+        """Name what changed, by more pairs."""
+        with self._lock:
+            if not self._eras.looking:
+                return False
+            if self._eras.look_again():
+                self._counters.since_change = self._eras.memory.count
+                self._publish()
+        return True
 
     def _fit(self) -> bool:
         """Fit what is not known, or a changed tool, when it is due."""

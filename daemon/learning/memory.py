@@ -46,6 +46,10 @@ class PairMemory:
         """Forget all pairs."""
         self._count = self._first = 0
 
+    def place_of(self, count: int) -> int:
+        """How many of the kept pairs are older than the one numbered `count` (from 0)."""
+        return min(max(count - self._oldest, 0), len(self))
+
     def restore(self, q: FloatArray, x: FloatArray, count: int, turns: FloatArray | None = None) -> None:
         """Hold the pairs q (n, d), x (n, 3), with `turns` as `turns_since` gives them: the newest of `count`."""
         self._count = self._first = count - len(q)

@@ -11,9 +11,13 @@ from daemon.status import CurvePoint
 from interfaces.errors import BodyschemaError
 from interfaces.records import FloatArray
 
+from .change import ChangeRecord
 from .claims import ClaimsState
 from .members import PRIOR
 from .orientation import OrientationState
+
+# Names of the arrays of the state before a change begin with this.
+BEFORE = "before/"
 
 
 class StateError(BodyschemaError):
@@ -25,9 +29,10 @@ class Counters(msgspec.Struct, kw_only=True):
 
     Attributes:
         store: identity of the store the pairs came from.
-        since_change: pairs since the tool was last changed, or since the beginning.
-        changes: tool changes that were told or found.
+        since_change: pairs since the last change, or since the beginning.
+        changes: changes of the tool, or of something else, that were told or found.
         doubted: pairs that looked like gross outliers.
+        missed: pairs that the sampler no longer kept when they were asked for.
     """
 
     store: str | None = None
@@ -39,6 +44,7 @@ class Counters(msgspec.Struct, kw_only=True):
     gaps_recovered: int = 0
     changes: int = 0
     doubted: int = 0
+    missed: int = 0
 
 
 class LearningHeader(msgspec.Struct, kw_only=True):
@@ -57,6 +63,8 @@ class LearningHeader(msgspec.Struct, kw_only=True):
         belief: what was believed of the chain before the first of these pairs, as bytes; None before the alignment.
         residual: what was known of the arm beyond that, as bytes; None if nothing was.
         orientation: what is known of how the marker is turned; None in a checkpoint of an older version.
+        change: the last change; None where there was none.
+        before: the state before it, for rollback; None where there is none. Its arrays' names begin with `BEFORE`.
     """
 
     fingerprint: str
@@ -74,6 +82,8 @@ class LearningHeader(msgspec.Struct, kw_only=True):
     belief: bytes | None = None
     residual: bytes | None = None
     orientation: OrientationState | None = None
+    change: ChangeRecord | None = None
+    before: LearningHeader | None = None
 
 
 @dataclass(frozen=True)
@@ -86,3 +96,18 @@ class LearningState:
 
     header: LearningHeader
     arrays: Mapping[str, FloatArray]
+
+    @property
+    def before(self) -> LearningState | None:
+        """The state before the last change; None where there is none."""
+        if self.header.before is None:
+            return None
+        arrays = {name.removeprefix(BEFORE): each for name, each in self.arrays.items() if name.startswith(BEFORE)}
+        return LearningState(self.header.before, arrays)
+
+    def with_before(self, before: LearningState | None) -> LearningState:
+        """The same state that can be rolled back to another one."""
+        if before is None:
+            return self
+        header = msgspec.structs.replace(self.header, before=before.header)
+        return LearningState(header, {**self.arrays, **{BEFORE + name: each for name, each in before.arrays.items()}})

@@ -161,7 +161,7 @@ def _doubt(job: Job, before: FloatArray) -> str | None:
     left_m = np.linalg.norm(before - held_out.x, axis=1)
     if not is_far_off(robot, left_m, job.sigma_m, share=FAR_OFF_AS_DRAWN):
         return None
-    return f"So far apart is no arm from its drawing. {mixed_up(robot, job.learnt_rows) or OTHER_CAUSES}."
+    return f"So far apart is no arm from its drawing. {mixed_up(robot, job.learnt_rows, job.sigma_m) or OTHER_CAUSES}."
 
 
 class _Live:
@@ -237,6 +237,7 @@ def _running(job: Job) -> Iterator[_Live]:
     environment = {
         **override("zenoh", "sampler", sampler_endpoint),
         **override("zenoh", "learner", learner_endpoint),
+        **override("zenoh", "router", ""),  # the live robot's is no concern of this one
         **override("drivers", "recording", str(fed.resolve())),
         **{name: text for key, value in job.drivers.items() for name, text in override("drivers", key, value).items()},
         **override("daemon", "any_step", job.any_step),

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from html import escape
 
-from diagnosis.numbers import Number, chance, mm, named, numbers_of, percent, place, share, telling
+from diagnosis.numbers import Number, chance, mm, numbers_of, percent, place, rival_named, share, telling
 from diagnosis.result import Cause, DiagnosisFile, Indistinguishable, Rejected
 
 # What says nothing new where it is the same as another.
@@ -71,17 +71,18 @@ def rivals(cause: Cause) -> str:
 
 def _rival(rival: Indistinguishable) -> str:
     tell = "no motion tells them apart" if rival.by == "any_motion" else "another motion can tell"
-    what = escape(named(rival.effect, rival.where, rival.source))
+    what = escape(rival_named(rival))
     return f"<b>{what}</b>, with a probability of {percent(rival.probability)}; {tell}"
 
 
 def hypotheses(rejected: Sequence[Rejected]) -> str:
     """What was looked for and is not there, the nearest first, the rest folded away."""
     rows = [
-        f"<tr><td>{escape(place(row))}<td>{row.held_out_gain_percent:+.2f} %<td>{chance(row.p_value)}</tr>"
+        f"<tr><td>{escape(place(row))}<td>{row.held_out_gain_percent:+.2f} %<td>{chance(row.p_value)}"
+        f"<td>{escape(row.why)}</tr>"
         for row in rejected
     ]
-    heads = ("Not there", "would gain, held out", "p-value, corrected")
+    heads = ("Not there", "would gain, held out", "p-value, corrected", "and yet")
     shown = _table(heads, rows[:NEAREST])
     if len(rows) <= NEAREST:
         return shown

@@ -172,9 +172,18 @@ class ChainBelief:
         """
         if not (tolerance > 0.0 and math.isfinite(tolerance)):
             raise SettingError(f"tolerance must be finite and greater than 0 m, got {tolerance!r}")
-        moved = np.zeros((self.parameters.size, 3))
-        moved[self.parameters.tool] = tolerance * np.eye(3)
-        free, root = squared(np.concatenate([self.root, moved], axis=1))
+        size = self.parameters.size
+        return self.widened(np.arange(size)[self.parameters.tool], np.full(3, tolerance))
+
+    def widened(self, columns: IntArray, std: FloatArray) -> Self:
+        """The same chain but for some parameters that were changed, by `std` (k,) [rad, m] (1-sigma of each).
+
+        Args:
+            columns: which (k,).
+        """
+        changed = np.zeros((self.parameters.size, len(columns)))
+        changed[columns, np.arange(len(columns))] = std
+        free, root = squared(np.concatenate([self.root, changed], axis=1))
         full = np.zeros((self.parameters.size, self.parameters.size))
         full[np.ix_(free, free)] = root
         return type(self)(self.parameters, self.mean, full, self.noise)

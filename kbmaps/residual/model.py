@@ -13,7 +13,7 @@ from typing import Self, cast
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kbmaps.arrays import FloatArray, frozen, rows, rows_or_vector
+from kbmaps.arrays import FloatArray, IntArray, frozen, rows, rows_or_vector
 from kbmaps.chains.belief import ChainBelief
 from kbmaps.chains.chain import RigidChain
 from kbmaps.chains.packed import CHAIN, chain_arrays, chain_from_arrays
@@ -180,12 +180,21 @@ class ResidualModel:
         if not (tolerance > 0.0 and math.isfinite(tolerance)):
             raise SettingError(f"tolerance must be finite and greater than 0 m, got {tolerance!r}")
         parameters, scaling = self.features.parameters, self.features.scaling
-        moved = np.zeros((len(self.root), 3))
-        moved[parameters.tool] = tolerance * np.eye(3)
-        root = cast(FloatArray, np.linalg.qr(np.concatenate([self.root, moved], axis=1).T, mode="r")).T
+        widened = self.widened(np.arange(parameters.size)[parameters.tool], np.full(3, tolerance))
         if scaling.load is None:
             scaling = replace(scaling, load=self.chain.fixed[-1, :3, 3])
-        return type(self)(ResidualFeatures(parameters, scaling), self.change, self.weights, root, self.noise)
+        return replace(widened, features=ResidualFeatures(parameters, scaling))
+
+    def widened(self, columns: IntArray, std: FloatArray) -> Self:
+        """The same arm but for some parameters of the chain that were changed, by `std` (k,) [rad, m] (1-sigma).
+
+        Args:
+            columns: which (k,).
+        """
+        changed = np.zeros((len(self.root), len(columns)))
+        changed[columns, np.arange(len(columns))] = std
+        root = cast(FloatArray, np.linalg.qr(np.concatenate([self.root, changed], axis=1).T, mode="r")).T
+        return replace(self, root=root)
 
     def to_bytes(self) -> bytes:
         """The model as one self-describing byte string; `from_bytes` gives the same predictions to the last bit."""

@@ -243,7 +243,8 @@ def cause_judged(truth: Truth, named: Named, index: int | None, whole: bool) -> 
     needless: list[str] = []
     wrong_reach: list[str] = []
     if index is not None:
-        for member in cause.indistinguishable_from:
+        # What has no name is no effect that an oracle could put in the place of a true one.
+        for member in (member for member in cause.indistinguishable_from if not member.what):
             needless += _needless(truth, index, member)
             wrong_reach += _wrong_reach(truth, index, member)
     numbers, left_out = judged_numbers(truth, named, index) if index is not None and whole else ((), {})

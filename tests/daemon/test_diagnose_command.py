@@ -314,6 +314,24 @@ def test_millimetres_are_seen(recording, tmp_path) -> None:
     assert "these look like millimetres" in refused(file, "--robot", DESK_ARM)
 
 
+@pytest.mark.parametrize(("unit", "factor"), [("milliseconds", 1e3), ("microseconds", 1e6), ("nanoseconds", 1e9)])
+def test_times_in_another_unit_are_seen(recording, tmp_path, unit, factor) -> None:
+    line = refused(written(recording, tmp_path, t=factor * recording.t), "--robot", DESK_ARM)
+    assert f"these look like {unit}" in line
+    assert f"divide by {factor:g}" in line
+
+
+def test_all_joints_that_count_the_other_way_are_told_together(recording, tmp_path) -> None:
+    line = refused(written(recording, tmp_path, q=-recording.q), "--robot", DESK_ARM)
+    assert "all joints counting the other way" in line
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_positions_in_a_left_handed_frame_are_seen(recording, tmp_path, axis) -> None:
+    x = recording.x * np.where(np.arange(3) == axis, -1.0, 1.0)
+    assert "the positions mirrored" in refused(written(recording, tmp_path, x=x), "--robot", DESK_ARM)
+
+
 def test_a_mirrored_joint_is_seen(recording, tmp_path) -> None:
     file = written(recording, tmp_path, q=recording.q * [1, -1, 1, 1])
     assert "counting the other way" in refused(file, "--robot", DESK_ARM)

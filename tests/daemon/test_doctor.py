@@ -17,6 +17,7 @@ from daemon.bus import Bus
 from daemon.cli import app
 from daemon.config import Config
 from daemon.doctor_view import show
+from daemon.identity import Route
 from daemon.keys import Keys
 from daemon.servo_wiring import Check
 from daemon.status import SamplerStatus
@@ -151,20 +152,20 @@ def test_a_disk_that_is_nearly_full_is_told(tmp_path, monkeypatch, free_mib, sta
 
 
 def test_a_free_endpoint_is_ok(endpoint) -> None:
-    assert "is free for it" in doctor.zenoh_check("sampler", endpoint, "x/alive").said
+    assert "is free for it" in doctor.zenoh_check("sampler", Route((endpoint,)), "x/alive").said
 
 
 def test_a_process_that_answers_is_ok(endpoint) -> None:
     with Bus(listen=endpoint) as bus:
         bus.token("x/alive")
-        assert f"answers on {endpoint}" in doctor.zenoh_check("sampler", endpoint, "x/alive").said
+        assert f"answers on {endpoint}" in doctor.zenoh_check("sampler", Route((endpoint,)), "x/alive").said
 
 
 def test_somebody_else_on_the_endpoint_is_wrong() -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
         server.listen()
-        check = doctor.zenoh_check("sampler", f"tcp/127.0.0.1:{port}", "x/alive")
+        check = doctor.zenoh_check("sampler", Route((f"tcp/127.0.0.1:{port}",)), "x/alive")
     assert check.state == "wrong"
     assert check.mend.startswith(f"ss -ltnp 'sport = :{port}'")
 

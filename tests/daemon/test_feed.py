@@ -39,12 +39,14 @@ class Store:
 
     def __init__(self, pairs: list[Pair]) -> None:
         self.pairs, self.store, self.asked, self.answers = pairs, STORE, 0, True
+        self.gone = self.goes = 0  # of the oldest pairs: so many are not kept, and with each answer so many more
 
     def __call__(self, begin: int) -> PairsReply:
         self.asked += 1
         if not self.answers:
             raise BusError("nobody answers")
-        page = [pair_to_wire(pair) for pair in self.pairs if pair.seq >= begin][:PAGE]
+        page = [pair_to_wire(pair) for pair in self.pairs if pair.seq >= max(begin, self.gone + 1)][:PAGE]
+        self.gone = min(self.gone + self.goes, len(self.pairs) - 1)
         return PairsReply(self.store, len(self.pairs), page)
 
 
@@ -161,6 +163,37 @@ def test_what_comes_while_paused_is_learnt_after_resume() -> None:
     fed.feed.resume()
     fed.settle()
     assert fed.learnt == (10, 10)
+
+
+# --- pairs that the sampler no longer keeps
+
+
+def test_a_new_learner_begins_with_the_oldest_pair_that_is_left(caplog) -> None:
+    fed = Fed(stored=20)
+    fed.history.gone = 12
+    fed.settle()
+    assert fed.learnt == (8, 20)
+    assert fed.learning.counters.missed == 12
+    assert "no longer keeps the pairs 1 to 12" in caplog.text
+
+
+def test_a_learner_that_was_away_too_long_goes_on_and_counts_what_it_missed() -> None:
+    fed = Fed(stored=5)
+    fed.settle()
+    fed.history.pairs, fed.history.gone = PAIRS[:30], 20
+    fed.publish(*PAIRS[28:30])
+    fed.settle()
+    assert fed.learnt == (15, 30)
+    assert (fed.learning.counters.missed, fed.feed.problem) == (15, None)
+
+
+def test_pairs_that_go_while_a_learner_catches_up_are_skipped_too() -> None:
+    fed = Fed(stored=30)
+    fed.history.goes = 10  # with each answer
+    fed.settle()
+    assert fed.learnt[1] == 30
+    assert fed.learnt[0] + fed.learning.counters.missed == 30
+    assert fed.learning.counters.missed > 0
 
 
 # --- what cannot be taken

@@ -19,7 +19,7 @@ from kbmaps.contest import CLEARLY, SHORTEST
 
 PAGE = (Path(__file__).parents[2] / "docs" / "learner.md").read_text(encoding="utf-8")
 SETTINGS = re.search(r"```toml\n(.*?)```", PAGE, re.DOTALL)[1]
-WITHOUT_DEFAULT = {"state_dir"}
+WITHOUT_DEFAULT = {"state_dir", "keep_days", "keep_mb"}
 
 
 @pytest.mark.parametrize(("table", "kind"), [("learner", LearnerConfig), ("daemon", DaemonConfig)])

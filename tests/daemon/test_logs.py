@@ -1,9 +1,13 @@
 from __future__ import annotations
 
+import faulthandler
 import io
 import logging
+import os
 import signal
-from collections.abc import Iterator
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import pytest
 
@@ -19,22 +23,118 @@ def root_logger() -> Iterator[None]:
     root.handlers[:], root.level = handlers, level
 
 
-def logged(environment: dict[str, str]) -> str:
-    stream = io.StringIO()
-    logs.set_up(environment=environment, stream=stream)
-    logging.getLogger("daemon.sampler").warning("the disk\nis nearly full")
-    logging.getLogger("daemon.sampler").info("all is well")
-    logging.getLogger("daemon.sampler").debug("details")
-    return stream.getvalue()
+def logged(file: Path, environment: Callable[[os.stat_result], dict[str, str]]) -> list[str]:
+    """The lines of a log whose stream is a file, as the journal's is a socket."""
+    with file.open("w") as stream:
+        logs.set_up(environment=environment(os.fstat(stream.fileno())), stream=stream)
+        log = logging.getLogger("daemon.sampler")
+        log.warning("the disk\nis nearly full")
+        log.info("all is well")
+        log.debug("details")
+        faulthandler.disable()
+    return file.read_text().splitlines()
 
 
-def test_the_journal_gets_a_priority_at_the_head_of_every_line() -> None:
-    lines = logged({"JOURNAL_STREAM": "8:1"}).splitlines()
-    assert lines == ["<4>daemon.sampler: the disk", "<4>is nearly full", "<6>daemon.sampler: all is well"]
+def of_journal(status: os.stat_result) -> dict[str, str]:
+    return {"JOURNAL_STREAM": f"{status.st_dev}:{status.st_ino}"}
 
 
-def test_a_person_gets_time_and_level() -> None:
-    assert logged({}).splitlines()[-1].endswith("INFO    daemon.sampler: all is well")
+def test_the_journal_gets_one_line_an_event_with_its_priority(tmp_path) -> None:
+    assert logged(tmp_path / "log", of_journal) == [
+        "<4>daemon.sampler: the disk | is nearly full",
+        "<6>daemon.sampler: all is well",
+    ]
+
+
+@pytest.mark.parametrize("inherited", [{}, {"JOURNAL_STREAM": "8:1"}])
+def test_a_person_gets_time_and_level_also_in_a_terminal_that_the_journal_s_session_started(
+    tmp_path, inherited
+) -> None:
+    assert logged(tmp_path / "log", lambda _: inherited)[-1].endswith("INFO    daemon.sampler: all is well")
+
+
+class HandClock:
+    """A clock that is moved by hand."""
+
+    time = 0.0
+
+    def __call__(self) -> float:
+        return self.time
+
+
+class Journal:
+    """A journal's handler with its lines."""
+
+    def __init__(self) -> None:
+        self._stream, self.now = io.StringIO(), HandClock()
+        self.handler = logs.JournalHandler(self._stream, self.now)
+
+    def say(self, text: str, level: int = logging.WARNING) -> None:
+        self.handler.handle(logging.LogRecord("bus", level, "", 0, text, None, None))
+
+    @property
+    def lines(self) -> list[str]:
+        return self._stream.getvalue().splitlines()
+
+
+def test_an_error_is_one_line_with_its_traceback() -> None:
+    journal = Journal()
+    try:
+        raise ValueError("too far")
+    except ValueError:
+        record = logging.LogRecord("bus", logging.ERROR, "", 0, "a query failed", None, sys.exc_info())
+    journal.handler.handle(record)
+    assert len(journal.lines) == 1
+    assert journal.lines[0].startswith("<3>bus: a query failed | Traceback")
+    assert journal.lines[0].endswith("| ValueError: too far")
+
+
+def test_what_is_said_again_is_counted_and_told_when_a_minute_is_over() -> None:
+    journal = Journal()
+    for _ in range(100):
+        journal.say("no answer")
+    journal.now.time = 61.0
+    journal.say("all is well")
+    assert journal.lines == ["<4>bus: no answer", "<4>bus: 99 more times in 61 s: no answer", "<4>bus: all is well"]
+
+
+def test_after_a_minute_it_is_said_again() -> None:
+    journal = Journal()
+    journal.say("no answer")
+    journal.now.time = 61.0
+    journal.say("no answer")
+    assert journal.lines == ["<4>bus: no answer"] * 2
+
+
+def test_a_flood_that_differs_in_its_numbers_is_cut_off() -> None:
+    journal = Journal()
+    for number in range(500):
+        journal.say(f"pair {number} was refused")
+    journal.handler.close()
+    assert journal.lines[:2] == ["<4>bus: pair 0 was refused", "<4>bus: pair 1 was refused"]
+    assert len(journal.lines) == logs.OFTEN + 1
+    assert journal.lines[-1] == f"<4>bus: {500 - logs.OFTEN} more times in 0 s: pair # was refused"
+
+
+def test_two_joints_with_the_same_trouble_are_both_named() -> None:
+    journal = Journal()
+    for joint in (3, 4, 3, 4):
+        journal.say(f"joint {joint} is hot")
+    assert journal.lines == ["<4>bus: joint 3 is hot", "<4>bus: joint 4 is hot"]
+
+
+def test_an_error_is_not_kept_back_for_a_warning_of_the_same_words() -> None:
+    journal = Journal()
+    for level in (logging.WARNING, logging.ERROR):
+        journal.say("the bus is silent", level)
+    assert journal.lines == ["<4>bus: the bus is silent", "<3>bus: the bus is silent"]
+
+
+def test_what_was_said_is_forgotten_before_it_fills_the_memory() -> None:
+    journal = Journal()
+    for k in range(5000):
+        journal.say("x" * (k % 1000))
+    assert len(journal.handler._said) <= logs.REMEMBERED
 
 
 def test_a_signal_calls_for_an_orderly_end() -> None:
@@ -50,3 +150,11 @@ def test_signals_are_handled_as_before_afterwards() -> None:
     with on_termination(lambda: None):
         pass
     assert signal.getsignal(signal.SIGTERM) is before
+
+
+def test_a_hangup_calls_for_a_reload_where_one_is_wanted() -> None:
+    called = []
+    with on_termination(lambda: called.append("stop"), reload=lambda: called.append("reload")):
+        signal.raise_signal(signal.SIGHUP)
+    assert called == ["reload"]
+    assert signal.getsignal(signal.SIGHUP) is signal.SIG_DFL

@@ -129,6 +129,14 @@ def test_a_source_that_can_be_looked_for_cheaply_is_opened_again_sooner() -> Non
     assert clock.t == pytest.approx(100.0 + 21 * 0.2)
 
 
+def test_what_only_a_new_process_may_open_ends_this_one() -> None:
+    clock = SteppedClock()
+    script = Scripted([SourceLost("unplugged"), READING], openings=[None, SourceLost("not permitted")])
+    source = Reopening(script, "the encoders", clock, clock.sleep, forbidden=lambda: "/dev/ttyUSB1")
+    with source, pytest.raises(SourceError, match="/dev/ttyUSB1 came back as another device, which only a new start"):
+        read_until_reading(source)
+
+
 # --- other cameras are plugged in
 
 

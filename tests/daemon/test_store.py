@@ -14,8 +14,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from daemon.store import APPLICATION_ID, PairReader, PairStore, Session
+from daemon.store import PairReader, PairStore, Session
 from daemon.store_rows import pair_of, row_of
+from daemon.store_schema import APPLICATION_ID
 from interfaces.errors import StoreError
 from interfaces.records import MarkerFix, Pair, frozen_array
 
@@ -174,7 +175,7 @@ def test_a_reader_says_whose_pairs_they_are(file, store) -> None:
 
 def test_the_store_keeps_what_the_sampler_worked_with(file, store) -> None:
     fill(store, 1)
-    with sqlite3.connect(file) as connection:
+    with contextlib.closing(sqlite3.connect(file)) as connection:
         row = connection.execute("SELECT robot_toml, urdf, config, version, host FROM sessions").fetchone()
     assert row == ("[robot]", "<robot/>", "{}", "0", "host")
 
@@ -183,7 +184,7 @@ def test_runs_that_see_no_pair_leave_nothing_behind(file) -> None:
     for _ in range(5):
         with PairStore(file, SESSION):
             pass
-    with sqlite3.connect(file) as connection:
+    with contextlib.closing(sqlite3.connect(file)) as connection:
         assert connection.execute("SELECT count(*) FROM sessions").fetchone()[0] == 1
 
 

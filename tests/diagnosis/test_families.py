@@ -35,7 +35,7 @@ def test_columns_times_numbers_are_the_moves_by_what_they_are_moved(start, found
 
 def test_a_part_of_a_family_moves_as_the_family_with_the_same_numbers_does(start, found) -> None:
     rng = np.random.default_rng(0)
-    for family in (family for family in found if family.kind == "body" and not family.paired):
+    for family in (family for family in found if family.kind == "body" and family.ties is None):
         way = Way.of(family, start)
         part = way.along(np.linalg.qr(rng.normal(size=(way.amounts, 2)))[0])
         numbers = rng.normal(size=len(part.scales)) / part.scales
@@ -49,8 +49,8 @@ def test_a_link_that_gives_at_its_near_end_turns_about_what_carries_it() -> None
     found, gravity = families(run), run.simulation.gravity
     for k in np.flatnonzero(~np.array(run.simulation.upward)):
         what = f"what carries {run.simulation.robot.joints[k]} gives under the arm's weight"
-        family = [family for family in found if family.paired and family.what == what][1]
-        T_camera_carrier = run.frames[:, k] @ np.linalg.inv(gravity.in_carrier(k))
+        *_, family = (one for one in found if one.what == what and one.ties is not None and not one.is_specific)
+        T_camera_carrier = run.frames[:, k] @ np.linalg.inv(gravity.in_supports(k)[-1])
         axes, lever = T_camera_carrier[:, :3, :3], run.measured - T_camera_carrier[:, :3, 3]
         turned = np.cross(np.swapaxes(axes, 1, 2), lever[:, None, :]).swapaxes(1, 2)
         np.testing.assert_allclose(family.moves(run)[:, :, 3:], turned, atol=1e-9)

@@ -82,20 +82,48 @@ def test_causes_that_a_narrow_motion_cannot_tell_apart_are_told_as_rivals_in_thi
     assert file.verdict == "undecided"
 
 
-def test_following_the_advice_tells_them_apart(planted, open_case) -> None:
-    robot = surveyed_arm()
-    (advice,) = conclusion(open_case).advice
+def advised(robot: RobotDescription, advice: str) -> Motion:
+    """The narrow motion with the joint that is advised moved as is advised."""
     match = ADVISED.search(advice)
     assert match is not None
     joint, low, high = match[1], *np.radians([float(match[2]), float(match[3])])
     q = narrow(robot).q.copy()
     share = 0.5 + 0.5 * np.sin(np.arange(len(q)) / 7.0)
     q[:, robot.joints.index(joint)] = low + share * (high - low)
-    file = conclusion(diagnosed(robot, motion_of(q), planted, NARROW))
+    return motion_of(q)
+
+
+def test_following_the_advice_tells_them_apart(planted, open_case) -> None:
+    robot = surveyed_arm()
+    (advice,) = conclusion(open_case).advice
+    file = conclusion(diagnosed(robot, advised(robot, advice), planted, NARROW))
     (cause,) = file.causes
     assert (cause.effect, cause.where, cause.rivals) == (planted.name, SHOULDER, ())
     assert file.verdict == "explained"
     assert file.advice == ()
+
+
+def test_the_motion_that_is_advised_tells_the_simulations_of_both_apart(open_case) -> None:
+    robot = surveyed_arm()
+    (standing,) = open_case.standings
+    (rival,) = standing.rivals
+    (advice,) = conclusion(open_case).advice
+    motion = advised(robot, advice)
+    for simulation in (open_case.extended.simulation, rival.instead.simulation):
+        (effect,) = simulation.effects
+        file = conclusion(diagnosed(robot, motion, effect, NARROW))
+        assert [(cause.effect, cause.rivals) for cause in file.causes] == [(effect.name, ())]
+
+
+def test_effects_that_are_only_small_are_not_said_to_be_the_same_in_any_motion() -> None:
+    robot = surveyed_arm()
+    truth = Effect.at(robot, "joint_eccentricity", SHOULDER, values=[0.0012, 0.0])
+    kinds = ("joint_eccentricity", "joint_scale")
+    found = diagnosed(robot, walk(robot, 2, ROWS), truth, kinds)
+    rivals = [rival for standing in found.standings for rival in standing.rivals]
+    assert rivals
+    assert not any(rival.is_same_anywhere for rival in rivals)
+    assert "of them, since the effect is small" in " ".join(conclusion(found).advice)
 
 
 def test_a_cause_that_nothing_else_comes_near_has_no_rivals() -> None:

@@ -35,3 +35,10 @@ def test_a_gain_on_fitted_pairs_alone_is_called_none():
     said = sentence("unexplained", [_link(1.0)], errors, Gain(-9.0, (-20.0, 2.0)))
     assert "no others" in said
     assert "-9" not in said
+
+
+def test_the_sentence_tells_what_the_causes_explain_and_what_the_smooth_model_adds():
+    errors = Errors(10.0, 10.0, 5.0, 2.0, 1.9)
+    said = sentence("unexplained", [_link(1.0)], errors, Gain(80.0, (75.0, 85.0)), named_mm=6.0)
+    assert "it explains 40 % of the error, and 80 % of the error with a smooth model of what has no name" in said
+    assert "10 mm → 6 mm → 2 mm" in said

@@ -1,0 +1,316 @@
+"""Changes while running: `python -m benchmarks.changes [--quiet] [--seeds N] [--joints 6 7] [--sigmas 1 5 20]`.
+
+The learner's watch over guided walks in steps of 1 to 3 degrees, as the sampler takes them. It holds the pairs against
+a chain of 1,000 pairs (--known); the arm changes 520 to 580 pairs later. By case: after how many pairs the change is
+noticed (mean, 95th percentile, share within 30), against two CUSUMs that know its size and direction and have one false
+alarm in 50,000 pairs by theory (Siegmund 1985): one that knows the arm to the last digit too, and one that has the same
+model and, like it, counts no pair beyond four sigmas (so it is of no use for large changes). Then the share that is
+named rightly and wrongly 100 and 300 pairs after the change.
+
+With --quiet: walks without a change, with 1 % gross outliers, of arms that are rigid and of arms that are not, with
+nothing but a chain to follow them; the false alarms among them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import math
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from benchmarks.first_pairs import REACH
+from benchmarks.rough_arm import RoughArm, rough_arm
+from daemon.learning.adaptation import Origin
+from daemon.learning.arm import KnownArm
+from daemon.learning.change import NAMED
+from daemon.learning.claims import Claim
+from daemon.learning.misfit import OUTLIER_SIGMAS
+from daemon.learning.solver import fitted_belief
+from daemon.learning.watch import LOOKED_BACK, Reference, Watch
+from interfaces.records import FloatArray, Pair, frozen_array
+from kbmaps import ChainBelief, ChainParameters, ChainTolerances, learning_bases
+
+# After half as many pairs as the chain knows, on which it is tried out, the change comes within so many, and is to be
+# noticed within so many.
+KNOWN, CHANGED_WITHIN, LONGEST = 1000, (20, 80), 600
+STEPS_DEG = (1.0, 3.0)
+TOLERANCES = ChainTolerances(
+    axes=math.radians(3.0),
+    points=0.015,
+    zeros=math.radians(3.0),
+    tool=0.03,
+    base_rotation=math.radians(3.0),
+    base_translation=0.03,
+)
+IN_TIME, NAMED_AFTER = 30, (100, 300)
+PAIRS_BETWEEN_FALSE_ALARMS = 50_000
+# Of a quiet walk: a new chain is fitted so often, to so many of the last pairs.
+REFIT, FITTED = 500, 2000
+OUTLIERS, OUTLIER_M = 0.01, 0.3
+# An arm that is no chain: by how much, at most, in how many waves over a turn.
+BENT_M, WAVES = 0.004, 2.0
+
+
+@dataclass(frozen=True)
+class Case:
+    """A change: the tool by so many metres, the camera (about 1 degree and 10 mm), or a joint's zero by radians."""
+
+    name: str
+    kind: str
+    size: float
+
+
+CASES = (
+    Case("tool 5 mm", "tool", 0.005),
+    Case("tool 10 mm", "tool", 0.010),
+    Case("tool 30 mm", "tool", 0.030),
+    Case("tool 200 mm", "tool", 0.200),
+    Case("camera 1 deg, 10 mm", "camera", 1.0),
+    Case("joint 0.5 deg", "joint", math.radians(0.5)),
+    Case("joint 1 deg", "joint", math.radians(1.0)),
+    Case("joint 2 deg", "joint", math.radians(2.0)),
+)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """One seed: delays [pairs], infinite where it was not noticed, and what it was called after so many pairs."""
+
+    delay: float
+    optimal: float
+    optimal_with_model: float
+    early: bool
+    named: tuple[str, ...]
+
+
+def walk(joints: int, count: int, rng: np.random.Generator) -> FloatArray:
+    """Straight ways between random waypoints in steps of 1 to 3 degrees, shape (count, joints)."""
+    q, goal = [np.zeros(joints)], rng.uniform(-REACH, REACH, joints)
+    while len(q) < count:
+        step = math.radians(rng.uniform(*STEPS_DEG))
+        while np.linalg.norm(goal - q[-1]) < step:
+            goal = rng.uniform(-REACH, REACH, joints)
+        way = goal - q[-1]
+        q.append(q[-1] + step * way / np.linalg.norm(way))
+    return np.array(q)
+
+
+def changed(arm: RoughArm, case: Case, rng: np.random.Generator) -> tuple[RoughArm, FloatArray, int | None]:
+    """The arm after a change, the change of its parameters, and the joint whose zero it is."""
+    parameters, joint = arm.parameters, None
+    theta = np.zeros(parameters.size)
+    if case.kind == "tool":
+        theta[parameters.tool] = case.size * direction(rng)
+    elif case.kind == "camera":
+        theta[parameters.base_turn] = math.radians(1.0) * direction(rng)
+        theta[parameters.base_shift] = 0.01 * direction(rng)
+    else:
+        # The first and the last joint's zeros look like another camera and another tool.
+        joint = int(rng.integers(1, arm.drawing.joints - 1))
+        theta[np.arange(parameters.size)[parameters.zeros][joint]] = case.size
+    return RoughArm(parameters, arm.change + theta), theta, joint
+
+
+def direction(rng: np.random.Generator) -> FloatArray:
+    vector = rng.normal(size=3)
+    return vector / np.linalg.norm(vector)
+
+
+def reference(arm: RoughArm, q: FloatArray, x: FloatArray, sigma: float) -> Reference:
+    """The chain of pairs q (n, d) [rad] and x (n, 3) [m]."""
+    belief = fitted_belief(ChainBelief.from_tolerances(ChainParameters(arm.drawing), TOLERANCES), q, x)
+    bases = learning_bases(np.full(q.shape[1], -np.pi), np.full(q.shape[1], np.pi), [False] * q.shape[1])
+    kbmap = belief.chain.to_kbmap(bases)
+    variance = np.full(3, sigma**2)
+    known, good = len(q), np.linalg.norm(x - belief.predict(q), axis=1) < OUTLIER_SIGMAS * belief.noise
+    q, x = q[good][-LOOKED_BACK:], x[good][-LOOKED_BACK:]
+    return Reference(kbmap, kbmap, belief, belief, None, Claim(np.zeros(3)), known, q, x, variance)
+
+
+def cusum_threshold(information: float) -> float:
+    """What a CUSUM of Gaussian log likelihood ratios may reach (Siegmund 1985, section 2.6).
+
+    Args:
+        information: mean log likelihood ratio of a pair after the change.
+    """
+    beyond = 1.166 * math.sqrt(2.0 * information)
+
+    threshold = 1.0
+    for _ in range(100):  # a contraction: its slope is below 1 where false alarms are rare
+        threshold = math.log(PAIRS_BETWEEN_FALSE_ALARMS * information + 1.0 + threshold + beyond) - beyond
+    return max(threshold, 0.0)
+
+
+def outcome(case: Case, joints: int, sigma: float, seed: int, known_pairs: int) -> Outcome:
+    rng = np.random.default_rng([seed, joints, round(1e4 * sigma), CASES.index(case)])
+    arm = rough_arm(joints, rng, TOLERANCES)
+    at = known_pairs // 2 + int(rng.integers(*CHANGED_WITHIN))
+    q = walk(joints, known_pairs + at + LONGEST, rng)
+    x = arm.measured(q, sigma, rng)
+    after, theta, joint = changed(arm, case, rng)
+    moved = after.positions(q[known_pairs + at :]) - arm.positions(q[known_pairs + at :])
+    x[known_pairs + at :] += moved
+    known = reference(arm, q[:known_pairs], x[:known_pairs], sigma)
+    watch = Watch()
+    watch.asked()
+    watch.offer(known)
+    ratios = ((x - arm.positions(q))[known_pairs + at :] * moved).sum(axis=1) - 0.5 * np.square(moved).sum(axis=1)
+    information = 0.5 * float(np.square(moved).sum(axis=1).mean()) / sigma**2
+    threshold = cusum_threshold(information)
+    optimal = delay_of(cusum(ratios / sigma**2), threshold)
+    with_model, delay, early, named = math.inf, math.inf, False, []
+    origin = None
+    for k in range(at + LONGEST):
+        watch.add(pair_of(k, q[known_pairs + k], x[known_pairs + k], sigma), kept=True)
+        since = k - at + 1
+        if since > 0 and math.isinf(with_model) and best_known(watch, theta, case, joint) > threshold:
+            with_model = since
+        if origin is None and watch.alarmed:
+            delay, early = since, since <= 0
+            noticed = watch.noticed()
+            if early or noticed is None:
+                break
+            origin = Origin(noticed, KnownArm(known.belief, TOLERANCES)), known_pairs + noticed.first
+        if origin is not None and since in NAMED_AFTER:
+            found = origin[0].explain(q[origin[1] : known_pairs + k + 1], x[origin[1] : known_pairs + k + 1])
+            named.append(verdict(found[0].kind.name, found[0].kind.joint, found[0].probability, case, joint))
+        if origin is not None and since >= NAMED_AFTER[-1] and not math.isinf(with_model):
+            break
+    named += ["not noticed"] * (len(NAMED_AFTER) - len(named))
+    return Outcome(delay, optimal, with_model, early, tuple(named))
+
+
+def verdict(name: str, joint: int | None, probability: float, case: Case, truth: int | None) -> str:
+    if probability < NAMED:
+        return "undecided"
+    return "right" if (name, joint) == (case.kind, truth) else "wrong"
+
+
+def best_known(watch: Watch, theta: FloatArray, case: Case, joint: int | None) -> float:
+    """The greatest log likelihood ratio of the true change over the onsets, by the watch's own model."""
+    detector = watch.detector
+    if detector is None:
+        return -math.inf
+    place = 0
+    for kind in detector.kinds:
+        if (kind.name, kind.joint) == (case.kind, joint):
+            at, change = slice(place, place + len(kind.columns)), theta[kind.columns] / kind.units
+            _, information, score = detector.sums()
+            return float((score[:, at] @ change - 0.5 * (information[:, at, at] @ change) @ change).max())
+        place += len(kind.columns)
+    return -math.inf
+
+
+def cusum(ratios: FloatArray) -> FloatArray:
+    total = np.concatenate([[0.0], np.cumsum(ratios)])
+    return (total - np.minimum.accumulate(total))[1:]
+
+
+def delay_of(statistic: FloatArray, threshold: float) -> float:
+    reached = np.flatnonzero(statistic > threshold)
+    return float(reached[0] + 1) if len(reached) else math.inf
+
+
+def pair_of(number: int, q: FloatArray, x: FloatArray, sigma: float) -> Pair:
+    cov = frozen_array(sigma**2 * np.eye(3))
+    return Pair("simulated", number + 1, 1, number / 30.0, "", frozen_array(q), frozen_array(x), cov)
+
+
+def quiet(joints: int, sigma: float, seed: int, pairs: int, *, bent: bool) -> int:
+    """False alarms along a walk where nothing changes; after one the watch begins anew."""
+    rng = np.random.default_rng([seed, joints, round(1e4 * sigma), bent, 99])
+    arm = rough_arm(joints, rng, TOLERANCES)
+    q = walk(joints, KNOWN + pairs, rng)
+    x = arm.measured(q, sigma, rng)
+    if bent:
+        waves = rng.normal(size=(joints, 3)) * WAVES / math.sqrt(joints)
+        x += BENT_M * np.sin(q @ waves + rng.uniform(0.0, 2.0 * np.pi, 3))
+    wild = rng.random(len(q)) < OUTLIERS
+    x[wild] += OUTLIER_M * rng.normal(size=(int(wild.sum()), 3))
+    alarms, watch = 0, Watch()
+    for k in range(KNOWN, len(q)):
+        if (k - KNOWN) % REFIT == 0:
+            watch.asked()
+            if watch.wants_reference:
+                first = max(0, k - FITTED)
+                watch.offer(reference(arm, q[first:k], x[first:k], sigma))
+        watch.add(pair_of(k, q[k], x[k], sigma), kept=not wild[k])
+        if watch.alarmed:
+            alarms, watch = alarms + 1, Watch()
+            watch.asked()
+            watch.offer(reference(arm, q[max(0, k - FITTED) : k], x[max(0, k - FITTED) : k], sigma))
+    return alarms
+
+
+def row(case: Case, found: list[Outcome]) -> str:
+    delays = np.array([each.delay for each in found if not each.early])
+    optimal, with_model = (
+        np.array([getattr(each, name) for each in found]) for name in ("optimal", "optimal_with_model")
+    )
+    shares = [
+        "/".join(f"{np.mean([each.named[k] == said for each in found]):4.0%}" for said in ("right", "wrong"))
+        for k in range(len(NAMED_AFTER))
+    ]
+    late = np.isinf(delays)
+    cells = [np.where(np.isinf(each), LONGEST, each).mean() for each in (delays, optimal, with_model)]
+    return (
+        f"  {case.name:20s} {cells[0]:6.1f} {np.percentile(np.where(late, LONGEST, delays), 95):6.0f} "
+        f"{np.mean(delays <= IN_TIME):5.0%} {cells[1]:6.1f} {cells[2]:6.1f}  {cells[0] / cells[1]:5.2f} "
+        f"{cells[0] / cells[2]:5.2f}   {shares[0]}  {shares[1]}  "
+        f"{late.sum()} missed, {sum(each.early for each in found)} early"
+    )
+
+
+def print_quiet(arguments: argparse.Namespace) -> None:
+    for bent in (False, True):
+        for joints in arguments.joints:
+            for sigma in arguments.sigmas:
+                began = time.process_time()
+                alarms = [quiet(joints, 1e-3 * sigma, seed, arguments.pairs, bent=bent) for seed in seeds_of(arguments)]
+                pairs, cpu = arguments.pairs * len(alarms), time.process_time() - began
+                print(
+                    f"{'not rigid' if bent else 'rigid':9s} d = {joints}, sigma {sigma:g} mm: {sum(alarms)} false "
+                    f"alarms in {pairs} pairs; {1e3 * cpu / pairs:.2f} ms a pair",
+                    flush=True,
+                )
+
+
+def seeds_of(arguments: argparse.Namespace) -> Iterator[int]:
+    yield from range(arguments.first, arguments.first + arguments.seeds)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quiet", action="store_true", help="false alarms")
+    parser.add_argument("--seeds", type=int, default=50)
+    parser.add_argument("--first", type=int, default=0, help="the first seed")
+    parser.add_argument("--pairs", type=int, default=5000, help="of a quiet walk")
+    parser.add_argument("--joints", type=int, nargs="+", default=[6, 7])
+    parser.add_argument("--sigmas", type=float, nargs="+", default=[1.0, 5.0, 20.0], help="[mm]")
+    parser.add_argument("--known", type=int, default=KNOWN, help="pairs that the chain knows")
+    parser.add_argument("--only", default="", help="a part of the case's name")
+    arguments = parser.parse_args()
+    if arguments.quiet:
+        print_quiet(arguments)
+        return
+    for joints in arguments.joints:
+        for sigma in arguments.sigmas:
+            print(
+                f"d = {joints}, sigma {sigma:g} mm: delay mean, 95 %, within {IN_TIME}; CUSUM knowing the arm, with "
+                "the same model; ratios to both; named right/wrong after 100 and 300 pairs"
+            )
+            for case in CASES:
+                if arguments.only in case.name:
+                    found = [outcome(case, joints, 1e-3 * sigma, seed, arguments.known) for seed in seeds_of(arguments)]
+                    print(row(case, found), flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,137 @@
+"""Who may do what over zenoh: roles, and the rules of zenoh's access control that enforce them.
+
+The rules stand where connections come in: at the router, or at a process that listens beyond its own machine. What no
+rule allows is dropped there, before it reaches a process.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import msgspec
+
+from .keys import Keys
+
+EVERY_ROBOT = "*"
+# Cache and announcements of advanced publications stand beside their key, hidden from wild cards.
+CACHE = "@adv/**"
+
+Deed = Literal["says", "hears", "asks", "answers", "shows", "watches"]
+# What each deed needs: messages from whoever does it, and messages to it.
+_MESSAGES: dict[Deed, tuple[tuple[str, ...], tuple[str, ...]]] = {
+    "says": (("put", "delete"), ("declare_subscriber",)),
+    "hears": (("declare_subscriber",), ("put", "delete")),
+    "asks": (("query",), ("reply", "declare_queryable")),
+    "answers": (("declare_queryable", "reply"), ("query",)),
+    "shows": (("liveliness_token",), ("liveliness_query", "declare_liveliness_subscriber")),
+    "watches": (("liveliness_query", "declare_liveliness_subscriber"), ("liveliness_token",)),
+}
+
+
+class Names(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Who has which role: common names of certificates, or names of users where passwords are asked for.
+
+    Attributes:
+        viewer: asks for predictions, pairs, the model and states, and hears pairs and states.
+        operator: a viewer who may give commands, and change the simulated robot's tool.
+        sampler: the process of that name: publishes pairs, answers from its store.
+        learner: the process of that name: hears pairs, answers predictions.
+    """
+
+    viewer: tuple[str, ...] = ()
+    operator: tuple[str, ...] = ()
+    sampler: tuple[str, ...] = ()
+    learner: tuple[str, ...] = ()
+
+
+ROLES = tuple(field.name for field in msgspec.structs.fields(Names))
+
+
+@dataclass(frozen=True, slots=True)
+class Subjects:
+    """How those who connect are told apart.
+
+    Attributes:
+        by_user: by the name that a password was given for; else by their certificates' common names.
+    """
+
+    by_user: bool
+
+    def of(self, names: tuple[str, ...]) -> dict[str, list[str]]:
+        """The subjects of these names, as zenoh's configuration has them."""
+        return {"usernames" if self.by_user else "cert_common_names": list(names)}
+
+
+def deeds(role: str, keys: Keys) -> dict[Deed, tuple[str, ...]]:
+    """The keys under which the role may do each deed."""
+    pair, cache = keys.pair, f"{keys.pair}/{CACHE}"
+    states, alive = (keys.status("sampler"), keys.status("learner")), (keys.alive("sampler"), keys.alive("learner"))
+    questions = (keys.predict, keys.jacobian, keys.ik, keys.model)
+    # Where a role speaks of both processes, so may wild cards: status/*, alive/*.
+    views: dict[Deed, tuple[str, ...]] = {
+        "hears": (pair, keys.status("*")),
+        "asks": (*questions, keys.pairs, keys.status("*"), pair, cache),
+        "watches": (keys.alive("*"), cache),
+    }
+    if role == "viewer":
+        return views
+    if role == "operator":
+        return {**views, "asks": (*views["asks"], keys.command("*"), keys.simulation)}
+    if role == "sampler":
+        return {
+            "says": (pair, states[0]),
+            "answers": (keys.pairs, states[0], keys.command("sampler"), keys.simulation, pair, cache),
+            "asks": (keys.predict,),
+            "shows": (alive[0], cache),
+            "watches": (keys.alive("*"),),
+        }
+    return {
+        "says": (states[1],),
+        "hears": (pair,),
+        "answers": (*questions, states[1], keys.command("learner")),
+        "asks": (keys.pairs, pair, cache),
+        "shows": (alive[1],),
+        "watches": (keys.alive("*"), cache),
+    }
+
+
+def access_control(names_of_robot: Mapping[str, Names], subjects: Subjects) -> dict[str, Any]:
+    """zenoh's table `access_control`: everything is denied but what the roles do under their robots' keys.
+
+    Args:
+        names_of_robot: by the robot's name, or `*` for every robot.
+    """
+    rules: list[dict[str, Any]] = []
+    owners: list[dict[str, Any]] = []
+    policies: list[dict[str, Any]] = []
+    for robot, names in names_of_robot.items():
+        for role in ROLES:
+            who: tuple[str, ...] = getattr(names, role)
+            if not who:
+                continue
+            identity = f"{role} of {robot}"
+            of_role = list(_rules(identity, deeds(role, Keys(robot))))
+            rules += of_role
+            owners.append({"id": identity, **subjects.of(who)})
+            policies.append({"rules": [rule["id"] for rule in of_role], "subjects": [identity]})
+    return {
+        "enabled": True,
+        "default_permission": "deny",
+        "rules": rules,
+        "subjects": owners,
+        "policies": policies,
+    }
+
+
+def _rules(identity: str, allowed: Mapping[Deed, tuple[str, ...]]) -> Iterator[dict[str, Any]]:
+    for deed, keys in allowed.items():
+        for flow, messages in zip(("ingress", "egress"), _MESSAGES[deed], strict=True):
+            yield {
+                "id": f"{identity} {deed} {flow}",
+                "messages": list(messages),
+                "flows": [flow],
+                "permission": "allow",
+                "key_exprs": list(keys),
+            }

@@ -1,0 +1,45 @@
+"""`bodyschema restore`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+from daemon.commands.options import HERE, flag
+
+
+def restore(
+    file: Annotated[Path, Parameter(help="What `bodyschema backup` wrote.")],
+    /,
+    *,
+    robot: Annotated[Path, Parameter(help="Where robot.toml goes, and beside it what it names.")] = HERE,
+    state_dir: Annotated[Path | None, Parameter(help="Where state goes; else as that robot.toml says.")] = None,
+    force: Annotated[bool, flag("Move what is in the way aside.")] = False,
+) -> None:
+    """Put a backup back: robot.toml, the files that it names, pairs and checkpoint. Verified before anything changes.
+
+    The store is another one from then on, so that no learner mixes its new pairs with those that came after the backup.
+
+    Needs: sampler and learner at rest.
+
+    Next: `bodyschema run`, or `systemctl start` of the robot's services.
+    """
+    from rich.console import Console
+
+    from daemon.backup import Backup
+    from daemon.restoring import restore as put_back
+
+    console = Console(highlight=False, soft_wrap=True)
+    with Backup(file) as opened:
+        made = opened.manifest
+        done = put_back(opened, robot, state_dir, force=force)
+    console.print(f"{made.robot} as it was at {made.written_utc}: {made.pairs} pairs to number {made.last_seq}")
+    for written in done.written:
+        console.print(f"  {written}", markup=False)
+    for aside in done.aside:
+        console.print(f"  what was there before is {aside}", markup=False)
+    for origin, target in done.elsewhere.items():
+        console.print(f"  robot.toml names {origin}: put {target} there, or mend robot.toml", markup=False)
+    console.print("A learner on another machine takes the pairs as those of another store: tell it reset_to_prior.")

@@ -1,0 +1,39 @@
+"""`bodyschema router`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+from daemon.commands.options import flag
+
+
+def router(
+    file: Annotated[Path, Parameter(help="Who may connect, and do what.")] = Path("router.toml"),
+    /,
+    *,
+    zenohd: Annotated[bool, flag("Print the configuration for zenoh's own zenohd, and end.")] = False,
+    verbose: Annotated[bool, flag("Log more.")] = False,
+) -> None:
+    """Let machines meet: sampler, learner and viewers connect here by TLS, and each does what its role says.
+
+    Ends with SIGTERM or Ctrl-C. docs/security.md shows how certificates are made; deploy/ has files to begin with.
+
+    Needs: router.toml, and the certificates that it names.
+
+    Next: `router` and `[zenoh.tls]` in each machine's robot.toml; `bodyschema doctor` there.
+    """
+    from daemon import logs
+    from daemon.router import RouterConfig, run_router
+    from daemon.signals import Wishes, on_termination
+
+    config = RouterConfig.load(file)
+    if zenohd:
+        print(config.as_zenohd())  # noqa: T201
+        return
+    logs.set_up(verbose=verbose)
+    wishes = Wishes()
+    with on_termination(wishes.end):
+        run_router(config, lambda: wishes.ending)

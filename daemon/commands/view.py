@@ -1,0 +1,43 @@
+"""`bodyschema view`."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from cyclopts import Parameter
+from cyclopts.validators import Number
+
+from daemon.commands.options import HERE, RobotFile, flag
+from daemon.view_process import PORT
+
+
+def view(
+    *,
+    robot: RobotFile = HERE,
+    port: Annotated[
+        int,
+        Parameter(help="For the browser on this machine; 0: a free one.", validator=Number(gte=0, lte=65535)),
+    ] = PORT,
+    verbose: Annotated[bool, flag("Log more.")] = False,
+) -> None:
+    """A page in a browser on this machine: error over time, where to move next, residuals, segments, buttons.
+
+    It reads everything over zenoh, so it may run anywhere that reaches both processes, and they may come and go. The
+    page is for this machine alone (docs/view.md says how to look at it from another). Ends with SIGTERM or Ctrl-C.
+
+    Needs: the extra `view` (`pip install 'bodyschema[view]'`), robot.toml, and something to see: `bodyschema run`.
+
+    Next: open the address in a browser.
+    """
+    from rich.console import Console
+
+    from daemon import logs
+    from daemon.config import Config
+    from daemon.view_process import require_extra
+
+    require_extra()
+    from daemon.view.server import serve
+
+    logs.set_up(verbose=verbose)
+    console = Console(highlight=False, soft_wrap=True)
+    serve(Config.load(robot), port, lambda address: console.print(f"look at {address}", markup=False))

@@ -1,0 +1,112 @@
+"""Going on after a change: what changed is forgotten, what did not stays known."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from interfaces.records import FloatArray
+from kbmaps import ChainBelief, ChangeKind, Explanation, KBMap, any_change, explanations
+
+from .arm import OTHER_TOOL_M, KnownArm
+from .change import NAMED, TOOL
+from .solver import fitted_belief
+from .watch import Noticed
+
+# A kind less probable than this need not be forgotten for a change that is not named yet.
+IMPROBABLE = 0.02
+# What changed may be anywhere within so many times its most probable change (1-sigma), and so many noises.
+WIDER, LEAST_NOISES = 3.0, 3.0
+# Runs of neighbours that are left out in turn to hold the new model against the old one.
+FOLDS = 4
+# Pairs farther from a prediction than so many sigmas count as that far.
+_CLIPPED = 5.0
+# Of fewer pairs nothing is learnt of what was known already.
+_FEWEST_BEFORE = 10
+
+
+@dataclass(frozen=True, eq=False)
+class Adapted:
+    """Where learning goes on.
+
+    Attributes:
+        prior: the map to learn on top of.
+        arm: what is known before the first pair since the change.
+        belief: what is believed of the chain after these pairs.
+    """
+
+    prior: KBMap
+    arm: KnownArm
+    belief: ChainBelief
+
+
+class Origin:
+    """The arm as it was known before a change, and what the pairs since say of the change.
+
+    Args:
+        noticed: the change.
+        arm: what was known of the arm before the first pair of its era; how well it may be made is taken from it.
+    """
+
+    def __init__(self, noticed: Noticed, arm: KnownArm) -> None:
+        self._noticed, self._reference = noticed, noticed.reference
+        quiet = [k for k in range(noticed.first) if noticed.kept[k]]
+        q, x = noticed.q[quiet], noticed.x[quiet]
+        wide = self._reference.wide
+        if len(quiet) >= _FEWEST_BEFORE:
+            wide = fitted_belief(wide, q, self._of_chain(q, x))
+        self._before = arm.updated(wide, self._reference.residual)
+
+    def explain(self, q: FloatArray, x: FloatArray) -> list[Explanation]:
+        """How probable each kind of change is after the pairs since then, q (n, d) [rad] and x (n, 3) [m]."""
+        noticed, belief = self._noticed, self._before.chain
+        kinds = (*noticed.kinds, any_change(belief.parameters))
+        return explanations(belief, kinds, q, self._of_chain(q, x), noticed.noise_m, noticed.shared)
+
+    def adapt(self, found: Sequence[Explanation], q: FloatArray, x: FloatArray) -> Adapted:
+        """Forget what may have changed, and learn it from the pairs since, q (n, d) [rad] and x (n, 3) [m].
+
+        Args:
+            found: how probable each kind of change is, the most probable first.
+        """
+        arm = self._forgetful(found)
+        belief = fitted_belief(arm.chain, q, self._of_chain(q, x))
+        bases, known = self._reference.map.bases, self._reference.belief.chain
+        net = self._reference.map.net[:3] + belief.chain.to_kbmap(bases).net - known.to_kbmap(bases).net
+        return Adapted(KBMap(bases, net), arm, belief)
+
+    def is_better(self, found: Sequence[Explanation], q: FloatArray, x: FloatArray) -> bool:
+        """Whether an adapted model predicts pairs since the change that it does not know better than the old one.
+
+        Runs of q (n, d) [rad] and x (n, 3) [m], n at least 2, are left out in turn.
+        """
+        arm, y = self._forgetful(found), self._of_chain(q, x)
+        limit = _CLIPPED * self._noticed.noise_m
+        old = np.minimum(np.linalg.norm(y - self._reference.belief.predict(q), axis=1), limit)
+        new = np.empty(len(q))
+        for left_out in np.array_split(np.arange(len(q)), min(FOLDS, len(q))):
+            others = np.setdiff1d(np.arange(len(q)), left_out)
+            belief = fitted_belief(arm.chain, q[others], y[others])
+            new[left_out] = np.minimum(np.linalg.norm(y[left_out] - belief.predict(q[left_out]), axis=1), limit)
+        return float(np.square(new).sum()) < float(np.square(old).sum())
+
+    def _of_chain(self, q: FloatArray, x: FloatArray) -> FloatArray:
+        """What of positions x (n, 3) [m] the chain has to explain: what the model knows beyond it stays as it is."""
+        return x - self._reference.beyond_chain(q)
+
+    def _forgetful(self, found: Sequence[Explanation]) -> KnownArm:
+        arm = self._before
+        kinds = found[:1] if found[0].probability >= NAMED else [e for e in found if e.probability >= IMPROBABLE]
+        for each in kinds:
+            if each.kind.name == TOOL:
+                arm = arm.with_other_tool()
+            else:
+                arm = arm.widened(each.kind.columns, self._widths(each.kind, each.change))
+        return arm
+
+    def _widths(self, kind: ChangeKind, change: FloatArray) -> FloatArray:
+        moves = change / kind.units
+        size = WIDER * float(np.sqrt(np.square(moves).mean()))
+        return kind.units * min(max(size, LEAST_NOISES * self._noticed.noise_m), OTHER_TOOL_M)

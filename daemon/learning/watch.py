@@ -1,0 +1,239 @@
+"""Watching for a change: what the model of some time ago makes of the pairs that came since."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from interfaces.records import FloatArray, Pair
+from kbmaps import ChainBelief, ChangeDetector, ChangeKind, KBMap, ResidualModel, SharedNoise, Suspicion
+
+from .claims import Claim
+from .learnt import LearntModel
+
+# A model of fewer pairs says too little, and may be too far off to be held against others.
+FEWEST_KNOWN = 100
+# A newer model takes the place of the present one after half as many pairs as it knows, within these limits: a change
+# that took longer to show would be a part of it.
+SHORTEST_TRIAL, LONGEST_TRIAL = 50, 1000
+# So many of the pairs that a model knows show its noise.
+LOOKED_BACK = 500
+# So many of the newest errors of pairs that a model did not know show how far these lie from it.
+SHOWN = 3000
+
+
+@dataclass(frozen=True, eq=False)
+class Reference:
+    """A model that knows no pair of the watched ones, and what is believed with it.
+
+    Attributes:
+        model: what answered.
+        map: the best that was a map.
+        belief: what was believed of the chain.
+        wide: the same, were it not for how well the arm seems to be made.
+        residual: what was known of the arm beyond that; None: nothing.
+        claim: what was claimed of the model.
+        known: how many pairs it knows.
+        q, x: some of the last of these, in their order (n, d) [rad] and (n, 3) [m].
+        variance: of these measurements (3,) [m²].
+    """
+
+    model: LearntModel
+    map: KBMap
+    belief: ChainBelief
+    wide: ChainBelief
+    residual: ResidualModel | None
+    claim: Claim
+    known: int
+    q: FloatArray
+    x: FloatArray
+    variance: FloatArray
+
+    def beyond_chain(self, q: FloatArray) -> FloatArray:
+        """Positions (n, 3) [m] of the model at q (n, d) [rad] minus those of the chain."""
+        return self.model.predict(q) - self.belief.predict(q)
+
+    def errors(self, q: FloatArray, x: FloatArray, variance: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Errors of pairs q (n, d), x (n, 3) and their variance but for the chain's numbers, (n, 3) [m, m²]."""
+        return x - self.model.predict(q), variance + self.claim.beyond_chain(q)
+
+    def noise(self) -> SharedNoise:
+        """Of its whitened errors, as the pairs show it that it knows."""
+        errors, variances = self.errors(self.q, self.x, self.variance)
+        used = (4 * self.q.shape[1] + 3) * len(self.q) / self.known
+        share = float((1.0 - self.variance / variances).mean())
+        return SharedNoise.of(errors / np.sqrt(variances), used).at_least(SharedNoise.claimed(share))
+
+
+@dataclass(frozen=True, eq=False)
+class Noticed:
+    """A change, as it was noticed.
+
+    Attributes:
+        reference: the model before it.
+        kinds: what may have changed.
+        noise_m: 1-sigma of a coordinate of one measurement around the model [m].
+        shared: how many neighbours say as much as one would.
+        first: the most probable first pair since the change, of those watched.
+        earliest, latest: between which it is, with 95 % probability.
+        seqs: sequence numbers of the watched pairs (n,).
+        kept: which of them (n,) were learnt, and not doubted.
+        q, x: the watched pairs, (n, d) [rad] and (n, 3) [m].
+        turns: their orientations, quaternions (n, 4), NaN where a pair has none.
+    """
+
+    reference: Reference
+    kinds: tuple[ChangeKind, ...]
+    noise_m: float
+    shared: float
+    first: int
+    earliest: int
+    latest: int
+    seqs: tuple[int, ...]
+    kept: tuple[bool, ...]
+    q: FloatArray
+    x: FloatArray
+    turns: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class _Watched:
+    seq: int
+    q: FloatArray
+    x: FloatArray
+    variance: FloatArray
+    turn: FloatArray
+    kept: bool
+
+
+class Watch:
+    """Holds the pairs since a reference against it, and renews the reference while nothing changes.
+
+    How far pairs that a model does not know lie from it is seen from such pairs alone: fitted to its own ones, a chain
+    that is wrong looks right. So the first reference is tried out before it can raise an alarm.
+    """
+
+    def __init__(self) -> None:
+        self._reference: Reference | None = None
+        self._next: Reference | None = None
+        self._next_at = self._asked_at = 0
+        self._pairs: list[_Watched] = []
+        self._detector: ChangeDetector | None = None
+        self._suspicion: Suspicion | None = None
+        self._shown = np.empty((0, 3))
+
+    @property
+    def ready(self) -> bool:
+        """Whether there is a model that pairs are held against, and it was tried out."""
+        return self._detector is not None and len(self._shown) > 0
+
+    @property
+    def detector(self) -> ChangeDetector | None:
+        """What holds the pairs against the present reference; None before there is one."""
+        return self._detector
+
+    @property
+    def alarmed(self) -> bool:
+        """Whether there was a change."""
+        return self._suspicion is not None and self._suspicion.alarm
+
+    @property
+    def wants_reference(self) -> bool:
+        """Whether the model that was solved for last can become the next reference."""
+        return self._next is None or self._next_at == self._asked_at
+
+    def asked(self) -> None:
+        """The solver works on all pairs up to here."""
+        if self._reference is None:
+            self._pairs.clear()  # what comes first after the model that is the first reference counts
+        self._asked_at = len(self._pairs)
+
+    def offer(self, reference: Reference) -> None:
+        """A model of the pairs up to the last `asked`."""
+        if reference.known < FEWEST_KNOWN or not self.wants_reference:
+            return
+        self._next, self._next_at = reference, self._asked_at
+        if self._reference is None:
+            self._renew()
+
+    def add(self, pair: Pair, *, kept: bool) -> None:
+        """One more pair, learnt or, not `kept`, doubted."""
+        turn = np.full(4, np.nan) if pair.R is None else pair.R
+        self._pairs.append(_Watched(pair.seq, pair.q, pair.x, np.diag(pair.cov), turn, kept))
+        if self._detector is None:
+            return
+        self._feed(self._pairs[-1:])
+        if not self.ready:
+            if self._reference is not None and len(self._pairs) >= _trial(self._reference.known):
+                self._show()
+                self._hold(self._reference)
+        elif self._detector.due:
+            self._suspicion = self._detector.suspicion()
+        tried = len(self._pairs) - self._next_at
+        if self._next is not None and self.ready and not self.alarmed and tried >= _trial(self._next.known):
+            self._show()
+            self._renew()
+
+    def noticed(self, run: int = 0) -> Noticed | None:
+        """The change that the pairs show; None: they do not, or there is nothing to hold them against.
+
+        Args:
+            run: so many of the last pairs have shown it in another way: it began there if not before.
+        """
+        reference, detector = self._reference, self._detector
+        if reference is None or detector is None or not self.ready or not (self.alarmed or run):
+            return None
+        suspicion = detector.suspicion()
+        earliest, latest = suspicion.interval()
+        first = suspicion.onset
+        if not suspicion.alarm:
+            first = earliest = latest = len(self._pairs) - run
+        pairs = self._pairs
+        variance = float(np.mean([each.variance for each in pairs]) + reference.claim.beyond_chain(reference.q).mean())
+        return Noticed(
+            reference,
+            detector.kinds,
+            float(np.sqrt(detector.noise.single * variance)),
+            detector.noise.whole / detector.noise.single,
+            first,
+            earliest,
+            latest,
+            tuple(each.seq for each in pairs),
+            tuple(each.kept for each in pairs),
+            np.array([each.q for each in pairs]),
+            np.array([each.x for each in pairs]),
+            np.array([each.turn for each in pairs]),
+        )
+
+    def _show(self) -> None:
+        """The pairs have shown how far they lie from a model that does not know them."""
+        if self._detector is not None:
+            self._shown = np.concatenate([self._shown, self._detector.surprises])[-SHOWN:]
+
+    def _renew(self) -> None:
+        """The next reference takes its place."""
+        if self._next is not None:
+            self._pairs = self._pairs[self._next_at :]
+            self._asked_at, self._next_at = max(self._asked_at - self._next_at, 0), 0
+            self._reference, self._next = self._next, None
+            self._hold(self._reference)
+
+    def _hold(self, reference: Reference) -> None:
+        """Hold all pairs against this reference, with the noise that was shown."""
+        noise = SharedNoise.of(self._shown) if len(self._shown) else reference.noise()
+        variances = reference.errors(reference.q, reference.x, reference.variance)[1]
+        noise_m = float(np.sqrt(noise.single * variances.mean()))
+        distance_m = float(np.linalg.norm(reference.x, axis=1).mean())
+        self._detector, self._suspicion = ChangeDetector(reference.belief, noise, noise_m, distance_m), None
+        self._feed(self._pairs)
+
+    def _feed(self, pairs: list[_Watched]) -> None:
+        if self._reference is None or self._detector is None or not pairs:
+            return
+        q, x, variance = (np.array([getattr(each, name) for each in pairs]) for name in ("q", "x", "variance"))
+        self._detector.add(q, *self._reference.errors(q, x, variance))
+
+
+def _trial(known: int) -> int:
+    return min(max(known // 2, SHORTEST_TRIAL), LONGEST_TRIAL)

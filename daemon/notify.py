@@ -1,0 +1,81 @@
+"""What a service tells systemd, by sd_notify(3): datagrams to the socket that NOTIFY_SOCKET names."""
+
+from __future__ import annotations
+
+import logging
+import os
+import socket
+import time
+from collections.abc import MutableMapping
+
+log = logging.getLogger(__name__)
+
+SOCKET, WATCHDOG, WATCHDOG_PID = "NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID"
+SEND_LIMIT_S = 0.5  # working loops tell: a systemd that does not listen must not hold them up
+LONGEST_STATUS = 400
+
+
+class Notifier:
+    """Tells systemd; without a socket to tell it to, does nothing.
+
+    Attributes:
+        watchdog_s: systemd ends the process when it has heard no `WATCHDOG=1` for so long [s]; None: it does not look.
+    """
+
+    def __init__(self, address: str | None = None, watchdog_s: float | None = None) -> None:
+        """Tell nobody, or who listens on `address`: a path, or with `@` at its head an abstract name."""
+        self._address = None if address is None else _as_address(address)
+        self._failed = False
+        self.watchdog_s = None if address is None else watchdog_s
+
+    @classmethod
+    def of_environment(cls, environment: MutableMapping[str, str] = os.environ) -> Notifier:
+        """What systemd asked this process for. Taken out of the environment: it is not for the process's children."""
+        address = environment.pop(SOCKET, None) or None
+        microseconds, pid = environment.pop(WATCHDOG, ""), environment.pop(WATCHDOG_PID, "")
+        ours = not pid or pid == str(os.getpid())
+        watched = ours and microseconds.isdigit() and int(microseconds) > 0
+        return cls(address, int(microseconds) / 1e6 if watched else None)
+
+    @property
+    def is_heard(self) -> bool:
+        """Whether there is somebody to tell: a systemd that started this process."""
+        return self._address is not None
+
+    def ready(self) -> None:
+        """All is up, or up again after `reloading`."""
+        self._tell("READY=1")
+
+    def reloading(self) -> None:
+        """The configuration is read again; `ready` ends it."""
+        self._tell(f"RELOADING=1\nMONOTONIC_USEC={time.clock_gettime_ns(time.CLOCK_MONOTONIC) // 1000}")
+
+    def stopping(self) -> None:
+        """The process comes to its end."""
+        self._tell("STOPPING=1")
+
+    def status(self, line: str) -> None:
+        """One line that `systemctl status` shows."""
+        self._tell(f"STATUS={' '.join(line.split())[:LONGEST_STATUS]}")
+
+    def feed_watchdog(self) -> None:
+        """The process works."""
+        self._tell("WATCHDOG=1")
+
+    def _tell(self, state: str) -> None:
+        if self._address is None:
+            return
+        try:
+            with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as sending:
+                sending.settimeout(SEND_LIMIT_S)
+                sending.sendto(state.encode(), self._address)
+        except OSError as error:
+            if not self._failed:
+                log.warning("systemd cannot be told %s: %s", state.partition("=")[0], error.strerror or error)
+            self._failed = True
+        else:
+            self._failed = False
+
+
+def _as_address(name: str) -> str:
+    return f"\0{name[1:]}" if name.startswith("@") else name

@@ -1,0 +1,96 @@
+"""What robot.toml says of the sampler's work, which may change while it runs."""
+
+from __future__ import annotations
+
+import logging
+import threading
+
+from interfaces.errors import BodyschemaError
+from interfaces.protocols import Clock
+
+from .align import JointBuffer
+from .config import Config, DaemonConfig
+from .devices import DeviceWatch
+from .gate import Gate
+from .reload import reload
+from .retention import Keep
+from .service import Service
+from .session import session_of
+from .store import PairStore
+
+log = logging.getLogger(__name__)
+
+TABLES = ("robot", "camera", "zenoh", "daemon", "drivers", "vision", "sim", "effects", "unexplained")
+CHANGEABLE = {("daemon", key) for key in DaemonConfig.__struct_fields__ if key != "state_dir"}
+
+
+class SamplerRules:
+    """Holds those who go by the rules to what robot.toml says; from any thread."""
+
+    def __init__(
+        self,
+        config: Config,
+        store: PairStore,
+        devices: DeviceWatch,
+        wall: Clock,
+        *,
+        gate: Gate,
+        buffer: JointBuffer,
+        deciding: threading.Lock,
+    ) -> None:
+        """The rules are those of `config` so far.
+
+        Args:
+            deciding: held while a pair is decided on and stored: no pair sees one half of a change.
+        """
+        self._config, self._store, self._devices, self._wall = config, store, devices, wall
+        self._gate, self._buffer, self._deciding = gate, buffer, deciding
+        self._one_at_a_time = threading.Lock()
+
+    def reload(self) -> str:
+        """Read robot.toml again; what came of it. Pairs go on meanwhile.
+
+        Raises:
+            ConfigError: it is wrong; nothing changed.
+            StoreError: the new session cannot be kept; nothing changed.
+        """
+        with self._one_at_a_time:
+            found = reload(self._config, TABLES, CHANGEABLE)
+            if found.changed:
+                self._follow(found.config)
+        message = found.message("sampler")
+        log.info("robot.toml was read again: %s", message)
+        return message
+
+    def reload_aside(self, service: Service) -> None:
+        """`reload` in a thread of its own, because frames do not wait; who asked by a signal reads the log."""
+        threading.Thread(target=self._reload_for, args=(service,), name="reload").start()
+
+    def trim(self) -> None:
+        """Delete a part of the pairs that are not to be kept, if there are some.
+
+        Raises:
+            StoreError: the disk is full or broken.
+        """
+        with self._deciding:
+            deleted = self._store.trim(Keep.of(self._config.tables.daemon), self._wall.utc())
+        if deleted:
+            log.info("the oldest %d pairs were deleted, as [daemon] keep_days and keep_mb say", deleted)
+
+    def _follow(self, config: Config) -> None:
+        session, rules = session_of(config, self._wall), config.tables.daemon
+        with self._deciding:
+            self._store.go_on_with(session)
+            self._devices.note_again()
+            self._gate.follow(rules)
+            self._buffer.max_gap_s = rules.max_reading_gap_s
+            self._config = config
+
+    def _reload_for(self, service: Service) -> None:
+        service.reloading()
+        try:
+            self.reload()
+        except BodyschemaError as error:
+            log.error("robot.toml was read again and is not followed: %s", error)
+        finally:
+            service.reloaded()

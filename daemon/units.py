@@ -1,0 +1,196 @@
+"""The units of sampler and learner for systemd: one template for each, and for each robot what is its own."""
+
+from __future__ import annotations
+
+import os
+import re
+import sys
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from .config import Config
+from .servo_wiring import configured_ports
+
+PROCESSES = ("sampler", "learner")
+FOLDER = Path("etc/systemd/system")
+OWN = "robot.conf"
+# Beginnings of what `ProtectHome=tmpfs` and `PrivateTmp=yes` hide.
+HIDDEN = tuple(Path(path) for path in ("/home", "/root", "/run/user", "/tmp", "/var/tmp"))
+LOOPBACK = re.compile(r"[a-z]+/(127\.[0-9.]+|localhost|\[::1\]):[0-9]+.*|unixsock-stream/.+")
+# Versions of systemd from which on a service that fails again and again is started less and less often.
+WITH_RESTART_STEPS = 254
+
+# zenoh asks the kernel for the machine's interfaces (netlink) and places its memory (mbind); the learner's background
+# work makes itself nicer (setpriority). No RemoveIPC: it would take the other unit's shared memory, of the same user.
+_SANDBOX = """\
+UMask=0027
+NoNewPrivileges=yes
+CapabilityBoundingSet=
+AmbientCapabilities=
+LockPersonality=yes
+MemoryDenyWriteExecute=yes
+PrivateMounts=yes
+PrivateTmp=yes
+ProcSubset=pid
+ProtectClock=yes
+ProtectControlGroups=yes
+ProtectHome=tmpfs
+ProtectHostname=yes
+ProtectKernelLogs=yes
+ProtectKernelModules=yes
+ProtectKernelTunables=yes
+ProtectProc=invisible
+ProtectSystem=strict
+RestrictAddressFamilies=AF_UNIX AF_INET AF_INET6 AF_NETLINK
+RestrictNamespaces=yes
+RestrictRealtime=yes
+RestrictSUIDSGID=yes
+SystemCallArchitectures=native
+SystemCallErrorNumber=EPERM
+SystemCallFilter=@system-service
+SystemCallFilter=~@privileged @resources
+SystemCallFilter=mbind setpriority
+"""
+_UNIT = """\
+# Written by `bodyschema install service`; `bodyschema install service --uninstall` removes it.
+# What belongs to one robot is in bodyschema-{process}@ROBOT.service.d/{own}.
+[Unit]
+Description=bodyschema: the {process} of %i
+After=network.target
+# Never give up: a robot that is switched on late is found.
+StartLimitIntervalSec=0
+
+[Service]
+# Ready when {ready}.
+Type=notify
+NotifyAccess=main
+ExecStart={command} {process}
+ExecReload=/bin/kill -HUP $MAINPID
+# Fed by the loops that work, so that one which hangs starves it; the abort leaves every thread's place in the journal.
+WatchdogSec={watchdog_s}
+WatchdogSignal=SIGABRT
+TimeoutStartSec=90
+TimeoutStopSec=30
+KillMode=mixed
+Restart=on-failure
+{restart}
+# The store and the checkpoint.
+StateDirectory=bodyschema/%i
+StateDirectoryMode=0750
+Environment=XDG_STATE_HOME=%S
+
+# Nobody from outside is reached or heard, unless robot.toml has endpoints on other machines.
+IPAddressDeny=any
+IPAddressAllow=localhost
+{devices}
+{sandbox}
+[Install]
+WantedBy=multi-user.target
+"""
+# Longer than any loop's slowest round: the learner's background work took 6 s with twelve joints on a busy machine.
+_WATCHDOG_S = {"sampler": 30, "learner": 60}
+_READY = {
+    "sampler": "encoders and cameras are read, the store is open and zenoh answers",
+    "learner": "the checkpoint is read and zenoh answers",
+}
+_DEVICES = {
+    "sampler": """\
+# No device but the ports and cameras that robot.toml names.
+DevicePolicy=closed
+SupplementaryGroups=dialout video""",
+    "learner": """\
+PrivateDevices=yes
+PrivateUsers=yes""",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Installed:
+    """The bodyschema that the units start.
+
+    Attributes:
+        command: how it is called.
+        folders: what it is made of.
+        systemd: version of the machine's systemd.
+    """
+
+    command: Sequence[str]
+    folders: Sequence[Path]
+    systemd: int
+
+    @classmethod
+    def here(cls, systemd: int) -> Installed:
+        """The one that runs."""
+        folders = (Path(sys.prefix), Path(sys.base_prefix), Path(__file__).parents[1])
+        return cls((os.path.abspath(sys.executable), "-P", "-m", "daemon"), folders, systemd)
+
+
+def template(process: str, installed: Installed) -> str:
+    """The unit `bodyschema-<process>@.service`."""
+    restart = "RestartSec=5"
+    if installed.systemd >= WITH_RESTART_STEPS:
+        restart = "RestartSec=1\nRestartSteps=6\nRestartMaxDelaySec=60"
+    return _UNIT.format(
+        process=process,
+        own=OWN,
+        ready=_READY[process],
+        command=" ".join(map(_quoted, installed.command)),
+        watchdog_s=_WATCHDOG_S[process],
+        restart=restart,
+        devices=_DEVICES[process],
+        sandbox=_SANDBOX,
+    )
+
+
+def of_robot(process: str, config: Config, user: str, installed: Installed) -> str:
+    """What `bodyschema-<process>@<robot>.service.d/robot.conf` says: whose it is, and what it may see and use."""
+    lines = [f"# {config.robot.name}, as {config.file.absolute()} described it.", "[Service]", f"User={user}"]
+    lines.append(f"Environment={_quoted(f'BODYSCHEMA_ROBOT={config.file.absolute()}')}")
+    lines += [f"BindReadOnlyPaths={_quoted(path)}" for path in hidden([*installed.folders, *folders_of(config)])]
+    if config.tables.daemon.state_dir is not None:
+        kind = "BindPaths" if hidden([config.state_dir]) else "ReadWritePaths"
+        lines.append(f"{kind}={_quoted(config.state_dir)}")
+    if process == "sampler":
+        lines += [f"DeviceAllow={_quoted(device)} rw" for device in devices_of(config)]
+    if not all(LOOPBACK.fullmatch(endpoint) for endpoint in endpoints_of(config)):
+        lines.append("IPAddressAllow=any")
+    return "\n".join(lines) + "\n"
+
+
+def devices_of(config: Config) -> list[str]:
+    """The ports and cameras that robot.toml names, each once."""
+    cameras = config.tables.vision.cameras
+    named = [*configured_ports(config).values(), *({} if cameras is None else cameras.devices).values()]
+    return list(dict.fromkeys(name for name in named if name.startswith("/dev/")))
+
+
+def endpoints_of(config: Config) -> list[str]:
+    """Where the two processes listen or connect to."""
+    zenoh, ros2 = config.tables.zenoh, config.tables.drivers.ros2
+    return [zenoh.sampler, zenoh.learner, *([] if ros2 is None else [ros2.router])]
+
+
+def folders_of(config: Config) -> list[Path]:
+    """The folders of robot.toml and of the files that it names."""
+    tables, home = config.tables, config.file.absolute().parent
+    cameras = tables.vision.cameras
+    named = [tables.drivers.recording, None if cameras is None else cameras.calibration]
+    files = [config.file, config.robot.tree.file, *(home / name for name in named if name is not None)]
+    return [Path(os.path.abspath(file)).parent for file in files]
+
+
+def hidden(folders: Iterable[Path]) -> list[Path]:
+    """Those of `folders` that a service does not see unless it is told to, without those inside others."""
+    found = sorted({Path(os.path.abspath(folder)) for folder in folders})
+    seen = [folder for folder in found if any(folder.is_relative_to(hiding) for hiding in HIDDEN)]
+    return [folder for folder in seen if not any(folder.is_relative_to(other) for other in seen if other != folder)]
+
+
+def _quoted(word: object) -> str:
+    """A word of a unit file, as systemd.syntax(7) wants it: a percent sign begins a specifier."""
+    text = str(word).replace("%", "%%")
+    if not re.search(r"[\s\"'\\]", text):
+        return text
+    escaped = text.replace("\\", "\\\\").replace('"', '\\"')
+    return f'"{escaped}"'

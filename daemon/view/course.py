@@ -1,0 +1,89 @@
+"""The course of learning, as far as the view has looked on."""
+
+from __future__ import annotations
+
+from daemon.status import LearnerStatus
+
+from .documents import Change, CourseDocument, SeriesDocument, Version
+
+LARGEST_SERIES = 600
+LARGEST_COURSE = 50
+
+
+class Series:
+    """Figures over time, at most `LARGEST_SERIES`, evenly spread."""
+
+    def __init__(self) -> None:
+        self._rows: list[tuple[float, float | None, float | None, float | None, float | None]] = []
+        self._stride, self._offered = 1, 0
+
+    def add(
+        self,
+        t: float,
+        *,
+        error_m: float | None,
+        claimed_m: float | None,
+        pairs_per_s: float | None,
+        predict_s: float | None,
+    ) -> None:
+        """The figures at one time, as in `SeriesDocument`; not every one is kept."""
+        is_kept = self._offered % self._stride == 0
+        self._offered += 1
+        if not is_kept:
+            return
+        self._rows.append((t, error_m, claimed_m, pairs_per_s, predict_s))
+        if len(self._rows) > LARGEST_SERIES:
+            self._stride *= 2
+            self._rows = self._rows[::2]
+
+    @property
+    def document(self) -> SeriesDocument:
+        """All of them, by columns."""
+        columns = [list(column) for column in zip(*self._rows, strict=True)] or [[] for _ in range(5)]
+        return SeriesDocument(*columns)
+
+
+class Course:
+    """Tool changes and the models that answered, from one state of the learner to the next."""
+
+    def __init__(self) -> None:
+        self._changes: list[Change] = []
+        self._versions: list[Version] = []
+        self._store: str | None = None
+
+    @property
+    def document(self) -> CourseDocument:
+        """What is known now."""
+        return CourseDocument(list(self._changes), list(self._versions))
+
+    def note(self, status: LearnerStatus, now: float) -> None:
+        """What the learner said at this time, UTC [s since 1970]."""
+        begun_anew = self._versions and status.pairs < self._versions[-1].pairs
+        if begun_anew or status.store != self._store:
+            self._changes, self._versions, self._store = [], [], status.store
+        changed = self._note_change(status, now)
+        if status.model:
+            self._note_version(status, now, changed=changed)
+
+    def _note_change(self, status: LearnerStatus, now: float) -> bool:
+        at = status.pairs - status.pairs_since_change
+        if at <= 0 or (self._changes and self._changes[-1].pairs >= at):
+            return False
+        found = None if status.last_change is None else status.last_change.found
+        self._changes = [*self._changes, Change(at, now, found)][-LARGEST_COURSE:]
+        return True
+
+    def _note_version(self, status: LearnerStatus, now: float, *, changed: bool) -> None:
+        last = self._versions[-1] if self._versions else None
+        goes_on = last is not None and last.answering == status.answering and not changed
+        version = Version(
+            since=last.since if goes_on and last else now,
+            first_pairs=last.first_pairs if goes_on and last else status.pairs,
+            pairs=status.pairs,
+            answering=status.answering,
+            model=status.model,
+            error_m=status.prequential_m.get(status.answering),
+            after_change=last.after_change if goes_on and last else changed,
+        )
+        earlier = self._versions[:-1] if goes_on else self._versions
+        self._versions = [*earlier, version][-LARGEST_COURSE:]

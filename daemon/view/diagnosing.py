@@ -1,0 +1,175 @@
+"""Diagnoses that the page asks for: a process of its own, on pairs that were copied from the sampler."""
+
+from __future__ import annotations
+
+import logging
+import os
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+import msgspec
+
+from daemon import recordings
+from daemon.diagnosis_run import DIAGNOSIS, REPORT
+from daemon.recorder import History
+from daemon.signals import with_parent
+from diagnosis.result import DiagnosisFile
+from interfaces.errors import BodyschemaError, RecordingError, RequestError
+from interfaces.records import Pair
+
+from .documents import DiagnosisDocument
+
+log = logging.getLogger(__name__)
+
+# More would take many minutes, and say little more.
+NEWEST_PAIRS = 4000
+# It has time; learner and sampler have not.
+NICENESS = 10
+END_LIMIT_S = 5.0
+RECORDING = "newest_pairs.csv"
+
+
+class Diagnoses:
+    """One diagnosis after the other, while the with statement lasts."""
+
+    def __init__(
+        self,
+        robot_file: Path,
+        joints: tuple[str, ...],
+        history: Callable[[int], History],
+        tell: Callable[[DiagnosisDocument], None],
+    ) -> None:
+        """None was asked for yet.
+
+        Args:
+            history: so many of the newest pairs.
+            tell: given the state whenever it changes, from any thread.
+        """
+        self._robot_file, self._joints, self._history, self._tell = robot_file, joints, history, tell
+        self._lock = threading.Lock()
+        self._document = DiagnosisDocument()
+        self._thread: threading.Thread | None = None
+        self._child: subprocess.Popen[str] | None = None
+        self._stopping = False
+        self._folder = tempfile.TemporaryDirectory(prefix="bodyschema-view-")
+        tell(self._document)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._end()
+        if self._thread is not None:
+            self._thread.join()
+        self._folder.cleanup()
+
+    def start(self) -> int:
+        """Begin one; its number.
+
+        Raises:
+            RequestError: one is running.
+        """
+        with self._lock:
+            if self._thread is not None and self._thread.is_alive():
+                raise RequestError("a diagnosis is running. Wait for it, or stop it")
+            number = self._document.number + 1
+            self._stopping = False
+            self._thread = threading.Thread(target=self._run, args=(number,), name="diagnosis")
+            self._say(number=number, state="copying", pairs=0, said="", started=time.time(), verdict=None)
+            self._thread.start()
+        return number
+
+    def stop(self) -> None:
+        """End the one that runs.
+
+        Raises:
+            RequestError: none runs.
+        """
+        if self._thread is None or not self._thread.is_alive():
+            raise RequestError("no diagnosis is running")
+        self._end()
+
+    def report(self) -> bytes | None:
+        """The last diagnosis' page; None while there is none."""
+        number = self._document.report
+        return None if number is None else (self._out(number) / REPORT).read_bytes()
+
+    def _out(self, number: int) -> Path:
+        return Path(self._folder.name) / str(number)
+
+    def _end(self) -> None:
+        with self._lock:
+            self._stopping = True
+            if self._child is not None:
+                self._child.terminate()
+
+    def _run(self, number: int) -> None:
+        try:
+            pairs = self._copy(self._out(number))
+            self._say(state="running", pairs=pairs, said="starting")
+            self._diagnose(self._out(number), number)
+        except Exception as error:
+            if not isinstance(error, BodyschemaError):
+                log.exception("a diagnosis failed")
+            self._say(state="stopped" if self._stopping else "failed", said="" if self._stopping else str(error))
+
+    def _copy(self, out: Path) -> int:
+        out.mkdir()
+        history = self._history(NEWEST_PAIRS)
+        pairs: list[Pair] = []
+        while not self._stopping and len(pairs) < NEWEST_PAIRS and (page := history.page()):
+            pairs += page
+        if not pairs or self._stopping:
+            raise RequestError("the sampler has no pairs yet. Move the arm in front of the camera")
+        recordings.write(recordings.from_pairs(pairs, self._joints), out / RECORDING)
+        return len(pairs)
+
+    def _diagnose(self, out: Path, number: int) -> None:
+        command = [sys.executable, "-m", "daemon", "diagnose", str(out / RECORDING)]
+        command += ["--robot", str(self._robot_file), "--out", str(out)]
+        with self._lock:
+            if self._stopping:
+                raise RequestError("stopped")
+            # This thread waits for the child, which may not outlive it.
+            self._child = subprocess.Popen(
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.PIPE,
+                text=True,
+                env=os.environ | with_parent(),
+                process_group=0,
+            )
+        os.setpriority(os.PRIO_PROCESS, self._child.pid, NICENESS)
+        last = self._follow(self._child)
+        code = self._child.wait()
+        with self._lock:
+            self._child = None
+        if code != 0:
+            raise RecordingError(last.removeprefix("bodyschema: ") or f"ended with code {code}", file=RECORDING)
+        file = msgspec.json.decode((out / DIAGNOSIS).read_bytes(), type=DiagnosisFile)
+        self._say(state="done", said=file.sentence, verdict=file.verdict, report=number)
+
+    def _follow(self, child: subprocess.Popen[str]) -> str:
+        """Tell each step; the last line that the child said."""
+        last = ""
+        assert child.stderr is not None
+        with child.stderr:
+            for line in child.stderr:
+                if line.strip():
+                    last = line.strip()
+                    self._say(said=last)
+        return last
+
+    def _say(self, **changed: object) -> None:
+        self._document = msgspec.structs.replace(self._document, **changed)
+        self._tell(self._document)

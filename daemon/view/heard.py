@@ -1,0 +1,70 @@
+"""What one of the processes said of itself last."""
+
+from __future__ import annotations
+
+import threading
+from typing import Any, Generic, TypeVar
+
+from daemon.status import LearnerStatus, SamplerStatus
+from daemon.wire import decode
+from interfaces.errors import RequestError
+from interfaces.protocols import Clock
+
+from .documents import ProcessDocument
+
+# A process says something every second; on a busy machine later.
+SILENT_AFTER_S = 5.0
+
+S = TypeVar("S", SamplerStatus, LearnerStatus)
+
+
+class Heard(Generic[S]):
+    """The newest state of one process; any thread may use it."""
+
+    def __init__(self, kind: type[S], endpoint: str, clock: Clock) -> None:
+        self._kind, self._endpoint, self._clock = kind, endpoint, clock
+        self._lock = threading.Lock()
+        self._alive = False
+        self._heard_at: float | None = None
+        self._heard_utc: float | None = None
+        self._status: S | None = None
+        self._fields: dict[str, Any] | None = None
+        self._problem: str | None = None
+
+    @property
+    def status(self) -> S | None:
+        """What it said last, whether it is there now or not."""
+        with self._lock:
+            return self._status
+
+    @property
+    def answers(self) -> bool:
+        """Whether it is there now."""
+        with self._lock:
+            return self._is_there()
+
+    def take(self, payload: bytes, utc: float) -> None:
+        """A publication of its state, received at this time [s since 1970]."""
+        try:
+            status, fields, problem = decode(payload, self._kind), decode(payload, dict[str, Any]), None
+        except RequestError as error:
+            status, fields, problem = None, None, f"{error}. Is it of another version?"
+        with self._lock:
+            self._heard_at, self._heard_utc, self._problem = self._clock.now(), utc, problem
+            if status is not None:
+                self._status, self._fields = status, fields
+
+    def note_alive(self, alive: bool) -> None:
+        """Its liveliness token came, or is gone."""
+        with self._lock:
+            self._alive = alive
+
+    @property
+    def document(self) -> ProcessDocument:
+        """For the page."""
+        with self._lock:
+            return ProcessDocument(self._is_there(), self._endpoint, self._heard_utc, self._problem, self._fields)
+
+    def _is_there(self) -> bool:
+        recent = self._heard_at is not None and self._clock.now() - self._heard_at < SILENT_AFTER_S
+        return self._alive and recent

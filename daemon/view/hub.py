@@ -1,0 +1,113 @@
+"""What the page shows, as named documents, and the browsers that follow them."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import msgspec
+
+from interfaces.errors import BodyschemaError
+
+MOST_FOLLOWERS = 32
+
+
+class HubFullError(BodyschemaError):
+    """So many browsers follow already."""
+
+    def __init__(self) -> None:
+        super().__init__(f"{MOST_FOLLOWERS} pages are open already. Close one")
+
+
+class Follower:
+    """One browser: the documents that it has not got yet, each as it is now. Who is slow misses what was between."""
+
+    def __init__(self, documents: dict[str, bytes]) -> None:
+        """For the event loop that runs now; `documents` are the first to take."""
+        self._loop, self._news = asyncio.get_running_loop(), asyncio.Event()
+        self._lock = threading.Lock()
+        self._pending = dict(documents)
+        self._news.set()
+
+    def offer(self, topic: str, document: bytes) -> None:
+        """A document is new; from any thread."""
+        with self._lock:
+            self._pending[topic] = document
+        self.wake()
+
+    def wake(self) -> None:
+        """Let `take` return; from any thread."""
+        self._loop.call_soon_threadsafe(self._news.set)
+
+    async def take(self, timeout_s: float) -> dict[str, bytes]:
+        """What is new; nothing when nothing is for so long [s]."""
+        try:
+            await asyncio.wait_for(self._news.wait(), timeout_s)
+        except TimeoutError:
+            return {}
+        self._news.clear()
+        with self._lock:
+            taken, self._pending = self._pending, {}
+        return taken
+
+
+class Hub:
+    """Documents as JSON, each replaced as a whole; from any thread."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._documents: dict[str, bytes] = {}
+        self._followers: set[Follower] = set()
+        self._closed = False
+
+    @property
+    def closed(self) -> bool:
+        """Whether nothing comes any more."""
+        return self._closed
+
+    @property
+    def full(self) -> bool:
+        """Whether no more may follow."""
+        return len(self._followers) >= MOST_FOLLOWERS
+
+    def put(self, topic: str, document: object) -> None:
+        """Replace a document; followers hear of it when it differs."""
+        encoded = msgspec.json.encode(document)
+        with self._lock:
+            if self._documents.get(topic) == encoded:
+                return
+            self._documents[topic] = encoded
+            for follower in self._followers:
+                follower.offer(topic, encoded)
+
+    def all(self) -> bytes:
+        """All documents as one JSON object."""
+        with self._lock:
+            return msgspec.json.encode({topic: msgspec.Raw(document) for topic, document in self._documents.items()})
+
+    @contextmanager
+    def following(self) -> Iterator[Follower]:
+        """A follower for the time of the with statement, which begins with all documents.
+
+        Raises:
+            HubFullError: too many follow.
+        """
+        with self._lock:
+            if self.full:
+                raise HubFullError
+            follower = Follower(self._documents)
+            self._followers.add(follower)
+        try:
+            yield follower
+        finally:
+            with self._lock:
+                self._followers.discard(follower)
+
+    def close(self) -> None:
+        """Nothing comes any more: let every follower end."""
+        with self._lock:
+            self._closed = True
+            for follower in self._followers:
+                follower.wake()

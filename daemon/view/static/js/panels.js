@@ -1,0 +1,137 @@
+// Tiles, tables and sentences.
+import { bar, byId, element, row, text } from "./dom.js";
+import { clock, joint, milliseconds, mm, span, whole, words } from "./format.js";
+
+const last = (values) => values?.findLast((value) => value !== null);
+
+export function tiles({ sampler, learner, series }) {
+  const status = learner?.status;
+  text("tile-error", mm(status?.prequential_m[status.answering]));
+  text("tile-claimed", mm(status?.claimed_error_m));
+  text("tile-pairs", whole(status?.pairs ?? sampler?.status?.pairs));
+  const tool = status && status.pairs_since_change < status.pairs ? `, ${whole(status.pairs_since_change)} with this tool` : "";
+  text("tile-pairs-label", `pairs learnt${tool}`);
+  text("tile-rate", sampler?.answers ? sampler.status.pairs_per_s.toFixed(1) : "–");
+  text("tile-predict", learner?.answers ? milliseconds(last(series?.predict_s)) : "–");
+  text("tile-model", status?.answering ?? "–");
+  text("tile-model-label", status?.model ? `answers, version ${status.model.slice(0, 8)}` : "answers");
+}
+
+export function pills({ sampler, learner }) {
+  for (const [name, process] of [["sampler", sampler], ["learner", learner]]) {
+    const pill = byId(`pill-${name}`);
+    const state = process?.answers ? process.status.state : process ? (process.heard ? "gone" : "not there") : "…";
+    const health = process?.status?.health ?? [];
+    const calm = ["paused", "ended", "waiting", "aligning"].includes(state) || health.length > 0;
+    pill.className = `pill ${!process ? "" : !process.answers || state === "failed" ? "bad" : calm ? "warn" : "good"}`;
+    pill.querySelector("b").textContent = state;
+  }
+}
+
+export function outlook({ learner, outlook: sentence }) {
+  const found = learner?.status?.outlook;
+  text("outlook", found && sentence ? sentence : "Not known yet: the learner says so after its first solution.");
+  const table = byId("forecast");
+  table.hidden = !found;
+  if (!found) return;
+  const differs = found.best_motion_m.some((error, k) => error !== found.like_so_far_m[k]);
+  table.tHead.replaceChildren(row(element("th", {}, ""), ...["now", ...found.further_pairs.map((pairs) => `+${pairs} pairs`)].map((name) => element("th", { scope: "col" }, name))));
+  const rows = [row("as so far", mm(found.error_m), ...found.like_so_far_m.map(mm))];
+  if (differs) {
+    rows.push(row(found.best_motion, mm(found.error_m), ...found.best_motion_m.map(mm)));
+    rows[1].className = "best";
+  }
+  table.tBodies[0].replaceChildren(...rows);
+}
+
+// The joints that the best motion names, unless it is no better than going on.
+function movedNext(found, joints) {
+  if (!found || found.best_motion_m.every((error, k) => error === found.like_so_far_m[k])) return new Set();
+  const named = new Set(found.best_motion.split(/[\s,]+/));
+  const some = joints.filter((name) => named.has(name));
+  return new Set(some.length ? some : joints);
+}
+
+export function coverage({ sampler, learner, robot }) {
+  const ranges = Object.entries(sampler?.status?.coverage ?? {});
+  const next = movedNext(learner?.status?.outlook, ranges.map(([name]) => name));
+  const items = ranges.map(([name, range]) => {
+    const slides = robot?.slides.includes(name);
+    const width = range.upper_limit - range.lower_limit || 1;
+    const share = (value) => Math.min(Math.max((value - range.lower_limit) / width, 0), 1);
+    const [from, to] = [share(range.low), share(range.high)];
+    const seen = `${joint(range.low, slides)} … ${joint(range.high, slides)}`;
+    const ends = [["", joint(range.lower_limit, slides)], ["seen", seen], ["", joint(range.upper_limit, slides)]];
+    return element(
+      "li", { className: next.has(name) ? "next" : "" },
+      element("span", { className: "name", title: name }, name), bar(from, to, true),
+      element("span", { className: "share" }, `${Math.round(100 * (to - from))} %`),
+      element("span", { className: "ends" }, ...ends.map(([kind, value]) => element("span", { className: kind }, value))),
+    );
+  });
+  byId("coverage").replaceChildren(...items);
+}
+
+export function rejected({ sampler }) {
+  const status = sampler?.status;
+  const reasons = Object.entries(status?.rejected ?? {}).sort((a, b) => b[1] - a[1]);
+  const total = reasons.reduce((sum, [, count]) => sum + count, 0);
+  text("frames", status ? `${whole(total)} of ${whole(status.frames)} frames since the sampler started.` : "");
+  byId("rejected").hidden = !reasons.length;
+  const rows = reasons.map(([reason, count]) => row(words(reason), barCell(count / reasons[0][1]), whole(count), `${((100 * count) / Math.max(status.frames, 1)).toFixed(1)} %`));
+  byId("rejected").tBodies[0].replaceChildren(...rows);
+}
+
+export function segments({ segments: found }) {
+  const newest = [...(found ?? [])].reverse();
+  const most = Math.max(1, ...newest.map((segment) => segment.pairs));
+  const rows = newest.map((segment, k) => {
+    const made = row(String(segment.segment), `${segment.complete ? "" : "≥ "}${whole(segment.pairs)}`, barCell(segment.pairs / most), segment.pairs > 1 ? span(segment.lasted_s) : "–", clock(Date.parse(segment.utc) / 1e3));
+    if (k === 0) made.className = "now";
+    return made;
+  });
+  byId("segments").tBodies[0].replaceChildren(...rows);
+}
+
+// What the learner suspects to have changed: a list of kinds with what it says of each. Not every learner tells.
+export function suspicions({ learner }) {
+  const found = learner?.status?.changes;
+  const entries = Array.isArray(found) ? found : [];
+  byId("suspicions").hidden = !entries.length;
+  byId("suspicions").replaceChildren(...entries.map((entry) => element("li", {}, typeof entry === "object" ? fields(entry) : String(entry))));
+}
+
+function fields(entry) {
+  const told = Object.entries(entry).filter(([, value]) => value !== null);
+  return told.map(([name, value]) => (typeof value === "number" && !Number.isInteger(value) ? `${words(name)} ${value.toPrecision(3)}` : `${words(name)} ${value}`)).join(", ");
+}
+
+export function models({ learner, course }) {
+  const versions = [...(course?.versions ?? [])].reverse();
+  byId("versions").tBodies[0].replaceChildren(...versions.map((version, k) => {
+    const pairs = version.first_pairs === version.pairs ? whole(version.pairs) : `${whole(version.first_pairs)}–${whole(version.pairs)}`;
+    const named = `${version.answering}${version.after_change ? ", new tool" : ""}`;
+    const made = row(clock(version.since), named, pairs, mm(version.error_m), element("td", {}, element("code", {}, version.model.slice(0, 8))));
+    if (k === 0) made.className = "now";
+    return made;
+  }));
+  const status = learner?.status;
+  const errors = Object.entries(status?.prequential_m ?? {}).sort((a, b) => a[1] - b[1]);
+  const worst = Math.max(1e-12, ...errors.map(([, error]) => error));
+  byId("models").hidden = !errors.length;
+  byId("models").tBodies[0].replaceChildren(...errors.map(([name, error]) => {
+    const made = row(name, barCell(error / worst), mm(error));
+    if (name === status.answering) made.className = "now";
+    return made;
+  }));
+}
+
+export function footer({ robot, sampler, learner }) {
+  const versions = [robot && `page ${robot.version}`, sampler?.status && `sampler ${sampler.status.version}`, learner?.status && `learner ${learner.status.version}`];
+  const store = sampler?.status?.store;
+  text("footer", [...versions.filter(Boolean), store && `store ${store}`].filter(Boolean).join(" · "));
+}
+
+function barCell(share) {
+  return element("td", { className: "wide" }, bar(0, share));
+}

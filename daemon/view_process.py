@@ -1,0 +1,48 @@
+"""The page as a process beside those that work."""
+
+from __future__ import annotations
+
+import logging
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib.util import find_spec
+from pathlib import Path
+
+from daemon.signals import with_parent
+from interfaces.errors import ConfigError
+
+log = logging.getLogger(__name__)
+
+END_LIMIT_S = 5.0
+PORT = 8420
+NEEDED = ("starlette", "uvicorn")
+
+
+def require_extra() -> None:
+    """ConfigError unless the extra `view` is installed."""
+    if any(find_spec(name) is None for name in NEEDED):
+        raise ConfigError("the page needs the extra `view`", remedy="Install it: `pip install 'bodyschema[view]'`")
+
+
+@contextmanager
+def shown(robot_file: Path, port: int = PORT) -> Iterator[subprocess.Popen[bytes]]:
+    """The page beside this process, from here to the end of the with statement.
+
+    What becomes of the page is no matter of life for whoever is shown: a port that is taken is a line in the log.
+    """
+    command = [sys.executable, "-m", "daemon", "view", "--robot", str(robot_file), "--port", str(port)]
+    process = subprocess.Popen(command, stdin=subprocess.DEVNULL, env=os.environ | with_parent(), process_group=0)
+    try:
+        yield process
+    finally:
+        process.terminate()
+        try:
+            code = process.wait(END_LIMIT_S)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            code = process.wait()
+        if code > 0:
+            log.warning("the page had ended with exit code %d; its message is above", code)

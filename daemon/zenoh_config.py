@@ -1,0 +1,134 @@
+"""The table [zenoh] of robot.toml: where the processes are, and who may reach them."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from interfaces.errors import ConfigError
+from interfaces.toml_file import line_of
+
+from .access import Names, Subjects, access_control
+from .identity import SECURE, Identity, LoginConfig, Route, TlsConfig, is_local
+
+# Sockets in the file system have no port.
+ENDPOINT = re.compile(r"(tcp|udp|tls|quic|ws)/.+:[0-9]+|unixsock-stream/.+")
+PROCESSES = ("sampler", "learner")
+HOW_TO = "docs/security.md shows how"
+
+
+class ZenohConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The table [zenoh].
+
+    Attributes:
+        sampler, learner: where the two processes listen. Beyond this machine only with `tls` and `access`.
+        router: where machines meet: both processes connect to it too, and whoever does not find them here asks there;
+            empty where there is none.
+        tls: certificates; needed for every endpoint that is not on this machine.
+        login: name and password for a router or a process that asks for them.
+        users_file: lines `user:password` of those who may connect to the processes, in the place of certificates.
+        access: who may do what at the processes, where they listen beyond this machine.
+    """
+
+    sampler: str = "tcp/127.0.0.1:7447"
+    learner: str = "tcp/127.0.0.1:7448"
+    router: str = ""
+    tls: TlsConfig | None = None
+    login: LoginConfig | None = None
+    users_file: str | None = None
+    access: Names | None = None
+
+    def endpoint(self, process: str) -> str:
+        """Where `sampler` or `learner` listens."""
+        return self.learner if process == "learner" else self.sampler
+
+    def identity(self, folder: Path) -> Identity | None:
+        """Who this machine is to others; None without certificates. ConfigError where its files cannot be used."""
+        return None if self.tls is None else Identity.of(self.tls, self.login, self.users_file, folder)
+
+    def check(self, file: Path, text: str) -> None:
+        """ConfigError with the line for what is no endpoint, or open to the network without protection."""
+
+        def refuse(key: str, what: str, remedy: str) -> None:
+            raise ConfigError(f"zenoh.{key}{what}", file=file, line=line_of(text, ("zenoh", key)), remedy=remedy)
+
+        endpoints = {"sampler": self.sampler, "learner": self.learner, "router": self.router}
+        for name, endpoint in endpoints.items():
+            if name == "router" and not endpoint:
+                continue
+            if not ENDPOINT.fullmatch(endpoint):
+                refuse(name, f": {endpoint!r} is no endpoint", "Write one like tcp/127.0.0.1:7447")
+            if is_local(endpoint):
+                continue
+            if not endpoint.startswith(SECURE):
+                refuse(name, f": {_naked(endpoint)}", f"{_instead(name, endpoint)}; {HOW_TO}")
+            if self.tls is None:
+                refuse(name, f": {endpoint} needs certificates", f"Name them in [zenoh.tls]; {HOW_TO}")
+        if self.sampler == self.learner:
+            refuse("learner", ": sampler and learner have the same endpoint", "Give two")
+        for name in PROCESSES:
+            self._check_listening(name, refuse)
+        self._check_identity(file, text)
+
+    def _check_listening(self, name: str, refuse: Any) -> None:
+        endpoint = self.endpoint(name)
+        if not endpoint.startswith(SECURE):
+            return
+        if self.tls is None or self.tls.certificate is None:
+            refuse(name, f": to listen on {endpoint} takes a certificate", f"Name it in [zenoh.tls]; {HOW_TO}")
+        if self.access is None:
+            refuse(name, f": nobody may do anything on {endpoint}", f"Say who may in [zenoh.access]; {HOW_TO}")
+
+    def _check_identity(self, file: Path, text: str) -> None:
+        if self.tls is None and (self.login is not None or self.users_file is not None):
+            key = "login" if self.login is not None else "users_file"
+            line = line_of(text, ("zenoh", key))
+            remedy = f"Name the certificates in [zenoh.tls]; {HOW_TO}"
+            raise ConfigError(f"zenoh.{key}: passwords go over TLS only", file=file, line=line, remedy=remedy)
+        try:
+            self.identity(file.parent)
+        except ConfigError as error:
+            line = line_of(text, ("zenoh", "tls"))
+            raise ConfigError(error.what, file=file, line=line, remedy=error.remedy) from error
+
+    def route(self, process: str, folder: Path) -> Route:
+        """Where a client finds the process: on this machine, or through the router."""
+        own = self.endpoint(process)
+        endpoints = (own, self.router) if self.router else (own,)
+        return Route(endpoints, self.identity(folder))
+
+    def settings_of(self, process: str, robot: str, folder: Path) -> dict[str, Any]:
+        """zenoh's configuration of the process, apart from what every session of ours has."""
+        connect = [self.sampler] if process == "learner" else []
+        settings: dict[str, Any] = {
+            "listen/endpoints": [self.endpoint(process)],
+            "connect/endpoints": [*connect, self.router] if self.router else connect,
+        }
+        if self.router:
+            # A router passes nothing on between peers, which do not know each other here.
+            settings["mode"] = "router"
+        identity = self.identity(folder)
+        if identity is not None:
+            settings |= identity.settings()
+            if self.endpoint(process).startswith(SECURE):
+                names = self.access or Names()
+                settings["access_control"] = access_control({robot: names}, Subjects(identity.by_user))
+        return settings
+
+
+def _naked(endpoint: str) -> str:
+    protocol = endpoint.partition("/")[0]
+    return f"{endpoint} is open to the network, and {protocol} asks nobody who he is and hides nothing"
+
+
+def _instead(name: str, endpoint: str) -> str:
+    secured = f"tls/{endpoint.partition('/')[2]}"
+    if name == "router":
+        return f"Write {secured}, with [zenoh.tls]"
+    home = f"tcp/127.0.0.1:{endpoint.rpartition(':')[2]}"
+    return (
+        f"Write {home} for this machine alone; for others {secured}, with [zenoh.tls] and [zenoh.access], or a router"
+    )

@@ -1,0 +1,194 @@
+"""Noticing a change from the errors of a model that was learnt before it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from kbmaps.arrays import FloatArray, IntArray
+from kbmaps.chains.belief import ChainBelief
+from kbmaps.changes.kinds import ChangeKind, change_kinds
+from kbmaps.changes.mixture import SIZES, log_ratios
+from kbmaps.changes.onsets import Onsets
+from kbmaps.changes.shared_noise import SharedNoise
+
+# On average at least so many pairs lie between two false alarms, as far as the model's claims are true.
+PAIRS_BETWEEN_FALSE_ALARMS = 100_000.0
+# No single pair counts for more than one that lies so many sigmas away: it may be an outlier.
+CLIPPED_SIGMAS = 4.0
+# So many of the newest pairs tell whether the noise has grown.
+_RECENT = 50
+_CLEARLY = 3.0
+# While nothing is strange, it is enough to look every so many pairs: after a pair beyond so many sigmas, or when a
+# change is so probable, each pair counts.
+LOOK_EVERY, STRANGE_SIGMAS, LOOK_CLOSELY = 5, 3.0, 4.0
+
+
+@dataclass(frozen=True, eq=False)
+class Suspicion:
+    """How probable a change is.
+
+    Attributes:
+        log_odds: logarithm of the Shiryaev-Roberts statistic: of all likelihood ratios together.
+        alarm: whether that is more than `PAIRS_BETWEEN_FALSE_ALARMS` allow without a change.
+        onsets: pairs (m,), counted from the detector's first, from which on the change may be.
+        shares: how probable each of them is (m,), if there was a change.
+        kinds: how probable each kind is (k,), in the order of the detector's kinds, if there was a change.
+    """
+
+    log_odds: float
+    alarm: bool
+    onsets: IntArray
+    shares: FloatArray
+    kinds: FloatArray
+
+    @property
+    def onset(self) -> int:
+        """The most probable first pair of the change."""
+        return int(self.onsets[self.shares.argmax()])
+
+    def interval(self, probability: float = 0.95) -> tuple[int, int]:
+        """Between which pairs the change began, with so much probability."""
+        tail = 0.5 * (1.0 - probability)
+        low, high = np.searchsorted(np.cumsum(self.shares), [tail, 1.0 - tail]).clip(max=len(self.onsets) - 1)
+        # Onsets that are no longer kept lie before the next one that is.
+        return int(self.onsets[low]), int(
+            self.onsets[min(high + 1, len(self.onsets) - 1)] - (high + 1 < len(self.onsets))
+        )
+
+
+class ChangeDetector:
+    """Looks for a change of the tool, the camera or a joint's zero at an unknown pair, of an unknown size.
+
+    The errors r of a model that knows none of the pairs are, with the derivatives J of its chain,
+
+        r_i = J_i (c + θ [i ≥ t]) + e_i
+
+    with c what the model's own belief leaves open (known ever better from these errors), e the noise, partly shared by
+    neighbours, and θ the change from pair t on. For each t that is kept and each kind, θ has a likelihood ratio
+    (Willsky and Jones 1976, there maximised), averaged over sizes. Their sum over t is the statistic of
+    Shiryaev and Roberts: without a change its expectation after n pairs is n, so that the first time it exceeds A
+    comes after A pairs at least on average (Pollak 1987, "Average run lengths of an optimal method of detecting a
+    change in distribution"). So A is the number of pairs between two false alarms.
+
+    Args:
+        belief: what is believed of the chain, by pairs before the first of these.
+        noise: of the whitened errors.
+        noise_m: 1-sigma of a coordinate of one measurement [m]: what small and large changes are.
+        distance_m: usual distance of the marker from the camera [m].
+        pairs_between_false_alarms: on average, at least.
+    """
+
+    def __init__(
+        self,
+        belief: ChainBelief,
+        noise: SharedNoise,
+        noise_m: float,
+        distance_m: float,
+        pairs_between_false_alarms: float = PAIRS_BETWEEN_FALSE_ALARMS,
+    ) -> None:
+        self._belief, self._noise = belief, noise
+        self._root = belief.root[:, np.square(belief.root).any(axis=0)]
+        self.kinds: tuple[ChangeKind, ...] = change_kinds(belief.parameters, distance_m)
+        self._columns = np.concatenate([kind.columns for kind in self.kinds])
+        self._units = np.concatenate([kind.units for kind in self.kinds])
+        ends = np.cumsum([len(kind.columns) for kind in self.kinds])
+        self._places = [slice(end - len(kind.columns), end) for kind, end in zip(self.kinds, ends, strict=True)]
+        self._log_shares = np.log([kind.share for kind in self.kinds])
+        self._sizes = noise_m * np.array(SIZES)
+        self._limit = math.log(pairs_between_false_alarms)
+        known = self._root.shape[1]
+        self._posterior, self._mean = np.eye(known), np.zeros(known)
+        self._onsets = Onsets(known, len(self._columns))
+        self._differences: list[float] = []
+        self._surprises: list[FloatArray] = []
+        self._strange, self._looked_at, self._log_odds = False, 0, -math.inf
+
+    @property
+    def pairs(self) -> int:
+        """How many pairs it has seen."""
+        return self._onsets.pairs
+
+    @property
+    def noise(self) -> SharedNoise:
+        """Of the whitened errors, as given."""
+        return self._noise
+
+    @property
+    def surprises(self) -> FloatArray:
+        """Whitened errors (n, 3) of all pairs, each against what was expected after those before it.
+
+        They are in units of the noise: what was not known of the model is taken out.
+        """
+        return np.array(self._surprises).reshape(-1, 3)
+
+    def add(self, q: FloatArray, errors: FloatArray, variances: FloatArray) -> None:
+        """Pairs that came after those that the model knows, in their order.
+
+        Args:
+            q: where (n, d) [rad, m].
+            errors: measured minus predicted (n, 3) [m].
+            variances: of each coordinate: the measurement's, and what the model misses beyond its belief (n, 3) [m²].
+        """
+        _, jacobian = self._belief.parameters.linearised(self._belief.mean, q)
+        weights = 1.0 / np.sqrt(variances)
+        known = weights[..., None] * (jacobian @ self._root)
+        changed = weights[..., None] * (jacobian[:, :, self._columns] * self._units)
+        for row_known, row_changed, error in zip(known, changed, weights * errors, strict=True):
+            self._add(row_known, row_changed, error)
+
+    def _add(self, known: FloatArray, changed: FloatArray, error: FloatArray) -> None:
+        """One pair's whitened derivatives by what is believed (3, k) and by changes (3, c), and its error (3,)."""
+        expected, gain = known @ self._mean, self._posterior @ known.T
+        covariance = known @ gain
+        spread = math.sqrt(self._noise.single + float(np.trace(covariance)) / 3.0)
+        off = error - expected
+        off = off * min(1.0, CLIPPED_SIGMAS * spread / max(float(np.linalg.norm(off)), 1e-300))
+        if self._surprises:
+            apart = float(np.square(off * math.sqrt(self._noise.single) / spread - self._surprises[-1]).mean()) / 2.0
+            self._differences = [*self._differences[1 - _RECENT :], apart]
+        self._surprises.append(off * math.sqrt(self._noise.single) / spread)
+        error = expected + off
+        self._strange = float(np.linalg.norm(off)) > STRANGE_SIGMAS * spread
+        self._onsets.add(known.T @ changed, changed.T @ changed, changed.T @ error)
+        step = np.linalg.solve(covariance + self._noise.whole * np.eye(3), gain.T)
+        self._mean = self._mean + off @ step
+        self._posterior = self._posterior - gain @ step
+
+    @property
+    def due(self) -> bool:
+        """Whether `suspicion` may have grown enough to be asked for."""
+        late = self.pairs - self._looked_at >= LOOK_EVERY
+        return self.pairs > self._looked_at and (late or self._strange or self._log_odds > LOOK_CLOSELY)
+
+    def sums(self) -> tuple[IntArray, FloatArray, FloatArray]:
+        """What the pairs since each onset (m,) say of all that may change, in metres of the marker's way.
+
+        Returns:
+            The onsets, and the information (m, c, c) and score (m, c) of changes in the order of the kinds.
+        """
+        onsets, crossed, information, score = self._onsets.since()
+        noise = self._grown_noise()
+        variances = noise.of_runs((self.pairs - onsets).astype(np.float64))
+        explained = crossed.transpose(0, 2, 1) @ (self._posterior @ crossed) / noise.whole
+        information = (information - explained) / variances[:, None, None]
+        return onsets, information, (score - np.matvec(crossed.transpose(0, 2, 1), self._mean)) / variances[:, None]
+
+    def suspicion(self) -> Suspicion:
+        """How probable a change is after the pairs so far, at least one."""
+        onsets, information, score = self.sums()
+        terms = np.stack([log_ratios(information[:, at, at], score[:, at], self._sizes) for at in self._places], axis=1)
+        terms += self._log_shares + np.log(self._onsets.weights)[:, None]
+        log_odds = float(np.logaddexp.reduce(terms, axis=None))
+        shares = np.exp(terms - log_odds)
+        self._looked_at, self._log_odds = self.pairs, log_odds
+        return Suspicion(log_odds, log_odds > self._limit, onsets, shares.sum(axis=1), shares.sum(axis=0))
+
+    def _grown_noise(self) -> SharedNoise:
+        """The noise, or more where the newest pairs scatter more: that is no change of the arm."""
+        if len(self._differences) < _RECENT:
+            return self._noise
+        chance = 1.0 + _CLEARLY * math.sqrt(1.0 / _RECENT)
+        return self._noise.times(max(1.0, float(np.mean(self._differences)) / (self._noise.single * chance)))

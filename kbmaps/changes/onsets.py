@@ -1,0 +1,70 @@
+"""What has been summed up since each of the pairs from which on there may be a change."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from kbmaps.arrays import FloatArray, IntArray
+
+# Every one of the newest pairs may be the first of a change; of older ones they thin out by this share of their age.
+SPACING = 0.15
+_SLOTS = 96
+
+
+class Onsets:
+    """Sums over all pairs, and what they were before each onset that is kept.
+
+    Args:
+        known: numbers that are known, with an uncertainty.
+        changes: numbers that may change.
+    """
+
+    def __init__(self, known: int, changes: int) -> None:
+        self._crossed, self._information = np.zeros((known, changes)), np.zeros((changes, changes))
+        self._score = np.zeros(changes)
+        self._crossed_before = np.zeros((_SLOTS, known, changes))
+        self._information_before = np.zeros((_SLOTS, changes, changes))
+        self._score_before = np.zeros((_SLOTS, changes))
+        self._onset = np.zeros(_SLOTS, dtype=np.intp)
+        self._slots: list[int] = []
+        self._free = list(range(_SLOTS))
+        self.pairs = 0
+
+    @property
+    def weights(self) -> FloatArray:
+        """How many pairs each onset stands for (m,), itself and those after it that are no longer kept."""
+        onsets = self._onset[self._slots]
+        return np.diff(np.append(onsets, self.pairs)).astype(np.float64)
+
+    def add(self, crossed: FloatArray, information: FloatArray, score: FloatArray) -> None:
+        """One more pair: D'C (k, c), C'C (c, c) and C'r (c,) of its derivatives D, C and its error r."""
+        slot = self._free.pop()
+        self._onset[slot] = self.pairs
+        self._crossed_before[slot], self._information_before[slot] = self._crossed, self._information
+        self._score_before[slot] = self._score
+        self._slots.append(slot)
+        self._crossed += crossed
+        self._information += information
+        self._score += score
+        self.pairs += 1
+        self._thin()
+
+    def since(self) -> tuple[IntArray, FloatArray, FloatArray, FloatArray]:
+        """Onsets (m,), ascending, and the sums from each of them on: (m, k, c), (m, c, c) and (m, c)."""
+        slots = self._slots
+        return (
+            self._onset[slots],
+            self._crossed - self._crossed_before[slots],
+            self._information - self._information_before[slots],
+            self._score - self._score_before[slots],
+        )
+
+    def _thin(self) -> None:
+        """Drop the newest onset whose neighbours are near enough to each other for their age, all but the first."""
+        for k in range(len(self._slots) - 2, 0, -1):
+            before, after = self._onset[self._slots[k - 1]], self._onset[self._slots[k + 1]]
+            if after - before <= SPACING * (self.pairs - after):
+                self._free.append(self._slots.pop(k))
+                return
+        if not self._free:
+            self._free.append(self._slots.pop(1))

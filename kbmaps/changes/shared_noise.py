@@ -1,0 +1,116 @@
+"""How much of their noise neighbours on a path share, and how little a run of them therefore says."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import ndtr, stdtrit  # pyright: ignore[reportMissingTypeStubs, reportUnknownVariableType]
+
+from kbmaps.arrays import FloatArray, frozen
+
+# Errors of a model are shared by about so many neighbours of a path, where nothing is known of it: 20 degrees of it.
+USUALLY_SHARED = 10
+# Sums over longer lags than this, or than this share of the series, would be more noise than sum.
+_LONGEST_LAG, _LONGEST_LAG_SHARE = 200, 0.125
+# Neighbours share something where their products are so many standard errors above 0.
+_CLEARLY = 2.0
+# A Gaussian coordinate is so far out once in as many pairs as lie between false alarms [sigmas]: there the estimated
+# variance has to hold.
+_TAIL_SIGMAS = 4.5
+# Longer runs than that are as such.
+_LONGEST_RUN = 1000
+# A fit takes at most this share of what neighbours share.
+_MOST_TAKEN = 0.8
+
+
+@dataclass(frozen=True, eq=False)
+class SharedNoise:
+    """The variance of whitened residuals, and of means of runs of neighbours times their length.
+
+    Attributes:
+        variances: n times the variance of the mean of n neighbours, for n = 1, 2, ... (m,); constant from there on.
+            A model that errs may err alike all along a walk: a change has to be larger than that, however many pairs
+            show it.
+        whole: the same of all pairs of a long walk, where such errors are of all signs.
+    """
+
+    variances: FloatArray
+    whole: float
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "variances", frozen(self.variances))
+
+    @property
+    def single(self) -> float:
+        """Variance of one residual."""
+        return float(self.variances[0])
+
+    def of_runs(self, lengths: FloatArray) -> FloatArray:
+        """n times the variance of the mean of n neighbours, for these n (m,)."""
+        return self.variances[np.minimum(lengths.astype(np.intp), len(self.variances)) - 1]
+
+    @classmethod
+    def claimed(cls, share: float) -> SharedNoise:
+        """That of residuals of unit variance, of which this share is a model's error and so shared by neighbours."""
+        alike = 1.0 + share * np.arange(_LONGEST_RUN if share > 0.0 else 1, dtype=np.float64)
+        return cls(alike, 1.0 + share * (USUALLY_SHARED - 1))
+
+    @classmethod
+    def of(cls, residuals: FloatArray, used: float = 0.0) -> SharedNoise:
+        """That of residuals (n, 3), n at least 2, in their order, as large as it may well be.
+
+        n Var(mean of n) = γ_0 + 2 Σ_{k<n} (1 − k/n) γ_k with the autocovariances γ, for as long as pairs of
+        neighbouring lags stay positive (Geyer 1992, initial positive sequence). A variance of ν independent parts makes
+        a Gaussian a Student variable, which is far out more often: the variances are raised by as much.
+
+        Args:
+            used: how many numbers were fitted to the residuals.
+        """
+        n = len(residuals)
+        square = float(np.square(residuals).mean()) * 3 * n / max(3 * n - used, n)
+        kept = _autocovariances(residuals, _CLEARLY * square * math.sqrt(2.0 / (3.0 * n)))
+        lengths = np.arange(1, len(kept) + 2)
+        shares = np.maximum(1.0 - np.arange(1, len(kept) + 1) / lengths[:, None], 0.0)
+        variances = square + 2.0 * shares @ kept
+        together = np.maximum(variances / square, 1.0)
+        if len(kept):
+            # What neighbours share has fewer independent parts, of which a fit takes more: new pairs show more of it.
+            taken = min(used * float(together[-1]) / (3.0 * n), _MOST_TAKEN)
+            alone = max(square - max(float(kept[0]), 0.0), 0.0)
+            variances = alone + (variances - alone) / (1.0 - taken)
+        variances = np.maximum.accumulate(variances * _raised(3.0 * n / together))
+        whole = float(variances[-1])
+        if len(kept):
+            longer = np.append(variances, np.full(max(_LONGEST_RUN - len(variances), 0), whole))
+            variances = np.maximum(longer, square + max(float(kept[0]), 0.0) * np.arange(len(longer)))
+        return cls(variances, whole)
+
+    def at_least(self, other: SharedNoise) -> SharedNoise:
+        """The larger of both."""
+        lengths = np.arange(1.0, max(len(self.variances), len(other.variances)) + 1)
+        variances = np.maximum(self.of_runs(lengths), other.of_runs(lengths))
+        return SharedNoise(variances, max(self.whole, other.whole))
+
+    def times(self, factor: float) -> SharedNoise:
+        """With all variances multiplied."""
+        return SharedNoise(factor * self.variances, factor * self.whole)
+
+
+def _autocovariances(residuals: FloatArray, chance: float) -> FloatArray:
+    """Those of residuals (n, 3) at lags 1, 2, ... for as long as neighbours clearly share something, perhaps none."""
+    n = len(residuals)
+    longest = min(int(n * _LONGEST_LAG_SHARE), _LONGEST_LAG) // 2 * 2
+    lags = np.array([float(np.vdot(residuals[k:], residuals[:-k])) / (3 * (n - k)) for k in range(1, longest + 1)])
+    pairs = lags.reshape(-1, 2).sum(axis=1)
+    if not len(pairs) or pairs[0] <= chance:
+        return np.empty(0)
+    ends = np.flatnonzero(pairs <= 0.0)
+    return lags[: 2 * (int(ends[0]) if len(ends) else len(pairs))]
+
+
+def _raised(parts: FloatArray) -> FloatArray:
+    """By how much variances of so many independent parts have to be raised."""
+    tail = float(ndtr(-_TAIL_SIGMAS))
+    return np.square(stdtrit(np.maximum(parts, 3.0), 1.0 - tail) / _TAIL_SIGMAS)

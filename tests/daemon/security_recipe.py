@@ -1,0 +1,43 @@
+"""docs/security.md carried out: its openssl lines, its tables, and the files of deploy/."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+PAGE = ROOT / "docs" / "security.md"
+SEVERAL, TWO = ROOT / "deploy" / "several_machines", ROOT / "deploy" / "two_machines"
+OPENSSL_S = 60.0
+
+
+def blocks(language: str) -> list[str]:
+    """The page's blocks of code in a language, in order."""
+    return re.findall(rf"^```{language}\n(.*?)^```", PAGE.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE)
+
+
+def carried_out(folder: Path) -> Path:
+    """`folder` with the certificates that the page's lines make there."""
+    script = "set -eu\n" + "\n".join(blocks("bash"))
+    command = ["bash", "-c", script]
+    try:
+        done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=OPENSSL_S, check=False)
+    except FileNotFoundError:
+        pytest.skip("there is no bash here")
+    if "openssl: command not found" in done.stderr:
+        pytest.skip("there is no openssl here")
+    assert done.returncode == 0, done.stderr
+    assert "anna.pem: OK" in done.stdout
+    return folder
+
+
+def table(file: Path, **changed: str) -> str:
+    """A file of deploy/ with some strings in the place of others: `old` of the keyword `new=old`."""
+    text = file.read_text(encoding="utf-8")
+    for new, old in changed.items():
+        assert old in text
+        text = text.replace(old, new)
+    return text

@@ -1,0 +1,309 @@
+"""`bodyschema backup` and `bodyschema restore`."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+import threading
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from guided_arm import Scene, new_learning, teach
+from small_arm import URDF, write_small_arm
+
+from daemon.backup import MANIFEST, ROBOT_TOML, STORE, Backup, BackupError, write_backup
+from daemon.bus import Bus
+from daemon.checkpoint import read_checkpoint, write_checkpoint
+from daemon.cli import command_line
+from daemon.config import Config
+from daemon.keys import Keys
+from daemon.learning import LearningState
+from daemon.restoring import restore
+from daemon.session import session_of
+from daemon.store import PairReader, PairStore
+from interfaces.clock import SystemClock
+from interfaces.errors import StoreError
+from interfaces.records import MarkerFix, frozen_array
+
+UTC = "2026-11-21T12:00:00.000+00:00"
+COV = frozen_array(np.eye(3) * 1e-6)
+PAIRS = 20
+
+
+def fill(store: PairStore, count: int) -> None:
+    for k in range(count):
+        fix = MarkerFix(float(k), frozen_array([0.1 * k, 0.2, 1.0]), COV)
+        store.append(1, UTC, frozen_array([0.01 * k, -0.1]), fix)
+
+
+def stored(file: Path) -> list[tuple[int, list[float]]]:
+    with PairReader(file) as pairs:
+        return [(pair.seq, pair.x.tolist()) for pair in pairs.read()]
+
+
+@pytest.fixture
+def config(tmp_path: Path, free_endpoint: Callable[[], str]) -> Config:
+    """A robot with pairs and no checkpoint."""
+    folder = tmp_path / "robot"
+    folder.mkdir()
+    zenoh = f'[zenoh]\nsampler = "{free_endpoint()}"\nlearner = "{free_endpoint()}"\n'
+    config = Config.load(write_small_arm(folder, zenoh + '[daemon]\nstate_dir = "state"\n'), {})
+    with PairStore(config.store_file, session_of(config, SystemClock())) as store:
+        fill(store, PAIRS)
+    return config
+
+
+@pytest.fixture(scope="module")
+def learnt() -> LearningState:
+    learning = new_learning()
+    teach(learning, Scene.draw(0, 5).pairs, background=False)
+    return learning.state()
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    return tmp_path / "arm.zip"
+
+
+@pytest.fixture
+def backed_up(config: Config, file: Path) -> Path:
+    write_backup(config, file, utc=UTC, version="0")
+    return file
+
+
+def put_back(file: Path, robot: Path, *, force: bool = False) -> Config:
+    with Backup(file) as backup:
+        restore(backup, robot, force=force)
+    return Config.load(robot, {})
+
+
+@pytest.fixture
+def elsewhere(tmp_path: Path) -> Path:
+    return tmp_path / "other" / "robot.toml"
+
+
+def test_what_is_restored_on_another_machine_is_what_was_backed_up(config, backed_up, elsewhere) -> None:
+    again = put_back(backed_up, elsewhere)
+    assert stored(again.store_file) == stored(config.store_file)
+    assert elsewhere.read_bytes() == config.file.read_bytes()
+    assert elsewhere.with_name("arm.urdf").read_text() == URDF
+
+
+def test_pairs_go_on_after_the_newest_that_was_restored(backed_up, elsewhere) -> None:
+    again = put_back(backed_up, elsewhere)
+    with PairStore(again.store_file, session_of(again, SystemClock())) as store:
+        fill(store, 1)
+    assert stored(again.store_file)[-1][0] == PAIRS + 1
+
+
+def test_a_backup_of_a_running_sampler_has_every_pair_to_its_last(config, file) -> None:
+    sampling, enough = threading.Event(), threading.Event()
+
+    def sample() -> None:
+        with PairStore(config.store_file, session_of(config, SystemClock())) as store:
+            while not enough.is_set():
+                fill(store, 10)
+                sampling.set()
+
+    thread = threading.Thread(target=sample)
+    thread.start()
+    try:
+        assert sampling.wait(30)
+        made = write_backup(config, file, utc=UTC, version="0")
+    finally:
+        enough.set()
+        thread.join()
+    with zipfile.ZipFile(file) as archive:
+        archive.extract(STORE, file.parent)
+    assert [seq for seq, _ in stored(file.parent / STORE)] == list(range(1, made.last_seq + 1))
+    assert made.last_seq > PAIRS
+
+
+def test_the_checkpoint_goes_on_with_the_restored_store(config, file, elsewhere, learnt) -> None:
+    with PairReader(config.store_file) as pairs:
+        learnt.header.counters.store = pairs.identity
+    write_checkpoint(config.checkpoint_file, learnt, robot="arm", utc=UTC)
+    write_backup(config, file, utc=UTC, version="0")
+    again = put_back(file, elsewhere)
+    state = read_checkpoint(again.checkpoint_file, robot="arm")
+    with PairReader(again.store_file) as pairs:
+        assert state.header.counters.store == pairs.identity
+    assert state.header.counters.pairs == learnt.header.counters.pairs
+
+
+def test_a_restored_store_is_another_one_so_that_no_learner_mixes_it_with_the_first(
+    config, backed_up, elsewhere
+) -> None:
+    again = put_back(backed_up, elsewhere)
+    with PairReader(config.store_file) as one, PairReader(again.store_file) as other:
+        assert one.identity != other.identity
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """Of all files but locks, which are always empty."""
+    files = [path for path in folder.rglob("*") if path.is_file() and path.suffix != ".lock"]
+    return {str(path.relative_to(folder)): path.read_bytes() for path in files}
+
+
+def refused(file: Path, robot: Path) -> str:
+    """The message with which a backup is refused; nothing is other than before."""
+    robot.parent.mkdir(exist_ok=True)
+    before = contents(robot.parent)
+    with pytest.raises((BackupError, StoreError)) as refusal:
+        put_back(file, robot)
+    assert contents(robot.parent) == before
+    return str(refusal.value)
+
+
+def test_what_is_there_is_not_overwritten(config, backed_up) -> None:
+    message = refused(backed_up, config.file)
+    assert f"{config.store_file}: there already, and not what {backed_up} has" in message
+    assert "Give --force" in message
+
+
+def test_force_keeps_what_was_there_under_another_name(config, backed_up) -> None:
+    with PairStore(config.store_file, session_of(config, SystemClock())) as store:
+        fill(store, 5)
+    put_back(backed_up, config.file, force=True)
+    kept = config.store_file.with_name("pairs.sqlite.before-restore-1")
+    assert (len(stored(config.store_file)), len(stored(kept))) == (PAIRS, PAIRS + 5)
+
+
+def test_another_robot_toml_is_not_overwritten(backed_up, elsewhere) -> None:
+    elsewhere.parent.mkdir()
+    elsewhere.write_text("# mine\n")
+    assert f"{elsewhere}: there already" in refused(backed_up, elsewhere)
+
+
+def test_a_sampler_that_writes_the_store_is_not_disturbed(config, backed_up) -> None:
+    with (
+        PairStore(config.store_file, session_of(config, SystemClock())),
+        pytest.raises(StoreError, match="another sampler is writing"),
+    ):
+        put_back_in_another_process(backed_up, config)
+
+
+def put_back_in_another_process(file: Path, config: Config) -> None:
+    """The lock is a process's: this one's own would not be in its way."""
+    command = [sys.executable, "-m", "daemon", "restore", file, "--robot", config.file, "--force"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    if done.returncode:
+        raise StoreError(done.stderr)
+
+
+def test_a_running_learner_is_to_be_stopped_first(config, backed_up, elsewhere) -> None:
+    with Bus(listen=config.tables.zenoh.learner) as bus:
+        bus.token(Keys("arm").alive("learner"))
+        assert "the learner of arm runs. Nothing was changed. Stop it first" in refused(backed_up, elsewhere)
+
+
+# --- files that are no backups
+
+
+def altered(file: Path, change: Callable[[dict[str, bytes]], None]) -> Path:
+    with zipfile.ZipFile(file) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    change(members)
+    other = file.with_name("altered.zip")
+    with zipfile.ZipFile(other, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, data in members.items():
+            archive.writestr(name, data)
+    return other
+
+
+def test_a_damaged_store_in_it_is_refused(backed_up, elsewhere) -> None:
+    def damage(members: dict[str, bytes]) -> None:
+        members[STORE] = members[STORE][:-1] + b"x"
+
+    assert f"{STORE} in" in (said := refused(altered(backed_up, damage), elsewhere))
+    assert "its checksum does not match" in said
+
+
+def test_a_file_that_unpacks_to_more_than_it_says_is_refused(backed_up, elsewhere) -> None:
+    def swell(members: dict[str, bytes]) -> None:
+        members[STORE] += bytes(10**7)
+
+    assert "its checksum does not match" in refused(altered(backed_up, swell), elsewhere)
+
+
+@pytest.mark.parametrize("name", ["robot/../../escaped", "/etc/escaped", "elsewhere/escaped"])
+def test_a_name_that_leads_elsewhere_is_refused(backed_up, elsewhere, name) -> None:
+    def lead_astray(members: dict[str, bytes]) -> None:
+        manifest = json.loads(members[MANIFEST])
+        manifest["files"][name] = manifest["files"][ROBOT_TOML]
+        members[MANIFEST], members[name] = json.dumps(manifest).encode(), members[ROBOT_TOML]
+
+    assert "it would be written elsewhere" in refused(altered(backed_up, lead_astray), elsewhere)
+
+
+def test_a_file_that_the_manifest_does_not_know_is_refused(backed_up, elsewhere) -> None:
+    stranger = altered(backed_up, lambda members: members.update({"robot/stranger": b"x"}))
+    assert "does not hold the files that its manifest.json says" in refused(stranger, elsewhere)
+
+
+def test_a_backup_of_a_newer_version_is_refused(backed_up, elsewhere) -> None:
+    def renew(members: dict[str, bytes]) -> None:
+        members[MANIFEST] = members[MANIFEST].replace(b'"schema": 1', b'"schema": 2')
+
+    assert "was written by a newer bodyschema (schema 2" in refused(altered(backed_up, renew), elsewhere)
+
+
+@pytest.mark.parametrize("data", [b"", b"my diary", b"PK\x03\x04 not quite"])
+def test_a_file_that_is_no_archive_is_refused(file, elsewhere, data) -> None:
+    file.write_bytes(data)
+    assert f"{file} is no backup, or is damaged" in refused(file, elsewhere)
+
+
+def test_a_torn_backup_is_refused(backed_up, elsewhere) -> None:
+    backed_up.write_bytes(backed_up.read_bytes()[:-100])
+    assert "is no backup, or is damaged" in refused(backed_up, elsewhere)
+
+
+# --- writing one
+
+
+def test_a_backup_that_is_there_is_not_overwritten(config, backed_up) -> None:
+    before = backed_up.read_bytes()
+    with pytest.raises(BackupError, match=r"is there already\. Give another name, or --force"):
+        write_backup(config, backed_up, utc=UTC, version="0")
+    assert backed_up.read_bytes() == before
+
+
+def test_a_backup_that_cannot_be_finished_leaves_the_old_one_and_nothing_else(config, backed_up) -> None:
+    before = backed_up.read_bytes()
+    shutil.rmtree(config.state_dir)
+    with pytest.raises(StoreError, match="there is no store"):
+        write_backup(config, backed_up, utc=UTC, version="0", replace=True)
+    assert backed_up.read_bytes() == before
+    assert sorted(path.name for path in backed_up.parent.iterdir()) == ["arm.zip", "robot"]
+
+
+def test_only_its_owner_reads_it(backed_up) -> None:
+    assert backed_up.stat().st_mode & 0o777 == 0o600
+
+
+def test_a_urdf_in_another_folder_is_kept_and_its_place_is_told(config, file, elsewhere, capsys) -> None:
+    urdf = config.file.parent.parent / "models" / "arm.urdf"
+    urdf.parent.mkdir()
+    config.robot.tree.file.rename(urdf)
+    config.file.write_text(config.file.read_text().replace('"arm.urdf"', '"../models/arm.urdf"'))
+    write_backup(Config.load(config.file, {}), file, utc=UTC, version="0")
+    command_line("restore")(
+        ["restore", str(file), "--robot", str(elsewhere)], exit_on_error=False, result_action="return_value"
+    )
+    kept = elsewhere.parent / "elsewhere" / "arm.urdf"
+    assert kept.read_text() == URDF
+    assert f"put {kept} there" in capsys.readouterr().out
+
+
+def test_the_commands_go_there_and_back(config, file, elsewhere, capsys) -> None:
+    for words in (["backup", file, "--robot", config.file], ["restore", file, "--robot", elsewhere]):
+        command_line(words[0])(list(map(str, words)), exit_on_error=False, result_action="return_value")
+    shown = capsys.readouterr().out
+    assert f"{file}: arm, 20 pairs to number 20, no checkpoint yet" in shown
+    assert f"  {elsewhere}\n" in shown

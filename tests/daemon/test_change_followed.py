@@ -1,0 +1,176 @@
+"""A change that nobody told: it is noticed, dated, followed at once, and can be rolled back."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import msgspec
+import numpy as np
+import pytest
+from guided_arm import NOW_AND_THEN, Scene, built_chain, measured, new_learning, path, teach
+from scipy.spatial.transform import Rotation
+
+from daemon.config import LearnerConfig
+from daemon.learning import Learning, LearningState
+from daemon.learning.adaptation import Origin
+from daemon.learning.arm import KnownArm
+from daemon.learning.claims import Claim
+from daemon.learning.nominal import chain_tolerances
+from daemon.learning.state import LearningHeader
+from daemon.learning.watch import Noticed, Reference
+from interfaces.errors import RequestError
+from interfaces.records import FloatArray
+from kbmaps import ChainBelief, ChainParameters, RigidChain, change_kinds, learning_bases
+
+SIGMA, TAUGHT, SINCE = 0.002, 180, 40
+# The second joint's zero.
+JOINT = 1
+
+
+def with_camera_moved(chain: RigidChain) -> RigidChain:
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_rotvec([0.0, np.radians(2.0), 0.0]).as_matrix()
+    pose[:3, 3] = 0.01, 0.0, 0.01
+    return chain.transformed(pose)
+
+
+def with_zero_moved(chain: RigidChain) -> RigidChain:
+    fixed = chain.fixed.copy()
+    fixed[JOINT + 1, :3, :3] = (
+        Rotation.from_rotvec(np.radians(3.0) * chain.axes[JOINT]).as_matrix() @ fixed[JOINT + 1, :3, :3]
+    )
+    # The zero turns all that comes after the joint.
+    fixed[JOINT + 1, :3, 3] = Rotation.from_rotvec(np.radians(3.0) * chain.axes[JOINT]).apply(fixed[JOINT + 1, :3, 3])
+    return RigidChain(fixed, chain.axes, chain.prismatic)
+
+
+CHANGES = {
+    "tool": lambda chain: chain.with_tool([0.012, 0.009, 0.02]),
+    "camera": with_camera_moved,
+    "joint": with_zero_moved,
+}
+
+
+@dataclass(frozen=True)
+class Followed:
+    """A learner before and after a change that it was not told of."""
+
+    kind: str
+    learning: Learning
+    before: RigidChain
+    after: RigidChain
+    q: FloatArray
+    noticed_at: int
+
+    @classmethod
+    def draw(cls, kind: str) -> Followed:
+        rng = np.random.default_rng(5)
+        before, q = built_chain(rng), path(rng, TAUGHT + SINCE)
+        after = CHANGES[kind](before)
+        learning, noticed = new_learning(settings=LearnerConfig(replays_per_pair=0.0)), 0
+        teach(learning, measured(before, q[:TAUGHT], rng, sigma_m=SIGMA), every=NOW_AND_THEN)
+        assert learning.counters.changes == 0
+        for pair in measured(after, q[TAUGHT:], rng, first=TAUGHT + 1, sigma_m=SIGMA):
+            teach(learning, [pair], background=pair.seq % NOW_AND_THEN == 0)
+            if learning.counters.changes and not noticed:
+                noticed = pair.seq
+        while learning.work():
+            pass
+        return cls(kind, learning, before, after, q, noticed)
+
+    def error_m(self, chain: RigidChain) -> float:
+        return Scene(chain, self.q[TAUGHT:], []).error_m(self.learning)
+
+
+@pytest.fixture(
+    scope="module",
+    params=["joint", pytest.param("tool", marks=pytest.mark.soak), pytest.param("camera", marks=pytest.mark.soak)],
+)
+def followed(request: pytest.FixtureRequest) -> Followed:
+    return Followed.draw(request.param)
+
+
+def test_it_is_noticed_once_and_within_ten_pairs(followed: Followed) -> None:
+    assert followed.learning.counters.changes == 1
+    assert TAUGHT < followed.noticed_at <= TAUGHT + 10
+
+
+def test_it_is_dated(followed: Followed) -> None:
+    change = followed.learning.change
+    assert change is not None
+    assert change.earliest_seq - 2 <= TAUGHT + 1 <= change.latest_seq + 2
+
+
+def test_what_it_was_is_among_the_probable_kinds_and_nothing_else_is_named(followed: Followed) -> None:
+    change = followed.learning.change
+    assert change is not None
+    named = change.named
+    assert named is None or (named.name, named.joint) == (followed.kind, JOINT if followed.kind == "joint" else None)
+    assert followed.kind in [kind.name for kind in change.kinds if kind.probability > 0.05]
+
+
+def test_the_learner_answers_for_the_arm_as_it_is_now(followed: Followed) -> None:
+    assert followed.error_m(followed.after) < 0.4 * followed.error_m(followed.before)
+
+
+def test_a_learner_that_was_restored_can_be_rolled_back(followed: Followed) -> None:
+    restored = new_learning()
+    restored.restore(followed.learning.state())
+    restored.rollback()
+    here = Scene(followed.before, followed.q[:TAUGHT], [])
+    there = Scene(followed.after, followed.q[:TAUGHT], [])
+    assert here.error_m(restored) < 0.5 * there.error_m(restored)
+
+
+def test_rolled_back_it_answers_as_before_the_change_and_learns_no_pair_again(followed: Followed) -> None:
+    restored = new_learning()
+    restored.restore(followed.learning.state())
+    restored.rollback()
+    counters = restored.counters
+    assert (counters.pairs, counters.last_seq) == (TAUGHT + SINCE, TAUGHT + SINCE)
+    assert restored.change is None
+    change = followed.learning.change
+    assert change is not None
+    assert abs(len(restored.state().arrays["q"]) - TAUGHT) <= abs(change.first_seq - 1 - TAUGHT)
+
+
+def test_without_a_change_there_is_nothing_to_roll_back() -> None:
+    with pytest.raises(RequestError, match="there was no change"):
+        new_learning().rollback()
+
+
+def test_a_told_change_can_be_rolled_back() -> None:
+    learning, scene = new_learning(), Scene.draw(0, 30)
+    teach(learning, scene.pairs, every=NOW_AND_THEN)
+    before = learning.snapshot.predict(scene.q).x
+    learning.tool_changed()
+    learning.rollback()
+    np.testing.assert_array_equal(learning.snapshot.predict(scene.q).x, before)
+
+
+def test_a_checkpoint_of_an_older_version_is_gone_on_from() -> None:
+    learning, restored = new_learning(), new_learning()
+    teach(learning, Scene.draw(0, 20).pairs, every=NOW_AND_THEN)
+    state = learning.state()
+    older = msgspec.to_builtins(state.header)
+    del older["change"], older["before"]
+    restored.restore(LearningState(msgspec.convert(older, LearningHeader), state.arrays))
+    assert (restored.counters.pairs, restored.change) == (20, None)
+
+
+@pytest.mark.parametrize("moved_m", [0.0, 0.02])
+def test_a_model_that_predicts_new_pairs_no_better_does_not_take_the_old_one_s_place(moved_m: float) -> None:
+    rng = np.random.default_rng(0)
+    parameters = ChainParameters(built_chain(rng))
+    tolerances = chain_tolerances(LearnerConfig())
+    belief = ChainBelief(parameters, np.zeros(parameters.size), np.diag(np.full(parameters.size, 1e-5)), SIGMA)
+    chain, q = belief.chain, path(rng, 20)
+    x = chain.with_tool([0.0, moved_m, 0.0]).positions(q) + SIGMA * rng.normal(size=(*q.shape[:1], 3))
+    kbmap = chain.to_kbmap(learning_bases(np.full(4, -np.pi), np.full(4, np.pi), [False] * 4))
+    variance = np.full(3, SIGMA**2)
+    reference = Reference(kbmap, kbmap, belief, belief, None, Claim(np.zeros(3)), 500, q, x, variance)
+    kinds, turns = change_kinds(parameters, 1.0), np.full((20, 4), np.nan)
+    seqs, kept = tuple(range(1, 21)), (True,) * 20
+    noticed = Noticed(reference, kinds, SIGMA, 1.0, 0, 0, 0, seqs, kept, q, x, turns)
+    origin = Origin(noticed, KnownArm(belief, tolerances))
+    assert origin.is_better(origin.explain(q, x), q, x) == (moved_m > 0.0)

@@ -1,0 +1,90 @@
+"""What the learner says of a change, in the log and in the status."""
+
+from __future__ import annotations
+
+import logging
+
+import msgspec
+import pytest
+
+from daemon.changes import Changes
+from daemon.learning.change import ChangeRecord, KindOfChange
+
+JOINTS = ("waist", "shoulder", "elbow")
+UNDECIDED = ChangeRecord(
+    first_seq=201,
+    earliest_seq=199,
+    latest_seq=202,
+    noticed_seq=210,
+    found=True,
+    kinds=[
+        KindOfChange("joint", 1, 0.6),
+        KindOfChange("tool", None, 0.3),
+        KindOfChange("camera", None, 0.1),
+        KindOfChange("joint", 2, 0.0),
+        KindOfChange("joint", 0, 0.0),
+    ],
+    moved_m=0.0121,
+)
+NAMED = msgspec.structs.replace(UNDECIDED, kinds=[KindOfChange("joint", 1, 0.97), KindOfChange("tool", None, 0.03)])
+
+
+def logged(caplog: pytest.LogCaptureFixture) -> list[str]:
+    return [record.getMessage() for record in caplog.records]
+
+
+@pytest.fixture
+def changes(caplog: pytest.LogCaptureFixture) -> Changes:
+    caplog.set_level(logging.INFO)
+    return Changes(JOINTS)
+
+
+def test_a_change_is_one_line_when_it_is_noticed_and_one_when_it_is_named(changes: Changes, caplog) -> None:
+    for record in (None, UNDECIDED, UNDECIDED, NAMED, NAMED):
+        changes.note(record)
+    assert logged(caplog) == [
+        "change found at pair 201 (199 to 202, noticed at 210): undecided, marker moved by 12.1 mm",
+        "the change at pair 201 is joint shoulder",
+    ]
+
+
+def test_a_told_change_is_logged_as_such(changes: Changes, caplog) -> None:
+    changes.note(ChangeRecord.told(20))
+    assert logged(caplog) == ["tool changed at pair 21 (told)"]
+
+
+def test_a_rollback_is_logged(changes: Changes, caplog) -> None:
+    changes.note(UNDECIDED)
+    changes.note(None, rolled_back=True)
+    assert logged(caplog)[-1] == "rolled back to the model before pair 201"
+
+
+def test_what_was_told_before_a_restart_is_not_told_again(caplog) -> None:
+    caplog.set_level(logging.INFO)
+    Changes(JOINTS, UNDECIDED).note(UNDECIDED)
+    assert logged(caplog) == []
+
+
+def test_the_status_names_joints_as_the_robot_does(changes: Changes) -> None:
+    status = changes.status(NAMED, can_roll_back=True)
+    assert status is not None
+    assert (status.kind, status.probabilities) == ("joint shoulder", {"joint shoulder": 0.97, "tool": 0.03})
+
+
+@pytest.mark.parametrize(("joint", "alike"), [(0, "camera"), (1, None), (2, "tool")])
+def test_the_zeros_at_both_ends_are_like_another_camera_and_another_tool(
+    changes: Changes, joint: int, alike: str | None
+) -> None:
+    others = [KindOfChange("joint", k, 0.0) for k in range(3) if k != joint]
+    record = msgspec.structs.replace(NAMED, kinds=[KindOfChange("joint", joint, 0.97), *others])
+    status = changes.status(record, can_roll_back=True)
+    assert status is not None
+    assert status.alike == alike
+
+
+def test_what_no_motion_tells_apart_is_named_together() -> None:
+    record = msgspec.structs.replace(
+        UNDECIDED,
+        kinds=[KindOfChange("joint", 2, 0.6), KindOfChange("tool", None, 0.39), KindOfChange("joint", 0, 0.0)],
+    )
+    assert record.named == KindOfChange("joint", 2, 0.6)

@@ -1,0 +1,249 @@
+"""`bodyschema install service`: the units, held to systemd's own tools where they are."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from small_arm import write_small_arm
+
+from daemon import service_files
+from daemon.cli import command_line
+from daemon.config import Config
+from daemon.service_files import ServiceFiles, user_for
+from daemon.units import FOLDER, PROCESSES, Installed, devices_of, hidden, of_robot, template
+from interfaces.errors import ConfigError
+
+ROOT = Path(__file__).parents[2]
+EXPOSURE = 2.0
+PORT = "/dev/serial/by-id/usb-FTDI_USB__-__Serial_Converter_FT4THV5P-if00-port0"
+EYES = ("/dev/v4l/by-id/usb-left-video-index0", "/dev/v4l/by-id/usb-right-video-index0")
+HARDWARE = f"""
+[vision.cameras.two]
+left = "{EYES[0]}"
+right = "{EYES[1]}"
+image_size_px = [640, 480]
+[drivers.dynamixel.buses.arm]
+port = "{PORT}"
+[[drivers.dynamixel.servos]]
+joint = "waist"
+id = 1
+model = "XM430-W350"
+[[drivers.dynamixel.servos]]
+joint = "shoulder"
+id = 2
+model = "XM430-W350"
+"""
+STEREO = "focal_px = 600.0\nprincipal_point_px = [319.5, 239.5]\nbaseline_m = 0.2\nimage_size_px = [640, 480]\n"
+HERE = Installed(("/bin/true",), (Path("/home/pi/arm/.venv"), Path("/usr")), 252)
+analyze = pytest.mark.skipif(
+    shutil.which("systemd-analyze") is None, reason="systemd-analyze (Debian: systemd) is not installed"
+)
+
+
+@pytest.fixture
+def robot(tmp_path: Path) -> Path:
+    folder = tmp_path / "robot"
+    folder.mkdir()
+    return write_small_arm(folder, STEREO + HARDWARE)
+
+
+@pytest.fixture
+def config(robot: Path) -> Config:
+    return Config.load(robot, {})
+
+
+def install(*arguments: object) -> None:
+    command_line("install")(
+        ["install", "service", *map(str, arguments)], exit_on_error=False, result_action="return_value"
+    )
+
+
+def written(folder: Path, config: Config) -> dict[Path, str]:
+    """The units of `config` in `folder`, as on a machine."""
+    files = ServiceFiles(config.robot.name, root=folder)
+    texts = files.texts(config, "daemon", HERE)
+    files.install(texts)
+    return texts
+
+
+def unit_path(folder: Path) -> dict[str, str]:
+    return os.environ | {"SYSTEMD_UNIT_PATH": f"{folder / FOLDER}:/lib/systemd/system"}
+
+
+@analyze
+@pytest.mark.parametrize("process", PROCESSES)
+def test_systemd_finds_nothing_to_complain_of(tmp_path, config, process) -> None:
+    written(tmp_path, config)
+    command = ["systemd-analyze", "verify", "--man=no", f"bodyschema-{process}@arm.service"]
+    done = subprocess.run(command, env=unit_path(tmp_path), capture_output=True, text=True, timeout=60, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def exposure(folder: Path, process: str) -> float:
+    command = ["systemd-analyze", "security", "--offline=true", "--no-pager", f"bodyschema-{process}@arm.service"]
+    done = subprocess.run(command, env=unit_path(folder), capture_output=True, text=True, timeout=60, check=False)
+    return float(re.search(r"exposure level for \S+: ([0-9.]+)", done.stdout)[1])
+
+
+@analyze
+@pytest.mark.parametrize("process", PROCESSES)
+def test_the_sandbox_leaves_little_exposed(tmp_path, config, process) -> None:
+    written(tmp_path, config)
+    assert exposure(tmp_path, process) <= EXPOSURE
+
+
+@analyze
+@pytest.mark.parametrize("process", PROCESSES)
+def test_it_does_also_where_the_other_process_is_on_another_machine(tmp_path, config, process) -> None:
+    zenoh = config.tables.zenoh.__class__(sampler="tcp/192.0.2.1:7447")
+    tables = config.tables.__class__(**{**_fields(config.tables), "zenoh": zenoh})
+    written(tmp_path, config.with_tables(tables))
+    assert "IPAddressAllow=any" in of_robot(process, config.with_tables(tables), "daemon", HERE)
+    assert exposure(tmp_path, process) <= EXPOSURE
+
+
+def _fields(struct: object) -> dict[str, object]:
+    return {name: getattr(struct, name) for name in struct.__struct_fields__}
+
+
+def values(text: str, key: str) -> list[str]:
+    return re.findall(rf"^{key}=(.*)$", text, re.MULTILINE)
+
+
+def test_the_sampler_may_open_the_named_ports_and_cameras_and_nothing_else(config) -> None:
+    own = of_robot("sampler", config, "daemon", HERE)
+    assert values(own, "DeviceAllow") == [f"{PORT} rw", f"{EYES[0]} rw", f"{EYES[1]} rw"]
+    assert values(template("sampler", HERE), "DevicePolicy") == ["closed"]
+    assert values(template("sampler", HERE), "DeviceAllow") == []
+
+
+def test_the_learner_may_open_no_device(config) -> None:
+    assert values(of_robot("learner", config, "daemon", HERE), "DeviceAllow") == []
+    assert values(template("learner", HERE), "PrivateDevices") == ["yes"]
+
+
+def test_a_port_that_is_no_device_needs_no_rule(tmp_path) -> None:
+    robot = write_small_arm(tmp_path, STEREO + HARDWARE.replace(PORT, "./bus"))
+    assert devices_of(Config.load(robot, {})) == list(EYES)
+
+
+def test_nobody_outside_this_machine_is_reached_while_all_endpoints_are_on_it(config) -> None:
+    assert values(template("sampler", HERE), "IPAddressDeny") == ["any"]
+    assert values(of_robot("sampler", config, "daemon", HERE), "IPAddressAllow") == []
+
+
+def test_what_a_home_holds_is_seen_as_far_as_it_is_needed() -> None:
+    folders = ["/home/pi/arm/.venv", "/home/pi/arm", "/usr/lib", "/opt/arm", "/root/.pyenv/versions/3.11"]
+    assert hidden(map(Path, folders)) == [Path("/home/pi/arm"), Path("/root/.pyenv/versions/3.11")]
+
+
+def test_a_state_dir_of_one_s_own_can_be_written(tmp_path) -> None:
+    robot = write_small_arm(tmp_path, '[daemon]\nstate_dir = "/srv/pairs of 100 %"\n')
+    own = of_robot("sampler", Config.load(robot, {}), "daemon", HERE)
+    assert values(own, "ReadWritePaths") == ['"/srv/pairs of 100 %%"']
+
+
+def test_a_new_systemd_starts_a_service_that_fails_again_less_and_less_often() -> None:
+    new = replace(HERE, systemd=254)
+    assert values(template("sampler", new), "RestartSteps") == ["6"]
+    assert values(template("sampler", HERE), "RestartSteps") == []  # 252 would complain of it
+
+
+@pytest.mark.parametrize("process", PROCESSES)
+def test_the_units_in_deploy_are_those_that_are_written(process) -> None:
+    shown = (ROOT / "deploy" / "systemd" / f"bodyschema-{process}@.service").read_text(encoding="utf-8")
+    assert shown == template(process, Installed(("/opt/bodyschema/bin/bodyschema",), (), 252))
+
+
+# --- the command
+
+
+def test_yes_writes_the_units_and_says_how_to_start_them(tmp_path, robot, capsys) -> None:
+    install("--robot", robot, "--user", "daemon", "--yes", "--root", tmp_path)
+    assert len(ServiceFiles("arm", root=tmp_path).installed()) == 4
+    enable = "sudo systemctl enable --now bodyschema-sampler@arm.service bodyschema-learner@arm.service"
+    assert enable in capsys.readouterr().out
+
+
+def test_a_dry_run_shows_them_and_writes_nothing(tmp_path, robot, capsys) -> None:
+    install("--robot", robot, "--user", "daemon", "--dry-run", "--root", tmp_path)
+    assert not (tmp_path / "etc").exists()
+    assert f"DeviceAllow={PORT} rw" in capsys.readouterr().out
+
+
+def test_units_that_are_there_are_left_as_they_are(tmp_path, robot, capsys) -> None:
+    for _ in range(2):
+        install("--robot", robot, "--user", "daemon", "--yes", "--root", tmp_path)
+    assert "All of it is there already" in capsys.readouterr().out
+
+
+def test_uninstall_leaves_what_other_robots_need(tmp_path, robot, config) -> None:
+    install("--robot", robot, "--user", "daemon", "--yes", "--root", tmp_path)
+    other = robot.with_name("other.toml")
+    other.write_text(robot.read_text().replace('name = "arm"', 'name = "leg"'))
+    install("--robot", other, "--user", "daemon", "--yes", "--root", tmp_path)
+    install("--robot", robot, "--uninstall", "--yes", "--root", tmp_path)
+    left = sorted(path.name for path in (tmp_path / FOLDER).iterdir())
+    assert left == [
+        "bodyschema-learner@.service",
+        "bodyschema-learner@leg.service.d",
+        "bodyschema-sampler@.service",
+        "bodyschema-sampler@leg.service.d",
+    ]
+    install("--robot", other, "--uninstall", "--yes", "--root", tmp_path)
+    assert list((tmp_path / FOLDER).iterdir()) == []
+
+
+def test_a_dry_run_of_uninstall_removes_nothing(tmp_path, robot) -> None:
+    install("--robot", robot, "--user", "daemon", "--yes", "--root", tmp_path)
+    install("--robot", robot, "--uninstall", "--dry-run", "--root", tmp_path)
+    assert len(ServiceFiles("arm", root=tmp_path).installed()) == 4
+
+
+def test_a_learner_alone_needs_no_hardware(tmp_path) -> None:
+    robot = write_small_arm(tmp_path)
+    install("--robot", robot, "--only", "learner", "--user", "daemon", "--yes", "--root", tmp_path)
+    assert [path.parent.name for path in ServiceFiles("arm", root=tmp_path).installed()] == [
+        "bodyschema-learner@arm.service.d",
+        "system",
+    ]
+
+
+def test_a_robot_without_hardware_is_refused(tmp_path) -> None:
+    robot = write_small_arm(tmp_path)
+    with pytest.raises(ConfigError, match="no driver is configured"):
+        install("--robot", robot, "--user", "daemon", "--yes", "--root", tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("user", "said"),
+    [("root", "is not to run as root"), ("nobody", "is not to run as nobody"), ("gnome", "no user 'gnome'")],
+)
+def test_who_the_service_is_to_run_as_has_to_be_a_user_and_not_root(user, said) -> None:
+    with pytest.raises(ConfigError, match=said):
+        user_for(user)
+
+
+def test_the_service_is_that_of_who_called_sudo(monkeypatch) -> None:
+    monkeypatch.setenv("SUDO_USER", "daemon")
+    assert user_for(None) == "daemon"
+
+
+def test_systemd_is_told_on_this_machine_alone(tmp_path, config) -> None:
+    ran: list[object] = []
+    ServiceFiles("arm", root=tmp_path, run=ran.append).install({})
+    ServiceFiles("arm", run=ran.append).install({})
+    assert ran == [["systemctl", "daemon-reload"]]
+
+
+def test_a_folder_that_cannot_be_written_names_the_command(tmp_path, config, monkeypatch) -> None:
+    (tmp_path / "etc").write_text("no folder")
+    monkeypatch.setattr(service_files.os, "geteuid", lambda: 1000)
+    with pytest.raises(ConfigError, match=r"sudo .* install service --yes$"):
+        written(tmp_path, config)

@@ -1,0 +1,223 @@
+"""What systemd is told: when a process is ready, that all of its loops work, how it is."""
+
+from __future__ import annotations
+
+import os
+import socket
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from daemon.notify import Notifier
+from daemon.service import SETTLED_S, SIGNS_PER_WATCHDOG, Service, with_health
+from interfaces.clock import SystemClock
+
+WATCHDOG_S = 8.0
+LOOPS = ("encoders", "frames")
+
+
+class HandClock(SystemClock):
+    """A clock that is moved by hand."""
+
+    time = 100.0
+
+    def now(self) -> float:
+        return self.time
+
+
+class Heard:
+    """A socket that hears what systemd would."""
+
+    def __init__(self, address: str) -> None:
+        self.socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self.socket.bind(address)
+        self.socket.setblocking(False)
+
+    def all(self) -> list[str]:
+        said: list[str] = []
+        while True:
+            try:
+                said.append(self.socket.recv(4096).decode())
+            except BlockingIOError:
+                return said
+
+
+@pytest.fixture
+def systemd(tmp_path: Path) -> Iterator[Heard]:
+    heard = Heard(str(tmp_path / "notify"))
+    yield heard
+    heard.socket.close()
+
+
+@pytest.fixture
+def clock() -> HandClock:
+    return HandClock()
+
+
+@pytest.fixture
+def service(systemd: Heard, tmp_path: Path, clock: HandClock) -> Service:
+    return Service(Notifier(str(tmp_path / "notify"), WATCHDOG_S), LOOPS, clock)
+
+
+def a_round_of(service: Service, clock: HandClock, *loops: str) -> None:
+    clock.time += WATCHDOG_S / SIGNS_PER_WATCHDOG
+    for loop in loops:
+        service.beat(loop)
+
+
+def test_the_watchdog_is_fed_while_all_loops_come_round(service, clock, systemd) -> None:
+    for _ in range(3):
+        a_round_of(service, clock, *LOOPS)
+    assert systemd.all() == ["WATCHDOG=1"] * 3
+
+
+@pytest.mark.parametrize("hanging", LOOPS)
+def test_one_loop_that_hangs_starves_the_watchdog(service, clock, systemd, hanging) -> None:
+    for _ in range(100):
+        a_round_of(service, clock, *(loop for loop in LOOPS if loop != hanging))
+    assert systemd.all() == []
+
+
+def test_loops_that_come_round_often_tell_systemd_no_oftener_than_it_needs(service, clock, systemd) -> None:
+    for _ in range(1000):
+        clock.time += 0.002
+        for loop in LOOPS:
+            service.beat(loop)
+    assert len(systemd.all()) == 1  # in 2 s of the watchdog's 8
+
+
+def test_nobody_waits_for_a_loop_that_came_to_its_end(service, clock, systemd) -> None:
+    service.leave("encoders")
+    a_round_of(service, clock, "frames")
+    assert systemd.all() == ["WATCHDOG=1"]
+
+
+def test_ready_is_said_once(service, systemd) -> None:
+    service.ready()
+    service.ready()
+    assert systemd.all() == ["READY=1"]
+
+
+def test_a_reload_begins_with_its_time_and_ends_with_ready(service, systemd) -> None:
+    service.reloading()
+    service.reloaded()
+    first, last = systemd.all()
+    assert first.startswith("RELOADING=1\nMONOTONIC_USEC=")
+    assert last == "READY=1"
+
+
+def test_a_status_is_one_line_and_told_when_it_is_another(service, systemd) -> None:
+    for line in ("running, 2 pairs", "running, 2 pairs", "the disk\nis full"):
+        service.tell(line)
+    assert systemd.all() == ["STATUS=running, 2 pairs", "STATUS=the disk is full"]
+
+
+def test_a_status_has_the_first_thing_that_is_wrong() -> None:
+    assert with_health("running", []) == "running"
+    assert with_health("running", ["the cameras are lost", "the disk is full"]) == (
+        "running. the cameras are lost (and 1 more)"
+    )
+
+
+def test_a_name_without_a_file_is_told_too(clock) -> None:
+    name = f"bodyschema-test-{os.getpid()}"
+    heard = Heard(f"\0{name}")
+    Notifier(f"@{name}").ready()
+    assert heard.all() == ["READY=1"]
+    heard.socket.close()
+
+
+def test_what_systemd_asks_for_is_not_handed_on_to_children(tmp_path) -> None:
+    environment = {"NOTIFY_SOCKET": "/run/n", "WATCHDOG_USEC": "20000000", "WATCHDOG_PID": str(os.getpid()), "A": "b"}
+    notifier = Notifier.of_environment(environment)
+    assert (environment, notifier.watchdog_s, notifier.is_heard) == ({"A": "b"}, 20.0, True)
+
+
+@pytest.mark.parametrize(
+    "environment",
+    [
+        {},
+        {"WATCHDOG_USEC": "20000000"},
+        {"NOTIFY_SOCKET": "/run/n", "WATCHDOG_USEC": "20000000", "WATCHDOG_PID": "1"},
+        {"NOTIFY_SOCKET": "/run/n", "WATCHDOG_USEC": "soon"},
+    ],
+)
+def test_a_watchdog_of_nobody_or_of_another_process_is_not_fed(environment) -> None:
+    assert Notifier.of_environment(environment).watchdog_s is None
+
+
+def test_a_systemd_that_is_gone_is_logged_once_and_ends_nothing(tmp_path, caplog) -> None:
+    notifier = Notifier(str(tmp_path / "gone"))
+    notifier.ready()
+    notifier.feed_watchdog()
+    assert [record.getMessage() for record in caplog.records] == [
+        "systemd cannot be told READY: No such file or directory"
+    ]
+
+
+# --- devices that come back under another number
+
+
+class Permissions:
+    """Whether systemd lets the service open its devices."""
+
+    granted = True
+
+    def __call__(self, device: str) -> bool:
+        return self.granted
+
+
+@pytest.fixture
+def plugged(tmp_path: Path) -> Path:
+    device = tmp_path / "ttyUSB1"
+    device.touch()
+    return device
+
+
+@pytest.fixture
+def permissions() -> Permissions:
+    return Permissions()
+
+
+@pytest.fixture
+def owner(systemd: Heard, clock: HandClock, plugged: Path, permissions: Permissions) -> Service:
+    notifier = Notifier(systemd.socket.getsockname())
+    return Service(notifier, LOOPS, clock, devices=[str(plugged)], may_open=permissions)
+
+
+def test_a_device_that_may_be_opened_is_not_forbidden(owner) -> None:
+    assert owner.forbidden() is None
+
+
+def test_a_device_that_may_not_be_opened_for_long_is_forbidden(owner, clock, permissions, plugged) -> None:
+    permissions.granted = False
+    assert owner.forbidden() is None  # its group may come yet
+    clock.time += SETTLED_S
+    assert owner.forbidden() == str(plugged)
+
+
+def test_a_device_that_gets_its_group_late_is_not_forbidden(owner, clock, permissions) -> None:
+    permissions.granted = False
+    owner.forbidden()
+    clock.time += SETTLED_S
+    permissions.granted = True
+    assert owner.forbidden() is None
+    permissions.granted = False
+    assert owner.forbidden() is None
+
+
+def test_a_device_that_is_not_there_is_waited_for(owner, clock, permissions, plugged) -> None:
+    plugged.unlink()
+    permissions.granted = False
+    owner.forbidden()
+    clock.time += 1000.0
+    assert owner.forbidden() is None
+
+
+def test_outside_of_systemd_nothing_is_forbidden(clock, plugged, permissions) -> None:
+    permissions.granted = False
+    process = Service(Notifier(), LOOPS, clock, devices=[str(plugged)], may_open=permissions)
+    process.forbidden()
+    clock.time += 1000.0
+    assert process.forbidden() is None

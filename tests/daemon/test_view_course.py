@@ -1,0 +1,114 @@
+"""What the page shows of the course of learning and of the newest pairs."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgspec
+import numpy as np
+from test_status import LEARNER
+
+from daemon.status import LearnerStatus, ToolChange
+from daemon.view.course import LARGEST_SERIES, Course, Series
+from daemon.view.recent import KEPT, LARGEST_CLOUD, RecentPairs, cloud
+from daemon.wire import PredictReply
+from interfaces.errors import RequestError
+from interfaces.records import Pair, frozen_array
+
+
+def learner(pairs: int, **changed: Any) -> LearnerStatus:
+    told = {"pairs": pairs, "last_seq": pairs, "pairs_since_change": pairs, "last_change": None} | changed
+    return msgspec.structs.replace(LEARNER, **told)
+
+
+def pair(seq: int, segment: int = 1) -> Pair:
+    return Pair(
+        store="2f9a",
+        seq=seq,
+        segment=segment,
+        t=0.1 * seq,
+        utc="2026-11-21T15:01:26+00:00",
+        q=frozen_array([0.01 * seq, 0.0]),
+        x=frozen_array([0.5, 0.001 * seq, 0.0]),
+        cov=frozen_array(np.eye(3)),
+    )
+
+
+def test_a_series_of_months_stays_small_and_covers_all_of_it() -> None:
+    series = Series()
+    for t in range(100_000):
+        series.add(float(t), error_m=0.001, claimed_m=None, pairs_per_s=10.0, predict_s=None)
+    t = series.document.t
+    assert LARGEST_SERIES / 4 < len(t) <= LARGEST_SERIES
+    assert t[0] < 1000 < 99_000 < t[-1]
+    assert np.ptp(np.diff(t)) == 0
+
+
+def test_a_tool_change_is_marked_once_where_it_was() -> None:
+    course = Course()
+    for pairs in (90, 100):
+        course.note(learner(pairs), 1.0)
+    for pairs in (101, 110, 200):
+        told = {"pairs_since_change": pairs - 100, "last_change": ToolChange(101, True)}
+        course.note(learner(pairs, **told), 2.0)
+    assert [(change.pairs, change.found) for change in course.document.changes] == [(100, True)]
+
+
+def test_a_span_of_one_model_is_one_line_with_its_newest_version() -> None:
+    course = Course()
+    for pairs, answering, model in ((1, "nlms", "a"), (20, "nlms", "b"), (30, "rigid", "c"), (40, "rigid", "d")):
+        course.note(learner(pairs, answering=answering, model=model), float(pairs))
+    spans = [(span.answering, span.first_pairs, span.pairs, span.model) for span in course.document.versions]
+    assert spans == [("nlms", 1, 20, "b"), ("rigid", 30, 40, "d")]
+
+
+def test_a_tool_change_begins_another_span() -> None:
+    course = Course()
+    course.note(learner(100), 1.0)
+    course.note(learner(101, pairs_since_change=1), 2.0)
+    assert [span.after_change for span in course.document.versions] == [False, True]
+
+
+def test_learning_that_began_anew_has_no_past() -> None:
+    course = Course()
+    course.note(learner(100, pairs_since_change=20), 1.0)
+    course.note(learner(3, store="another"), 2.0)
+    assert course.document.changes == []
+    assert [span.first_pairs for span in course.document.versions] == [3]
+
+
+def test_segments_are_counted_and_the_first_known_one_may_have_begun_before() -> None:
+    recent = RecentPairs()
+    recent.add([pair(seq, segment=4 + (seq > 12)) for seq in range(10, 20)])
+    found = [(segment.segment, segment.pairs, segment.complete) for segment in recent.segments()]
+    assert found == [(4, 3, False), (5, 7, True)]
+
+
+def test_of_a_store_of_any_size_only_the_newest_pairs_are_kept() -> None:
+    recent = RecentPairs()
+    recent.add(pair(seq) for seq in range(1, 2 * KEPT))
+    assert (len(recent), recent.newest.seq) == (KEPT, 2 * KEPT - 1)
+
+
+def test_the_cloud_is_of_this_tool_s_learnt_pairs_evenly_spread() -> None:
+    recent = RecentPairs()
+    recent.add(pair(seq) for seq in range(1, 2501))
+    chosen = [chosen.seq for chosen in recent.chosen(500, 2400)]
+    assert (len(chosen), chosen[0], chosen[-1]) == (LARGEST_CLOUD, 501, 2400)
+
+
+def test_a_residual_is_measured_less_predicted() -> None:
+    def predict(q: list[list[float]]) -> PredictReply:
+        n = len(q)
+        return PredictReply([[0.4, 0.0, 0.0]] * n, [[0.0] * 3] * n, [True] * n, "6b6f", 9, None)
+
+    found = cloud([pair(2), pair(4)], predict)
+    assert found.residual == [[0.1, 0.002, 0.0], [0.1, 0.004, 0.0]]
+    assert found.model == "6b6f"
+
+
+def test_before_there_is_a_model_the_cloud_is_empty() -> None:
+    def refuse(q: list[list[float]]) -> PredictReply:
+        raise RequestError("there is no model yet")
+
+    assert cloud([pair(1)], refuse).x == []

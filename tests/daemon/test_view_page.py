@@ -1,0 +1,266 @@
+"""The page's addresses, without a browser: what they answer, and whom they refuse."""
+
+from __future__ import annotations
+
+import asyncio
+import re
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from typing import Any
+
+import pytest
+
+httpx = pytest.importorskip("httpx")
+pytest.importorskip("starlette")
+
+from daemon.view.app import LARGEST_BODY, STATIC, application  # noqa: E402
+from daemon.view.hub import MOST_FOLLOWERS, Hub  # noqa: E402
+from interfaces.errors import BusError, RequestError  # noqa: E402
+
+HERE = "http://127.0.0.1:8420"
+PAUSE = {"process": "sampler", "command": "pause"}
+ADDRESSES = ["/", "/api/state", "/api/events", "/report", "/static/style.css", "/static/js/main.js"]
+
+
+@dataclass
+class Processes:
+    """Stands for both processes and the diagnoses; remembers what it was told."""
+
+    told: list[tuple[str, ...]] = field(default_factory=list)
+    error: Exception | None = None
+    page: bytes | None = None
+
+    def command(self, process: str, name: str) -> str:
+        self._note(process, name)
+        return "no pairs are accepted until resume"
+
+    def start(self) -> int:
+        self._note("start")
+        return 3
+
+    def stop(self) -> None:
+        self._note("stop")
+
+    def report(self) -> bytes | None:
+        return self.page
+
+    def _note(self, *words: str) -> None:
+        if self.error is not None:
+            raise self.error
+        self.told.append(words)
+
+
+@pytest.fixture
+def processes() -> Processes:
+    return Processes()
+
+
+@pytest.fixture
+def hub() -> Hub:
+    hub = Hub()
+    hub.put("robot", {"robot": "arm"})
+    return hub
+
+
+@pytest.fixture
+def ask(hub: Hub, processes: Processes):
+    def asked(method: str, address: str, headers: dict[str, str] | None = None, **more: Any):
+        async def once():
+            transport = httpx.ASGITransport(app=application(hub, processes, processes))
+            async with httpx.AsyncClient(transport=transport, base_url=HERE) as client:
+                own = {"Origin": HERE} if method not in ("GET", "HEAD") else {}
+                return await client.request(method, address, headers=own | (headers or {}), **more)
+
+        return asyncio.run(once())
+
+    return asked
+
+
+def test_a_button_s_command_reaches_the_process_and_its_words_come_back(ask, processes) -> None:
+    answer = ask("POST", "/api/command", json=PAUSE)
+    assert (answer.status_code, answer.json()["message"]) == (200, "no pairs are accepted until resume")
+    assert processes.told == [("sampler", "pause")]
+
+
+@pytest.mark.parametrize("address", ADDRESSES)
+@pytest.mark.parametrize("host", ["evil.example", "evil.example:8420", "127.0.0.1.evil.example", "localhost@evil", ""])
+def test_who_asks_for_another_host_is_refused_everywhere(ask, address: str, host: str) -> None:
+    """As after DNS rebinding, when the name of another site leads here."""
+    assert ask("GET", address, {"Host": host}).status_code == 403
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1:8420", "localhost:9000", "LOCALHOST", "[::1]:8420"])
+def test_this_machine_s_names_are_served_on_any_port_so_that_a_tunnel_works(ask, host: str) -> None:
+    assert ask("GET", "/", {"Host": host}).status_code == 200
+
+
+@pytest.mark.parametrize(
+    ("method", "address"), [("POST", "/api/command"), ("POST", "/api/diagnosis"), ("DELETE", "/api/diagnosis")]
+)
+@pytest.mark.parametrize(
+    "origin",
+    ["http://evil.example", "null", "https://127.0.0.1:8420", "http://127.0.0.1:9999", "http://localhost:8420"],
+)
+def test_another_page_s_button_does_nothing(ask, processes, method: str, address: str, origin: str) -> None:
+    assert ask(method, address, {"Origin": origin}, json=PAUSE).status_code == 403
+    assert processes.told == []
+
+
+def test_a_command_without_an_origin_does_nothing(hub, processes) -> None:
+    async def post() -> int:
+        transport = httpx.ASGITransport(app=application(hub, processes, processes))
+        async with httpx.AsyncClient(transport=transport, base_url=HERE) as client:
+            return (await client.post("/api/command", json=PAUSE)).status_code
+
+    assert asyncio.run(post()) == 403
+    assert processes.told == []
+
+
+@pytest.mark.parametrize("address", ADDRESSES)
+def test_another_page_may_not_read_here_either(ask, address: str) -> None:
+    assert ask("GET", address, {"Origin": "http://evil.example"}).status_code == 403
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        b"",
+        b"pause",
+        b'{"process": "learner", "command": "reset_to_prior"}',
+        b'{"process": "sampler", "command": "zero_force_off"}',
+        b'{"process": "camera", "command": "pause"}',
+        b'{"process": "sampler", "command": "pause", "also": 1}',
+        b'{"process": "sampler", "command": "pause"}' + b" " * LARGEST_BODY,
+    ],
+)
+def test_what_no_button_says_is_refused_and_nothing_happens(ask, processes, body: bytes) -> None:
+    answer = ask("POST", "/api/command", {"Content-Type": "application/json"}, content=body)
+    assert answer.status_code == 400
+    assert answer.json()["error"]
+    assert processes.told == []
+
+
+def test_a_form_s_encoding_is_refused(ask, processes) -> None:
+    """A page from elsewhere can send forms without asking first."""
+    answer = ask("POST", "/api/command", {"Content-Type": "text/plain"}, content=b'{"process":"sampler"}')
+    assert (answer.status_code, processes.told) == (400, [])
+
+
+@pytest.mark.parametrize(("error", "code"), [(BusError("nobody answers"), 503), (RequestError("not now"), 400)])
+def test_why_a_process_did_not_do_it_is_told(ask, processes, error: Exception, code: int) -> None:
+    processes.error = error
+    answer = ask("POST", "/api/command", json=PAUSE)
+    assert (answer.status_code, answer.json()) == (code, {"error": str(error)})
+
+
+def test_a_diagnosis_is_begun_and_stopped(ask, processes) -> None:
+    assert ask("POST", "/api/diagnosis").json() == {"number": 3}
+    assert ask("DELETE", "/api/diagnosis").status_code == 204
+    assert processes.told == [("start",), ("stop",)]
+
+
+def test_a_second_diagnosis_is_told_to_wait(ask, processes) -> None:
+    processes.error = RequestError("a diagnosis is running")
+    assert ask("POST", "/api/diagnosis").json() == {"error": "a diagnosis is running"}
+
+
+def test_a_report_is_served_without_any_script(ask, processes) -> None:
+    processes.page = b"<!doctype html><title>report</title>"
+    answer = ask("GET", "/report")
+    assert answer.content == processes.page
+    policy = answer.headers["Content-Security-Policy"]
+    assert "default-src 'none'" in policy
+    assert "script-src" not in policy
+    assert "sandbox" in policy
+
+
+def test_before_any_diagnosis_there_is_no_report(ask) -> None:
+    assert ask("GET", "/report").status_code == 404
+
+
+def test_a_path_out_of_the_folder_is_not_found(ask) -> None:
+    for path in ("/static/../app.py", "/static/%2e%2e/app.py", "/static/js/..%2f..%2f..%2fapp.py"):
+        assert ask("GET", path).status_code == 404
+
+
+def test_the_page_may_load_from_here_alone(ask) -> None:
+    policy = ask("GET", "/").headers["Content-Security-Policy"]
+    assert policy.startswith("default-src 'none'; script-src 'self'")
+    assert "unsafe" not in policy
+    assert "frame-ancestors 'none'" in policy
+
+
+def test_a_browser_gets_every_document_at_first(ask, hub) -> None:
+    hub.put("sampler", {"answers": False})
+    hub.close()
+    answer = ask("GET", "/api/events")
+    assert answer.headers["content-type"].startswith("text/event-stream")
+    assert 'event: robot\ndata: {"robot":"arm"}\n\n' in answer.text
+    assert 'event: sampler\ndata: {"answers":false}\n\n' in answer.text
+
+
+def test_all_documents_are_one_object_for_programs(ask, hub) -> None:
+    hub.put("outlook", None)
+    assert ask("GET", "/api/state").json() == {"robot": {"robot": "arm"}, "outlook": None}
+
+
+def test_too_many_pages_are_told_so(ask, hub) -> None:
+    async def fill() -> int:
+        with ExitStack() as stack:
+            for _ in range(MOST_FOLLOWERS):
+                stack.enter_context(hub.following())
+            transport = httpx.ASGITransport(app=application(hub, Processes(), Processes()))
+            async with httpx.AsyncClient(transport=transport, base_url=HERE) as client:
+                return (await client.get("/api/events")).status_code
+
+    assert asyncio.run(fill()) == 503
+
+
+def test_a_slow_browser_gets_the_newest_of_each_document_alone(hub) -> None:
+    async def follow() -> dict[str, bytes]:
+        with hub.following() as follower:
+            for number in range(100):
+                hub.put("series", number)
+            return await follower.take(10.0)
+
+    assert asyncio.run(follow()) == {"robot": b'{"robot":"arm"}', "series": b"99"}
+
+
+def test_what_did_not_change_is_not_sent_again(hub) -> None:
+    async def follow() -> dict[str, bytes]:
+        with hub.following() as follower:
+            await follower.take(10.0)
+            hub.put("robot", {"robot": "arm"})
+            return await follower.take(0.01)
+
+    assert asyncio.run(follow()) == {}
+
+
+PAGE = (STATIC / "index.html").read_text(encoding="utf-8")
+KINDS = (".html", ".css", ".js")
+OURS = sorted(file for file in STATIC.rglob("*") if file.suffix in KINDS and "vendor" not in file.parts)
+
+
+def test_the_page_has_every_element_that_its_scripts_ask_for() -> None:
+    asked = {
+        name
+        for file in OURS
+        for name in re.findall(r'(?:byId|text|Chart)\("([a-z-]+)"', file.read_text(encoding="utf-8"))
+    }
+    assert asked - set(re.findall(r'id="([a-z-]+)"', PAGE)) == set()
+    assert len(asked) > 30
+
+
+@pytest.mark.parametrize("file", OURS, ids=lambda file: file.name)
+def test_nothing_is_loaded_from_a_network(file) -> None:
+    found = re.findall(r"""["'(]((?:https?:)?//[^"')]*)""", file.read_text(encoding="utf-8"))
+    assert [address for address in found if address != "http://www.w3.org/2000/svg"] == []
+
+
+def test_text_from_outside_is_never_taken_for_html() -> None:
+    for file in OURS:
+        assert not re.search(r"innerHTML|outerHTML|insertAdjacentHTML|document\.write|\beval\b", file.read_text())
+
+
+def test_what_is_vendored_comes_with_its_licence() -> None:
+    assert "MIT" in (STATIC / "vendor" / "uPlot.LICENSE").read_text(encoding="utf-8")

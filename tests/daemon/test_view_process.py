@@ -1,0 +1,60 @@
+"""The page as a process beside those that work."""
+
+from __future__ import annotations
+
+import http.client
+import socket
+import time
+from pathlib import Path
+
+import pytest
+from small_arm import write_small_arm
+
+from daemon import view_process
+from daemon.cli import app
+from daemon.view_process import shown
+from interfaces.errors import ConfigError
+
+pytest.importorskip("uvicorn")
+LIMIT_S = 100.0
+
+
+@pytest.fixture
+def robot(tmp_path: Path, free_endpoint) -> Path:
+    tables = f'[zenoh]\nsampler = "{free_endpoint()}"\nlearner = "{free_endpoint()}"\n'
+    return write_small_arm(tmp_path, tables)
+
+
+def page(port: int) -> str | None:
+    """The page; None while nobody answers."""
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
+    try:
+        connection.request("GET", "/")
+        return connection.getresponse().read().decode()
+    except OSError:
+        return None
+    finally:
+        connection.close()
+
+
+def test_the_page_is_there_as_long_as_the_process_that_shows_it(robot: Path, endpoint: str) -> None:
+    port, deadline = int(endpoint.rpartition(":")[2]), time.monotonic() + LIMIT_S
+    with shown(robot, port):
+        while (found := page(port)) is None:
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
+    assert "<title>bodyschema</title>" in found
+    assert page(port) is None
+
+
+def test_a_port_that_is_taken_is_no_matter_for_whoever_is_shown(robot: Path, caplog) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken, shown(robot, taken.getsockname()[1]) as process:
+        process.wait(LIMIT_S)
+    assert "the page had ended with exit code 1" in caplog.text
+
+
+@pytest.mark.parametrize("command", [["view"], ["learner", "--view"], ["run", "--view"]])
+def test_without_the_extra_the_error_names_it(robot: Path, command: list[str], monkeypatch) -> None:
+    monkeypatch.setattr(view_process, "NEEDED", ("no_such_library",))
+    with pytest.raises(ConfigError, match=r"bodyschema\[view\]"):
+        app([*command, "--robot", str(robot)], result_action="return_value")

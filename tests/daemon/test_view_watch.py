@@ -1,0 +1,169 @@
+"""The page's side of zenoh: processes that come, go and come back."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+from small_arm import write_small_arm
+from test_status import LEARNER, SAMPLER
+
+from daemon.bus import Bus
+from daemon.config import Config
+from daemon.keys import Keys
+from daemon.view.hub import Hub
+from daemon.view.watch import Watch
+from daemon.wire import CommandReply, CommandRequest, PairMessage, PairsReply, PredictReply, decode, encode
+from interfaces.errors import BusError, RequestError
+
+LIMIT_S = 60.0
+KEYS = Keys("arm")
+
+
+def until(holds: Callable[[], Any]) -> Any:
+    deadline = time.monotonic() + LIMIT_S
+    while not (found := holds()):
+        assert time.monotonic() < deadline, "it did not come in time"
+        time.sleep(0.02)
+    return found
+
+
+@pytest.fixture
+def config(tmp_path: Path, free_endpoint) -> Config:
+    tables = f'[zenoh]\nsampler = "{free_endpoint()}"\nlearner = "{free_endpoint()}"\n'
+    return Config.load(write_small_arm(tmp_path, tables), {})
+
+
+@pytest.fixture
+def hub() -> Hub:
+    return Hub()
+
+
+@pytest.fixture
+def watch(config: Config, hub: Hub) -> Iterator[Watch]:
+    with Watch(config, hub) as watch:
+        yield watch
+
+
+def document(hub: Hub, topic: str) -> Any:
+    return json.loads(hub.all()).get(topic)
+
+
+@contextmanager
+def process(endpoint: str, name: str, status: object, answers: dict[str, Callable[..., bytes]]) -> Iterator[None]:
+    """One of the two processes, as zenoh shows it; it says its state all the while."""
+    with Bus(listen=endpoint) as bus:
+        for key, answer in answers.items():
+            bus.answer(key, answer)
+        bus.token(KEYS.alive(name))
+        publish, done = bus.publisher(KEYS.status(name)), threading.Event()
+
+        def say() -> None:
+            while not done.wait(0.1):
+                publish(encode(status))
+
+        thread = threading.Thread(target=say)
+        thread.start()
+        try:
+            yield
+        finally:
+            done.set()
+            thread.join()
+
+
+def predict(request) -> bytes:
+    n = len(json.loads(request.payload)["q"])
+    return encode(PredictReply([[0.5, 0.0, 0.0]] * n, [[0.0] * 3] * n, [True] * n, "6b6f", 9, None))
+
+
+def command(request) -> bytes:
+    name = decode(request.payload, CommandRequest).command
+    if name == "tool_changed":
+        return encode(CommandReply(name, "another tool"))
+    raise RequestError("the learner has nothing to do with that")
+
+
+def learner(config: Config, status: object = LEARNER):
+    answers = {KEYS.predict: predict, KEYS.command("learner"): command}
+    return process(config.tables.zenoh.learner, "learner", status, answers)
+
+
+def sampler(config: Config, pairs: int):
+    stored = [
+        PairMessage("2f9a", seq, 1, 0.1 * seq, "", [0.01 * seq, 0.0], (0.5, 0.0, 0.003), (1e-6, 0, 0, 1e-6, 0, 1e-6))
+        for seq in range(1, pairs + 1)
+    ]
+
+    def answer(request) -> bytes:
+        first = int(request.parameters["from"])
+        return encode(PairsReply("2f9a", pairs, stored[first - 1 : first + 99]))
+
+    status = msgspec.structs.replace(SAMPLER, pairs=pairs)
+    return process(config.tables.zenoh.sampler, "sampler", status, {KEYS.pairs: answer})
+
+
+def test_a_learner_that_goes_is_missed_and_one_that_comes_back_is_seen(config, hub, watch) -> None:
+    def answers() -> bool:
+        found = document(hub, "learner")
+        return found is not None and found["answers"]
+
+    with learner(config):
+        until(answers)
+    until(lambda: not answers())
+    assert document(hub, "learner")["status"]["pairs"] == LEARNER.pairs  # what it knew last is still to be seen
+    with learner(config):
+        until(answers)
+
+
+def test_residuals_and_segments_come_from_the_sampler_s_pairs_and_the_learner_s_answers(config, hub, watch) -> None:
+    told = msgspec.structs.replace(LEARNER, pairs=250, last_seq=250, pairs_since_change=250)
+    with sampler(config, 250), learner(config, told):
+        cloud = until(lambda: (found := document(hub, "cloud")) and len(found["x"]) == 250 and found)
+        assert cloud["residual"][0] == [0.0, 0.0, 0.003]
+        assert [segment["pairs"] for segment in document(hub, "segments")] == [250]
+        assert until(lambda: any(document(hub, "series")["predict_s"]))
+
+
+def test_fields_that_this_version_does_not_know_are_passed_on(config, hub, watch) -> None:
+    newer = msgspec.to_builtins(LEARNER) | {"mood": "fine"}
+    with learner(config, newer):
+        until(lambda: (found := document(hub, "learner")) and found["status"] and found["status"]["mood"] == "fine")
+
+
+def test_a_state_that_is_not_understood_is_told_and_ends_nothing(config, hub, watch) -> None:
+    with learner(config, {"robot": 3}):
+        said = until(lambda: (found := document(hub, "learner")) and found["problem"])
+    assert "another version" in said
+    with learner(config):
+        until(lambda: document(hub, "learner")["status"] is not None)
+
+
+def test_where_to_move_next_is_told_in_words(config, hub, watch) -> None:
+    with learner(config):
+        assert "moving shoulder over its range gains most" in until(lambda: document(hub, "outlook"))
+
+
+def test_a_command_gets_the_process_own_words(config, watch) -> None:
+    with learner(config):
+        until(lambda: _answered(watch))
+        with pytest.raises(RequestError, match="nothing to do with that"):
+            watch.command("learner", "pause")
+
+
+def _answered(watch: Watch) -> bool:
+    try:
+        return watch.command("learner", "tool_changed") == "another tool"
+    except BusError:
+        return False
+
+
+def test_without_a_sampler_nobody_has_the_pairs(watch) -> None:
+    with pytest.raises(BusError, match="bodyschema sampler"):
+        watch.history(10)

@@ -1,0 +1,45 @@
+"""What a diagnosis could not find out is told, with the reason."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from planted_cases import SHOULDER, Motion, desk_arm, seen, walk
+
+from diagnosis.conclusion import conclusion
+from diagnosis.diagnosis import Diagnosis, diagnose
+from effects import Effect, Simulation
+
+
+@pytest.fixture(scope="module")
+def small() -> Diagnosis:
+    robot = desk_arm()
+    truth = Effect.at(robot, "joint_offset", SHOULDER, values=[0.02])
+    return diagnose(seen(robot, walk(robot, 1), (truth,), 1), Simulation(robot), only=("joint_offset", "joint_scale"))
+
+
+def test_a_search_that_ended_at_its_longest_is_told(small) -> None:
+    assert conclusion(small).limitations == small.hypotheses.limitations
+    ended = dataclasses.replace(small, ended_early=True)
+    assert "there may be more of them" in conclusion(ended).limitations[-1]
+
+
+def test_what_is_rejected_though_chance_hardly_brings_it_about_has_a_word_why(small) -> None:
+    rest = dataclasses.replace(small, extended=small.aligned, standings=())
+    rows = {(row.effect, row.where): row for row in conclusion(rest).rejected}
+    assert rows["joint_offset", SHOULDER].p_value < 1e-3
+    assert rows["joint_offset", SHOULDER].why
+    assert all(not row.why for row in rows.values() if row.p_value >= 1e-3)
+
+
+def test_a_play_that_runs_hardly_cross_is_told_with_what_to_record() -> None:
+    robot = desk_arm()
+    way = walk(robot, 1)
+    short = Motion(way.q, way.t, np.arange(len(way.q)) // 4)
+    truth = Effect.at(robot, "backlash", SHOULDER, values=[0.12])
+    found = diagnose(seen(robot, short, (truth,), 1), Simulation(robot), only=("backlash",))
+    (told,) = [line for line in conclusion(found).limitations if "side of its play" in line]
+    assert SHOULDER in told
+    assert "Record longer runs" in told

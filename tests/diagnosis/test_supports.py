@@ -1,0 +1,90 @@
+"""A mount that gives under the arm's weight is not taken for a joint that does, nor the other way round."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from planted_cases import DESK_ARM, ELBOW, SHOULDER, SIGMA_M, measured, seen, walk
+from scipy.spatial.transform import Rotation
+
+from diagnosis.conclusion import conclusion
+from diagnosis.diagnosis import diagnose
+from diagnosis.result import DiagnosisFile
+from effects import Effect, Simulation
+from interfaces.recording import Recording
+from interfaces.robot import RobotDescription
+
+MASSES = {"turret": 0.6, "upper_arm": 0.5, "forearm": 0.35, "wrist": 0.15, "gripper": 0.1}
+
+
+@pytest.fixture(scope="module")
+def robot(tmp_path_factory) -> RobotDescription:
+    """The desk arm, held by its motors, with masses half way along its links; camera and marker are known."""
+    folder: Path = tmp_path_factory.mktemp("heavy")
+    urdf = DESK_ARM.with_name("desk_arm.urdf").read_text()
+    for link, kg in MASSES.items():
+        mass = f'<inertial><origin xyz="0.01 0 0.1"/><mass value="{kg}"/></inertial>'
+        urdf = urdf.replace(f'<link name="{link}"/>', f'<link name="{link}">{mass}</link>')
+    (folder / "desk_arm.urdf").write_text(urdf)
+    text = DESK_ARM.read_text().replace("torque_free", "held").replace("_known = false", "_known = true")
+    (folder / "robot.toml").write_text(text)
+    return RobotDescription.load(folder / "robot.toml")
+
+
+def moments_about_the_floor(robot: RobotDescription, q: np.ndarray) -> np.ndarray:
+    """Of the arm's weight (n, 3) [N·m], by how much the height of its centre changes as the floor is tilted."""
+    moments, forces = Simulation(robot).gravity.loads(q)
+    (T, *_) = Simulation(robot).gravity.in_supports(0)
+    return moments[:, 0] @ T[:3, :3].T + np.cross(T[:3, 3], forces[:, 0] @ T[:3, :3].T)
+
+
+def on_a_soft_mount(robot: RobotDescription, times_the_noise: float, seed: int) -> Recording:
+    """Seen when the floor turns about its origin, alike about all axes, in proportion to the moment on it."""
+    motion, camera = walk(robot, seed), robot.camera.pose
+    x = Simulation(robot).positions(motion)
+    floor = x @ camera[:3, :3].T + camera[:3, 3]
+    turned = 1e-5 * moments_about_the_floor(robot, motion.q)
+    moved = (Rotation.from_rotvec(turned).apply(floor) - camera[:3, 3]) @ camera[:3, :3] - x
+    moved *= times_the_noise * SIGMA_M / np.sqrt(np.square(moved).mean())
+    return measured(robot, motion, x + moved + SIGMA_M * np.random.default_rng([seed, 1]).normal(size=x.shape))
+
+
+def found(recording: Recording, robot: RobotDescription) -> DiagnosisFile:
+    return conclusion(diagnose(recording, Simulation(robot)))
+
+
+@pytest.mark.parametrize("size", [1.0, 4.0])
+def test_a_mount_that_gives_alike_about_all_axes_is_unexplained_and_no_cause_is_named(robot, size) -> None:
+    file = found(on_a_soft_mount(robot, size, 1), robot)
+    assert (file.verdict, file.causes) == ("unexplained", ())
+    assert file.unexplained.what[0].endswith("gives under the arm's weight")
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_small_one_is_no_sure_cause(robot, seed) -> None:
+    file = found(on_a_soft_mount(robot, 0.3, seed), robot)
+    assert all(cause.probability < 0.9 for cause in file.causes)
+
+
+@pytest.mark.parametrize("where", [SHOULDER, ELBOW])
+def test_a_joint_that_gives_is_named(robot, where) -> None:
+    truth = Effect.at(robot, "joint_compliance", where, values=[0.03])
+    (cause,) = found(seen(robot, walk(robot, 1), (truth,), 1), robot).causes
+    assert (cause.effect, cause.where) == ("joint_compliance", where)
+
+
+def test_what_may_be_a_mount_that_gives_is_told_with_how_to_see_it(robot) -> None:
+    truth = Effect.at(robot, "joint_compliance", SHOULDER, values=[4e-4])
+    file = found(seen(robot, walk(robot, 1), (truth,), 1), robot)
+    (cause,) = file.causes
+    (rival,) = [rival for rival in cause.rivals if rival.effect == "unexplained"]
+    assert rival.what.endswith("gives under the arm's weight")
+    assert any(line.startswith(f"Watch whether {rival.what}") for line in file.advice)
+
+
+def test_the_frames_that_bear_a_joint_begin_with_its_own_link_and_end_with_the_next_joints(robot) -> None:
+    poses = Simulation(robot).gravity.in_supports(robot.joints.index(SHOULDER))
+    assert len(poses) == 1
+    np.testing.assert_allclose(poses[0][:3, 3], [0.03, 0.0, 0.06])

@@ -1,0 +1,151 @@
+"""A change is noticed, dated and named from the errors of a model; no change is not."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from planted_chains import random_chain
+
+from kbmaps import (
+    ChainBelief,
+    ChainParameters,
+    ChainTolerances,
+    ChangeDetector,
+    SharedNoise,
+    any_change,
+    change_kinds,
+    explanations,
+)
+from kbmaps.changes.mixture import log_ratios
+
+SIGMA = 0.002
+TOLERANCES = ChainTolerances(axes=0.003, points=0.001, zeros=0.003, tool=0.001)
+BEFORE, AFTER = 60, 80
+KINDS = {"tool": None, "camera": None, "joint": 2}
+
+
+class Arm:
+    """An arm that is as drawn within its tolerances, along a smooth path that it goes on with after a change."""
+
+    def __init__(self, seed: int, pairs: int = BEFORE + AFTER) -> None:
+        self.rng = np.random.default_rng(seed)
+        self.parameters = ChainParameters(random_chain(self.rng, "RRRRR"))
+        self.belief = ChainBelief.from_tolerances(self.parameters, TOLERANCES)
+        self.truth = self.parameters.standard_deviations(TOLERANCES) * self.rng.normal(size=self.parameters.size)
+        phases, speeds = self.rng.uniform(0.0, 6.0, 5), self.rng.uniform(0.03, 0.08, 5)
+        self.q = np.sin(speeds * np.arange(pairs)[:, None] + phases)
+        self.x = self.parameters.positions(self.truth, self.q) + SIGMA * self.rng.normal(size=(pairs, 3))
+
+    def change(self, kind: str, size_m: float) -> None:
+        """From the pair `BEFORE` on, by about so much at the marker."""
+        chosen = next(
+            each for each in change_kinds(self.parameters, 0.5) if (each.name, each.joint) == (kind, KINDS[kind])
+        )
+        moved = self.truth.copy()
+        direction = self.rng.normal(size=len(chosen.columns))
+        moved[chosen.columns] += size_m * chosen.units * direction / np.linalg.norm(direction)
+        shift = self.parameters.positions(moved, self.q) - self.parameters.positions(self.truth, self.q)
+        self.x[BEFORE:] += shift[BEFORE:]
+
+    def detector(self) -> ChangeDetector:
+        return ChangeDetector(self.belief, SharedNoise(np.ones(1), 1.0), SIGMA, 0.5)
+
+    def feed(self, detector: ChangeDetector, pairs: slice) -> None:
+        q, x = self.q[pairs], self.x[pairs]
+        detector.add(q, x - self.belief.predict(q), np.full((len(q), 3), SIGMA**2))
+
+    def noticed(self) -> tuple[ChangeDetector, int]:
+        """The detector when it raised an alarm, and how many pairs it had seen."""
+        detector = self.detector()
+        for k in range(len(self.q)):
+            self.feed(detector, slice(k, k + 1))
+            if detector.suspicion().alarm:
+                return detector, k + 1
+        raise AssertionError("no alarm")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("seed", range(3))
+def test_a_change_ten_times_the_noise_is_noticed_within_ten_pairs_and_dated(seed: int, kind: str) -> None:
+    arm = Arm(seed)
+    arm.change(kind, 10.0 * SIGMA)
+    detector, pairs = arm.noticed()
+    earliest, latest = detector.suspicion().interval()
+    assert BEFORE < pairs <= BEFORE + 10
+    assert earliest - 2 <= BEFORE <= latest + 2
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("seed", range(3))
+def test_a_change_is_named_rightly_by_the_pairs_since(seed: int, kind: str) -> None:
+    arm = Arm(seed)
+    arm.change(kind, 10.0 * SIGMA)
+    kinds = (*change_kinds(arm.parameters, 0.5), any_change(arm.parameters))
+    best = explanations(arm.belief, kinds, arm.q[BEFORE:], arm.x[BEFORE:], SIGMA)[0]
+    assert (best.kind.name, best.kind.joint) == (kind, KINDS[kind])
+
+
+def test_where_the_arm_hardly_moved_since_nothing_is_named() -> None:
+    arm = Arm(0)
+    arm.change("tool", 10.0 * SIGMA)
+    kinds = change_kinds(arm.parameters, 0.5)
+    here = np.full(3, BEFORE)
+    assert explanations(arm.belief, kinds, arm.q[here], arm.x[here], SIGMA)[0].probability < 0.95
+
+
+def test_probabilities_of_all_kinds_add_up_to_one() -> None:
+    arm = Arm(0)
+    kinds = (*change_kinds(arm.parameters, 0.5), any_change(arm.parameters))
+    found = explanations(arm.belief, kinds, arm.q, arm.x, SIGMA)
+    assert sum(each.probability for each in found) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_without_a_change_there_is_no_alarm(seed: int) -> None:
+    arm = Arm(seed, 400)
+    detector = arm.detector()
+    for k in range(0, 400, 10):
+        arm.feed(detector, slice(k, k + 10))
+        assert not detector.suspicion().alarm
+
+
+def test_without_a_change_the_likelihood_ratio_is_one_on_average() -> None:
+    # Small sizes: of large ones the mean is made of values too rare to draw.
+    rng = np.random.default_rng(0)
+    information = np.diag([0.2, 0.5, 1.0])
+    score = rng.normal(size=(200_000, 3)) * np.sqrt(np.diag(information))
+    ratios = np.exp(log_ratios(np.broadcast_to(information, (len(score), 3, 3)), score, np.array([0.5, 0.8])))
+    assert ratios.mean() == pytest.approx(1.0, abs=0.01)
+
+
+def test_two_wild_outliers_in_a_row_are_no_change() -> None:
+    arm = Arm(1)
+    arm.x[BEFORE : BEFORE + 2] += 1.0
+    detector = arm.detector()
+    arm.feed(detector, slice(BEFORE + 2))
+    assert not detector.suspicion().alarm
+
+
+def test_noise_that_has_doubled_is_no_change() -> None:
+    arm = Arm(2, 400)
+    arm.x[BEFORE:] += np.sqrt(3.0) * SIGMA * arm.rng.normal(size=(400 - BEFORE, 3))
+    detector = arm.detector()
+    for k in range(400):
+        arm.feed(detector, slice(k, k + 1))
+        assert not detector.suspicion().alarm
+
+
+def test_what_neighbours_share_makes_runs_of_them_say_less() -> None:
+    rng = np.random.default_rng(0)
+    alone = rng.normal(size=(600, 3))
+    shared = alone + np.repeat(rng.normal(size=(60, 3)), 10, axis=0)
+    assert SharedNoise.of(alone).whole < 1.5
+    assert SharedNoise.of(shared).whole > 6.0
+
+
+def test_pairs_that_come_together_say_what_they_say_one_by_one() -> None:
+    arm, one, all_ = Arm(0), Arm(0).detector(), Arm(0).detector()
+    arm.feed(all_, slice(50))
+    for k in range(50):
+        arm.feed(one, slice(k, k + 1))
+    assert one.suspicion().log_odds == pytest.approx(all_.suspicion().log_odds)

@@ -1,0 +1,52 @@
+"""At a desk somewhere on the network: waits until the learner has all pairs, then asks as a viewer and as an operator.
+
+Usage: python desk.py ENDPOINT PAIRS. Prints one line of JSON. A program of its own, since it runs on a host of its own.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from pathlib import Path
+
+from daemon.bus import client
+from daemon.identity import Identity, Route
+from daemon.keys import Keys
+from interfaces.errors import BodyschemaError, BusError
+
+LIMIT_S = 60.0
+KEYS = Keys("arm")
+
+
+def route(endpoint: str, name: str) -> Route:
+    files = (Path(f"{file}") for file in ("ca.pem", f"{name}.pem", f"{name}.key"))
+    return Route((endpoint,), Identity(*(file.absolute() for file in files)))
+
+
+def asked(where: Route, key: str, **request: object) -> dict[str, object]:
+    try:
+        with client(where) as bus:
+            return json.loads(bus.ask_one(key, json.dumps(request).encode() if request else b""))
+    except BodyschemaError as error:
+        return {"error": str(error)}
+
+
+def main(endpoint: str, pairs: str) -> None:
+    viewer, operator = route(endpoint, "anna"), route(endpoint, "bert")
+    until = time.monotonic() + LIMIT_S
+    while asked(viewer, KEYS.status("learner")).get("pairs") != int(pairs):
+        if time.monotonic() > until:
+            raise BusError("the pairs have not come")
+        time.sleep(0.2)
+    answers = {
+        "predict": asked(viewer, KEYS.predict, q=[0.3, 0.1]),
+        "viewer's command": asked(viewer, KEYS.command("learner"), command="pause"),
+        "operator's command": asked(operator, KEYS.command("learner"), command="pause"),
+        "sampler": asked(viewer, KEYS.status("sampler")),
+    }
+    print(json.dumps(answers))
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

@@ -1,0 +1,41 @@
+"""Runs `bodyschema` and lets a loop hang, as a device or a disk would, as long as a file of its name is in a folder.
+
+python stalled_at.py FOLDER sampler --robot robot.toml
+"""
+
+from __future__ import annotations
+
+import importlib
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from daemon.cli import main
+
+# What each loop does in its round.
+WORK = {
+    "encoders": ("daemon.reopen", "Reopening", "read", "the encoders"),
+    "frames": ("daemon.reopen", "Reopening", "read", "the cameras"),
+    "learning": ("daemon.feed", "PairFeed", "step", None),
+    "background": ("daemon.findings", "Findings", "renew", None),
+    "status": ("daemon.learner", "Learner", "status", None),
+}
+
+
+def hanging(work: Callable[..., Any], name: str | None, file: Path) -> Callable[..., Any]:
+    def doomed(self: Any, *arguments: Any) -> Any:
+        while name in (None, getattr(self, "_name", None)) and file.exists():
+            time.sleep(0.01)
+        return work(self, *arguments)
+
+    return doomed
+
+
+if __name__ == "__main__":
+    folder = Path(sys.argv.pop(1))
+    for loop, (module, kind, method, name) in WORK.items():
+        owner = getattr(importlib.import_module(module), kind)
+        setattr(owner, method, hanging(getattr(owner, method), name, folder / loop))
+    main()

@@ -1,0 +1,101 @@
+"""Files that older versions wrote, kept in tests/daemon/older_versions: what a robot has after an upgrade."""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+import sqlite3
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from small_arm import URDF
+from test_kill import running, status_when, write_robot
+
+from daemon.backup import Backup, write_backup
+from daemon.checkpoint import CheckpointError, read_checkpoint
+from daemon.config import Config
+from daemon.restoring import restore
+from daemon.session import session_of
+from daemon.status import LearnerStatus
+from daemon.store import PairReader, PairStore
+from daemon.store_schema import SCHEMA_VERSION
+from interfaces.clock import SystemClock
+from interfaces.errors import StoreError
+
+OLDER = Path(__file__).parents[1] / "daemon" / "older_versions"
+PAIRS = 40  # in each of the files
+ROWS = 60
+
+
+@pytest.fixture
+def config(tmp_path: Path, free_endpoint: Callable[[], str]) -> Config:
+    """A robot with the pairs of the first version."""
+    config = write_robot(tmp_path, free_endpoint, rows=ROWS)
+    config.state_dir.mkdir()
+    shutil.copy(OLDER / "pairs_1.sqlite", config.store_file)
+    return config
+
+
+def schema(file: Path) -> int:
+    with contextlib.closing(sqlite3.connect(file)) as connection:
+        return connection.execute("PRAGMA user_version").fetchone()[0]
+
+
+def test_the_first_version_s_pairs_are_brought_to_the_present_schema_as_they_were(config: Config) -> None:
+    with PairReader(config.store_file) as before:
+        pairs, identity = before.read(), before.identity
+    assert schema(config.store_file) == 1  # a reader changes nothing
+    with PairStore(config.store_file, session_of(config, SystemClock())) as store:
+        assert store.identity == identity
+        assert [(p.seq, p.utc, p.q.tolist(), p.x.tolist()) for p in store.read()] == [
+            (p.seq, p.utc, p.q.tolist(), p.x.tolist()) for p in pairs
+        ]
+    assert (schema(config.store_file), len(pairs)) == (SCHEMA_VERSION, PAIRS)
+
+
+def test_a_migration_that_cannot_be_finished_leaves_the_first_version(config: Config) -> None:
+    with contextlib.closing(sqlite3.connect(config.store_file)) as connection:
+        connection.execute("CREATE TABLE devices (somebody, elses)")
+    with pytest.raises(StoreError), PairStore(config.store_file, session_of(config, SystemClock())):
+        pass
+    assert schema(config.store_file) == 1
+
+
+def test_the_first_version_s_pairs_are_backed_up_and_restored(config: Config, tmp_path: Path) -> None:
+    write_backup(config, tmp_path / "arm.zip", utc="", version="0")
+    with Backup(tmp_path / "arm.zip") as backup:
+        restore(backup, tmp_path / "other" / "robot.toml")
+    with PairReader(tmp_path / "other" / "state" / "pairs.sqlite") as pairs:
+        assert pairs.last_seq() == PAIRS
+
+
+@pytest.mark.parametrize(
+    ("version", "said"),
+    [
+        (1, "has the version 1; this bodyschema reads"),
+        (2, "has the version 2; this bodyschema reads"),
+        (3, "cannot be understood: Object missing required field"),
+    ],
+)
+def test_a_checkpoint_that_can_no_longer_be_read_says_why(version: int, said: str) -> None:
+    with pytest.raises(CheckpointError, match=said):
+        read_checkpoint(OLDER / f"learner_{version}.ckpt", robot="arm")
+
+
+def test_a_learner_with_an_older_checkpoint_keeps_it_and_learns_every_stored_pair_again(config: Config) -> None:
+    shutil.copy(OLDER / "learner_1.ckpt", config.checkpoint_file)
+    with running(config, "sampler"), running(config, "learner"):
+        status = status_when(config, "learner", LearnerStatus, lambda status: status.pairs == PAIRS + ROWS)
+    assert (status.last_seq, status.missed, status.refused) == (PAIRS + ROWS, 0, 0)
+    kept = config.checkpoint_file.with_name("learner.ckpt.unusable-1")
+    assert f"It was kept as {kept}; the learner learns again" in status.health[0]
+    assert kept.read_bytes() == (OLDER / "learner_1.ckpt").read_bytes()
+
+
+def test_every_setting_of_the_first_version_is_still_one(tmp_path: Path) -> None:
+    (tmp_path / "arm.urdf").write_text(URDF)
+    shutil.copy(OLDER / "robot_1.toml", tmp_path / "robot.toml")
+    config = Config.load(tmp_path / "robot.toml", {})
+    assert config.tables.learner.checkpoint_every_s == 0.2
+    assert config.tables.sim.tool_changes == ()

@@ -1,0 +1,253 @@
+"""The page in a browser, with both processes running in simulation behind it."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from daemon.config import Config
+from daemon.demo.processes import started_daemon
+from daemon.demo.scene import Scene, prepare
+from daemon.keys import Keys
+
+pytest.importorskip("pybullet")
+pytest.importorskip("uvicorn")
+playwright = pytest.importorskip("playwright.sync_api")
+expect = playwright.expect
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+QUIET = ["--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking"]
+QUIET += ["--disable-component-update", "--disable-sync"]
+# On a busy machine everything takes longer, and passes.
+LIMIT_MS = 90_000
+pytestmark = [
+    pytest.mark.skipif(CHROMIUM is None, reason="no chromium is installed (Debian's package chromium)"),
+    pytest.mark.timeout(400),
+]
+SIZES = {"desktop": {"width": 1280, "height": 900}, "phone": {"width": 360, "height": 740}}
+
+
+class PageServer:
+    """`bodyschema view` on a port of its own, which can be ended and started again."""
+
+    def __init__(self, robot: Path, port: str) -> None:
+        self._command = [sys.executable, "-m", "daemon", "view", "--robot", str(robot), "--port", port]
+        self.address = f"http://127.0.0.1:{port}/"
+        self.start()
+
+    def start(self) -> None:
+        """Return when a browser may ask."""
+        self._process = subprocess.Popen(self._command, stdout=subprocess.PIPE, text=True)
+        assert self._process.stdout is not None
+        assert self._process.stdout.readline() == f"look at {self.address}\n"
+
+    def end(self) -> None:
+        """By SIGTERM, in order, whoever looks."""
+        self._process.terminate()
+        assert self._process.wait(60) == 0
+        self._process.communicate()
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Scene]:
+    scene = prepare(tmp_path_factory.mktemp("view") / "demo", 3)
+    with started_daemon(scene) as daemon:
+        config = Config.load(scene.robot_file, {})
+        for process in ("sampler", "learner"):
+            daemon.wait_for(getattr(config.tables.zenoh, process), Keys(config.robot.name).alive(process))
+        yield scene
+
+
+@pytest.fixture(scope="module")
+def server(scene: Scene, free_endpoint) -> Iterator[PageServer]:
+    server = PageServer(scene.robot_file, free_endpoint().rpartition(":")[2])
+    yield server
+    server.end()
+
+
+@pytest.fixture(scope="module")
+def address(server: PageServer) -> str:
+    return server.address
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    with playwright.sync_playwright() as running:
+        browser = running.chromium.launch(executable_path=CHROMIUM, args=QUIET)
+        yield browser
+        browser.close()
+
+
+@pytest.fixture
+def page(browser, address: str) -> Iterator[Any]:
+    with opened(browser, address) as page:
+        yield page
+
+
+@contextmanager
+def opened(browser, address: str, size: str = "desktop", scheme: str = "light") -> Iterator[Any]:
+    """The page; whatever the browser complains of, or fetches from elsewhere, is an error."""
+    context = browser.new_context(viewport=SIZES[size], color_scheme=scheme)
+    complaints: list[str] = []
+    page = context.new_page()
+    page.set_default_timeout(LIMIT_MS)
+    page.on("console", lambda message: complaints.append(message.text) if message.type == "error" else None)
+    page.on("pageerror", lambda error: complaints.append(str(error)))
+    page.on("request", lambda asked: None if asked.url.startswith(address) else complaints.append(asked.url))
+    page.goto(address)
+    yield page
+    context.close()
+    assert complaints == []
+
+
+def says(page, name: str, text: str) -> None:
+    expect(page.locator(name)).to_contain_text(re.compile(text), timeout=LIMIT_MS)
+
+
+def child_of(name: str, robot: Path) -> int:
+    """The process of this robot that `bodyschema run` started under this name."""
+    for folder in Path("/proc").iterdir():
+        try:
+            words = (folder / "cmdline").read_bytes().decode().split("\0") if folder.name.isdigit() else []
+        except OSError:
+            continue
+        if name in words and str(robot) in words:
+            return int(folder.name)
+    raise AssertionError(f"there is no {name}")
+
+
+def test_every_panel_shows_what_runs(page) -> None:
+    says(page, "#robot", "upper_body")
+    says(page, "#pill-sampler", "running")
+    says(page, "#pill-learner", "learning")
+    says(page, "#tile-error", r"[\d.]+ mm")
+    says(page, "#tile-predict", r"[\d.]+ ms")
+    says(page, "#outlook", "more pairs like these")
+    says(page, "#cloud-text", r"\d+ pairs with this tool, all learnt already: median [\d.]+ mm")
+    says(page, "#error-text", r"[\d.]+ mm after \d+ pairs")
+    says(page, "#latency-text", r"Median [\d.]+ ms")
+    expect(page.locator("#error-plot canvas")).to_be_visible()
+    expect(page.locator("#coverage li")).to_have_count(7)
+    assert page.locator("#segments tbody tr").count() >= 1
+    assert page.locator("#models tbody tr").count() >= 2
+    assert page.locator("#versions tbody tr").count() >= 1
+
+
+def test_pause_and_resume_are_one_button(page) -> None:
+    page.click("#pause")
+    says(page, "#pill-sampler", "paused")
+    says(page, "#notices", "no pairs are accepted until resume")
+    expect(page.locator("#pause")).to_have_text("Resume")
+    says(page, "#rejected", "paused")
+    page.click("#pause")
+    says(page, "#pill-sampler", "running")
+
+
+def test_a_changed_tool_is_asked_for_twice_and_then_marked(page) -> None:
+    says(page, "#error-text", "pairs")
+    page.click("#tool")
+    page.keyboard.press("Escape")
+    expect(page.locator("#tool-dialog")).to_be_hidden()
+    assert "the tool changed after" not in page.locator("#error-text").inner_text()
+    page.click("#tool")
+    page.click("text=Yes, the tool was changed")
+    says(page, "#error-text", r"the tool changed after [\d,]+")
+    says(page, "#versions", "new tool")
+
+
+def test_a_diagnosis_is_begun_and_stopped_by_buttons(page) -> None:
+    page.click("#diagnose")
+    says(page, "#diagnosis", r"Diagnosis of the newest [\d,]+ pairs")
+    expect(page.locator("#diagnose")).to_be_disabled()
+    page.click("#diagnosis-stop")
+    says(page, "#diagnosis", "The diagnosis was stopped")
+    expect(page.locator("#diagnose")).to_be_enabled()
+
+
+def test_a_learner_that_is_silent_is_named_and_the_page_goes_on_when_it_is_back(page, scene: Scene) -> None:
+    says(page, "#pill-learner", "learning")
+    learner = child_of("learner", scene.robot_file)
+    os.kill(learner, signal.SIGSTOP)
+    try:
+        says(page, "#notices", "The learner has not answered since .*bodyschema learner")
+        says(page, "#pill-learner", "gone")
+        expect(page.locator("#tool")).to_be_disabled()
+    finally:
+        os.kill(learner, signal.SIGCONT)
+    says(page, "#pill-learner", "learning")
+    expect(page.locator("#notices")).not_to_contain_text("The learner has not answered", timeout=LIMIT_MS)
+    expect(page.locator("#tool")).to_be_enabled()
+
+
+def test_everything_is_reached_with_the_keyboard_alone(page) -> None:
+    says(page, "#cloud-text", "median")
+    expect(page.locator("#pause")).to_be_enabled()
+    expect(page.locator("#tool")).to_be_enabled()
+    reached = []
+    for _ in range(14):
+        page.keyboard.press("Tab")
+        reached.append(page.evaluate("document.activeElement.id || document.activeElement.name"))
+    assert {"pause", "tool", "diagnose", "axis", "cloud", "cloud-reset"} <= set(reached)
+    page.focus("#cloud")
+    before = page.evaluate("document.getElementById('cloud').toDataURL()")
+    page.keyboard.press("ArrowRight")
+    page.wait_for_function("before => document.getElementById('cloud').toDataURL() !== before", arg=before)
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("size", SIZES)
+def test_nothing_is_wider_than_the_screen_and_all_text_can_be_read(browser, address, size: str, scheme: str) -> None:
+    with opened(browser, address, size, scheme) as page:
+        says(page, "#cloud-text", "median")
+        assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+        assert page.evaluate(CONTRASTS) == []
+
+
+# What has less contrast than WCAG 2.2 asks of text, 4.5 to 1: its relative luminance, of what is written on what.
+CONTRASTS = """() => {
+  const numbers = (color) => color.match(/[\\d.]+/g).map(Number);
+  const light = (color) => {
+    const linear = (c) => (c <= 0.04045 ? c / 12.92 : ((c + 0.055) / 1.055) ** 2.4);
+    const [r, g, b] = numbers(color).slice(0, 3).map((c) => linear(c / 255));
+    return 0.2126 * r + 0.7152 * g + 0.0722 * b;
+  };
+  const ground = (e) => {
+    for (; e; e = e.parentElement) {
+      const color = getComputedStyle(e).backgroundColor;
+      if (numbers(color)[3] !== 0) return color;
+    }
+    return "rgb(255, 255, 255)";
+  };
+  const poor = [];
+  for (const e of document.querySelectorAll("body *")) {
+    const own = [...e.childNodes].some((n) => n.nodeType === 3 && n.data.trim());
+    if (!own || !e.checkVisibility() || e.disabled || e.closest("svg")) continue;
+    const [a, b] = [light(getComputedStyle(e).color), light(ground(e))].sort((x, y) => y - x);
+    if ((a + 0.05) / (b + 0.05) < 4.5) poor.push(`${e.tagName} ${e.id || e.className}: ${e.textContent}`);
+  }
+  return poor;
+}"""
+
+
+def test_a_page_s_server_that_ends_is_named_and_comes_back_by_itself(browser, server: PageServer) -> None:
+    context = browser.new_context()
+    page = context.new_page()
+    page.goto(server.address)
+    says(page, "#pill-learner", "learning")
+    server.end()
+    says(page, "#notices", "The page's server does not answer")
+    expect(page.locator("#pause")).to_be_disabled()
+    server.start()
+    expect(page.locator("#pause")).to_be_enabled(timeout=LIMIT_MS)
+    expect(page.locator("#notices")).not_to_contain_text("server does not answer", timeout=LIMIT_MS)
+    context.close()
