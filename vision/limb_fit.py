@@ -28,11 +28,13 @@ _LEAST_DETERMINANT = 1e-6
 # A ray's samples share pixels with each other and with its neighbours': variance of even backgrounds, that the filters
 # take for 1; and how many waves that knowledge is worth.
 _SHARED_PIXELS, _WORTH = 1.3, 3.0
-# Where whole arcs are farther off than so many times the variance that their samples leave open, what was fitted is no
-# ball's limb alone: something covers it, or the background goes along with it.
-_LARGEST_DENSITY, _ROUGH = 20.0, 0.6
+# What covers a ball breaks its limb at sharp corners, which shows in the quick waves; what is behind it bends whole arcs,
+# in the slow ones, which the claim follows. Beyond so many times the variance of the samples it is no ball's limb alone.
+_LARGEST_DENSITY = 15.0
 # What a lens leaves of its distortion makes a limb oval, by this part of its radius at most, but fits all around.
 _MOST_OVAL, _CLEAN_DENSITY = 0.015, 3.0
+# An oval is tried where the slow waves are this large.
+_BENT_DENSITY = 20.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,10 +86,10 @@ def fit_limb(
         if moved_px < _SETTLED_PX and abs(blur_px - last_blur_px) < _SETTLED_BLUR_PX:
             break
     aliased = blur_px < _ALIASED_PX
-    if fit is None or (_is_torn(fit.waves) and not aliased):
+    if fit is None or (fit.waves.quick > _LARGEST_DENSITY and not aliased):
         return None
     # What the waves show less than the pixels' noise alone makes is chance.
-    seen, count = fit.waves.once_round(), fit.waves.count
+    seen, count = fit.waves.evened().once_round(), fit.waves.count
     cov = max(seen, (count * seen + _WORTH * _SHARED_PIXELS) / (count + _WORTH)) * fit.inverse
     # A blurred disc's edge, where it is steepest, is nearer to the centre than the disc's.
     radius_px += blur_px**2 / (2.0 * radius_px)
@@ -97,15 +99,10 @@ def fit_limb(
 def _fit(limb: Limb, radius_px: float) -> _Fit | None:
     """The circle through the limb; an oval one where no circle fits, but that does all around."""
     fit = _least_squares(limb, radius_px, oval=False)
-    if fit is None or not _is_torn(fit.waves):
+    if fit is None or fit.waves.slow < _BENT_DENSITY:
         return fit
     other = _least_squares(limb, radius_px, oval=True)
     return other if other is not None and other.waves.slow < _CLEAN_DENSITY else fit
-
-
-def _is_torn(around: Waves) -> bool:
-    """Whether whole arcs are off; errors that change from ray to ray, as aliased pixels make them, tear nothing."""
-    return around.slow > max(_LARGEST_DENSITY, _ROUGH * around.quick)
 
 
 def _least_squares(limb: Limb, radius_px: float, *, oval: bool) -> _Fit | None:

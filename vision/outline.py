@@ -55,10 +55,8 @@ _ENOUGH = 60
 _TRIPLES = np.array(list(combinations(range(_ARCS), 3)))
 # What is left when all noise has averaged out [px].
 _FLOOR_PX = 0.002
-# Coverage and limb have to agree to so many of their sigmas.
-_LARGEST_CONTRADICTION = 8.0
-# What they disagree by is claimed as uncertainty, to this part.
-_DISTRUST = 0.2
+# What coverage and limb disagree by is claimed as uncertainty, to this part; beyond so many of their sigmas wholly.
+_DISTRUST, _LARGEST_CONTRADICTION = 0.2, 4.0
 # Below this, relative to the cubed trace, the outline points do not determine centre and radius.
 _LEAST_DETERMINANT = 1e-5
 
@@ -133,16 +131,17 @@ def fit_outline(
 
 
 def _refined(image: Float32Array, gate: Gate, rough: Outline, shape: FloatArray) -> Outline | None:
-    """`rough` with the centre, radius and covariance that the limb tells; None when the two contradict each other."""
+    """`rough` with the centre, radius and covariance that the limb tells; None when that is no ball's limb."""
     fitted = fit_limb(image, gate, rough.centre_px, rough.radius_px, shape)
     if fitted is None:
         return None
     if fitted.aliased:
         return rough
     moved_px = fitted.centre_px - rough.centre_px
-    cov_px = fitted.cov_px + _FLOOR_PX**2 * np.eye(2) + _DISTRUST**2 * np.outer(moved_px, moved_px)
-    if moved_px @ np.linalg.solve(cov_px + rough.cov_px, moved_px) > _LARGEST_CONTRADICTION**2:
-        return None
+    cov_px = fitted.cov_px + _FLOOR_PX**2 * np.eye(2)
+    contradiction = float(moved_px @ np.linalg.solve(cov_px + rough.cov_px, moved_px))
+    distrust = _DISTRUST if contradiction < _LARGEST_CONTRADICTION**2 else 1.0
+    cov_px += distrust**2 * np.outer(moved_px, moved_px)
     return replace(
         rough,
         centre_px=fitted.centre_px,

@@ -7,7 +7,7 @@ better.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -32,6 +32,10 @@ class Waves:
     slow: float
     quick: float
     count: float
+
+    def evened(self) -> Waves:
+        """The same where nothing but chance makes the quick waves larger than the slow ones: both tell one noise."""
+        return replace(self, slow=max(self.slow, 0.5 * (self.slow + self.quick)))
 
     def once_round(self) -> float:
         """Variance in the wave that goes once round.
