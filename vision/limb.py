@@ -11,6 +11,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from interfaces.records import FloatArray
 
@@ -75,8 +76,8 @@ def _filtered(angles: FloatArray, rays: FloatArray, both: tuple[Filters, Filters
     own, across = both
     information, moved = np.zeros((2, len(angles)))
     widening, widening_information = 0.0, 1e-9
-    for channel, one in zip(rays, (own, across, across), strict=True):
-        texture = np.argmax(_log_likelihood(channel[None], one), axis=0)
+    likeliest = np.concatenate([_likeliest(rays[:1], own), _likeliest(rays[1:], across)])
+    for channel, one, texture in zip(rays, (own, across, across), likeliest, strict=True):
         contrast, shift = (np.einsum("nm,nm->n", part[texture], channel) for part in (one.contrast, one.shift))
         contrast = mean_of_three(contrast)
         inverse = 1.0 / one.shift_variance[texture]
@@ -96,14 +97,14 @@ def _filtered(angles: FloatArray, rays: FloatArray, both: tuple[Filters, Filters
     )
 
 
-def _log_likelihood(rays: FloatArray, one: Filters) -> FloatArray:
-    """Of each texture (k) and ray (n): shape (k, n), the mean of three neighbouring rays."""
-    kinds, columns = one.log_determinant.size, rays.shape[2]
+def _likeliest(rays: FloatArray, one: Filters) -> NDArray[np.intp]:
+    """Which texture is the likeliest of each ray (n) of some channels (c), by three neighbours: shape (c, n)."""
+    channels, count, columns = rays.shape
     flat = rays.reshape(-1, columns)
-    whitened = (flat @ one.precision.transpose(1, 0, 2).reshape(columns, -1)).reshape(-1, kinds, columns)
-    square = np.einsum("nkm,nm->kn", whitened, flat).reshape(kinds, len(rays), -1).sum(axis=1)
-    likelihood = -0.5 * (square + len(rays) * one.log_determinant[:, None])
-    return mean_of_three(likelihood.T).T
+    whitened = (flat @ one.precisions).reshape(len(flat), -1, columns)
+    square = np.einsum("nkm,nm->nk", whitened, flat).reshape(channels, count, -1)
+    likelihood = -0.5 * (square + one.log_determinant)
+    return np.argmax([mean_of_three(channel) for channel in likelihood], axis=2)
 
 
 def _own_colour_first(colour: FloatArray) -> FloatArray:
@@ -125,4 +126,5 @@ def _noise(inside: Float32Array, beyond: Float32Array) -> float:
     on_ball = 1.4826 * median(np.abs(np.diff(inside, axis=0)).ravel()) / math.sqrt(2.0)
     apart = round(1.0 / STEP_PX)
     rough = mean_of_three(((beyond[:, apart:] - beyond[:, :-apart]) ** 2).mean(axis=(1, 2)))
-    return max(_LEAST_NOISE, on_ball, math.sqrt(0.5 * float(np.quantile(rough, _EVEN_RAYS))))
+    even = int(_EVEN_RAYS * (len(rough) - 1))
+    return max(_LEAST_NOISE, on_ball, math.sqrt(0.5 * float(np.partition(rough, even)[even])))

@@ -40,7 +40,7 @@ class Filters:
     """One filter for each of k textures of the background, over m samples of a ray in units of their noise.
 
     Attributes:
-        precision: inverse covariances of the samples, shape (k, m, m), whose
+        precisions: inverse covariances of the samples side by side, shape (m, k·m), whose
         log_determinant: logarithms of the covariances' determinants, shape (k,), make the likelihood.
         shift: (k, m), what the edge is off by times the contrast [px], with
         shift_variance: (k,) [px²].
@@ -49,7 +49,7 @@ class Filters:
         widening_variance: (k,) [px²].
     """
 
-    precision: FloatArray
+    precisions: FloatArray
     log_determinant: FloatArray
     shift: FloatArray
     shift_variance: FloatArray
@@ -105,7 +105,8 @@ def _filters(at: tuple[float, ...], radius_px: float, blur_px: float, own_colour
         contrast = (level * ball - _FREE * beyond) @ precision
         log_determinant = float(np.linalg.slogdet(cov)[1])
         rows.append((precision, log_determinant, shift, shift_variance, contrast, widening, widening_variance))
-    return Filters(*(np.array(column) for column in zip(*rows, strict=True)))
+    precisions, *others = (np.array(column) for column in zip(*rows, strict=True))
+    return Filters(np.concatenate(list(precisions), axis=1), *others)
 
 
 def _best_filter(cov: FloatArray, signal: FloatArray) -> tuple[FloatArray, float]:

@@ -26,10 +26,11 @@ from .waves import waves
 
 BoolArray = NDArray[np.bool_]
 
-# Half-widths [px] of the ring in which the edge is looked for: about the rough circle, then about the outline.
-_WINDOWS_PX = (4.0, 2.0, 2.0)
-# The outline is found when a step in the narrow ring moved it less than this [px].
-_SETTLED_PX = 0.3
+# Half-widths [px] of the ring in which the edge is looked for: about a circle that is right to a pixel, and about others.
+_NARROW_PX, _WIDE_PX = 2.0, 4.0
+# The outline is found when a step in the narrow ring moved it less than the first of these [px]; a rough circle that is
+# off by more than the second one is looked at in the wide ring.
+_SETTLED_PX, _ROUGH_PX = 0.4, 1.0
 _RING_STEP_PX = 0.5
 _BACKGROUND_PX = 2.0
 _INNER_COLUMNS = 6
@@ -50,6 +51,8 @@ _LEAST_GATE_PX, _LARGEST_GATE_PX, _GATE_SIGMAS = 0.8, 2.0, 3.5
 _ARC, _LEAST_HALF_ARC, _OFF_PX = 0.1, 3, 0.35
 # The outline in so many arcs, of which any three may tell the circle.
 _ARCS = 10
+# Where no point is farther than this from the circle through all, none has to be left out [px].
+_AGREED_PX = 0.4
 # About so many points are enough to tell which circle most agree on.
 _ENOUGH = 60
 _TRIPLES = np.array(list(combinations(range(_ARCS), 3)))
@@ -114,20 +117,32 @@ def fit_outline(
         radius_px: rough radius [px], right to about a fifth.
         shape: the ellipse's shape (2, 2), see `sphere.Ellipse`.
     """
-    outline = None
-    for window_px in _WINDOWS_PX:
-        half = min(window_px, 0.6 * radius_px)
-        edges = _find_edges(image, gate, centre_px, radius_px, shape, half)
-        outline = None if edges is None else _fit_circle(edges, centre_px, shape)
-        if outline is None:
-            return None
-        moved_px = float(np.linalg.norm(outline.centre_px - centre_px)) + abs(outline.radius_px - radius_px)
+    outline, moved_px = _step(image, gate, centre_px, radius_px, shape, _NARROW_PX)
+    if moved_px > _ROUGH_PX:
+        outline, moved_px = _step(image, gate, centre_px, radius_px, shape, _WIDE_PX)
         if moved_px > max(2.0, 0.5 * radius_px):
             return None
-        centre_px, radius_px = outline.centre_px, outline.radius_px
-        if half <= _WINDOWS_PX[-1] and moved_px < _SETTLED_PX:
+        # The wide ring settles nothing.
+        moved_px = max(moved_px, _SETTLED_PX)
+    for _ in range(2):
+        if outline is None or moved_px < _SETTLED_PX:
             break
+        radius_px = outline.radius_px
+        outline, moved_px = _step(image, gate, outline.centre_px, radius_px, shape, _NARROW_PX)
+        if moved_px > max(2.0, 0.5 * radius_px):
+            return None
     return None if outline is None else _refined(image, gate, outline, shape)
+
+
+def _step(
+    image: Float32Array, gate: Gate, centre_px: FloatArray, radius_px: float, shape: FloatArray, window_px: float
+) -> tuple[Outline | None, float]:
+    """The outline within a ring of half-width `window_px` about a circle, and how far it is from that circle [px]."""
+    edges = _find_edges(image, gate, centre_px, radius_px, shape, min(window_px, 0.6 * radius_px))
+    outline = None if edges is None else _fit_circle(edges, centre_px, shape)
+    if outline is None:
+        return None, math.inf
+    return outline, float(np.linalg.norm(outline.centre_px - centre_px)) + abs(outline.radius_px - radius_px)
 
 
 def _refined(image: Float32Array, gate: Gate, rough: Outline, shape: FloatArray) -> Outline | None:
@@ -219,6 +234,8 @@ def _fit_circle(edges: _Edges, centre_px: FloatArray, shape: FloatArray) -> Outl
         spread = 1.4826 * median(np.abs(residual[told]))
         gate = min(max(_GATE_SIGMAS * spread, _LEAST_GATE_PX), _LARGEST_GATE_PX)
         used, weight = weight, np.where(np.abs(residual) < gate, edges.weight, 0.0)
+        if np.array_equal(used, weight):
+            break
     if solution[2] <= 0:
         return None
     density = waves(edges.angles, np.sqrt(used) * residual, float(solution[2])).once_round()
@@ -261,8 +278,11 @@ def _agreeing(design: FloatArray, edges: _Edges) -> FloatArray:
     told = np.flatnonzero(edges.weight > 0)
     if len(told) < 2 * _ARCS:
         return edges.weight
-    arcs = np.array_split(told, _ARCS)
-    means = np.array([[*design[arc].mean(axis=0), edges.distance_px[arc].mean()] for arc in arcs])[_TRIPLES]
+    points = np.column_stack([design[told], edges.distance_px[told]])
+    if _all_agree(points, edges.weight[told]):
+        return edges.weight
+    begins = np.arange(_ARCS) * len(told) // _ARCS
+    means = (np.add.reduceat(points, begins) / np.diff(begins, append=len(told))[:, None])[_TRIPLES]
     told = told[:: max(1, len(told) // _ENOUGH)]
     circles = np.linalg.solve(means[..., :3] + 1e-9 * np.eye(3), means[..., 3:])[..., 0]
     off = np.abs(edges.distance_px[told] - circles @ design[told].T)
@@ -271,3 +291,13 @@ def _agreeing(design: FloatArray, edges: _Edges) -> FloatArray:
     best = int(np.argmin(spread))
     gate = min(max(_GATE_SIGMAS * 1.4826 * float(spread[best]), _LEAST_GATE_PX), _LARGEST_GATE_PX)
     return np.where(np.abs(edges.distance_px - design @ circles[best]) < gate, edges.weight, 0.0)
+
+
+def _all_agree(points: FloatArray, weight: FloatArray) -> bool:
+    """Whether one circle fits all points: rows of a design matrix and what it has to give, shape (n, 4) [px]."""
+    weighted = points[:, :3] * weight[:, None]
+    normal = weighted.T @ points
+    if np.linalg.det(normal[:, :3]) < _LEAST_DETERMINANT * np.trace(normal[:, :3]) ** 3:
+        return False
+    residual = points[:, 3] - points[:, :3] @ np.linalg.solve(normal[:, :3], normal[:, 3])
+    return bool(np.abs(residual).max() < _AGREED_PX)
