@@ -28,8 +28,9 @@ _LEAST_DETERMINANT = 1e-6
 # A ray's samples share pixels with each other and with its neighbours': variance of even backgrounds, that the filters
 # take for 1; and how many waves that knowledge is worth.
 _SHARED_PIXELS, _WORTH = 1.3, 3.0
-# What covers a ball breaks its limb at sharp corners, which shows in the quick waves; what is behind it bends whole arcs,
-# in the slow ones, which the claim follows. Beyond so many times the variance of the samples it is no ball's limb alone.
+# What covers a ball breaks its limb at sharp corners, which shows in the quick waves; what is behind it bends whole
+# arcs, in the slow ones, which the claim follows. Beyond so many times the variance of the samples it is no ball's
+# limb alone.
 _LARGEST_DENSITY = 18.0
 # What a lens leaves of its distortion makes a limb oval, by this part of its radius at most, but fits all around.
 _MOST_OVAL, _CLEAN_DENSITY = 0.015, 3.0

@@ -26,7 +26,7 @@ from .waves import waves
 
 BoolArray = NDArray[np.bool_]
 
-# Half-widths [px] of the ring in which the edge is looked for: about a circle that is right to a pixel, and about others.
+# Half-widths [px] of the ring in which the edge is looked for: about a circle right to a pixel, and about others.
 _NARROW_PX, _WIDE_PX = 2.0, 4.0
 # The outline is found when a step in the narrow ring moved it less than the first of these [px]; a rough circle that is
 # off by more than the second one is looked at in the wide ring.
@@ -240,14 +240,16 @@ def _fit_circle(edges: _Edges, centre_px: FloatArray, shape: FloatArray) -> Outl
         return None
     density = waves(edges.angles, np.sqrt(used) * residual, float(solution[2])).once_round()
     inverse = density * np.linalg.inv(normal)
-    hidden = edges.covered | ((weight == 0) & ~edges.uneven)
+    # What hides a ball moves its edge inwards; outwards does what has its colour behind it.
+    apart = (weight == 0) & ~edges.uneven
+    hidden = edges.covered | (apart & (residual < 0))
     return Outline(
         centre_px=centre_px + shape @ solution[:2],
         radius_px=float(solution[2]),
         cov_px=shape @ inverse[:2, :2] @ shape + _FLOOR_PX**2 * np.eye(2),
         radius_sigma_px=math.sqrt(inverse[2, 2]),
         visible=1.0 - float(np.mean(hidden)),
-        uneven=float(np.mean(edges.uneven)),
+        uneven=float(np.mean(edges.uneven | (apart & ~hidden))),
         off=_share_off(edges.weight, residual),
     )
 
