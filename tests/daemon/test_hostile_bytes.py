@@ -57,7 +57,9 @@ KINDS = (
     wire.PairMessage, wire.PairsReply, wire.JointsRequest, wire.IkRequest, wire.CommandRequest, wire.CommandReply,
     wire.PredictReply, wire.JacobianReply, wire.IkReply, wire.ErrorReply, SamplerStatus, LearnerStatus,
 )  # fmt: skip
-leaves = st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5)
+# MessagePack has no larger integers; JSON's are among the nasty texts.
+integers = st.integers(-(2**63), 2**64 - 1)
+leaves = st.none() | st.booleans() | integers | st.floats() | st.text(max_size=5)
 anything = st.recursive(
     leaves, lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=3), inner, max_size=3)
 )
