@@ -19,11 +19,12 @@ from importlib.metadata import version
 from daemon.answers import Answers
 from daemon.bus import Bus, Request
 from daemon.changes import Changes
-from daemon.checkpoint import CheckpointError, read_checkpoint, set_aside, write_checkpoint
+from daemon.checkpoint import CheckpointError, generations, read_checkpoint, set_aside, write_checkpoint
 from daemon.config import Config
 from daemon.expected import ExpectedMarker
 from daemon.feed import PairFeed
 from daemon.findings import Findings
+from daemon.history import Page, read_page
 from daemon.keys import Keys
 from daemon.learning import Learning, NominalModel, StateError
 from daemon.learning.solver import LARGEST_NET
@@ -33,7 +34,7 @@ from daemon.service import Service, with_health
 from daemon.signals import Wishes
 from daemon.solver_process import SolverLostError, SolverProcess
 from daemon.status import LearnerStatus
-from daemon.wire import OCTETS, CommandReply, CommandRequest, PairsReply, decode, encode
+from daemon.wire import OCTETS, CommandReply, CommandRequest, decode, encode
 from daemon.wiring import open_marker_topic
 from interfaces.errors import BodyschemaError, RequestError
 from interfaces.protocols import Clock
@@ -193,24 +194,35 @@ class Learner:
         for problem in (self._feed.problem, self._checkpoint_problem, self._set_aside):
             if problem is not None:
                 yield problem
+        if self._feed.refused is not None:
+            yield f"pairs were refused, {self._learning.counters.refused} so far; the last: {self._feed.refused}"
         if self._nominal.size > LARGEST_NET:
             yield f"{self._nominal.joints} joints are too many for the exact map; the others learn without it"
 
     def _restore(self) -> None:
-        file = self._config.checkpoint_file
-        try:
-            state = read_checkpoint(file, robot=self._robot.name)
-            if state is None:
-                return
-            self._learning.restore(state)
-        except (CheckpointError, StateError, KBMapsError, *DOES_NOT_FIT) as error:
-            aside = set_aside(file)
-            said = f"the checkpoint's parts do not fit: {error!r}" if isinstance(error, DOES_NOT_FIT) else str(error)
-            self._set_aside = f"{said}. It was kept as {aside}; the learner learns again from the sampler's history"
-            log.error("%s", self._set_aside)
-            self._learning = Learning(self._nominal, self._settings, self._solver)
+        """Go on from the checkpoint, or else from the one before; what is of no use is kept aside."""
+        said: list[str] = []
+        for file in generations(self._config.checkpoint_file):
+            try:
+                state = read_checkpoint(file, robot=self._robot.name)
+                if state is None:
+                    continue
+                self._learning.restore(state)
+            except (CheckpointError, StateError, KBMapsError, *DOES_NOT_FIT) as error:
+                unfit = isinstance(error, DOES_NOT_FIT)
+                why = f"the checkpoint's parts do not fit: {error!r}" if unfit else str(error)
+                said.append(f"{why}. It was kept as {set_aside(file)}")
+                self._learning = Learning(self._nominal, self._settings, self._solver)
+            else:
+                pairs = self._learning.counters.pairs
+                log.info("went on from %s with %d pairs", file, pairs)
+                said += [f"the learner went on from {file} with {pairs} pairs"] if said else []
+                break
         else:
-            log.info("went on from %s with %d pairs", file, self._learning.counters.pairs)
+            said += ["the learner learns again from the sampler's history"] if said else []
+        if said:
+            self._set_aside = "; ".join(said)
+            log.error("%s", self._set_aside)
 
     def _declare(self) -> None:
         bus, keys, answers = self._bus, self._keys, self._answers
@@ -229,9 +241,8 @@ class Learner:
         if alive:
             self._feed.wake()
 
-    def _history(self, begin: int) -> PairsReply:
-        payload = self._bus.ask_one(f"{self._keys.pairs}?from={begin}", timeout_s=HISTORY_LIMIT_S)
-        return decode(payload, PairsReply)
+    def _history(self, begin: int) -> Page:
+        return read_page(self._bus.ask_one(f"{self._keys.pairs}?from={begin}", timeout_s=HISTORY_LIMIT_S))
 
     def _command(self, request: Request) -> bytes:
         command = decode(request.payload, CommandRequest, request.encoding).command

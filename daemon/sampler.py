@@ -15,7 +15,7 @@ import numpy as np
 from interfaces.clock import SystemClock
 from interfaces.errors import ConfigError, RequestError, SourceEnded
 from interfaces.protocols import Clock
-from interfaces.records import FloatArray, JointReading, MarkerFix, MarkerMiss, Pair, Reason
+from interfaces.records import FloatArray, JointReading, MarkerFix, MarkerMiss, Reason
 
 from .align import JointBuffer
 from .bus import Bus, Request
@@ -35,6 +35,7 @@ from .sources import Head, Sources
 from .status import SamplerStatus
 from .store import PairStore
 from .store_file import disk_free
+from .storing import Storing
 from .tally import Tally
 from .wire import CommandReply, CommandRequest, decode, encode, pair_to_wire
 
@@ -103,6 +104,7 @@ class Sampler:
         rules, prismatic = config.tables.daemon, config.robot.chain.prismatic
         self._buffer = JointBuffer(prismatic, rules.max_reading_gap_s, live=sources.live, kept_s=AROUND_S)
         self._gate = Gate(rules, prismatic, store.last())
+        self._storing = Storing(store, self._wall)
         self._tally = Tally(config.robot, self._wall, store.reader.joint_ranges())
         self._seq = store.reader.last_seq()
         self._publish = bus.publisher(self._keys.pair, cache=PAIR_CACHE)
@@ -133,7 +135,7 @@ class Sampler:
         """Sample until `stop`, or with `exit_at_end` until the sources are through.
 
         Raises:
-            StoreError: a pair could not be stored; it was not published either, and none came after it.
+            StoreError: the store is damaged; the pair was not published either, and none came after it.
             SourceError: a source could not be opened at the start.
         """
         self._service.tell("opening encoders and cameras")
@@ -232,6 +234,8 @@ class Sampler:
             return Reason.PAUSED
         if isinstance(seen, MarkerMiss):
             return seen.reason
+        if not (np.isfinite(seen.x).all() and np.isfinite(seen.cov).all()):
+            return Reason.NOT_FINITE
         q = self._angles(seen)
         if isinstance(q, Reason):
             return q
@@ -242,13 +246,15 @@ class Sampler:
             if self._paused:
                 self._gate.break_segment()
                 return Reason.PAUSED
-            if self._devices.look():
+            others = self._storing.attempt(self._devices.look)
+            if others is None:
+                return Reason.NOT_STORED
+            if others:
                 self._gate.break_segment()
             verdict = self._gate.offer(seen.t, q, seen.x)
             if isinstance(verdict, Reason):
                 return verdict
-            self._accept(verdict, q, seen)
-        return None
+            return self._accept(verdict, q, seen)
 
     def _angles(self, fix: MarkerFix) -> FloatArray | Reason:
         """Joint angles at the time of a fix, if they are known well enough for how well that time is known."""
@@ -260,11 +266,15 @@ class Sampler:
                 return Reason.MOVING
         return self._buffer.at(fix.t, JOINTS_TIMEOUT_S)
 
-    def _accept(self, verdict: Accepted, q: FloatArray, fix: MarkerFix) -> None:
-        pair: Pair = self._store.append(verdict.segment, self._wall.utc(), q, fix)
+    def _accept(self, verdict: Accepted, q: FloatArray, fix: MarkerFix) -> Reason | None:
+        pair = self._storing.append(verdict.segment, q, fix)
+        if pair is None:
+            self._gate.break_segment()
+            return Reason.NOT_STORED
         self._seq = pair.seq
         self._tally.accept(q)
         self._publish(encode(pair_to_wire(pair)))
+        return None
 
     def _check_encoders(self) -> None:
         if self._failure is not None:
@@ -368,7 +378,7 @@ class Sampler:
 
     def _health(self) -> list[str]:
         said: list[str] = [trouble for trouble in (self._joints.trouble, self._marker.trouble) if trouble]
-        said += complaints_of(self._encoders) + self._devices.changes
+        said += complaints_of(self._encoders) + self._devices.changes + self._storing.complaints
         if self._failure is not None:
             said.append(str(self._failure))
         elif not self._ended:
