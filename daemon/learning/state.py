@@ -19,8 +19,6 @@ from .orientation import OrientationState
 
 # Names of the arrays of the state before a change begin with this.
 BEFORE = "before/"
-
-
 # Names of stored nets begin with this.
 NET = "net_"
 

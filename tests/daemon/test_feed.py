@@ -8,8 +8,8 @@ import pytest
 from guided_arm import STORE, Scene, make_pair, new_learning
 
 from daemon.feed import RETRY_S, WAITING, PairFeed
-from daemon.learning import Learning
 from daemon.history import Page, read_page
+from daemon.learning import Learning
 from daemon.wire import PairMessage, PairsReply, encode, pair_to_wire
 from interfaces.errors import BusError, RequestError
 from interfaces.records import Pair
