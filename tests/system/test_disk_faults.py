@@ -8,6 +8,7 @@ import json
 import os
 from collections.abc import Callable
 from contextlib import ExitStack
+from pathlib import Path
 
 import numpy as np
 import pytest

@@ -33,7 +33,8 @@ class Promised:
     Attributes:
         accepted: number of the last pair that a sampler had accepted.
         possible: checkpoints, the last that was safe and those after it; None stands for none at all.
-        previous: those that the one before may be.
+        previous: those that the one before may be. It may always be none: it gives its name away before the present
+            one takes it.
     """
 
     accepted: int = 0
@@ -47,7 +48,7 @@ class Promised:
             self.possible.append(bytes(disk.names[CHECKPOINT].present))
         elif done.operation is Operation.SYNC_FOLDER:
             self.possible = self.possible[-1:]
-            self.previous = [*self.previous[-2:], *self.possible]
+            self.previous = [None, *self.previous[-2:], *self.possible]
         elif done.operation is Operation.WRITE and done.data.rstrip().isdigit():
             self.accepted = int(done.data)
 
