@@ -19,14 +19,15 @@ from importlib.metadata import version
 from daemon.answers import Answers
 from daemon.bus import Bus, Request
 from daemon.changes import Changes
-from daemon.checkpoint import CheckpointError, generations, read_checkpoint, set_aside, write_checkpoint
+from daemon.checkpoint import CheckpointError, write_checkpoint
 from daemon.config import Config
 from daemon.expected import ExpectedMarker
 from daemon.feed import PairFeed
 from daemon.findings import Findings
+from daemon.going_on import go_on
 from daemon.history import Page, read_page
 from daemon.keys import Keys
-from daemon.learning import Learning, NominalModel, StateError
+from daemon.learning import Learning, NominalModel
 from daemon.learning.solver import LARGEST_NET
 from daemon.notify import Notifier
 from daemon.reload import reload
@@ -38,7 +39,6 @@ from daemon.wire import OCTETS, CommandReply, CommandRequest, decode, encode
 from daemon.wiring import open_marker_topic
 from interfaces.errors import BodyschemaError, RequestError
 from interfaces.protocols import Clock
-from kbmaps import KBMapsError
 
 log = logging.getLogger(__name__)
 
@@ -48,8 +48,6 @@ HISTORY_LIMIT_S = 5.0
 IDLE_S = 0.02
 SOLVE_WHEN_IDLE_S = 0.5
 BACKGROUND_NICENESS = 10
-# What a checkpoint raises whose checksum is right and whose parts are not.
-DOES_NOT_FIT = (ArithmeticError, LookupError, TypeError, ValueError)
 # What has to come round for the learner to be alive.
 LOOPS = ("learning", "background", "status")
 TABLES = ("robot", "camera", "zenoh", "daemon", "drivers", "learner", "effects", "unexplained")
@@ -64,14 +62,14 @@ class Learner:
     def __init__(
         self, config: Config, solver: SolverProcess, bus: Bus, clock: Clock, service: Service | None = None
     ) -> None:
-        self._config, self._solver, self._bus, self._clock = config, solver, bus, clock
+        self._config, self._bus, self._clock = config, bus, clock
         self._service = Service.nobodys(clock) if service is None else service
         self._settings, self._robot = config.tables.learner, config.robot
         self._keys = Keys(config.robot.name)
         self._nominal = NominalModel.extended_by(config.simulation)
-        self._learning = Learning(self._nominal, self._settings, solver)
-        self._set_aside: str | None = None
-        self._restore()
+        self._learning, self._set_aside = go_on(
+            lambda: Learning(self._nominal, self._settings, solver), config.checkpoint_file, config.robot.name
+        )
         self._feed = PairFeed(self._learning, self._history, clock, lambda: self._service.beat("learning"))
         self._findings = Findings(self._learning, config.robot, clock)
         self._answers = Answers(self._learning, config.robot, clock)
@@ -198,31 +196,6 @@ class Learner:
             yield f"pairs were refused, {self._learning.counters.refused} so far; the last: {self._feed.refused}"
         if self._nominal.size > LARGEST_NET:
             yield f"{self._nominal.joints} joints are too many for the exact map; the others learn without it"
-
-    def _restore(self) -> None:
-        """Go on from the checkpoint, or else from the one before; what is of no use is kept aside."""
-        said: list[str] = []
-        for file in generations(self._config.checkpoint_file):
-            try:
-                state = read_checkpoint(file, robot=self._robot.name)
-                if state is None:
-                    continue
-                self._learning.restore(state)
-            except (CheckpointError, StateError, KBMapsError, *DOES_NOT_FIT) as error:
-                unfit = isinstance(error, DOES_NOT_FIT)
-                why = f"the checkpoint's parts do not fit: {error!r}" if unfit else str(error)
-                said.append(f"{why}. It was kept as {set_aside(file)}")
-                self._learning = Learning(self._nominal, self._settings, self._solver)
-            else:
-                pairs = self._learning.counters.pairs
-                log.info("went on from %s with %d pairs", file, pairs)
-                said += [f"the learner went on from {file} with {pairs} pairs"] if said else []
-                break
-        else:
-            said += ["the learner learns again from the sampler's history"] if said else []
-        if said:
-            self._set_aside = "; ".join(said)
-            log.error("%s", self._set_aside)
 
     def _declare(self) -> None:
         bus, keys, answers = self._bus, self._keys, self._answers

@@ -7,7 +7,6 @@ import math
 import threading
 import time
 from contextlib import ExitStack
-from dataclasses import replace
 from importlib.metadata import version
 
 import numpy as np
@@ -22,7 +21,7 @@ from .bus import Bus, Request
 from .config import Config
 from .devices import DeviceWatch
 from .gate import Accepted, Gate
-from .gaze_loop import GazeLoop, HandModel
+from .gaze_loop import gaze_of
 from .history import answer_pairs
 from .keys import Keys
 from .powered import asked
@@ -31,7 +30,7 @@ from .sampler_rules import SamplerRules
 from .service import Service, with_health
 from .servo_status import accept_turns, buses_of, complaints_of, servos_of
 from .simulation import answer_simulation
-from .sources import Head, Sources
+from .sources import Sources
 from .status import SamplerStatus
 from .store import PairStore
 from .store_file import disk_free
@@ -44,7 +43,6 @@ log = logging.getLogger(__name__)
 READ_TIMEOUT_S = 0.2
 JOINTS_TIMEOUT_S = 1.0  # how long a frame waits for the encoders to reach its time
 AROUND_S = 0.1  # of a frame whose time is uncertain: how fast the joints are
-PREDICT_S = 0.2  # what the gaze waits for the learner
 STATUS_EVERY_S = 1.0
 SILENT_AFTER_S = 2.0  # a source that has said nothing for so long is reported
 ZERO_FORCE = "zero_force"  # that [robot] hold says, and the drive is called
@@ -95,8 +93,8 @@ class Sampler:
         self._powered = {drive.name: drive for drive in sources.powered}
         held = config.robot.robot.hold == "zero_force"
         self._bears = self._powered.get(ZERO_FORCE) if held else None
-        self._cameras, self._calibration = sources.cameras, sources.calibration
-        self._gaze = None if sources.head is None else self._gaze_loop(sources.head)
+        self._cameras = sources.cameras
+        self._gaze = gaze_of(config.robot, sources, bus, self._wall)
         self._simulation, self._source_clock = sources.simulation, sources.clock
         self._joints = Reopening(sources.joints, "the encoders", self._wall, forbidden=self._service.forbidden)
         self._encoders, self._devices = sources.joints, DeviceWatch(sources.joints, store, self._wall)
@@ -333,15 +331,6 @@ class Sampler:
         message = "no pairs are accepted until resume" if self._paused else "pairs are accepted, in a new segment"
         log.info("%s: %s", command, message)
         return encode(CommandReply(command, message), request.encoding)
-
-    def _gaze_loop(self, head: Head) -> GazeLoop:
-        def predict(payload: bytes) -> bytes:
-            return self._bus.ask_one(self._keys.predict, payload, timeout_s=PREDICT_S)
-
-        robot = self._config.robot
-        if self._calibration is not None:
-            robot = replace(robot, calibration=self._calibration)
-        return GazeLoop(robot, head, HandModel(robot, predict, self._wall))
 
     def _power(self, name: str, *, on: bool) -> str:
         if self._simulation is not None:
