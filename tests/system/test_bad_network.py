@@ -101,6 +101,7 @@ def test_over_a_slow_network_every_pair_comes_though_late(tmp_path, free_endpoin
         expect_each_pair_learnt_once(config)
 
 
+@pytest.mark.soak
 def test_a_learner_that_is_gone_for_a_while_catches_up(tmp_path, free_endpoint) -> None:
     config = write_robot(tmp_path, free_endpoint)
     with running(config, "sampler"):
@@ -109,6 +110,26 @@ def test_a_learner_that_is_gone_for_a_while_catches_up(tmp_path, free_endpoint) 
         sampler_with(config, SOME + MORE)
         with running(config, "learner"):
             expect_each_pair_learnt_once(config)
+
+
+def in_a_namespace(how: str, folder: Path, pairs: int) -> int:
+    """How many pairs were accepted, and learnt once each, by processes whose kernel makes the network bad."""
+    if subprocess.run(["unshare", "--net", "true"], capture_output=True, check=False).returncode:
+        pytest.skip("network namespaces need root")
+    script = Path(__file__).with_name("kernel_network.py")
+    command = ["unshare", "--net", sys.executable, script, how, folder, str(pairs)]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    done = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
+    if "qdisc kind is unknown" in done.stderr:
+        pytest.skip("this kernel has no tbf")
+    assert done.returncode == 0, done.stderr
+    return int(done.stdout)
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize(("how", "pairs"), [("down", 200), ("down", 6000), ("slow", 300)])
+def test_minutes_without_a_link_or_with_a_slow_one_cost_no_pair(tmp_path, how, pairs) -> None:
+    assert in_a_namespace(how, tmp_path, pairs) > pairs
 
 
 SUBSCRIBER = """
@@ -120,7 +141,7 @@ with Bus(connect=sys.argv[1]) as bus:
 """
 
 
-@pytest.mark.parametrize("stopped", [False, True], ids=["slow", "stopped"])
+@pytest.mark.parametrize("stopped", [pytest.param(False, marks=pytest.mark.soak), True], ids=["slow", "stopped"])
 def test_a_subscriber_that_takes_nothing_delays_nobody_else(tmp_path, free_endpoint, stopped) -> None:
     config = write_robot(tmp_path, free_endpoint, pairs_per_s=200.0)
     with running(config, "sampler"), running(config, "learner"):

@@ -118,18 +118,20 @@ def answer(config: Config, process: str, key: str, payload: bytes = b"") -> byte
             time.sleep(0.05)
 
 
-def status_when(config: Config, process: str, kind: type[S], true: Callable[[S], bool]) -> S:
+def status_when(
+    config: Config, process: str, kind: type[S], true: Callable[[S], bool], limit_s: float = LIFE_LIMIT_S
+) -> S:
     """The process's status, as soon as `true` holds for it."""
-    deadline = time.monotonic() + LIFE_LIMIT_S
+    deadline = time.monotonic() + limit_s
     while not true(status := decode(answer(config, process, KEYS.status(process)), kind)):
         assert time.monotonic() < deadline, status
         time.sleep(0.05)
     return status
 
 
-def learner_with(config: Config, pairs: int) -> LearnerStatus:
+def learner_with(config: Config, pairs: int, limit_s: float = LIFE_LIMIT_S) -> LearnerStatus:
     """The learner's status as soon as it has so many pairs."""
-    return status_when(config, "learner", LearnerStatus, lambda status: status.last_seq >= pairs)
+    return status_when(config, "learner", LearnerStatus, lambda status: status.last_seq >= pairs, limit_s)
 
 
 def sampler_with(config: Config, pairs: int) -> SamplerStatus:
