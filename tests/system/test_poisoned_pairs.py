@@ -5,11 +5,12 @@ from __future__ import annotations
 import contextlib
 import json
 import sqlite3
+import time
 from collections.abc import Iterator
 
 import numpy as np
 import pytest
-from two_processes import KEYS, answer, learner_with, running, status_when, write_robot
+from two_processes import KEYS, LIFE_LIMIT_S, answer, learner_with, running, status_when, write_robot
 
 from daemon.bus import Bus
 from daemon.config import Config
@@ -61,14 +62,19 @@ def history(config: Config) -> Iterator[Bus]:
 
 
 def expect_numbers(config: Config, pairs: int) -> None:
-    """The learner answers numbers that are right to a centimetre along the walk."""
-    status_when(config, "learner", LearnerStatus, lambda status: status.at_rest)
+    """The learner answers numbers, at once, and once it had its time right ones, to two centimetres where the drawing is four off."""
     q = [[0.1, 0.9], [0.5, 1.0], [-0.3, 0.8]]
-    reply = decode(answer(config, "learner", KEYS.predict, encode(JointsRequest(q))), PredictReply)
-    truth = built(config).positions(np.array(q))
-    assert reply.pairs == pairs
-    assert np.isfinite(reply.sigma).all()
-    assert np.linalg.norm(np.array(reply.x) - truth, axis=1).max() < 0.01
+    truth, deadline = built(config).positions(np.array(q)), time.monotonic() + LIFE_LIMIT_S
+    while True:
+        reply = decode(answer(config, "learner", KEYS.predict, encode(JointsRequest(q))), PredictReply)
+        assert reply.pairs == pairs
+        assert np.isfinite(reply.sigma).all()
+        off_m = float(np.linalg.norm(np.array(reply.x) - truth, axis=1).max())
+        assert np.isfinite(off_m)
+        if off_m < 0.02:
+            return
+        assert time.monotonic() < deadline, off_m
+        time.sleep(0.05)
 
 
 @pytest.mark.parametrize(
