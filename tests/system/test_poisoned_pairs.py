@@ -62,7 +62,7 @@ def history(config: Config) -> Iterator[Bus]:
 
 
 def expect_numbers(config: Config, pairs: int) -> None:
-    """The learner answers numbers, at once, and in time right ones: to two centimetres where the drawing is four off."""
+    """The learner answers numbers at once, and in time right ones: to 2 cm, where the drawing is 4 cm off."""
     q = [[0.1, 0.9], [0.5, 1.0], [-0.3, 0.8]]
     truth, deadline = built(config).positions(np.array(q)), time.monotonic() + LIFE_LIMIT_S
     while True:
