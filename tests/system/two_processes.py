@@ -142,7 +142,9 @@ def sampler_with(config: Config, pairs: int) -> SamplerStatus:
 def pause(config: Config) -> int:
     """Let the sampler accept no more pairs; how many there are."""
     answer(config, "sampler", KEYS.command("sampler"), encode(CommandRequest("pause")))
-    return status_when(config, "sampler", SamplerStatus, lambda status: "paused" in status.rejected).pairs
+    return status_when(
+        config, "sampler", SamplerStatus, lambda status: "paused" in status.rejected or status.state == "ended"
+    ).pairs
 
 
 def expect_each_pair_learnt_once(config: Config) -> LearnerStatus:
