@@ -26,8 +26,8 @@ from daemon import checkpoint, wire
 from daemon.bus import Request
 from daemon.checkpoint import CheckpointError
 from daemon.config import Config
+from daemon.going_on import DOES_NOT_FIT
 from daemon.history import answer_pairs
-from daemon.learner import DOES_NOT_FIT
 from daemon.learning import StateError
 from daemon.router import RouterConfig
 from daemon.status import LearnerStatus, SamplerStatus
