@@ -133,5 +133,5 @@ def _least_squares(limb: Limb, radius_px: float, *, oval: bool) -> _Fit | None:
         weight = np.where(np.abs(residual) < _FARTHEST_PX, limb.weight / (1.0 + square / usual / _FREEDOM), 0.0)
     if np.abs(solution[3:]).max(initial=0.0) > _MOST_OVAL * radius_px:
         return None
-    around = waves(limb.angles, np.sqrt(used) * residual, radius_px, first=3 if oval else 2)
+    around = waves(np.sqrt(used) * residual, radius_px, first=3 if oval else 2)
     return _Fit(solution[:2], float(solution[2]), inverse[:3, :3], around)

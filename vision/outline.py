@@ -238,7 +238,7 @@ def _fit_circle(edges: _Edges, centre_px: FloatArray, shape: FloatArray) -> Outl
             break
     if solution[2] <= 0:
         return None
-    density = waves(edges.angles, np.sqrt(used) * residual, float(solution[2])).once_round()
+    density = waves(np.sqrt(used) * residual, float(solution[2])).once_round()
     inverse = density * np.linalg.inv(normal)
     # What hides a ball moves its edge inwards; outwards does what has its colour behind it.
     apart = (weight == 0) & ~edges.uneven

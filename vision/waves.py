@@ -47,16 +47,18 @@ class Waves:
         return (1.0 + 0.25 / self.count) ** 2 * (self.slow + max(0.0, self.slow - self.quick))
 
 
-def waves(angles: FloatArray, residual: FloatArray, radius_px: float, first: int = 2) -> Waves:
-    """The waves in the residuals (n,) of an outline's points in the directions (n,) [rad]; 0 where there is none.
+def waves(residual: FloatArray, radius_px: float, first: int = 2) -> Waves:
+    """The waves in the residuals (n,) of an outline's points, evenly spread around it; 0 where there is none.
 
     `first` is the slowest wave that the fit left in.
     """
-    last_slow = max(first + _LEAST_WAVES - 1, round(radius_px / _WAVE_RADIUS_PX))
-    last_quick = max(last_slow + 1, min(2 * last_slow, round(radius_px)))
+    quickest = len(residual) // 2
+    last_slow = min(max(first + _LEAST_WAVES - 1, round(radius_px / _WAVE_RADIUS_PX)), quickest - 1)
+    last_quick = min(max(last_slow + 1, min(2 * last_slow, round(radius_px))), quickest)
     harmonics = np.arange(first, last_quick + 1)
-    parts = np.exp(-1j * harmonics[:, None] * angles) @ residual
+    parts = np.fft.rfft(residual)[first : last_quick + 1]
     power = np.abs(parts) ** 2 * np.exp((harmonics * _SMOOTHING_PX / radius_px) ** 2) / np.count_nonzero(residual)
-    is_slow = harmonics <= last_slow
-    share = harmonics[is_slow] ** -2.0 / np.sum(harmonics[is_slow] ** -2.0)
-    return Waves(float(share @ power[is_slow]), float(np.mean(power[~is_slow])), 1.0 / float(share @ share))
+    slow = last_slow - first + 1
+    weight = harmonics[:slow] ** -2.0
+    share = weight / weight.sum()
+    return Waves(float(share @ power[:slow]), float(power[slow:].mean()), 1.0 / float(share @ share))
