@@ -170,12 +170,13 @@ class Bus:
 
         self._declared.append(self._open.liveliness().declare_subscriber(key, receive, history=True))
 
-    def alive(self, key: str, *, timeout_s: float = 2.0) -> bool:
-        """Whether somebody is alive under `key`, which this session does not watch too.
+    def alive(self, key: str, *, timeout_s: float = 2.0) -> list[str]:
+        """The keys under which somebody is alive that match this one, and which this session does not watch too.
 
         zenoh answers from what a watch of the same session has heard so far, which may be nothing yet.
         """
-        return any(reply.ok is not None for reply in self._open.liveliness().get(key, timeout=timeout_s))
+        replies = self._open.liveliness().get(key, timeout=timeout_s)
+        return [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
 
     def ask(self, key: str, payload: bytes = b"", *, encoding: str = JSON, timeout_s: float = 5.0) -> list[Reply]:
         """All replies to a query; none when nobody answers under `key`."""
@@ -355,7 +356,7 @@ def is_alive(endpoint: str | Route, token: str, *, open_timeout_s: float = OPEN_
     """Whether somebody listens on `endpoint` and has declared the liveliness token."""
     try:
         with client(endpoint, open_timeout_s) as bus:
-            return bus.alive(token)
+            return bool(bus.alive(token))
     except BusError:
         return False
 

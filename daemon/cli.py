@@ -36,6 +36,7 @@ COMMANDS = {
     "learner": "Only the learner: pairs in, answers out. On any machine.",
     "router": "Where machines meet: TLS, and who may do what.",
     "status": "What both processes do and found, and if it is enough.",
+    "fleet": "Many robots: who is there, which unit is off, and why.",
     "view": "A page: errors, where to move next, residuals, buttons.",
     "predict": "Ask where the marker is at given joint angles.",
     "ik": "Ask for joint angles that bring the marker to a position.",

@@ -189,15 +189,22 @@ def _most(left_out: LeftOut) -> str:
 
 
 def _aligned(x: FloatArray, other: FloatArray) -> Aligned | None:
-    """By the least squares of Kabsch 1976."""
     if len(x) < _FEWEST_ALIGNED:
         return None
+    moved, turn = laid_on(x, other)
+    angle = float(np.degrees(Rotation.from_matrix(turn).magnitude()))
+    return Aligned(Distances.of(moved - x), _three(1e3 * (x.mean(axis=0) - other.mean(axis=0))), angle)
+
+
+def laid_on(x: FloatArray, other: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """The positions `other` (n, 3) turned and shifted as a whole onto `x` (n, 3), and the turn (3, 3).
+
+    By the least squares of Kabsch 1976.
+    """
     middle, other_middle = x.mean(axis=0), other.mean(axis=0)
     U, _, Vt = np.linalg.svd((other - other_middle).T @ (x - middle))
     turn = Vt.T @ np.diag([1.0, 1.0, np.sign(np.linalg.det(Vt.T @ U.T))]) @ U.T
-    left = (other - other_middle) @ turn.T - (x - middle)
-    angle = float(np.degrees(Rotation.from_matrix(turn).magnitude()))
-    return Aligned(Distances.of(left), _three(1e3 * (middle - other_middle)), angle)
+    return (other - other_middle) @ turn.T + middle, turn
 
 
 def _worst(first: Recording, match: _Match, apart: FloatArray) -> tuple[WorstRow, ...]:

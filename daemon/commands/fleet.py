@@ -1,0 +1,139 @@
+"""`bodyschema fleet`."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import cyclopts
+from cyclopts import Parameter
+from cyclopts.validators import Number
+
+from daemon.commands.options import HERE, VARIABLE, flag, several
+
+if TYPE_CHECKING:
+    from daemon.fleet.roster import Place
+
+fleet = cyclopts.App(
+    name="fleet",
+    help="""Many robots: who is there, which unit is off, and why.
+
+    Needs: robots whose processes run, at a router or on this machine; for `diagnose` only their recordings.
+
+    Next: `bodyschema fleet list`, `bodyschema fleet compare`, `bodyschema fleet diagnose RECORDING...`.
+    """,
+)
+
+Connect = Annotated[
+    tuple[str, ...], several("A router, or a robot's process, to look for robots at, like tcp/127.0.0.1:7447")
+]
+Robots = Annotated[
+    tuple[Path, ...],
+    several(f"robot.toml that names where to look, and its certificates; else {VARIABLE} or the one here"),
+]
+
+
+@fleet.command(name="list", sort_key=1)
+def list_robots(
+    *,
+    connect: Connect = (),
+    robot: Robots = (),
+    watch: Annotated[bool, flag("Go on showing it, until Ctrl-C.")] = False,
+    json: Annotated[bool, flag("As JSON, a list with both processes' states.")] = False,
+) -> None:
+    """All robots that are there: pairs, rate, error, the model that answers, health.
+
+    Found by their liveliness tokens. With --watch --json there is one line about every second. Exit code 1 when
+    nobody is there.
+
+    Needs: robots that run (`bodyschema run`), and a way to them.
+
+    Next: `bodyschema fleet compare`; `bodyschema status --robot` for one of them.
+    """
+    import time
+
+    from rich.console import Console
+    from rich.live import Live
+
+    from daemon.fleet.roster import Fleet
+    from daemon.fleet.roster_view import as_json, screen
+    from daemon.status_view import EVERY_S
+
+    looked_at, console = _places(connect, robot), Console(highlight=False)
+    with Fleet(looked_at) as robots:
+        if watch and not json:
+            with Live(console=console, auto_refresh=False, screen=console.is_terminal) as live:
+                while True:
+                    live.update(screen(robots.look(), robots.unreached), refresh=True)
+                    time.sleep(EVERY_S)
+        while True:
+            members = robots.look()
+            if json:
+                console.file.write(as_json(members) + "\n")
+                console.file.flush()
+            elif members:
+                console.print(screen(members, robots.unreached))
+            if not watch:
+                break
+            time.sleep(EVERY_S)
+    if not any(member.alive for member in members):
+        _nobody(looked_at)
+
+
+@fleet.command(sort_key=2)
+def compare(
+    *,
+    connect: Connect = (),
+    robot: Robots = (),
+    as_json: Annotated[bool, flag("Print the figures as JSON.", name="--json")] = False,
+) -> None:
+    """How far the models of robots of one type are apart, and which unit is off, in which figures.
+
+    Robots are of one type when their joints have the same names. Their learners are asked at the same poses, from the
+    ranges that most of them have moved in; each model is laid as a whole on the median of all, since cameras stand
+    where they stand. Zeros and tool that stand out from the others' are named.
+
+    Needs: at least two robots of a type whose learners run, and the sampler of one of them; three to say which is off.
+
+    Next: `bodyschema fleet diagnose` with their recordings, for causes.
+    """
+    from rich.console import Console
+
+    from daemon.fleet.asking import compare_types
+    from daemon.fleet.comparison_view import view
+    from daemon.fleet.roster import Fleet
+    from daemon.wire import encode
+    from interfaces.errors import RequestError
+
+    looked_at = _places(connect, robot)
+    with Fleet(looked_at) as robots:
+        members = robots.look()
+        if not any(member.alive for member in members):
+            _nobody(looked_at)
+        found, left_out = compare_types(robots, members)
+    if not found:
+        raise RequestError(f"nothing to compare. {'; '.join(left_out)}")
+    if as_json:
+        sys.stdout.write(encode({"types": found, "not_compared": left_out}).decode() + "\n")
+        return
+    Console(highlight=False).print(view(found, left_out))
+
+
+def _places(connect: tuple[str, ...], robot: tuple[Path, ...]) -> list[Place]:
+    import os
+
+    from daemon.fleet.roster import places
+
+    described = robot or (() if connect else (Path(os.environ.get(VARIABLE, HERE)),))
+    return places(connect, described)
+
+
+def _nobody(places: list[Place]) -> None:
+    from interfaces.errors import BusError
+
+    where = ", ".join(str(place.route) for place in places)
+    raise BusError(
+        f"no robot is alive on {where}. Start one with `bodyschema run`; at a router with TLS, your name needs the "
+        "role viewer (docs/security.md)"
+    )

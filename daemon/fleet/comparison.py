@@ -1,0 +1,213 @@
+"""Models of robots of one type side by side: how far each is from what most of them say, and in which figures."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import msgspec
+import numpy as np
+from scipy.spatial.transform import Rotation
+from scipy.stats import norm
+
+from daemon.comparison import Distances, laid_on
+from daemon.status import ChainCalibration, JointRange
+from interfaces.errors import RequestError
+from interfaces.records import FloatArray
+
+POSES = 400
+# Of two, nobody can say which is the odd one.
+FEWEST_TO_JUDGE = 3
+# A robot is off when its model is farther from the median than this many times what the models claim, and what the
+# robots are apart from it in the middle.
+FAR = 3.0
+# A figure stands out when chance brings it about so seldom, among all figures of all robots.
+CHANCE = 0.05
+ROUNDS = 20
+# Standard error of a median of normal numbers, over that of their mean.
+MEDIAN_COSTS = math.sqrt(math.pi / 2.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """What one robot's learner says at the common poses.
+
+    Attributes:
+        x: positions (n, 3) in its own measurement frame [m].
+        sigma_m: the error that it claims there, root mean square of the distance [m].
+        in_support: share of the poses that lie where it has data.
+    """
+
+    robot: str
+    x: FloatArray
+    sigma_m: float
+    in_support: float
+    calibration: ChainCalibration | None
+
+
+class Odd(msgspec.Struct, frozen=True):
+    """A figure of a robot that differs from those of the others by more than its uncertainty.
+
+    Attributes:
+        figure: in words, as in `zero of elbow`.
+        difference, half_width: from the median of the robots, with half its 95 % interval [unit].
+        unit: rad or m.
+    """
+
+    figure: str
+    difference: float
+    half_width: float
+    unit: str
+
+
+class Unit(msgspec.Struct, frozen=True, kw_only=True):
+    """One robot beside the others.
+
+    Attributes:
+        apart: its model from the median model, each laid on it as a whole: cameras may stand anywhere.
+        claimed_mm: the error that its learner claims at the poses, root mean square.
+        in_support: share of the poses that lie where it has data.
+        is_off: whether it is the odd one; null where there are too few robots to say.
+        odd: its figures that stand out, the most improbable first.
+        camera_moved_mm, camera_turned_deg: from where its robot.toml says that the camera stands.
+    """
+
+    robot: str
+    apart: Distances
+    claimed_mm: float
+    in_support: float
+    is_off: bool | None
+    odd: tuple[Odd, ...]
+    camera_moved_mm: float | None
+    camera_turned_deg: float | None
+
+
+class TypeComparison(msgspec.Struct, frozen=True):
+    """Robots with the same joints.
+
+    Attributes:
+        low, high: the range of each joint that the poses are from [rad or m].
+    """
+
+    joints: tuple[str, ...]
+    poses: int
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+    units: tuple[Unit, ...]
+
+
+def common_poses(coverages: Sequence[Mapping[str, JointRange]], joints: tuple[str, ...], seed: int = 0) -> FloatArray:
+    """Poses (n, d) [rad, m] from the ranges that robots have in common in the middle: one that hardly moved is no bar.
+
+    Raises:
+        RequestError: no robot tells where its joints have been.
+    """
+    ranges = [[(each[joint].low, each[joint].high) for joint in joints] for each in coverages]
+    if not ranges:
+        raise RequestError("no sampler of these robots answers, so nobody knows where their joints have been")
+    low, high = np.sort(np.median(np.array(ranges), axis=0), axis=1).T
+    return np.random.default_rng(seed).uniform(low, high, (POSES, len(joints)))
+
+
+def compared(joints: tuple[str, ...], q: FloatArray, models: Sequence[Model]) -> TypeComparison:
+    """The models, at the poses q (n, d), of at least two robots."""
+    middle = median_model([model.x for model in models])
+    apart = [Distances.of(laid_on(middle, model.x)[0] - middle) for model in models]
+    typical = float(np.median([each.rms_mm for each in apart]))
+    claimed = float(np.median([1e3 * model.sigma_m for model in models]))
+    figures = _figures(models)
+    units = tuple(
+        Unit(
+            robot=model.robot,
+            apart=each,
+            claimed_mm=1e3 * model.sigma_m,
+            in_support=model.in_support,
+            is_off=_is_off(each.rms_mm, typical, math.hypot(1e3 * model.sigma_m, claimed), len(models)),
+            odd=_odd(k, figures) if len(models) >= FEWEST_TO_JUDGE else (),
+            camera_moved_mm=_camera_moved(model.calibration),
+            camera_turned_deg=_camera_turned(model.calibration),
+        )
+        for k, (model, each) in enumerate(zip(models, apart, strict=True))
+    )
+    low, high = (tuple(map(float, ends)) for ends in (q.min(axis=0), q.max(axis=0)))
+    return TypeComparison(joints, len(q), low, high, units)
+
+
+def median_model(positions: Sequence[FloatArray]) -> FloatArray:
+    """Positions (n, 3) that are the coordinates' median of all models' (n, 3), each laid on them as a whole.
+
+    Begins with the model that the others are nearest to, so that an odd one does not choose the frame.
+    """
+
+    def distance(x: FloatArray) -> float:
+        return float(np.median([np.linalg.norm(laid_on(x, other)[0] - x) for other in positions]))
+
+    middle = min(positions, key=distance)
+    for _ in range(ROUNDS):
+        middle = np.median([laid_on(middle, x)[0] for x in positions], axis=0)
+    return middle
+
+
+def _is_off(rms_mm: float, typical_mm: float, claimed_mm: float, robots: int) -> bool | None:
+    return None if robots < FEWEST_TO_JUDGE else rms_mm > FAR * max(typical_mm, claimed_mm)
+
+
+@dataclass(frozen=True, eq=False)
+class _Figure:
+    """One figure of all robots: values and half widths (m,), NaN where a robot's pairs do not tell it."""
+
+    name: str
+    unit: str
+    values: FloatArray
+    half_widths: FloatArray
+
+
+def _figures(models: Sequence[Model]) -> list[_Figure]:
+    told: dict[tuple[str, str], dict[int, tuple[float, float]]] = {}
+    for k, model in enumerate(models):
+        found = model.calibration
+        if found is None:
+            continue
+        for joint, zero in found.zeros.items():
+            if zero is not None:
+                told.setdefault((f"zero of {joint}", "rad"), {})[k] = zero.value, zero.half_width
+        for axis, figure in zip("xyz", found.marker_xyz, strict=True):
+            told.setdefault((f"tool in {axis}", "m"), {})[k] = figure.learnt, figure.half_width
+    figures = []
+    for (name, unit), of_robots in told.items():
+        numbers = np.full((2, len(models)), np.nan)
+        for k, (value, half_width) in of_robots.items():
+            numbers[:, k] = value, half_width
+        if len(of_robots) >= FEWEST_TO_JUDGE:
+            figures.append(_Figure(name, unit, *numbers))
+    return figures
+
+
+def _odd(robot: int, figures: Sequence[_Figure]) -> tuple[Odd, ...]:
+    """The figures of the robot that stand out."""
+    tried = sum(int(np.isfinite(figure.values).sum()) for figure in figures)
+    found: list[tuple[float, Odd]] = []
+    for figure in figures:
+        own, others = figure.half_widths[robot], figure.half_widths[np.isfinite(figure.half_widths)]
+        difference = float(figure.values[robot] - np.nanmedian(figure.values))
+        half_width = math.hypot(own, MEDIAN_COSTS * float(np.median(others)) / math.sqrt(len(others)))
+        far = abs(difference) / half_width if half_width > 0.0 else math.inf * abs(difference)
+        if far > norm.isf(0.5 * CHANCE / tried) / norm.isf(0.025):
+            found.append((far, Odd(figure.name, difference, half_width, figure.unit)))
+    return tuple(odd for _, odd in sorted(found, key=lambda each: -each[0]))
+
+
+def _camera_moved(found: ChainCalibration | None) -> float | None:
+    if found is None:
+        return None
+    return 1e3 * math.dist([each.drawn for each in found.camera_xyz], [each.learnt for each in found.camera_xyz])
+
+
+def _camera_turned(found: ChainCalibration | None) -> float | None:
+    if found is None:
+        return None
+    drawn, learnt = (
+        Rotation.from_euler("xyz", [getattr(each, which) for each in found.camera_rpy]) for which in ("drawn", "learnt")
+    )
+    return math.degrees((drawn.inv() * learnt).magnitude())

@@ -1,0 +1,178 @@
+"""Who is there: robots by their liveliness tokens, and what their processes say of themselves."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import TracebackType
+from typing import Self, TypeVar
+
+from daemon.bus import Bus
+from daemon.config import Config
+from daemon.identity import SECURE, Route
+from daemon.keys import Keys
+from daemon.status import LearnerStatus, SamplerStatus
+from daemon.wire import decode
+from daemon.zenoh_config import ENDPOINT, PROCESSES
+from interfaces.errors import BusError, RequestError
+
+ANSWER_LIMIT_S = 2.0
+EVERYBODY = "*"
+
+Status = TypeVar("Status", SamplerStatus, LearnerStatus)
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where robots are looked for.
+
+    Attributes:
+        robots: names of those that are expected there; others are found too, where one may ask for them.
+    """
+
+    route: Route
+    robots: tuple[str, ...] = ()
+
+
+@dataclass(eq=False)
+class Member:
+    """One robot of the fleet as it is now.
+
+    Attributes:
+        alive: which of its processes are.
+        sampler, learner: what they say; None where one did not answer.
+        route: where its learner was found, else its sampler; None where neither was.
+    """
+
+    name: str
+    alive: set[str] = field(default_factory=set)
+    sampler: SamplerStatus | None = None
+    learner: LearnerStatus | None = None
+    route: Route | None = None
+
+    @property
+    def joints(self) -> tuple[str, ...] | None:
+        """Names of its joints; None where nobody tells them."""
+        if self.sampler is not None and self.sampler.coverage:
+            return tuple(self.sampler.coverage)
+        if self.learner is not None and self.learner.calibration is not None:
+            return tuple(self.learner.calibration.zeros)
+        return None
+
+    @property
+    def error_m(self) -> float | None:
+        """Recent mean distance between the answering model's predictions and the measurements [m]."""
+        return None if self.learner is None else self.learner.prequential_m.get(self.learner.answering)
+
+    @property
+    def health(self) -> list[str]:
+        """What is wrong, as sentences; empty when all is well."""
+        said = [sentence for status in (self.sampler, self.learner) if status is not None for sentence in status.health]
+        if not self.alive:
+            return ["neither its sampler nor its learner is alive"]
+        for process, status in zip(PROCESSES, (self.sampler, self.learner), strict=True):
+            if process in self.alive and status is None:
+                said.append(f"the {process} is alive and does not answer")
+        if "learner" not in self.alive:
+            said.append("its learner is not alive: nobody learns or answers")
+        return said
+
+
+def places(endpoints: Sequence[str], files: Sequence[Path]) -> list[Place]:
+    """Where to look: endpoints of routers or processes, and what descriptions of robots name, each once.
+
+    Raises:
+        RequestError: something is no endpoint, or it takes certificates, which only a description names.
+        ConfigError: a description is wrong.
+    """
+    found: dict[Route, set[str]] = {}
+    for endpoint in endpoints:
+        if not ENDPOINT.fullmatch(endpoint):
+            raise RequestError(f"--connect {endpoint}: this is no endpoint. Write one like tcp/127.0.0.1:7447")
+        if endpoint.startswith(SECURE):
+            raise RequestError(
+                f"--connect {endpoint} takes certificates. Give --robot with a robot.toml whose [zenoh] has this "
+                "router and them (docs/security.md)"
+            )
+        found.setdefault(Route((endpoint,)), set())
+    for file in files:
+        config = Config.load(file)
+        zenoh, identity = config.tables.zenoh, config.tables.zenoh.identity(file.parent)
+        for endpoint in [zenoh.router] if zenoh.router else [zenoh.learner, zenoh.sampler]:
+            found.setdefault(Route((endpoint,), identity), set()).add(config.robot.name)
+    return [Place(route, tuple(sorted(names))) for route, names in found.items()]
+
+
+class Fleet:
+    """Asks all robots for their states. Use as a context manager; robots, and places, may come and go.
+
+    Attributes:
+        unreached: why places could not be asked the last time, in words.
+    """
+
+    def __init__(self, places: Sequence[Place]) -> None:
+        self._places = places
+        self._sessions: dict[Route, Bus] = {}
+        self._open = ExitStack()
+        self.unreached: list[str] = []
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._open.__exit__(kind, error, trace)
+
+    def look(self) -> list[Member]:
+        """The robots now, by name.
+
+        Raises:
+            BusError: none of the places can be reached.
+        """
+        members = {name: Member(name) for place in self._places for name in place.robots}
+        self.unreached = []
+        for place in self._places:
+            try:
+                self._look_at(place, members)
+            except BusError as error:
+                self.unreached.append(str(error))
+        if len(self.unreached) == len(self._places):
+            raise BusError(self.unreached[0])
+        return [members[name] for name in sorted(members)]
+
+    def bus(self, route: Route) -> Bus:
+        """The session to a place; BusError when nobody is there."""
+        if route not in self._sessions:
+            self._sessions[route] = self._open.enter_context(Bus(connect=route, client=True))
+        return self._sessions[route]
+
+    def _look_at(self, place: Place, members: dict[str, Member]) -> None:
+        bus = self.bus(place.route)
+        asked = [EVERYBODY]
+        tokens = bus.alive(Keys(EVERYBODY).alive(EVERYBODY), timeout_s=ANSWER_LIMIT_S)
+        if not tokens:  # nobody is there, or one may ask for those alone whom one knows
+            asked = list(place.robots)
+            tokens = [token for name in asked for token in bus.alive(Keys(name).alive(EVERYBODY))]
+        if not tokens:
+            return
+        for token in tokens:
+            _, name, _, process = token.split("/")
+            member = members.setdefault(name, Member(name))
+            member.alive.add(process)
+            if process == "learner" or member.route is None:
+                member.route = place.route
+        for who in asked:
+            for sampler in _states(bus, who, "sampler", SamplerStatus):
+                members.setdefault(sampler.robot, Member(sampler.robot)).sampler = sampler
+            for learner in _states(bus, who, "learner", LearnerStatus):
+                members.setdefault(learner.robot, Member(learner.robot)).learner = learner
+
+
+def _states(bus: Bus, robots: str, process: str, kind: type[Status]) -> Iterator[Status]:
+    for reply in bus.ask(Keys(robots).status(process), timeout_s=ANSWER_LIMIT_S):
+        if reply.error is None:
+            with suppress(RequestError):  # of a version that speaks otherwise: it does not answer
+                yield decode(reply.payload, kind)
