@@ -120,6 +120,66 @@ def compare(
     Console(highlight=False).print(view(found, left_out))
 
 
+@fleet.command(sort_key=3)
+def diagnose(
+    *recordings: Annotated[Path, Parameter(help="Recordings (.csv, .parquet) or pair stores (.sqlite).")],
+    folder: Annotated[
+        Path | None, Parameter(name="--from", help="All recordings in this folder and those in it.")
+    ] = None,
+    robot: Annotated[
+        Path | None,
+        Parameter(show_default=False, help=f"robot.toml of all; else the one beside each, {VARIABLE}, or here."),
+    ] = None,
+    out: Annotated[Path | None, Parameter(help="Write a folder for each, with report.html and the rest, here.")] = None,
+    scheduler: Annotated[
+        str | None, Parameter(help="A Dask scheduler's address, tcp://HOST:8786; else this machine's cores.")
+    ] = None,
+    workers: Annotated[
+        int | None, Parameter(help="Processes on this machine; else one for each core.", validator=Number(gte=1))
+    ] = None,
+    effects: Annotated[str | None, Parameter(help="Look for these alone, as in backlash,joint_offset.")] = None,
+    exclude: Annotated[str | None, Parameter(help="Do not look for these.")] = None,
+    seed: Annotated[int, Parameter(help="Of the resampling behind the intervals.", validator=Number(gte=0))] = 0,
+    as_json: Annotated[bool, flag("Print the summary as JSON.", name="--json")] = False,
+) -> None:
+    """`bodyschema diagnose` of many recordings side by side, and which unit of a type is off and why.
+
+    A recording that fails is a row that says why. What more than half of the units of a type have is told as their
+    description's. Ctrl-C ends it; reports that were written stay. Exit code 1 when no recording could be diagnosed.
+
+    Needs: the extra `fleet` (`pip install 'bodyschema[fleet]'`); workers elsewhere need this package, not the files.
+
+    Next: open OUT/NAME/report.html.
+    """
+    from rich.console import Console
+
+    from daemon.diagnosis_run import Asked
+    from daemon.fleet.diagnosing import diagnose_all, require_extra
+    from daemon.fleet.diagnosing import workers as cluster
+    from daemon.fleet.recordings import jobs
+    from daemon.fleet.summary import summary
+    from daemon.fleet.summary_view import progress, view
+    from daemon.wire import encode
+
+    require_extra()
+    wanted, asked = jobs(recordings, folder, robot), Asked.of(effects, exclude, seed)
+    with (
+        progress(Console(stderr=True, highlight=False), len(wanted)) as (told, done),
+        cluster(scheduler, len(wanted), workers) as client,
+    ):
+        results = diagnose_all(wanted, asked, out, client, told, done)
+    found = summary(results)
+    if as_json:
+        sys.stdout.write(encode(found).decode() + "\n")
+    else:
+        console = Console(highlight=False)
+        console.print(view(found))
+        if out is not None:
+            console.print(f"\nEach report is {out}/NAME/report.html.", markup=False)
+    if all(row.error is not None for row in found.rows):
+        sys.exit(1)
+
+
 def _places(connect: tuple[str, ...], robot: tuple[Path, ...]) -> list[Place]:
     import os
 

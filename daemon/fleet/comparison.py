@@ -19,8 +19,8 @@ from interfaces.records import FloatArray
 POSES = 400
 # Of two, nobody can say which is the odd one.
 FEWEST_TO_JUDGE = 3
-# A robot is off when its model is farther from the median than this many times what the models claim, and what the
-# robots are apart from it in the middle.
+# A robot is off when one of its figures stands out; or its model is farther from the median than so many times what the
+# models claim, and what the robots are apart from it in the middle.
 FAR = 3.0
 # A figure stands out when chance brings it about so seldom, among all figures of all robots.
 CHANCE = 0.05
@@ -47,7 +47,7 @@ class Model:
 
 
 class Odd(msgspec.Struct, frozen=True):
-    """A figure of a robot that differs from those of the others by more than its uncertainty.
+    """A figure of a robot that differs from the others' by more than its uncertainty and what they differ by.
 
     Attributes:
         figure: in words, as in `zero of elbow`.
@@ -117,14 +117,17 @@ def compared(joints: tuple[str, ...], q: FloatArray, models: Sequence[Model]) ->
     typical = float(np.median([each.rms_mm for each in apart]))
     claimed = float(np.median([1e3 * model.sigma_m for model in models]))
     figures = _figures(models)
+    judged = len(models) >= FEWEST_TO_JUDGE
+    odd = [_odd(k, figures) if judged else () for k in range(len(models))]
+    far = [FAR * max(typical, math.hypot(1e3 * model.sigma_m, claimed)) for model in models]
     units = tuple(
         Unit(
             robot=model.robot,
             apart=each,
             claimed_mm=1e3 * model.sigma_m,
             in_support=model.in_support,
-            is_off=_is_off(each.rms_mm, typical, math.hypot(1e3 * model.sigma_m, claimed), len(models)),
-            odd=_odd(k, figures) if len(models) >= FEWEST_TO_JUDGE else (),
+            is_off=bool(odd[k]) or each.rms_mm > far[k] if judged else None,
+            odd=odd[k],
             camera_moved_mm=_camera_moved(model.calibration),
             camera_turned_deg=_camera_turned(model.calibration),
         )
@@ -147,10 +150,6 @@ def median_model(positions: Sequence[FloatArray]) -> FloatArray:
     for _ in range(ROUNDS):
         middle = np.median([laid_on(middle, x)[0] for x in positions], axis=0)
     return middle
-
-
-def _is_off(rms_mm: float, typical_mm: float, claimed_mm: float, robots: int) -> bool | None:
-    return None if robots < FEWEST_TO_JUDGE else rms_mm > FAR * max(typical_mm, claimed_mm)
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,10 +191,17 @@ def _odd(robot: int, figures: Sequence[_Figure]) -> tuple[Odd, ...]:
         own, others = figure.half_widths[robot], figure.half_widths[np.isfinite(figure.half_widths)]
         difference = float(figure.values[robot] - np.nanmedian(figure.values))
         half_width = math.hypot(own, MEDIAN_COSTS * float(np.median(others)) / math.sqrt(len(others)))
-        far = abs(difference) / half_width if half_width > 0.0 else math.inf * abs(difference)
+        possible = math.hypot(half_width, norm.isf(0.025) * _spread(figure.values))
+        far = abs(difference) / possible if possible > 0.0 else 0.0
         if far > norm.isf(0.5 * CHANCE / tried) / norm.isf(0.025):
             found.append((far, Odd(figure.name, difference, half_width, figure.unit)))
     return tuple(odd for _, odd in sorted(found, key=lambda each: -each[0]))
+
+
+def _spread(values: FloatArray) -> float:
+    """1-sigma by which most robots differ in a figure, from the median of their distances to the median."""
+    told = values[np.isfinite(values)]
+    return float(np.median(np.abs(told - np.median(told))) / norm.ppf(0.75))
 
 
 def _camera_moved(found: ChainCalibration | None) -> float | None:

@@ -36,7 +36,7 @@ def sentences(comparison: TypeComparison) -> list[str]:
         return [*said, "Of two robots nobody can say which is the odd one."]
     off = [unit for unit in units if unit.is_off]
     if not off:
-        said.append("None is farther from the others than the models claim to be wrong.")
+        said.append("None is farther from the others than the models claim to be wrong, and no figure stands out.")
     for unit in off:
         why = [figure_told(odd) for odd in unit.odd[:3]]
         told = f": {'; '.join(why)}" if why else "; none of its figures stands out alone"

@@ -1,0 +1,234 @@
+"""The diagnosis of many recordings on Dask: on this machine's cores, or wherever a scheduler has workers.
+
+What a worker gets is the recording and the robot's description, read here: it needs this package, and no file of ours.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+
+from daemon.config import Config
+from daemon.diagnosis_run import Asked, Found, Source, measured, require_folder, run, written
+from diagnosis.result import DiagnosisFile
+from interfaces.errors import BodyschemaError, ConfigError
+
+from .recordings import Job
+
+if TYPE_CHECKING:
+    from distributed import Client, Future
+
+# A diagnosis that ended so many workers (for its memory, say) is not tried again.
+WORKERS_LOST = 1
+CONNECT_LIMIT_S = 10.0
+TOPIC = "bodyschema"
+
+
+@dataclass(frozen=True)
+class Diagnosed:
+    """What came of one recording.
+
+    Attributes:
+        joints: of its robot; empty where its description could not be read.
+        file: the diagnosis; None where there is none.
+        timed: whether the recording has times.
+        error: why there is none.
+    """
+
+    job: Job
+    robot: str
+    joints: tuple[str, ...]
+    file: DiagnosisFile | None = None
+    timed: bool = False
+    error: str | None = None
+
+
+@dataclass(frozen=True)
+class _Read:
+    """A recording that can be diagnosed."""
+
+    job: Job
+    config: Config
+    source: Source
+
+
+Told = Callable[[str, str], None]
+Done = Callable[[Diagnosed], None]
+
+
+def require_extra() -> None:
+    """ConfigError unless the extra `fleet` is installed."""
+    if find_spec("distributed") is None:
+        raise ConfigError(
+            "many diagnoses at once need the extra `fleet`", remedy="Install it: `pip install 'bodyschema[fleet]'`"
+        )
+
+
+def diagnose_all(
+    jobs: Sequence[Job],
+    asked: Asked,
+    out: Path | None,
+    cluster: Client,
+    told: Told,
+    done: Done,
+) -> list[Diagnosed]:
+    """Diagnose all recordings; one that fails is told as that, and ends no other.
+
+    Args:
+        out: a folder for each is written here.
+        cluster: a client of the scheduler; what is under way is cancelled when this ends early.
+        told: is called with a recording's name and what is done with it just now.
+        done: is called with each result as it comes.
+
+    Returns:
+        What came of each, in the order of the jobs.
+
+    Raises:
+        RecordingError: the folder cannot be written.
+    """
+    from distributed import as_completed
+
+    if out is not None:
+        require_folder(out)
+    results: dict[str, Diagnosed] = {}
+
+    def take(result: Diagnosed) -> None:
+        results[result.job.name] = result
+        done(result)
+
+    futures: dict[Future[Any], _Read] = {}
+    cluster.subscribe_topic(TOPIC, lambda event: told(*event[1]))
+    try:
+        for read in map(_read, jobs):
+            if isinstance(read, Diagnosed):
+                take(read)
+                continue
+            work = cluster.submit(_work, read, asked, out is not None, key=f"diagnose-{read.job.name}", pure=False)
+            futures[work] = read
+        for future in as_completed(list(futures), raise_errors=False):
+            take(_result(future, futures[future], out))
+    finally:
+        cluster.cancel(list(futures), force=True)
+        cluster.unsubscribe_topic(TOPIC)
+    return [results[job.name] for job in jobs]
+
+
+@contextmanager
+def workers(scheduler: str | None, jobs: int, count: int | None = None) -> Iterator[Client]:
+    """A client of the scheduler at an address; without one, of processes on this machine.
+
+    Dask gives each process one thread of BLAS.
+
+    Args:
+        jobs: so many recordings want a worker.
+        count: of processes; None: one for each core, and no more than jobs.
+
+    Raises:
+        ConfigError: the scheduler does not answer, or has no workers.
+    """
+    from dask import config
+    from distributed import Client, LocalCluster
+
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what matters comes as errors of the diagnoses
+    with config.set({"distributed.scheduler.allowed-failures": WORKERS_LOST}):
+        if scheduler is not None:
+            with _client_of(scheduler) as client:
+                yield client
+            return
+        with (
+            LocalCluster(
+                n_workers=count or min(os.cpu_count() or 1, jobs),
+                threads_per_worker=1,
+                processes=True,
+                dashboard_address=None,  # pyright: ignore[reportArgumentType]
+                silence_logs=logging.CRITICAL,
+            ) as local,
+            Client(local) as client,
+        ):
+            client.run(_leave_ctrl_c)
+            yield client
+
+
+def _client_of(scheduler: str) -> Client:
+    from distributed import Client
+
+    try:
+        client = Client(scheduler, timeout=CONNECT_LIMIT_S)
+    except (OSError, ValueError, TimeoutError) as error:
+        raise ConfigError(
+            f"no Dask scheduler answers on {scheduler}",
+            remedy="Start one with `dask scheduler`, or leave --scheduler out: then this machine's cores do it",
+        ) from error
+    if not client.scheduler_info(n_workers=-1)["workers"]:
+        client.close()
+        raise ConfigError(
+            f"the Dask scheduler on {scheduler} has no workers", remedy=f"Start some: `dask worker {scheduler}`"
+        )
+    return client
+
+
+def _leave_ctrl_c() -> None:
+    """On a worker of our terminal: Ctrl-C is for who started it, who ends it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def _read(job: Job) -> _Read | Diagnosed:
+    """The recording with its robot; why it cannot be diagnosed where it cannot be read."""
+    try:
+        config = Config.load(job.robot)
+    except BodyschemaError as error:
+        return Diagnosed(job, job.name, (), error=str(error))
+    try:
+        return _Read(job, config, measured(config, job.recording, live=False))
+    except BodyschemaError as error:
+        return Diagnosed(job, config.robot.name, config.robot.joints, error=str(error))
+
+
+def _work(read: _Read, asked: Asked, with_report: bool) -> tuple[bytes, Found | None] | str:
+    """On a worker: diagnosis.json, and what the other files are written from, where its paths mean something.
+
+    Or why there is none: not every exception of ours survives the way back.
+    """
+    from distributed import get_worker
+
+    worker = get_worker()
+    try:
+        found = run(read.config, read.source, asked, lambda said: worker.log_event(TOPIC, (read.job.name, said)))
+    except BodyschemaError as error:
+        return str(error)
+    return found.json.encode(), found if with_report else None
+
+
+def _result(future: Future[Any], read: _Read, out: Path | None) -> Diagnosed:
+    robot = read.config.robot
+    try:
+        answer = future.result()
+        if not isinstance(answer, str) and out is not None:
+            written(answer[1], out / read.job.name)
+    except Exception as error:  # whatever a worker ran into is told in its row, and is no matter of the others
+        answer = _why(error)
+    if isinstance(answer, str):
+        return Diagnosed(read.job, robot.name, robot.joints, error=answer)
+    file = msgspec.json.decode(answer[0], type=DiagnosisFile)
+    return Diagnosed(read.job, robot.name, robot.joints, file, read.source.recording.t is not None)
+
+
+def _why(error: Exception) -> str:
+    from distributed import KilledWorker
+
+    if isinstance(error, BodyschemaError):
+        return str(error)
+    if isinstance(error, KilledWorker):
+        return "its worker was ended, by the system for its memory perhaps. Try fewer --workers"
+    if isinstance(error, ModuleNotFoundError):
+        return f"the worker has no module {error.name}: install the same bodyschema there"
+    return f"internal error, please report it: {type(error).__name__}: {error}"

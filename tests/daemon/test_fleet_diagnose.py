@@ -1,0 +1,168 @@
+"""Many recordings diagnosed on Dask: which unit is off, what fails alone, what ends cleanly."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import sys
+from pathlib import Path
+from unittest import mock
+
+import pytest
+from hidden_units import DESK_ARM, unit
+
+from daemon.cli import main
+from daemon.fleet.diagnosing import Diagnosed
+from daemon.fleet.recordings import Job, jobs
+from daemon.fleet.summary import summary
+from daemon.fleet.summary_view import sentences
+from diagnosis.result import Cause, DiagnosisFile, Errors, Gain, Interval, Pairs, Unexplained
+from interfaces.errors import RecordingError, RequestError
+from interfaces.robot import RobotDescription
+
+pytest.importorskip("distributed", reason="the extra fleet is not installed")
+
+
+def fleet(*words: object) -> tuple[object, str, str]:
+    """Exit code, standard output and standard error of `bodyschema fleet`."""
+    out, err = io.StringIO(), io.StringIO()
+    with (
+        mock.patch.object(sys, "argv", ["bodyschema", "fleet", *map(str, words)]),
+        contextlib.redirect_stdout(out),
+        contextlib.redirect_stderr(err),
+        pytest.raises(SystemExit) as ended,
+    ):
+        main()
+    return ended.value.code or 0, out.getvalue(), err.getvalue()
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two units that are as drawn, one whose elbow turns 2 % farther than it says, and a file that is no recording."""
+    folder, robot = tmp_path_factory.mktemp("units"), RobotDescription.load(DESK_ARM)
+    unit(robot, 1).write_csv(folder / "left.csv")
+    unit(robot, 2, scaled=(2, 1.02)).write_csv(folder / "right.csv")
+    unit(robot, 3).write_csv(folder / "spare.csv")
+    (folder / "broken.csv").write_text("nonsense\n1\n")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def told(folder: Path) -> tuple[object, str, str]:
+    few = ("--effects", "joint_scale,backlash")
+    return fleet("diagnose", "--from", folder, "--robot", DESK_ARM, "--out", folder / "out", *few, "--json")
+
+
+@pytest.fixture(scope="module")
+def rows(told: tuple[object, str, str]) -> dict[str, dict]:
+    assert told[0] == 0
+    return {row["name"]: row for row in json.loads(told[1])["rows"]}
+
+
+def test_the_unit_with_the_hidden_fault_is_named_with_its_joint_and_number(rows: dict[str, dict]) -> None:
+    assert rows["right"]["verdict"] == "explained"
+    (cause,) = rows["right"]["causes"]
+    assert cause.startswith("joint_scale at elbow_pitch: scale +")
+    assert float(cause.split("+")[1].split(" ")[0]) == pytest.approx(2.0, abs=0.1)
+
+
+def test_units_without_a_fault_have_none(rows: dict[str, dict]) -> None:
+    assert [rows[name]["verdict"] for name in ("left", "spare")] == ["nothing_found"] * 2
+
+
+def test_a_recording_that_fails_is_a_row_and_ends_no_other(rows: dict[str, dict]) -> None:
+    assert "there is no column for the joint" in rows["broken"]["error"]
+    assert len(rows) == 4
+
+
+def test_the_unit_that_is_off_is_told_apart_from_its_type(told: tuple[object, str, str]) -> None:
+    (found,) = json.loads(told[1])["types"]
+    assert (sorted(found["well"]), list(found["off"])) == (["left", "spare"], ["right"])
+
+
+def test_each_robot_has_a_folder_with_its_report(folder: Path, rows: dict[str, dict]) -> None:
+    assert {file.parent.name for file in (folder / "out").glob("*/report.html")} == {"left", "right", "spare"}
+
+
+def test_what_was_found_loads_as_a_robot_s_description(folder: Path, rows: dict[str, dict]) -> None:
+    assert RobotDescription.load(folder / "out" / "right" / "extended.toml").joints
+
+
+def test_progress_is_a_line_for_each_that_is_done(told: tuple[object, str, str]) -> None:
+    assert [line.split(":")[0] for line in told[2].splitlines()] == [f"{k} of 4" for k in range(1, 5)]
+
+
+def test_a_scheduler_that_does_not_answer_is_told_with_its_address(folder: Path, endpoint: str) -> None:
+    address = endpoint.replace("tcp/", "tcp://")
+    with mock.patch("daemon.fleet.diagnosing.CONNECT_LIMIT_S", 0.5):
+        code, _, err = fleet("diagnose", folder / "left.csv", "--robot", DESK_ARM, "--scheduler", address)
+    assert code == 1
+    assert f"no Dask scheduler answers on {address}" in err
+
+
+def test_nothing_named_is_refused() -> None:
+    with pytest.raises(RequestError, match="nothing to diagnose"):
+        jobs([], None, None)
+
+
+def test_a_folder_without_recordings_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match="no recording is in it"):
+        jobs([], tmp_path, None)
+
+
+def test_recordings_of_one_name_are_told_apart_by_their_folders(tmp_path: Path) -> None:
+    files = [tmp_path / name / "pairs.csv" for name in ("left", "right")]
+    assert [job.name for job in jobs(files, None, DESK_ARM)] == ["left_pairs", "right_pairs"]
+
+
+def test_the_robot_beside_a_recording_is_taken(tmp_path: Path) -> None:
+    (tmp_path / "robot.toml").touch()
+    (job,) = jobs([tmp_path / "pairs.csv"], None, None)
+    assert job.robot == tmp_path / "robot.toml"
+
+
+def result(name: str, *effects: str) -> Diagnosed:
+    causes = tuple(
+        Cause(
+            effect=effect,
+            where="elbow" if effect.startswith("joint") else None,
+            source=None,
+            parameters={"offset_rad": Interval(0.02, (0.019, 0.021))},
+            probability=0.99,
+            share_of_gain_percent=100.0,
+            held_out_gain_percent=50.0,
+            stability_percent=None,
+            indistinguishable_from=(),
+            rivals=(),
+            evidence="",
+        )
+        for effect in effects
+    )
+    errors = Errors(2.0, 2.0, 2.0, 1.0, 1.0)
+    file = DiagnosisFile(
+        verdict="explained" if causes else "nothing_found",
+        sentence="",
+        pairs=Pairs(100, 30, 0),
+        rms_mm=errors,
+        mean_mm=errors,
+        gain=Gain(50.0, (45.0, 55.0)),
+        causes=causes,
+        rejected=(),
+        unexplained=Unexplained(0.0, (), 1.0),
+        stability=None,
+        advice=(),
+        limitations=(),
+    )
+    return Diagnosed(Job(name, Path(name), Path()), "arm", ("waist", "elbow"), file)
+
+
+def test_what_most_units_have_is_told_of_their_description() -> None:
+    (found,) = summary([result(name, "joint_offset") for name in "abc"] + [result("d")]).types
+    assert found.off == {}
+    assert "3 of 4 units have joint_offset at elbow (a, b, c)" in " ".join(sentences(found))
+
+
+def test_where_a_tool_sits_is_each_unit_s_own() -> None:
+    (found,) = summary([result(name, "tool_offset") for name in "abc"]).types
+    assert (found.shared, sorted(found.off)) == ((), ["a", "b", "c"])
