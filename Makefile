@@ -54,7 +54,7 @@ goals: setup    ## What was to be reached beside what is; goes on where the last
 
 lock:           ## Renew requirements.lock from pyproject.toml
 	@$(BIN)/python -m pip install --disable-pip-version-check --quiet uv
-	@$(BIN)/uv pip compile --quiet --upgrade --python-version 3.11 --extra sim --extra export --extra view --extra bench --extra docs --extra dev \
+	@$(BIN)/uv pip compile --quiet --upgrade --python-version 3.11 --extra sim --extra export --extra view --extra fleet --extra bench --extra docs --extra dev \
 		--generate-hashes --no-emit-index-url --no-annotate --no-header pyproject.toml -o requirements.lock
 
 wheel: setup    ## Build the wheel into dist/
