@@ -21,7 +21,8 @@ from .status import ChainCalibration, JointZero, LearntFigure, Outlook
 
 log = logging.getLogger(__name__)
 
-# Finding them takes at most one part in so many of the background thread's time, and comes no more often than this.
+# Finding them takes at most one part in so many of the background thread's time, which the robots share, and comes no
+# more often than this.
 SHARE = 10.0
 EVERY_S = 1.0
 
@@ -34,8 +35,14 @@ class Findings:
     What was found may be read by any thread.
     """
 
-    def __init__(self, learning: Learning, robot: RobotDescription, clock: Clock) -> None:
+    def __init__(self, learning: Learning, robot: RobotDescription, clock: Clock, robots: int = 1) -> None:
+        """Nothing is found yet.
+
+        Args:
+            robots: so many share the background's thread.
+        """
         self._learning, self._robot, self._clock = learning, robot, clock
+        self._parts = SHARE * robots
         self._found_of: tuple[ChainBelief | None, str] = None, ""
         self._due_at = clock.now()
         self._found: tuple[ChainCalibration | None, Outlook | None] = None, None
@@ -78,7 +85,7 @@ class Findings:
             log.warning("status has no calibration for now: %s", error)
             self._found = None, None
         end = self._clock.now()
-        self._due_at = begin + max(SHARE * (end - begin), EVERY_S)
+        self._due_at = begin + max(self._parts * (end - begin), EVERY_S)
 
 
 def _found(robot: RobotDescription, known: Known) -> tuple[ChainCalibration, Outlook | None]:

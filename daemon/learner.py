@@ -1,18 +1,15 @@
-"""The process that learns and answers. It needs a sampler for new pairs, but goes on answering without one.
+"""What learns and answers. It needs a sampler for new pairs, but goes on answering without one.
 
-Threads: zenoh's (queries, from an immutable snapshot; published pairs, into a queue), one that learns each pair at
-once, one at low priority for replay and the solver's orders, and the main thread for status and checkpoints.
+Threads: zenoh's (queries, from an immutable snapshot; published pairs, into a queue), one for each robot that learns
+each pair at once, one at low priority for replay and the solver's orders, and the main thread for status and
+checkpoints; `daemon.learner_host` has the last two.
 """
 
 from __future__ import annotations
 
 import contextlib
-import gc
 import logging
-import os
-import sys
 import threading
-import time
 from collections.abc import Callable, Iterator
 from importlib.metadata import version
 
@@ -28,50 +25,58 @@ from daemon.going_on import go_on
 from daemon.history import Page, read_page
 from daemon.keys import Keys
 from daemon.learning import Learning, NominalModel
-from daemon.learning.solver import LARGEST_NET
-from daemon.notify import Notifier
+from daemon.learning.solver import LARGEST_NET, Solver
 from daemon.reload import reload
 from daemon.service import Service, with_health
-from daemon.signals import Wishes
-from daemon.solver_process import SolverLostError, SolverProcess
 from daemon.status import LearnerStatus
 from daemon.wire import OCTETS, CommandReply, CommandRequest, decode, encode
 from daemon.wiring import open_marker_topic
-from interfaces.errors import BodyschemaError, RequestError
+from interfaces.errors import RequestError
 from interfaces.protocols import Clock
 
 log = logging.getLogger(__name__)
 
-TICK_S = 0.05
-STATUS_EVERY_S = 1.0
 HISTORY_LIMIT_S = 5.0
-IDLE_S = 0.02
-SOLVE_WHEN_IDLE_S = 0.5
-BACKGROUND_NICENESS = 10
+IDLE_S = 0.2
 # What has to come round for the learner to be alive.
-LOOPS = ("learning", "background", "status")
+LISTENING = "learning"
+LOOPS = (LISTENING, "background", "status")
 TABLES = ("robot", "camera", "zenoh", "daemon", "drivers", "learner", "effects", "unexplained")
 CHANGEABLE = {("learner", "checkpoint_every_s")}
-# Python hands the interpreter from thread to thread this often at least; its own 5 ms would be a query's delay.
-SWITCH_INTERVAL_S = 2e-4
 
 
 class Learner:
     """One robot's learner with its answers, its checkpoint and its state of health."""
 
     def __init__(
-        self, config: Config, solver: SolverProcess, bus: Bus, clock: Clock, service: Service | None = None
+        self,
+        config: Config,
+        solver: Solver,
+        bus: Bus,
+        clock: Clock,
+        service: Service | None = None,
+        *,
+        loop: str = LISTENING,
+        robots: int = 1,
     ) -> None:
+        """A learner that goes on from its checkpoint; nothing is declared yet.
+
+        Args:
+            solver: for this robot alone.
+            loop: what its loop of new pairs is called for the watchdog.
+            robots: so many share the background's thread with it, itself among them.
+        """
         self._config, self._bus, self._clock = config, bus, clock
         self._service = Service.nobodys(clock) if service is None else service
+        self._loop = loop
         self._settings, self._robot = config.tables.learner, config.robot
         self._keys = Keys(config.robot.name)
         self._nominal = NominalModel.extended_by(config.simulation)
         self._learning, self._set_aside = go_on(
             lambda: Learning(self._nominal, self._settings, solver), config.checkpoint_file, config.robot.name
         )
-        self._feed = PairFeed(self._learning, self._history, clock, lambda: self._service.beat("learning"))
-        self._findings = Findings(self._learning, config.robot, clock)
+        self._feed = PairFeed(self._learning, self._history, clock, lambda: self._service.beat(loop))
+        self._findings = Findings(self._learning, config.robot, clock, robots)
         self._answers = Answers(self._learning, config.robot, clock)
         self._sampler_alive = False
         self._started_at = clock.now()
@@ -86,13 +91,9 @@ class Learner:
 
     @contextlib.contextmanager
     def serving(self) -> Iterator[None]:
-        """Answer, learn and replay from here to the end of the with statement; then write a last checkpoint."""
-        threads = [
-            threading.Thread(target=self._guarded, args=(loop,), name=loop.__name__.strip("_"))
-            for loop in (self._learn_pairs, self._work_in_background)
-        ]
-        for thread in threads:
-            thread.start()
+        """Answer and learn from here to the end of the with statement; then write a last checkpoint."""
+        listening = threading.Thread(target=self._guarded, args=(self._learn_pairs,), name="learn_pairs")
+        listening.start()
         try:
             self._declare()
             with self._publishing():
@@ -100,8 +101,7 @@ class Learner:
         finally:
             self._stop.set()
             self._feed.wake()
-            for thread in threads:
-                thread.join()
+            listening.join()
             self.checkpoint()
 
     def _publishing(self) -> contextlib.AbstractContextManager[None]:
@@ -296,82 +296,30 @@ class Learner:
 
     def _learn_pairs(self) -> None:
         while not self._stop.is_set():
-            self._service.beat("learning")
+            self._service.beat(self._loop)
             self._feed.step(IDLE_S)
             with self._feed.lock:
                 self._changes.note(self._learning.change)
 
-    def _work_in_background(self) -> None:
-        with contextlib.suppress(OSError):  # niceness is a courtesy: without it answers are a little later
-            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), BACKGROUND_NICENESS)
-        idle_since = self._clock.now()
-        while not self._stop.is_set():
-            self._service.beat("background")
-            try:
-                self._findings.renew()
-                worked = self._learning.work()
-                pairs = self._learning.counters.pairs
-                self._rested_with = pairs if self._learning.at_rest and self._findings.at_rest else None
-            except SolverLostError as error:
-                log.warning("%s", error)
-                self._learning.restart_solver()
-                self._rested_with = None
-                self._stop.wait(1.0)
-                continue
-            if worked:
-                idle_since = self._clock.now()
-                self._stop.wait(1e-4)  # whoever waits for the lock gets it now
-            elif not self._stop.wait(IDLE_S) and self._clock.now() - idle_since > SOLVE_WHEN_IDLE_S:
-                self._learning.solve_soon()
+    def work(self) -> bool:
+        """A piece of what is not urgent; False when there is none. SolverLostError: the solver lost its pairs."""
+        self._findings.renew()
+        worked = self._learning.work()
+        pairs = self._learning.counters.pairs
+        self._rested_with = pairs if self._learning.at_rest and self._findings.at_rest else None
+        return worked
 
+    def restart_solver(self) -> None:
+        """Give a new solver the pairs again."""
+        self._learning.restart_solver()
+        self._rested_with = None
 
-def run_learner(config: Config, clock: Clock, wishes: Wishes, notifier: Notifier) -> None:
-    """Learn and answer until `wishes` has an end.
-
-    Args:
-        notifier: is told when all is up, that `LOOPS` work, and how the learner is.
-
-    Raises:
-        BusError: the learner's port is in use.
-        CheckpointError: an unusable checkpoint cannot be moved aside.
-    """
-    sys.setswitchinterval(SWITCH_INTERVAL_S)
-    endpoints, service = config.tables.zenoh, Service(notifier, LOOPS, clock)
-    with SolverProcess() as solver, Bus(listen=endpoints.learner, settings=config.zenoh_settings("learner")) as bus:
-        learner = Learner(config, solver, bus, clock, service)
-        publish = bus.publisher(Keys(config.robot.name).status("learner"))
-        gc.collect()
-        gc.freeze()  # what start-up left behind need not be looked through again
-        with learner.serving():
-            log.info("the learner of %s answers on %s", config.robot.name, endpoints.learner)
-            service.ready()
-            published_at = clock.now() - STATUS_EVERY_S
-            while not wishes.ending:
-                if clock.now() - published_at >= STATUS_EVERY_S:
-                    published_at = clock.now()
-                    status = learner.status()
-                    publish(encode(status))
-                    service.tell(status_line(status))
-                if wishes.reloading:
-                    wishes.reloading = False
-                    _reload(learner, service)
-                learner.tick()
-                time.sleep(TICK_S)
-            service.stopping()
+    def solve_soon(self) -> None:
+        """Let the solver catch up: nothing else is left to do."""
+        self._learning.solve_soon()
 
 
 def status_line(status: LearnerStatus) -> str:
     """How the learner is, in a line."""
     claimed = "" if status.claimed_error_m is None else f", {1e3 * status.claimed_error_m:.1f} mm claimed"
     return with_health(f"{status.state}, {status.pairs} pairs, {status.answering} answers{claimed}", status.health)
-
-
-def _reload(learner: Learner, service: Service) -> None:
-    """Whoever asked by a signal reads the log."""
-    service.reloading()
-    try:
-        log.info("robot.toml was read again: %s", learner.reload())
-    except BodyschemaError as error:
-        log.error("robot.toml was read again and is not followed: %s", error)
-    finally:
-        service.reloaded()

@@ -16,6 +16,7 @@ import struct
 import subprocess
 import sys
 import time
+from collections import defaultdict
 from types import TracebackType
 from typing import IO, Self
 
@@ -48,6 +49,7 @@ class StartTask(msgspec.Struct, frozen=True, tag="start"):
     residual: bytes | None
     prior_stays: bool
     tolerances: ChainTolerances | None
+    robot: int = 0
 
 
 class Learn(msgspec.Struct, frozen=True, tag="learn"):
@@ -57,10 +59,13 @@ class Learn(msgspec.Struct, frozen=True, tag="learn"):
     q: bytes
     x: bytes
     turns: bytes | None = None
+    robot: int = 0
 
 
 class Solve(msgspec.Struct, frozen=True, tag="solve"):
     """Solve for all pairs so far."""
+
+    robot: int = 0
 
 
 class Oriented(msgspec.Struct, frozen=True):
@@ -95,6 +100,8 @@ _solutions = msgspec.msgpack.Decoder(Solution)
 class SolverProcess:
     """A `Solver` in a child process, started with the first task. Use as a context manager.
 
+    It may keep the pairs of several robots, by their numbers, and solves for one at a time.
+
     All methods but `__exit__` raise SolverLostError when the child has died.
     """
 
@@ -115,7 +122,7 @@ class SolverProcess:
         """Process id of the child, or None before the first task."""
         return self._child.pid if self._child is not None else None
 
-    def start(self, task: Task) -> None:
+    def start(self, task: Task, robot: int = 0) -> None:
         """Forget all pairs and begin a new task."""
         if self._child is None:
             command = [sys.executable, "-m", "daemon.solver_process"]
@@ -132,17 +139,18 @@ class SolverProcess:
                 residual=None if task.residual is None else task.residual.to_bytes(),
                 prior_stays=task.prior_stays,
                 tolerances=task.tolerances,
+                robot=robot,
             )
         )
 
-    def learn(self, q: FloatArray, x: FloatArray, turns: FloatArray | None = None) -> None:
+    def learn(self, q: FloatArray, x: FloatArray, turns: FloatArray | None = None, robot: int = 0) -> None:
         """More pairs, q (n, d) [rad], x (n, 3) [m] and orientations (n, 4), NaN where a pair has none."""
         told = None if turns is None else turns.astype("<f8").tobytes()
-        self._send(Learn(q.shape[1], q.astype("<f8").tobytes(), x.astype("<f8").tobytes(), told))
+        self._send(Learn(q.shape[1], q.astype("<f8").tobytes(), x.astype("<f8").tobytes(), told, robot))
 
-    def solve(self) -> None:
+    def solve(self, robot: int = 0) -> None:
         """Ask for the solution of all pairs so far."""
-        self._send(Solve())
+        self._send(Solve(robot))
 
     def poll(self) -> Solved | None:
         """The next solution that has come, without waiting."""
@@ -222,8 +230,10 @@ def _belief(data: bytes | None) -> ChainBelief | None:
 
 def serve(orders: IO[bytes], solutions: IO[bytes]) -> None:
     """Carry out orders until they end; before another solve, rest for as long as the last one took."""
-    solver, rested_at = DirectSolver(), 0.0
+    solvers: defaultdict[int, DirectSolver] = defaultdict(DirectSolver)
+    rested_at = 0.0
     while (order := _read(orders)) is not None:
+        solver = solvers[order.robot]
         if isinstance(order, StartTask):
             prior, belief = KBMap.from_bytes(order.prior), ChainBelief.from_bytes(order.belief)
             residual = None if order.residual is None else ResidualModel.from_bytes(order.residual)

@@ -1,0 +1,86 @@
+"""The robots of one learner host, and the processes that they are spread over."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from daemon.config import Config
+from daemon.learner_host import session_settings
+from daemon.signals import on_termination
+from daemon.supervise import Child, Supervisor
+from interfaces.errors import ConfigError
+
+
+def descriptions(named: Sequence[Path]) -> list[Path]:
+    """Descriptions of robots, each once: files, and of a folder those in it and a robot.toml in each folder of it.
+
+    Raises:
+        ConfigError: a folder has none.
+    """
+    found: list[Path] = []
+    for path in named:
+        inside = sorted([*path.glob("*.toml"), *path.glob("*/robot.toml")]) if path.is_dir() else [path]
+        if not inside:
+            raise ConfigError("no robot.toml is in this folder", file=path, remedy="Name the robots' descriptions")
+        found += inside
+    return list(dict.fromkeys(found))
+
+
+def configs_of(files: Sequence[Path], state_dir: Path | None) -> list[Config]:
+    """The robots, with their states in `state_dir` when there is one, a folder each where they are several.
+
+    Raises:
+        ConfigError: a description is wrong, or of a robot that cannot be learnt.
+    """
+    configs = [Config.load(file) for file in files]
+    for config in configs:
+        config.require_learnable()
+    if state_dir is None:
+        return configs
+    if len(configs) == 1:
+        return [configs[0].with_state_dir(state_dir)]
+    return [config.with_state_dir(state_dir / config.robot.name) for config in configs]
+
+
+def shares(configs: Sequence[Config], processes: int) -> list[list[Config]]:
+    """The robots in so many shares at most, alike in size; robots of one learner's endpoint are not parted.
+
+    Raises:
+        ConfigError: the endpoints are too few for as many processes.
+    """
+    by_endpoint: dict[str, list[Config]] = {}
+    for config in configs:
+        by_endpoint.setdefault(config.tables.zenoh.learner, []).append(config)
+    if len(by_endpoint) < processes:
+        raise ConfigError(
+            f"{processes} processes cannot share the {len(by_endpoint)} endpoints of these robots' learners",
+            remedy="Give each robot a `learner` of its own in [zenoh], or fewer --processes",
+        )
+    parts: list[list[Config]] = [[] for _ in range(processes)]
+    for group in sorted(by_endpoint.values(), key=len, reverse=True):
+        min(parts, key=len).extend(group)
+    return parts
+
+
+def spread(configs: Sequence[Config], processes: int, options: Sequence[str]) -> None:
+    """Learn in several processes, each with its share of the robots, until SIGTERM or Ctrl-C.
+
+    Raises:
+        ConfigError: they cannot be parted, or not be served by one process.
+        BodyschemaError: a process refused to start.
+    """
+    children: list[Child] = []
+    for number, share in enumerate(shares(configs, processes), 1):
+        session_settings(share)  # refuses here what would end the process
+        command = [sys.executable, "-m", "daemon", "learner", *options]
+        for config in share:
+            command += ["--robot", str(config.file)]
+        if share[0].given_state_dir is not None:
+            folder = share[0].given_state_dir
+            command += ["--state-dir", str(folder if len(share) == 1 else folder.parent)]
+        children.append(Child(f"learner {number}", command))
+    supervisor = Supervisor(children)
+    with on_termination(supervisor.stop):
+        supervisor.run()

@@ -1,0 +1,184 @@
+"""One process that learns for one robot or for several: a zenoh session, a solver's process and a background thread.
+
+Each robot has its own thread for new pairs, so that one whose sampler is stuck keeps no other from learning. What can
+wait is done for all in turns.
+"""
+
+from __future__ import annotations
+
+import gc
+import logging
+import sys
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from typing import Any
+
+from daemon.access import Names, Subjects, access_control
+from daemon.background import Background
+from daemon.bus import Bus
+from daemon.config import Config
+from daemon.identity import SECURE
+from daemon.keys import Keys
+from daemon.learner import LISTENING, LOOPS, Learner, status_line
+from daemon.notify import Notifier
+from daemon.service import Service
+from daemon.signals import Wishes
+from daemon.solver_process import SolverProcess
+from daemon.solver_seats import SharedSolver
+from daemon.wire import encode
+from interfaces.errors import BodyschemaError, ConfigError
+from interfaces.protocols import Clock
+
+log = logging.getLogger(__name__)
+
+TICK_S = 0.05
+STATUS_EVERY_S = 1.0
+# A status takes milliseconds: of more robots than these each tells less often how it is, unless it is asked.
+TOLD_EVERY_SECOND = 10
+# Of one processor: what is not urgent leaves the rest to new pairs and queries, which share the interpreter with it.
+SHARED_WORK = 0.3
+# Python hands the interpreter from thread to thread this often at least; its own 5 ms would be a query's delay.
+SWITCH_INTERVAL_S = 2e-4
+
+
+def run_learners(configs: Sequence[Config], clock: Clock, wishes: Wishes, notifier: Notifier) -> None:
+    """Learn and answer for all robots until `wishes` has an end.
+
+    Args:
+        notifier: is told when all is up, that every loop works, and how the learners are.
+
+    Raises:
+        ConfigError: the robots cannot be served by one process.
+        BusError: a learner's port is in use.
+        CheckpointError: an unusable checkpoint cannot be moved aside.
+    """
+    sys.setswitchinterval(SWITCH_INTERVAL_S)
+    loops = LOOPS if len(configs) == 1 else (*(_loop(config) for config in configs), *LOOPS[1:])
+    service = Service(notifier, loops, clock)
+    with ExitStack() as stack:
+        process = stack.enter_context(SolverProcess())
+        bus = stack.enter_context(Bus(settings=session_settings(configs)))
+        learners = _learners(configs, process, bus, clock, service)
+        gc.collect()
+        gc.freeze()  # what start-up left behind need not be looked through again
+        failed = stack.enter_context(_working(learners, service, clock))
+        for config, learner in zip(configs, learners, strict=True):
+            stack.enter_context(learner.serving())
+            log.info("the learner of %s answers on %s", config.robot.name, config.tables.zenoh.learner)
+        service.ready()
+        _attend(
+            learners, [bus.publisher(Keys(c.robot.name).status("learner")) for c in configs], wishes, service, failed
+        )
+        service.stopping()
+
+
+def session_settings(configs: Sequence[Config]) -> dict[str, Any]:
+    """zenoh's configuration of the one session of all robots.
+
+    Raises:
+        ConfigError: two are called alike, or their tables [zenoh] name other routers or certificates.
+    """
+    settings = configs[0].zenoh_settings("learner")
+    if len(configs) == 1:
+        return settings
+    first, names = configs[0], set[str]()
+    for config in configs:
+        if config.robot.name in names:
+            raise ConfigError(f"two robots are called {config.robot.name}", file=config.file, remedy="Rename one")
+        names.add(config.robot.name)
+        if _way(config) != _way(first):
+            raise ConfigError(
+                f"[zenoh] has another router, or other certificates, than {first.file}",
+                file=config.file,
+                remedy="Robots of one learner share them; else give this one a learner of its own",
+            )
+    for key in ("listen/endpoints", "connect/endpoints"):
+        settings[key] = list(dict.fromkeys(end for c in configs for end in c.zenoh_settings("learner")[key]))
+    identity = _way(first)[1]
+    if identity is not None and any(end.startswith(SECURE) for end in settings["listen/endpoints"]):
+        who = {config.robot.name: config.tables.zenoh.access or Names() for config in configs}
+        settings["access_control"] = access_control(who, Subjects(identity.by_user))
+    return settings
+
+
+def _way(config: Config) -> tuple[str, Any]:
+    return config.tables.zenoh.router, config.tables.zenoh.identity(config.file.parent)
+
+
+def _loop(config: Config) -> str:
+    return f"{LISTENING} {config.robot.name}"
+
+
+def _learners(
+    configs: Sequence[Config], process: SolverProcess, bus: Bus, clock: Clock, service: Service
+) -> list[Learner]:
+    if len(configs) == 1:
+        return [Learner(configs[0], process, bus, clock, service)]
+    shared = SharedSolver(process)
+    return [
+        Learner(config, shared.seat(), bus, clock, service, loop=_loop(config), robots=len(configs))
+        for config in configs
+    ]
+
+
+@contextmanager
+def _working(learners: Sequence[Learner], service: Service, clock: Clock) -> Iterator[list[Exception]]:
+    """The background's thread; what ended it before its time is in the list."""
+    stop, failed = threading.Event(), list[Exception]()
+    share = 1.0 if len(learners) == 1 else SHARED_WORK
+    background = Background(learners, service, clock, stop, share=share)
+
+    def guarded() -> None:
+        try:
+            background.run()
+        except Exception as error:
+            failed.append(error)
+
+    thread = threading.Thread(target=guarded, name="background")
+    thread.start()
+    try:
+        yield failed
+    finally:
+        stop.set()
+        thread.join()
+
+
+def _attend(
+    learners: Sequence[Learner],
+    publishers: Sequence[Any],
+    wishes: Wishes,
+    service: Service,
+    failed: Sequence[Exception],
+) -> None:
+    """Statuses, checkpoints and wishes, until the end is wished for."""
+    every_s = STATUS_EVERY_S * max(1.0, len(learners) / TOLD_EVERY_SECOND)
+    begin = time.monotonic()
+    due = [begin + every_s * k / len(learners) for k in range(len(learners))]
+    while not wishes.ending:
+        for k, (learner, publish) in enumerate(zip(learners, publishers, strict=True)):
+            if time.monotonic() >= due[k]:
+                due[k] = time.monotonic() + every_s
+                status = learner.status()
+                publish(encode(status))
+                line = status_line(status)
+                service.tell(line if len(learners) == 1 else f"{len(learners)} robots; {status.robot}: {line}")
+            if wishes.reloading:
+                _reload(learner, service)
+            learner.tick()
+        wishes.reloading = False
+        if failed:
+            raise failed[0]
+        time.sleep(TICK_S)
+
+
+def _reload(learner: Learner, service: Service) -> None:
+    """Whoever asked by a signal reads the log."""
+    service.reloading()
+    try:
+        log.info("robot.toml was read again: %s", learner.reload())
+    except BodyschemaError as error:
+        log.error("robot.toml was read again and is not followed: %s", error)
+    finally:
+        service.reloaded()

@@ -1,0 +1,111 @@
+"""One solver's process for several robots: each has a seat, and they take turns by need."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+
+from daemon.learning import Solved, Task
+from daemon.solver_process import SolverLostError, SolverProcess
+from interfaces.records import FloatArray
+
+
+class SharedSolver:
+    """Gives a process one robot's orders at a time. For one thread.
+
+    What a robot tells waits here until it is its turn: the process does not listen while it solves.
+    """
+
+    def __init__(self, process: SolverProcess) -> None:
+        self._process = process
+        self._seats: list[Seat] = []
+        self._solving: Seat | None = None
+        self._turn = 0
+
+    def seat(self) -> Seat:
+        """A solver for one more robot."""
+        seat = Seat(self, self._process, len(self._seats))
+        self._seats.append(seat)
+        return seat
+
+    def attend(self) -> None:
+        """Take what the process has answered, and give the turn to who needs it most.
+
+        Raises:
+            SolverLostError: the process has ended; all seats are empty.
+        """
+        try:
+            if self._solving is not None and (solved := self._process.poll()) is not None:
+                self._solving.answers.append(solved)
+                if solved.last:
+                    self._solving = None
+            if self._solving is None:
+                self._give_turn()
+        except SolverLostError:
+            self._solving = None
+            for seat in self._seats:
+                seat.clear()
+            raise
+
+    def _give_turn(self) -> None:
+        waiting = [seat for seat in self._seats if seat.asked]
+        if not waiting:
+            return
+        self._turn += 1
+        seat = max(waiting, key=lambda seat: seat.need(self._turn))
+        seat.tell(self._turn)
+        self._solving = seat
+
+
+class Seat:
+    """A `Solver` of one robot, in a process shared with others.
+
+    Attributes:
+        asked: whether a solution is wanted that the process does not work on yet.
+        answers: those that were not taken yet.
+    """
+
+    def __init__(self, shared: SharedSolver, process: SolverProcess, robot: int) -> None:
+        self._shared, self._process, self._robot = shared, process, robot
+        self._orders: deque[Callable[[], None]] = deque()
+        self._pairs = self._new = self._had_turn = 0
+        self.asked = False
+        self.answers: deque[Solved] = deque()
+
+    def start(self, task: Task) -> None:
+        """Forget all pairs and begin a new task."""
+        self.clear()
+        self._orders.append(lambda: self._process.start(task, self._robot))
+
+    def learn(self, q: FloatArray, x: FloatArray, turns: FloatArray | None = None) -> None:
+        """More pairs, q (n, d) [rad], x (n, 3) [m] and orientations (n, 4), NaN where a pair has none."""
+        self._new += len(q)
+        self._orders.append(lambda: self._process.learn(q, x, turns, self._robot))
+
+    def solve(self) -> None:
+        """Ask for the solution of all pairs so far, when it is this robot's turn."""
+        self.asked = True
+
+    def poll(self) -> Solved | None:
+        """The next solution that has come, without waiting."""
+        self._shared.attend()
+        return self.answers.popleft() if self.answers else None
+
+    def need(self, turn: int) -> float:
+        """How urgent it is: by which share the pairs have grown, times the turns that others have had since."""
+        return (turn - self._had_turn) * self._new / max(self._pairs, 1)
+
+    def tell(self, turn: int) -> None:
+        """Tell the process all that waits, and ask it."""
+        while self._orders:
+            self._orders[0]()
+            self._orders.popleft()
+        self._process.solve(self._robot)
+        self._pairs, self._new, self._had_turn, self.asked = self._pairs + self._new, 0, turn, False
+
+    def clear(self) -> None:
+        """Nothing was told or asked yet."""
+        self._orders.clear()
+        self.answers.clear()
+        self._pairs = self._new = 0
+        self.asked = False
