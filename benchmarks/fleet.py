@@ -121,7 +121,7 @@ class Usage:
 
 
 def _family(pid: int) -> list[int]:
-    children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+    children = [child for file in Path(f"/proc/{pid}/task").glob("*/children") for child in file.read_text().split()]
     return [pid, *(one for child in children for one in _family(int(child)))]
 
 
@@ -175,11 +175,12 @@ def _row(pid: int, ends: list[str], walks: list[Walk], publish: list, rate: floa
             counts = _counted(asked, own)
             behind += [len(walks[names.index(name)].pairs) - counts[name] for name in own]
     per_robot = 100.0 / spent / len(walks)
+    memory_mb = after.memory / len(walks) / 1e6
     learnt = 1.0 - sum(max(b, 0) for b in behind) / published
     return (
         f"| {len(walks)} | {per_robot * (after.learners_s - before.learners_s):.1f} | "
-        f"{per_robot * (after.solvers_s - before.solvers_s):.1f} | {published / spent / len(walks):.1f} | {learnt:.0%} | "
-        f"{statistics.median(behind):.0f}, {max(behind)} | {after.memory / len(walks) / 1e6:.0f} | {load:.0f} |"
+        f"{per_robot * (after.solvers_s - before.solvers_s):.1f} | {published / spent / len(walks):.1f} | "
+        f"{learnt:.0%} | {statistics.median(behind):.0f}, {max(behind)} | {memory_mb:.0f} | {load:.0f} |"
     )
 
 

@@ -14,7 +14,7 @@ from kbmaps import ChainBelief, Contest, JointBasis, ResidualModel, SupportSet
 from .members import INSTANT, PRIOR, RESIDUAL, RIGID, SOLVED, TRUSTED
 from .misfit import misfit
 from .scores import ErrorMemory
-from .unknowns import ChainLayer, DepartureLayer, GrowingSupport, Layer, Predict
+from .unknowns import ChainLayer, DepartureLayer, GrowingSupport, Layer, Predict, Where
 
 _SUPPORT, _CONTEST = "support_q", "squares_"
 
@@ -35,12 +35,17 @@ class Claim:
 
     def variance(self, q: FloatArray) -> FloatArray:
         """Variance per axis of predictions at q (n, d) [rad], shape (n, 3) [m²]."""
-        left_open = sum((layer.variance(q) for layer in self.layers), np.zeros((len(q), 3)))
+        return self.variance_there(Where(q))
+
+    def variance_there(self, where: Where) -> FloatArray:
+        """As `variance`."""
+        left_open = sum((layer.variance(where) for layer in self.layers), np.zeros((len(where.q), 3)))
         return self.surprise**2 * (self.inside**2 + left_open)
 
     def beyond_chain(self, q: FloatArray) -> FloatArray:
         """The part of it that is no uncertainty of the chain's numbers at q (n, d) [rad], shape (n, 3) [m²]."""
-        open_layers = (layer.variance(q) for layer in self.layers if isinstance(layer, Layer) and layer.sigma > 0.0)
+        where = Where(q)
+        open_layers = (layer.variance(where) for layer in self.layers if isinstance(layer, Layer) and layer.sigma > 0.0)
         return self.inside**2 + sum(open_layers, np.zeros((len(q), 3)))
 
 
@@ -160,6 +165,7 @@ class Claims:
         errors: Mapping[str, FloatArray],
         variance: FloatArray,
         delayed: FloatArray | None = None,
+        where: Where | None = None,
     ) -> None:
         """One pair that was predicted before it is learnt.
 
@@ -169,10 +175,12 @@ class Claims:
             variance: the measurement's (3,) [m²].
             delayed: the error (3,) [m] of the instant learner as old as the solutions. On a path a few pairs are far,
                 so the models are compared at the same age.
+            where: q (1, d), if other claims were asked there.
         """
+        where = where or Where(q[None])
         for name, error in errors.items():
             predicted = (x - error)[None]
-            claimed = self.of(name, lambda _, predicted=predicted: predicted).variance(q[None])[0] + variance
+            claimed = self.of(name, lambda _, predicted=predicted: predicted).variance_there(where)[0] + variance
             self.errors[name].add(error, variance, float(np.square(error).sum() / claimed.sum()))
         compared = dict(errors) if delayed is None else {**errors, INSTANT: delayed}
         self._contest.add({name: float(np.square(error).sum()) for name, error in compared.items()})

@@ -22,6 +22,7 @@ from .orientation import OrientationModel, Orientations
 from .orientation_solver import OrientationSolution
 from .solver import Solved, Task
 from .state import NET, LearningHeader
+from .unknowns import Where
 from .watch import LOOKED_BACK as KNOWN_PAIRS
 from .watch import Reference, Watch
 
@@ -109,13 +110,17 @@ class Era:
         """Whether there are replay steps to do."""
         return self._replays_due >= 1.0 and len(self.memory) > 0
 
-    def limit_m(self, pair: Pair) -> float:
-        """How far from its prediction the pair may lie before it is doubted [m]."""
-        variance = np.diag(pair.cov)
+    def limit_m(self, pair: Pair, where: Where | None = None) -> float:
+        """How far from its prediction the pair may lie before it is doubted [m].
+
+        Args:
+            where: its q (1, d), if other claims are asked there.
+        """
+        variance, where = np.diag(pair.cov), where or Where(pair.q[None])
         claimed = float(
             np.sqrt(
                 self._claims.of(self.answering, partial(self.members.predict, self.answering))
-                .variance(pair.q[None])
+                .variance_there(where)
                 .sum()
             )
         )
@@ -124,13 +129,14 @@ class Era:
 
     def learn(self, pair: Pair) -> bool:
         """Learn one pair at once; False if it is doubted."""
-        errors, limit = self.members.errors(pair.q, pair.x), self.limit_m(pair)
+        where = Where(pair.q[None])
+        errors, limit = self.members.errors(pair.q, pair.x), self.limit_m(pair, where)
         if self.doubts.doubt(pair.q, pair.x, float(np.linalg.norm(errors[self.answering])), limit):
             self.members.learn(pair.q, errors[INSTANT], limit / DOUBT)  # a step no longer than any other
             self.watch.add(pair, kept=False)
             return False
         delayed = None if self.members.delayed is None else pair.x - self.members.delayed.predict(pair.q)
-        self._claims.predicted(pair.q, pair.x, errors, np.diag(pair.cov), delayed)
+        self._claims.predicted(pair.q, pair.x, errors, np.diag(pair.cov), delayed, where)
         self._choose()
         self.members.learn(pair.q, errors[INSTANT], np.inf)
         self._learn_turn(pair.q, pair.R, pair.cov_R)

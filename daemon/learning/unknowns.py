@@ -14,6 +14,30 @@ from kbmaps import ChainBelief, JointBasis, ResidualModel, SupportSet
 Predict = Callable[[FloatArray], FloatArray]
 
 
+class Where:
+    """Configurations q (n, d) [rad] that several claims are asked at: what these have in common is found once."""
+
+    def __init__(self, q: FloatArray) -> None:
+        self.q = q
+        # By identity; who is asked is kept, so that no other gets its number.
+        self._left_open: dict[int, tuple[SupportSet, FloatArray]] = {}
+        self._chains: dict[int, tuple[ChainBelief | ResidualModel, tuple[FloatArray, FloatArray]]] = {}
+
+    def unexplained(self, support: SupportSet | None) -> FloatArray:
+        """As the function of that name."""
+        if support is None:
+            return np.ones(len(self.q))
+        if id(support) not in self._left_open:
+            self._left_open[id(support)] = support, unexplained(support, self.q)
+        return self._left_open[id(support)][1]
+
+    def chain(self, belief: ChainBelief | ResidualModel) -> tuple[FloatArray, FloatArray]:
+        """Positions and the variance of each coordinate, both (n, 3) [m, m²]."""
+        if id(belief) not in self._chains:
+            self._chains[id(belief)] = belief, belief.predict_with_variance(self.q)
+        return self._chains[id(belief)][1]
+
+
 @dataclass(frozen=True)
 class Layer:
     """What is unknown where no data was.
@@ -26,9 +50,9 @@ class Layer:
     support: SupportSet | None
     sigma: float
 
-    def variance(self, q: FloatArray) -> FloatArray:
-        """Variance of a coordinate that is left open at q (n, d) [rad], shape (n, 1) [m²]."""
-        return unexplained(self.support, q)[:, None] * self.sigma**2
+    def variance(self, where: Where) -> FloatArray:
+        """Variance of a coordinate that is left open there, shape (n, 1) [m²]."""
+        return where.unexplained(self.support)[:, None] * self.sigma**2
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,9 +61,9 @@ class ChainLayer:
 
     belief: ChainBelief | ResidualModel
 
-    def variance(self, q: FloatArray) -> FloatArray:
-        """Variance of each coordinate that is left open at q (n, d) [rad], shape (n, 3) [m²]."""
-        return self.belief.predict_with_variance(q)[1]
+    def variance(self, where: Where) -> FloatArray:
+        """Variance of each coordinate that is left open there, shape (n, 3) [m²]."""
+        return where.chain(self.belief)[1]
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,9 +80,10 @@ class DepartureLayer:
     belief: ChainBelief
     support: SupportSet | None = None
 
-    def variance(self, q: FloatArray) -> FloatArray:
-        """Squared difference of each coordinate at q (n, d) [rad], shape (n, 3) [m²]."""
-        return unexplained(self.support, q)[:, None] * np.square(self.predict(q) - self.belief.predict(q))
+    def variance(self, where: Where) -> FloatArray:
+        """Squared difference of each coordinate there, shape (n, 3) [m²]."""
+        departure = self.predict(where.q) - where.chain(self.belief)[0]
+        return where.unexplained(self.support)[:, None] * np.square(departure)
 
 
 def unexplained(support: SupportSet | None, q: FloatArray) -> FloatArray:

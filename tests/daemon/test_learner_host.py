@@ -1,0 +1,223 @@
+"""Several robots on one learner host: one session, one solver, work in turns."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from guided_arm import JOINTS, nominal_model
+from small_arm import write_small_arm
+
+from daemon.background import Background
+from daemon.bus import client
+from daemon.config import Config
+from daemon.fleet.hosting import configs_of, descriptions, shares
+from daemon.keys import Keys
+from daemon.learner_host import run_learners, session_settings
+from daemon.learning import Solved, Task
+from daemon.notify import Notifier
+from daemon.service import Service
+from daemon.signals import Wishes
+from daemon.solver_process import SolverLostError
+from daemon.solver_seats import SharedSolver
+from daemon.status import LearnerStatus
+from daemon.wire import decode
+from interfaces.clock import SystemClock
+from interfaces.errors import BusError, ConfigError
+from kbmaps import ChainTolerances
+
+NOMINAL = nominal_model()
+LIMIT_S = 30.0
+TASK = Task(1, NOMINAL.prior(), NOMINAL.belief(NOMINAL.chain, ChainTolerances()))
+
+
+def described(folder: Path, name: str, learner: str, more: str = "") -> Path:
+    (folder / name).mkdir()
+    file = write_small_arm(folder / name, f'[zenoh]\nlearner = "{learner}"\n{more}[daemon]\nstate_dir = "state"\n')
+    file.write_text(file.read_text().replace('name = "arm"', f'name = "{name}"'))
+    return file
+
+
+@pytest.fixture
+def robots(tmp_path: Path, free_endpoint: Callable[[], str]) -> list[Config]:
+    endpoint = free_endpoint()
+    return [Config.load(described(tmp_path, name, endpoint)) for name in ("left", "right")]
+
+
+def asked(endpoint: str, robot: str) -> LearnerStatus:
+    """The state of a robot's learner, as soon as it answers."""
+    deadline = time.monotonic() + LIMIT_S
+    while True:
+        try:
+            with client(endpoint) as bus:
+                return decode(bus.ask_one(Keys(robot).status("learner")), LearnerStatus)
+        except BusError:
+            if time.monotonic() > deadline:
+                raise
+
+
+def test_every_robot_is_answered_for_by_the_one_process(robots: list[Config]) -> None:
+    wishes = Wishes()
+    host = threading.Thread(target=run_learners, args=(robots, SystemClock(), wishes, Notifier()))
+    host.start()
+    try:
+        said = [asked(robots[0].tables.zenoh.learner, name) for name in ("left", "right")]
+    finally:
+        wishes.end()
+        host.join()
+    assert [status.robot for status in said] == ["left", "right"]
+    assert all(config.checkpoint_file.exists() for config in robots)
+
+
+def test_two_robots_of_one_name_are_refused(robots: list[Config]) -> None:
+    with pytest.raises(ConfigError, match="two robots are called left"):
+        session_settings([robots[0], robots[0]])
+
+
+def test_robots_of_different_routers_are_refused(tmp_path: Path, robots: list[Config]) -> None:
+    other = described(tmp_path, "spare", "tcp/127.0.0.1:7999", 'router = "tcp/127.0.0.1:7450"\n')
+    with pytest.raises(ConfigError, match="another router"):
+        session_settings([*robots, Config.load(other)])
+
+
+def test_a_folder_stands_for_the_robots_in_it(tmp_path: Path, robots: list[Config]) -> None:
+    assert descriptions([tmp_path]) == [config.file for config in robots]
+
+
+def test_a_folder_without_robots_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"no robot\.toml is in this folder"):
+        descriptions([tmp_path])
+
+
+def test_each_of_several_robots_has_a_folder_of_its_own_for_its_state(tmp_path: Path, robots: list[Config]) -> None:
+    configs = configs_of([config.file for config in robots], tmp_path / "states")
+    assert [config.state_dir for config in configs] == [tmp_path / "states" / name for name in ("left", "right")]
+
+
+def test_robots_of_one_endpoint_are_not_parted(robots: list[Config]) -> None:
+    with pytest.raises(ConfigError, match="cannot share the 1 endpoints"):
+        shares(robots, 2)
+
+
+# --- one solver for several
+
+
+class ScriptedProcess:
+    """Answers nothing until the test says so; may be lost."""
+
+    def __init__(self) -> None:
+        self.told: list[tuple[str, int]] = []
+        self.answer: Solved | None = None
+        self.lost = False
+
+    def start(self, task: Task, robot: int) -> None:
+        self.told.append(("start", robot))
+
+    def learn(self, q: object, x: object, turns: object, robot: int) -> None:
+        self.told.append(("learn", robot))
+
+    def solve(self, robot: int) -> None:
+        self.told.append(("solve", robot))
+
+    def poll(self) -> Solved | None:
+        if self.lost:
+            raise SolverLostError("lost")
+        answer, self.answer = self.answer, None
+        return answer
+
+
+@pytest.fixture
+def process() -> ScriptedProcess:
+    return ScriptedProcess()
+
+
+@pytest.fixture
+def shared(process: ScriptedProcess) -> SharedSolver:
+    return SharedSolver(process)  # type: ignore[arg-type]
+
+
+def pairs(count: int) -> tuple[np.ndarray, np.ndarray]:
+    return np.zeros((count, JOINTS)), np.zeros((count, 3))
+
+
+def test_what_a_robot_tells_waits_while_the_process_solves_for_another(
+    shared: SharedSolver, process: ScriptedProcess
+) -> None:
+    first, second = shared.seat(), shared.seat()
+    for seat in (first, second):
+        seat.start(TASK)
+        seat.learn(*pairs(10))
+        seat.solve()
+    first.poll()
+    assert process.told == [("start", 0), ("learn", 0), ("solve", 0)]
+    process.answer = Solved(1, 10, "", None, None, last=True)
+    assert second.poll() is None
+    assert process.told[3:] == [("start", 1), ("learn", 1), ("solve", 1)]
+    assert first.poll() is not None
+
+
+def test_the_robot_whose_pairs_grew_most_has_the_next_turn(shared: SharedSolver, process: ScriptedProcess) -> None:
+    busy, old, new = (shared.seat() for _ in range(3))
+    for seat, count in ((busy, 10), (old, 10), (new, 10)):
+        seat.learn(*pairs(count))
+        seat.solve()
+        seat.poll()
+        process.answer = Solved(1, count, "", None, None, last=True)
+        seat.poll()
+    busy.solve()
+    busy.poll()
+    old.learn(*pairs(1))
+    new.learn(*pairs(9))
+    old.solve()
+    new.solve()
+    process.answer = Solved(1, 10, "", None, None, last=True)
+    busy.poll()
+    assert process.told[-1] == ("solve", 2)
+
+
+def test_a_lost_process_leaves_no_order_behind(shared: SharedSolver, process: ScriptedProcess) -> None:
+    first, second = shared.seat(), shared.seat()
+    second.learn(*pairs(5))
+    first.learn(*pairs(5))
+    first.solve()
+    first.poll()
+    process.lost = True
+    second.solve()
+    with pytest.raises(SolverLostError):
+        first.poll()
+    process.lost = False
+    assert (second.asked, second.poll()) == (False, None)
+
+
+# --- work in turns
+
+
+class Scripted:
+    """Has so many pieces of work; ends everything after the last."""
+
+    def __init__(self, name: str, pieces: int, done: list[str], end: Callable[[], None]) -> None:
+        self._name, self._left, self._done, self._end = name, pieces, done, end
+
+    def work(self) -> bool:
+        if self._left == 0:
+            return False
+        self._left -= 1
+        self._done.append(self._name)
+        if len(self._done) == 6:
+            self._end()
+        return True
+
+    def restart_solver(self) -> None: ...
+
+    def solve_soon(self) -> None: ...
+
+
+def test_no_robot_waits_for_another_s_backlog() -> None:
+    stop, done = threading.Event(), list[str]()
+    workers = [Scripted("busy", 4, done, stop.set), Scripted("quiet", 2, done, stop.set)]
+    Background(workers, Service.nobodys(SystemClock()), SystemClock(), stop).run()
+    assert done == ["busy", "quiet", "busy", "quiet", "busy", "busy"]
