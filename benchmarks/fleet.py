@@ -31,6 +31,7 @@ from daemon.config import Config
 from daemon.keys import Keys
 from daemon.status import LearnerStatus
 from daemon.wire import PairMessage, PairsReply, decode, encode
+from interfaces.errors import BodyschemaError
 
 JOINTS = 6
 SIGMA_M = 2e-3
@@ -157,7 +158,7 @@ def measure(robots: int, rate: float, seconds: float, processes: int) -> str:
 
 def _row(pid: int, ends: list[str], walks: list[Walk], publish: list, rate: float, seconds: float) -> str:
     names = [f"arm_{k}" for k in range(len(walks))]
-    _await_answers(ends)
+    _await_answers(ends, names)
     before, begin, published = Usage.of(pid), time.monotonic(), 0
     load = os.getloadavg()[0]
     while (now := time.monotonic() - begin) < seconds:
@@ -184,15 +185,18 @@ def _row(pid: int, ends: list[str], walks: list[Walk], publish: list, rate: floa
     )
 
 
-def _await_answers(ends: list[str]) -> None:
+def _await_answers(ends: list[str], names: list[str]) -> None:
+    """Until every robot's learner answers: they come up one after the other."""
     deadline = time.monotonic() + LIMIT_S
     for place, end in enumerate(ends):
-        while True:
+        waiting = names[place :: len(ends)]
+        while waiting:
             try:
                 with client(end) as bus:
-                    bus.ask_one(Keys(f"arm_{place}").status("learner"))
-                break
-            except Exception:
+                    while waiting:
+                        bus.ask_one(Keys(waiting[0]).status("learner"))
+                        waiting.pop(0)
+            except BodyschemaError:
                 if time.monotonic() > deadline:
                     raise
                 time.sleep(0.2)
