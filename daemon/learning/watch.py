@@ -19,6 +19,8 @@ FEWEST_KNOWN = 100
 SHORTEST_TRIAL, LONGEST_TRIAL = 50, 1000
 # So many of the pairs that a model knows show its noise.
 LOOKED_BACK = 500
+# An alarm that a bent arm explains is looked at again when the pairs since the change have grown by this factor.
+LOOK_AGAIN = 1.25
 # So many of the newest errors of pairs that a model did not know show how far these lie from it.
 SHOWN = 3000
 
@@ -121,6 +123,7 @@ class Watch:
         self._pairs: list[_Watched] = []
         self._detector: ChangeDetector | None = None
         self._suspicion: Suspicion | None = None
+        self._alarmed, self._look_at = False, 0
         self._shown = np.empty((0, 3))
 
     @property
@@ -135,8 +138,8 @@ class Watch:
 
     @property
     def alarmed(self) -> bool:
-        """Whether there was a change."""
-        return self._suspicion is not None and self._suspicion.alarm
+        """Whether there was a change: an arm that bends would not show the same without one."""
+        return self._alarmed
 
     @property
     def wants_reference(self) -> bool:
@@ -169,11 +172,25 @@ class Watch:
                 self._show()
                 self._hold(self._reference)
         elif self._detector.due:
-            self._suspicion = self._detector.suspicion()
+            self._suspect(self._detector)
         tried = len(self._pairs) - self._next_at
         if self._next is not None and self.ready and not self.alarmed and tried >= _trial(self._next.known):
             self._show()
             self._renew()
+
+    def refute(self) -> None:
+        """What seemed to be a change is none, as far as the pairs tell so far."""
+        if self._suspicion is not None:
+            self._alarmed = False
+            pairs = len(self._pairs)
+            self._look_at = pairs + int((LOOK_AGAIN - 1.0) * (pairs - self._suspicion.onset)) + 1
+
+    def _suspect(self, detector: ChangeDetector) -> None:
+        self._suspicion = detector.suspicion()
+        if self._suspicion.alarm and not self._alarmed and len(self._pairs) >= self._look_at:
+            self._alarmed = detector.stands(self._suspicion)
+            if not self._alarmed:
+                self.refute()
 
     def noticed(self, run: int = 0) -> Noticed | None:
         """The change that the pairs show; None: they do not, or there is nothing to hold them against.
@@ -187,7 +204,7 @@ class Watch:
         suspicion = detector.suspicion()
         earliest, latest = suspicion.interval()
         first = suspicion.onset
-        if not suspicion.alarm:
+        if not self.alarmed:
             first = earliest = latest = len(self._pairs) - run
         pairs = self._pairs
         variance = float(np.mean([each.variance for each in pairs]) + reference.claim.beyond_chain(reference.q).mean())
@@ -226,6 +243,7 @@ class Watch:
         noise_m = float(np.sqrt(noise.single * variances.mean()))
         distance_m = float(np.linalg.norm(reference.x, axis=1).mean())
         self._detector, self._suspicion = ChangeDetector(reference.belief, noise, noise_m, distance_m), None
+        self._alarmed, self._look_at = False, 0
         self._feed(self._pairs)
 
     def _feed(self, pairs: list[_Watched]) -> None:

@@ -9,6 +9,7 @@ import numpy as np
 
 from kbmaps.arrays import FloatArray, IntArray
 from kbmaps.chains.belief import ChainBelief
+from kbmaps.changes.bending import log_ratios_if_it_bends
 from kbmaps.changes.kinds import ChangeKind, change_kinds
 from kbmaps.changes.mixture import SIZES, log_ratios
 from kbmaps.changes.onsets import Onsets
@@ -104,6 +105,7 @@ class ChangeDetector:
         self._onsets = Onsets(known, len(self._columns))
         self._differences: list[float] = []
         self._surprises: list[FloatArray] = []
+        self._rows: list[tuple[FloatArray, FloatArray, FloatArray, FloatArray]] = []
         self._strange, self._looked_at, self._log_odds = False, 0, -math.inf
 
     @property
@@ -136,11 +138,13 @@ class ChangeDetector:
         weights = 1.0 / np.sqrt(variances)
         known = weights[..., None] * (jacobian @ self._root)
         changed = weights[..., None] * (jacobian[:, :, self._columns] * self._units)
-        for row_known, row_changed, error in zip(known, changed, weights * errors, strict=True):
-            self._add(row_known, row_changed, error)
+        prismatic = self._belief.parameters.reference.prismatic
+        angles = np.where(prismatic, q / self._belief.parameters.reach, q)
+        for angle, row_known, row_changed, error in zip(angles, known, changed, weights * errors, strict=True):
+            self._rows.append((angle, self._add(row_known, row_changed, error), row_known, row_changed))
 
-    def _add(self, known: FloatArray, changed: FloatArray, error: FloatArray) -> None:
-        """One pair's whitened derivatives by what is believed (3, k) and by changes (3, c), and its error (3,)."""
+    def _add(self, known: FloatArray, changed: FloatArray, error: FloatArray) -> FloatArray:
+        """One pair's whitened derivatives by what is believed (3, k) and by changes (3, c), and its error (3,), which is returned as it counts."""
         expected, gain = known @ self._mean, self._posterior @ known.T
         covariance = known @ gain
         spread = math.sqrt(self._noise.single + float(np.trace(covariance)) / 3.0)
@@ -156,6 +160,7 @@ class ChangeDetector:
         step = np.linalg.solve(covariance + self._noise.whole * np.eye(3), gain.T)
         self._mean = self._mean + off @ step
         self._posterior = self._posterior - gain @ step
+        return error
 
     @property
     def due(self) -> bool:
@@ -185,6 +190,18 @@ class ChangeDetector:
         shares = np.exp(terms - log_odds)
         self._looked_at, self._log_odds = self.pairs, log_odds
         return Suspicion(log_odds, log_odds > self._limit, onsets, shares.sum(axis=1), shares.sum(axis=0))
+
+    def stands(self, suspicion: Suspicion) -> bool:
+        """Whether it is an alarm as well if the arm may bend, before and after, as the pairs before let it expect."""
+        angles, errors, known, changed = (np.array(each) for each in zip(*self._rows, strict=True))
+        scale = 1.0 / math.sqrt(self._noise.single)
+        ratios = log_ratios_if_it_bends(
+            angles, scale * errors, scale * known, scale * changed, self._places, suspicion.onset, self._sizes
+        )
+        # Other onsets add as much to it as they did without a bend.
+        others = -math.log(float(suspicion.shares.max()))
+        weight = self._onsets.weights[int(suspicion.shares.argmax())]
+        return float(np.logaddexp.reduce(ratios + self._log_shares)) + math.log(weight) + others > self._limit
 
     def _grown_noise(self) -> SharedNoise:
         """The noise, or more where the newest pairs scatter more: that is no change of the arm."""
