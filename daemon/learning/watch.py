@@ -122,8 +122,8 @@ class Watch:
         self._next_at = self._asked_at = 0
         self._pairs: list[_Watched] = []
         self._detector: ChangeDetector | None = None
-        self._suspicion: Suspicion | None = None
-        self._alarmed, self._look_at = False, 0
+        self._change: Suspicion | None = None
+        self._look_at = 0
         self._shown = np.empty((0, 3))
 
     @property
@@ -139,7 +139,7 @@ class Watch:
     @property
     def alarmed(self) -> bool:
         """Whether there was a change: an arm that bends would not show the same without one."""
-        return self._alarmed
+        return self._change is not None
 
     @property
     def wants_reference(self) -> bool:
@@ -180,16 +180,14 @@ class Watch:
 
     def refute(self) -> None:
         """What seemed to be a change is none, as far as the pairs tell so far."""
-        if self._suspicion is not None:
-            self._alarmed = False
-            pairs = len(self._pairs)
-            self._look_at = pairs + int((LOOK_AGAIN - 1.0) * (pairs - self._suspicion.onset)) + 1
+        since = 0 if self._change is None else len(self._pairs) - self._change.onset
+        self._change, self._look_at = None, len(self._pairs) + int((LOOK_AGAIN - 1.0) * since) + 1
 
     def _suspect(self, detector: ChangeDetector) -> None:
-        self._suspicion = detector.suspicion()
-        if self._suspicion.alarm and not self._alarmed and len(self._pairs) >= self._look_at:
-            self._alarmed = detector.stands(self._suspicion)
-            if not self._alarmed:
+        suspicion = detector.suspicion()
+        if suspicion.alarm and self._change is None and len(self._pairs) >= self._look_at:
+            self._change = detector.suspicion_if_it_bends()
+            if not self._change.alarm:
                 self.refute()
 
     def noticed(self, run: int = 0) -> Noticed | None:
@@ -201,11 +199,9 @@ class Watch:
         reference, detector = self._reference, self._detector
         if reference is None or detector is None or not self.ready or not (self.alarmed or run):
             return None
-        suspicion = detector.suspicion()
-        earliest, latest = suspicion.interval()
-        first = suspicion.onset
-        if not self.alarmed:
-            first = earliest = latest = len(self._pairs) - run
+        first = earliest = latest = len(self._pairs) - run
+        if self._change is not None:
+            first, (earliest, latest) = self._change.onset, self._change.interval()
         pairs = self._pairs
         variance = float(np.mean([each.variance for each in pairs]) + reference.claim.beyond_chain(reference.q).mean())
         return Noticed(
@@ -242,8 +238,8 @@ class Watch:
         variances = reference.errors(reference.q, reference.x, reference.variance)[1]
         noise_m = float(np.sqrt(noise.single * variances.mean()))
         distance_m = float(np.linalg.norm(reference.x, axis=1).mean())
-        self._detector, self._suspicion = ChangeDetector(reference.belief, noise, noise_m, distance_m), None
-        self._alarmed, self._look_at = False, 0
+        self._detector = ChangeDetector(reference.belief, noise, noise_m, distance_m)
+        self._change, self._look_at = None, 0
         self._feed(self._pairs)
 
     def _feed(self, pairs: list[_Watched]) -> None:

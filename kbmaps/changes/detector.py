@@ -9,7 +9,7 @@ import numpy as np
 
 from kbmaps.arrays import FloatArray, IntArray
 from kbmaps.chains.belief import ChainBelief
-from kbmaps.changes.bending import log_ratios_if_it_bends
+from kbmaps.changes.bending import MOST_PAIRS, log_ratios_if_it_bends
 from kbmaps.changes.kinds import ChangeKind, change_kinds
 from kbmaps.changes.mixture import SIZES, log_ratios
 from kbmaps.changes.onsets import Onsets
@@ -186,22 +186,28 @@ class ChangeDetector:
         onsets, information, score = self.sums()
         terms = np.stack([log_ratios(information[:, at, at], score[:, at], self._sizes) for at in self._places], axis=1)
         terms += self._log_shares + np.log(self._onsets.weights)[:, None]
+        suspicion = self._suspected(onsets, terms)
+        self._looked_at, self._log_odds = self.pairs, suspicion.log_odds
+        return suspicion
+
+    def suspicion_if_it_bends(self) -> Suspicion:
+        """How probable a change is if the arm may bend, before and after, as its pairs let expect; at least one pair.
+
+        It costs some hundred times as much as `suspicion`: to be asked for when that is an alarm.
+        """
+        rows = list(zip(*self._rows[-MOST_PAIRS:], strict=True))
+        angles, errors, known, changed = (np.array(each) for each in rows)
+        scale = 1.0 / math.sqrt(self._noise.single)
+        onsets, stands_for, terms = log_ratios_if_it_bends(
+            angles, scale * errors, scale * known, scale * changed, self._places, self._sizes
+        )
+        terms = terms + self._log_shares + np.log(stands_for)[:, None]
+        return self._suspected(onsets + self.pairs - len(angles), terms)
+
+    def _suspected(self, onsets: IntArray, terms: FloatArray) -> Suspicion:
         log_odds = float(np.logaddexp.reduce(terms, axis=None))
         shares = np.exp(terms - log_odds)
-        self._looked_at, self._log_odds = self.pairs, log_odds
         return Suspicion(log_odds, log_odds > self._limit, onsets, shares.sum(axis=1), shares.sum(axis=0))
-
-    def stands(self, suspicion: Suspicion) -> bool:
-        """Whether it is an alarm as well if the arm may bend, before and after, as the pairs before let it expect."""
-        angles, errors, known, changed = (np.array(each) for each in zip(*self._rows, strict=True))
-        scale = 1.0 / math.sqrt(self._noise.single)
-        ratios = log_ratios_if_it_bends(
-            angles, scale * errors, scale * known, scale * changed, self._places, suspicion.onset, self._sizes
-        )
-        # Other onsets add as much to it as they did without a bend.
-        others = -math.log(float(suspicion.shares.max()))
-        weight = self._onsets.weights[int(suspicion.shares.argmax())]
-        return float(np.logaddexp.reduce(ratios + self._log_shares)) + math.log(weight) + others > self._limit
 
     def _grown_noise(self) -> SharedNoise:
         """The noise, or more where the newest pairs scatter more: that is no change of the arm."""
