@@ -18,9 +18,13 @@ NOISES = (0.5, 0.7, 1.0, 1.4)
 # Those that are less probable than this by all pairs are left out.
 _LEAST = 0.01
 # Runs of neighbours count by their means; a run is as long as this share of its age, at most so many pairs.
-_RUN_SHARE, _LONGEST_RUN = 0.05, 6
-# A change may begin with a run; of older ones only with those that lie so far apart, as a share of their age.
-_SPACING = 0.1
+_RUN_SHARE, _LONGEST_RUN = 0.04, 6
+# A change may begin with each of so many runs, of older ones with those that lie so far apart, as a share of their age:
+# it is best seen soon, where a pair that counts wrongly costs most.
+_EACH, _SPACING = 30, 0.1
+# A pair farther than so many sigmas from the middle of so many neighbours counts as that far: it may be an outlier.
+# Where more than half of them moved together, the middle moved as well.
+_CLIPPED_SIGMAS, _NEIGHBOURS = 4.0, 5
 # So many of the newest pairs are looked at.
 MOST_PAIRS = 1200
 
@@ -52,6 +56,7 @@ def log_ratios_if_it_bends(
     changed: FloatArray,
     places: Sequence[slice],
     sizes: FloatArray,
+    suspected: int,
 ) -> tuple[IntArray, FloatArray, FloatArray]:
     """Log of the likelihood ratio of each kind of change to none, where the arm bends before and after.
 
@@ -66,12 +71,13 @@ def log_ratios_if_it_bends(
         changed: by what may change (n, 3, c).
         places: which of these each kind of change has.
         sizes: of a change, 1-sigma of each number.
+        suspected: the pair with which it most probably began if the arm is rigid.
 
     Returns:
         Pairs (t,), ascending, with which the change may begin, for how many each stands, and the ratios (t, kinds).
     """
-    pairs = len(angles)
-    starts = pairs - np.array(_ages(pairs, _RUN_SHARE, _LONGEST_RUN)[::-1])
+    pairs, errors = len(angles), _without_outliers(errors)
+    starts = np.array(sorted({suspected, *(pairs - age for age in _ages(pairs, _RUN_SHARE, _LONGEST_RUN))}))
     lengths = np.diff(np.append(starts, pairs)).astype(np.float64)
     rows = np.concatenate([known, changed, errors[..., None]], axis=2)
     means = np.add.reduceat(rows, starts) / lengths[:, None, None]
@@ -79,7 +85,7 @@ def log_ratios_if_it_bends(
     weighed = means * np.sqrt(lengths)[:, None, None]
     unchanged = np.concatenate([weighed[..., : known.shape[2]], weighed[..., -1:]], axis=2)
     bends = _probable_bends(angles, starts, lengths, unchanged, within)
-    firsts = _apart(starts, pairs)
+    firsts = _apart(starts, pairs, suspected)
     ratios = np.empty((len(firsts), len(places)))
     changing = slice(known.shape[2], known.shape[2] + changed.shape[2])
     for k, first in enumerate(firsts):
@@ -132,6 +138,18 @@ def _compared(sums: FloatArray, known: int, places: Sequence[slice], sizes: Floa
     return np.stack([log_ratios(information[:, at, at], score[:, at], sizes) for at in places], axis=1)
 
 
+def _without_outliers(errors: FloatArray) -> FloatArray:
+    """Errors (n, 3) in units of their noise, in their order, none of them far from its neighbours."""
+    if len(errors) < _NEIGHBOURS:
+        return errors
+    middles = np.median(np.lib.stride_tricks.sliding_window_view(errors, _NEIGHBOURS, axis=0), axis=2)
+    ends = (_NEIGHBOURS // 2, _NEIGHBOURS // 2)
+    middles = np.pad(middles, (ends, (0, 0)), mode="edge")
+    off = errors - middles
+    far = np.linalg.norm(off, axis=1, keepdims=True)
+    return middles + off * np.minimum(1.0, _CLIPPED_SIGMAS / np.maximum(far, 1e-300))
+
+
 def _ages(pairs: int, share: float, longest: int) -> list[int]:
     """Ever larger ages, 1 to `pairs`, the last one included."""
     ages = [min(1, pairs)]
@@ -140,11 +158,12 @@ def _ages(pairs: int, share: float, longest: int) -> list[int]:
     return ages
 
 
-def _apart(starts: IntArray, pairs: int) -> IntArray:
-    """Those of the starts (m,) that are far enough apart for their age, the newest and the first included."""
+def _apart(starts: IntArray, pairs: int, suspected: int) -> IntArray:
+    """Those of the starts (m,) that are far enough apart for their age, with the newest, the first and this one."""
     kept = [int(starts[-1])]
     for start in starts[-2::-1].tolist():
-        if pairs - start >= (1.0 + _SPACING) * (pairs - kept[-1]) or start == starts[0]:
+        age = pairs - start
+        if age <= _EACH or age >= (1.0 + _SPACING) * (pairs - kept[-1]) or start in (starts[0], suspected):
             kept.append(start)
     return np.array(kept[::-1])
 

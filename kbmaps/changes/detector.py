@@ -141,10 +141,11 @@ class ChangeDetector:
         prismatic = self._belief.parameters.reference.prismatic
         angles = np.where(prismatic, q / self._belief.parameters.reach, q)
         for angle, row_known, row_changed, error in zip(angles, known, changed, weights * errors, strict=True):
-            self._rows.append((angle, self._add(row_known, row_changed, error), row_known, row_changed))
+            self._rows.append((angle, error, row_known, row_changed))
+            self._add(row_known, row_changed, error)
 
-    def _add(self, known: FloatArray, changed: FloatArray, error: FloatArray) -> FloatArray:
-        """One pair's whitened derivatives by what is believed (3, k) and by changes (3, c), and its error (3,), which is returned as it counts."""
+    def _add(self, known: FloatArray, changed: FloatArray, error: FloatArray) -> None:
+        """One pair's whitened derivatives by what is believed (3, k) and by changes (3, c), and its error (3,)."""
         expected, gain = known @ self._mean, self._posterior @ known.T
         covariance = known @ gain
         spread = math.sqrt(self._noise.single + float(np.trace(covariance)) / 3.0)
@@ -160,7 +161,6 @@ class ChangeDetector:
         step = np.linalg.solve(covariance + self._noise.whole * np.eye(3), gain.T)
         self._mean = self._mean + off @ step
         self._posterior = self._posterior - gain @ step
-        return error
 
     @property
     def due(self) -> bool:
@@ -198,11 +198,13 @@ class ChangeDetector:
         rows = list(zip(*self._rows[-MOST_PAIRS:], strict=True))
         angles, errors, known, changed = (np.array(each) for each in rows)
         scale = 1.0 / math.sqrt(self._noise.single)
+        first = self.pairs - len(angles)
+        suspected = max(self.suspicion().onset - first, 0)
         onsets, stands_for, terms = log_ratios_if_it_bends(
-            angles, scale * errors, scale * known, scale * changed, self._places, self._sizes
+            angles, scale * errors, scale * known, scale * changed, self._places, self._sizes, suspected
         )
         terms = terms + self._log_shares + np.log(stands_for)[:, None]
-        return self._suspected(onsets + self.pairs - len(angles), terms)
+        return self._suspected(onsets + first, terms)
 
     def _suspected(self, onsets: IntArray, terms: FloatArray) -> Suspicion:
         log_odds = float(np.logaddexp.reduce(terms, axis=None))
