@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
@@ -105,7 +106,7 @@ class ChangeDetector:
         self._onsets = Onsets(known, len(self._columns))
         self._differences: list[float] = []
         self._surprises: list[FloatArray] = []
-        self._rows: list[tuple[FloatArray, FloatArray, FloatArray, FloatArray]] = []
+        self._rows: deque[tuple[FloatArray, FloatArray, FloatArray, FloatArray]] = deque(maxlen=MOST_PAIRS)
         self._strange, self._looked_at, self._log_odds = False, 0, -math.inf
 
     @property
@@ -195,7 +196,7 @@ class ChangeDetector:
 
         It costs some hundred times as much as `suspicion`: to be asked for when that is an alarm.
         """
-        rows = list(zip(*self._rows[-MOST_PAIRS:], strict=True))
+        rows = list(zip(*self._rows, strict=True))
         angles, errors, known, changed = (np.array(each) for each in rows)
         scale = 1.0 / math.sqrt(self._noise.single)
         first = self.pairs - len(angles)
