@@ -12,11 +12,11 @@ from kbmaps.changes.mixture import log_ratios
 
 # Over how far a bend is much the same [rad of all joints together], how large it is over the noise of a pair, and the
 # noise over what it was thought to be: equally probable, each of them.
-LENGTHS = (0.35, 0.7, 1.4)
+LENGTHS = (0.7, 1.4)
 BENDS = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
 NOISES = (0.5, 0.7, 1.0, 1.4)
-# Those that are less probable than this by all pairs are left out.
-_LEAST = 0.01
+# Those less probable than this by all pairs, were there no change, are left out: even with one they hardly count.
+_LEAST = 1e-6
 # Runs of neighbours count by their means; a run is as long as this share of its age, at most so many pairs.
 _RUN_SHARE, _LONGEST_RUN = 0.04, 6
 # A change may begin with each of so many runs, of older ones with those that lie so far apart, as a share of their age:
