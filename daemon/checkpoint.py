@@ -1,5 +1,7 @@
 """The learner's state on disk: one file, replaced as a whole, so that a kill leaves the old one or the new one.
 
+The one before is kept beside it, for the day when a disk gives back something else than was written.
+
 Layout, all little-endian:
 
     magic     8 bytes   b"BSCKPT\\r\\n"
@@ -51,16 +53,20 @@ class _Header(msgspec.Struct, frozen=True):
 
 
 def write_checkpoint(file: Path, state: LearningState, *, robot: str, utc: str) -> None:
-    """Replace the checkpoint `file` by `state`.
+    """Replace the checkpoint `file` by `state`; what it was stays as the previous one.
 
     Raises:
-        CheckpointError: the disk is full or read-only; the old checkpoint is still there.
+        CheckpointError: the disk is full or read-only, or the state is no use; the old checkpoint is still there.
     """
+    poisoned = state.poisoned()
+    if poisoned is not None:
+        raise CheckpointError(f"the checkpoint {file} was not written: {poisoned} of the state is not finite")
     data = _encode(state, robot, utc)
     temporary = file.with_name(file.name + ".tmp")
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
         _write_through(temporary, data)
+        _keep_previous(file)
         os.replace(temporary, file)
         _sync_folder(file.parent)
     except OSError as error:
@@ -90,6 +96,11 @@ def read_checkpoint(file: Path, *, robot: str) -> LearningState | None:
         arrays[entry.name] = np.frombuffer(payload[:size], dtype="<f8").astype(np.float64).reshape(entry.shape)
         payload = payload[size:]
     return LearningState(header.learning, arrays)
+
+
+def generations(file: Path) -> tuple[Path, Path]:
+    """Where the checkpoint is looked for: `file`, and the one before it."""
+    return file, file.with_name(file.name + ".previous")
 
 
 def set_aside(file: Path) -> Path:
@@ -130,6 +141,18 @@ def _decode(file: Path, data: bytes) -> tuple[_Header, memoryview]:
     if len(payload) != sum(8 * math.prod(entry.shape) for entry in header.arrays):
         raise CheckpointError(f"the checkpoint {file} does not hold the arrays that its header announces")
     return header, payload
+
+
+def _keep_previous(file: Path) -> None:
+    """Give the present checkpoint a second name, so that it never lacks its own."""
+    if not file.exists():
+        return
+    previous = generations(file)[1]
+    previous.unlink(missing_ok=True)
+    try:
+        os.link(file, previous)
+    except OSError:  # a file system without hard links
+        os.replace(file, previous)
 
 
 def _write_through(file: Path, data: bytes) -> None:

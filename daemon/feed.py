@@ -7,8 +7,9 @@ import queue
 import threading
 from collections.abc import Callable
 
+from daemon.history import Page, Unreadable
 from daemon.learning import Learning
-from daemon.wire import PairMessage, PairsReply, decode, pair_from_wire
+from daemon.wire import PairMessage, decode, pair_from_wire
 from interfaces.errors import BusError, RequestError
 from interfaces.protocols import Clock
 
@@ -17,7 +18,7 @@ log = logging.getLogger(__name__)
 WAITING = 1024
 RETRY_S = 1.0
 
-History = Callable[[int], PairsReply]
+History = Callable[[int], Page]
 
 
 class PairFeed:
@@ -47,12 +48,18 @@ class PairFeed:
         self._missed = True
         self._behind, self._paused = False, False
         self._retry_at = 0.0
+        self._refused: str | None = None
         self.restart()
 
     @property
     def problem(self) -> str | None:
         """Why pairs that come are not learnt, or None."""
         return self._problem
+
+    @property
+    def refused(self) -> str | None:
+        """What was wrong with the pair that was refused last, or None."""
+        return self._refused
 
     @property
     def paused(self) -> bool:
@@ -137,13 +144,15 @@ class PairFeed:
                 reply = self._history(begin)
             except (BusError, RequestError) as error:
                 log.debug("history could not be asked: %s", error)
+                if isinstance(error, RequestError):
+                    self._problem = f"the sampler does not give the pairs from {begin} on: {error}"
                 self._retry_at = self._clock.now() + RETRY_S
                 return
             with self.lock:
                 if begin == self._cursor + 1 and self._end_of(reply):
                     return
 
-    def _end_of(self, reply: PairsReply) -> bool:
+    def _end_of(self, reply: Page) -> bool:
         """Learn a page of history; True when there is nothing more to ask for."""
         if self._store not in (None, reply.store):
             self._meet_foreign(reply.store)
@@ -168,7 +177,7 @@ class PairFeed:
         self._behind = self._cursor < reply.last_seq and self._cursor > before
         return not self._behind
 
-    def _skip_gone(self, reply: PairsReply) -> None:
+    def _skip_gone(self, reply: Page) -> None:
         """Go on with the oldest pair that is left where those before it are no longer kept."""
         gone = reply.pairs[0].seq - self._cursor - 1 if reply.pairs else 0
         if gone > 0:
@@ -181,8 +190,10 @@ class PairFeed:
             self._learning.missed(gone)
             self._store, self._cursor = reply.store, self._cursor + gone
 
-    def _learnt(self, message: PairMessage) -> bool:
+    def _learnt(self, message: PairMessage | Unreadable) -> bool:
         try:
+            if isinstance(message, Unreadable):
+                raise RequestError(message.why)
             self._learning.learn(pair_from_wire(message, self._joints), self._clock.now())
         except RequestError as error:
             self._refuse(error)
@@ -191,6 +202,7 @@ class PairFeed:
 
     def _refuse(self, error: RequestError) -> None:
         log.warning("a pair was refused: %s", error)
+        self._refused = str(error)
         self._learning.refuse()
 
     def _meet_foreign(self, store: str) -> None:

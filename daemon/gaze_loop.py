@@ -6,6 +6,7 @@ import logging
 import math
 import threading
 from collections.abc import Callable
+from dataclasses import replace
 from types import TracebackType
 from typing import Self
 
@@ -17,7 +18,9 @@ from interfaces.protocols import Clock
 from interfaces.records import FloatArray
 from interfaces.robot import RobotDescription
 
-from .sources import Head
+from .bus import Bus
+from .keys import Keys
+from .sources import Head, Sources
 from .wire import JointsRequest, PredictReply, decode, encode
 
 log = logging.getLogger(__name__)
@@ -26,6 +29,7 @@ PERIOD_S = 0.04
 GAIN = 0.5  # of a step towards the middle; the head follows with a delay
 GOOD_M = 0.02  # a learnt model that is less sure of the hand is not asked
 ASK_AGAIN_S = 1.0
+PREDICT_S = 0.2  # what the head waits for the learner
 
 Predict = Callable[[bytes], bytes]
 """Asks the learner: a `JointsRequest`, and its `PredictReply`; BusError or RequestError without an answer."""
@@ -108,3 +112,14 @@ class GazeLoop:
                 self.look()
         except Exception:
             log.exception("the gaze failed; the head stands still")
+
+
+def gaze_of(robot: RobotDescription, sources: Sources, bus: Bus, wall: Clock) -> GazeLoop | None:
+    """What turns the head of a robot that has one, with its cameras as they were calibrated."""
+    if sources.head is None:
+        return None
+    key = Keys(robot.name).predict
+    if sources.calibration is not None:
+        robot = replace(robot, calibration=sources.calibration)
+    model = HandModel(robot, lambda payload: bus.ask_one(key, payload, timeout_s=PREDICT_S), wall)
+    return GazeLoop(robot, sources.head, model)

@@ -1,15 +1,66 @@
-"""The stored pairs, answered over zenoh."""
+"""The stored pairs over zenoh: answered by the sampler, read by the learner."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated
+
+import msgspec
 
 from interfaces.errors import RequestError
 
 from .bus import Request
 from .store import PairReader
-from .wire import PairsReply, encode, pair_to_wire
+from .wire import PairMessage, PairsReply, decode, encode, pair_to_wire
 
 LARGEST_REPLY = 1000
 _LARGEST_SEQ = 2**62
+
+
+@dataclass(frozen=True, slots=True)
+class Unreadable:
+    """A stored pair that is none, `why` says what is wrong with it."""
+
+    seq: int
+    why: str
+
+
+@dataclass(frozen=True, slots=True)
+class Page:
+    """A `PairsReply` in which one pair that is none spoils no other."""
+
+    store: str
+    last_seq: int
+    pairs: Sequence[PairMessage | Unreadable]
+
+
+class _RawPage(msgspec.Struct, frozen=True):
+    store: str
+    last_seq: int
+    pairs: list[msgspec.Raw]
+
+
+class _Numbered(msgspec.Struct, frozen=True):
+    seq: Annotated[int, msgspec.Meta(ge=1)]
+
+
+def read_page(payload: bytes) -> Page:
+    """The page in a reply of the sampler, JSON.
+
+    Raises:
+        RequestError: it is none, or has a pair without a number.
+    """
+    page = decode(payload, _RawPage)
+    return Page(page.store, page.last_seq, [_read(bytes(raw)) for raw in page.pairs])
+
+
+def _read(raw: bytes) -> PairMessage | Unreadable:
+    try:
+        return decode(raw, PairMessage)
+    except RequestError as error:
+        seq = decode(raw, _Numbered).seq
+        return Unreadable(seq, f"pair {seq} is {error}")
 
 
 def answer_pairs(reader: PairReader, request: Request) -> bytes:

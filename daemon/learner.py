@@ -19,13 +19,15 @@ from importlib.metadata import version
 from daemon.answers import Answers
 from daemon.bus import Bus, Request
 from daemon.changes import Changes
-from daemon.checkpoint import CheckpointError, read_checkpoint, set_aside, write_checkpoint
+from daemon.checkpoint import CheckpointError, write_checkpoint
 from daemon.config import Config
 from daemon.expected import ExpectedMarker
 from daemon.feed import PairFeed
 from daemon.findings import Findings
+from daemon.going_on import go_on
+from daemon.history import Page, read_page
 from daemon.keys import Keys
-from daemon.learning import Learning, NominalModel, StateError
+from daemon.learning import Learning, NominalModel
 from daemon.learning.solver import LARGEST_NET
 from daemon.notify import Notifier
 from daemon.reload import reload
@@ -33,11 +35,10 @@ from daemon.service import Service, with_health
 from daemon.signals import Wishes
 from daemon.solver_process import SolverLostError, SolverProcess
 from daemon.status import LearnerStatus
-from daemon.wire import OCTETS, CommandReply, CommandRequest, PairsReply, decode, encode
+from daemon.wire import OCTETS, CommandReply, CommandRequest, decode, encode
 from daemon.wiring import open_marker_topic
 from interfaces.errors import BodyschemaError, RequestError
 from interfaces.protocols import Clock
-from kbmaps import KBMapsError
 
 log = logging.getLogger(__name__)
 
@@ -47,8 +48,6 @@ HISTORY_LIMIT_S = 5.0
 IDLE_S = 0.02
 SOLVE_WHEN_IDLE_S = 0.5
 BACKGROUND_NICENESS = 10
-# What a checkpoint raises whose checksum is right and whose parts are not.
-DOES_NOT_FIT = (ArithmeticError, LookupError, TypeError, ValueError)
 # What has to come round for the learner to be alive.
 LOOPS = ("learning", "background", "status")
 TABLES = ("robot", "camera", "zenoh", "daemon", "drivers", "learner", "effects", "unexplained")
@@ -63,14 +62,14 @@ class Learner:
     def __init__(
         self, config: Config, solver: SolverProcess, bus: Bus, clock: Clock, service: Service | None = None
     ) -> None:
-        self._config, self._solver, self._bus, self._clock = config, solver, bus, clock
+        self._config, self._bus, self._clock = config, bus, clock
         self._service = Service.nobodys(clock) if service is None else service
         self._settings, self._robot = config.tables.learner, config.robot
         self._keys = Keys(config.robot.name)
         self._nominal = NominalModel.extended_by(config.simulation)
-        self._learning = Learning(self._nominal, self._settings, solver)
-        self._set_aside: str | None = None
-        self._restore()
+        self._learning, self._set_aside = go_on(
+            lambda: Learning(self._nominal, self._settings, solver), config.checkpoint_file, config.robot.name
+        )
         self._feed = PairFeed(self._learning, self._history, clock, lambda: self._service.beat("learning"))
         self._findings = Findings(self._learning, config.robot, clock)
         self._answers = Answers(self._learning, config.robot, clock)
@@ -193,24 +192,10 @@ class Learner:
         for problem in (self._feed.problem, self._checkpoint_problem, self._set_aside):
             if problem is not None:
                 yield problem
+        if self._feed.refused is not None:
+            yield f"pairs were refused, {self._learning.counters.refused} so far; the last: {self._feed.refused}"
         if self._nominal.size > LARGEST_NET:
             yield f"{self._nominal.joints} joints are too many for the exact map; the others learn without it"
-
-    def _restore(self) -> None:
-        file = self._config.checkpoint_file
-        try:
-            state = read_checkpoint(file, robot=self._robot.name)
-            if state is None:
-                return
-            self._learning.restore(state)
-        except (CheckpointError, StateError, KBMapsError, *DOES_NOT_FIT) as error:
-            aside = set_aside(file)
-            said = f"the checkpoint's parts do not fit: {error!r}" if isinstance(error, DOES_NOT_FIT) else str(error)
-            self._set_aside = f"{said}. It was kept as {aside}; the learner learns again from the sampler's history"
-            log.error("%s", self._set_aside)
-            self._learning = Learning(self._nominal, self._settings, self._solver)
-        else:
-            log.info("went on from %s with %d pairs", file, self._learning.counters.pairs)
 
     def _declare(self) -> None:
         bus, keys, answers = self._bus, self._keys, self._answers
@@ -229,9 +214,8 @@ class Learner:
         if alive:
             self._feed.wake()
 
-    def _history(self, begin: int) -> PairsReply:
-        payload = self._bus.ask_one(f"{self._keys.pairs}?from={begin}", timeout_s=HISTORY_LIMIT_S)
-        return decode(payload, PairsReply)
+    def _history(self, begin: int) -> Page:
+        return read_page(self._bus.ask_one(f"{self._keys.pairs}?from={begin}", timeout_s=HISTORY_LIMIT_S))
 
     def _command(self, request: Request) -> bytes:
         command = decode(request.payload, CommandRequest, request.encoding).command

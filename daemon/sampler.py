@@ -7,7 +7,6 @@ import math
 import threading
 import time
 from contextlib import ExitStack
-from dataclasses import replace
 from importlib.metadata import version
 
 import numpy as np
@@ -15,14 +14,14 @@ import numpy as np
 from interfaces.clock import SystemClock
 from interfaces.errors import ConfigError, RequestError, SourceEnded
 from interfaces.protocols import Clock
-from interfaces.records import FloatArray, JointReading, MarkerFix, MarkerMiss, Pair, Reason
+from interfaces.records import FloatArray, JointReading, MarkerFix, MarkerMiss, Reason
 
 from .align import JointBuffer
 from .bus import Bus, Request
 from .config import Config
 from .devices import DeviceWatch
 from .gate import Accepted, Gate
-from .gaze_loop import GazeLoop, HandModel
+from .gaze_loop import gaze_of
 from .history import answer_pairs
 from .keys import Keys
 from .powered import asked
@@ -31,10 +30,11 @@ from .sampler_rules import SamplerRules
 from .service import Service, with_health
 from .servo_status import accept_turns, buses_of, complaints_of, servos_of
 from .simulation import answer_simulation
-from .sources import Head, Sources
+from .sources import Sources
 from .status import SamplerStatus
 from .store import PairStore
 from .store_file import disk_free
+from .storing import Storing
 from .tally import Tally
 from .wire import CommandReply, CommandRequest, decode, encode, pair_to_wire
 
@@ -43,7 +43,6 @@ log = logging.getLogger(__name__)
 READ_TIMEOUT_S = 0.2
 JOINTS_TIMEOUT_S = 1.0  # how long a frame waits for the encoders to reach its time
 AROUND_S = 0.1  # of a frame whose time is uncertain: how fast the joints are
-PREDICT_S = 0.2  # what the gaze waits for the learner
 STATUS_EVERY_S = 1.0
 SILENT_AFTER_S = 2.0  # a source that has said nothing for so long is reported
 ZERO_FORCE = "zero_force"  # that [robot] hold says, and the drive is called
@@ -94,8 +93,8 @@ class Sampler:
         self._powered = {drive.name: drive for drive in sources.powered}
         held = config.robot.robot.hold == "zero_force"
         self._bears = self._powered.get(ZERO_FORCE) if held else None
-        self._cameras, self._calibration = sources.cameras, sources.calibration
-        self._gaze = None if sources.head is None else self._gaze_loop(sources.head)
+        self._cameras = sources.cameras
+        self._gaze = gaze_of(config.robot, sources, bus, self._wall)
         self._simulation, self._source_clock = sources.simulation, sources.clock
         self._joints = Reopening(sources.joints, "the encoders", self._wall, forbidden=self._service.forbidden)
         self._encoders, self._devices = sources.joints, DeviceWatch(sources.joints, store, self._wall)
@@ -103,6 +102,7 @@ class Sampler:
         rules, prismatic = config.tables.daemon, config.robot.chain.prismatic
         self._buffer = JointBuffer(prismatic, rules.max_reading_gap_s, live=sources.live, kept_s=AROUND_S)
         self._gate = Gate(rules, prismatic, store.last())
+        self._storing = Storing(store, self._wall)
         self._tally = Tally(config.robot, self._wall, store.reader.joint_ranges())
         self._seq = store.reader.last_seq()
         self._publish = bus.publisher(self._keys.pair, cache=PAIR_CACHE)
@@ -133,7 +133,7 @@ class Sampler:
         """Sample until `stop`, or with `exit_at_end` until the sources are through.
 
         Raises:
-            StoreError: a pair could not be stored; it was not published either, and none came after it.
+            StoreError: the store is damaged; the pair was not published either, and none came after it.
             SourceError: a source could not be opened at the start.
         """
         self._service.tell("opening encoders and cameras")
@@ -232,6 +232,8 @@ class Sampler:
             return Reason.PAUSED
         if isinstance(seen, MarkerMiss):
             return seen.reason
+        if not (np.isfinite(seen.x).all() and np.isfinite(seen.cov).all()):
+            return Reason.NOT_FINITE
         q = self._angles(seen)
         if isinstance(q, Reason):
             return q
@@ -242,13 +244,15 @@ class Sampler:
             if self._paused:
                 self._gate.break_segment()
                 return Reason.PAUSED
-            if self._devices.look():
+            others = self._storing.attempt(self._devices.look)
+            if others is None:
+                return Reason.NOT_STORED
+            if others:
                 self._gate.break_segment()
             verdict = self._gate.offer(seen.t, q, seen.x)
             if isinstance(verdict, Reason):
                 return verdict
-            self._accept(verdict, q, seen)
-        return None
+            return self._accept(verdict, q, seen)
 
     def _angles(self, fix: MarkerFix) -> FloatArray | Reason:
         """Joint angles at the time of a fix, if they are known well enough for how well that time is known."""
@@ -260,11 +264,15 @@ class Sampler:
                 return Reason.MOVING
         return self._buffer.at(fix.t, JOINTS_TIMEOUT_S)
 
-    def _accept(self, verdict: Accepted, q: FloatArray, fix: MarkerFix) -> None:
-        pair: Pair = self._store.append(verdict.segment, self._wall.utc(), q, fix)
+    def _accept(self, verdict: Accepted, q: FloatArray, fix: MarkerFix) -> Reason | None:
+        pair = self._storing.append(verdict.segment, q, fix)
+        if pair is None:
+            self._gate.break_segment()
+            return Reason.NOT_STORED
         self._seq = pair.seq
         self._tally.accept(q)
         self._publish(encode(pair_to_wire(pair)))
+        return None
 
     def _check_encoders(self) -> None:
         if self._failure is not None:
@@ -324,15 +332,6 @@ class Sampler:
         log.info("%s: %s", command, message)
         return encode(CommandReply(command, message), request.encoding)
 
-    def _gaze_loop(self, head: Head) -> GazeLoop:
-        def predict(payload: bytes) -> bytes:
-            return self._bus.ask_one(self._keys.predict, payload, timeout_s=PREDICT_S)
-
-        robot = self._config.robot
-        if self._calibration is not None:
-            robot = replace(robot, calibration=self._calibration)
-        return GazeLoop(robot, head, HandModel(robot, predict, self._wall))
-
     def _power(self, name: str, *, on: bool) -> str:
         if self._simulation is not None:
             raise RequestError(f"{name} is of a real arm: in the simulation the head follows the hand by itself")
@@ -368,7 +367,7 @@ class Sampler:
 
     def _health(self) -> list[str]:
         said: list[str] = [trouble for trouble in (self._joints.trouble, self._marker.trouble) if trouble]
-        said += complaints_of(self._encoders) + self._devices.changes
+        said += complaints_of(self._encoders) + self._devices.changes + self._storing.complaints
         if self._failure is not None:
             said.append(str(self._failure))
         elif not self._ended:

@@ -20,7 +20,7 @@ from interfaces.records import FloatArray, MarkerFix, Pair, frozen_array
 from . import store_schema
 from .retention import Keep, delete_until
 from .store_file import NOTHING_CHANGED, explained, lock
-from .store_rows import COLUMNS, COLUMNS_BEFORE_ORIENTATION, pair_of, row_of
+from .store_rows import COLUMNS, COLUMNS_BEFORE_ORIENTATION, as_json, pair_of, row_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -212,7 +212,7 @@ class PairStore:
             connection.execute("DELETE FROM devices WHERE from_seq > ?", (self._seq,))
             connection.execute(
                 "INSERT INTO devices (session, from_seq, utc, record) VALUES (?, ?, ?, ?)",
-                (self._session_id, self._seq + 1, utc, _json(record)),
+                (self._session_id, self._seq + 1, utc, as_json(record)),
             )
 
     def go_on_with(self, session: Session) -> None:
@@ -323,7 +323,3 @@ class PairStore:
         if self._lock_file is not None:
             os.close(self._lock_file)
             self._lock_file = None
-
-
-def _json(value: object) -> str:
-    return msgspec.json.encode(value).decode()

@@ -11,9 +11,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from interfaces.errors import StoreError
+from interfaces.errors import StoreError, StoreUnwritable
 
 NOTHING_CHANGED = "Nothing was changed"
+# What SQLite says when the disk takes nothing now.
+_PASSING = ("SQLITE_FULL", "SQLITE_IOERR", "SQLITE_READONLY", "SQLITE_CANTOPEN", "SQLITE_BUSY")
 
 
 @contextmanager
@@ -22,11 +24,12 @@ def explained(file: Path) -> Iterator[None]:
     try:
         yield
     except sqlite3.Error as error:
-        raise StoreError(explanation(file, error)) from error
+        kind = StoreUnwritable if _name(error).startswith(_PASSING) else StoreError
+        raise kind(explanation(file, error)) from error
 
 
 def explanation(file: Path, error: sqlite3.Error) -> str:
-    name = getattr(error, "sqlite_errorname", "")
+    name = _name(error)
     if name == "SQLITE_FULL" or (name.startswith("SQLITE_IOERR") and free_bytes(file) < 2**16):
         return unwritable(file, errno.ENOSPC, "")
     if name.startswith(("SQLITE_READONLY", "SQLITE_CANTOPEN")):
@@ -36,6 +39,10 @@ def explanation(file: Path, error: sqlite3.Error) -> str:
     if name.startswith("SQLITE_CORRUPT") or isinstance(error, sqlite3.DataError):
         return damaged(file, str(error))
     return f"{file}: {error} ({name or type(error).__name__}). Check the disk"
+
+
+def _name(error: sqlite3.Error) -> str:
+    return getattr(error, "sqlite_errorname", "")
 
 
 def unwritable(file: Path, number: int | None, what: str | None) -> str:

@@ -5,22 +5,21 @@ from __future__ import annotations
 from typing import Any
 
 import msgspec
-import numpy as np
 
-from interfaces.records import FloatArray, Pair, frozen_array
+from interfaces.covariance import from_upper, upper_triangle
+from interfaces.records import Pair, frozen_array
 
 # Stores of schemas 1 and 2 have these alone.
 COLUMNS_BEFORE_ORIENTATION = "seq, segment, t, utc, q, x, cov, centres_px"
 COLUMNS = f"{COLUMNS_BEFORE_ORIENTATION}, R, cov_R"
-_UPPER = np.triu_indices(3)
 
 
 def row_of(pair: Pair) -> tuple[Any, ...]:
     """The values of `COLUMNS`."""
-    arrays = (_json(pair.q.tolist()), _json(pair.x.tolist()), _json(pair.cov[_UPPER].tolist()))
-    centres = None if pair.centres_px is None else _json(pair.centres_px)
-    turn = None if pair.R is None else _json(pair.R.tolist())
-    cov_turn = None if pair.cov_R is None else _json(pair.cov_R[_UPPER].tolist())
+    arrays = (as_json(pair.q.tolist()), as_json(pair.x.tolist()), as_json(upper_triangle(pair.cov)))
+    centres = None if pair.centres_px is None else as_json(pair.centres_px)
+    turn = None if pair.R is None else as_json(pair.R.tolist())
+    cov_turn = None if pair.cov_R is None else as_json(upper_triangle(pair.cov_R))
     return (pair.seq, pair.segment, pair.t, pair.utc, *arrays, centres, turn, cov_turn)
 
 
@@ -36,18 +35,13 @@ def pair_of(store: str, row: tuple[Any, ...]) -> Pair:
         utc=utc,
         q=frozen_array(msgspec.json.decode(q)),
         x=frozen_array(msgspec.json.decode(x)),
-        cov=_symmetric(upper),
+        cov=frozen_array(from_upper(msgspec.json.decode(upper))),
         centres_px=None if centres is None else tuple(msgspec.json.decode(centres)),
         R=None if turn is None else frozen_array(msgspec.json.decode(turn)),
-        cov_R=None if cov_turn is None else _symmetric(cov_turn),
+        cov_R=None if cov_turn is None else frozen_array(from_upper(msgspec.json.decode(cov_turn))),
     )
 
 
-def _symmetric(upper: str) -> FloatArray:
-    cov = np.zeros((3, 3))
-    cov[_UPPER] = msgspec.json.decode(upper)
-    return frozen_array(cov + np.triu(cov, 1).T)
-
-
-def _json(numbers: object) -> str:
+def as_json(numbers: object) -> str:
+    """Numbers, or what holds them, in a column."""
     return msgspec.json.encode(numbers).decode()

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from .config import Config
+from .identity import is_local
 from .servo_wiring import configured_ports
 
 PROCESSES = ("sampler", "learner")
@@ -17,7 +18,6 @@ FOLDER = Path("etc/systemd/system")
 OWN = "robot.conf"
 # Beginnings of what `ProtectHome=tmpfs` and `PrivateTmp=yes` hide.
 HIDDEN = tuple(Path(path) for path in ("/home", "/root", "/run/user", "/tmp", "/var/tmp"))
-LOOPBACK = re.compile(r"[a-z]+/(127\.[0-9.]+|localhost|\[::1\]):[0-9]+.*|unixsock-stream/.+")
 # Versions of systemd from which on a service that fails again and again is started less and less often.
 WITH_RESTART_STEPS = 254
 
@@ -153,7 +153,7 @@ def of_robot(process: str, config: Config, user: str, installed: Installed) -> s
         lines.append(f"{kind}={_quoted(config.state_dir)}")
     if process == "sampler":
         lines += [f"DeviceAllow={_quoted(device)} rw" for device in devices_of(config)]
-    if not all(LOOPBACK.fullmatch(endpoint) for endpoint in endpoints_of(config)):
+    if not all(map(is_local, endpoints_of(config))):
         lines.append("IPAddressAllow=any")
     return "\n".join(lines) + "\n"
 
@@ -168,14 +168,20 @@ def devices_of(config: Config) -> list[str]:
 def endpoints_of(config: Config) -> list[str]:
     """Where the two processes listen or connect to."""
     zenoh, ros2 = config.tables.zenoh, config.tables.drivers.ros2
-    return [zenoh.sampler, zenoh.learner, *([] if ros2 is None else [ros2.router])]
+    routers = [zenoh.router, "" if ros2 is None else ros2.router]
+    return [zenoh.sampler, zenoh.learner, *(router for router in routers if router)]
 
 
 def folders_of(config: Config) -> list[Path]:
     """The folders of robot.toml and of the files that it names."""
     tables, home = config.tables, config.file.absolute().parent
-    cameras = tables.vision.cameras
-    named = [tables.drivers.recording, None if cameras is None else cameras.calibration]
+    cameras, unexplained = tables.vision.cameras, tables.unexplained
+    named = [
+        tables.drivers.recording,
+        None if cameras is None else cameras.calibration,
+        None if unexplained is None else unexplained["model"],
+        *tables.zenoh.files,
+    ]
     files = [config.file, config.robot.tree.file, *(home / name for name in named if name is not None)]
     return [Path(os.path.abspath(file)).parent for file in files]
 

@@ -13,6 +13,7 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
+from interfaces.covariance import from_upper, upper_triangle
 from interfaces.errors import RequestError
 from interfaces.recording_columns import QUATERNION_TOLERANCE
 from interfaces.records import FloatArray, Pair, frozen_array
@@ -191,9 +192,9 @@ def pair_to_wire(pair: Pair) -> PairMessage:
         utc=pair.utc,
         q=pair.q.tolist(),
         x=(x, y, z),
-        cov=_upper(pair.cov),
+        cov=upper_triangle(pair.cov),
         R=None if pair.R is None else _four(pair.R),
-        cov_R=None if pair.cov_R is None else _upper(pair.cov_R),
+        cov_R=None if pair.cov_R is None else upper_triangle(pair.cov_R),
     )
 
 
@@ -219,26 +220,15 @@ def pair_from_wire(message: PairMessage, joints: int) -> Pair:
         utc=message.utc,
         q=frozen_array(q),
         x=frozen_array(message.x),
-        cov=_symmetric(message.cov),
+        cov=frozen_array(from_upper(message.cov)),
         R=None if message.R is None else frozen_array(message.R),
-        cov_R=None if message.cov_R is None else _symmetric(message.cov_R),
+        cov_R=None if message.cov_R is None else frozen_array(from_upper(message.cov_R)),
     )
-
-
-def _upper(cov: FloatArray) -> tuple[float, float, float, float, float, float]:
-    xx, xy, xz, yy, yz, zz = cov[np.triu_indices(3)].tolist()
-    return xx, xy, xz, yy, yz, zz
 
 
 def _four(turn: FloatArray) -> tuple[float, float, float, float]:
     x, y, z, w = turn.tolist()
     return x, y, z, w
-
-
-def _symmetric(upper: Sequence[float]) -> FloatArray:
-    cov = np.zeros((3, 3))
-    cov[np.triu_indices(3)] = upper
-    return frozen_array(cov + np.triu(cov, 1).T)
 
 
 def finite_vector(name: str, values: Sequence[float], joints: tuple[str, ...]) -> np.ndarray:

@@ -45,6 +45,17 @@ class ZenohConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         """Where `sampler` or `learner` listens."""
         return self.learner if process == "learner" else self.sampler
 
+    @property
+    def files(self) -> tuple[str, ...]:
+        """Certificates, keys and passwords, as they are named."""
+        tls, login = self.tls, self.login
+        named = (
+            *(() if tls is None else (tls.ca, tls.certificate, tls.key)),
+            None if login is None else login.password_file,
+            self.users_file,
+        )
+        return tuple(name for name in named if name is not None)
+
     def identity(self, folder: Path) -> Identity | None:
         """Who this machine is to others; None without certificates. ConfigError where its files cannot be used."""
         return None if self.tls is None else Identity.of(self.tls, self.login, self.users_file, folder)

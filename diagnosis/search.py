@@ -94,13 +94,15 @@ class Search:
             fit = self._reviewed(start)
             self.path.append(fit)
         while len(self.path) <= _MOST_CAUSES:
-            better = self._added(fit)[0] or self._two_in_place_of_one(fit) or self._simpler_and_one_more(fit)
+            added = self._added(fit)[0]
+            better = added or self._two_in_place_of_one(fit) or self._simpler_and_one_more(fit)
             if better is None:
                 break
             causes = named(better.causes)
             if causes in self._seen:
                 break
-            self._tell(f"found {describe(better.causes[-1])}")
+            if added is not None:
+                self._tell(f"found {describe(added.causes[-1])}")
             self._seen.add(causes)
             fit = self._reviewed(better)
             self.path.append(fit)
@@ -153,7 +155,8 @@ class Search:
                     continue
                 better, more = self._added(tried)
                 if better is not None and worth + more > 1.0:
-                    self._tell(f"exchanged {describe(cause)} for {describe(candidate.effect)}")
+                    found = f"{describe(candidate.effect)} and {describe(better.causes[-1])}"
+                    self._tell(f"exchanged {describe(cause)} for {found}")
                     return better
         return None
 

@@ -7,7 +7,8 @@ BodyschemaError
 ├── SourceError         an encoder chain or a camera
 │   ├── SourceEnded     there will be no more readings (a recording is through)
 │   └── SourceLost      the device went away; opening it again may help
-├── StoreError          the pair store: full, read-only, foreign or damaged
+├── StoreError          the pair store: foreign or damaged
+│   └── StoreUnwritable the disk is full, read-only or failing: trying again later may help
 ├── BusError            zenoh: port in use, nobody there, time-out
 └── RequestError        a query that cannot be answered: says what is wrong with it
 """
@@ -68,6 +69,10 @@ class SourceLost(SourceError):
 
 class StoreError(BodyschemaError):
     """The pair store is full, read-only, foreign or damaged."""
+
+
+class StoreUnwritable(StoreError):
+    """The disk takes nothing now; trying again later may help."""
 
 
 class BusError(BodyschemaError):

@@ -11,6 +11,7 @@ from typing import Self, TextIO
 import numpy as np
 from numpy.typing import NDArray
 
+from .covariance import from_upper, upper_triangles
 from .errors import RecordingError
 from .recording_columns import (
     CENTRES,
@@ -26,7 +27,6 @@ from .recording_columns import (
     check_header,
     check_values,
     extra_columns,
-    full_covariances,
 )
 from .recording_csv import FIRST_ROW_LINE, csv_columns, read_csv_table, write_csv_rows
 from .recording_parquet import INTEGER_COLUMNS, parquet_columns, read_parquet_table, write_parquet_table
@@ -136,7 +136,7 @@ class Recording:
             return table.columns(names) if table.has(names) else None
 
         sigma, upper = optional(SIGMA), optional(COVARIANCE)
-        cov = None if upper is None else full_covariances(upper)
+        cov = None if upper is None else from_upper(upper)
         if sigma is not None:
             cov = np.zeros((len(sigma), 3, 3))
             cov[:, range(3), range(3)] = sigma**2
@@ -163,8 +163,7 @@ class Recording:
             blocks.append((("segment",), self.segment[:, None].astype(np.float64)))
         blocks += [(self.joints, self.q), (POSITION, self.x)]
         if self.cov is not None:
-            rows, columns = np.triu_indices(3)
-            blocks.append((COVARIANCE, self.cov[:, rows, columns]))
+            blocks.append((COVARIANCE, upper_triangles(self.cov)))
         if self.centres_px is not None:
             blocks.append((CENTRES, self.centres_px))
         if self.orientation is not None:

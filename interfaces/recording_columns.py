@@ -21,6 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from .covariance import from_upper
 from .records import FloatArray
 from .suggest import did_you_mean
 
@@ -146,22 +147,13 @@ def check_values(table: Table) -> None:
             bad = ~((sigma >= SMALLEST_SIGMA_M) & (sigma <= LARGEST_SIGMA_M))
             _first(bad, lambda row, s=sigma: f"{float(s[row])!r} is no sigma: it has to be a positive length", name)
     if table.has(COVARIANCE):
-        bad = ~positive_definite(full_covariances(table.columns(COVARIANCE)))
+        bad = ~positive_definite(from_upper(table.columns(COVARIANCE)))
         _first(bad, lambda _: "the covariance is not positive definite", "cxx", "Give variances above zero")
     if table.has(ORIENTATION):
         with np.errstate(over="ignore"):
             length = np.linalg.norm(table.columns(ORIENTATION), axis=1)
         bad = ~(np.abs(length - 1.0) <= QUATERNION_TOLERANCE)
         _first(bad, lambda row: f"the quaternion has the length {length[row]:.6g}, not 1", "qx", "Normalise it")
-
-
-def full_covariances(upper: FloatArray) -> FloatArray:
-    """Covariances, shape (n, 3, 3), from their upper triangles, shape (n, 6)."""
-    cov = np.empty((len(upper), 3, 3))
-    rows, columns = np.triu_indices(3)
-    cov[:, rows, columns] = upper
-    cov[:, columns, rows] = upper
-    return cov
 
 
 def positive_definite(cov: FloatArray) -> BoolArray:

@@ -37,6 +37,8 @@ class Reason(StrEnum):
     MOVING = "moving"  # joints too fast for the uncertainty of the time stamps
     TOO_NEAR = "too_near"  # nearer than the smallest step to the predecessor: wait
     PAUSED = "paused"  # an operator paused the sampler
+    NOT_FINITE = "not_finite"  # the tracker gave a position that is no number
+    NOT_STORED = "not_stored"  # the disk took no pair: full, read-only or failing
     NOT_BORNE = "not_borne"  # zero-force is to bear the arm, and is off
 
 

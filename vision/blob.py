@@ -80,12 +80,14 @@ class Disc:
         centre_px: centre of its ellipse, shape (2,) [px].
         radius_px: radius of the circle of the same area [px].
         cov_px: covariance of the centre, shape (2, 2) [px²].
+        radius_sigma_px: 1-sigma of the radius [px].
         level: how bright the marker's colour is on it [grey levels].
     """
 
     centre_px: FloatArray
     radius_px: float
     cov_px: FloatArray
+    radius_sigma_px: float
     level: float
 
     def is_same_as(self, other: Disc) -> bool:
@@ -127,15 +129,17 @@ def measure(image: ImageArray, patch: Patch, eye: Pinhole, gate: Gate, config: V
     reach = outline.radius_px + config.border_margin_px
     if (centre_px - reach < 0).any() or (centre_px + reach > (width - 1, height - 1)).any():
         return Reason.AT_BORDER
-    return Disc(centre_px, outline.radius_px, outline.cov_px, _level(image, centre_px, outline.radius_px, gate))
+    level = _level(image, centre_px, outline.radius_px, gate)
+    return Disc(centre_px, outline.radius_px, outline.cov_px, outline.radius_sigma_px, level)
 
 
 def roughly(image: ImageArray, patch: Patch, gate: Gate) -> Disc | None:
     """The ball that a patch may be though it could not be measured; None when it is not round."""
     if patch.fill < _WHOLE_DISC_FILL:
         return None
-    cov_px = (_ROUGH_SIGMA * patch.radius_px) ** 2 * np.eye(2)
-    return Disc(patch.centre_px, patch.radius_px, cov_px, _level(image, patch.centre_px, patch.radius_px, gate))
+    sigma_px = _ROUGH_SIGMA * patch.radius_px
+    level = _level(image, patch.centre_px, patch.radius_px, gate)
+    return Disc(patch.centre_px, patch.radius_px, sigma_px**2 * np.eye(2), sigma_px, level)
 
 
 def _is_whole(outline: Outline, config: VisionConfig) -> bool:

@@ -62,8 +62,8 @@ class VisionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         min_visible: share of the outline that has to be seen where the fitted ellipse says.
         max_centre_sigma_px: a centre less certain than this is doubtful: what was fitted is no ellipse [px].
         epipolar_px: largest difference of the eyes' rows [px], on top of the noise of the two centres ...
-        epipolar_sigmas: ... which counts this many times.
-        eye_size_ratio: largest ratio of the sizes the two eyes claim for the ball.
+        epipolar_sigmas: ... which counts this many times, in sizes too.
+        eye_size_ratio: largest ratio of the sizes the two eyes claim for the ball, besides noise.
         depth_size_ratio: largest ratio between the radius seen and the one expected at the triangulated depth.
         max_speed_m_s: faster than this the marker does not move; what is farther off is something else [m/s].
         max_candidates: at most this many patches per eye are looked at closely, the most disc-like first.
@@ -83,7 +83,7 @@ class VisionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     max_centre_sigma_px: Positive = 0.4
     epipolar_px: Annotated[float, Meta(ge=0)] = 0.5
     epipolar_sigmas: Annotated[float, Meta(ge=0)] = 4.0
-    eye_size_ratio: Ratio = 1.2
+    eye_size_ratio: Ratio = 1.05
     depth_size_ratio: Ratio = 1.3
     max_speed_m_s: Positive = 3.0
     max_candidates: Annotated[int, Meta(ge=1)] = 12

@@ -9,7 +9,7 @@ from itertools import product
 import numpy as np
 
 from interfaces.camera import StereoCalibration
-from interfaces.records import Reason
+from interfaces.records import ImageArray, Reason
 
 from .blob import Disc
 from .config import VisionConfig
@@ -18,6 +18,8 @@ from .triangulate import Location, locate
 
 # A mirror gives back less than this of the light, and its copy stands farther off.
 _MIRRORED_LIGHT = 0.8
+# Discs of the two eyes that may be one thing; and how much of a thing's place has to show its colour.
+_SAME_SIZE, _SAME_ROW_PX, _LEAST_SHOWN = 1.2, 2.0, 0.6
 
 
 class StereoMatcher:
@@ -48,6 +50,37 @@ class StereoMatcher:
         fitting = [outcome for outcome in outcomes if isinstance(outcome, Location)]
         return len(_without_reflections([found, *fitting])) > 1
 
+    def shows_too(
+        self, disc: Disc, others: Sequence[Disc], mask: ImageArray, found: Location, *, in_left: bool
+    ) -> bool:
+        """Whether a disc of one eye may be a second marker that the other eye sees, too, but not as a disc.
+
+        Args:
+            disc: measured or rough, and not the marker that was found.
+            others: the discs of the other eye, which tell that such a pair has been checked.
+            mask: what has the marker's colour in the other eye, shape (height, width).
+            found: the marker.
+            in_left: whether `disc` is the left eye's.
+        """
+        if any(_alike(disc, other) for other in others):
+            return False
+        radius_px = self._calibration.focal_px * self._config.radius_m / float(found.x[2])
+        if disc.level < _MIRRORED_LIGHT * found.level and disc.radius_px < radius_px:
+            return False
+        u, v = disc.centre_px
+        disparity_px = self._calibration.baseline_m * disc.radius_px / self._config.radius_m
+        ends_px = disparity_px / self._config.depth_size_ratio, disparity_px * self._config.depth_size_ratio
+        first, last = (u - ends_px[1], u - ends_px[0]) if in_left else (u + ends_px[0], u + ends_px[1])
+        # The square inside the disc.
+        half = max(1, round(disc.radius_px / math.sqrt(2.0)))
+        rows = mask[max(round(v) - half, 0) : round(v) + half + 1]
+        columns = np.arange(max(math.floor(first), half), min(math.ceil(last), mask.shape[1] - 1 - half) + 1)
+        own_u = float(found.centres_px[2 if in_left else 0])
+        columns = columns[np.abs(columns - own_u) > radius_px + half]
+        total = np.concatenate([[0.0], np.cumsum(rows.mean(axis=0) / 255.0)])
+        shares = (total[columns + half + 1] - total[columns - half]) / (2 * half + 1)
+        return bool((shares > _LEAST_SHOWN).any())
+
     def _check(self, left: Disc, right: Disc) -> Location | Reason:
         location = locate(self._calibration, self._config.radius_m, left, right)
         if location is None:
@@ -60,15 +93,23 @@ class StereoMatcher:
 
     def _sizes_fit(self, location: Location, left: Disc, right: Disc) -> bool:
         baseline = np.array([self._calibration.baseline_m, 0.0, 0.0])
-        ratios = []
+        ratios: list[float] = []
         for disc, x_eye in ((left, location.x), (right, location.x - baseline)):
             expected = self._eye.outline(x_eye, self._config.radius_m)
             if expected is None:
                 return False
             ratios.append(disc.radius_px / expected.radius_px)
-        between_eyes = max(ratios) / min(ratios)
+        # How far apart noise may bring the two, besides.
+        sigma = math.hypot(*(disc.radius_sigma_px / disc.radius_px for disc in (left, right)))
+        between_eyes = max(ratios) / min(ratios) / (1.0 + self._config.epipolar_sigmas * sigma)
         against_depth = max(*ratios, 1.0 / min(ratios))
         return between_eyes <= self._config.eye_size_ratio and against_depth <= self._config.depth_size_ratio
+
+
+def _alike(one: Disc, other: Disc) -> bool:
+    """Whether two discs, one of each eye, are at the same row and of the same size, roughly."""
+    size = max(one.radius_px, other.radius_px) / min(one.radius_px, other.radius_px)
+    return size < _SAME_SIZE and abs(float(one.centre_px[1] - other.centre_px[1])) < _SAME_ROW_PX
 
 
 def _without_reflections(found: list[Location]) -> list[Location]:

@@ -10,24 +10,27 @@ anti-aliased edge counts by its coverage.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 from itertools import combinations
-from typing import cast
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from interfaces.records import FloatArray
 
 from .colour import Float32Array, Gate
+from .limb_fit import fit_limb
+from .polar import ball_colour, mean_of_three, median, ray_angles, sample
+from .waves import waves
 
 BoolArray = NDArray[np.bool_]
 
-# Half-widths [px] of the ring in which the edge is looked for: about the rough circle, then about the outline.
-_WINDOWS_PX = (4.0, 2.0, 2.0)
-# The outline is found when a step in the narrow ring moved it less than this [px].
-_SETTLED_PX = 0.3
+# Half-widths [px] of the ring in which the edge is looked for: about a circle right to a pixel, and about others.
+_NARROW_PX, _WIDE_PX = 2.0, 4.0
+# The outline is found when a step in the narrow ring moved it less than the first of these [px]; a rough circle that is
+# off by more than the second one is looked at in the wide ring.
+_SETTLED_PX, _ROUGH_PX = 0.4, 1.0
 _RING_STEP_PX = 0.5
 _BACKGROUND_PX = 2.0
 _INNER_COLUMNS = 6
@@ -48,15 +51,15 @@ _LEAST_GATE_PX, _LARGEST_GATE_PX, _GATE_SIGMAS = 0.8, 2.0, 3.5
 _ARC, _LEAST_HALF_ARC, _OFF_PX = 0.1, 3, 0.35
 # The outline in so many arcs, of which any three may tell the circle.
 _ARCS = 10
+# Where no point is farther than this from the circle through all, none has to be left out [px].
+_AGREED_PX = 0.4
 # About so many points are enough to tell which circle most agree on.
 _ENOUGH = 60
 _TRIPLES = np.array(list(combinations(range(_ARCS), 3)))
-# The waves that tell the covariance go up to this one, or up to radius / _WAVE_RADIUS_PX if that is more.
-_LEAST_WAVES, _WAVE_RADIUS_PX = 4, 3.0
-# Lens and interpolation smooth along the outline too, which takes power from the quicker waves (1-sigma) [px].
-_SMOOTHING_PX = 1.0
 # What is left when all noise has averaged out [px].
-_FLOOR_PX = 0.005
+_FLOOR_PX = 0.002
+# What coverage and limb disagree by is claimed as uncertainty, to this part; beyond so many of their sigmas wholly.
+_DISTRUST, _LARGEST_CONTRADICTION = 0.2, 4.0
 # Below this, relative to the cubed trace, the outline points do not determine centre and radius.
 _LEAST_DETERMINANT = 1e-5
 
@@ -69,6 +72,7 @@ class Outline:
         centre_px: centre of the ellipse, shape (2,) [px].
         radius_px: radius of the circle of the same area [px].
         cov_px: covariance of the centre, shape (2, 2) [px²].
+        radius_sigma_px: 1-sigma of the radius [px].
         visible: share of the outline that nothing hides.
         uneven: share of the outline at which the background is too uneven to tell.
         off: share of the fit's weights where the outline leaves the ellipse in whole arcs.
@@ -77,6 +81,7 @@ class Outline:
     centre_px: FloatArray
     radius_px: float
     cov_px: FloatArray
+    radius_sigma_px: float
     visible: float
     uneven: float
     off: float
@@ -112,41 +117,73 @@ def fit_outline(
         radius_px: rough radius [px], right to about a fifth.
         shape: the ellipse's shape (2, 2), see `sphere.Ellipse`.
     """
-    outline = None
-    for window_px in _WINDOWS_PX:
-        half = min(window_px, 0.6 * radius_px)
-        edges = _find_edges(image, gate, centre_px, radius_px, shape, half)
-        outline = None if edges is None else _fit_circle(edges, centre_px, shape)
-        if outline is None:
-            return None
-        moved_px = float(np.linalg.norm(outline.centre_px - centre_px)) + abs(outline.radius_px - radius_px)
+    outline, moved_px = _step(image, gate, centre_px, radius_px, shape, _NARROW_PX)
+    if moved_px > _ROUGH_PX:
+        outline, moved_px = _step(image, gate, centre_px, radius_px, shape, _WIDE_PX)
         if moved_px > max(2.0, 0.5 * radius_px):
             return None
-        centre_px, radius_px = outline.centre_px, outline.radius_px
-        if half <= _WINDOWS_PX[-1] and moved_px < _SETTLED_PX:
+        # The wide ring settles nothing.
+        moved_px = max(moved_px, _SETTLED_PX)
+    for _ in range(2):
+        if outline is None or moved_px < _SETTLED_PX:
             break
-    return outline
+        radius_px = outline.radius_px
+        outline, moved_px = _step(image, gate, outline.centre_px, radius_px, shape, _NARROW_PX)
+        if moved_px > max(2.0, 0.5 * radius_px):
+            return None
+    return None if outline is None else _refined(image, gate, outline, shape)
+
+
+def _step(
+    image: Float32Array, gate: Gate, centre_px: FloatArray, radius_px: float, shape: FloatArray, window_px: float
+) -> tuple[Outline | None, float]:
+    """The outline within a ring of half-width `window_px` about a circle, and how far it is from that circle [px]."""
+    edges = _find_edges(image, gate, centre_px, radius_px, shape, min(window_px, 0.6 * radius_px))
+    outline = None if edges is None else _fit_circle(edges, centre_px, shape)
+    if outline is None:
+        return None, math.inf
+    return outline, float(np.linalg.norm(outline.centre_px - centre_px)) + abs(outline.radius_px - radius_px)
+
+
+def _refined(image: Float32Array, gate: Gate, rough: Outline, shape: FloatArray) -> Outline | None:
+    """`rough` with the centre, radius and covariance that the limb tells; None when that is no ball's limb."""
+    fitted = fit_limb(image, gate, rough.centre_px, rough.radius_px, shape)
+    if fitted is None:
+        return None
+    if fitted.aliased:
+        return rough
+    moved_px = fitted.centre_px - rough.centre_px
+    cov_px = fitted.cov_px + _FLOOR_PX**2 * np.eye(2)
+    contradiction = float(moved_px @ np.linalg.solve(cov_px + rough.cov_px, moved_px))
+    distrust = _DISTRUST if contradiction < _LARGEST_CONTRADICTION**2 else 1.0
+    cov_px += distrust**2 * np.outer(moved_px, moved_px)
+    return replace(
+        rough,
+        centre_px=fitted.centre_px,
+        radius_px=fitted.radius_px,
+        cov_px=cov_px,
+        radius_sigma_px=fitted.radius_sigma_px,
+    )
 
 
 def _find_edges(
     image: Float32Array, gate: Gate, centre_px: FloatArray, radius_px: float, shape: FloatArray, half_px: float
 ) -> _Edges | None:
-    count = int(np.clip(round(2 * np.pi * radius_px), 24, 400))
-    angles: FloatArray = np.linspace(0.0, 2 * np.pi, count, endpoint=False)
+    angles = ray_angles(radius_px)
     cells = max(2, round(2 * half_px / _RING_STEP_PX))
     step = 2 * half_px / cells
     inner = np.linspace(0.3 * radius_px, radius_px - half_px, _INNER_COLUMNS)
     ring = radius_px - half_px + (np.arange(cells) + 0.5) * step
     outer = radius_px + half_px + (np.arange(round(_BACKGROUND_PX / _RING_STEP_PX)) + 0.5) * _RING_STEP_PX
-    samples = _sample(image, centre_px, angles, np.concatenate([inner, ring, outer]).astype(np.float64), shape)
+    samples = sample(image, centre_px, angles, np.concatenate([inner, ring, outer]).astype(np.float64), shape)
     inside, outside = samples[:, : len(inner)], samples[:, len(inner) + cells :]
 
-    colour = _ball_colour(inside, gate)
+    colour = ball_colour(inside, gate)
     if colour is None:
         return None
-    level = np.maximum(_mean_of_three(gate.amount(inside[:, -2:]).mean(axis=1)), 0.0)
-    covered = level < _LEAST_LEVEL * _median(level)
-    background = _mean_of_three(outside.mean(axis=1))
+    level = np.maximum(mean_of_three(gate.amount(inside[:, -2:]).mean(axis=1)), 0.0)
+    covered = level < _LEAST_LEVEL * median(level)
+    background = mean_of_three(outside.mean(axis=1))
     towards, separation = _discriminant(level, colour, background, gate.shading_sigma)
     told = (separation > _LEAST_SEPARATION**2) & ~covered
     scale = 1.0 / np.where(told, separation, 1.0)
@@ -156,26 +193,6 @@ def _find_edges(
     unevenness_px = half_px * np.sqrt(np.mean(share[:, cells:] ** 2, axis=1))
     weight = told / (1.0 + (unevenness_px / _EDGE_SIGMA_PX) ** 2)
     return _Edges(angles, distance, weight, covered, ~told | (unevenness_px > _UNEVEN_PX))
-
-
-def _sample(
-    image: Float32Array, centre_px: FloatArray, angles: FloatArray, radii: FloatArray, shape: FloatArray
-) -> Float32Array:
-    """`image` at every angle (rows) and radius (columns) of the ellipse's own polar coordinates."""
-    directions = np.stack([np.cos(angles), np.sin(angles)], axis=1) @ shape
-    at = (centre_px + directions[:, None, :] * radii[:, None]).astype(np.float32)
-    samples = cv2.remap(image, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return cast(Float32Array, samples)
-
-
-def _ball_colour(inside: Float32Array, gate: Gate) -> FloatArray | None:
-    """The ball's colour (3,) per unit of its amount; the median leaves highlights out."""
-    samples = inside.reshape(-1, 3)
-    amount = gate.amount(samples)
-    coloured = amount > 1.0
-    if np.count_nonzero(coloured) < len(amount) // 2:
-        return None
-    return np.median(samples[coloured] / amount[coloured, None], axis=0).astype(np.float64)
 
 
 def _discriminant(
@@ -200,18 +217,6 @@ def _discriminant(
     return direction, np.einsum("nc,nc->n", direction, apart)
 
 
-def _mean_of_three(values: NDArray[np.floating]) -> FloatArray:
-    """Mean over three neighbours along the closed first axis."""
-    wrapped = np.concatenate([values[-1:], values, values[:1]]).astype(np.float64)
-    return (wrapped[:-2] + wrapped[1:-1] + wrapped[2:]) / 3.0
-
-
-def _median(values: FloatArray) -> float:
-    """The upper median; NumPy's own costs ten times as much for the few values here."""
-    middle = len(values) // 2
-    return float(np.partition(values, middle)[middle])
-
-
 def _fit_circle(edges: _Edges, centre_px: FloatArray, shape: FloatArray) -> Outline | None:
     """Least squares for the centre's shift and the radius; points too far off are left out in turn."""
     design = np.stack([np.cos(edges.angles), np.sin(edges.angles), np.ones_like(edges.angles)], axis=1)
@@ -226,19 +231,25 @@ def _fit_circle(edges: _Edges, centre_px: FloatArray, shape: FloatArray) -> Outl
             return None
         solution = np.linalg.solve(normal, design.T @ (weight * edges.distance_px))
         residual = edges.distance_px - design @ solution
-        spread = 1.4826 * _median(np.abs(residual[told]))
+        spread = 1.4826 * median(np.abs(residual[told]))
         gate = min(max(_GATE_SIGMAS * spread, _LEAST_GATE_PX), _LARGEST_GATE_PX)
         used, weight = weight, np.where(np.abs(residual) < gate, edges.weight, 0.0)
+        if np.array_equal(used, weight):
+            break
     if solution[2] <= 0:
         return None
-    density = _noise_density(edges.angles, np.sqrt(used) * residual, float(solution[2]))
-    hidden = edges.covered | ((weight == 0) & ~edges.uneven)
+    density = waves(np.sqrt(used) * residual, float(solution[2])).once_round()
+    inverse = density * np.linalg.inv(normal)
+    # What hides a ball moves its edge inwards; outwards does what has its colour behind it.
+    apart = (weight == 0) & ~edges.uneven
+    hidden = edges.covered | (apart & (residual < 0))
     return Outline(
         centre_px=centre_px + shape @ solution[:2],
         radius_px=float(solution[2]),
-        cov_px=density * (shape @ np.linalg.inv(normal)[:2, :2] @ shape) + _FLOOR_PX**2 * np.eye(2),
+        cov_px=shape @ inverse[:2, :2] @ shape + _FLOOR_PX**2 * np.eye(2),
+        radius_sigma_px=math.sqrt(inverse[2, 2]),
         visible=1.0 - float(np.mean(hidden)),
-        uneven=float(np.mean(edges.uneven)),
+        uneven=float(np.mean(edges.uneven | (apart & ~hidden))),
         off=_share_off(edges.weight, residual),
     )
 
@@ -269,8 +280,11 @@ def _agreeing(design: FloatArray, edges: _Edges) -> FloatArray:
     told = np.flatnonzero(edges.weight > 0)
     if len(told) < 2 * _ARCS:
         return edges.weight
-    arcs = np.array_split(told, _ARCS)
-    means = np.array([[*design[arc].mean(axis=0), edges.distance_px[arc].mean()] for arc in arcs])[_TRIPLES]
+    points = np.column_stack([design[told], edges.distance_px[told]])
+    if _all_agree(points, edges.weight[told]):
+        return edges.weight
+    begins = np.arange(_ARCS) * len(told) // _ARCS
+    means = (np.add.reduceat(points, begins) / np.diff(begins, append=len(told))[:, None])[_TRIPLES]
     told = told[:: max(1, len(told) // _ENOUGH)]
     circles = np.linalg.solve(means[..., :3] + 1e-9 * np.eye(3), means[..., 3:])[..., 0]
     off = np.abs(edges.distance_px[told] - circles @ design[told].T)
@@ -281,22 +295,11 @@ def _agreeing(design: FloatArray, edges: _Edges) -> FloatArray:
     return np.where(np.abs(edges.distance_px - design @ circles[best]) < gate, edges.weight, 0.0)
 
 
-def _noise_density(angles: FloatArray, residual: FloatArray, radius_px: float) -> float:
-    """Variance [px²] of one outline point in the slow waves round the outline, of which the centre's error is one.
-
-    Neighbouring outline points share pixels and background, so their variance alone would claim too little. A
-    shift of the centre is the wave that goes once round. It was fitted away, and the next ones tell its size, the
-    nearer the better. Pixel noise gives all waves the same power; what is behind the ball disturbs whole arcs and
-    makes the slow ones larger. So their excess over the quick ones counts once more.
-    """
-    last_slow = max(_LEAST_WAVES, round(radius_px / _WAVE_RADIUS_PX))
-    last_quick = max(last_slow + 1, min(2 * last_slow, round(radius_px)))
-    harmonics = np.arange(2, last_quick + 1)
-    waves = np.exp(-1j * harmonics[:, None] * angles) @ residual
-    power = np.abs(waves) ** 2 * np.exp((harmonics * _SMOOTHING_PX / radius_px) ** 2) / np.count_nonzero(residual)
-    is_slow = harmonics <= last_slow
-    share = harmonics[is_slow] ** -2.0 / np.sum(harmonics[is_slow] ** -2.0)
-    slow, quick = float(share @ power[is_slow]), float(np.mean(power[~is_slow]))
-    # Student's t with two degrees of freedom per wave: 1-sigma of a spread that is itself estimated.
-    student = 1.0 + 0.25 * float(share @ share)
-    return student**2 * (slow + max(0.0, slow - quick))
+def _all_agree(points: FloatArray, weight: FloatArray) -> bool:
+    """Whether one circle fits all points: rows of a design matrix and what it has to give, shape (n, 4) [px]."""
+    weighted = points[:, :3] * weight[:, None]
+    normal = weighted.T @ points
+    if np.linalg.det(normal[:, :3]) < _LEAST_DETERMINANT * np.trace(normal[:, :3]) ** 3:
+        return False
+    residual = points[:, 3] - points[:, :3] @ np.linalg.solve(normal[:, :3], normal[:, 3])
+    return bool(np.abs(residual).max() < _AGREED_PX)

@@ -109,9 +109,23 @@ class StereoTracker:
             return right
         found = self._matcher.match(left, right)
         # The marker may be the one of two that could not be measured in both eyes.
-        if isinstance(found, Location) and self._matcher.has_rival(found, left + left_rough, right + right_rough):
+        if isinstance(found, Location) and self._has_rival(frame, found, left + left_rough, right + right_rough):
             return Reason.AMBIGUOUS
         return found
+
+    def _has_rival(self, frame: StereoFrame, found: Location, left: list[Disc], right: list[Disc]) -> bool:
+        """Whether something else in view, measured or not, may be the marker."""
+        if self._matcher.has_rival(found, left, right):
+            return True
+        eyes = ((left, right, frame.right, found.centres_px[:2]), (right, left, frame.left, found.centres_px[2:]))
+        for discs, others, image, centre_px in eyes:
+            rest = [disc for disc in discs if np.linalg.norm(disc.centre_px - centre_px) > disc.radius_px]
+            if not rest:
+                continue
+            mask = self._gate.mask(image)
+            if any(self._matcher.shows_too(disc, others, mask, found, in_left=discs is left) for disc in rest):
+                return True
+        return False
 
     def _discs(self, image: ImageArray, region: Region) -> tuple[list[Disc] | Reason, list[Disc]]:
         """The discs in one eye; when there is none, why the most disc-like patch is none. And what is round, but could

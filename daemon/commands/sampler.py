@@ -20,8 +20,8 @@ def sampler(
 ) -> None:
     """Turn encoder readings and camera frames into pairs, keep and publish them. Ends with SIGTERM or Ctrl-C.
 
-    The store takes each pair before it is published; when it cannot (the disk is full), the sampler ends with exit
-    code 1 and nothing is lost.
+    The store takes each pair before it is published. While it cannot (the disk is full), the status says so and no
+    pairs are taken.
 
     Needs: robot.toml (`bodyschema config init`) with joints and cameras or a recording; or --sim.
 

@@ -21,7 +21,7 @@ from .memory import PairMemory, Permutations
 from .orientation import OrientationModel, Orientations
 from .orientation_solver import OrientationSolution
 from .solver import Solved, Task
-from .state import LearningHeader
+from .state import NET, LearningHeader
 from .watch import LOOKED_BACK as KNOWN_PAIRS
 from .watch import Reference, Watch
 
@@ -37,8 +37,6 @@ JUDGED_ANEW = 0.25
 LOOKED_BACK_IN_REPLAY = 4
 # Of so many pairs, the chain is believed before it has predicted any. Of fewer, one that is wrong would not show.
 FEWEST_TO_BELIEVE = 3
-# Names of stored nets begin with this.
-NET = "net_"
 
 
 class Era:

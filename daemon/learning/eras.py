@@ -18,13 +18,13 @@ from .arm import KnownArm
 from .change import NAMED_WITHIN, ChangeRecord, KindOfChange
 from .claims import Claims
 from .curve import Curve
-from .era import NET, Era
+from .era import Era
 from .fitting import Fit, Fitting
 from .gate import DOUBT, explained, sound
 from .members import PRIOR
 from .memory import PairMemory
 from .nominal import PAIRS_TO_REFIT, NominalModel, chain_tolerances
-from .state import Counters, LearningHeader, LearningState, StateError
+from .state import NET, Counters, LearningHeader, LearningState, StateError
 from .watch import LOOK_AGAIN, Noticed
 
 # RMS distance between a nominal model and reality that surprises nobody [m].
@@ -75,7 +75,7 @@ class Eras:
         """As they were when `state` was taken.
 
         Raises:
-            StateError: it belongs to another nominal model, or to other tolerances.
+            StateError: it belongs to another nominal model, or to other tolerances, or is not finite.
         """
         header, arrays = state.header, state.arrays
         eras = cls(nominal, settings, task_numbers)
@@ -83,6 +83,8 @@ class Eras:
             raise StateError(
                 "it belongs to another nominal model or to other tolerances: robot.toml or the URDF has changed since"
             )
+        if (poisoned := state.poisoned()) is not None:
+            raise StateError(f"it is of no use: {poisoned} is not finite")
         eras.fitting.restore(header.next_fit, header.first_fit, arrays)
         eras.claims.restore(header.claims, arrays)
         eras.change = header.change

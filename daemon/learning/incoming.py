@@ -11,6 +11,10 @@ from .state import Counters
 
 # A measurement farther away than this is not one in metres [m].
 FARTHEST_M = 1000.0
+# Nobody turns a joint so often: such a number is not an angle [rad or m].
+LARGEST_Q = 1e6
+# Of a covariance's largest eigenvalue: so far below zero the smallest may be rounded.
+ROUNDING = 1e-6
 
 
 def check_pair(pair: Pair, counters: Counters, joints: int) -> None:
@@ -27,3 +31,10 @@ def check_pair(pair: Pair, counters: Counters, joints: int) -> None:
         raise RequestError(f"pair {pair.seq} has a number that is not finite")
     if np.abs(pair.x).max() > FARTHEST_M:
         raise RequestError(f"pair {pair.seq} lies {np.abs(pair.x).max():.0f} m away; positions are in metres")
+    if np.abs(pair.q).max() > LARGEST_Q:
+        raise RequestError(f"pair {pair.seq} has the joint angle {np.abs(pair.q).max():.3g}; angles are in radians")
+    if np.abs(pair.cov).max() > FARTHEST_M**2:
+        raise RequestError(f"pair {pair.seq} says that it may be {np.sqrt(np.abs(pair.cov).max()):.3g} m wrong")
+    spread = np.linalg.eigvalsh(pair.cov)
+    if spread[0] < -ROUNDING * max(spread[-1], 0.0):
+        raise RequestError(f"pair {pair.seq} has a cov that is no covariance: a variance of {spread[0]:.3g} m²")

@@ -92,9 +92,16 @@ class Snapshot:
         return self.map if turned is None or self.map.size > LARGEST_NET else turned.planes(self.map)
 
     def predict(self, q: FloatArray) -> Prediction:
-        """Predictions for joint angles q (n, d) [rad]; NoFrameError while there is no model."""
+        """Predictions for joint angles q (n, d) [rad].
+
+        Raises:
+            NoFrameError: there is no model.
+            RequestError: an answer would not be a number.
+        """
         x = self.require_model().predict(q)
         sigma, in_support = np.sqrt(self.claim.variance(q)), unexplained(self.support, q) < IN_SUPPORT
+        if not (np.isfinite(x).all() and np.isfinite(sigma).all()):
+            raise RequestError("the model has no finite answer at these joint angles; angles are in radians")
         if self.orientation is None:
             return Prediction(x, sigma, in_support)
         rotations, variance = self.orientation.predict(q)

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import msgspec
+import numpy as np
 
 from daemon.status import CurvePoint
 from interfaces.errors import BodyschemaError
@@ -18,6 +19,8 @@ from .orientation import OrientationState
 
 # Names of the arrays of the state before a change begin with this.
 BEFORE = "before/"
+# Names of stored nets begin with this.
+NET = "net_"
 
 
 class StateError(BodyschemaError):
@@ -111,3 +114,8 @@ class LearningState:
             return self
         header = msgspec.structs.replace(self.header, before=before.header)
         return LearningState(header, {**self.arrays, **{BEFORE + name: each for name, each in before.arrays.items()}})
+
+    def poisoned(self) -> str | None:
+        """The name of a net, or of what the pairs were, that is not finite; None when all is well."""
+        nets = (name for name in self.arrays if name.startswith(NET))
+        return next((name for name in (*nets, "q", "x") if not np.isfinite(self.arrays[name]).all()), None)

@@ -23,6 +23,8 @@ LOOKED_BACK = 500
 LOOK_AGAIN = 1.25
 # So many of the newest errors of pairs that a model did not know show how far these lie from it.
 SHOWN = 3000
+# No measurement is more exact, whatever it says [m].
+SMALLEST_M = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +60,7 @@ class Reference:
 
     def errors(self, q: FloatArray, x: FloatArray, variance: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Errors of pairs q (n, d), x (n, 3) and their variance but for the chain's numbers, (n, 3) [m, m²]."""
-        return x - self.model.predict(q), variance + self.claim.beyond_chain(q)
+        return x - self.model.predict(q), np.maximum(variance + self.claim.beyond_chain(q), SMALLEST_M**2)
 
     def noise(self) -> SharedNoise:
         """Of its whitened errors, as the pairs show it that it knows."""

@@ -44,7 +44,7 @@ class Series:
 
 
 class Course:
-    """Tool changes and the models that answered, from one state of the learner to the next."""
+    """Changes and the models that answered, from one state of the learner to the next."""
 
     def __init__(self) -> None:
         self._changes: list[Change] = []
@@ -67,10 +67,13 @@ class Course:
 
     def _note_change(self, status: LearnerStatus, now: float) -> bool:
         at = status.pairs - status.pairs_since_change
-        if at <= 0 or (self._changes and self._changes[-1].pairs >= at):
+        kind = None if status.last_change is None else status.last_change.kind
+        if at > 0 and self._changes and self._changes[-1].pairs >= at:
+            self._changes[-1] = Change(self._changes[-1].pairs, self._changes[-1].t, kind)
             return False
-        found = None if status.last_change is None else status.last_change.found
-        self._changes = [*self._changes, Change(at, now, found)][-LARGEST_COURSE:]
+        if at <= 0:
+            return False
+        self._changes = [*self._changes, Change(at, now, kind)][-LARGEST_COURSE:]
         return True
 
     def _note_version(self, status: LearnerStatus, now: float, *, changed: bool) -> None:

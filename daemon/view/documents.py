@@ -55,11 +55,17 @@ class SeriesDocument(msgspec.Struct, frozen=True):
 
 
 class Change(msgspec.Struct, frozen=True):
-    """A change of the tool, after so many learnt pairs; `t` is when the view heard of it, UTC [s since 1970]."""
+    """A change of the tool, the camera or a joint's zero.
+
+    Attributes:
+        pairs: learnt before it.
+        t: when the view heard of it, UTC [s since 1970].
+        kind: as in the learner's status; null where it does not tell.
+    """
 
     pairs: int
     t: float
-    found: bool | None
+    kind: str | None
 
 
 class Version(msgspec.Struct, frozen=True):

@@ -102,7 +102,8 @@ class ChangeDetector:
         self._sizes = noise_m * np.array(SIZES)
         self._limit = math.log(pairs_between_false_alarms)
         known = self._root.shape[1]
-        self._posterior, self._mean = np.eye(known), np.zeros(known)
+        # A root of the covariance: a difference of covariances would be none after thousands of pairs.
+        self._posterior_root, self._mean = np.eye(known), np.zeros(known)
         self._onsets = Onsets(known, len(self._columns))
         self._differences: list[float] = []
         self._surprises: list[FloatArray] = []
@@ -147,8 +148,8 @@ class ChangeDetector:
 
     def _add(self, known: FloatArray, changed: FloatArray, error: FloatArray) -> None:
         """One pair's whitened derivatives by what is believed (3, k) and by changes (3, c), and its error (3,)."""
-        expected, gain = known @ self._mean, self._posterior @ known.T
-        covariance = known @ gain
+        expected, seen = known @ self._mean, known @ self._posterior_root
+        covariance = seen @ seen.T
         spread = math.sqrt(self._noise.single + float(np.trace(covariance)) / 3.0)
         off = error - expected
         off = off * min(1.0, CLIPPED_SIGMAS * spread / max(float(np.linalg.norm(off)), 1e-300))
@@ -159,9 +160,11 @@ class ChangeDetector:
         error = expected + off
         self._strange = float(np.linalg.norm(off)) > STRANGE_SIGMAS * spread
         self._onsets.add(known.T @ changed, changed.T @ changed, changed.T @ error)
-        step = np.linalg.solve(covariance + self._noise.whole * np.eye(3), gain.T)
-        self._mean = self._mean + off @ step
-        self._posterior = self._posterior - gain @ step
+        step = np.linalg.solve(covariance + self._noise.whole * np.eye(3), seen)
+        self._mean = self._mean + self._posterior_root @ (off @ step)
+        _, lengths, directions = np.linalg.svd(seen, full_matrices=False)
+        lost = 1.0 - np.sqrt(self._noise.whole / (np.square(lengths) + self._noise.whole))
+        self._posterior_root = self._posterior_root - (self._posterior_root @ directions.T * lost) @ directions
 
     @property
     def due(self) -> bool:
@@ -178,7 +181,8 @@ class ChangeDetector:
         onsets, crossed, information, score = self._onsets.since()
         noise = self._grown_noise()
         variances = noise.of_runs((self.pairs - onsets).astype(np.float64))
-        explained = crossed.transpose(0, 2, 1) @ (self._posterior @ crossed) / noise.whole
+        rooted = self._posterior_root.T @ crossed
+        explained = rooted.transpose(0, 2, 1) @ rooted / noise.whole
         information = (information - explained) / variances[:, None, None]
         return onsets, information, (score - np.matvec(crossed.transpose(0, 2, 1), self._mean)) / variances[:, None]
 

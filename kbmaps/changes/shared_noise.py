@@ -21,6 +21,8 @@ _CLEARLY = 2.0
 _TAIL_SIGMAS = 4.5
 # Longer runs than that are as such.
 _LONGEST_RUN = 1000
+# Residuals that are 0 tell of no variance; no model is so much better than its claim.
+_LEAST = 1e-12
 # A fit takes at most this share of what neighbours share.
 _MOST_TAKEN = 0.8
 
@@ -69,7 +71,7 @@ class SharedNoise:
             used: how many numbers were fitted to the residuals.
         """
         n = len(residuals)
-        square = float(np.square(residuals).mean()) * 3 * n / max(3 * n - used, n)
+        square = max(float(np.square(residuals).mean()), _LEAST) * 3 * n / max(3 * n - used, n)
         kept = _autocovariances(residuals, _CLEARLY * square * math.sqrt(2.0 / (3.0 * n)))
         lengths = np.arange(1, len(kept) + 2)
         shares = np.maximum(1.0 - np.arange(1, len(kept) + 1) / lengths[:, None], 0.0)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from guided_arm import Scene, new_learning, teach
 
-from daemon.checkpoint import CheckpointError, read_checkpoint, set_aside, write_checkpoint
+from daemon.checkpoint import CheckpointError, generations, read_checkpoint, set_aside, write_checkpoint
 from daemon.learning import LearningState
 
 UTC = "2026-11-21T12:00:00.000+00:00"
@@ -59,10 +59,37 @@ def test_before_the_first_checkpoint_there_is_none(file) -> None:
     assert read_checkpoint(file, robot="arm") is None
 
 
-def test_a_new_checkpoint_takes_the_place_of_the_old_one_and_leaves_no_other_file(written, new) -> None:
+def test_a_new_checkpoint_takes_the_place_of_the_old_one_which_stays_as_the_previous(written, old, new) -> None:
     write(written, new)
-    assert same(new, read_checkpoint(written, robot="arm"))
-    assert list(written.parent.iterdir()) == [written]
+    present, previous = generations(written)
+    assert same(new, read_checkpoint(present, robot="arm"))
+    assert same(old, read_checkpoint(previous, robot="arm"))
+    assert set(written.parent.iterdir()) == {present, previous}
+
+
+def test_of_many_checkpoints_two_are_kept(written, old, new) -> None:
+    for state in (new, old, new, old):
+        write(written, state)
+    assert set(written.parent.iterdir()) == set(generations(written))
+    assert same(new, read_checkpoint(generations(written)[1], robot="arm"))
+
+
+def test_a_file_system_without_hard_links_keeps_the_previous_too(written, old, new, monkeypatch) -> None:
+    def refuse(*_: object) -> None:
+        raise PermissionError(1, "Operation not permitted")
+
+    monkeypatch.setattr("os.link", refuse)
+    write(written, new)
+    kept = [read_checkpoint(file, robot="arm") for file in generations(written)]
+    assert all(map(same, (new, old), kept))
+
+
+@pytest.mark.parametrize("name", ["net_nlms", "q", "x"])
+def test_a_state_with_a_number_that_is_not_finite_is_not_written(written, old, new, name) -> None:
+    poisoned = {**new.arrays, name: np.full_like(new.arrays[name], np.nan)}
+    with pytest.raises(CheckpointError, match=f"was not written: {name} of the state is not finite"):
+        write(written, LearningState(new.header, poisoned))
+    assert same(old, read_checkpoint(written, robot="arm"))
 
 
 def test_a_full_disk_is_named_and_leaves_the_old_checkpoint(written, old, new) -> None:
@@ -70,7 +97,7 @@ def test_a_full_disk_is_named_and_leaves_the_old_checkpoint(written, old, new) -
     with pytest.raises(CheckpointError, match=f"{written} could not be written: the disk is full. Free some space"):
         write(written, new)
     assert same(old, read_checkpoint(written, robot="arm"))
-    assert list(written.parent.iterdir()) == [written]
+    assert not written.with_name("learner.ckpt.tmp").exists()
 
 
 def test_a_read_only_disk_is_named(mount_small_disk, old) -> None:

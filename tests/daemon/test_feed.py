@@ -8,9 +8,10 @@ import pytest
 from guided_arm import STORE, Scene, make_pair, new_learning
 
 from daemon.feed import RETRY_S, WAITING, PairFeed
+from daemon.history import Page, read_page
 from daemon.learning import Learning
 from daemon.wire import PairMessage, PairsReply, encode, pair_to_wire
-from interfaces.errors import BusError
+from interfaces.errors import BusError, RequestError
 from interfaces.records import Pair
 
 PAGE = 7
@@ -40,14 +41,17 @@ class Store:
     def __init__(self, pairs: list[Pair]) -> None:
         self.pairs, self.store, self.asked, self.answers = pairs, STORE, 0, True
         self.gone = self.goes = 0  # of the oldest pairs: so many are not kept, and with each answer so many more
+        self.refusal: str | None = None
 
-    def __call__(self, begin: int) -> PairsReply:
+    def __call__(self, begin: int) -> Page:
         self.asked += 1
         if not self.answers:
             raise BusError("nobody answers")
+        if self.refusal is not None:
+            raise RequestError(self.refusal)
         page = [pair_to_wire(pair) for pair in self.pairs if pair.seq >= max(begin, self.gone + 1)][:PAGE]
         self.gone = min(self.gone + self.goes, len(self.pairs) - 1)
-        return PairsReply(self.store, len(self.pairs), page)
+        return read_page(encode(PairsReply(self.store, len(self.pairs), page)))
 
 
 def payload(pair: Pair) -> bytes:
@@ -247,3 +251,24 @@ def test_an_older_copy_of_the_store_is_told() -> None:
     fed.settle()
     assert fed.learnt == (10, 10)
     assert "ends at pair 4, but 10 were learnt: it is an older copy" in fed.feed.problem
+
+
+@pytest.mark.parametrize("spoilt", [[7], [1], [6, 7, 8], [1, 20]])
+def test_stored_pairs_that_are_none_are_refused_and_those_after_them_learnt(spoilt) -> None:
+    fed = Fed(stored=20)
+    for seq in spoilt:
+        fed.history.pairs[seq - 1] = replace(PAIRS[seq - 1], x=np.array([np.nan, 0.0, 1.0]))
+    fed.settle()
+    assert fed.learnt == (20 - len(spoilt), 20 if 20 not in spoilt else 19)
+    assert fed.learning.counters.refused == len(spoilt)
+    assert f"pair {spoilt[-1]} is not a PairMessage" in fed.feed.refused
+
+
+def test_a_history_that_is_refused_is_told_until_it_is_given() -> None:
+    fed = Fed(stored=10)
+    fed.history.refusal = "the store is damaged"
+    fed.feed.step(0.0)
+    assert fed.feed.problem == "the sampler does not give the pairs from 1 on: the store is damaged"
+    fed.history.refusal = None
+    fed.settle()
+    assert (fed.learnt, fed.feed.problem) == ((10, 10), None)

@@ -26,8 +26,8 @@ from daemon import checkpoint, wire
 from daemon.bus import Request
 from daemon.checkpoint import CheckpointError
 from daemon.config import Config
+from daemon.going_on import DOES_NOT_FIT
 from daemon.history import answer_pairs
-from daemon.learner import DOES_NOT_FIT
 from daemon.learning import StateError
 from daemon.router import RouterConfig
 from daemon.status import LearnerStatus, SamplerStatus
@@ -57,7 +57,9 @@ KINDS = (
     wire.PairMessage, wire.PairsReply, wire.JointsRequest, wire.IkRequest, wire.CommandRequest, wire.CommandReply,
     wire.PredictReply, wire.JacobianReply, wire.IkReply, wire.ErrorReply, SamplerStatus, LearnerStatus,
 )  # fmt: skip
-leaves = st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5)
+# MessagePack has no larger integers; JSON's are among the nasty texts.
+integers = st.integers(-(2**63), 2**64 - 1)
+leaves = st.none() | st.booleans() | integers | st.floats() | st.text(max_size=5)
 anything = st.recursive(
     leaves, lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=3), inner, max_size=3)
 )

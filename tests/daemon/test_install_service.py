@@ -15,8 +15,10 @@ from small_arm import write_small_arm
 from daemon import service_files
 from daemon.cli import command_line
 from daemon.config import Config
+from daemon.identity import TlsConfig
 from daemon.service_files import ServiceFiles, user_for
 from daemon.units import FOLDER, PROCESSES, Installed, devices_of, hidden, of_robot, template
+from daemon.zenoh_config import ZenohConfig
 from interfaces.errors import ConfigError
 
 ROOT = Path(__file__).parents[2]
@@ -136,6 +138,14 @@ def test_a_port_that_is_no_device_needs_no_rule(tmp_path) -> None:
 def test_nobody_outside_this_machine_is_reached_while_all_endpoints_are_on_it(config) -> None:
     assert values(template("sampler", HERE), "IPAddressDeny") == ["any"]
     assert values(of_robot("sampler", config, "daemon", HERE), "IPAddressAllow") == []
+
+
+def test_certificates_are_seen_and_the_router_on_another_machine_is_reached(config) -> None:
+    zenoh = ZenohConfig(router="tls/192.0.2.1:7447", tls=TlsConfig(ca="/home/pi/keys/ca.pem"))
+    tables = config.tables.__class__(**{**_fields(config.tables), "zenoh": zenoh})
+    own = of_robot("learner", config.with_tables(tables), "daemon", HERE)
+    assert "/home/pi/keys" in values(own, "BindReadOnlyPaths")
+    assert values(own, "IPAddressAllow") == ["any"]
 
 
 def test_what_a_home_holds_is_seen_as_far_as_it_is_needed() -> None:

@@ -219,23 +219,41 @@ def test_all_sources_are_closed_in_the_end(config) -> None:
 # --- a store that fails
 
 
-def test_a_pair_that_cannot_be_stored_is_not_published_and_ends_the_sampler(config, mount_small_disk) -> None:
+def test_pairs_that_a_full_disk_does_not_take_are_not_published_and_told(config, mount_small_disk) -> None:
     file = mount_small_disk("size=256k") / "pairs.sqlite"
     walk, published = Walk(config.robot, 3000, step_deg=1.0005), []
     with (
         PairStore(file, session_of(config, SystemClock())) as store,
         Bus(listen=config.tables.zenoh.sampler) as bus,
     ):
-        sampler = Sampler(config, walk.sources(), bus, store)
+        sampler = Sampler(config, walk.sources(), bus, store, exit_at_end=True)
         sampler._publish = published.append
-        with pytest.raises(StoreError, match="is full"):
-            sampler.run()
+        sampler.run()
         assert len(published) == store.last().seq
         status = sampler.status()
-    assert (status.state, status.health[0]) == (
-        "failed",
-        f"the disk of {file} is full. Free some space, or give a --state-dir on another disk. Nothing was changed",
+    lost = status.rejected["not_stored"]
+    assert lost == 3000 - len(published)
+    assert status.health[0] == (
+        f"the disk of {file} is full. Free some space, or give a --state-dir on another disk. Nothing was changed. "
+        f"No pairs are taken until the disk does ({lost} frames so far)"
     )
+
+
+def test_a_store_that_is_damaged_ends_the_sampler(config, monkeypatch) -> None:
+    def append(*_: object) -> None:
+        raise StoreError("the store is damaged")
+
+    monkeypatch.setattr(PairStore, "append", append)
+    with sampling(config, Walk(config.robot, 5).sources()) as sampler, pytest.raises(StoreError, match="is damaged"):
+        sampler.run()
+
+
+def test_a_position_that_is_no_number_makes_no_pair(config) -> None:
+    walk = Walk(config.robot, 10)
+    fixes = list(walk.fixes)
+    fixes[4] = replace(fixes[4], x=frozen_array([np.nan, 0.0, 1.0]))
+    pairs, status = sample(config, walk.sources(fixes=fixes))
+    assert (len(pairs), status.rejected) == (9, {"not_finite": 1})
 
 
 # --- what others see

@@ -8,7 +8,7 @@ import msgspec
 import numpy as np
 from test_status import LEARNER
 
-from daemon.status import LearnerStatus, ToolChange
+from daemon.status import Change, LearnerStatus
 from daemon.view.course import LARGEST_SERIES, Course, Series
 from daemon.view.recent import KEPT, LARGEST_CLOUD, RecentPairs, cloud
 from daemon.wire import PredictReply
@@ -19,6 +19,13 @@ from interfaces.records import Pair, frozen_array
 def learner(pairs: int, **changed: Any) -> LearnerStatus:
     told = {"pairs": pairs, "last_seq": pairs, "pairs_since_change": pairs, "last_change": None} | changed
     return msgspec.structs.replace(LEARNER, **told)
+
+
+def change(kind: str) -> Change:
+    return Change(
+        first_seq=101, earliest_seq=100, latest_seq=102, noticed_seq=105, found=True, kind=kind, probabilities={},
+        alike=None, moved_m=None, can_roll_back=True,
+    )  # fmt: skip
 
 
 def pair(seq: int, segment: int = 1) -> Pair:
@@ -44,14 +51,14 @@ def test_a_series_of_months_stays_small_and_covers_all_of_it() -> None:
     assert np.ptp(np.diff(t)) == 0
 
 
-def test_a_tool_change_is_marked_once_where_it_was() -> None:
+def test_a_change_is_marked_once_where_it_was_and_named_when_it_is_known() -> None:
     course = Course()
     for pairs in (90, 100):
         course.note(learner(pairs), 1.0)
     for pairs in (101, 110, 200):
-        told = {"pairs_since_change": pairs - 100, "last_change": ToolChange(101, True)}
-        course.note(learner(pairs, **told), 2.0)
-    assert [(change.pairs, change.found) for change in course.document.changes] == [(100, True)]
+        last = change("undecided" if pairs < 200 else "camera")
+        course.note(learner(pairs, pairs_since_change=pairs - 100, last_change=last), 2.0)
+    assert [(mark.pairs, mark.kind) for mark in course.document.changes] == [(100, "camera")]
 
 
 def test_a_span_of_one_model_is_one_line_with_its_newest_version() -> None:

@@ -196,3 +196,19 @@ def test_pairs_that_come_together_say_what_they_say_one_by_one() -> None:
     for k in range(50):
         arm.feed(one, slice(k, k + 1))
     assert one.suspicion().log_odds == pytest.approx(all_.suspicion().log_odds)
+
+
+@pytest.mark.parametrize("sigma_m", [1e-3, 1e-6, 1e-9])
+def test_however_exact_thousands_of_pairs_are_what_is_not_known_never_becomes_less_than_nothing(sigma_m) -> None:
+    arm = Arm(0, pairs=3000)
+    arm.x = arm.parameters.positions(arm.truth, arm.q)
+    detector = ChangeDetector(arm.belief, SharedNoise(np.ones(1), 1.0), sigma_m, 0.5)
+    detector.add(arm.q, arm.x - arm.belief.predict(arm.q), np.full(arm.x.shape, sigma_m**2))
+    assert np.isfinite(detector.surprises).all()
+    assert np.isfinite(detector.suspicion().log_odds)
+
+
+def test_residuals_that_are_nothing_have_a_variance_all_the_same() -> None:
+    noise = SharedNoise.of(np.zeros((200, 3)))
+    assert noise.single > 0.0
+    assert np.isfinite(noise.variances).all()

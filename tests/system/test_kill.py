@@ -2,68 +2,27 @@ from __future__ import annotations
 
 import contextlib
 import subprocess
-import sys
 import threading
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 import pytest
 from killed_at import LEARNER_POINTS, NOWHERE, SAMPLER_POINTS
-from small_arm import URDF
+from two_processes import KEYS, LIFE_LIMIT_S, learner_with, pause, running, write_robot
 
-from daemon.bus import Bus, client
+from daemon.bus import Bus
 from daemon.config import Config
-from daemon.keys import Keys
-from daemon.status import LearnerStatus, SamplerStatus
+from daemon.status import LearnerStatus
 from daemon.store import PairReader
-from daemon.wire import CommandRequest, PairMessage, decode, encode, pair_to_wire
-from interfaces.errors import BodyschemaError
-from interfaces.recording import Recording
+from daemon.wire import PairMessage, decode, encode, pair_to_wire
 
 # The limits only end a test that would never end; on a busy machine everything here takes longer, and passes.
 pytestmark = pytest.mark.timeout(600)
-LIFE_LIMIT_S = 100.0
-KEYS = Keys("arm")
-S = TypeVar("S", SamplerStatus, LearnerStatus)
-PAIRS_PER_S = 60.0
-CHECKPOINT_EVERY_S = 0.2
+# The last sampler goes on while learners are still killed: thousands of pairs are left to learn.
+CATCH_UP_LIMIT_S = 900.0
 LATEST_PAIR, LATEST_CHECKPOINT, LATEST_S = 40, 3, 1.0
-ROBOT = """[robot]
-name = "arm"
-urdf = "arm.urdf"
-joints = ["waist", "shoulder"]
-marker_link = "hand"
-marker_xyz = [0.2, 0.0, 0.0]
-[camera]
-parent_link = "base"
-[zenoh]
-sampler = "{sampler}"
-learner = "{learner}"
-[drivers]
-recording = "walk.csv"
-[daemon]
-state_dir = "state"
-any_step = true
-[learner]
-checkpoint_every_s = {checkpoint_every_s}
-"""
-
-
-def write_robot(folder: Path, endpoint: Callable[[], str], rows: int = 60_000) -> Config:
-    """A robot whose encoders and camera are the recording of a walk."""
-    (folder / "arm.urdf").write_text(URDF)
-    robot_file = folder / "robot.toml"
-    robot_file.write_text(ROBOT.format(sampler=endpoint(), learner=endpoint(), checkpoint_every_s=CHECKPOINT_EVERY_S))
-    config = Config.load(robot_file, {})
-    t = np.arange(rows) / PAIRS_PER_S
-    q = np.stack([1.5 * np.sin(0.3 * t), 1.2 * np.sin(0.17 * t + 1.0)], axis=1)
-    x = config.robot.chain.with_tool([0.03, 0.01, -0.02]).positions(q)
-    Recording(config.robot.joints, q, x, t).write_csv(folder / "walk.csv")
-    return config
 
 
 @dataclass(frozen=True)
@@ -91,19 +50,9 @@ def plan(rng: np.random.Generator, points: list[str], kills: int, latest: int) -
     ]
 
 
-@contextlib.contextmanager
-def running(config: Config, process: str, kill: Kill | None = None) -> Iterator[subprocess.Popen[bytes]]:
-    """A process of ours, doomed when there is a `kill`; it is gone after the with statement."""
-    wrapper, journal = Path(__file__).with_name("killed_at.py"), config.file.with_name("journal")
-    fate = (kill.point, str(kill.nth)) if kill else (NOWHERE, "0")
-    command = [sys.executable, wrapper, *fate, journal, process, "--robot", config.file]
-    with (config.file.parent / f"{process}.log").open("ab") as log:
-        child = subprocess.Popen(command, stdin=subprocess.DEVNULL, stderr=log)
-    try:
-        yield child
-    finally:
-        child.kill()
-        child.wait()
+def doomed(config: Config, process: str, kill: Kill) -> contextlib.AbstractContextManager[subprocess.Popen[bytes]]:
+    """A process of ours that has a `kill` before it."""
+    return running(config, process, fate=(kill.point, str(kill.nth)))
 
 
 class Lives:
@@ -132,7 +81,7 @@ class Lives:
             witness.watch(KEYS.alive(self._process), lambda alive: self._born.set() if alive else None)
             for kill in self._kills:
                 self._born.clear()
-                with running(self._config, self._process, kill) as child:
+                with doomed(self._config, self._process, kill) as child:
                     self.deaths.append(self._death(child, kill))
                 if self.deaths[-1] != kill.point or self._enough.is_set():
                     break
@@ -157,33 +106,6 @@ class Lives:
             return f"ended with exit code {child.wait(kill.after_s)}"
         except subprocess.TimeoutExpired:
             return NOWHERE
-
-
-def answer(config: Config, process: str, key: str, payload: bytes = b"") -> bytes:
-    """What the process answers, as soon as it does."""
-    deadline = time.monotonic() + LIFE_LIMIT_S
-    while True:
-        try:
-            with client(getattr(config.tables.zenoh, process)) as bus:
-                return bus.ask_one(key, payload)
-        except BodyschemaError:
-            assert time.monotonic() < deadline
-            time.sleep(0.05)
-
-
-def status_when(config: Config, process: str, kind: type[S], true: Callable[[S], bool]) -> S:
-    """The process's status, as soon as `true` holds for it."""
-    deadline = time.monotonic() + LIFE_LIMIT_S
-    while not true(status := decode(answer(config, process, KEYS.status(process)), kind)):
-        assert time.monotonic() < deadline, status
-        time.sleep(0.05)
-    return status
-
-
-def pause(config: Config) -> int:
-    """Let the sampler accept no more pairs; how many there are."""
-    answer(config, "sampler", KEYS.command("sampler"), encode(CommandRequest("pause")))
-    return status_when(config, "sampler", SamplerStatus, lambda status: "paused" in status.rejected).pairs
 
 
 @dataclass(frozen=True)
@@ -221,7 +143,7 @@ def kill_again_and_again(config: Config, kills: int, seed: int) -> Aftermath:
         samplers.wait()
         learners.wait()
         pairs = pause(config)
-        status = status_when(config, "learner", LearnerStatus, lambda status: status.last_seq >= pairs)
+        status = learner_with(config, pairs, CATCH_UP_LIMIT_S)
     with PairReader(config.store_file) as store:
         stored = [decode(encode(pair_to_wire(pair)), PairMessage) for pair in store.read()]
     return Aftermath(
@@ -237,7 +159,7 @@ def kill_again_and_again(config: Config, kills: int, seed: int) -> Aftermath:
 
 @pytest.fixture(scope="module")
 def aftermath(tmp_path_factory: pytest.TempPathFactory, free_endpoint: Callable[[], str]) -> Aftermath:
-    return kill_again_and_again(write_robot(tmp_path_factory.mktemp("kill"), free_endpoint), kills=20, seed=0)
+    return kill_again_and_again(write_robot(tmp_path_factory.mktemp("kill"), free_endpoint), kills=12, seed=0)
 
 
 def numbers(pairs: list[PairMessage]) -> list[int]:
@@ -245,7 +167,7 @@ def numbers(pairs: list[PairMessage]) -> list[int]:
 
 
 def test_every_kill_comes_where_it_was_planned(aftermath: Aftermath) -> None:
-    assert len(aftermath.deaths) == 20
+    assert len(aftermath.deaths) == 12
     assert aftermath.deaths == aftermath.planned
     assert set(aftermath.deaths) == {*SAMPLER_POINTS, *LEARNER_POINTS, NOWHERE}
 
@@ -303,7 +225,7 @@ def test_a_sampler_killed_at_its_17th_pair_leaves_exactly_the_committed_ones(
     tmp_path: Path, free_endpoint, point: str, stored: int
 ) -> None:
     config = write_robot(tmp_path, free_endpoint, rows=40)
-    with running(config, "sampler", Kill(point, 17, 0.0, False)) as child:
+    with doomed(config, "sampler", Kill(point, 17, 0.0, False)) as child:
         assert child.wait(LIFE_LIMIT_S) == -9
     with PairReader(config.store_file) as reader:
         assert [pair.seq for pair in reader.read()] == list(range(1, stored + 1))

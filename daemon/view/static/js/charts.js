@@ -1,6 +1,6 @@
 // Plots over pairs and over time, on uPlot.
 import { byId, element, text } from "./dom.js";
-import { clock, milliseconds, mm, whole } from "./format.js";
+import { changed, clock, milliseconds, mm, whole } from "./format.js";
 
 const uPlot = window.uPlot;
 const color = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
@@ -66,7 +66,7 @@ function line(label, stroke, value, more = {}) {
   return { label, stroke: color(stroke), width: 2, value: (_, shown) => value(shown), points: { show: false }, spanGaps: false, ...more };
 }
 
-// Dashed lines where the tool changed.
+// Dashed lines where something changed, with what it was.
 function marks(places) {
   return {
     hooks: {
@@ -77,7 +77,7 @@ function marks(places) {
         ctx.lineWidth = 1.5 * devicePixelRatio;
         ctx.setLineDash([5 * devicePixelRatio, 4 * devicePixelRatio]);
         ctx.font = `${11 * devicePixelRatio}px system-ui`;
-        for (const at of places()) {
+        for (const { at, said } of places()) {
           const x = plot.valToPos(at, "x", true);
           if (x < bbox.left || x > bbox.left + bbox.width) continue;
           ctx.beginPath();
@@ -86,7 +86,7 @@ function marks(places) {
           ctx.stroke();
           const nearEnd = x > bbox.left + 0.85 * bbox.width;
           ctx.textAlign = nearEnd ? "right" : "left";
-          ctx.fillText("tool changed", x + (nearEnd ? -5 : 5) * devicePixelRatio, bbox.top + 12 * devicePixelRatio);
+          ctx.fillText(said, x + (nearEnd ? -5 : 5) * devicePixelRatio, bbox.top + 12 * devicePixelRatio);
         }
         ctx.restore();
       },
@@ -125,8 +125,8 @@ export class ErrorChart {
     else this.chart.show([series?.t ?? [], positive(series?.error_m ?? []), positive(series?.claimed_m ?? [])], "time");
     if (!curve.length) return;
     const [[first, begin], [pairs, error]] = [curve[0], curve.at(-1)];
-    const changed = this.changes.length ? `; the tool changed after ${this.changes.map((change) => whole(change.pairs)).join(", ")}` : "";
-    text("error-text", `${mm(error)} after ${whole(pairs)} pairs, ${mm(begin)} after ${whole(first)}${changed}.`);
+    const told = this.changes.length ? `; ${this.changes.map((change) => `${changed(change.kind)} after ${whole(change.pairs)}`).join(", ")}` : "";
+    text("error-text", `${mm(error)} after ${whole(pairs)} pairs, ${mm(begin)} after ${whole(first)}${told}.`);
   }
 
   options(key) {
@@ -141,7 +141,7 @@ export class ErrorChart {
       scales: { x: { time }, y: { distr: 3 } },
       axes: [time ? { ...axis(undefined, times), space: 70 } : axis("pairs learnt"), { ...axis("mm", millimetres), size: 58 }],
       cursor: { drag: { x: true, y: false } },
-      plugins: [marks(() => this.changes.map((change) => (time ? change.t : change.pairs)))],
+      plugins: [marks(() => this.changes.map((change) => ({ at: time ? change.t : change.pairs, said: changed(change.kind) })))],
     };
   }
 }

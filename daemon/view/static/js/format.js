@@ -31,6 +31,14 @@ export function clock(secondsSince1970) {
   return new Date(1e3 * secondsSince1970).toLocaleTimeString("en-GB");
 }
 
+// What changed, in words; the learner's kinds are tool, camera, joint NAME, other and undecided.
+export function changed(kind) {
+  if (kind === "tool") return "tool changed";
+  if (kind === "camera") return "camera moved";
+  if (kind?.startsWith("joint ")) return `zero of ${kind.slice(6)} moved`;
+  return "something changed";
+}
+
 export function words(name) {
   return name.replaceAll("_", " ");
 }

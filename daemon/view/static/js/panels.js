@@ -1,6 +1,6 @@
 // Tiles, tables and sentences.
 import { bar, byId, element, row, text } from "./dom.js";
-import { clock, joint, milliseconds, mm, span, whole, words } from "./format.js";
+import { changed, clock, joint, milliseconds, mm, span, whole, words } from "./format.js";
 
 const last = (values) => values?.findLast((value) => value !== null);
 
@@ -93,24 +93,19 @@ export function segments({ segments: found }) {
   byId("segments").tBodies[0].replaceChildren(...rows);
 }
 
-// What the learner suspects to have changed: a list of kinds with what it says of each. Not every learner tells.
+// What the last change was, while more than one kind is probable.
 export function suspicions({ learner }) {
-  const found = learner?.status?.changes;
-  const entries = Array.isArray(found) ? found : [];
-  byId("suspicions").hidden = !entries.length;
-  byId("suspicions").replaceChildren(...entries.map((entry) => element("li", {}, typeof entry === "object" ? fields(entry) : String(entry))));
-}
-
-function fields(entry) {
-  const told = Object.entries(entry).filter(([, value]) => value !== null);
-  return told.map(([name, value]) => (typeof value === "number" && !Number.isInteger(value) ? `${words(name)} ${value.toPrecision(3)}` : `${words(name)} ${value}`)).join(", ");
+  const probable = Object.entries(learner?.status?.last_change?.probabilities ?? {}).sort((a, b) => b[1] - a[1]);
+  const open = probable.length > 1 && probable[0][1] < 0.95;
+  byId("suspicions").hidden = !open;
+  byId("suspicions").replaceChildren(...(open ? probable.map(([kind, probability]) => element("li", {}, `${changed(kind)}: ${Math.round(100 * probability)} %`)) : []));
 }
 
 export function models({ learner, course }) {
   const versions = [...(course?.versions ?? [])].reverse();
   byId("versions").tBodies[0].replaceChildren(...versions.map((version, k) => {
     const pairs = version.first_pairs === version.pairs ? whole(version.pairs) : `${whole(version.first_pairs)}–${whole(version.pairs)}`;
-    const named = `${version.answering}${version.after_change ? ", new tool" : ""}`;
+    const named = `${version.answering}${version.after_change ? ", after a change" : ""}`;
     const made = row(clock(version.since), named, pairs, mm(version.error_m), element("td", {}, element("code", {}, version.model.slice(0, 8))));
     if (k === 0) made.className = "now";
     return made;

@@ -1,0 +1,54 @@
+"""Where a learner goes on: from its checkpoint, else from the one before it, else from nothing."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from pathlib import Path
+
+from daemon.checkpoint import CheckpointError, generations, read_checkpoint, set_aside
+from daemon.learning import Learning, StateError
+from kbmaps import KBMapsError
+
+log = logging.getLogger(__name__)
+
+# What a checkpoint raises whose checksum is right and whose parts are not.
+DOES_NOT_FIT = (ArithmeticError, LookupError, TypeError, ValueError)
+
+
+def go_on(new: Callable[[], Learning], checkpoint: Path, robot: str) -> tuple[Learning, str | None]:
+    """A learner that goes on from the newest checkpoint that is of use.
+
+    Args:
+        new: makes a learner that knows nothing.
+        checkpoint: the newest; what is of no use is kept beside it under another name.
+
+    Returns:
+        The learner, and what was wrong, if anything was.
+
+    Raises:
+        CheckpointError: a checkpoint of no use cannot be moved aside.
+    """
+    said: list[str] = []
+    for file in generations(checkpoint):
+        learning = new()
+        try:
+            state = read_checkpoint(file, robot=robot)
+            if state is None:
+                continue
+            learning.restore(state)
+        except (CheckpointError, StateError, KBMapsError, *DOES_NOT_FIT) as error:
+            unfit = isinstance(error, DOES_NOT_FIT)
+            why = f"the checkpoint's parts do not fit: {error!r}" if unfit else str(error)
+            said.append(f"{why}. It was kept as {set_aside(file)}")
+            continue
+        pairs = learning.counters.pairs
+        log.info("went on from %s with %d pairs", file, pairs)
+        return learning, _told([*said, f"the learner went on from {file} with {pairs} pairs"]) if said else None
+    return new(), _told([*said, "the learner learns again from the sampler's history"]) if said else None
+
+
+def _told(said: list[str]) -> str:
+    text = "; ".join(said)
+    log.error("%s", text)
+    return text

@@ -1,0 +1,97 @@
+"""Pairs that no sensor can mean: the learner refuses or doubts them, says so, and answers numbers all the same."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from guided_arm import NOW_AND_THEN, Scene, new_learning, nominal_model, teach
+
+from daemon.config import LearnerConfig
+from daemon.learning import DirectSolver, Learning, LearningState, StateError
+from interfaces.errors import RequestError
+from interfaces.records import Pair, frozen_array
+
+TAUGHT = 40
+Spoil = Callable[[Pair], Pair]
+
+
+def with_q(value: float) -> Spoil:
+    return lambda pair: replace(pair, q=frozen_array(np.full_like(pair.q, value)))
+
+
+def with_x(value: float) -> Spoil:
+    return lambda pair: replace(pair, x=frozen_array(pair.x + value))
+
+
+def with_cov(cov: np.ndarray) -> Spoil:
+    return lambda pair: replace(pair, cov=frozen_array(cov))
+
+
+REFUSED: dict[str, tuple[Spoil, str]] = {
+    "an angle that is no number": (with_q(np.nan), "not finite"),
+    "a place that is no number": (with_x(np.nan), "not finite"),
+    "an infinite place": (with_x(np.inf), "not finite"),
+    "a covariance that is no number": (with_cov(np.full((3, 3), np.nan)), "not finite"),
+    "a place in millimetres": (with_x(5e3), "positions are in metres"),
+    "an absurd angle": (with_q(1e300), "angles are in radians"),
+    "a huge covariance": (with_cov(1e300 * np.eye(3)), "m wrong"),
+    "a negative variance": (with_cov(np.diag([1e-6, -1e-6, 1e-6])), "is no covariance"),
+    "a correlation above one": (with_cov(1e-6 * np.array([[1, 2, 0], [2, 1, 0], [0, 0, 1]])), "is no covariance"),
+}
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return Scene.draw(0, 2 * TAUGHT)
+
+
+@pytest.mark.parametrize("kind", REFUSED)
+@pytest.mark.parametrize("before", [0, 5])
+def test_a_pair_that_no_sensor_can_mean_is_refused_with_its_reason_and_changes_nothing(scene, kind, before) -> None:
+    learning, (spoil, why) = new_learning(), REFUSED[kind]
+    teach(learning, scene.pairs[:before])
+    was = learning.snapshot
+    with pytest.raises(RequestError, match=why):
+        learning.learn(spoil(scene.pairs[before]), 0.0)
+    assert learning.snapshot is was
+    assert learning.counters.last_seq == before
+
+
+@pytest.fixture(scope="module")
+def clean_error_m(scene: Scene) -> float:
+    """Of a learner that met no wild pair."""
+    learning = new_learning()
+    teach(learning, scene.pairs, every=NOW_AND_THEN)
+    return scene.error_m(learning)
+
+
+@pytest.mark.parametrize("spoil", [with_x(10.0), with_x(-900.0), with_q(1e5), with_cov(1e4 * np.eye(3))])
+@pytest.mark.parametrize("first", [0, TAUGHT])
+def test_after_wild_pairs_that_could_be_true_a_walk_brings_the_learner_back(scene, clean_error_m, spoil, first) -> None:
+    learning, pairs = new_learning(), list(scene.pairs)
+    pairs[first : first + 2] = map(spoil, pairs[first : first + 2])
+    teach(learning, pairs, every=NOW_AND_THEN)
+    prediction = learning.snapshot.predict(scene.q)
+    assert np.isfinite(prediction.sigma).all()
+    assert scene.error_m(learning) < 4.0 * clean_error_m
+
+
+def test_a_question_whose_answer_would_be_no_number_is_refused(scene, monkeypatch) -> None:
+    learning = new_learning()
+    snapshot = learning.snapshot
+    monkeypatch.setattr(type(snapshot.model), "predict", lambda _, q: np.full((len(q), 3), np.nan))
+    with pytest.raises(RequestError, match="no finite answer"):
+        snapshot.predict(scene.q[:2])
+
+
+@pytest.mark.parametrize("name", ["net_prior", "net_nlms", "q", "x"])
+def test_a_state_with_a_number_that_is_not_finite_is_not_gone_on_from(scene, name) -> None:
+    learning = new_learning()
+    teach(learning, scene.pairs[:5])
+    state = learning.state()
+    poisoned = LearningState(state.header, {**state.arrays, name: state.arrays[name] * np.nan})
+    with pytest.raises(StateError, match=f"{name} is not finite"):
+        Learning(nominal_model(), LearnerConfig(), DirectSolver()).restore(poisoned)

@@ -1,0 +1,104 @@
+"""A folder whose disk fails on demand, below any process that `disk_shim/shim.c` is preloaded into."""
+
+from __future__ import annotations
+
+import mmap
+import os
+import shutil
+import struct
+import subprocess
+from collections.abc import Iterator
+from dataclasses import dataclass
+from enum import IntEnum
+from pathlib import Path
+
+HERE = Path(__file__).parent / "disk_shim"
+FAULTS = struct.Struct("<2iq")
+RECORD = struct.Struct("<2I3Q")
+
+
+def compiled(folder: Path) -> Path | None:
+    """The shim, compiled into `folder`; None where there is no compiler."""
+    compiler = shutil.which("cc") or shutil.which("gcc")
+    if compiler is None:
+        return None
+    library = folder / "disk_shim.so"
+    flags = ["-shared", "-fPIC", "-O1", "-Wall", "-Wextra", "-Werror"]
+    subprocess.run([compiler, *flags, HERE / "shim.c", "-o", library, "-ldl", "-lpthread"], check=True)
+    return library
+
+
+class FailingDisk:
+    """What is wrong with the disk of a folder, and with the wall clock of whoever works with it.
+
+    Attributes:
+        environment: of a process for which it is so.
+        log: where all is noted that is done to the folder.
+    """
+
+    def __init__(self, folder: Path, library: Path) -> None:
+        folder.mkdir(parents=True, exist_ok=True)
+        file, self.log = folder.with_name("faults"), folder.with_name("disk.log")
+        file.write_bytes(bytes(FAULTS.size))
+        with file.open("r+b") as stream:
+            self._faults = mmap.mmap(stream.fileno(), FAULTS.size)
+        self._errno, self._slow_ms, self._clock_s = 0, 0, 0
+        self.environment = {
+            "LD_PRELOAD": str(library),
+            "DISK_SHIM_FOLDER": os.path.realpath(folder),
+            "DISK_SHIM_LOG": str(self.log),
+            "DISK_SHIM_FAULTS": str(file),
+        }
+
+    def refuse(self, number: int) -> None:
+        """Whatever is written fails with this errno; 0: it does not."""
+        self._errno = number
+        self._tell()
+
+    def slow(self, milliseconds: int) -> None:
+        """Whatever is written takes so long."""
+        self._slow_ms = milliseconds
+        self._tell()
+
+    def move_clock(self, seconds: int) -> None:
+        """The wall clock is so far ahead."""
+        self._clock_s = seconds
+        self._tell()
+
+    def _tell(self) -> None:
+        self._faults[:] = FAULTS.pack(self._errno, self._slow_ms, self._clock_s)
+
+
+class Operation(IntEnum):
+    """What was done to the folder."""
+
+    WRITE = 1
+    TRUNCATE = 2
+    SYNC = 3
+    SYNC_FOLDER = 4
+    CREATE = 5
+    RENAME = 6
+    UNLINK = 7
+    LINK = 8
+
+
+@dataclass(frozen=True, slots=True)
+class Done:
+    """One operation: on the file `inode`, at `offset`; with names, `name` and in `data` the second one."""
+
+    operation: Operation
+    inode: int
+    offset: int
+    name: str
+    data: bytes
+
+
+def read_log(log: Path) -> Iterator[Done]:
+    """All that was done, in its order."""
+    notes, at = log.read_bytes(), 0
+    while at < len(notes):
+        operation, name_size, inode, offset, data_size = RECORD.unpack_from(notes, at)
+        named = at + RECORD.size
+        data = named + name_size
+        at = data + data_size
+        yield Done(Operation(operation), inode, offset, notes[named:data].decode(), notes[data:at])

@@ -1,0 +1,200 @@
+"""Sampler and learner with a bad network between them, and with others who burden them: no pair is lost or doubled."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from bad_link import BadLink
+from two_processes import (
+    KEYS,
+    LIFE_LIMIT_S,
+    answer,
+    expect_each_pair_learnt_once,
+    learner_with,
+    running,
+    sampler_with,
+    status_when,
+    write_robot,
+)
+
+from daemon.bus import client
+from daemon.config import Config
+from daemon.status import LearnerStatus
+from daemon.wire import JointsRequest, encode
+from interfaces.errors import BodyschemaError
+
+pytestmark = pytest.mark.timeout(600)
+SOME, MORE = 20, 60
+
+
+def over(link: BadLink, config: Config) -> Config:
+    """The configuration of a learner that reaches the sampler over the link."""
+    text = config.file.read_text().replace(config.tables.zenoh.sampler, link.endpoint)
+    file = config.file.with_name("far.toml")
+    file.write_text(text)
+    return Config.load(file, {})
+
+
+@contextlib.contextmanager
+def apart(folder: Path, free_endpoint) -> Iterator[tuple[Config, BadLink]]:
+    """Both processes with a link between them, and some pairs learnt."""
+    config = write_robot(folder, free_endpoint)
+    with (
+        BadLink(config.tables.zenoh.sampler) as link,
+        running(config, "sampler"),
+        running(over(link, config), "learner"),
+    ):
+        learner_with(config, SOME)
+        yield config, link
+
+
+def predicts(config: Config) -> None:
+    answer(config, "learner", KEYS.predict, encode(JointsRequest([0.1, 0.2])))
+
+
+def lose_each_other(config: Config, link: BadLink, pairs: int) -> None:
+    """Part them until the learner has noticed and the sampler has so many more pairs; then let them meet."""
+    link.part()
+    noticed = status_when(config, "learner", LearnerStatus, lambda status: not status.sampler_alive)
+    sampler_with(config, noticed.last_seq + pairs)
+    predicts(config)
+    link.meet()
+    status_when(config, "learner", LearnerStatus, lambda status: status.sampler_alive)
+
+
+def test_after_a_partition_the_learner_catches_up_without_loss_or_doubling(tmp_path, free_endpoint) -> None:
+    with apart(tmp_path, free_endpoint) as (config, link):
+        lose_each_other(config, link, MORE)
+        status = expect_each_pair_learnt_once(config)
+    assert status.gaps_recovered >= MORE
+
+
+@pytest.mark.soak
+def test_after_a_partition_of_minutes_thousands_of_pairs_are_caught_up_with(tmp_path, free_endpoint) -> None:
+    with apart(tmp_path, free_endpoint) as (config, link):
+        for pairs in (6000, 300, 300):
+            lose_each_other(config, link, pairs)
+        expect_each_pair_learnt_once(config)
+
+
+def test_connections_that_are_cut_again_and_again_cost_no_pair(tmp_path, free_endpoint) -> None:
+    with apart(tmp_path, free_endpoint) as (config, link):
+        for _ in range(8):
+            link.cut()
+            sampler_with(config, sampler_with(config, 0).pairs + 10)
+        expect_each_pair_learnt_once(config)
+
+
+def test_over_a_slow_network_every_pair_comes_though_late(tmp_path, free_endpoint) -> None:
+    with apart(tmp_path, free_endpoint) as (config, link):
+        link.delay_s, link.bytes_per_s = 0.4, 40_000
+        learner_with(config, sampler_with(config, 0).pairs + MORE)
+        expect_each_pair_learnt_once(config)
+
+
+@pytest.mark.soak
+def test_a_learner_that_is_gone_for_a_while_catches_up(tmp_path, free_endpoint) -> None:
+    config = write_robot(tmp_path, free_endpoint)
+    with running(config, "sampler"):
+        with running(config, "learner"):
+            learner_with(config, SOME)
+        sampler_with(config, SOME + MORE)
+        with running(config, "learner"):
+            expect_each_pair_learnt_once(config)
+
+
+def in_a_namespace(how: str, folder: Path, pairs: int) -> int:
+    """How many pairs were accepted, and learnt once each, by processes whose kernel makes the network bad."""
+    if subprocess.run(["unshare", "--net", "true"], capture_output=True, check=False).returncode:
+        pytest.skip("network namespaces need root")
+    script = Path(__file__).with_name("kernel_network.py")
+    command = ["unshare", "--net", sys.executable, script, how, folder, str(pairs)]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    done = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
+    if "qdisc kind is unknown" in done.stderr:
+        pytest.skip("this kernel has no tbf")
+    assert done.returncode == 0, done.stderr
+    return int(done.stdout)
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize(("how", "pairs"), [("down", 200), ("down", 6000), ("slow", 300)])
+def test_minutes_without_a_link_or_with_a_slow_one_cost_no_pair(tmp_path, how, pairs) -> None:
+    assert in_a_namespace(how, tmp_path, pairs) > pairs
+
+
+SUBSCRIBER = """
+import sys, time, zenoh
+from daemon.bus import Bus
+with Bus(connect=sys.argv[1]) as bus:
+    bus.subscribe(sys.argv[2], lambda payload: (print("heard", flush=True), time.sleep(3600)))
+    time.sleep(3600)
+"""
+
+
+@pytest.mark.parametrize("stopped", [pytest.param(False, marks=pytest.mark.soak), True], ids=["slow", "stopped"])
+def test_a_subscriber_that_takes_nothing_delays_nobody_else(tmp_path, free_endpoint, stopped) -> None:
+    config = write_robot(tmp_path, free_endpoint, pairs_per_s=200.0)
+    with running(config, "sampler"), running(config, "learner"):
+        learner_with(config, SOME)
+        command = [sys.executable, "-c", SUBSCRIBER, config.tables.zenoh.sampler, KEYS.pair]
+        with subprocess.Popen(command, stdout=subprocess.PIPE) as subscriber:
+            try:
+                assert subscriber.stdout is not None
+                assert subscriber.stdout.readline() == b"heard\n"
+                if stopped:
+                    os.kill(subscriber.pid, signal.SIGSTOP)
+                sampler_with(config, sampler_with(config, 0).pairs + 5 * MORE)
+                learner_with(config, sampler_with(config, 0).pairs)
+                expect_each_pair_learnt_once(config)
+            finally:
+                subscriber.kill()
+
+
+class Flood:
+    """Clients that ask for as large a batch as they may, each as soon as it was answered."""
+
+    def __init__(self, config: Config, clients: int) -> None:
+        self._config, self._end = config, threading.Event()
+        self._threads = [threading.Thread(target=self._ask) for _ in range(clients)]
+        self._lock, self.answered = threading.Lock(), 0
+
+    def __enter__(self) -> Flood:
+        for thread in self._threads:
+            thread.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._end.set()
+        for thread in self._threads:
+            thread.join(LIFE_LIMIT_S)
+
+    def _ask(self) -> None:
+        batch = encode(JointsRequest(np.random.default_rng(0).uniform(-1, 1, (2000, 2)).tolist()))
+        with client(self._config.tables.zenoh.learner) as bus:
+            while not self._end.is_set():
+                with contextlib.suppress(BodyschemaError):  # refused, or not in time: that is the learner's right
+                    bus.ask_one(KEYS.predict, batch)
+                    with self._lock:
+                        self.answered += 1
+
+
+def test_under_a_flood_of_queries_pairs_go_on_being_learnt(tmp_path, free_endpoint) -> None:
+    config = write_robot(tmp_path, free_endpoint)
+    with running(config, "sampler"), running(config, "learner"):
+        begun = learner_with(config, SOME).last_seq
+        with Flood(config, 6) as flood:
+            learner_with(config, begun + 2 * MORE)
+            assert flood.answered > 0
+            status = learner_with(config, sampler_with(config, 0).pairs)
+        assert status.health == []
+        expect_each_pair_learnt_once(config)

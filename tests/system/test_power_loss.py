@@ -1,0 +1,160 @@
+"""The power goes at any moment of two working processes: what was accepted is there, the checkpoint is one that was."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import pytest
+from failing_disk import Done, FailingDisk, Operation, read_log
+from power_loss import Disk
+from two_processes import KEYS, answer, ended_well, learner_with, running, write_robot
+
+from daemon.checkpoint import generations, read_checkpoint
+from daemon.config import Config
+from daemon.session import session_of
+from daemon.store import PairReader, PairStore
+from daemon.wire import CommandRequest, encode, pair_to_wire
+from interfaces.clock import SystemClock
+from interfaces.errors import StoreError
+
+pytestmark = pytest.mark.timeout(600)
+CHECKPOINT = "learner.ckpt"
+
+
+@dataclass
+class Promised:
+    """What has to be there, whatever the disk lost.
+
+    Attributes:
+        accepted: number of the last pair that a sampler had accepted.
+        possible: checkpoints, the last that was safe and those after it; None stands for none at all.
+        previous: those that the one before may be. It may always be none: it gives its name away before the present
+            one takes it.
+    """
+
+    accepted: int = 0
+    possible: list[bytes | None] = field(default_factory=lambda: [None])
+    previous: list[bytes | None] = field(default_factory=lambda: [None])
+
+    def follow(self, done: Done, disk: Disk) -> None:
+        """What was done adds to it."""
+        if done.operation is Operation.RENAME and done.data.decode() == CHECKPOINT:
+            self.previous += self.possible
+            self.possible.append(bytes(disk.names[CHECKPOINT].present))
+        elif done.operation is Operation.SYNC_FOLDER:
+            self.possible = self.possible[-1:]
+            self.previous = [None, *self.previous[-2:], *self.possible]
+        elif done.operation is Operation.WRITE and done.data.rstrip().isdigit():
+            self.accepted = int(done.data)
+
+
+def work(config: Config, disk_shim: Path, pairs: int) -> Path:
+    """Let both processes do so many pairs, end them, and give the log of what they did to the disk."""
+    disk = FailingDisk(config.state_dir, disk_shim)
+    with ExitStack() as stack:
+        children = [
+            stack.enter_context(
+                running(config, name, journal=config.state_dir / "journal", environment=disk.environment)
+            )
+            for name in ("sampler", "learner")
+        ]
+        learner_with(config, pairs)
+        answer(config, "learner", KEYS.command("learner"), encode(CommandRequest("checkpoint")))
+        assert all(map(ended_well, children))
+    return disk.log
+
+
+class Losses:
+    """Loses the power again and again while what was done is done anew, and holds what is left to the promise."""
+
+    def __init__(self, config: Config, folder: Path) -> None:
+        self._config, self._folder = config, folder
+        with PairReader(config.store_file) as store:
+            self._pairs = [pair_to_wire(pair) for pair in store.read()]
+        self.losses = self.torn = self.without_last = 0
+
+    def at(self, moments: set[int], log: list[Done], rng: np.random.Generator) -> None:
+        disk, promised = Disk(), Promised()
+        for number, done in enumerate(log):
+            disk.do(done)
+            promised.follow(done, disk)
+            if number in moments:
+                shutil.rmtree(self._folder, ignore_errors=True)
+                self._folder.mkdir()
+                disk.after_power_loss(rng, self._folder)
+                self._expect(promised, disk)
+
+    def _expect(self, promised: Promised, disk: Disk) -> None:
+        self.losses += 1
+        store_file = self._folder / self._config.store_file.name
+        self.torn += any(
+            (self._folder / name).read_bytes() != bytes(file.present)
+            for name, file in disk.names.items()
+            if (self._folder / name).exists()
+        )
+        with PairStore(store_file, session_of(self._config, SystemClock())) as store:
+            left = [pair_to_wire(pair) for pair in store.read()]
+            identity = store.identity
+        assert len(left) >= promised.accepted
+        if left:
+            assert identity == self._pairs[0].store
+            assert left == self._pairs[: len(left)]
+        for file, ones in zip(
+            generations(self._folder / CHECKPOINT), (promised.possible, promised.previous), strict=True
+        ):
+            there = file.read_bytes() if file.exists() else None
+            assert there in ones
+            state = read_checkpoint(file, robot="arm")
+            assert state is None or state.header.counters.last_seq <= len(left)
+
+
+def lose_power(
+    folder: Path, endpoint: Callable[[], str], disk_shim: Path, pairs: int, losses: int, seed: int
+) -> Losses:
+    """At random moments, half of them around what was done to the checkpoint and to the folder."""
+    config = write_robot(folder, endpoint, pairs_per_s=400.0)
+    log = list(read_log(work(config, disk_shim, pairs)))
+    rng = np.random.default_rng(seed)
+    rare = [
+        number
+        for number, done in enumerate(log)
+        if done.operation not in (Operation.WRITE, Operation.SYNC) or len(done.data) > 4096
+    ]
+    around = rng.choice(rare, losses // 2) + rng.integers(-1, 3, losses // 2)
+    moments = {*rng.integers(len(log), size=losses - losses // 2).tolist(), *around.clip(0, len(log) - 1).tolist()}
+    happened = Losses(config, folder / "after")
+    happened.at(moments, log, rng)
+    return happened
+
+
+def test_after_a_power_loss_accepted_pairs_are_there_and_the_checkpoint_is_the_old_or_the_new(
+    tmp_path, free_endpoint, disk_shim
+) -> None:
+    happened = lose_power(tmp_path, free_endpoint, disk_shim, pairs=150, losses=80, seed=0)
+    assert happened.torn > 20  # the losses were some
+
+
+@pytest.mark.soak
+@pytest.mark.timeout(3000)
+@pytest.mark.parametrize("seed", [1, 2])
+def test_two_thousand_power_losses_of_a_store_that_is_tidied_up_lose_nothing(
+    tmp_path, free_endpoint, disk_shim, seed
+) -> None:
+    happened = lose_power(tmp_path, free_endpoint, disk_shim, pairs=1500, losses=2000, seed=seed)
+    assert happened.torn > 500
+
+
+def without_syncs(log: Iterator[Done]) -> list[Done]:
+    return [done for done in log if done.operation not in (Operation.SYNC, Operation.SYNC_FOLDER)]
+
+
+def test_a_store_that_never_synced_would_lose_pairs(tmp_path, free_endpoint, disk_shim) -> None:
+    config = write_robot(tmp_path, free_endpoint, rows=40)
+    log = without_syncs(read_log(work(config, disk_shim, 40)))
+    with pytest.raises((AssertionError, StoreError)):
+        Losses(config, tmp_path / "after").at(set(range(len(log) - 40, len(log))), log, np.random.default_rng(0))

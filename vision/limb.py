@@ -1,0 +1,132 @@
+"""Where rays leave a ball, to a hundredth of a pixel: matched filters along rays, each made for its background.
+
+The filters are those of `limb_filters`. Which texture a ray's background has is what its samples make likeliest.
+Colours are turned so that the first channel is the ball's own colour: its shading is unknown there, while the other
+two channels show nothing of the ball but its gloss.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from interfaces.records import FloatArray
+
+from .colour import Float32Array, Gate
+from .limb_filters import STEP_PX, Filters, filters, places
+from .polar import ball_colour, mean_of_three, median, ray_angles, sample
+
+# Samples on the ball that tell its colour and the noise, from this part of its radius on.
+_INNER_COLUMNS, _INNER_PART = 4, 0.3
+# A sample's noise is at least this [grey levels]; so many of the rays have a background that shows not much else.
+_LEAST_NOISE, _EVEN_RAYS = 1.0, 0.3
+# Beyond so many blurs the ball no longer shows.
+_BEYOND_BLURS = 2.0
+# No ray tells its edge better than this, and one that tells it worse tells nothing [px].
+_BEST_SIGMA_PX, _WORST_SIGMA_PX = 0.03, 0.5
+# The blur changes by this factor at most from one look to the next.
+_LARGEST_WIDENING = 1.5
+
+
+@dataclass(frozen=True, slots=True)
+class Limb:
+    """The ball's edge, ray by ray.
+
+    Attributes:
+        angles: directions of the rays, shape (n,) [rad].
+        offset_px: how far beyond the outline that was thought of the edge is, shape (n,) [px].
+        weight: inverse variances of `offset_px`, shape (n,) [1/px²]; 0 where a ray does not tell.
+        blur_px: 1-sigma of lens and interpolation, as the edge shows it [px].
+    """
+
+    angles: FloatArray
+    offset_px: FloatArray
+    weight: FloatArray
+    blur_px: float
+
+
+def find_limb(
+    image: Float32Array, gate: Gate, centre_px: FloatArray, radius_px: float, shape: FloatArray, blur_px: float
+) -> Limb | None:
+    """The edge about an outline that is right to a few tenths of a pixel; None when no ball shows there.
+
+    Args:
+        image: BGR, shape (height, width, 3), grey levels.
+        centre_px, radius_px, shape: the outline, see `sphere.Ellipse`.
+        blur_px: how wide the edge is thought to be, to a third [px].
+    """
+    angles = ray_angles(radius_px)
+    at = places(radius_px, blur_px)
+    inner = np.linspace(_INNER_PART * radius_px, max(radius_px + at[0], 0.5 * radius_px), _INNER_COLUMNS)
+    samples = sample(image, centre_px, angles, np.concatenate([inner, radius_px + at]), shape)
+    colour = ball_colour(samples[:, :_INNER_COLUMNS], gate)
+    if colour is None:
+        return None
+    turned = samples @ _own_colour_first(colour).astype(np.float32)
+    noise = _noise(turned[:, :_INNER_COLUMNS, 1:], turned[:, _INNER_COLUMNS:][:, at > _BEYOND_BLURS * blur_px])
+    rays = np.moveaxis(turned[:, _INNER_COLUMNS:].astype(np.float64) / noise, 2, 0)
+    return _filtered(angles, rays, filters(radius_px, blur_px), blur_px)
+
+
+def _filtered(angles: FloatArray, rays: FloatArray, both: tuple[Filters, Filters], blur_px: float) -> Limb:
+    """What the filters make of the samples (3, n, m) of n rays in units of the noise, the ball's own colour first."""
+    own, across = both
+    information, moved = np.zeros((2, len(angles)))
+    widening, widening_information = 0.0, 1e-9
+    likeliest = np.concatenate([_likeliest(rays[:1], own), _likeliest(rays[1:], across)])
+    for channel, one, texture in zip(rays, (own, across, across), likeliest, strict=True):
+        contrast, shift = (np.einsum("nm,nm->n", part[texture], channel) for part in (one.contrast, one.shift))
+        contrast = mean_of_three(contrast)
+        inverse = 1.0 / one.shift_variance[texture]
+        information += contrast**2 * inverse
+        moved += contrast * shift * inverse
+        if one is across:
+            inverse = 1.0 / one.widening_variance[texture]
+            widening += float(np.sum(contrast * inverse * np.einsum("nm,nm->n", one.widening[texture], channel)))
+            widening_information += float(np.sum(contrast**2 * inverse))
+    told = information > _WORST_SIGMA_PX**-2
+    information[~told] = 1.0
+    return Limb(
+        angles,
+        np.where(told, moved / information, 0.0),
+        told / (1.0 / information + _BEST_SIGMA_PX**2),
+        blur_px * min(max(1.0 + widening / widening_information / blur_px, 1 / _LARGEST_WIDENING), _LARGEST_WIDENING),
+    )
+
+
+def _likeliest(rays: FloatArray, one: Filters) -> NDArray[np.intp]:
+    """Which texture is the likeliest of each ray (n) of some channels (c), by three neighbours: shape (c, n)."""
+    channels, count, columns = rays.shape
+    flat = rays.reshape(-1, columns)
+    whitened = (flat @ one.precisions).reshape(len(flat), -1, columns)
+    square = np.einsum("nkm,nm->nk", whitened, flat).reshape(channels, count, -1)
+    likelihood = -0.5 * (square + one.log_determinant)
+    return np.argmax([mean_of_three(channel) for channel in likelihood], axis=2)
+
+
+def _own_colour_first(colour: FloatArray) -> FloatArray:
+    """An orthonormal basis of colours, as columns: the ball's own, then what grey has across it, then the rest."""
+    own = colour / np.linalg.norm(colour)
+    grey = np.ones(3) - own.sum() * own
+    if np.linalg.norm(grey) < 0.1:
+        grey = np.array([1.0, 0.0, 0.0]) - own[0] * own
+    grey /= np.linalg.norm(grey)
+    # The cross product; NumPy's own costs more than all else here.
+    rest = own[[1, 2, 0]] * grey[[2, 0, 1]] - own[[2, 0, 1]] * grey[[1, 2, 0]]
+    return np.column_stack([own, grey, rest])
+
+
+def _noise(inside: Float32Array, beyond: Float32Array) -> float:
+    """A sample's noise (1-sigma) [grey levels].
+
+    Of neighbours on the ball, across its colour, shape (n, columns, 2); and, as light brings noise with it, along the
+    rays of the most even part of what is beyond, shape (n, columns, 3).
+    """
+    on_ball = 1.4826 * median(np.abs(np.diff(inside, axis=0)).ravel()) / math.sqrt(2.0)
+    apart = round(1.0 / STEP_PX)
+    rough = mean_of_three(((beyond[:, apart:] - beyond[:, :-apart]) ** 2).mean(axis=(1, 2)))
+    even = int(_EVEN_RAYS * (len(rough) - 1))
+    return max(_LEAST_NOISE, on_ball, math.sqrt(0.5 * float(np.partition(rough, even)[even])))

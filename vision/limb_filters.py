@@ -1,0 +1,125 @@
+"""Filters that tell, best of all linear ones, where a ray of samples leaves a ball.
+
+Samples at t [px] along a ray, t = 0 where the outline is thought to be, are
+
+    ball(t) · S(t) + background(t) · (1 − S(t)) + shift · contrast · g(t) + noise,
+
+with S the blurred step from 1 on the ball to 0 beyond it and g its slope. What neither filter nor likelihood may take
+for known has a prior as a Gaussian process, in units of the noise: the background's level is free, its slope moderate,
+and its texture a random walk from the outline on. Towards its own colour the ball's level and its shading are free (a
+sphere's depends on the normal's part along the ray, √(1 − ρ²)); across that colour a ball shows nothing but gloss,
+which fades towards the limb. The rougher the background, the less a filter trusts samples far from the edge.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from interfaces.records import FloatArray
+
+STEP_PX = 0.5
+# Half-widths of what is looked at, on the ball and beyond [px], for a blur of USUAL_BLUR_PX; more needs more room.
+_INSIDE_PX, _OUTSIDE_PX, USUAL_BLUR_PX = 4.0, 8.0, 0.86
+# Textures that are told apart: 1-sigma of the random walk over 1 px, in units of the noise.
+_ROUGHNESS = (0.05, 0.5, 2.0, 8.0, 30.0)
+# Priors' variances, in units of the noise: what is free, the background's slope [1/px²], the ball's level across its
+# own colour, and a blur that is not quite the true one, times the contrast.
+_FREE, _SLOPE, _ACROSS, _BLUR = 1e4, 1.0, 0.3, 100.0
+# Gloss and uneven light: 1-sigma that a sample on the ball gets for each px² from where the edge's blur ends.
+_GLOSS, _EDGE_BLURS = 2.0, 1.4
+# Integration step of what the lens blurs [px].
+_FINE_PX = 0.05
+
+
+@dataclass(frozen=True, slots=True)
+class Filters:
+    """One filter for each of k textures of the background, over m samples of a ray in units of their noise.
+
+    Attributes:
+        precisions: inverse covariances of the samples side by side, shape (m, k·m), whose
+        log_determinant: logarithms of the covariances' determinants, shape (k,), make the likelihood.
+        shift: (k, m), what the edge is off by times the contrast [px], with
+        shift_variance: (k,) [px²].
+        contrast: (k, m), ball less background at the edge.
+        widening: (k, m), what the blur is off by times the contrast [px], with
+        widening_variance: (k,) [px²].
+    """
+
+    precisions: FloatArray
+    log_determinant: FloatArray
+    shift: FloatArray
+    shift_variance: FloatArray
+    contrast: FloatArray
+    widening: FloatArray
+    widening_variance: FloatArray
+
+
+def places(radius_px: float, blur_px: float) -> FloatArray:
+    """Where to sample rays, shape (m,) [px] from the outline: little of a small ball, more where the blur is wide."""
+    wider = max(1.0, blur_px / USUAL_BLUR_PX)
+    inside = min(round(_INSIDE_PX * wider / STEP_PX), max(3, round(0.9 * radius_px / (2 * STEP_PX))))
+    outside = round(_OUTSIDE_PX * wider / STEP_PX)
+    return np.arange(-inside + 0.5, outside) * STEP_PX
+
+
+def filters(radius_px: float, blur_px: float) -> tuple[Filters, Filters]:
+    """The filters towards the ball's own colour and across it, at `places(radius_px, blur_px)`.
+
+    Both figures count to a few per cent, so that those of a ball that is followed are computed once.
+    """
+    at = tuple(places(radius_px, blur_px).tolist())
+    radius_px, blur_px = _rounded(radius_px, 10), _rounded(blur_px, 20)
+    return _filters(at, radius_px, blur_px, True), _filters(at, radius_px, blur_px, False)
+
+
+def _rounded(value: float, steps: int) -> float:
+    return math.exp(round(steps * math.log(value)) / steps)
+
+
+@lru_cache(maxsize=512)
+def _filters(at: tuple[float, ...], radius_px: float, blur_px: float, own_colour: bool) -> Filters:
+    t = np.array(at)
+    ball = np.array([0.5 * math.erfc(x / (blur_px * math.sqrt(2.0))) for x in at])
+    slope = np.exp(-0.5 * (t / blur_px) ** 2) / (blur_px * math.sqrt(2.0 * math.pi))
+    wider = slope * t / blur_px
+    beyond = 1.0 - ball
+    # The ball's level at t = 0 and how it falls towards the limb.
+    level, fall = (_FREE, _FREE) if own_colour else (_ACROSS, _ACROSS)
+    normal = _blurred_normal(t, radius_px, blur_px)
+    gloss = (_GLOSS * np.clip(-t - _EDGE_BLURS * blur_px, 0.0, None) ** 2) ** 2
+    known = np.eye(len(t)) + np.diag(gloss) + level * np.outer(ball, ball) + fall * np.outer(normal, normal)
+    # Of a random walk from 0 to both sides.
+    walk = 0.5 * (np.abs(t)[:, None] + np.abs(t) - np.abs(t[:, None] - t))
+    rows: list[tuple[FloatArray | float, ...]] = []
+    for roughness in _ROUGHNESS:
+        background = _FREE + _SLOPE * np.outer(t, t) + roughness**2 * walk
+        cov: FloatArray = (known + np.outer(beyond, beyond) * background).astype(np.float64)
+        shift, shift_variance = _best_filter(cov + _BLUR * np.outer(wider, wider), slope)
+        widening, widening_variance = _best_filter(cov + _FREE * np.outer(slope, slope), wider)
+        cov += _BLUR * np.outer(wider, wider) + _FREE * np.outer(slope, slope)
+        precision: FloatArray = np.linalg.inv(cov).astype(np.float64)
+        contrast = (level * ball - _FREE * beyond) @ precision
+        log_determinant = float(np.linalg.slogdet(cov)[1])
+        rows.append((precision, log_determinant, shift, shift_variance, contrast, widening, widening_variance))
+    precisions, *others = (np.array(column) for column in zip(*rows, strict=True))
+    return Filters(np.concatenate(list(precisions), axis=1), *others)
+
+
+def _best_filter(cov: FloatArray, signal: FloatArray) -> tuple[FloatArray, float]:
+    """The unbiased linear filter (m,) of least variance for how much of `signal` (m,) there is, and that variance."""
+    weighted: FloatArray = np.linalg.solve(cov, signal).astype(np.float64)
+    variance = 1.0 / float(signal @ weighted)
+    return weighted * variance, variance
+
+
+def _blurred_normal(t: FloatArray, radius_px: float, blur_px: float) -> FloatArray:
+    """The part along the line of sight of a sphere's normal, 0 beyond the sphere, as a blurred image shows it."""
+    reach = 4.0 * blur_px
+    fine = np.arange(t[0] - reach, t[-1] + reach, _FINE_PX)
+    normal = np.sqrt(np.clip(1.0 - (1.0 + np.minimum(fine, 0.0) / radius_px) ** 2, 0.0, None))
+    weight = np.exp(-0.5 * ((t[:, None] - fine) / blur_px) ** 2)
+    return weight @ normal / weight.sum(axis=1)

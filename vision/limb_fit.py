@@ -1,0 +1,137 @@
+"""The ellipse through a ball's limb, and how sure it is."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from interfaces.records import FloatArray
+
+from .colour import Float32Array, Gate
+from .limb import Limb, find_limb
+from .limb_filters import USUAL_BLUR_PX
+from .polar import median
+from .waves import Waves, waves
+
+# The limb is looked for so often at most, and is found when a look moved it and its blur less than this [px].
+_LOOKS, _SETTLED_PX, _SETTLED_BLUR_PX = 4, 0.02, 0.05
+# Blurs that are looked for [px].
+_SHARPEST_PX, _WIDEST_PX = 0.4, 3.0
+# An edge sharper than this after interpolation [px] was not anti-aliased: coverage tells more than its place does.
+_ALIASED_PX = 0.55
+# Student's degrees of freedom of an edge's error: how little what is far off counts. Beyond this nothing counts [px].
+_FREEDOM, _FARTHEST_PX, _ROUNDS = 4.0, 1.0, 3
+# Below this, relative to the cubed trace, the limb does not determine centre and radius.
+_LEAST_DETERMINANT = 1e-6
+# A ray's samples share pixels with each other and with its neighbours': variance of even backgrounds, that the filters
+# take for 1; and how many waves that knowledge is worth.
+_SHARED_PIXELS, _WORTH = 1.3, 3.0
+# What covers a ball breaks its limb at sharp corners, which shows in the quick waves; what is behind it bends whole
+# arcs, in the slow ones, which the claim follows. Beyond so many times the variance of the samples it is no ball's
+# limb alone.
+_LARGEST_DENSITY = 18.0
+# What a lens leaves of its distortion makes a limb oval, by this part of its radius at most, but fits all around.
+_MOST_OVAL, _CLEAN_DENSITY = 0.015, 3.0
+# An oval is tried where the slow waves are this large.
+_BENT_DENSITY = 20.0
+
+
+@dataclass(frozen=True, slots=True)
+class Circle:
+    """The circle whose image under the ellipse's shape is the limb.
+
+    Attributes:
+        centre_px: shape (2,) [px].
+        radius_px: [px].
+        cov_px: covariance of the centre, shape (2, 2) [px²].
+        radius_sigma_px: 1-sigma of the radius [px].
+        aliased: whether the image was not anti-aliased, so that all this is worth little.
+    """
+
+    centre_px: FloatArray
+    radius_px: float
+    cov_px: FloatArray
+    radius_sigma_px: float
+    aliased: bool
+
+
+@dataclass(frozen=True, slots=True)
+class _Fit:
+    """Shift (2,) and growth [px] of the circle, the inverse normal matrix (3, 3) [px²], and what the waves tell."""
+
+    shift_px: FloatArray
+    growth_px: float
+    inverse: FloatArray
+    waves: Waves
+
+
+def fit_limb(
+    image: Float32Array, gate: Gate, centre_px: FloatArray, radius_px: float, shape: FloatArray
+) -> Circle | None:
+    """The ellipse through the limb near the outline given, which is right to half a pixel or so.
+
+    None when nothing there is like a ball's limb, or not all around.
+    """
+    blur_px = USUAL_BLUR_PX
+    fit: _Fit | None = None
+    for _ in range(_LOOKS):
+        limb = find_limb(image, gate, centre_px, radius_px, shape, blur_px)
+        fit = None if limb is None else _fit(limb, radius_px)
+        if limb is None or fit is None:
+            return None
+        centre_px, radius_px = centre_px + shape @ fit.shift_px, radius_px + fit.growth_px
+        last_blur_px, blur_px = blur_px, min(max(limb.blur_px, _SHARPEST_PX), _WIDEST_PX)
+        moved_px = max(float(np.linalg.norm(fit.shift_px)), abs(fit.growth_px))
+        if moved_px < _SETTLED_PX and abs(blur_px - last_blur_px) < _SETTLED_BLUR_PX:
+            break
+    aliased = blur_px < _ALIASED_PX
+    if fit is None or (fit.waves.quick > _LARGEST_DENSITY and not aliased):
+        return None
+    # What the waves show less than the pixels' noise alone makes is chance.
+    seen, count = fit.waves.evened().once_round(), fit.waves.count
+    cov = max(seen, (count * seen + _WORTH * _SHARED_PIXELS) / (count + _WORTH)) * fit.inverse
+    # A blurred disc's edge, where it is steepest, is nearer to the centre than the disc's.
+    radius_px += blur_px**2 / (2.0 * radius_px)
+    return Circle(centre_px, radius_px, shape @ cov[:2, :2] @ shape, math.sqrt(cov[2, 2]), aliased)
+
+
+def _fit(limb: Limb, radius_px: float) -> _Fit | None:
+    """The circle through the limb; an oval one where no circle fits, but that does all around."""
+    fit = _least_squares(limb, radius_px, oval=False)
+    if fit is None or fit.waves.slow < _BENT_DENSITY:
+        return fit
+    other = _least_squares(limb, radius_px, oval=True)
+    return other if other is not None and other.waves.slow < _CLEAN_DENSITY else fit
+
+
+def _least_squares(limb: Limb, radius_px: float, *, oval: bool) -> _Fit | None:
+    """Weighted least squares; what is far off counts little."""
+    design = np.stack([np.cos(limb.angles), np.sin(limb.angles), np.ones_like(limb.angles)], axis=1)
+    if oval:
+        design = np.column_stack([design, np.cos(2.0 * limb.angles), np.sin(2.0 * limb.angles)])
+    told = limb.weight > 0
+    if np.count_nonzero(told) < len(told) // 2:
+        return None
+    weight = used = limb.weight
+    solution: FloatArray = np.zeros(3)
+    inverse: FloatArray = np.eye(3)
+    residual = limb.offset_px
+    for _ in range(_ROUNDS):
+        used = weight
+        normal = (design * used[:, None]).T @ design
+        if np.count_nonzero(used) < len(told) // 2:
+            return None
+        if np.linalg.det(normal) < _LEAST_DETERMINANT * np.trace(normal) ** len(normal):
+            return None
+        inverse = np.linalg.inv(normal).astype(np.float64)
+        solution = inverse @ (design.T @ (used * limb.offset_px))
+        residual = limb.offset_px - design @ solution
+        square = residual**2 * limb.weight
+        usual = max(1.0, 1.4826**2 * median(square[told]))
+        weight = np.where(np.abs(residual) < _FARTHEST_PX, limb.weight / (1.0 + square / usual / _FREEDOM), 0.0)
+    if np.abs(solution[3:]).max(initial=0.0) > _MOST_OVAL * radius_px:
+        return None
+    around = waves(np.sqrt(used) * residual, radius_px, first=3 if oval else 2)
+    return _Fit(solution[:2], float(solution[2]), inverse[:3, :3], around)

@@ -1,0 +1,64 @@
+"""Errors round an outline, as waves: how large is the one that moves the centre?
+
+Neighbouring points of an outline share pixels and background, so their variance alone would claim too little. A shift
+of the centre is the wave that goes once round. The fit has removed it, and the next ones tell its size, the nearer the
+better.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from interfaces.records import FloatArray
+
+# The slow waves are so many, or up to the one of radius / _WAVE_RADIUS_PX if that is more.
+_LEAST_WAVES, _WAVE_RADIUS_PX = 3, 3.0
+# Lens and interpolation smooth along the outline too, which takes power from the quicker waves (1-sigma) [px].
+_SMOOTHING_PX = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Waves:
+    """Variances per point, in the square of the residuals' unit.
+
+    Attributes:
+        slow: in the slowest waves that the fit left in.
+        quick: in those that are quicker.
+        count: how many waves the slow ones are worth.
+    """
+
+    slow: float
+    quick: float
+    count: float
+
+    def evened(self) -> Waves:
+        """The same where nothing but chance makes the quick waves larger than the slow ones: both tell one noise."""
+        return replace(self, slow=max(self.slow, 0.5 * (self.slow + self.quick)))
+
+    def once_round(self) -> float:
+        """Variance in the wave that goes once round.
+
+        Pixel noise gives all waves the same power; what is behind the ball disturbs whole arcs and makes the slow ones
+        larger. So their excess over the quick ones counts once more.
+        """
+        # Student's t with two degrees of freedom per wave: 1-sigma of a spread that is itself estimated.
+        return (1.0 + 0.25 / self.count) ** 2 * (self.slow + max(0.0, self.slow - self.quick))
+
+
+def waves(residual: FloatArray, radius_px: float, first: int = 2) -> Waves:
+    """The waves in the residuals (n,) of an outline's points, evenly spread around it; 0 where there is none.
+
+    `first` is the slowest wave that the fit left in.
+    """
+    quickest = len(residual) // 2
+    last_slow = min(max(first + _LEAST_WAVES - 1, round(radius_px / _WAVE_RADIUS_PX)), quickest - 1)
+    last_quick = min(max(last_slow + 1, min(2 * last_slow, round(radius_px))), quickest)
+    harmonics = np.arange(first, last_quick + 1)
+    parts = np.fft.rfft(residual)[first : last_quick + 1]
+    power = np.abs(parts) ** 2 * np.exp((harmonics * _SMOOTHING_PX / radius_px) ** 2) / np.count_nonzero(residual)
+    slow = last_slow - first + 1
+    weight = harmonics[:slow] ** -2.0
+    share = weight / weight.sum()
+    return Waves(float(share @ power[:slow]), float(power[slow:].mean()), 1.0 / float(share @ share))
