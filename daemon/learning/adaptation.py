@@ -52,7 +52,7 @@ class Origin:
 
     def __init__(self, noticed: Noticed, arm: KnownArm) -> None:
         self._noticed, self._reference = noticed, noticed.reference
-        quiet = [k for k in range(noticed.first) if noticed.kept[k]]
+        quiet = [k for k in range(min(noticed.earliest, noticed.first)) if noticed.kept[k]]
         q, x = noticed.q[quiet], noticed.x[quiet]
         wide = self._reference.wide
         if len(quiet) >= _FEWEST_BEFORE:
@@ -60,8 +60,14 @@ class Origin:
         self._before = arm.updated(wide, self._reference.residual)
 
     def explain(self, q: FloatArray, x: FloatArray) -> list[Explanation]:
-        """How probable each kind of change is after the pairs since then, q (n, d) [rad] and x (n, 3) [m]."""
+        """How probable each kind of change is after the pairs since then, q (n, d) [rad] and x (n, 3) [m].
+
+        The first ones, which may be of before, say nothing once there are as many that are not.
+        """
         noticed, belief = self._noticed, self._before.chain
+        doubtful = max(noticed.latest - noticed.first, 0)
+        if len(q) >= 2 * doubtful:
+            q, x = q[doubtful:], x[doubtful:]
         kinds = (*noticed.kinds, any_change(belief.parameters))
         return explanations(belief, kinds, q, self._of_chain(q, x), noticed.noise_m, noticed.shared)
 

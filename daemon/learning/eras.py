@@ -25,14 +25,10 @@ from .members import PRIOR
 from .memory import PairMemory
 from .nominal import PAIRS_TO_REFIT, NominalModel, chain_tolerances
 from .state import NET, Counters, LearningHeader, LearningState, StateError
-from .watch import Noticed
+from .watch import LOOK_AGAIN, Noticed
 
 # RMS distance between a nominal model and reality that surprises nobody [m].
 EXPECTED_M = 0.1
-
-
-# What changed is looked at again when the pairs since then have grown by this factor.
-LOOK_AGAIN = 1.25
 # So many pairs can be held against each other without knowing them.
 FEWEST_TO_ADAPT = 3
 
@@ -62,7 +58,7 @@ class Eras:
         self.present: Era | None = None
         self.change: ChangeRecord | None = None
         self._origin: Origin | None = None
-        self._look_at = self._adapt_at = 0
+        self._look_at = 0
 
     @classmethod
     def at_nominal(cls, nominal: NominalModel, settings: LearnerConfig, task_numbers: Iterator[int]) -> Eras:
@@ -167,14 +163,12 @@ class Eras:
     def adapt(self, era: Era, noticed: Noticed) -> bool:
         """Begin the era after a change, if that predicts pairs since then better that it does not know."""
         q, x = noticed.q[noticed.first :], noticed.x[noticed.first :]
-        if len(q) < self._adapt_at:
-            return False
         origin = Origin(noticed, era.arm)
         found = origin.explain(q, x)
-        self._adapt_at = self._look_at = int(LOOK_AGAIN * len(q)) + 1
         if not origin.is_better(found, q, x):
+            era.watch.refute()
             return False
-        self._adapt_at = 0
+        self._look_at = int(LOOK_AGAIN * len(q)) + 1
         seqs = (*noticed.seqs, noticed.seqs[-1] + 1)
         self.change = ChangeRecord(
             first_seq=noticed.seqs[noticed.first],

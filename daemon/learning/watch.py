@@ -19,6 +19,8 @@ FEWEST_KNOWN = 100
 SHORTEST_TRIAL, LONGEST_TRIAL = 50, 1000
 # So many of the pairs that a model knows show its noise.
 LOOKED_BACK = 500
+# An alarm that a bent arm explains is looked at again when the pairs since the change have grown by this factor.
+LOOK_AGAIN = 1.25
 # So many of the newest errors of pairs that a model did not know show how far these lie from it.
 SHOWN = 3000
 # No measurement is more exact, whatever it says [m].
@@ -122,7 +124,8 @@ class Watch:
         self._next_at = self._asked_at = 0
         self._pairs: list[_Watched] = []
         self._detector: ChangeDetector | None = None
-        self._suspicion: Suspicion | None = None
+        self._change: Suspicion | None = None
+        self._look_at = 0
         self._shown = np.empty((0, 3))
 
     @property
@@ -137,8 +140,8 @@ class Watch:
 
     @property
     def alarmed(self) -> bool:
-        """Whether there was a change."""
-        return self._suspicion is not None and self._suspicion.alarm
+        """Whether there was a change: an arm that bends would not show the same without one."""
+        return self._change is not None
 
     @property
     def wants_reference(self) -> bool:
@@ -171,11 +174,23 @@ class Watch:
                 self._show()
                 self._hold(self._reference)
         elif self._detector.due:
-            self._suspicion = self._detector.suspicion()
+            self._suspect(self._detector)
         tried = len(self._pairs) - self._next_at
         if self._next is not None and self.ready and not self.alarmed and tried >= _trial(self._next.known):
             self._show()
             self._renew()
+
+    def refute(self) -> None:
+        """What seemed to be a change is none, as far as the pairs tell so far."""
+        since = 0 if self._change is None else len(self._pairs) - self._change.onset
+        self._change, self._look_at = None, len(self._pairs) + int((LOOK_AGAIN - 1.0) * since) + 1
+
+    def _suspect(self, detector: ChangeDetector) -> None:
+        suspicion = detector.suspicion()
+        if suspicion.alarm and self._change is None and len(self._pairs) >= self._look_at:
+            self._change = detector.suspicion_if_it_bends()
+            if not self._change.alarm:
+                self.refute()
 
     def noticed(self, run: int = 0) -> Noticed | None:
         """The change that the pairs show; None: they do not, or there is nothing to hold them against.
@@ -186,11 +201,9 @@ class Watch:
         reference, detector = self._reference, self._detector
         if reference is None or detector is None or not self.ready or not (self.alarmed or run):
             return None
-        suspicion = detector.suspicion()
-        earliest, latest = suspicion.interval()
-        first = suspicion.onset
-        if not suspicion.alarm:
-            first = earliest = latest = len(self._pairs) - run
+        first = earliest = latest = len(self._pairs) - run
+        if self._change is not None:
+            first, (earliest, latest) = self._change.onset, self._change.interval()
         pairs = self._pairs
         variance = float(np.mean([each.variance for each in pairs]) + reference.claim.beyond_chain(reference.q).mean())
         return Noticed(
@@ -227,7 +240,8 @@ class Watch:
         variances = reference.errors(reference.q, reference.x, reference.variance)[1]
         noise_m = float(np.sqrt(noise.single * variances.mean()))
         distance_m = float(np.linalg.norm(reference.x, axis=1).mean())
-        self._detector, self._suspicion = ChangeDetector(reference.belief, noise, noise_m, distance_m), None
+        self._detector = ChangeDetector(reference.belief, noise, noise_m, distance_m)
+        self._change, self._look_at = None, 0
         self._feed(self._pairs)
 
     def _feed(self, pairs: list[_Watched]) -> None:

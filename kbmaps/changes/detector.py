@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
 
 from kbmaps.arrays import FloatArray, IntArray
 from kbmaps.chains.belief import ChainBelief
+from kbmaps.changes.bending import MOST_PAIRS, log_ratios_if_it_bends
 from kbmaps.changes.kinds import ChangeKind, change_kinds
 from kbmaps.changes.mixture import SIZES, log_ratios
 from kbmaps.changes.onsets import Onsets
@@ -105,6 +107,7 @@ class ChangeDetector:
         self._onsets = Onsets(known, len(self._columns))
         self._differences: list[float] = []
         self._surprises: list[FloatArray] = []
+        self._rows: deque[tuple[FloatArray, FloatArray, FloatArray, FloatArray]] = deque(maxlen=MOST_PAIRS)
         self._strange, self._looked_at, self._log_odds = False, 0, -math.inf
 
     @property
@@ -137,7 +140,10 @@ class ChangeDetector:
         weights = 1.0 / np.sqrt(variances)
         known = weights[..., None] * (jacobian @ self._root)
         changed = weights[..., None] * (jacobian[:, :, self._columns] * self._units)
-        for row_known, row_changed, error in zip(known, changed, weights * errors, strict=True):
+        prismatic = self._belief.parameters.reference.prismatic
+        angles = np.where(prismatic, q / self._belief.parameters.reach, q)
+        for angle, row_known, row_changed, error in zip(angles, known, changed, weights * errors, strict=True):
+            self._rows.append((angle, error, row_known, row_changed))
             self._add(row_known, row_changed, error)
 
     def _add(self, known: FloatArray, changed: FloatArray, error: FloatArray) -> None:
@@ -185,9 +191,29 @@ class ChangeDetector:
         onsets, information, score = self.sums()
         terms = np.stack([log_ratios(information[:, at, at], score[:, at], self._sizes) for at in self._places], axis=1)
         terms += self._log_shares + np.log(self._onsets.weights)[:, None]
+        suspicion = self._suspected(onsets, terms)
+        self._looked_at, self._log_odds = self.pairs, suspicion.log_odds
+        return suspicion
+
+    def suspicion_if_it_bends(self) -> Suspicion:
+        """How probable a change is if the arm may bend, before and after, as its pairs let expect; at least one pair.
+
+        It costs some hundred times as much as `suspicion`: to be asked for when that is an alarm.
+        """
+        rows = list(zip(*self._rows, strict=True))
+        angles, errors, known, changed = (np.array(each) for each in rows)
+        scale = 1.0 / math.sqrt(self._noise.single)
+        first = self.pairs - len(angles)
+        suspected = max(self.suspicion().onset - first, 0)
+        onsets, stands_for, terms = log_ratios_if_it_bends(
+            angles, scale * errors, scale * known, scale * changed, self._places, self._sizes, suspected
+        )
+        terms = terms + self._log_shares + np.log(stands_for)[:, None]
+        return self._suspected(onsets + first, terms)
+
+    def _suspected(self, onsets: IntArray, terms: FloatArray) -> Suspicion:
         log_odds = float(np.logaddexp.reduce(terms, axis=None))
         shares = np.exp(terms - log_odds)
-        self._looked_at, self._log_odds = self.pairs, log_odds
         return Suspicion(log_odds, log_odds > self._limit, onsets, shares.sum(axis=1), shares.sum(axis=0))
 
     def _grown_noise(self) -> SharedNoise:

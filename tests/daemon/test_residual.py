@@ -58,6 +58,10 @@ def test_it_answers_for_an_arm_that_sags(arm: SaggingArm, taught: Learning) -> N
     assert arm.error_m(snapshot.require_model()) < 0.6 * arm.error_m(snapshot.require_map())
 
 
+def test_that_it_sags_is_no_change(taught: Learning) -> None:
+    assert taught.counters.changes == 0
+
+
 def test_its_claim_holds_near_the_path(arm: SaggingArm, taught: Learning) -> None:
     q = near(np.random.default_rng(1), arm.q[:PAIRS])
     prediction = taught.snapshot.predict(q)

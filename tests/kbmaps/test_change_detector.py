@@ -27,12 +27,12 @@ KINDS = {"tool": None, "camera": None, "joint": 2}
 class Arm:
     """An arm that is as drawn within its tolerances, along a smooth path that it goes on with after a change."""
 
-    def __init__(self, seed: int, pairs: int = BEFORE + AFTER) -> None:
+    def __init__(self, seed: int, pairs: int = BEFORE + AFTER, speed: float = 1.0) -> None:
         self.rng = np.random.default_rng(seed)
         self.parameters = ChainParameters(random_chain(self.rng, "RRRRR"))
         self.belief = ChainBelief.from_tolerances(self.parameters, TOLERANCES)
         self.truth = self.parameters.standard_deviations(TOLERANCES) * self.rng.normal(size=self.parameters.size)
-        phases, speeds = self.rng.uniform(0.0, 6.0, 5), self.rng.uniform(0.03, 0.08, 5)
+        phases, speeds = self.rng.uniform(0.0, 6.0, 5), speed * self.rng.uniform(0.03, 0.08, 5)
         self.q = np.sin(speeds * np.arange(pairs)[:, None] + phases)
         self.x = self.parameters.positions(self.truth, self.q) + SIGMA * self.rng.normal(size=(pairs, 3))
 
@@ -46,6 +46,11 @@ class Arm:
         moved[chosen.columns] += size_m * chosen.units * direction / np.linalg.norm(direction)
         shift = self.parameters.positions(moved, self.q) - self.parameters.positions(self.truth, self.q)
         self.x[BEFORE:] += shift[BEFORE:]
+
+    def bend(self, size_m: float) -> None:
+        """The joints yield as they will, by about so much at the marker."""
+        waves = self.rng.normal(size=(3, self.q.shape[1])) * 0.7
+        self.x += size_m * np.sin(waves @ self.q.T + self.rng.uniform(0.0, 6.0, (3, 1))).T
 
     def detector(self) -> ChangeDetector:
         return ChangeDetector(self.belief, SharedNoise(np.ones(1), 1.0), SIGMA, 0.5)
@@ -141,6 +146,48 @@ def test_what_neighbours_share_makes_runs_of_them_say_less() -> None:
     shared = alone + np.repeat(rng.normal(size=(60, 3)), 10, axis=0)
     assert SharedNoise.of(alone).whole < 1.5
     assert SharedNoise.of(shared).whole > 6.0
+
+
+def alarms(arm: Arm) -> tuple[list[int], list[int]]:
+    """After how many pairs there is an alarm, and those after which it stands if the arm may bend."""
+    detector, raised, stands = arm.detector(), list[int](), list[int]()
+    for k in range(0, len(arm.q), 5):
+        arm.feed(detector, slice(k, k + 5))
+        suspicion = detector.suspicion()
+        if suspicion.alarm:
+            raised.append(k + 5)
+            if detector.suspicion_if_it_bends().alarm:
+                stands.append(k + 5)
+    return raised, stands
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_an_arm_that_bends_raises_no_alarm_that_stands(seed: int) -> None:
+    arm = Arm(seed, 200)
+    arm.bend(3.0 * SIGMA)
+    raised, stands = alarms(arm)
+    assert raised
+    assert not stands
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_change_of_an_arm_that_bends_is_noticed_and_dated(seed: int) -> None:
+    arm = Arm(seed, speed=0.4)
+    arm.bend(2.0 * SIGMA)
+    arm.change("tool", 10.0 * SIGMA)
+    detector = arm.detector()
+    arm.feed(detector, slice(BEFORE + 6))
+    suspicion = detector.suspicion_if_it_bends()
+    assert suspicion.alarm
+    assert abs(suspicion.onset - BEFORE) <= 1
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_an_alarm_of_a_rigid_arm_stands(kind: str) -> None:
+    arm = Arm(4)
+    arm.change(kind, 20.0 * SIGMA)
+    raised, stands = alarms(arm)
+    assert BEFORE < raised[0] <= stands[0] <= raised[0] + 5
 
 
 def test_pairs_that_come_together_say_what_they_say_one_by_one() -> None:
