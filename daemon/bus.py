@@ -237,12 +237,13 @@ class Bus:
     def _explain(self, message: str) -> str:
         if self._client and self._route is not None:
             return _unreached(self._route)
+        listen = self._listen or " or ".join(self._settings.get("listen/endpoints", ())) or "nothing"
         if "in use" in message:
             return (
-                f"the port of {self._listen} is in use. Stop the other bodyschema, "
+                f"the port of {listen} is in use. Stop the other bodyschema, "
                 "or give another endpoint in the table [zenoh] of robot.toml"
             )
-        return f"cannot open zenoh on {self._listen}: {message.split(' at /')[0]}. Mend the table [zenoh] of robot.toml"
+        return f"cannot open zenoh on {listen}: {message.split(' at /')[0]}. Mend the table [zenoh] of robot.toml"
 
     def _start(self, work: Callable[[], None]) -> None:
         thread = threading.Thread(target=work, name="answers")

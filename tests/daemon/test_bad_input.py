@@ -24,7 +24,6 @@ from daemon.cli import main
 from daemon.config import Config
 from daemon.keys import Keys
 from daemon.status import LearnerStatus
-from daemon.store import PairReader
 from daemon.wire import decode
 from interfaces.errors import BusError, RequestError
 
@@ -38,15 +37,6 @@ PR_CAPBSET_DROP, CAP_DAC_OVERRIDE = 24, 1
 ctypes.CDLL(None).prctl(PR_CAPBSET_DROP, CAP_DAC_OVERRIDE, 0, 0, 0)
 os.execv(sys.executable, [sys.executable, "-m", "daemon", *sys.argv[1:]])"""
 # SQLite says of a file that may not grow what it says of a disk that is full.
-ON_A_SMALL_DISK = """import sqlite3
-from daemon.cli import main
-connect = sqlite3.connect
-def small(*args, **kwargs):
-    connection = connect(*args, **kwargs)
-    connection.execute("PRAGMA max_page_count = 12")
-    return connection
-sqlite3.connect = small
-main()"""
 
 
 def run(*arguments: object, cwd: Path, by: tuple[str, ...] = ("-m", "daemon")) -> subprocess.CompletedProcess[str]:
@@ -210,20 +200,6 @@ def test_a_port_in_use_is_named_and_leaves_no_trace(robot, process) -> None:
         f"the port of {endpoint} is in use. Stop the other bodyschema, "
         "or give another endpoint in the table [zenoh] of robot.toml"
     )
-
-
-def test_a_full_disk_ends_the_sampler_with_all_accepted_pairs_in_the_store(robot) -> None:
-    rows = "".join(f"{0.0003 * k - 1.5},0.1,0.3,0.4,0.5\n" for k in range(2000))
-    (robot.parent / "walk.csv").write_text("waist,shoulder,x,y,z\n" + rows)
-    mend(robot, "[daemon]", "[daemon]\nany_step = true")
-    done = run("sampler", cwd=robot.parent, by=("-c", ON_A_SMALL_DISK))
-    file = robot.parent / "state" / "pairs.sqlite"
-    assert done.returncode == 1
-    assert f"bodyschema: the disk of {file} is full. Free some space, or give a --state-dir on another" in done.stderr
-    with PairReader(file) as reader:
-        stored = [pair.seq for pair in reader.read()]
-    assert 0 < len(stored) < 2000
-    assert stored == list(range(1, len(stored) + 1))
 
 
 @pytest.mark.parametrize(

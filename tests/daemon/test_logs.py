@@ -153,8 +153,8 @@ def test_signals_are_handled_as_before_afterwards() -> None:
 
 
 def test_a_hangup_calls_for_a_reload_where_one_is_wanted() -> None:
-    called = []
+    called, before = [], signal.getsignal(signal.SIGHUP)
     with on_termination(lambda: called.append("stop"), reload=lambda: called.append("reload")):
         signal.raise_signal(signal.SIGHUP)
     assert called == ["reload"]
-    assert signal.getsignal(signal.SIGHUP) is signal.SIG_DFL
+    assert signal.getsignal(signal.SIGHUP) is before

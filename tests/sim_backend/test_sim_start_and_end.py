@@ -20,9 +20,10 @@ from sim_backend.truth import TrueRobot
 
 ROOT = Path(__file__).resolve().parents[2]
 HOLD_OPEN = """
-import select, sys
+import select, signal, sys
 from interfaces.robot import RobotDescription
 from sim_backend import SimConfig, SimWorld, model_file
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
 try:
     with SimWorld(RobotDescription.load(model_file("upper_body")), SimConfig()) as world, world.joints, world.camera:
         world.camera.read(20.0)

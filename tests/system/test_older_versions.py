@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 from small_arm import URDF
-from test_kill import running, status_when, write_robot
+from two_processes import running, status_when, write_robot
 
 from daemon.backup import Backup, write_backup
 from daemon.checkpoint import CheckpointError, read_checkpoint

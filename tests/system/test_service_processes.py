@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 from stalled_at import WORK
-from test_kill import KEYS, write_robot
+from two_processes import KEYS, write_robot
 
 from daemon import learner, sampler
 from daemon.bus import client

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from test_kill import running, status_when, write_robot
+from two_processes import running, status_when, write_robot
 
 from daemon.cli import COMMANDS
 from daemon.status import LearnerStatus
