@@ -28,7 +28,7 @@ demo: setup     ## Watch the whole thing learn in simulation, about a minute
 	@$(BIN)/bodyschema demo
 
 test: setup     ## Run the tests
-	@$(BIN)/python -m pytest -n $$(($$(nproc) + 1)) --dist loadfile --no-loadscope-reorder
+	@$(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder
 
 check: setup    ## Lint: ruff, pyright, import-linter
 	@$(BIN)/ruff check .
