@@ -18,7 +18,7 @@ from benchmarks.rough_truths import MODELS, recording_split, run
 ANSWER = "ladder"
 _TRUTHS = ("sag1", "sag3", "eccentric", "gain", "affine", "lens")
 # Pairs, and how many seeds.
-_SIZES = {100: 50, 300: 50, 1000: 20, 3000: 6}
+_SIZES = {100: 50, 300: 50, 1000: 50, 3000: 50}
 _RECORDING = "ur5_laser"
 _FEW_POSES = 30
 
@@ -97,7 +97,7 @@ def _split(data: Path | None, pairs: int | None, seed: int) -> Values:
 
 
 def _recorded_row(data: Path | None) -> Row:
-    folds = (Study("UR5, four fifths of the rows", partial(_split, data, None), seeds=20),)
+    folds = (Study("UR5, four fifths of the rows", partial(_split, data, None), seeds=50),)
     few = (Study("UR5, 30 poses", partial(_split, data, _FEW_POSES), seeds=50),)
     return Row(
         "ur5",
