@@ -31,11 +31,11 @@ from daemon.learning.adaptation import Origin
 from daemon.learning.arm import KnownArm
 from daemon.learning.change import NAMED
 from daemon.learning.claims import Claim
-from daemon.learning.misfit import OUTLIER_SIGMAS
 from daemon.learning.solver import fitted_belief
 from daemon.learning.watch import LOOKED_BACK, Reference, Watch
 from interfaces.records import FloatArray, Pair, frozen_array
 from kbmaps import ChainBelief, ChainParameters, ChainTolerances, learning_bases
+from kbmaps.robust import OUTLIER_SIGMAS
 
 # After half as many pairs as the chain knows, on which it is tried out, the change comes within so many, and is to be
 # noticed within so many.

@@ -157,6 +157,8 @@ def _attend(
     begin = time.monotonic()
     due = [begin + every_s * k / len(learners) for k in range(len(learners))]
     while not wishes.ending:
+        # Taken before the round: a wish that comes during it is for every learner, and the next round's.
+        reloading, wishes.reloading = wishes.reloading, False
         for k, (learner, publish) in enumerate(zip(learners, publishers, strict=True)):
             if time.monotonic() >= due[k]:
                 due[k] = time.monotonic() + every_s
@@ -164,10 +166,9 @@ def _attend(
                 publish(encode(status))
                 line = status_line(status)
                 service.tell(line if len(learners) == 1 else f"{len(learners)} robots; {status.robot}: {line}")
-            if wishes.reloading:
+            if reloading:
                 _reload(learner, service)
             learner.tick()
-        wishes.reloading = False
         if failed:
             raise failed[0]
         time.sleep(TICK_S)

@@ -12,6 +12,9 @@ from kbmaps.pairs import Pairs
 MEDIAN_NORM = 1.538
 # No residual below a nanometre says anything: on noise-free data that is rounding.
 ROUNDING_M = 1e-9
+# A pair this many sigma from where the others predict it is an outlier: of good ones 3 in 100,000 are farther out
+# (chi, three dimensions).
+OUTLIER_SIGMAS = 4.8
 _ONE_SIGMA = 0.841344746
 
 

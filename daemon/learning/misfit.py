@@ -7,11 +7,10 @@ import math
 import numpy as np
 
 from interfaces.records import FloatArray
+from kbmaps.robust import OUTLIER_SIGMAS
 
 # What is smaller than so many of its standard errors may be chance.
 CLEARLY = 2.0
-# As in the fits: 3 of 100,000 good pairs are further out. What was left out there says nothing of what is missed.
-OUTLIER_SIGMAS = 4.8
 # Below this number of pairs, what was seen with the last tool counts.
 WARM = 10.0
 

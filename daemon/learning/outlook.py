@@ -11,6 +11,7 @@ from daemon.status import Outlook
 from interfaces.records import FloatArray
 from kbmaps import ChainBelief, ChainPosterior, ChainTolerances, candidate_motions, expected_gain, shared_by
 from kbmaps.planning.expected_gain import ALL, SAME
+from kbmaps.robust import OUTLIER_SIGMAS
 
 from .claims import Claim
 from .gate import MEDIAN_TO_SIGMA
@@ -27,8 +28,6 @@ WORTH = 0.05
 NOTICED = 0.1
 # Noise below this is none that a camera has; there has to be some [m].
 LEAST_NOISE_M = 1e-6
-# A pair beyond this many sigma of the noise is an outlier, as in the fit of the chain.
-OUTLIER_SIGMAS = 4.8
 
 
 @dataclass(frozen=True, eq=False)

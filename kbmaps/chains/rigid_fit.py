@@ -12,11 +12,8 @@ from scipy.special import chdtrc  # pyright: ignore[reportMissingTypeStubs, repo
 from kbmaps.arrays import BoolArray, FloatArray
 from kbmaps.chains.belief import ChainBelief, squared
 from kbmaps.pairs import Pairs
-from kbmaps.robust import MEDIAN_NORM, ROUNDING_M
+from kbmaps.robust import MEDIAN_NORM, OUTLIER_SIGMAS, ROUNDING_M
 
-# A pair this many sigma from where the others predict it is an outlier: of good ones 4 in 100,000 are as far out
-# (chi, three dimensions).
-_OUTLIER_SIGMAS = 4.8
 # A residual's variance is never taken for less than this share of the noise: below, the pair explains itself.
 _LEAST_SHARE = 1e-4
 _SCALES_PER_SIGMA = 3.0
@@ -216,7 +213,7 @@ def _anneal(fitter: _Fitter) -> None:
 def _polish(fitter: _Fitter, before: NoiseKnowledge) -> RigidFit:
     pairs = fitter.pairs
     typical = fitter.typical()
-    inliers = fitter.point.norms <= _OUTLIER_SIGMAS * typical
+    inliers = fitter.point.norms <= OUTLIER_SIGMAS * typical
     # Few pairs can be fitted with much noise or with little; what was told has the first say.
     noise = 1.0 if pairs.known else typical
     freedom = 0.0
@@ -226,7 +223,7 @@ def _polish(fitter: _Fitter, before: NoiseKnowledge) -> RigidFit:
         square = float(np.square(fitter.point.norms[inliers]).sum())
         estimate = _told_noise(square, freedom) if pairs.known else _found_noise(square, freedom, before, fitter)
         distances = fitter.point.deletion_distances(inliers, pairs.unit * max(estimate, fitter.typical()))
-        chosen = distances <= _OUTLIER_SIGMAS
+        chosen = distances <= OUTLIER_SIGMAS
         settled = bool((chosen == inliers).all()) and abs(estimate - noise) <= 1e-3 * noise
         inliers, noise = chosen, estimate
         if settled and step < _SMALL_STEP * math.sqrt(1.0 + freedom):

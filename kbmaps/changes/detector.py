@@ -105,7 +105,7 @@ class ChangeDetector:
         # A root of the covariance: a difference of covariances would be none after thousands of pairs.
         self._posterior_root, self._mean = np.eye(known), np.zeros(known)
         self._onsets = Onsets(known, len(self._columns))
-        self._differences: list[float] = []
+        self._differences: deque[float] = deque(maxlen=_RECENT)
         self._surprises: list[FloatArray] = []
         self._rows: deque[tuple[FloatArray, FloatArray, FloatArray, FloatArray]] = deque(maxlen=MOST_PAIRS)
         self._strange, self._looked_at, self._log_odds = False, 0, -math.inf
@@ -155,7 +155,7 @@ class ChangeDetector:
         off = off * min(1.0, CLIPPED_SIGMAS * spread / max(float(np.linalg.norm(off)), 1e-300))
         if self._surprises:
             apart = float(np.square(off * math.sqrt(self._noise.single) / spread - self._surprises[-1]).mean()) / 2.0
-            self._differences = [*self._differences[1 - _RECENT :], apart]
+            self._differences.append(apart)
         self._surprises.append(off * math.sqrt(self._noise.single) / spread)
         error = expected + off
         self._strange = float(np.linalg.norm(off)) > STRANGE_SIGMAS * spread

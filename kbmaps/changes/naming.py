@@ -12,9 +12,8 @@ from kbmaps.arrays import FloatArray
 from kbmaps.chains.belief import ChainBelief
 from kbmaps.changes.kinds import OTHER, ChangeKind
 from kbmaps.changes.mixture import SIZES
+from kbmaps.robust import OUTLIER_SIGMAS
 
-# A pair farther than this from what a kind predicts is an outlier to it, and costs no more than that [sigmas].
-OUTLIER_SIGMAS = 4.8
 # So many pairs, evenly spread, stand for all.
 MOST_PAIRS = 100
 _STEPS = 6

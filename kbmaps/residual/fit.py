@@ -18,10 +18,8 @@ from kbmaps.residual.correlation import innovations, most_probable
 from kbmaps.residual.evidence import Average, GroupedModel, Moments
 from kbmaps.residual.features import SMOOTH_GROUPS
 from kbmaps.residual.model import ResidualModel
-from kbmaps.robust import MEDIAN_NORM, ROUNDING_M
+from kbmaps.robust import MEDIAN_NORM, OUTLIER_SIGMAS, ROUNDING_M
 
-# Of the chi distribution in three dimensions: 3 of 100,000 good pairs are further out.
-_OUTLIER_SIGMAS = 4.8
 _ROUNDS, _SELECTIONS = 6, 2
 # Few enough rows for a processor's cache.
 _ROWS_AT_ONCE = 150
@@ -147,7 +145,7 @@ class _Fitter:
         norms = np.linalg.norm(residuals, axis=1)
         typical = max(float(np.median(norms)) / MEDIAN_NORM, self._least_noise)
         bound = typical if math.isinf(self.noise) else max(typical, self.noise)
-        self.inliers = norms <= _OUTLIER_SIGMAS * bound
+        self.inliers = norms <= OUTLIER_SIGMAS * bound
         if math.isinf(self.noise):
             self.noise = typical
 
