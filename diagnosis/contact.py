@@ -1,4 +1,4 @@
-"""On which side of its play a joint is."""
+"""What nobody knows where a run begins: on which side of its play a joint is, and how far it was from rest."""
 
 from __future__ import annotations
 
@@ -6,6 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .fit import Fit
+
+# A joint that has made up for all but so much of what it lacked is at rest.
+_AT_REST = 0.05
 
 
 def before_contact(fit: Fit) -> NDArray[np.bool_]:
@@ -20,3 +23,19 @@ def before_contact(fit: Fit) -> NDArray[np.bool_]:
             crossed = np.maximum.accumulate(q[first:end]) - np.minimum.accumulate(q[first:end]) >= effect.values[0]
             rows[first:end] |= ~crossed
     return rows
+
+
+def before_rest(fit: Fit) -> NDArray[np.bool_]:
+    """Rows (n,), but for the first of a run, at which a joint still lacks some of what it lacked as the run began."""
+    motion = fit.observations.motion
+    memory = max((effect.value("memory") for effect in fit.simulation.effects if effect.name == "settling"), default=0)
+    rows = np.zeros(len(motion), dtype=np.bool_)
+    if memory > 0.0:
+        for first, end in motion.runs:
+            rows[first + 1 : end] = memory ** np.cumsum(motion.pace[first + 1 : end]) > _AT_REST
+    return rows
+
+
+def doubtful(fit: Fit) -> NDArray[np.bool_]:
+    """Rows (n,) whose past is not known well enough."""
+    return before_contact(fit) | before_rest(fit)

@@ -15,7 +15,7 @@ from interfaces.records import FloatArray
 
 from .alignment import aligned
 from .alike import Alike, alike
-from .contact import before_contact
+from .contact import doubtful
 from .explanation import changed_by_the_way, explain, without_one
 from .fit import Fit, fitted
 from .held_out import Added, Blocks, added, gain_percent, held_out_errors, is_marker
@@ -115,7 +115,7 @@ class Diagnosis:
 
     @property
     def _off(self) -> np.ndarray:
-        return ~self.markers & self.extended.observations.trusted & ~before_contact(self.extended)
+        return ~self.markers & self.extended.observations.trusted & ~doubtful(self.extended)
 
     @property
     def outliers_are_found(self) -> bool:
@@ -207,10 +207,10 @@ def diagnose(
     tell(f"{len(hypotheses.effects)} hypotheses")
     search = Search(hypotheses.effects, tell)
     extended = search.run(start)
-    factor, unknown_side = instrument_factor(extended), before_contact(extended)
-    doubtful = unknown_side if unknown_side.mean() <= MOST_DOUBTFUL else np.zeros_like(unknown_side)
-    if abs(np.log(factor)) > _SAME_NOISE or doubtful.any():
-        observations = observations.with_factor(factor).without(doubtful)
+    factor, rows = instrument_factor(extended), doubtful(extended)
+    left_out = rows if rows.mean() <= MOST_DOUBTFUL else np.zeros_like(rows)
+    if abs(np.log(factor)) > _SAME_NOISE or left_out.any():
+        observations = observations.with_factor(factor).without(left_out)
         start = aligned(observations, simulation)
         extended = search.run(start.with_causes(extended.causes))
         search.path.insert(0, start)

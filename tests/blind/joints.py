@@ -9,6 +9,7 @@ import numpy as np
 from scipy.optimize import root_scalar
 
 from .arrays import FloatArray
+from .motion import FINE
 
 
 def off_centre_ring(shaft_rad: FloatArray, ex: float, ey: float) -> FloatArray:
@@ -51,8 +52,11 @@ def lagging(t: FloatArray, shaft: FloatArray, tau_s: float) -> FloatArray:
 
 
 def left_of_move(tau_s: float, move_s: float, rest_s: float) -> float:
-    """Part of a smooth move of `move_s` that a lagging output still lacks `rest_s` after its end."""
-    h = np.linspace(0.0, 1.0, 65)
+    """Part of a smooth move of `move_s` that a lagging output still lacks `rest_s` after its end.
+
+    The move is as a `Motion` has it: straight between `FINE` instants.
+    """
+    h = np.linspace(0.0, 1.0, FINE + 1)
     t = np.append(h * move_s, move_s + rest_s)
     return float(1.0 - lagging(t, np.append(h * h * (3.0 - 2.0 * h), 1.0), tau_s)[-1])
 

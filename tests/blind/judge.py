@@ -29,7 +29,7 @@ SAME_SHARE = 1e-4  # what is left of a signal, of its chi-square, by an effect t
 SURE = 0.9
 FEWEST_FALSE_FIXES = 3
 SHOWS, HIDDEN_FROM = 0.25, 0.02  # share of the variance from which a joint has to be named, and below which it must not
-FIRST_ORDER = ("settling", "joint_ripple")  # a lag over a smooth move; poles of unequal strength, read by atan2
+FIRST_ORDER = ("joint_ripple",)  # poles of unequal strength, read by atan2
 TELLS_LITTLE = 10.0  # usual sizes: a wider interval says that the motion does not tell the number
 
 
@@ -58,8 +58,9 @@ class Truth:
     def of(cls, case: HiddenCase, robot: RobotDescription, motion: Motion) -> Truth:
         """From a case and the motion that was recorded."""
         scene = Scene.of(robot, motion, case.measured.covariance)
-        nuisances = tuple(m.effect for h in case.nuisances if (m := meant(h, robot)) is not None)
-        both = [(h, m) for h in case.truth if (m := meant(h, robot)) is not None]
+        usual_s = float(np.median(np.diff(motion.clock)[motion.segment[1:] == motion.segment[:-1]]))
+        nuisances = tuple(m.effect for h in case.nuisances if (m := meant(h, robot, usual_s)) is not None)
+        both = [(h, m) for h in case.truth if (m := meant(h, robot, usual_s)) is not None]
         strange = tuple(h for h in case.truth if h.outside)
         hidden, meanings = tuple(h for h, _ in both), tuple(m for _, m in both)
         return cls(case, robot, scene, wide(scene), nuisances, hidden, meanings, strange)

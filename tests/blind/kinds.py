@@ -194,7 +194,8 @@ KINDS: dict[str, Kind] = {
         SHIFT,
         _drift,
         0.1,
-        "measured minus true position at the drift's end, in the measurement frame; before that times 1 − exp(−t/tau)",
+        "measured minus true position at the drift's end, in the measurement frame; before that times 1 − exp(−t/tau), "
+        "t since the first pair",
     ),
     "outliers": Kind("robot", (), _outliers, 1.0, "fraction of the fixes that are not the marker"),
 }

@@ -35,16 +35,20 @@ class Meant:
         return self.effect.key
 
 
-def meant(hidden: Hidden, robot: RobotDescription) -> Meant | None:
-    """The hidden effect in the words of the table; None for what no row of it describes."""
+def meant(hidden: Hidden, robot: RobotDescription, usual_s: float) -> Meant | None:
+    """The hidden effect in the words of the table; None for what no row of it describes.
+
+    Args:
+        usual_s: median time between two pairs of a run [s].
+    """
     if hidden.outside or hidden.effect == "outliers":
         return None
-    name, values = _named(hidden)
+    name, values = _named(hidden, usual_s)
     effect = Effect.at(robot, name, hidden.where, hidden.source, {k: v for k, v in values.items() if not math.isnan(v)})
     return Meant(effect, frozenset(name for name, value in values.items() if not math.isnan(value)))
 
 
-def _named(hidden: Hidden) -> tuple[str, Parameters]:
+def _named(hidden: Hidden, usual_s: float) -> tuple[str, Parameters]:
     """Name and numbers; NaN for a number that the mechanism does not have."""
     p, name = hidden.parameters, hidden.effect
     unit = "m" if any(key in p for key in ("turn_m", "offset_m", "jump_m", "play_m")) else "rad"
@@ -60,7 +64,7 @@ def _named(hidden: Hidden) -> tuple[str, Parameters]:
         case "backlash":
             return name, {f"width_{unit}": p[f"play_{unit}"]}
         case "settling":
-            return name, _settling(p)
+            return name, _settling(p, usual_s)
         case "tool_offset" | "tool_slip":
             return name, _shifts(p) | _moment(p)
         case "camera_pose" | "camera_moved" | "link_geometry":
@@ -86,11 +90,11 @@ def _periodic(name: str, p: Parameters) -> tuple[str, Parameters]:
     return name, numbers if name == "joint_eccentricity" else numbers | {"cycles_per_turn": poles}
 
 
-def _settling(p: Parameters) -> Parameters:
-    """What is left of a move, and of that after the next one; on a walk without rests there are no such numbers."""
+def _settling(p: Parameters, usual_s: float) -> Parameters:
+    """What is left of a move, and of that after the usual time; on a walk without rests there are no such numbers."""
     if "left" not in p:
         return {"fraction": math.nan, "memory": math.nan}
-    return {"fraction": p["left"], "memory": math.exp(-(p["move_s"] + p["rest_s"]) / p["tau_s"])}
+    return {"fraction": p["left"], "memory": math.exp(-usual_s / p["tau_s"])}
 
 
 def _shifts(p: Parameters) -> Parameters:

@@ -27,7 +27,7 @@ class Motion:
     """A path of the motor shafts, and when it is read.
 
     Attributes:
-        t: instants of the whole path, also where nothing is recorded [s], shape (f,).
+        t: instants of the whole path, also where nothing is recorded [s], shape (f,); the first pair is read at 0.
         shaft: positions at those instants, after the gears and free of any error [rad or m], shape (f, d).
         stamps: when pairs are read [s], shape (n,).
         segment: number of the run of pairs each belongs to, shape (n,).
@@ -113,7 +113,9 @@ class _Walk:
         t, q, read = self._timed(style, np.array(self._q), segment >= 0, np.array(self._jump))
         fine = _refined(t)
         quick = (STEP_S, READ_AFTER_S) if style == "stepped" else (None, None)
-        return Motion(style, fine, PchipInterpolator(t, q)(fine), read, segment[segment >= 0], *quick)
+        return Motion(
+            style, fine - read[0], PchipInterpolator(t, q)(fine), read - read[0], segment[segment >= 0], *quick
+        )
 
     def _region(self, pairs: int) -> int:
         """Walk until `pairs` pairs were seen."""
@@ -195,7 +197,8 @@ def _held(rng: np.random.Generator, ranges: FloatArray, pairs: int, visible: Vis
     t, order = _sorted_unique(np.concatenate([begin, end, stamps]))
     knots = np.concatenate([np.vstack([q[:1], q[:-1]]), q, q])[order]
     fine = _refined(t)
-    return Motion("held", fine, PchipInterpolator(t, knots)(fine), stamps, np.arange(pairs), lasts, rest)
+    shaft, first = PchipInterpolator(t, knots)(fine), stamps[0]
+    return Motion("held", fine - first, shaft, stamps - first, np.arange(pairs), lasts, rest)
 
 
 def _slow_noise(rng: np.random.Generator, count: int, sigma: float) -> FloatArray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from pathlib import Path
 
@@ -19,6 +20,7 @@ from .hidden import Hidden
 from .judge import Truth, compared, joints_right, judge, outcome
 from .judgement import CauseJudged, Crash, Judgement, Number, TruthJudged
 from .kinds import KINDS
+from .meaning import meant
 from .sealed import encoded, read
 
 PAIRS = 250
@@ -179,6 +181,15 @@ def test_the_table_says_with_the_meant_numbers_what_the_world_shows(name: str, t
         assert truth.meanings[0].told == {"fraction", "memory"}
     nothing, best = truth.scene.chi2(target, []), truth.fitted.chi2
     assert truth.scene.chi2(target, [effect]) < best + 0.02 * (nothing - best)
+
+
+@pytest.mark.parametrize(("usual_s", "memory"), [(0.06, math.exp(-1.0)), (0.12, math.exp(-2.0))])
+def test_what_a_joint_remembers_is_told_after_the_usual_time(usual_s: float, memory: float, truth_of: Hide) -> None:
+    parameters = {"left": 0.3, "move_s": 0.03, "rest_s": 0.03, "tau_s": 0.06}
+    hidden = Hidden("settling", "elbow", None, parameters, KINDS["settling"].sign)
+    meaning = meant(hidden, truth_of(ELBOW).robot, usual_s)
+    assert meaning is not None
+    assert meaning.effect.values.tolist() == pytest.approx([0.3, memory])
 
 
 def test_numbers_are_judged_by_their_interval(truth_of: Hide) -> None:

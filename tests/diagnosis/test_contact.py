@@ -1,0 +1,64 @@
+"""What nobody knows where a run begins is not asked of the rows after it."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from planted_cases import INTERVAL_S, SHOULDER, desk_arm, measured, motion_of, seen, walk
+
+from diagnosis.alignment import aligned
+from diagnosis.contact import before_contact, before_rest
+from diagnosis.fit import Fit
+from diagnosis.observations import Observations
+from effects import Effect, Motion, Simulation
+from interfaces.robot import RobotDescription
+
+RUN, UNSEEN = 20, 4
+
+
+@pytest.fixture(scope="module")
+def robot() -> RobotDescription:
+    return desk_arm()
+
+
+def in_runs(robot: RobotDescription, *effects: Effect) -> Fit:
+    """The effects fitted to what is seen of a walk on which every few rows the marker is lost."""
+    way = walk(robot, 3, 600)
+    x = seen(robot, way, effects, 3).x
+    kept = np.arange(len(way)) % (RUN + UNSEEN) < RUN
+    assert way.t is not None
+    t = way.t[kept]
+    segment = np.cumsum(np.diff(t, prepend=0.0) > 1.5 * INTERVAL_S, dtype=np.int64)
+    motion = Motion(way.q[kept], t, segment)
+    observations = Observations.of(measured(robot, motion, x[kept]), Simulation(robot))
+    return aligned(observations, Simulation(robot)).with_causes(effects)
+
+
+def test_a_joint_that_settles_is_at_rest_when_it_has_forgotten_what_was_before_the_run(robot) -> None:
+    lacking = before_rest(in_runs(robot, Effect.at(robot, "settling", SHOULDER, values=[0.3, 0.3])))
+    rows = np.flatnonzero(lacking[:RUN])
+    # 0.3 and 0.09 of it are more than a twentieth, 0.027 is not; the first row is never trusted in a walk.
+    np.testing.assert_array_equal(rows, [1, 2])
+
+
+def test_a_joint_that_remembers_nothing_is_at_rest_at_once(robot) -> None:
+    assert not before_rest(in_runs(robot, Effect.at(robot, "settling", SHOULDER, values=[0.3, 0.0]))).any()
+
+
+def test_a_run_that_begins_in_mid_move_makes_no_outliers_beyond_the_rows_before_rest(robot) -> None:
+    fit = in_runs(robot, Effect.at(robot, "settling", SHOULDER, values=[0.5, 0.3]))
+    again = aligned(fit.observations.without(before_rest(fit)), Simulation(robot)).with_causes(fit.causes)
+    assert fit.noise.share > 0.02
+    assert again.noise.share < 0.005
+
+
+def test_a_play_is_known_once_the_run_has_crossed_it(robot) -> None:
+    fit = in_runs(robot)
+    q = np.tile(np.median(fit.observations.motion.q, axis=0), (6, 1))
+    q[:, robot.joints.index(SHOULDER)] += [0.0, 0.01, 0.02, 0.03, 0.02, 0.01]
+    play = Effect.at(robot, "backlash", SHOULDER, values=[0.025])
+    crossing = dataclasses.replace(fit.observations, motion=motion_of(q), x=np.zeros((6, 3)))
+    there = dataclasses.replace(fit, observations=crossing, simulation=Simulation(robot, (play,)), nuisances=0)
+    np.testing.assert_array_equal(before_contact(there), [True, True, True, False, False, False])
