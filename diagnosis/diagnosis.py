@@ -172,7 +172,8 @@ class Diagnosis:
     def alike(self) -> tuple[Alike, ...]:
         """Effects that share a direction beside the best geometry."""
         named = {cause.key for cause in self.causes}
-        pairs = alike(self.geometry, self.hypotheses.effects)
+        joints = {cause.where for cause in self.causes}
+        pairs = alike(self.geometry, (effect for effect in self.hypotheses.effects if effect.where in joints))
         return tuple(pair for pair in pairs if named & {pair.one.key, pair.other.key})
 
     @cached_property

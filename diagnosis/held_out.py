@@ -7,7 +7,7 @@ of the other blocks and g the gradient of the block's own likelihood, the amount
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import stats
@@ -98,28 +98,86 @@ class Added:
 
 def added(fit: Fit, candidates: Sequence[Candidate], blocks: Blocks) -> list[Added]:
     """What each of the candidates would bring on top of a fit, to first order."""
-    before = held_out_square(fit, fit.columns, prior_precision(fit.simulation, fit.nuisances), blocks)
-    return [_added(fit, candidate.effect, before, blocks) for candidate in candidates]
+    folds = _Folds.of(fit, fit.columns, blocks)
+    before = folds.products.missed(prior_precision(fit.simulation, fit.nuisances))
+    return [_added(fit, candidate.effect, folds, before, blocks) for candidate in candidates]
 
 
-def _added(fit: Fit, effect: Effect, before: float, blocks: Blocks) -> Added:
+def _added(fit: Fit, effect: Effect, folds: _Folds, before: float, blocks: Blocks) -> Added:
     own = fit.weighted(fit.run.columns(effect)[:, :, effect.amounts])
     usual = np.array([effect.parameters[j].usual for j in effect.amounts])
     precision = [prior_precision(fit.simulation, fit.nuisances), 1.0 / np.square(LARGEST * usual)]
-    after = held_out_square(fit, np.concatenate([fit.columns, own], axis=2), np.concatenate(precision), blocks)
+    after = folds.beside(own).missed(np.concatenate(precision))
     gain = 1.0 - after / before if before > 0.0 else 0.0
     return Added(100.0 * gain, block_p_value(fit, own, blocks))
 
 
 def held_out_square(fit: Fit, columns: FloatArray, precision: FloatArray, blocks: Blocks) -> float:
     """Sum of the squares that columns (n, 3, p) leave of what a fit has left, on rows that were not fitted."""
-    left = fit.left.copy()
-    if columns.shape[2]:
-        ridge = np.diag(precision) * fit.noise.sigma**2
+    return _Folds.of(fit, columns, blocks).products.missed(precision)
+
+
+@dataclass(frozen=True, eq=False)
+class _Products:
+    """Of columns with one another and with what a fit has left, fold by fold.
+
+    Attributes:
+        inner, toward: (folds, p, p) and (folds, p).
+        square: of all that is left.
+        variance: of the noise, in units of the stated one.
+    """
+
+    inner: FloatArray
+    toward: FloatArray
+    square: float
+    variance: float
+
+    def missed(self, precision: FloatArray) -> float:
+        """Sum of the squares that is left of rows whose fold was not fitted, with this precision (p,) of amounts."""
+        square = self.square
+        if not len(precision):
+            return square
+        inners, towards = self.inner.sum(axis=0), self.toward.sum(axis=0)
+        for inner, toward in zip(self.inner, self.toward, strict=True):
+            step = solved(inners - inner + np.diag(precision) * self.variance, towards - toward)
+            square += float(step @ inner @ step - 2.0 * step @ toward)
+        return square
+
+
+@dataclass(frozen=True, eq=False)
+class _Folds:
+    """Columns and what a fit has left, fold by fold.
+
+    Attributes:
+        rows: of each fold: which they are, the columns there (3 m, p), and what is left (3 m,).
+        products: of them.
+    """
+
+    rows: tuple[tuple[IntArray, FloatArray, FloatArray], ...]
+    products: _Products
+
+    @classmethod
+    def of(cls, fit: Fit, columns: FloatArray, blocks: Blocks) -> _Folds:
+        """Columns (n, 3, p)."""
+        rows = []
         for fold in range(_FOLDS):
-            rows = blocks.fold == fold
-            left[rows] -= columns[rows] @ _solve(columns[~rows], fit.left[~rows], ridge)
-    return float(np.square(left).sum())
+            own = np.flatnonzero(blocks.fold == fold)
+            rows.append((own, columns[own].reshape(3 * len(own), columns.shape[2]), fit.left[own].ravel()))
+        inner, toward = np.array([c.T @ c for _, c, _ in rows]), np.array([c.T @ left for _, c, left in rows])
+        square = float(np.square(fit.left).sum())
+        return cls(tuple(rows), _Products(inner, toward, square, fit.noise.sigma**2))
+
+    def beside(self, more: FloatArray) -> _Products:
+        """With more columns (n, 3, k)."""
+        p, k = self.products.inner.shape[1], more.shape[2]
+        inner, toward = np.empty((_FOLDS, p + k, p + k)), np.empty((_FOLDS, p + k))
+        inner[:, :p, :p], toward[:, :p] = self.products.inner, self.products.toward
+        for fold, (own, columns, left) in enumerate(self.rows):
+            fresh = more[own].reshape(3 * len(own), k)
+            inner[fold, p:, p:], toward[fold, p:] = fresh.T @ fresh, fresh.T @ left
+            inner[fold, :p, p:] = columns.T @ fresh
+            inner[fold, p:, :p] = inner[fold, :p, p:].T
+        return replace(self.products, inner=inner, toward=toward)
 
 
 def block_p_value(fit: Fit, columns: FloatArray, blocks: Blocks) -> float:

@@ -33,6 +33,10 @@ _AT_95 = 3.841
 _TOLD_APART = 1e-7
 
 
+# Inner products (m, k, k) beside what is fitted, gradients (m, k) and raw squares (m, k) of m systems.
+_System = tuple[FloatArray, FloatArray, FloatArray]
+
+
 @dataclass(frozen=True, eq=False)
 class Candidate:
     """A hypothesis as it would explain most.
@@ -92,9 +96,10 @@ class Scan:
             case "settling":
                 return self._finely(effect, _MEMORIES)
             case _:
-                columns = self._fit.weighted(self._fit.run.columns(effect)[:, :, effect.amounts])
-                gain, amounts, dof = self._explained(columns, effect)
-                return Candidate(_with_amounts(effect, amounts), gain, dof) if dof else None
+                gains, amounts, dofs = self._solved(*self._linear(effect), effect)
+                if not dofs[0]:
+                    return None
+                return Candidate(_with_amounts(effect, amounts[0]), float(gains[0]), int(dofs[0]))
 
     def best_pair(self, hypotheses: Iterable[Effect]) -> tuple[Candidate, Candidate] | None:
         """The two effects of one number each that would explain most together; None where there are not two."""
@@ -177,20 +182,19 @@ class Scan:
         span = max(float(np.ptp(self._fit.run.readings.q[:, place.joint])), 1e-6)
         first, step = (2.0, 1.0) if not place.prismatic else (1.0 / span, 1.0 / span)
         coarse = first + step * np.arange(_MOST_CYCLES - 1)
-        gains, _, _ = self._rippled(effect, np.asarray(coarse, dtype=np.float64))
+        nearest = self._rippled(effect, np.asarray(coarse, dtype=np.float64))[0]
         # A peak is as wide as what turns the phase by one over the range.
         width = 1.0 / span if place.prismatic else 2.0 * np.pi / span
-        fine: FloatArray = coarse[int(np.argmax(gains))] + 0.5 * max(width, step) * np.linspace(-1.0, 1.0, 61)
+        fine: FloatArray = coarse[nearest] + 0.5 * max(width, step) * np.linspace(-1.0, 1.0, 61)
         fine = fine[fine > 0.5 * first]
-        gains, amounts, dofs = self._rippled(effect, np.asarray(fine, dtype=np.float64))
-        best = int(np.argmax(gains))
-        if not dofs[best]:
+        best, gains, amounts, dof = self._rippled(effect, np.asarray(fine, dtype=np.float64))
+        if not dof:
             return None
-        values = np.array([*amounts[best], fine[best]])
-        return Candidate(effect.with_values(values), float(gains[best]), int(dofs[best]), 2 * len(coarse))
+        values = np.array([*amounts, fine[best]])
+        return Candidate(effect.with_values(values), float(gains[best]), dof, 2 * len(coarse))
 
-    def _rippled(self, effect: Effect, cycles: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """`_solved` for each of equally spaced numbers of cycles (m,)."""
+    def _rippled(self, effect: Effect, cycles: FloatArray) -> tuple[int, FloatArray, FloatArray, int]:
+        """`_best` for each of equally spaced numbers of cycles (m,)."""
         place = self._fit.simulation.place(effect)
         angle = self._fit.run.readings.q[:, place.joint] * (2.0 * np.pi if place.prismatic else 1.0)
         # exp(i cycles angle), each from the one before.
@@ -210,7 +214,7 @@ class Scan:
         removed = (flat.T @ rows.onto).reshape(len(cycles), 2, -1)[:, ::-1]
         inner -= removed @ np.swapaxes(removed, 1, 2)
         gradient = (flat.T @ rows.toward[:, 0]).reshape(-1, 2)[:, ::-1]
-        return self._solved(inner, gradient, raw, effect)
+        return self._best(inner, gradient, raw, effect)
 
     def _moment(self, effect: Effect) -> Candidate | None:
         """Over all moments between two rows."""
@@ -230,34 +234,53 @@ class Scan:
         raw = np.einsum("taa->ta", inner).copy()
         removed = since(rows.onto).reshape(len(inner), k, -1)
         inner = inner - removed @ np.swapaxes(removed, 1, 2)
-        gains, amounts, dofs = self._solved(inner, since(rows.toward), raw, effect)
-        best = int(np.argmax(gains))
-        if not dofs[best]:
+        best, gains, amounts, dof = self._best(inner, since(rows.toward), raw, effect)
+        if not dof:
             return None
         row = best + _BESIDE
         moment = 0.5 * (clock[row - 1] + clock[row])
-        values = np.append(amounts[best], moment)
+        values = np.append(amounts, moment)
         interval = _interval(0.5 * (clock[_BESIDE - 1 : n - _BESIDE - 1] + clock[_BESIDE : n - _BESIDE]), gains)
-        return Candidate(effect.with_values(values), float(gains[best]), int(dofs[best]), len(gains), interval)
+        return Candidate(effect.with_values(values), float(gains[best]), dof, len(gains), interval)
 
-    def _explained(self, columns: FloatArray, effect: Effect) -> tuple[float, FloatArray, int]:
+    def _linear(self, effect: Effect) -> _System:
+        """The system of an effect that has amounts alone."""
+        encoder = effect.kind.encoder
+        if encoder is not None:
+            place = self._fit.simulation.place(effect)
+            factors = encoder.columns(self._fit.run.readings, place, effect.values)[:, effect.amounts]
+            return self._port(place.joint).mixed(factors)
+        columns = self._fit.weighted(self._fit.run.columns(effect)[:, :, effect.amounts])
         flat = columns.reshape(self._left.size, -1)
         inner = flat.T @ flat
         removed = flat.T @ self._basis.reshape(self._left.size, -1)
-        raw = np.diag(inner).copy()
-        gains, amounts, dofs = self._solved(
-            (inner - removed @ removed.T)[None], (flat.T @ self._left.ravel())[None], raw[None], effect
-        )
-        return float(gains[0]), amounts[0], int(dofs[0])
+        return (inner - removed @ removed.T)[None], (flat.T @ self._left.ravel())[None], np.diag(inner)[None]
 
     def _solved(
         self, inner: FloatArray, gradient: FloatArray, raw: FloatArray, effect: Effect
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Gains (m,), amounts (m, k) and degrees of freedom (m,) of m systems (m, k, k), of raw squares (m, k)."""
-        sigma2 = self._fit.noise.sigma**2
-        usual = np.array([effect.parameters[j].usual for j in effect.amounts])
-        # In units in which an amount that is as large as can be expected is one.
-        unit = LARGEST * usual
+        gains, amounts = self._gains(inner, gradient, effect)
+        dofs = self._dofs(inner, raw, effect)
+        return np.where(dofs > 0, gains, 0.0), amounts, dofs
+
+    def _best(
+        self, inner: FloatArray, gradient: FloatArray, raw: FloatArray, effect: Effect
+    ) -> tuple[int, FloatArray, FloatArray, int]:
+        """As `_solved`, of many systems: which is the best, gains (m,), its amounts (k,) and degrees of freedom."""
+        gains, amounts = self._gains(inner, gradient, effect)
+        best = int(np.argmax(gains))
+        # Only where the data tell nothing of the best are all others asked whether they tell more.
+        if not (dof := int(self._dofs(inner[[best]], raw[[best]], effect)[0])):
+            dofs = self._dofs(inner, raw, effect)
+            gains = np.where(dofs > 0, gains, 0.0)
+            best = int(np.argmax(gains))
+            dof = int(dofs[best])
+        return best, gains, amounts[best], dof
+
+    def _gains(self, inner: FloatArray, gradient: FloatArray, effect: Effect) -> tuple[FloatArray, FloatArray]:
+        """Gains (m,) and amounts (m, k)."""
+        sigma2, unit = self._fit.noise.sigma**2, _units(effect)
         scaled = inner * unit[:, None] * unit
         if len(unit) == 1:
             solved = gradient * unit / (scaled[:, 0] + sigma2)
@@ -266,11 +289,14 @@ class Scan:
         amounts = solved * unit
         explained = np.einsum("ma,ma->m", amounts, gradient)
         explained = np.clip(explained, 0.0, 0.999999 * self._rss)
+        return -3.0 * self._rows * np.log1p(-explained / self._rss), amounts
+
+    def _dofs(self, inner: FloatArray, raw: FloatArray, effect: Effect) -> FloatArray:
+        """Degrees of freedom (m,)."""
+        unit = _units(effect)
         shares = _eigenvalues(inner / np.sqrt(np.maximum(raw[:, :, None] * raw[:, None, :], 1e-300)))
-        told = _eigenvalues(scaled) > 10.0 * sigma2
-        dofs = ((shares > _TOLD_APART) & told).sum(axis=1)
-        gains = -3.0 * self._rows * np.log1p(-explained / self._rss)
-        return np.where(dofs > 0, gains, 0.0), amounts, dofs
+        told = _eigenvalues(inner * unit[:, None] * unit) > 10.0 * self._fit.noise.sigma**2
+        return ((shares > _TOLD_APART) & told).sum(axis=1)
 
     def _port(self, joint: int) -> _Rows:
         """How the weighted prediction moves with a joint."""
@@ -299,13 +325,23 @@ class _Rows:
     onto: FloatArray
     toward: FloatArray
 
-    def scaled(self, factors: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def scaled(self, factors: FloatArray) -> _System:
         """Inner products (m, k, k) beside what is fitted, gradients and raw squares (m, k) of rows times (n, m)."""
         k = self.toward.shape[1]
         inner = (np.square(factors).T @ self.inner).reshape(-1, k, k)
         raw = np.einsum("maa->ma", inner).copy()
         removed = (factors.T @ self.onto).reshape(len(inner), k, -1)
         return inner - removed @ np.swapaxes(removed, 1, 2), factors.T @ self.toward, raw
+
+    def mixed(self, factors: FloatArray) -> _System:
+        """The one system of k columns that are each this single column times factors (n, k), row by row."""
+        inner, removed = factors.T @ (self.inner * factors), factors.T @ self.onto
+        return (inner - removed @ removed.T)[None], (factors.T @ self.toward).T, np.diag(inner)[None]
+
+
+def _units(effect: Effect) -> FloatArray:
+    """Of an effect's amounts (k,): each as large as can be expected."""
+    return LARGEST * np.array([effect.parameters[j].usual for j in effect.amounts])
 
 
 def _eigenvalues(matrices: FloatArray) -> FloatArray:

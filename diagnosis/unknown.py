@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy import stats
@@ -28,6 +29,8 @@ _NUMBER = 2.0
 _TOLD, _LEFT = 1e-6, 1e-7
 # Whether blocks of time agree is asked of so many of a family's directions.
 _STRONGEST = 4
+# A row whose weight differs from one by less counts in full.
+_COUNTS_IN_FULL = 1e-9
 # Rounds in which families and causes are fitted in turn, until the likelihood rises by less than this [nats].
 _ROUNDS, _ENOUGH = 5, 0.1
 
@@ -68,6 +71,18 @@ class Way:
         of_amounts = np.maximum(np.sqrt(np.square(lengths / of_moves).mean(axis=0)), 1e-100)
         scales = (of_moves * of_amounts).ravel()
         return cls(family, whitened / scales, scales, amounts)
+
+    @cached_property
+    def inner(self) -> FloatArray:
+        """Products (p, p) of the columns with one another."""
+        return self.columns.T @ self.columns
+
+    def weighted_inner(self, weights: FloatArray) -> FloatArray:
+        """The same with rows weighted (n,), by those that do not count in full."""
+        partly = np.flatnonzero(1.0 - weights > _COUNTS_IN_FULL)
+        rows = self.columns.reshape(len(weights), 3, -1)[partly] * np.sqrt(1.0 - weights[partly])[:, None, None]
+        flat = rows.reshape(3 * len(partly), -1)
+        return self.inner - flat.T @ flat
 
     @property
     def moves(self) -> int:
@@ -137,15 +152,16 @@ class Unknowns:
     def nearest(self, fit: Fit, others: Sequence[Way] = ()) -> list[tuple[Way, float]]:
         """The ways that may be the best beside a fit and others, and their worth to first order [nats]."""
         basis, left = self.beside(fit, others)
-        weights = np.repeat(fit.root_weights[:, 0], 3)[:, None]
+        weights = np.repeat(fit.root_weights[:, 0], 3)
         rss, rows = float(left @ left), float(fit.noise.weights.sum())
+        seen = np.ascontiguousarray((np.column_stack([basis, left]) * weights[:, None]).T)
         ranked: list[tuple[float, Way, FloatArray | None]] = []
         for way in self._ways:
             if way in others:
                 continue
-            own = way.columns * weights
-            onto, toward = basis.T @ own, own.T @ left
-            inner = own.T @ own - onto.T @ onto
+            products = seen @ way.columns
+            onto, toward = products[:-1], products[-1]
+            inner = way.weighted_inner(fit.noise.weights) - onto.T @ onto
             values, vectors = np.linalg.eigh(inner)
             told = (values > _TOLD * max(float(values.max()), 1e-12)) & (values > _LEFT)
             explained = float(np.square(vectors[:, told].T @ toward / np.sqrt(values[told])).sum())

@@ -18,6 +18,8 @@ from .parameter import Parameter
 # Of the numerical derivative of a play by its width [rad, m].
 _WIDTH_STEP = 1e-6
 _PLAYS_KEPT, _MEMORIES_KEPT = 256, 256
+# What is left of a move when it is forgotten.
+_FORGOTTEN = 1e-17
 # A magnet farther off its axis, as a share of its radius, is none that could be read.
 _FARTHEST_OFF = 0.95
 
@@ -213,10 +215,12 @@ def _missing(motion: Motion, joint: int, memory: float) -> FloatArray:
         return moves
     kept = np.sign(memory) * abs(memory) ** motion.pace
     kept[motion.begins] = 0.0
-    missing, left = [], 0.0
-    for keep, move in zip(kept.tolist(), moves.tolist(), strict=True):
-        left = keep * left + move
-        missing.append(left)
+    missing, back = moves.copy(), 1
+    # Of so many rows back, then of twice as many: `kept` is what is left of a row's own so far before.
+    while back < len(missing) and np.abs(kept).max() > _FORGOTTEN:
+        missing[back:] += kept[back:] * missing[:-back]
+        kept[back:] *= kept[:-back]
+        back *= 2
     return frozen_array(missing)
 
 
