@@ -156,7 +156,9 @@ def _parameters(diagnosis: Diagnosis, cause: Effect, standing: Standing) -> dict
         value = float(cause.values[k])
         if k in fitted:
             half = float(halves[fitted.index(k)])
-            numbers[parameter.name] = Interval(value, (value - half, value + half))
+            # A period, a time constant and what is left of a move are never negative.
+            low = max(value - half, 0.0) if k in cause.shapes else value - half
+            numbers[parameter.name] = Interval(value, (low, value + half))
         else:
             numbers[parameter.name] = Interval(value, _moment_interval(cause, standing.itself))
     return numbers | _derived(cause, covariance)

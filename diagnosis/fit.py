@@ -24,6 +24,8 @@ _NOT_TRIED = 1e-3
 # share of it.
 _OF_A_PEAK, _OF_A_MEMORY, _OF_A_TIME = 0.5, 0.1, 0.3
 _LONGEST_MEMORY, _FEWEST_CYCLES = 0.95, 1.5
+# A period or a time constant of which nothing is told may be off by so many such steps.
+_UNTOLD = 10.0
 # A drift that is over after a smaller share of the recording is none: what is measured is off from the beginning.
 SHORTEST_DRIFT = 0.03
 _FEWEST_OUTLIERS = 1e-4
@@ -175,9 +177,11 @@ class Fit:
         """
         columns = np.concatenate([self.columns, self.shape_columns], axis=2)
         flat, variance = columns.reshape(self.left.size, -1), self.noise.sigma**2
-        precision = np.append(prior_precision(self.simulation, self.nuisances), self._shape_precision)
+        precision = np.append(prior_precision(self.simulation, self.nuisances), self._shape_precision / _UNTOLD**2)
         information = flat.T @ flat / variance + np.diag(precision)
-        covariance = np.asarray(np.linalg.pinv(information, rcond=1e-14, hermitian=True), dtype=np.float64)
+        # In units in which each number is told alike: seconds and radians are of very different size.
+        units = np.outer(scales := np.sqrt(np.diag(information)), scales)
+        covariance = np.asarray(np.linalg.pinv(information / units, rcond=1e-14, hermitian=True) / units)
         scores = np.einsum("nip,ni->np", columns, self.left) / variance
         firsts = np.unique(np.linspace(0, len(scores), _BLOCKS, endpoint=False).astype(int))
         moved = np.add.reduceat(scores, firsts, axis=0) @ covariance

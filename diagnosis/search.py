@@ -208,9 +208,9 @@ class Search:
         return [c for c in ranked[: 3 * _MOST] if c.gain >= floor][:_MOST]
 
     def refined(self, fit: Fit, sought: Effect) -> Fit:
-        """With the moment or period of one cause sought again beside the others as they are now fitted."""
+        """With the period or time constant of one cause sought again: as it moved along it may have gone astray."""
         cause = next(effect for effect in fit.causes if effect.identity == sought.identity)
-        if all(parameter.is_amount for parameter in cause.parameters):
+        if not cause.shapes:
             return fit
         others = [effect for effect in fit.causes if effect is not cause]
         again = Scan(fit.with_causes(others)).candidate(cause)
