@@ -173,3 +173,24 @@ def test_stereo_covariances_are_those_of_numerical_derivatives_of_triangulation(
         by_pixel = np.stack(moved, axis=1)
         expected = calibration.pixel_sigma**2 * by_pixel @ by_pixel.T
         np.testing.assert_allclose(stated, expected, rtol=1e-5, atol=1e-5 * np.trace(expected))
+
+
+def test_a_time_constant_is_as_sure_in_seconds_as_in_milliseconds(robot) -> None:
+    way, halves = walk(robot, 5), []
+    assert way.t is not None
+    for unit in (1.0, 1e3):
+        motion = dataclasses.replace(way, t=way.t * unit)
+        drift = Effect.at(robot, "thermal_drift", values=[0.003, 0.0, 0.001, 30.0 * unit])
+        fit = start_of(robot, motion, (drift,), 5).with_causes([drift])
+        halves.append(np.sqrt(fit.covariance[-1, -1]) / unit)
+    assert halves[1] == pytest.approx(halves[0], rel=1e-3)
+
+
+def test_a_time_constant_of_which_little_is_told_is_not_said_to_be_sure(robot) -> None:
+    way = walk(robot, 5)
+    assert way.t is not None
+    # By the end of the recording hardly more than a straight line has been seen.
+    long = 3.0 * float(way.t[-1])
+    drift = Effect.at(robot, "thermal_drift", values=[0.001, 0.0, 0.0, long])
+    fit = start_of(robot, way, (drift,), 5).with_causes([drift])
+    assert np.sqrt(fit.covariance[-1, -1]) > 0.5 * long
