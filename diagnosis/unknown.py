@@ -81,7 +81,7 @@ class Way:
         """The same with rows weighted (n,), by those that do not count in full."""
         partly = np.flatnonzero(1.0 - weights > _COUNTS_IN_FULL)
         rows = self.columns.reshape(len(weights), 3, -1)[partly] * np.sqrt(1.0 - weights[partly])[:, None, None]
-        flat = rows.reshape(3 * len(partly), -1)
+        flat = rows.reshape(3 * len(partly), self.columns.shape[1])
         return self.inner - flat.T @ flat
 
     @property
