@@ -65,7 +65,7 @@ class RouterConfig:
         Raises:
             ConfigError: something is unknown, missing or wrong; the message names file, line, key and remedy.
         """
-        raw, text = read_toml(file)
+        raw, text = read_toml(file, written_by="docs/security.md has one to begin with")
         tables = convert(raw, RouterTables, file=file, text=text)
 
         def refuse(what: str, remedy: str, *keys: str) -> None:
