@@ -49,7 +49,7 @@ TOLERANCES = ChainTolerances(
     base_rotation=math.radians(3.0),
     base_translation=0.03,
 )
-IN_TIME, NAMED_AFTER = 30, (100, 300)
+IN_TIME, NAMED_AFTER = 30, (30, 100, 300)
 PAIRS_BETWEEN_FALSE_ALARMS = 50_000
 # Of a quiet walk: a new chain is fitted so often, to so many of the last pairs.
 REFIT, FITTED = 500, 2000
@@ -60,11 +60,16 @@ BENT_M, WAVES = 0.004, 2.0
 
 @dataclass(frozen=True)
 class Case:
-    """A change: the tool by so many metres, the camera (about 1 degree and 10 mm), or a joint's zero by radians."""
+    """A change: the tool by so many metres, the camera (about 1 degree and 10 mm), or a joint's zero by radians.
+
+    Attributes:
+        mean_way: the size is how far the marker moves on average over the pairs after it [m].
+    """
 
     name: str
     kind: str
     size: float
+    mean_way: bool = False
 
 
 CASES = (
@@ -76,6 +81,8 @@ CASES = (
     Case("joint 0.5 deg", "joint", math.radians(0.5)),
     Case("joint 1 deg", "joint", math.radians(1.0)),
     Case("joint 2 deg", "joint", math.radians(2.0)),
+    Case("camera's way 10 mm", "camera", 0.010, mean_way=True),
+    Case("joint's way 10 mm", "joint", 0.010, mean_way=True),
 )
 
 
@@ -102,8 +109,10 @@ def walk(joints: int, count: int, rng: np.random.Generator) -> FloatArray:
     return np.array(q)
 
 
-def changed(arm: RoughArm, case: Case, rng: np.random.Generator) -> tuple[RoughArm, FloatArray, int | None]:
-    """The arm after a change, the change of its parameters, and the joint whose zero it is."""
+def changed(
+    arm: RoughArm, case: Case, q: FloatArray, rng: np.random.Generator
+) -> tuple[RoughArm, FloatArray, int | None]:
+    """The arm after a change, the change of its parameters, and the joint whose zero it is; q (n, d) come after it."""
     parameters, joint = arm.parameters, None
     theta = np.zeros(parameters.size)
     if case.kind == "tool":
@@ -114,7 +123,10 @@ def changed(arm: RoughArm, case: Case, rng: np.random.Generator) -> tuple[RoughA
     else:
         # The first and the last joint's zeros look like another camera and another tool.
         joint = int(rng.integers(1, arm.drawing.joints - 1))
-        theta[np.arange(parameters.size)[parameters.zeros][joint]] = case.size
+        theta[np.arange(parameters.size)[parameters.zeros][joint]] = math.radians(1.0) if case.mean_way else case.size
+    if case.mean_way:
+        moved = parameters.positions(arm.change + theta, q) - arm.positions(q)
+        theta *= case.size / float(np.linalg.norm(moved, axis=1).mean())
     return RoughArm(parameters, arm.change + theta), theta, joint
 
 
@@ -154,7 +166,7 @@ def outcome(case: Case, joints: int, sigma: float, seed: int, known_pairs: int) 
     at = known_pairs // 2 + int(rng.integers(*CHANGED_WITHIN))
     q = walk(joints, known_pairs + at + LONGEST, rng)
     x = arm.measured(q, sigma, rng)
-    after, theta, joint = changed(arm, case, rng)
+    after, theta, joint = changed(arm, case, q[known_pairs + at :], rng)
     moved = after.positions(q[known_pairs + at :]) - arm.positions(q[known_pairs + at :])
     x[known_pairs + at :] += moved
     known = reference(arm, q[:known_pairs], x[:known_pairs], sigma)
@@ -165,8 +177,8 @@ def outcome(case: Case, joints: int, sigma: float, seed: int, known_pairs: int) 
     information = 0.5 * float(np.square(moved).sum(axis=1).mean()) / sigma**2
     threshold = cusum_threshold(information)
     optimal = delay_of(cusum(ratios / sigma**2), threshold)
-    with_model, delay, early, named = math.inf, math.inf, False, []
-    origin = None
+    with_model, delay, early, origin = math.inf, math.inf, False, None
+    named = dict.fromkeys(NAMED_AFTER, "not noticed")
     for k in range(at + LONGEST):
         watch.add(pair_of(k, q[known_pairs + k], x[known_pairs + k], sigma), kept=True)
         since = k - at + 1
@@ -180,11 +192,10 @@ def outcome(case: Case, joints: int, sigma: float, seed: int, known_pairs: int) 
             origin = Origin(noticed, KnownArm(known.belief, TOLERANCES)), known_pairs + noticed.first
         if origin is not None and since in NAMED_AFTER:
             found = origin[0].explain(q[origin[1] : known_pairs + k + 1], x[origin[1] : known_pairs + k + 1])
-            named.append(verdict(found[0].kind.name, found[0].kind.joint, found[0].probability, case, joint))
+            named[since] = verdict(found[0].kind.name, found[0].kind.joint, found[0].probability, case, joint)
         if origin is not None and since >= NAMED_AFTER[-1] and not math.isinf(with_model):
             break
-    named += ["not noticed"] * (len(NAMED_AFTER) - len(named))
-    return Outcome(delay, optimal, with_model, early, tuple(named))
+    return Outcome(delay, optimal, with_model, early, tuple(named.values()))
 
 
 def verdict(name: str, joint: int | None, probability: float, case: Case, truth: int | None) -> str:

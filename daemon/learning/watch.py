@@ -8,6 +8,7 @@ import numpy as np
 
 from interfaces.records import FloatArray, Pair
 from kbmaps import ChainBelief, ChangeDetector, ChangeKind, KBMap, ResidualModel, SharedNoise, Suspicion
+from kbmaps.changes.detector import MOST_SURPRISES
 
 from .claims import Claim
 from .learnt import LearntModel
@@ -21,8 +22,8 @@ SHORTEST_TRIAL, LONGEST_TRIAL = 50, 1000
 LOOKED_BACK = 500
 # An alarm that a bent arm explains is looked at again when the pairs since the change have grown by this factor.
 LOOK_AGAIN = 1.25
-# So many of the newest errors of pairs that a model did not know show how far these lie from it.
-SHOWN = 3000
+# A model is the chain alone where it is that near to it, over the noise of a pair.
+_ALONE = 0.1
 # No measurement is more exact, whatever it says [m].
 SMALLEST_M = 1e-6
 
@@ -224,7 +225,7 @@ class Watch:
     def _show(self) -> None:
         """The pairs have shown how far they lie from a model that does not know them."""
         if self._detector is not None:
-            self._shown = np.concatenate([self._shown, self._detector.surprises])[-SHOWN:]
+            self._shown = np.concatenate([self._shown, self._detector.surprises])[-MOST_SURPRISES:]
 
     def _renew(self) -> None:
         """The next reference takes its place."""
@@ -241,6 +242,10 @@ class Watch:
         noise_m = float(np.sqrt(noise.single * variances.mean()))
         distance_m = float(np.linalg.norm(reference.x, axis=1).mean())
         self._detector = ChangeDetector(reference.belief, noise, noise_m, distance_m)
+        if float(np.square(reference.beyond_chain(reference.q)).mean()) < (_ALONE * noise_m) ** 2:
+            # What else a model was taught of these pairs would hide how the arm bends.
+            off = reference.x - reference.belief.predict(reference.q)
+            self._detector.recall(reference.q, off, variances)
         self._change, self._look_at = None, 0
         self._feed(self._pairs)
 
