@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,9 +20,10 @@ FEWEST_KNOWN = 100
 # that took longer to show would be a part of it.
 SHORTEST_TRIAL, LONGEST_TRIAL = 50, 1000
 # So many of the pairs that a model knows show its noise.
-LOOKED_BACK = 500
-# An alarm that a bent arm explains is looked at again when the pairs since the change have grown by this factor.
-LOOK_AGAIN = 1.25
+LOOKED_BACK = 1000
+# An alarm that a bent arm explains is looked at again when the pairs since the change have grown by this factor, or the
+# alarm's log odds by so much.
+LOOK_AGAIN, GROWN_ODDS = 1.25, 4.0
 # A model is the chain alone where it is that near to it, over the noise of a pair.
 _ALONE = 0.1
 # No measurement is more exact, whatever it says [m].
@@ -127,6 +129,7 @@ class Watch:
         self._detector: ChangeDetector | None = None
         self._change: Suspicion | None = None
         self._look_at = 0
+        self._odds = self._refuted_odds = -math.inf
         self._shown = np.empty((0, 3))
 
     @property
@@ -185,10 +188,13 @@ class Watch:
         """What seemed to be a change is none, as far as the pairs tell so far."""
         since = 0 if self._change is None else len(self._pairs) - self._change.onset
         self._change, self._look_at = None, len(self._pairs) + int((LOOK_AGAIN - 1.0) * since) + 1
+        self._refuted_odds = self._odds
 
     def _suspect(self, detector: ChangeDetector) -> None:
         suspicion = detector.suspicion()
-        if suspicion.alarm and self._change is None and len(self._pairs) >= self._look_at:
+        self._odds = suspicion.log_odds
+        due = len(self._pairs) >= self._look_at or self._odds > self._refuted_odds + GROWN_ODDS
+        if suspicion.alarm and self._change is None and due:
             self._change = detector.suspicion_if_it_bends()
             if not self._change.alarm:
                 self.refute()
@@ -247,6 +253,7 @@ class Watch:
             off = reference.x - reference.belief.predict(reference.q)
             self._detector.recall(reference.q, off, variances)
         self._change, self._look_at = None, 0
+        self._odds = self._refuted_odds = -math.inf
         self._feed(self._pairs)
 
     def _feed(self, pairs: list[_Watched]) -> None:

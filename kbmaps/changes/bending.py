@@ -56,7 +56,7 @@ def log_ratios_if_it_bends(
     """
     pairs, errors = len(angles), _without_outliers(errors)
     starts = np.array(sorted({suspected, *(pairs - age for age in _ages(pairs, _RUN_SHARE, _LONGEST_RUN))}))
-    runs = Runs.of(angles, known, turning, errors, starts)
+    runs = Runs.of(angles, known, turning, errors, starts, fitted=False)
     bends = probable_bends(runs, before)
     means = np.add.reduceat(changed, starts) / np.sqrt(runs.lengths)[:, None, None]
     changing = np.concatenate([means, runs.rows[..., -1:]], axis=2)
@@ -75,7 +75,7 @@ def log_evidence_of_bends(
 ) -> list[FloatArray]:
     """What pairs to which the belief was fitted say of bends; arguments as of `log_ratios_if_it_bends`."""
     starts = np.arange(0, len(angles), _LONGEST_RUN)
-    return log_evidence(Runs.of(angles, known, turning, _without_outliers(errors), starts).without_belief())
+    return log_evidence(Runs.of(angles, known, turning, _without_outliers(errors), starts, fitted=True))
 
 
 def _compared(sums: FloatArray, places: Sequence[slice], sizes: FloatArray) -> FloatArray:

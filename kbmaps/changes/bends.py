@@ -12,7 +12,8 @@ from scipy.special import ive  # pyright: ignore[reportMissingTypeStubs, reportU
 from kbmaps.arrays import FloatArray, IntArray
 
 # Over how far a bend is much the same [rad of all joints together], how large it is over the noise of a pair, how far a
-# joint's own error moves the marker over that noise, and the noise over what it was thought to be: equally probable.
+# joint's own error moves the marker over that noise, and the noise over what it was thought to be: equally probable, but
+# for an arm that has neither bends nor such errors, which is as probable as all others together.
 LENGTHS = (0.7, 1.4)
 BENDS = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
 TURNS = (0.0, 0.5, 2.0, 8.0)
@@ -24,8 +25,11 @@ NOTHING_SEEN = (0.0,) * len(LENGTHS)
 _OWN_LENGTH, _HARMONICS = 0.7, 3
 # Of what is none, the 1-sigma.
 _NONE = 1e-3
-# A parameter of which nothing is known may be so many times what the belief leaves open.
+# What is known, as far as pairs to which it was fitted tell: it may be off by so many times what the belief leaves open.
 _OPEN = 1e3
+# A chain that was fitted to an arm that bends took part of it for its own: what the belief leaves open is more by so much
+# for each square of a bend over the noise, in variance.
+_TAKEN_ALONG = 3.0
 # Those less probable than this by all pairs, were there no change, are left out: even with one they hardly count.
 _LEAST = 1e-6
 
@@ -41,6 +45,7 @@ class Runs:
             root of the run's length (m, 3, p).
         known: how many of these are known, with a prior of variance 1.
         within: sum of the squares of errors around their means.
+        fitted: whether what is known was fitted to these pairs, which then say nothing of it.
     """
 
     angles: FloatArray
@@ -48,10 +53,18 @@ class Runs:
     rows: FloatArray
     known: int
     within: float
+    fitted: bool
 
     @classmethod
     def of(
-        cls, angles: FloatArray, known: FloatArray, turning: FloatArray, errors: FloatArray, starts: IntArray
+        cls,
+        angles: FloatArray,
+        known: FloatArray,
+        turning: FloatArray,
+        errors: FloatArray,
+        starts: IntArray,
+        *,
+        fitted: bool,
     ) -> Runs:
         """Runs of pairs, which begin with these.
 
@@ -64,7 +77,7 @@ class Runs:
         rows = np.concatenate([known, _own_errors(angles, turning), errors[..., None]], axis=2)
         means = np.add.reduceat(rows, starts) / lengths[:, None, None]
         within = float(np.square(errors - np.repeat(means[..., -1], lengths, axis=0)).sum())
-        return cls(angles, starts, means * np.sqrt(lengths)[:, None, None], known.shape[2], within)
+        return cls(angles, starts, means * np.sqrt(lengths)[:, None, None], known.shape[2], within, fitted)
 
     @property
     def lengths(self) -> FloatArray:
@@ -83,12 +96,6 @@ class Runs:
             values, axes = np.linalg.eigh(summed / np.sqrt(lengths * lengths[:, None]))
             found.append((np.maximum(values, 0.0), axes))
         return tuple(found)
-
-    def without_belief(self) -> Runs:
-        """The same where nothing of what the belief has is known: it was fitted to these pairs."""
-        rows = self.rows.copy()
-        rows[..., : self.known] *= _OPEN
-        return Runs(self.angles, self.starts, rows, self.known, self.within)
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,21 +134,22 @@ def log_evidence(runs: Runs) -> list[FloatArray]:
         turned = np.tensordot(axes.T, runs.rows, axes=1)
         sums = np.tensordot(weights, turned.transpose(0, 2, 1) @ turned, axes=1)
         logs = 1.5 * np.log(weights).sum(axis=1) - 0.5 * runs.within / noises - alone * np.log(noises)
-        # A bend of no size has no length: it stands for as many as there are lengths.
-        logs[np.tile(_sizes(k), len(NOISES)) == 0.0] += np.log(len(LENGTHS))
         crossed = sums[:, :known, known:]
+        of_length: list[FloatArray] = []
         for turn in TURNS:
-            prior = _prior(runs, turn)
-            precision = sums[:, :known, :known] + np.diag(prior)
+            prior = _prior(runs, k, turn)
+            precision = sums[:, :known, :known] + prior[:, None] * np.eye(known)
             left = sums[:, known:, known:] - crossed.transpose(0, 2, 1) @ np.linalg.solve(precision, crossed)
-            volume = np.linalg.slogdet(precision)[1] - np.log(prior).sum()
-            found.append(logs - 0.5 * (left[:, 0, 0] + volume))
-    return [np.concatenate(found[k * len(TURNS) : (k + 1) * len(TURNS)]) for k in range(len(LENGTHS))]
+            volume = np.linalg.slogdet(precision)[1] - np.log(prior).sum(axis=1)
+            of_length.append(logs - 0.5 * (left[:, 0, 0] + volume))
+        found.append(np.concatenate(of_length))
+    return found
 
 
 def probable_bends(runs: Runs, before: Sequence[FloatArray | float]) -> list[Bends]:
     """What is probable by these pairs, if nothing changed, and by what others say (`log_evidence`)."""
-    logs = [now + past for now, past in zip(log_evidence(runs), before, strict=True)]
+    evidence = zip(log_evidence(runs), before, strict=True)
+    logs = [now + past + _log_prior(k) for k, (now, past) in enumerate(evidence)]
     total = np.logaddexp.reduce(np.concatenate(logs))
     return [_chosen(runs, k, each - total) for k, each in enumerate(logs) if (each - total > np.log(_LEAST)).any()]
 
@@ -150,14 +158,22 @@ def _chosen(runs: Runs, k: int, logs: FloatArray) -> Bends:
     values, axes = runs.axes[k]
     probable = np.flatnonzero(logs > np.log(_LEAST))
     every = _weights(k, values)[0]
-    weights = every[probable % len(every)]
+    weights, priors = every[probable % len(every)], np.concatenate([_prior(runs, k, turn) for turn in TURNS])
     turned = np.tensordot(axes.T, runs.rows[..., :-1], axes=1)
     known = np.empty((len(probable), turned.shape[2], turned.shape[0] * 3))
-    for h, (turn, weight) in enumerate(zip(probable // len(every), weights, strict=True)):
+    for h, (prior, weight) in enumerate(zip(priors[probable], weights, strict=True)):
         weighed = (turned * weight[:, None, None]).reshape(-1, turned.shape[2])
-        precision = weighed.T @ turned.reshape(weighed.shape) + np.diag(_prior(runs, TURNS[turn]))
+        precision = weighed.T @ turned.reshape(weighed.shape) + np.diag(prior)
         known[h] = np.linalg.solve(np.linalg.cholesky(precision), weighed.T)
     return Bends(axes, weights, known, logs[probable])
+
+
+def _log_prior(k: int) -> FloatArray:
+    """How probable each is before any pair (h,), of those of the length number k; they need not add up to one."""
+    sizes, turns = np.tile(_sizes(k), len(TURNS) * len(NOISES)), np.repeat(TURNS, len(NOISES) * len(_sizes(k)))
+    # A bend of no size has no length: it stands for as many as there are lengths.
+    shares = np.where(sizes == 0.0, float(len(LENGTHS)), 1.0)
+    return np.log(np.where(sizes + turns == 0.0, shares * (len(BENDS) * len(TURNS) - 1.0), shares))
 
 
 def _sizes(k: int) -> FloatArray:
@@ -172,10 +188,13 @@ def _weights(k: int, values: FloatArray) -> tuple[FloatArray, FloatArray]:
     return 1.0 / (noises[:, None] * (1.0 + sizes[:, None] * values)), noises
 
 
-def _prior(runs: Runs, turn: float) -> FloatArray:
-    """Over the variance (k,) of what is known, and of joints' own errors of this size."""
-    own = runs.rows.shape[2] - 1 - runs.known
-    return np.r_[np.ones(runs.known), np.full(own, max(turn, _NONE) ** -2.0)]
+def _prior(runs: Runs, k: int, turn: float) -> FloatArray:
+    """Over the variance (h, p) of what is known, and of joints' own errors of this size, with each noise and bend."""
+    squares = np.tile(np.square(_sizes(k)), len(NOISES)) + turn**2
+    left_open = np.full(len(squares), _OPEN**2) if runs.fitted else 1.0 + _TAKEN_ALONG * squares
+    known = np.repeat(1.0 / left_open[:, None], runs.known, axis=1)
+    own = np.full((len(known), runs.rows.shape[2] - 1 - runs.known), max(turn, _NONE) ** -2.0)
+    return np.concatenate([known, own], axis=1)
 
 
 def _own_errors(angles: FloatArray, turning: FloatArray) -> FloatArray:

@@ -20,6 +20,9 @@ from kbmaps.changes.shared_noise import SharedNoise
 
 # On average at least so many pairs lie between two false alarms, as far as the model's claims are true.
 PAIRS_BETWEEN_FALSE_ALARMS = 100_000.0
+# When the statistic first exceeds its limit, it exceeds it by far, most of all for the large changes that it allows for.
+# So its limit may be lower than that number of pairs, by this factor (`python -m benchmarks.false_alarms`).
+_OVERSHOOT = 0.25
 # No single pair counts for more than one that lies so many sigmas away: it may be an outlier.
 CLIPPED_SIGMAS = 4.0
 # So many of the newest pairs tell whether the noise has grown.
@@ -105,7 +108,7 @@ class ChangeDetector:
         self._places = [slice(end - len(kind.columns), end) for kind, end in zip(self.kinds, ends, strict=True)]
         self._log_shares = np.log([kind.share for kind in self.kinds])
         self._noise_m, self._sizes = noise_m, noise_m * np.array(SIZES)
-        self._limit = math.log(pairs_between_false_alarms)
+        self._limit = self.log_limit(pairs_between_false_alarms)
         known = self._root.shape[1]
         # A root of the covariance: a difference of covariances would be none after thousands of pairs.
         self._posterior_root, self._mean = np.eye(known), np.zeros(known)
@@ -116,6 +119,11 @@ class ChangeDetector:
         self._strange, self._looked_at, self._log_odds = False, 0, -math.inf
         self._fitted: tuple[FloatArray, FloatArray, FloatArray] | None = None
         self._bends_before: list[FloatArray] | None = None
+
+    @staticmethod
+    def log_limit(pairs_between_false_alarms: float) -> float:
+        """Beyond which log odds there is an alarm."""
+        return math.log(_OVERSHOOT * pairs_between_false_alarms)
 
     @property
     def pairs(self) -> int:
