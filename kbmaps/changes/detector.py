@@ -19,10 +19,10 @@ from kbmaps.changes.onsets import Onsets
 from kbmaps.changes.shared_noise import SharedNoise
 
 # On average at least so many pairs lie between two false alarms, as far as the model's claims are true.
-PAIRS_BETWEEN_FALSE_ALARMS = 100_000.0
+PAIRS_BETWEEN_FALSE_ALARMS = 75_000.0
 # When the statistic first exceeds its limit, it exceeds it by far, most of all for the large changes that it allows for.
 # So its limit may be lower than that number of pairs, by this factor (`python -m benchmarks.false_alarms`).
-_OVERSHOOT = 0.25
+_OVERSHOOT = 0.33
 # No single pair counts for more than one that lies so many sigmas away: it may be an outlier.
 CLIPPED_SIGMAS = 4.0
 # So many of the newest pairs tell whether the noise has grown.
