@@ -4,8 +4,8 @@ The learner's watch over guided walks in steps of 1 to 3 degrees, as the sampler
 a chain of 1,000 pairs (--known); the arm changes 520 to 580 pairs later. By case: after how many pairs the change is
 noticed (mean, 95th percentile, share within 30), against three that have one false alarm in 50,000 pairs by theory
 (Siegmund 1985; Pollak 1987): a CUSUM that knows the arm to the last digit and the change with its size and direction;
-one that knows the change but has the watch's own model of the arm and, like it, counts no pair beyond four sigmas (so it
-is of no use for large changes); and, with that model, the sum over onsets of one that knows kind and size of the
+one that knows the change but has the watch's own model of the arm and, like it, counts no pair beyond four sigmas (so
+it is of no use for large changes); and, with that model, the sum over onsets of one that knows kind and size of the
 change, but not its direction. Each with its mean, its own share within 30, and the ratio of the watch's mean to it.
 Then the shares that are named rightly, called undecided, and named wrongly 30, 100 and 300 pairs after the change; what
 is missing was not noticed by then.
@@ -54,6 +54,7 @@ TOLERANCES = ChainTolerances(
     base_rotation=math.radians(3.0),
     base_translation=0.03,
 )
+VERDICTS = RIGHT, UNDECIDED, WRONG = "right", "undecided", "wrong"
 IN_TIME, NAMED_AFTER = 30, (30, 100, 300)
 PAIRS_BETWEEN_FALSE_ALARMS = 50_000
 # Of a quiet walk: a new chain is fitted so often, to so many of the last pairs.
@@ -216,9 +217,9 @@ def verdict(found: list[Explanation], case: Case, joint: int | None) -> str:
     kinds = [KindOfChange(each.kind.name, each.kind.joint, each.probability) for each in found]
     record = msgspec.structs.replace(ChangeRecord.told(0), kinds=kinds)
     if record.named is None:
-        return "undecided"
+        return UNDECIDED
     right = (record.named.name, record.named.joint) == (case.kind, joint) or record.alike(record.named) == case.kind
-    return "right" if right else "wrong"
+    return RIGHT if right else WRONG
 
 
 def statistics_if_told(watch: Watch, theta: FloatArray, case: Case, joint: int | None) -> tuple[float, float]:
@@ -293,11 +294,11 @@ def row(case: Case, found: list[Outcome]) -> str:
     mean, cells = np.minimum(delays, LONGEST).mean(), ""
     for each in told:
         # One that counts no pair beyond four sigmas never sees what is far beyond that.
-        useful = np.isfinite(each).any()
         optimum = np.minimum(each, LONGEST).mean()
-        cells += f" {optimum:6.1f} {np.mean(each <= IN_TIME):4.0%} {mean / optimum:5.2f} |" if useful else 19 * " " + "|"
+        cell = f" {optimum:6.1f} {np.mean(each <= IN_TIME):4.0%} {mean / optimum:5.2f} |"
+        cells += cell if np.isfinite(each).any() else 19 * " " + "|"
     names = [
-        "/".join(f"{np.mean([each.named[k] == said for each in kept]):4.0%}" for said in ("right", "undecided", "wrong"))
+        "/".join(f"{np.mean([each.named[k] == said for each in kept]):4.0%}" for said in VERDICTS)
         for k in range(len(NAMED_AFTER))
     ]
     late = np.percentile(np.minimum(delays, LONGEST), 95)
@@ -343,8 +344,8 @@ def main() -> None:
         for sigma in arguments.sigmas:
             print(
                 f"d = {joints}, sigma {sigma:g} mm, {arguments.seeds} seeds: delay mean, 95 %, within {IN_TIME} | who "
-                f"knows change and arm: mean, within {IN_TIME}, ratio | change and model | kind, size and model | named "
-                f"right/undecided/wrong after {', '.join(map(str, NAMED_AFTER))} pairs"
+                f"knows change and arm: mean, within {IN_TIME}, ratio | change and model | kind, size and model | "
+                f"named right/undecided/wrong after {', '.join(map(str, NAMED_AFTER))} pairs"
             )
             for case in CASES:
                 if not arguments.only or case.name in arguments.only:

@@ -12,8 +12,8 @@ from scipy.special import ive  # pyright: ignore[reportMissingTypeStubs, reportU
 from kbmaps.arrays import FloatArray, IntArray
 
 # Over how far a bend is much the same [rad of all joints together], how large it is over the noise of a pair, how far a
-# joint's own error moves the marker over that noise, and the noise over what it was thought to be: equally probable, but
-# for an arm that has neither bends nor such errors, which is as probable as all others together.
+# joint's own error moves the marker over that noise, and the noise over what it was thought to be: equally probable,
+# but for an arm that has neither bends nor such errors, which is as probable as all others together.
 LENGTHS = (0.7, 1.4)
 BENDS = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
 TURNS = (0.0, 0.5, 2.0, 8.0)
@@ -25,10 +25,10 @@ NOTHING_SEEN = (0.0,) * len(LENGTHS)
 _OWN_LENGTH, _HARMONICS = 0.7, 3
 # Of what is none, the 1-sigma.
 _NONE = 1e-3
-# What is known, as far as pairs to which it was fitted tell: it may be off by so many times what the belief leaves open.
+# As far as pairs tell to which it was fitted, what is known may be off by so many times what the belief leaves open.
 _OPEN = 1e3
-# A chain that was fitted to an arm that bends took part of it for its own: what the belief leaves open is more by so much
-# for each square of a bend over the noise, in variance.
+# A chain that was fitted to an arm that bends took part of it for its own: the variance of what the belief leaves open
+# is more by so many times the square of the bend over the noise.
 _TAKEN_ALONG = 3.0
 # Those less probable than this by all pairs, were there no change, are left out: even with one they hardly count.
 _LEAST = 1e-6

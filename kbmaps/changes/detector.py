@@ -20,8 +20,8 @@ from kbmaps.changes.shared_noise import SharedNoise
 
 # On average at least so many pairs lie between two false alarms, as far as the model's claims are true.
 PAIRS_BETWEEN_FALSE_ALARMS = 75_000.0
-# When the statistic first exceeds its limit, it exceeds it by far, most of all for the large changes that it allows for.
-# So its limit may be lower than that number of pairs, by this factor (`python -m benchmarks.false_alarms`).
+# When the statistic first exceeds its limit, it often does so by far, most of all for the large changes that it allows
+# for. So the limit may be lower than that number of pairs, by this factor (`python -m benchmarks.false_alarms`).
 _OVERSHOOT = 0.33
 # No single pair counts for more than one that lies so many sigmas away: it may be an outlier.
 CLIPPED_SIGMAS = 4.0
@@ -80,7 +80,7 @@ class ChangeDetector:
     (Willsky and Jones 1976, there maximised), averaged over sizes. Their sum over t is the statistic of
     Shiryaev and Roberts: without a change its expectation after n pairs is n, so that the first time it exceeds A
     comes after A pairs at least on average (Pollak 1987, "Average run lengths of an optimal method of detecting a
-    change in distribution"). So A is the number of pairs between two false alarms.
+    change in distribution"), and after more as it then exceeds A by far.
 
     Args:
         belief: what is believed of the chain, by pairs before the first of these.
@@ -139,7 +139,8 @@ class ChangeDetector:
     def surprises(self) -> FloatArray:
         """Whitened errors (n, 3) of the newest pairs, n at most `MOST_SURPRISES`.
 
-        Each is against what was expected after the pairs before it. They are in units of the noise: what was not known of the model is taken out.
+        Each is against what was expected after the pairs before it. They are in units of the noise: what was not known
+        of the model is taken out.
         """
         return np.array(self._surprises).reshape(-1, 3)
 
