@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import cast
 
 import numpy as np
 from scipy.special import ive  # pyright: ignore[reportMissingTypeStubs, reportUnknownVariableType]
@@ -164,7 +165,7 @@ def _chosen(runs: Runs, k: int, logs: FloatArray) -> Bends:
     for h, (prior, weight) in enumerate(zip(priors[probable], weights, strict=True)):
         weighed = (turned * weight[:, None, None]).reshape(-1, turned.shape[2])
         precision = weighed.T @ turned.reshape(weighed.shape) + np.diag(prior)
-        known[h] = np.linalg.solve(np.linalg.cholesky(precision), weighed.T)
+        known[h] = np.linalg.solve(cast(FloatArray, np.linalg.cholesky(precision)), weighed.T)
     return Bends(axes, weights, known, logs[probable])
 
 
