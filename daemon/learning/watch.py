@@ -19,6 +19,8 @@ FEWEST_KNOWN = 100
 # A newer model takes the place of the present one after half as many pairs as it knows, within these limits: a change
 # that took longer to show would be a part of it.
 SHORTEST_TRIAL, LONGEST_TRIAL = 50, 1000
+# Where no newer model comes, the older half of so many pairs is no longer held against the present one.
+MOST_WATCHED = 5000
 # So many of the pairs that a model knows show its noise.
 LOOKED_BACK = 1000
 # An alarm that a bent arm explains is looked at again when the pairs since the change have grown by this factor, or the
@@ -143,6 +145,11 @@ class Watch:
         return self._detector
 
     @property
+    def held(self) -> int:
+        """How many pairs are kept, at most `MOST_WATCHED` but for those since an alarm."""
+        return len(self._pairs)
+
+    @property
     def alarmed(self) -> bool:
         """Whether there was a change: an arm that bends would not show the same without one."""
         return self._change is not None
@@ -169,6 +176,8 @@ class Watch:
     def add(self, pair: Pair, *, kept: bool) -> None:
         """One more pair, learnt or, not `kept`, doubted."""
         turn = np.full(4, np.nan) if pair.R is None else pair.R
+        if len(self._pairs) >= MOST_WATCHED and not self.alarmed:
+            self._shorten()
         self._pairs.append(_Watched(pair.seq, pair.q, pair.x, np.diag(pair.cov), turn, kept))
         if self._detector is None:
             return
@@ -232,6 +241,14 @@ class Watch:
         """The pairs have shown how far they lie from a model that does not know them."""
         if self._detector is not None:
             self._shown = np.concatenate([self._shown, self._detector.surprises])[-MOST_SURPRISES:]
+
+    def _shorten(self) -> None:
+        """The older half of the pairs goes."""
+        gone = len(self._pairs) // 2
+        del self._pairs[:gone]
+        self._asked_at, self._next_at = max(self._asked_at - gone, 0), max(self._next_at - gone, 0)
+        if self._reference is not None:
+            self._hold(self._reference)
 
     def _renew(self) -> None:
         """The next reference takes its place."""
