@@ -40,15 +40,19 @@ class StereoMatcher:
         # The check that the best pair failed at.
         return Reason.SIZE_MISMATCH if Reason.SIZE_MISMATCH in outcomes else Reason.EPIPOLAR
 
-    def has_rival(self, found: Location, left: Sequence[Disc], right: Sequence[Disc]) -> bool:
-        """Whether another pair of discs than the one `found`, measured or rough, may be a marker too."""
+    def doubt(self, found: Location, left: Sequence[Disc], right: Sequence[Disc]) -> Reason | None:
+        """Why the pair `found` may not be the marker: another pair, measured or rough, may be it too, or `found` may be that
+        one's mirrored copy."""
         others = [
             [disc for disc in discs if np.linalg.norm(disc.centre_px - centre_px) > disc.radius_px]
             for discs, centre_px in ((left, found.centres_px[:2]), (right, found.centres_px[2:]))
         ]
         outcomes = (self._check(one, other) for one, other in product(*others))
         fitting = [outcome for outcome in outcomes if isinstance(outcome, Location)]
-        return len(_without_reflections([found, *fitting])) > 1
+        rest = _without_reflections([found, *fitting])
+        if not any(one is found for one in rest):
+            return Reason.REFLECTION
+        return Reason.AMBIGUOUS if len(rest) > 1 else None
 
     def shows_too(
         self, disc: Disc, others: Sequence[Disc], mask: ImageArray, found: Location, *, in_left: bool
@@ -73,7 +77,9 @@ class StereoMatcher:
         first, last = (u - ends_px[1], u - ends_px[0]) if in_left else (u + ends_px[0], u + ends_px[1])
         # The square inside the disc.
         half = max(1, round(disc.radius_px / math.sqrt(2.0)))
-        rows = mask[max(round(v) - half, 0) : round(v) + half + 1]
+        rows = mask[max(round(v) - half, 0) : max(round(v) + half + 1, 0)]
+        if not len(rows):
+            return False
         columns = np.arange(max(math.floor(first), half), min(math.ceil(last), mask.shape[1] - 1 - half) + 1)
         own_u = float(found.centres_px[2 if in_left else 0])
         columns = columns[np.abs(columns - own_u) > radius_px + half]

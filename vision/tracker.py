@@ -25,7 +25,7 @@ _REGION_RADII, _REGION_PX, _REGION_STEPS = 1.6, 14.0, 0.7
 # After a longer pause the last fixes predict nothing [s].
 _LONGEST_PAUSE_S = 0.5
 # So long after the last fix the marker is expected within reach of it [s], if it moved on for no longer than this [s];
-# the reach is so many radii larger.
+# the reach is so many radii larger. Without a fix, what is left of two is the marker after that time.
 _LONGEST_MEMORY_S, _FAIR_PAUSE_S, _JUMP_RADII = 0.9, 0.1, 2.0
 
 # Fixes between two looks at the ball's colour.
@@ -70,6 +70,7 @@ class StereoTracker:
         self._whole = Region(0, 0, width, height)
         self._track: _Track | None = None
         self._last: _Last | None = None
+        self._rivalled: tuple[float, Reason] | None = None
         self._fixes = 0
 
     def track(self, frame: StereoFrame) -> MarkerFix | MarkerMiss:
@@ -83,6 +84,8 @@ class StereoTracker:
         found = self._look(frame, regions) if regions else None
         if not isinstance(found, Location):
             found = self._look(frame, (self._whole, self._whole))
+            if found is Reason.AMBIGUOUS or found is Reason.REFLECTION:
+                self._rivalled = frame.t, found
         if isinstance(found, Location):
             found = self._doubt(frame.t, found) or found
         if isinstance(found, Reason):
@@ -90,6 +93,7 @@ class StereoTracker:
                 _log.debug("marker lost at %.3f s: %s", frame.t, found)
             self._track = None
             return MarkerMiss(frame.t, found)
+        self._rivalled = None
         self._remember(frame.t, found)
         self._follow_colour(frame, found)
         ul, vl, ur, vr = (float(value) for value in found.centres_px)
@@ -98,6 +102,7 @@ class StereoTracker:
     def forget(self) -> None:
         """Look for the marker in the whole images next time."""
         self._track = self._last = None
+        self._rivalled = None
         self._gate.reset()
 
     def _look(self, frame: StereoFrame, regions: tuple[Region, Region]) -> Location | Reason:
@@ -109,14 +114,15 @@ class StereoTracker:
             return right
         found = self._matcher.match(left, right)
         # The marker may be the one of two that could not be measured in both eyes.
-        if isinstance(found, Location) and self._has_rival(frame, found, left + left_rough, right + right_rough):
-            return Reason.AMBIGUOUS
+        if isinstance(found, Location):
+            return self._rivalry(frame, found, left + left_rough, right + right_rough) or found
         return found
 
-    def _has_rival(self, frame: StereoFrame, found: Location, left: list[Disc], right: list[Disc]) -> bool:
-        """Whether something else in view, measured or not, may be the marker."""
-        if self._matcher.has_rival(found, left, right):
-            return True
+    def _rivalry(self, frame: StereoFrame, found: Location, left: list[Disc], right: list[Disc]) -> Reason | None:
+        """Why something else in view, measured or not, may be the marker instead."""
+        reason = self._matcher.doubt(found, left, right)
+        if reason is not None:
+            return reason
         eyes = ((left, right, frame.right, found.centres_px[:2]), (right, left, frame.left, found.centres_px[2:]))
         for discs, others, image, centre_px in eyes:
             rest = [disc for disc in discs if np.linalg.norm(disc.centre_px - centre_px) > disc.radius_px]
@@ -124,8 +130,8 @@ class StereoTracker:
                 continue
             mask = self._gate.mask(image)
             if any(self._matcher.shows_too(disc, others, mask, found, in_left=discs is left) for disc in rest):
-                return True
-        return False
+                return Reason.AMBIGUOUS
+        return None
 
     def _discs(self, image: ImageArray, region: Region) -> tuple[list[Disc] | Reason, list[Disc]]:
         """The discs in one eye; when there is none, why the most disc-like patch is none. And what is round, but could
@@ -162,7 +168,9 @@ class StereoTracker:
         """Why what was found in the images cannot be the marker that was seen a moment ago."""
         last = self._last
         if last is None or not 0 <= t - last.t <= _LONGEST_MEMORY_S:
-            return None
+            # One of two has gone; nothing tells which.
+            rivalled = self._rivalled
+            return rivalled[1] if rivalled is not None and 0 <= t - rivalled[0] <= _LONGEST_MEMORY_S else None
         away_m = float(np.linalg.norm(found.x - last.x))
         if away_m <= _JUMP_RADII * self.config.radius_m + self.config.max_speed_m_s * min(t - last.t, _FAIR_PAUSE_S):
             return None
