@@ -21,6 +21,8 @@ _LEAST_FILL = 0.45
 _WHOLE_DISC_FILL = 0.8
 # Parts of the strongest colour that tell the ball from what is behind it.
 _STRONG_SHARES = (0.5, 0.7)
+# Parts with the same box whose fill differs by less are the same patch.
+_SAME_FILL = 0.02
 # A part of the ball or of a brick has an edge on some sides only; on the others its surroundings are as colourful.
 _MOST_UNEVEN = 0.3
 # Where more of the outline than this leaves the ellipse, something covers the ball.
@@ -104,7 +106,9 @@ def find_patches(image: ImageArray, region: Region, gate: Gate, config: VisionCo
     patches = _patches(gate.mask(pixels), region, config)
     for patch in list(patches):
         if patch.fill < _WHOLE_DISC_FILL:
-            patches += _brighter_parts(image, patch, gate, config)
+            for part in _brighter_parts(image, patch, gate, config):
+                if not any(part.box == other.box and abs(part.fill - other.fill) < _SAME_FILL for other in patches):
+                    patches.append(part)
     return sorted(patches, key=lambda patch: -patch.fill)[: config.max_candidates]
 
 
@@ -227,9 +231,9 @@ def _patch(mask: ImageArray, stats: np.ndarray, region: Region) -> Patch | None:
         x, y = moments["m10"] / moments["m00"], moments["m01"] / moments["m00"]
     else:
         radius = enclosing
-    corner = np.array([region.left + left, region.top + top])
-    whole = Region(corner[0], corner[1], corner[0] + width, corner[1] + height)
-    return Patch(whole, corner + np.array([x, y]), radius, fill)
+    left, top = region.left + left, region.top + top
+    whole = Region(left, top, left + width, top + height)
+    return Patch(whole, np.array([left + x, top + y]), radius, fill)
 
 
 def _brighter_parts(image: ImageArray, patch: Patch, gate: Gate, config: VisionConfig) -> list[Patch]:

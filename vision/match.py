@@ -41,8 +41,10 @@ class StereoMatcher:
         return Reason.SIZE_MISMATCH if Reason.SIZE_MISMATCH in outcomes else Reason.EPIPOLAR
 
     def doubt(self, found: Location, left: Sequence[Disc], right: Sequence[Disc]) -> Reason | None:
-        """Why the pair `found` may not be the marker: another pair, measured or rough, may be it too, or `found` may be that
-        one's mirrored copy."""
+        """Why the pair `found` may not be the marker.
+
+        Another pair, of discs measured or rough, may be it too, or `found` may be a mirrored copy of that one.
+        """
         others = [
             [disc for disc in discs if np.linalg.norm(disc.centre_px - centre_px) > disc.radius_px]
             for discs, centre_px in ((left, found.centres_px[:2]), (right, found.centres_px[2:]))

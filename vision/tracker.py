@@ -140,6 +140,8 @@ class StereoTracker:
         rough: list[Disc] = []
         reason: Reason | None = None
         for patch in find_patches(image, region, self._gate, self.config):
+            if any(np.linalg.norm(patch.centre_px - disc.centre_px) < disc.radius_px for disc in discs):
+                continue
             outcome = measure(image, patch, self._eye, self._gate, self.config)
             if isinstance(outcome, Reason):
                 reason = reason or outcome
