@@ -194,7 +194,8 @@ def main() -> None:
     )
     # No wrong one among n: the rate is below 3/n with 95 % confidence.
     bound = f", below {100 * 3 / frames:.3f} % at 95 %" if wrong == 0 else ""
-    print(f"\n{wrong} wrong fixes in {frames} frames{bound}; {kept} of {good} good balls kept ({kept / good:.1%})")
+    share = f" ({kept / good:.1%})" if good else ""
+    print(f"\n{wrong} wrong fixes in {frames} frames{bound}; {kept} of {good} good balls kept{share}")
 
 
 if __name__ == "__main__":

@@ -73,10 +73,11 @@ def fit_limb(
 ) -> Circle | None:
     """The ellipse through the limb near the outline given, which is right to half a pixel or so.
 
-    None when nothing there is like a ball's limb, or not all around.
+    None when nothing there is like a ball's limb, or not all around. What the last of all looks still moved is claimed.
     """
     blur_px = USUAL_BLUR_PX
     fit: _Fit | None = None
+    unsettled = np.zeros(3)
     for _ in range(_LOOKS):
         limb = find_limb(image, gate, centre_px, radius_px, shape, blur_px)
         fit = None if limb is None else _fit(limb, radius_px)
@@ -86,13 +87,16 @@ def fit_limb(
         last_blur_px, blur_px = blur_px, min(max(limb.blur_px, _SHARPEST_PX), _WIDEST_PX)
         moved_px = max(float(np.linalg.norm(fit.shift_px)), abs(fit.growth_px))
         if moved_px < _SETTLED_PX and abs(blur_px - last_blur_px) < _SETTLED_BLUR_PX:
+            unsettled = np.zeros(3)
             break
+        unsettled = np.array([*fit.shift_px, fit.growth_px])
     aliased = blur_px < _ALIASED_PX
     if fit is None or (fit.waves.quick > _LARGEST_DENSITY and not aliased):
         return None
     # What the waves show less than the pixels' noise alone makes is chance.
     seen, count = fit.waves.evened().once_round(), fit.waves.count
     cov = max(seen, (count * seen + _WORTH * _SHARED_PIXELS) / (count + _WORTH)) * fit.inverse
+    cov += np.outer(unsettled, unsettled)
     # A blurred disc's edge, where it is steepest, is nearer to the centre than the disc's.
     radius_px += blur_px**2 / (2.0 * radius_px)
     return Circle(centre_px, radius_px, shape @ cov[:2, :2] @ shape, math.sqrt(cov[2, 2]), aliased)

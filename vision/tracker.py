@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -44,7 +45,10 @@ class _Track:
 
 @dataclass(frozen=True, slots=True)
 class _Last:
-    """The last fix: time [s], place (3,) [m], level of its colour [grey levels]."""
+    """The last fix, or the last pair of discs that may be the marker though they were not measured.
+
+    Time [s], place (3,) [m], level of its colour [grey levels].
+    """
 
     t: float
     x: FloatArray
@@ -70,7 +74,8 @@ class StereoTracker:
         self._whole = Region(0, 0, width, height)
         self._track: _Track | None = None
         self._last: _Last | None = None
-        self._rivalled: tuple[float, Reason] | None = None
+        self._ambiguous_t = -math.inf
+        self._sighted: _Last | None = None
         self._fixes = 0
 
     def track(self, frame: StereoFrame) -> MarkerFix | MarkerMiss:
@@ -84,8 +89,8 @@ class StereoTracker:
         found = self._look(frame, regions) if regions else None
         if not isinstance(found, Location):
             found = self._look(frame, (self._whole, self._whole))
-            if found is Reason.AMBIGUOUS or found is Reason.REFLECTION:
-                self._rivalled = frame.t, found
+            if found is Reason.AMBIGUOUS:
+                self._ambiguous_t = frame.t
         if isinstance(found, Location):
             found = self._doubt(frame.t, found) or found
         if isinstance(found, Reason):
@@ -93,7 +98,7 @@ class StereoTracker:
                 _log.debug("marker lost at %.3f s: %s", frame.t, found)
             self._track = None
             return MarkerMiss(frame.t, found)
-        self._rivalled = None
+        self._ambiguous_t = -math.inf
         self._remember(frame.t, found)
         self._follow_colour(frame, found)
         ul, vl, ur, vr = (float(value) for value in found.centres_px)
@@ -102,21 +107,31 @@ class StereoTracker:
     def forget(self) -> None:
         """Look for the marker in the whole images next time."""
         self._track = self._last = None
-        self._rivalled = None
+        self._ambiguous_t, self._sighted = -math.inf, None
         self._gate.reset()
 
     def _look(self, frame: StereoFrame, regions: tuple[Region, Region]) -> Location | Reason:
         left, left_rough = self._discs(frame.left, regions[0])
-        if isinstance(left, Reason):
+        if left is Reason.NO_MARKER:
             return left
         right, right_rough = self._discs(frame.right, regions[1])
-        if isinstance(right, Reason):
-            return right
-        found = self._matcher.match(left, right)
+        lefts, rights = (
+            rough if isinstance(discs, Reason) else discs + rough
+            for discs, rough in ((left, left_rough), (right, right_rough))
+        )
+        if isinstance(left, Reason):
+            answer = left
+        elif isinstance(right, Reason):
+            answer = right
+        else:
+            answer = self._matcher.match(left, right)
         # The marker may be the one of two that could not be measured in both eyes.
-        if isinstance(found, Location):
-            return self._rivalry(frame, found, left + left_rough, right + right_rough) or found
-        return found
+        if isinstance(answer, Location):
+            answer = self._rivalry(frame, answer, lefts, rights) or answer
+        if isinstance(answer, Reason):
+            seen = self._matcher.brightest(lefts, rights)
+            self._sighted = _Last(frame.t, seen.x, seen.level) if seen else self._sighted
+        return answer
 
     def _rivalry(self, frame: StereoFrame, found: Location, left: list[Disc], right: list[Disc]) -> Reason | None:
         """Why something else in view, measured or not, may be the marker instead."""
@@ -170,15 +185,24 @@ class StereoTracker:
         """Why what was found in the images cannot be the marker that was seen a moment ago."""
         last = self._last
         if last is None or not 0 <= t - last.t <= _LONGEST_MEMORY_S:
-            # One of two has gone; nothing tells which.
-            rivalled = self._rivalled
-            return rivalled[1] if rivalled is not None and 0 <= t - rivalled[0] <= _LONGEST_MEMORY_S else None
+            return self._doubt_without_track(t, found)
         away_m = float(np.linalg.norm(found.x - last.x))
         if away_m <= _JUMP_RADII * self.config.radius_m + self.config.max_speed_m_s * min(t - last.t, _FAIR_PAUSE_S):
             return None
         if is_reflection_of(found, last.level, float(np.linalg.norm(last.x))):
             return Reason.REFLECTION
         return Reason.IMPLAUSIBLE_SPEED
+
+    def _doubt_without_track(self, t: float, found: Location) -> Reason | None:
+        """Why what was found may not be the marker though nothing was, a moment ago."""
+        if 0 <= t - self._ambiguous_t <= _LONGEST_MEMORY_S:
+            # One of two that were alike has gone; nothing tells which.
+            return Reason.AMBIGUOUS
+        sighted = self._sighted
+        if sighted is None or not 0 <= t - sighted.t <= _LONGEST_MEMORY_S:
+            return None
+        is_copy = is_reflection_of(found, sighted.level, float(np.linalg.norm(sighted.x)))
+        return Reason.REFLECTION if is_copy else None
 
     def _remember(self, t: float, found: Location) -> None:
         velocity = np.zeros(4)
