@@ -56,12 +56,6 @@ class StereoMatcher:
             return Reason.REFLECTION
         return Reason.AMBIGUOUS if len(rest) > 1 else None
 
-    def brightest(self, left: Sequence[Disc], right: Sequence[Disc]) -> Location | None:
-        """Of the pairs of discs, measured or rough, that may be a marker, the one with most of its colour."""
-        outcomes = (self._check(one, other) for one, other in product(left, right))
-        fitting = [outcome for outcome in outcomes if isinstance(outcome, Location)]
-        return max(fitting, key=lambda one: one.level, default=None)
-
     def shows_too(
         self, disc: Disc, others: Sequence[Disc], mask: ImageArray, found: Location, *, in_left: bool
     ) -> bool:

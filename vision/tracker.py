@@ -45,13 +45,19 @@ class _Track:
 
 @dataclass(frozen=True, slots=True)
 class _Last:
-    """The last fix, or the last pair of discs that may be the marker though they were not measured.
-
-    Time [s], place (3,) [m], level of its colour [grey levels].
-    """
+    """The last fix: time [s], place (3,) [m], level of its colour [grey levels]."""
 
     t: float
     x: FloatArray
+    level: float
+
+
+@dataclass(frozen=True, slots=True)
+class _Sighting:
+    """A disc in a frame without a fix: time [s], how far off a marker of its size is [m], level of its colour."""
+
+    t: float
+    distance_m: float
     level: float
 
 
@@ -75,7 +81,7 @@ class StereoTracker:
         self._track: _Track | None = None
         self._last: _Last | None = None
         self._ambiguous_t = -math.inf
-        self._sighted: _Last | None = None
+        self._sighted: tuple[_Sighting, ...] = ()
         self._fixes = 0
 
     def track(self, frame: StereoFrame) -> MarkerFix | MarkerMiss:
@@ -107,7 +113,7 @@ class StereoTracker:
     def forget(self) -> None:
         """Look for the marker in the whole images next time."""
         self._track = self._last = None
-        self._ambiguous_t, self._sighted = -math.inf, None
+        self._ambiguous_t, self._sighted = -math.inf, ()
         self._gate.reset()
 
     def _look(self, frame: StereoFrame, regions: tuple[Region, Region]) -> Location | Reason:
@@ -129,8 +135,7 @@ class StereoTracker:
         if isinstance(answer, Location):
             answer = self._rivalry(frame, answer, lefts, rights) or answer
         if isinstance(answer, Reason):
-            seen = self._matcher.brightest(lefts, rights)
-            self._sighted = _Last(frame.t, seen.x, seen.level) if seen else self._sighted
+            self._sighted = tuple(self._sighting(frame.t, disc) for disc in (*lefts, *rights)) or self._sighted
         return answer
 
     def _rivalry(self, frame: StereoFrame, found: Location, left: list[Disc], right: list[Disc]) -> Reason | None:
@@ -198,11 +203,16 @@ class StereoTracker:
         if 0 <= t - self._ambiguous_t <= _LONGEST_MEMORY_S:
             # One of two that were alike has gone; nothing tells which.
             return Reason.AMBIGUOUS
-        sighted = self._sighted
-        if sighted is None or not 0 <= t - sighted.t <= _LONGEST_MEMORY_S:
-            return None
-        is_copy = is_reflection_of(found, sighted.level, float(np.linalg.norm(sighted.x)))
+        is_copy = any(
+            0 <= t - seen.t <= _LONGEST_MEMORY_S
+            and is_reflection_of(found, seen.level, self.config.depth_size_ratio * seen.distance_m)
+            for seen in self._sighted
+        )
         return Reason.REFLECTION if is_copy else None
+
+    def _sighting(self, t: float, disc: Disc) -> _Sighting:
+        radii = self._eye.distance_over_radius(disc.centre_px, disc.radius_px)
+        return _Sighting(t, radii * self.config.radius_m, disc.level)
 
     def _remember(self, t: float, found: Location) -> None:
         velocity = np.zeros(4)
