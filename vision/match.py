@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -18,6 +19,9 @@ from .triangulate import Location, locate
 
 # A mirror gives back less than this of the light, and its copy stands farther off.
 _MIRRORED_LIGHT = 0.8
+# What calibration leaves of a difference between the sizes that the eyes see (1-sigma, relative), and the 95 % limit of
+# the sum of two squared differences in sigmas: size and row. The claim grows with what is beyond.
+_SIZE_TOLERANCE, _USUAL_DOUBT = 0.002, 6.0
 # Discs of the two eyes that may be one thing; and how much of a thing's place has to show its colour.
 _SAME_SIZE, _SAME_ROW_PX, _LEAST_SHOWN = 1.2, 2.0, 0.6
 
@@ -97,18 +101,25 @@ class StereoMatcher:
         sigma = math.sqrt(location.variances_px[1] + location.variances_px[3])
         if abs(vl - vr) > self._config.epipolar_px + self._config.epipolar_sigmas * sigma:
             return Reason.EPIPOLAR
-        return location if self._sizes_fit(location, left, right) else Reason.SIZE_MISMATCH
+        ratios = self._size_ratios(location, left, right)
+        # How far apart noise may bring the sizes that the two eyes see.
+        size_sigma = math.hypot(*(disc.radius_sigma_px / disc.radius_px for disc in (left, right)))
+        if ratios is None or not self._sizes_fit(ratios, size_sigma):
+            return Reason.SIZE_MISMATCH
+        apart = math.log(ratios[0] / ratios[1]) / math.hypot(size_sigma, _SIZE_TOLERANCE), (vl - vr) / sigma
+        # What pulls one eye's centre does not pull both alike: it shows in the sizes and in the rows.
+        doubt = max(1.0, (apart[0] ** 2 + apart[1] ** 2) / _USUAL_DOUBT)
+        return replace(location, cov=doubt * location.cov)
 
-    def _sizes_fit(self, location: Location, left: Disc, right: Disc) -> bool:
+    def _size_ratios(self, location: Location, left: Disc, right: Disc) -> tuple[float, float] | None:
+        """How large the two eyes see the ball, as parts of what they have to."""
         baseline = np.array([self._calibration.baseline_m, 0.0, 0.0])
-        ratios: list[float] = []
-        for disc, x_eye in ((left, location.x), (right, location.x - baseline)):
-            expected = self._eye.outline(x_eye, self._config.radius_m)
-            if expected is None:
-                return False
-            ratios.append(disc.radius_px / expected.radius_px)
-        # How far apart noise may bring the two, besides.
-        sigma = math.hypot(*(disc.radius_sigma_px / disc.radius_px for disc in (left, right)))
+        outlines = [self._eye.outline(x_eye, self._config.radius_m) for x_eye in (location.x, location.x - baseline)]
+        if outlines[0] is None or outlines[1] is None:
+            return None
+        return left.radius_px / outlines[0].radius_px, right.radius_px / outlines[1].radius_px
+
+    def _sizes_fit(self, ratios: tuple[float, float], sigma: float) -> bool:
         between_eyes = max(ratios) / min(ratios) / (1.0 + self._config.epipolar_sigmas * sigma)
         against_depth = max(*ratios, 1.0 / min(ratios))
         return between_eyes <= self._config.eye_size_ratio and against_depth <= self._config.depth_size_ratio

@@ -266,3 +266,12 @@ def test_a_second_after_the_last_fix_the_marker_may_be_anywhere():
     tracker.track(stage(BALL))
     elsewhere = Ball((-0.1, -0.1, 1.3))
     assert sigmas_off(tracker.track(stage(elsewhere, t=1.2)), elsewhere) < FAR_SIGMAS
+
+
+def test_eyes_that_disagree_on_the_size_by_more_than_noise_claim_less():
+    matcher = StereoMatcher(SMALL, VisionConfig())
+    agreeing = seen_discs(BALL, level=120.0)
+    apart = [agreeing[0], replace(agreeing[1], radius_px=1.02 * agreeing[1].radius_px)]
+    found = [matcher.match([left], [right]) for left, right in (agreeing, apart)]
+    sigmas = [np.sqrt(np.diag(one.cov)) for one in found if isinstance(one, Location)]
+    assert (sigmas[1] > 2.0 * sigmas[0]).all()
