@@ -87,8 +87,9 @@ class StereoMatcher:
         if not len(rows):
             return False
         columns = np.arange(max(math.floor(first), half), min(math.ceil(last), mask.shape[1] - 1 - half) + 1)
-        own_u = float(found.centres_px[2 if in_left else 0])
-        columns = columns[np.abs(columns - own_u) > radius_px + half]
+        own_u, own_v = found.centres_px[2:] if in_left else found.centres_px[:2]
+        if abs(own_v - v) <= radius_px + half:
+            columns = columns[np.abs(columns - own_u) > radius_px + half]
         total = np.concatenate([[0.0], np.cumsum(rows.mean(axis=0) / 255.0)])
         shares = (total[columns + half + 1] - total[columns - half]) / (2 * half + 1)
         return bool((shares > _LEAST_SHOWN).any())

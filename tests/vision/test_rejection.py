@@ -2,6 +2,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from ball_renderer import SMALL, VGA, Look, in_eyes
@@ -235,6 +236,19 @@ def test_a_ball_that_is_mostly_white_is_saturated():
 def test_a_dimmer_copy_farther_off_is_no_second_marker():
     mirrored = Ball((-0.02, -0.03, 1.0), rgb=(0.45, 0.04, 0.04))
     assert sigmas_off(answer(BALL, mirrored), BALL) < FAR_SIGMAS
+
+
+def test_a_disc_that_one_eye_alone_measured_is_a_rival_of_what_is_above_it_in_the_other_eye():
+    matcher = StereoMatcher(SMALL, VisionConfig())
+    copy = seen_discs(Ball((0.0, -0.06, 1.6)), level=60.0)
+    found = matcher.match(*([disc] for disc in copy))
+    assert isinstance(found, Location)
+    # The marker's left image is right below the copy's.
+    marker = seen_discs(Ball((0.0, 0.0, 0.8)), level=120.0)
+    mask = np.zeros((240, 320), np.uint8)
+    u, v = np.rint(marker[0].centre_px).astype(int)
+    cv2.circle(mask, (int(u), int(v)), round(marker[0].radius_px), 255, -1)
+    assert matcher.shows_too(marker[1], [copy[0]], mask, found, in_left=False)
 
 
 def test_a_copy_beside_a_marker_that_was_not_measured_is_a_reflection():
