@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import cv2
 import msgspec
 import numpy as np
 
+from interfaces.errors import ConfigError
 from interfaces.records import ImageArray
 from vision.calibration.images import read_pairs
 from vision.cluster.measure import ClusterView, MeasuredCluster, measure_cluster
@@ -25,15 +27,17 @@ from vision.tag_image import TagImage
 from .camera_calibration import Images
 
 _MOST_GROWN, _SIGMAS = 0.01, 4.0
+_SIDE = re.compile(r"(\d+)=(\d+\.?\d*)")
 
 
 @dataclass(frozen=True)
 class Wanted:
-    """Which tags: of a dictionary, all or those of some numbers, with black squares of a side [m]."""
+    """Which tags: of a dictionary, all or those of some numbers; sides of their black squares [m], some by number."""
 
     dictionary: Dictionary
     side_m: float
     ids: tuple[int, ...] | None = None
+    other_sides_m: Mapping[int, float] = field(default_factory=dict[int, float])
 
 
 class TagFigures(msgspec.Struct):
@@ -76,12 +80,23 @@ def measured(images: Images, calibration: Path, wanted: Wanted, tell: Callable[[
         rig.require(pair.size_px, rig.serials)
         eyes = [_tags(finder, image, maps[eye]) for eye, image in enumerate((pair.left, pair.right))]
         views.append(ClusterView(pair.name, *eyes))
-    found = measure_cluster(views, rectification.calibration, wanted.side_m)
+    found = measure_cluster(views, rectification.calibration, wanted.side_m, wanted.other_sides_m)
     if abs(found.grown) > _MOST_GROWN + _SIGMAS * found.grown_sigma:
         raise CalibrationError(
             f"the black squares seem to be {1e3 * wanted.side_m * (1.0 + found.grown):.2f} mm wide, not "
             f"{1e3 * wanted.side_m:g}. Measure one and give --side-mm; or is this the calibration of other cameras?"
         )
+    return found
+
+
+def sides_of(text: str) -> dict[int, float]:
+    """Sides [m] of tags by their number, from a text like 7=25,8=25 [mm]; ConfigError when it is none."""
+    found: dict[int, float] = {}
+    for part in text.split(","):
+        told = _SIDE.fullmatch(part.strip())
+        if told is None or not float(told[2]) > 0:
+            raise ConfigError(f"--other-sides-mm {text} is not as in 7=25,8=25", remedy="Give tags' numbers and mm")
+        found[int(told[1])] = 1e-3 * float(told[2])
     return found
 
 

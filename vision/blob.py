@@ -21,6 +21,8 @@ _LEAST_FILL = 0.45
 _WHOLE_DISC_FILL = 0.8
 # Parts of the strongest colour that tell the ball from what is behind it.
 _STRONG_SHARES = (0.5, 0.7)
+# Parts with the same box whose fill differs by less are the same patch.
+_SAME_FILL = 0.02
 # A part of the ball or of a brick has an edge on some sides only; on the others its surroundings are as colourful.
 _MOST_UNEVEN = 0.3
 # Where more of the outline than this leaves the ellipse, something covers the ball.
@@ -29,6 +31,9 @@ _MOST_OFF = 0.15
 _WHITE, _MOST_WHITE = 250, 0.35
 # Centre of a patch that could not be measured: 1-sigma as a part of its radius.
 _ROUGH_SIGMA = 0.1
+# A patch at the border is a ball that reaches out of view where so many points of its outline are on a circle, up to
+# this part of the radius.
+_LEAST_ARC_POINTS, _ROUND = 8, 0.1
 # Pixels around a patch that the outline may reach into.
 _APRON_PX = 12
 
@@ -101,7 +106,9 @@ def find_patches(image: ImageArray, region: Region, gate: Gate, config: VisionCo
     patches = _patches(gate.mask(pixels), region, config)
     for patch in list(patches):
         if patch.fill < _WHOLE_DISC_FILL:
-            patches += _brighter_parts(image, patch, gate, config)
+            for part in _brighter_parts(image, patch, gate, config):
+                if not any(part.box == other.box and abs(part.fill - other.fill) < _SAME_FILL for other in patches):
+                    patches.append(part)
     return sorted(patches, key=lambda patch: -patch.fill)[: config.max_candidates]
 
 
@@ -129,17 +136,44 @@ def measure(image: ImageArray, patch: Patch, eye: Pinhole, gate: Gate, config: V
     reach = outline.radius_px + config.border_margin_px
     if (centre_px - reach < 0).any() or (centre_px + reach > (width - 1, height - 1)).any():
         return Reason.AT_BORDER
-    level = _level(image, centre_px, outline.radius_px, gate)
+    level = _level(image, patch.box, centre_px, outline.radius_px, gate)
     return Disc(centre_px, outline.radius_px, outline.cov_px, outline.radius_sigma_px, level)
 
 
 def roughly(image: ImageArray, patch: Patch, gate: Gate) -> Disc | None:
-    """The ball that a patch may be though it could not be measured; None when it is not round."""
-    if patch.fill < _WHOLE_DISC_FILL:
+    """The ball that a patch may be though it could not be measured, or that reaches out of view; None when it is not
+    round."""
+    circle = (patch.centre_px, patch.radius_px) if patch.fill >= _WHOLE_DISC_FILL else _cut_circle(image, patch, gate)
+    if circle is None:
         return None
-    sigma_px = _ROUGH_SIGMA * patch.radius_px
-    level = _level(image, patch.centre_px, patch.radius_px, gate)
-    return Disc(patch.centre_px, patch.radius_px, sigma_px**2 * np.eye(2), sigma_px, level)
+    centre_px, radius_px = circle
+    sigma_px = _ROUGH_SIGMA * radius_px
+    level = _level(image, patch.box, centre_px, radius_px, gate)
+    return Disc(centre_px, radius_px, sigma_px**2 * np.eye(2), sigma_px, level)
+
+
+def _cut_circle(image: ImageArray, patch: Patch, gate: Gate) -> tuple[FloatArray, float] | None:
+    """Centre (2,) and radius [px] of a round patch that the image's border cuts; None for others."""
+    height, width = image.shape[:2]
+    if _clear_of_border(patch.box, 1, (width, height)):
+        return None
+    contours, _ = cv2.findContours(gate.mask(patch.box.crop(image)), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    longest = max(contours, key=len, default=None)
+    if longest is None:
+        return None
+    points = longest.reshape(-1, 2) + np.array([patch.box.left, patch.box.top], dtype=np.float64)
+    points = points[((points > 1) & (points < (width - 2, height - 2))).all(axis=1)]
+    if len(points) < _LEAST_ARC_POINTS:
+        return None
+    # Kåsa's fit: |p|² = 2 c·p + r² − |c|² is linear in c and the rest.
+    middle = points.mean(axis=0)
+    design = np.column_stack([2.0 * (points - middle), np.ones(len(points))])
+    solution = np.linalg.lstsq(design, ((points - middle) ** 2).sum(axis=1), rcond=None)[0]
+    centre_px, radius_px = middle + solution[:2], math.sqrt(solution[2] + solution[:2] @ solution[:2])
+    off = np.linalg.norm(points - centre_px, axis=1) - radius_px
+    if math.sqrt(np.mean(off**2)) > _ROUND * radius_px or radius_px > math.hypot(width, height):
+        return None
+    return centre_px, radius_px + 0.5
 
 
 def _is_whole(outline: Outline, config: VisionConfig) -> bool:
@@ -152,9 +186,11 @@ def _is_whole(outline: Outline, config: VisionConfig) -> bool:
     )
 
 
-def _level(image: ImageArray, centre_px: FloatArray, radius_px: float, gate: Gate) -> float:
-    """Mean amount of the marker's colour in the square inside the disc."""
+def _level(image: ImageArray, box: Region, centre_px: FloatArray, radius_px: float, gate: Gate) -> float:
+    """Mean amount of the marker's colour in what a patch's box has of the square inside the disc."""
     first, last = (np.rint(centre_px + side * 0.6 * radius_px).astype(int) for side in (-1, 1))
+    first = np.clip(first, (box.left, box.top), (box.right - 1, box.bottom - 1))
+    last = np.clip(last, first, (box.right - 1, box.bottom - 1))
     return float(gate.amount(image[first[1] : last[1] + 1, first[0] : last[0] + 1]).mean())
 
 
@@ -195,9 +231,9 @@ def _patch(mask: ImageArray, stats: np.ndarray, region: Region) -> Patch | None:
         x, y = moments["m10"] / moments["m00"], moments["m01"] / moments["m00"]
     else:
         radius = enclosing
-    corner = np.array([region.left + left, region.top + top])
-    whole = Region(corner[0], corner[1], corner[0] + width, corner[1] + height)
-    return Patch(whole, corner + np.array([x, y]), radius, fill)
+    left, top = region.left + left, region.top + top
+    whole = Region(left, top, left + width, top + height)
+    return Patch(whole, np.array([left + x, top + y]), radius, fill)
 
 
 def _brighter_parts(image: ImageArray, patch: Patch, gate: Gate, config: VisionConfig) -> list[Patch]:

@@ -66,7 +66,8 @@ class ColourGate:
         first, rate = self._first, _FOLLOWED
         drift_deg = (self._band.hue_deg - first.hue_deg + 180.0) % 360.0 - 180.0 + rate * float(np.median(off_deg))
         most_deg = _FARTHEST * first.half_width_deg
-        saturation, value = (float(np.quantile(hsv[:, channel], 0.1)) / 255.0 for channel in (1, 2))
+        low = len(hsv) // 10
+        saturation, value = (float(np.partition(hsv[:, channel], low)[low]) / 255.0 for channel in (1, 2))
         self._use(
             HueBand(
                 (first.hue_deg + min(max(drift_deg, -most_deg), most_deg)) % 360.0,

@@ -79,7 +79,7 @@ class VisionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     min_brightness: Annotated[float, Meta(gt=0, le=1)] = 0.6
     min_pixels: Annotated[int, Meta(ge=12)] = 30
     border_margin_px: Annotated[float, Meta(ge=0)] = 3.0
-    min_visible: Annotated[float, Meta(ge=0.5, le=1)] = 0.85
+    min_visible: Annotated[float, Meta(ge=0.5, le=1)] = 0.75
     max_centre_sigma_px: Positive = 0.4
     epipolar_px: Annotated[float, Meta(ge=0)] = 0.5
     epipolar_sigmas: Annotated[float, Meta(ge=0)] = 4.0

@@ -17,7 +17,7 @@ from interfaces.records import FloatArray
 
 from .colour import Float32Array, Gate
 from .limb_filters import STEP_PX, Filters, filters, places
-from .polar import ball_colour, mean_of_three, median, ray_angles, sample
+from .polar import ball_colour, mean_of_three, median, rays_round, sample
 
 # Samples on the ball that tell its colour and the noise, from this part of its radius on.
 _INNER_COLUMNS, _INNER_PART = 4, 0.3
@@ -36,13 +36,13 @@ class Limb:
     """The ball's edge, ray by ray.
 
     Attributes:
-        angles: directions of the rays, shape (n,) [rad].
+        rays: cosine and sine of their directions, and 1, shape (n, 3).
         offset_px: how far beyond the outline that was thought of the edge is, shape (n,) [px].
         weight: inverse variances of `offset_px`, shape (n,) [1/px²]; 0 where a ray does not tell.
         blur_px: 1-sigma of lens and interpolation, as the edge shows it [px].
     """
 
-    angles: FloatArray
+    rays: FloatArray
     offset_px: FloatArray
     weight: FloatArray
     blur_px: float
@@ -58,26 +58,26 @@ def find_limb(
         centre_px, radius_px, shape: the outline, see `sphere.Ellipse`.
         blur_px: how wide the edge is thought to be, to a third [px].
     """
-    angles = ray_angles(radius_px)
+    rays = rays_round(radius_px)
     at = places(radius_px, blur_px)
     inner = np.linspace(_INNER_PART * radius_px, max(radius_px + at[0], 0.5 * radius_px), _INNER_COLUMNS)
-    samples = sample(image, centre_px, angles, np.concatenate([inner, radius_px + at]), shape)
+    samples = sample(image, centre_px, rays, np.concatenate([inner, radius_px + at]), shape)
     colour = ball_colour(samples[:, :_INNER_COLUMNS], gate)
     if colour is None:
         return None
     turned = samples @ _own_colour_first(colour).astype(np.float32)
     noise = _noise(turned[:, :_INNER_COLUMNS, 1:], turned[:, _INNER_COLUMNS:][:, at > _BEYOND_BLURS * blur_px])
-    rays = np.moveaxis(turned[:, _INNER_COLUMNS:].astype(np.float64) / noise, 2, 0)
-    return _filtered(angles, rays, filters(radius_px, blur_px), blur_px)
+    channels = np.moveaxis(turned[:, _INNER_COLUMNS:].astype(np.float64) / noise, 2, 0)
+    return _filtered(rays, channels, filters(radius_px, blur_px), blur_px)
 
 
-def _filtered(angles: FloatArray, rays: FloatArray, both: tuple[Filters, Filters], blur_px: float) -> Limb:
+def _filtered(rays: FloatArray, channels: FloatArray, both: tuple[Filters, Filters], blur_px: float) -> Limb:
     """What the filters make of the samples (3, n, m) of n rays in units of the noise, the ball's own colour first."""
     own, across = both
-    information, moved = np.zeros((2, len(angles)))
+    information, moved = np.zeros((2, len(rays)))
     widening, widening_information = 0.0, 1e-9
-    likeliest = np.concatenate([_likeliest(rays[:1], own), _likeliest(rays[1:], across)])
-    for channel, one, texture in zip(rays, (own, across, across), likeliest, strict=True):
+    likeliest = np.concatenate([_likeliest(channels[:1], own), _likeliest(channels[1:], across)])
+    for channel, one, texture in zip(channels, (own, across, across), likeliest, strict=True):
         contrast, shift = (np.einsum("nm,nm->n", part[texture], channel) for part in (one.contrast, one.shift))
         contrast = mean_of_three(contrast)
         inverse = 1.0 / one.shift_variance[texture]
@@ -90,19 +90,19 @@ def _filtered(angles: FloatArray, rays: FloatArray, both: tuple[Filters, Filters
     told = information > _WORST_SIGMA_PX**-2
     information[~told] = 1.0
     return Limb(
-        angles,
+        rays,
         np.where(told, moved / information, 0.0),
         told / (1.0 / information + _BEST_SIGMA_PX**2),
         blur_px * min(max(1.0 + widening / widening_information / blur_px, 1 / _LARGEST_WIDENING), _LARGEST_WIDENING),
     )
 
 
-def _likeliest(rays: FloatArray, one: Filters) -> NDArray[np.intp]:
+def _likeliest(channels: FloatArray, one: Filters) -> NDArray[np.intp]:
     """Which texture is the likeliest of each ray (n) of some channels (c), by three neighbours: shape (c, n)."""
-    channels, count, columns = rays.shape
-    flat = rays.reshape(-1, columns)
+    _, count, columns = channels.shape
+    flat = channels.reshape(-1, columns)
     whitened = (flat @ one.precisions).reshape(len(flat), -1, columns)
-    square = np.einsum("nkm,nm->nk", whitened, flat).reshape(channels, count, -1)
+    square = np.einsum("nkm,nm->nk", whitened, flat).reshape(-1, count, len(one.log_determinant))
     likelihood = -0.5 * (square + one.log_determinant)
     return np.argmax([mean_of_three(channel) for channel in likelihood], axis=2)
 

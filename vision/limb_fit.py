@@ -12,6 +12,7 @@ from interfaces.records import FloatArray
 from .colour import Float32Array, Gate
 from .limb import Limb, find_limb
 from .limb_filters import USUAL_BLUR_PX
+from .normal import inverse_of_normal
 from .polar import median
 from .waves import Waves, waves
 
@@ -72,10 +73,11 @@ def fit_limb(
 ) -> Circle | None:
     """The ellipse through the limb near the outline given, which is right to half a pixel or so.
 
-    None when nothing there is like a ball's limb, or not all around.
+    None when nothing there is like a ball's limb, or not all around. What the last of all looks still moved is claimed.
     """
     blur_px = USUAL_BLUR_PX
     fit: _Fit | None = None
+    unsettled = np.zeros(3)
     for _ in range(_LOOKS):
         limb = find_limb(image, gate, centre_px, radius_px, shape, blur_px)
         fit = None if limb is None else _fit(limb, radius_px)
@@ -85,13 +87,16 @@ def fit_limb(
         last_blur_px, blur_px = blur_px, min(max(limb.blur_px, _SHARPEST_PX), _WIDEST_PX)
         moved_px = max(float(np.linalg.norm(fit.shift_px)), abs(fit.growth_px))
         if moved_px < _SETTLED_PX and abs(blur_px - last_blur_px) < _SETTLED_BLUR_PX:
+            unsettled = np.zeros(3)
             break
+        unsettled = np.array([*fit.shift_px, fit.growth_px])
     aliased = blur_px < _ALIASED_PX
     if fit is None or (fit.waves.quick > _LARGEST_DENSITY and not aliased):
         return None
     # What the waves show less than the pixels' noise alone makes is chance.
     seen, count = fit.waves.evened().once_round(), fit.waves.count
     cov = max(seen, (count * seen + _WORTH * _SHARED_PIXELS) / (count + _WORTH)) * fit.inverse
+    cov += np.outer(unsettled, unsettled)
     # A blurred disc's edge, where it is steepest, is nearer to the centre than the disc's.
     radius_px += blur_px**2 / (2.0 * radius_px)
     return Circle(centre_px, radius_px, shape @ cov[:2, :2] @ shape, math.sqrt(cov[2, 2]), aliased)
@@ -108,30 +113,28 @@ def _fit(limb: Limb, radius_px: float) -> _Fit | None:
 
 def _least_squares(limb: Limb, radius_px: float, *, oval: bool) -> _Fit | None:
     """Weighted least squares; what is far off counts little."""
-    design = np.stack([np.cos(limb.angles), np.sin(limb.angles), np.ones_like(limb.angles)], axis=1)
+    design = limb.rays
     if oval:
-        design = np.column_stack([design, np.cos(2.0 * limb.angles), np.sin(2.0 * limb.angles)])
+        cos, sin = design[:, 0], design[:, 1]
+        design = np.column_stack([design, cos**2 - sin**2, 2.0 * sin * cos])
     told = limb.weight > 0
     if np.count_nonzero(told) < len(told) // 2:
         return None
     weight = used = limb.weight
     solution: FloatArray = np.zeros(3)
-    inverse: FloatArray = np.eye(3)
+    inverse: FloatArray | None = None
     residual = limb.offset_px
     for _ in range(_ROUNDS):
         used = weight
-        normal = (design * used[:, None]).T @ design
-        if np.count_nonzero(used) < len(told) // 2:
+        inverse = inverse_of_normal((design * used[:, None]).T @ design, _LEAST_DETERMINANT)
+        if inverse is None or np.count_nonzero(used) < len(told) // 2:
             return None
-        if np.linalg.det(normal) < _LEAST_DETERMINANT * np.trace(normal) ** len(normal):
-            return None
-        inverse = np.linalg.inv(normal).astype(np.float64)
         solution = inverse @ (design.T @ (used * limb.offset_px))
         residual = limb.offset_px - design @ solution
         square = residual**2 * limb.weight
         usual = max(1.0, 1.4826**2 * median(square[told]))
         weight = np.where(np.abs(residual) < _FARTHEST_PX, limb.weight / (1.0 + square / usual / _FREEDOM), 0.0)
-    if np.abs(solution[3:]).max(initial=0.0) > _MOST_OVAL * radius_px:
+    if inverse is None or np.abs(solution[3:]).max(initial=0.0) > _MOST_OVAL * radius_px:
         return None
     around = waves(np.sqrt(used) * residual, radius_px, first=3 if oval else 2)
     return _Fit(solution[:2], float(solution[2]), inverse[:3, :3], around)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -18,6 +19,9 @@ from .triangulate import Location, locate
 
 # A mirror gives back less than this of the light, and its copy stands farther off.
 _MIRRORED_LIGHT = 0.8
+# What calibration leaves of a difference between the sizes that the eyes see (1-sigma, relative), and the 95 % limit of
+# the sum of two squared differences in sigmas: size and row. The claim grows with what is beyond.
+_SIZE_TOLERANCE, _USUAL_DOUBT = 0.002, 6.0
 # Discs of the two eyes that may be one thing; and how much of a thing's place has to show its colour.
 _SAME_SIZE, _SAME_ROW_PX, _LEAST_SHOWN = 1.2, 2.0, 0.6
 
@@ -40,15 +44,21 @@ class StereoMatcher:
         # The check that the best pair failed at.
         return Reason.SIZE_MISMATCH if Reason.SIZE_MISMATCH in outcomes else Reason.EPIPOLAR
 
-    def has_rival(self, found: Location, left: Sequence[Disc], right: Sequence[Disc]) -> bool:
-        """Whether another pair of discs than the one `found`, measured or rough, may be a marker too."""
+    def doubt(self, found: Location, left: Sequence[Disc], right: Sequence[Disc]) -> Reason | None:
+        """Why the pair `found` may not be the marker.
+
+        Another pair, of discs measured or rough, may be it too, or `found` may be a mirrored copy of that one.
+        """
         others = [
             [disc for disc in discs if np.linalg.norm(disc.centre_px - centre_px) > disc.radius_px]
             for discs, centre_px in ((left, found.centres_px[:2]), (right, found.centres_px[2:]))
         ]
         outcomes = (self._check(one, other) for one, other in product(*others))
         fitting = [outcome for outcome in outcomes if isinstance(outcome, Location)]
-        return len(_without_reflections([found, *fitting])) > 1
+        rest = _without_reflections([found, *fitting])
+        if not any(one is found for one in rest):
+            return Reason.REFLECTION
+        return Reason.AMBIGUOUS if len(rest) > 1 else None
 
     def shows_too(
         self, disc: Disc, others: Sequence[Disc], mask: ImageArray, found: Location, *, in_left: bool
@@ -73,10 +83,13 @@ class StereoMatcher:
         first, last = (u - ends_px[1], u - ends_px[0]) if in_left else (u + ends_px[0], u + ends_px[1])
         # The square inside the disc.
         half = max(1, round(disc.radius_px / math.sqrt(2.0)))
-        rows = mask[max(round(v) - half, 0) : round(v) + half + 1]
+        rows = mask[max(round(v) - half, 0) : max(round(v) + half + 1, 0)]
+        if not len(rows):
+            return False
         columns = np.arange(max(math.floor(first), half), min(math.ceil(last), mask.shape[1] - 1 - half) + 1)
-        own_u = float(found.centres_px[2 if in_left else 0])
-        columns = columns[np.abs(columns - own_u) > radius_px + half]
+        own_u, own_v = found.centres_px[2:] if in_left else found.centres_px[:2]
+        if abs(own_v - v) <= radius_px + half:
+            columns = columns[np.abs(columns - own_u) > radius_px + half]
         total = np.concatenate([[0.0], np.cumsum(rows.mean(axis=0) / 255.0)])
         shares = (total[columns + half + 1] - total[columns - half]) / (2 * half + 1)
         return bool((shares > _LEAST_SHOWN).any())
@@ -89,18 +102,25 @@ class StereoMatcher:
         sigma = math.sqrt(location.variances_px[1] + location.variances_px[3])
         if abs(vl - vr) > self._config.epipolar_px + self._config.epipolar_sigmas * sigma:
             return Reason.EPIPOLAR
-        return location if self._sizes_fit(location, left, right) else Reason.SIZE_MISMATCH
+        ratios = self._size_ratios(location, left, right)
+        # How far apart noise may bring the sizes that the two eyes see.
+        size_sigma = math.hypot(*(disc.radius_sigma_px / disc.radius_px for disc in (left, right)))
+        if ratios is None or not self._sizes_fit(ratios, size_sigma):
+            return Reason.SIZE_MISMATCH
+        apart = math.log(ratios[0] / ratios[1]) / math.hypot(size_sigma, _SIZE_TOLERANCE), (vl - vr) / sigma
+        # What pulls one eye's centre does not pull both alike: it shows in the sizes and in the rows.
+        doubt = max(1.0, (apart[0] ** 2 + apart[1] ** 2) / _USUAL_DOUBT)
+        return replace(location, cov=doubt * location.cov)
 
-    def _sizes_fit(self, location: Location, left: Disc, right: Disc) -> bool:
+    def _size_ratios(self, location: Location, left: Disc, right: Disc) -> tuple[float, float] | None:
+        """How large the two eyes see the ball, as parts of what they have to."""
         baseline = np.array([self._calibration.baseline_m, 0.0, 0.0])
-        ratios: list[float] = []
-        for disc, x_eye in ((left, location.x), (right, location.x - baseline)):
-            expected = self._eye.outline(x_eye, self._config.radius_m)
-            if expected is None:
-                return False
-            ratios.append(disc.radius_px / expected.radius_px)
-        # How far apart noise may bring the two, besides.
-        sigma = math.hypot(*(disc.radius_sigma_px / disc.radius_px for disc in (left, right)))
+        outlines = [self._eye.outline(x_eye, self._config.radius_m) for x_eye in (location.x, location.x - baseline)]
+        if outlines[0] is None or outlines[1] is None:
+            return None
+        return left.radius_px / outlines[0].radius_px, right.radius_px / outlines[1].radius_px
+
+    def _sizes_fit(self, ratios: tuple[float, float], sigma: float) -> bool:
         between_eyes = max(ratios) / min(ratios) / (1.0 + self._config.epipolar_sigmas * sigma)
         against_depth = max(*ratios, 1.0 / min(ratios))
         return between_eyes <= self._config.eye_size_ratio and against_depth <= self._config.depth_size_ratio

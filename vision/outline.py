@@ -21,7 +21,8 @@ from interfaces.records import FloatArray
 
 from .colour import Float32Array, Gate
 from .limb_fit import fit_limb
-from .polar import ball_colour, mean_of_three, median, ray_angles, sample
+from .normal import inverse_of_normal
+from .polar import ball_colour, mean_of_three, median, rays_round, sample
 from .waves import waves
 
 BoolArray = NDArray[np.bool_]
@@ -99,7 +100,7 @@ class _Edges:
         uneven: where the background is too uneven to say that an edge elsewhere is not the ball's, shape (n,).
     """
 
-    angles: FloatArray
+    rays: FloatArray
     distance_px: FloatArray
     weight: FloatArray
     covered: BoolArray
@@ -169,13 +170,13 @@ def _refined(image: Float32Array, gate: Gate, rough: Outline, shape: FloatArray)
 def _find_edges(
     image: Float32Array, gate: Gate, centre_px: FloatArray, radius_px: float, shape: FloatArray, half_px: float
 ) -> _Edges | None:
-    angles = ray_angles(radius_px)
+    rays = rays_round(radius_px)
     cells = max(2, round(2 * half_px / _RING_STEP_PX))
     step = 2 * half_px / cells
     inner = np.linspace(0.3 * radius_px, radius_px - half_px, _INNER_COLUMNS)
     ring = radius_px - half_px + (np.arange(cells) + 0.5) * step
     outer = radius_px + half_px + (np.arange(round(_BACKGROUND_PX / _RING_STEP_PX)) + 0.5) * _RING_STEP_PX
-    samples = sample(image, centre_px, angles, np.concatenate([inner, ring, outer]).astype(np.float64), shape)
+    samples = sample(image, centre_px, rays, np.concatenate([inner, ring, outer]).astype(np.float64), shape)
     inside, outside = samples[:, : len(inner)], samples[:, len(inner) + cells :]
 
     colour = ball_colour(inside, gate)
@@ -192,7 +193,7 @@ def _find_edges(
     distance = radius_px - half_px + share[:, :cells].sum(axis=1) * step
     unevenness_px = half_px * np.sqrt(np.mean(share[:, cells:] ** 2, axis=1))
     weight = told / (1.0 + (unevenness_px / _EDGE_SIGMA_PX) ** 2)
-    return _Edges(angles, distance, weight, covered, ~told | (unevenness_px > _UNEVEN_PX))
+    return _Edges(rays, distance, weight, covered, ~told | (unevenness_px > _UNEVEN_PX))
 
 
 def _discriminant(
@@ -219,27 +220,28 @@ def _discriminant(
 
 def _fit_circle(edges: _Edges, centre_px: FloatArray, shape: FloatArray) -> Outline | None:
     """Least squares for the centre's shift and the radius; points too far off are left out in turn."""
-    design = np.stack([np.cos(edges.angles), np.sin(edges.angles), np.ones_like(edges.angles)], axis=1)
+    design = edges.rays
     told = edges.weight > 0
     weight = _agreeing(design, edges)
-    solution, normal, residual, used = np.zeros(3), np.eye(3), edges.distance_px, weight
+    solution, residual, used = np.zeros(3), edges.distance_px, weight
+    inverse: FloatArray | None = None
     for _ in range(3):
         if np.count_nonzero(weight) < len(weight) // 2:
             return None
-        normal = (design * weight[:, None]).T @ design
-        if np.linalg.det(normal) < _LEAST_DETERMINANT * np.trace(normal) ** 3:
+        inverse = inverse_of_normal((design * weight[:, None]).T @ design, _LEAST_DETERMINANT)
+        if inverse is None:
             return None
-        solution = np.linalg.solve(normal, design.T @ (weight * edges.distance_px))
+        solution = inverse @ (design.T @ (weight * edges.distance_px))
         residual = edges.distance_px - design @ solution
         spread = 1.4826 * median(np.abs(residual[told]))
         gate = min(max(_GATE_SIGMAS * spread, _LEAST_GATE_PX), _LARGEST_GATE_PX)
         used, weight = weight, np.where(np.abs(residual) < gate, edges.weight, 0.0)
         if np.array_equal(used, weight):
             break
-    if solution[2] <= 0:
+    if inverse is None or solution[2] <= 0:
         return None
     density = waves(np.sqrt(used) * residual, float(solution[2])).once_round()
-    inverse = density * np.linalg.inv(normal)
+    inverse = density * inverse
     # What hides a ball moves its edge inwards; outwards does what has its colour behind it.
     apart = (weight == 0) & ~edges.uneven
     hidden = edges.covered | (apart & (residual < 0))
@@ -278,11 +280,9 @@ def _agreeing(design: FloatArray, edges: _Edges) -> FloatArray:
     arcs, up to nearly half of the outline, and all of them pull inwards: least squares would go along.
     """
     told = np.flatnonzero(edges.weight > 0)
-    if len(told) < 2 * _ARCS:
+    if len(told) < 2 * _ARCS or _all_agree(design, edges):
         return edges.weight
     points = np.column_stack([design[told], edges.distance_px[told]])
-    if _all_agree(points, edges.weight[told]):
-        return edges.weight
     begins = np.arange(_ARCS) * len(told) // _ARCS
     means = (np.add.reduceat(points, begins) / np.diff(begins, append=len(told))[:, None])[_TRIPLES]
     told = told[:: max(1, len(told) // _ENOUGH)]
@@ -295,11 +295,11 @@ def _agreeing(design: FloatArray, edges: _Edges) -> FloatArray:
     return np.where(np.abs(edges.distance_px - design @ circles[best]) < gate, edges.weight, 0.0)
 
 
-def _all_agree(points: FloatArray, weight: FloatArray) -> bool:
-    """Whether one circle fits all points: rows of a design matrix and what it has to give, shape (n, 4) [px]."""
-    weighted = points[:, :3] * weight[:, None]
-    normal = weighted.T @ points
-    if np.linalg.det(normal[:, :3]) < _LEAST_DETERMINANT * np.trace(normal[:, :3]) ** 3:
+def _all_agree(design: FloatArray, edges: _Edges) -> bool:
+    """Whether one circle fits all points."""
+    weighted = design * edges.weight[:, None]
+    inverse = inverse_of_normal(weighted.T @ design, _LEAST_DETERMINANT)
+    if inverse is None:
         return False
-    residual = points[:, 3] - points[:, :3] @ np.linalg.solve(normal[:, :3], normal[:, 3])
-    return bool(np.abs(residual).max() < _AGREED_PX)
+    off = np.abs(edges.distance_px - design @ (inverse @ (weighted.T @ edges.distance_px)))
+    return bool(off[edges.weight > 0].max() < _AGREED_PX)

@@ -2,28 +2,38 @@
 
 from __future__ import annotations
 
+import math
+from functools import lru_cache
 from typing import cast
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from interfaces.records import FloatArray
+from interfaces.records import FloatArray, frozen_array
 
 from .colour import Float32Array, Gate
 
 
-def ray_angles(radius_px: float) -> FloatArray:
-    """Directions of rays about a pixel apart on the outline, shape (n,) [rad]."""
-    count = int(np.clip(round(2 * np.pi * radius_px), 24, 400))
-    return np.linspace(0.0, 2 * np.pi, count, endpoint=False)
+def rays_round(radius_px: float) -> FloatArray:
+    """Rays about a pixel apart on the outline, as rows (cos, sin, 1) of their angles, shape (n, 3).
+
+    These are the derivatives of a circle's points along the rays by its centre and its radius, too.
+    """
+    return _rays(min(max(round(2 * math.pi * radius_px), 24), 400))
+
+
+@lru_cache(maxsize=400)
+def _rays(count: int) -> FloatArray:
+    angles = np.linspace(0.0, 2 * np.pi, count, endpoint=False)
+    return frozen_array(np.stack([np.cos(angles), np.sin(angles), np.ones(count)], axis=1))
 
 
 def sample(
-    image: Float32Array, centre_px: FloatArray, angles: FloatArray, radii: FloatArray, shape: FloatArray
+    image: Float32Array, centre_px: FloatArray, rays: FloatArray, radii: FloatArray, shape: FloatArray
 ) -> Float32Array:
-    """`image` at every angle (rows) and radius (columns) of the ellipse's own polar coordinates."""
-    directions = np.stack([np.cos(angles), np.sin(angles)], axis=1) @ shape
+    """`image` on every ray (rows) and at every radius (columns) of the ellipse's own polar coordinates."""
+    directions = rays[:, :2] @ shape
     at = (centre_px + directions[:, None, :] * radii[:, None]).astype(np.float32)
     samples = cv2.remap(image, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return cast(Float32Array, samples)

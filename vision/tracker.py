@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,7 +26,7 @@ _REGION_RADII, _REGION_PX, _REGION_STEPS = 1.6, 14.0, 0.7
 # After a longer pause the last fixes predict nothing [s].
 _LONGEST_PAUSE_S = 0.5
 # So long after the last fix the marker is expected within reach of it [s], if it moved on for no longer than this [s];
-# the reach is so many radii larger.
+# the reach is so many radii larger. Without a fix, what is left of two is the marker after that time.
 _LONGEST_MEMORY_S, _FAIR_PAUSE_S, _JUMP_RADII = 0.9, 0.1, 2.0
 
 # Fixes between two looks at the ball's colour.
@@ -51,6 +52,15 @@ class _Last:
     level: float
 
 
+@dataclass(frozen=True, slots=True)
+class _Sighting:
+    """A disc in a frame without a fix: time [s], how far off a marker of its size is [m], level of its colour."""
+
+    t: float
+    distance_m: float
+    level: float
+
+
 class StereoTracker:
     """Finds one coloured ball in rectified stereo images.
 
@@ -70,6 +80,8 @@ class StereoTracker:
         self._whole = Region(0, 0, width, height)
         self._track: _Track | None = None
         self._last: _Last | None = None
+        self._ambiguous_t = -math.inf
+        self._sighted: tuple[_Sighting, ...] = ()
         self._fixes = 0
 
     def track(self, frame: StereoFrame) -> MarkerFix | MarkerMiss:
@@ -83,6 +95,8 @@ class StereoTracker:
         found = self._look(frame, regions) if regions else None
         if not isinstance(found, Location):
             found = self._look(frame, (self._whole, self._whole))
+            if found is Reason.AMBIGUOUS:
+                self._ambiguous_t = frame.t
         if isinstance(found, Location):
             found = self._doubt(frame.t, found) or found
         if isinstance(found, Reason):
@@ -90,6 +104,7 @@ class StereoTracker:
                 _log.debug("marker lost at %.3f s: %s", frame.t, found)
             self._track = None
             return MarkerMiss(frame.t, found)
+        self._ambiguous_t = -math.inf
         self._remember(frame.t, found)
         self._follow_colour(frame, found)
         ul, vl, ur, vr = (float(value) for value in found.centres_px)
@@ -98,25 +113,36 @@ class StereoTracker:
     def forget(self) -> None:
         """Look for the marker in the whole images next time."""
         self._track = self._last = None
+        self._ambiguous_t, self._sighted = -math.inf, ()
         self._gate.reset()
 
     def _look(self, frame: StereoFrame, regions: tuple[Region, Region]) -> Location | Reason:
         left, left_rough = self._discs(frame.left, regions[0])
-        if isinstance(left, Reason):
+        if left is Reason.NO_MARKER:
             return left
         right, right_rough = self._discs(frame.right, regions[1])
-        if isinstance(right, Reason):
-            return right
-        found = self._matcher.match(left, right)
+        lefts, rights = (
+            rough if isinstance(discs, Reason) else discs + rough
+            for discs, rough in ((left, left_rough), (right, right_rough))
+        )
+        if isinstance(left, Reason):
+            answer = left
+        elif isinstance(right, Reason):
+            answer = right
+        else:
+            answer = self._matcher.match(left, right)
         # The marker may be the one of two that could not be measured in both eyes.
-        if isinstance(found, Location) and self._has_rival(frame, found, left + left_rough, right + right_rough):
-            return Reason.AMBIGUOUS
-        return found
+        if isinstance(answer, Location):
+            answer = self._rivalry(frame, answer, lefts, rights) or answer
+        if isinstance(answer, Reason):
+            self._sighted = tuple(self._sighting(frame.t, disc) for disc in (*lefts, *rights)) or self._sighted
+        return answer
 
-    def _has_rival(self, frame: StereoFrame, found: Location, left: list[Disc], right: list[Disc]) -> bool:
-        """Whether something else in view, measured or not, may be the marker."""
-        if self._matcher.has_rival(found, left, right):
-            return True
+    def _rivalry(self, frame: StereoFrame, found: Location, left: list[Disc], right: list[Disc]) -> Reason | None:
+        """Why something else in view, measured or not, may be the marker instead."""
+        reason = self._matcher.doubt(found, left, right)
+        if reason is not None:
+            return reason
         eyes = ((left, right, frame.right, found.centres_px[:2]), (right, left, frame.left, found.centres_px[2:]))
         for discs, others, image, centre_px in eyes:
             rest = [disc for disc in discs if np.linalg.norm(disc.centre_px - centre_px) > disc.radius_px]
@@ -124,8 +150,8 @@ class StereoTracker:
                 continue
             mask = self._gate.mask(image)
             if any(self._matcher.shows_too(disc, others, mask, found, in_left=discs is left) for disc in rest):
-                return True
-        return False
+                return Reason.AMBIGUOUS
+        return None
 
     def _discs(self, image: ImageArray, region: Region) -> tuple[list[Disc] | Reason, list[Disc]]:
         """The discs in one eye; when there is none, why the most disc-like patch is none. And what is round, but could
@@ -134,6 +160,8 @@ class StereoTracker:
         rough: list[Disc] = []
         reason: Reason | None = None
         for patch in find_patches(image, region, self._gate, self.config):
+            if any(np.linalg.norm(patch.centre_px - disc.centre_px) < disc.radius_px for disc in discs):
+                continue
             outcome = measure(image, patch, self._eye, self._gate, self.config)
             if isinstance(outcome, Reason):
                 reason = reason or outcome
@@ -162,13 +190,29 @@ class StereoTracker:
         """Why what was found in the images cannot be the marker that was seen a moment ago."""
         last = self._last
         if last is None or not 0 <= t - last.t <= _LONGEST_MEMORY_S:
-            return None
+            return self._doubt_without_track(t, found)
         away_m = float(np.linalg.norm(found.x - last.x))
         if away_m <= _JUMP_RADII * self.config.radius_m + self.config.max_speed_m_s * min(t - last.t, _FAIR_PAUSE_S):
             return None
         if is_reflection_of(found, last.level, float(np.linalg.norm(last.x))):
             return Reason.REFLECTION
         return Reason.IMPLAUSIBLE_SPEED
+
+    def _doubt_without_track(self, t: float, found: Location) -> Reason | None:
+        """Why what was found may not be the marker though nothing was, a moment ago."""
+        if 0 <= t - self._ambiguous_t <= _LONGEST_MEMORY_S:
+            # One of two that were alike has gone; nothing tells which.
+            return Reason.AMBIGUOUS
+        is_copy = any(
+            0 <= t - seen.t <= _LONGEST_MEMORY_S
+            and is_reflection_of(found, seen.level, self.config.depth_size_ratio * seen.distance_m)
+            for seen in self._sighted
+        )
+        return Reason.REFLECTION if is_copy else None
+
+    def _sighting(self, t: float, disc: Disc) -> _Sighting:
+        radii = self._eye.distance_over_radius(disc.centre_px, disc.radius_px)
+        return _Sighting(t, radii * self.config.radius_m, disc.level)
 
     def _remember(self, t: float, found: Location) -> None:
         velocity = np.zeros(4)

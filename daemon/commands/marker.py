@@ -91,6 +91,9 @@ def cluster(
     /,
     *,
     side_mm: Annotated[float, Parameter(help="Side of the black squares as measured [mm].", validator=Number(gt=0))],
+    other_sides_mm: Annotated[
+        str | None, Parameter(help="Tags of another side [mm], as in 7=25,8=25.", show_default=False)
+    ] = None,
     calibration: Annotated[Path, Parameter(help="The calibration of the cameras.")] = Path("cameras.toml"),
     files: EyeFiles = BY_NAME,
     ids: Annotated[
@@ -102,7 +105,7 @@ def cluster(
     """Measure where the tags of a cluster are on it, from images, and print its tables for robot.toml.
 
     About 20 pairs of images, the cluster turned from one to the next so that every two neighbours are seen together
-    some time. All tags are of one side. Their places and all poses are fitted together; the frame of the marker is that
+    some time. Their places and all poses are fitted together; the frame of the marker is that
     of the tag with the lowest number. What does not fit one rigid body is left out and named.
 
     Needs: cameras.toml, and images of those cameras; no hardware.
@@ -111,12 +114,13 @@ def cluster(
     """
     from rich.console import Console
 
-    from daemon.cluster_wiring import Wanted, figures, measured, said, tables
+    from daemon.cluster_wiring import Wanted, figures, measured, said, sides_of, tables
     from daemon.tag_pages import numbers_of
     from daemon.wire import encode
 
     progress = Console(stderr=True, highlight=False, soft_wrap=True)
-    wanted = Wanted(family, 1e-3 * side_mm, None if ids is None else tuple(numbers_of(ids)))
+    numbers = None if ids is None else tuple(numbers_of(ids))
+    wanted = Wanted(family, 1e-3 * side_mm, numbers, sides_of(other_sides_mm) if other_sides_mm else {})
     found = measured(files.of(images), calibration, wanted, lambda text: progress.print(text, markup=False))
     if as_json:
         sys.stdout.write(encode(figures(found)).decode() + "\n")

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from ball_renderer import SMALL, VGA, Look, clutter, render_pair
 from scenes import RADIUS_M, Errors, compare, measure_errors, place
+from scipy.stats import binom
 
 from interfaces.camera import StereoCalibration
 from interfaces.records import MarkerFix
@@ -64,7 +65,9 @@ def test_the_centres_have_no_bias(errors):
 
 
 def test_a_ball_in_full_view_is_found_nearly_always(errors):
-    assert len(errors.misses) < 0.06 * (len(errors.x) + len(errors.misses)), errors.misses
+    # 45 of 1200 others are missed; at a rate of 4 % there are more than this once in a thousand times.
+    most = binom.isf(1e-3, len(errors.x) + len(errors.misses), 0.04)
+    assert len(errors.misses) <= most, errors.misses
 
 
 def test_more_image_noise_makes_the_claimed_sigma_larger():

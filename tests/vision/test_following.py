@@ -100,6 +100,28 @@ def test_a_ball_followed_out_of_the_image_is_at_border_then_gone():
     assert answers[-1] is Reason.NO_MARKER
 
 
+@pytest.mark.parametrize(("t", "said"), [(0.5, Reason.AMBIGUOUS), (1.2, None)])
+def test_of_two_balls_alike_the_one_that_is_left_is_the_marker_after_a_second(t, said):
+    tracker = StereoTracker(SMALL)
+    tracker.track(stage(NEAR, ELSEWHERE))
+    assert reason(tracker.track(stage(ELSEWHERE, t=t))) is said
+
+
+def test_the_mirrored_copy_of_a_ball_that_was_in_view_but_not_measured_is_a_reflection():
+    tracker = StereoTracker(SMALL)
+    hand = Slab((NEAR.x[0] + 0.7 * NEAR.radius_m, -0.1), (0.2, 0.1), NEAR.x[2])
+    mirrored = Ball((0.1, -0.05, 1.3), rgb=(0.45, 0.04, 0.04))
+    assert reason(tracker.track(stage(NEAR, hand))) is Reason.OCCLUDED
+    assert reason(tracker.track(stage(mirrored, t=FRAME_S))) is Reason.REFLECTION
+
+
+def test_a_followed_ball_stays_the_marker_though_another_one_was_in_view_beside_it():
+    tracker = tracker_that_saw(NEAR)
+    tracker.track(stage(t=FRAME_S))
+    tracker.track(stage(NEAR, ELSEWHERE, t=2 * FRAME_S))
+    assert sigmas_off(tracker.track(stage(NEAR, t=3 * FRAME_S)), NEAR) < FAR_SIGMAS
+
+
 class Camera:
     """Gives the frames it was given, one a read."""
 

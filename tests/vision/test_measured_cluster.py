@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import tomllib
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import cv2
@@ -14,13 +15,16 @@ from scipy.spatial.transform import Rotation
 from tag_renderer import Sheet, photograph
 
 from daemon.cli import app
-from daemon.cluster_wiring import ClusterFile
+from daemon.cluster_wiring import ClusterFile, sides_of
 from interfaces.camera import StereoCalibration
+from interfaces.errors import ConfigError
 from interfaces.records import FloatArray
 from vision.cluster.measure import ClusterView, MeasuredCluster, measure_cluster
+from vision.cluster.tables import cluster_tables
 from vision.lens import Lens
 from vision.rig import CalibrationError, Made, StereoRig, parameter_names
 from vision.rig_file import write_rig
+from vision.tag_config import PlacedTag
 from vision.tag_image import TagImage
 
 EYES = StereoCalibration(600.0, (319.5, 239.5), 0.12, (640, 480), 0.0)
@@ -51,15 +55,18 @@ def poses(rng: np.random.Generator, count: int) -> list[tuple[FloatArray, FloatA
     return [(Rotation.from_rotvec(turn).as_matrix() @ facing, rng.uniform(low, high)) for turn in turns]
 
 
-def looked(places: Places, rng: np.random.Generator, count: int = 20) -> list[ClusterView]:
-    """Exact corners and noise, of the tags that face an eye by 70° or less."""
+def looked(
+    places: Places, rng: np.random.Generator, count: int = 20, sides_m: Mapping[int, float] | None = None
+) -> list[ClusterView]:
+    """Exact corners and noise, of the tags that face an eye by 70° or less; some may have sides of their own [m]."""
     views = []
     for k, (turn, x) in enumerate(poses(rng, count)):
         eyes = []
         for eye in (np.zeros(3), np.array([EYES.baseline_m, 0.0, 0.0])):
             tags = {}
             for id, (rotation, place) in places.items():
-                corners = (SIDE_M * SQUARE @ rotation.T + place) @ turn.T + x - eye
+                side_m = (sides_m or {}).get(id, SIDE_M)
+                corners = (side_m * SQUARE @ rotation.T + place) @ turn.T + x - eye
                 sight = corners.mean(axis=0)
                 if -(turn @ rotation[:, 2]) @ sight < 0.35 * np.linalg.norm(sight):
                     continue
@@ -96,6 +103,27 @@ def test_tags_are_found_where_they_were_glued_and_the_intervals_cover() -> None:
     assert 0.58 < np.mean(ratio < 1.0) < 0.78
     assert np.mean(ratio < 2.0) > 0.90
     assert np.abs(np.concatenate(off)[:, :3]).max() < 3e-4
+
+
+def test_tags_of_other_sides_are_found_where_they_were_glued() -> None:
+    rng = np.random.default_rng(2)
+    places, sides_m = built(rng), {4: 0.025, 9: 0.03}
+    found = measure_cluster(looked(places, rng, sides_m=sides_m), EYES, SIDE_M, sides_m)
+    assert np.abs(errors(found, places)[0]).max() < 3e-4
+    assert {tag.placed.id: tag.placed.side_m for tag in found.tags} == {3: None, 4: 0.025, 7: None, 8: None, 9: 0.03}
+
+
+def test_the_tables_name_the_side_of_tags_that_have_their_own() -> None:
+    tags = [PlacedTag(id=3), PlacedTag(id=4, side_m=0.025)]
+    said = tomllib.loads(cluster_tables("apriltag_36h11", SIDE_M, tags))
+    assert said["vision"]["tag"]["side_m"] == SIDE_M
+    assert [tag.get("side_m") for tag in said["vision"]["cluster"]["tags"]] == [None, 0.025]
+
+
+@pytest.mark.parametrize("text", ["7", "7=", "=25", "seven=25", "7=-25", "7=nan", "7=25,"])
+def test_a_text_that_tells_no_sides_is_refused(text: str) -> None:
+    with pytest.raises(ConfigError, match="is not as in 7=25,8=25"):
+        sides_of(text)
 
 
 def test_a_tag_that_moved_in_one_view_is_left_out_and_named() -> None:

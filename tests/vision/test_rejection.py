@@ -2,15 +2,20 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
-from ball_renderer import SMALL, VGA, Look
+from ball_renderer import SMALL, VGA, Look, in_eyes
 from scenes import Ball, Slab, reason, sigmas_off, stage
 
 from interfaces.errors import SourceError
 from interfaces.records import MarkerFix, Reason, StereoFrame
+from vision.blob import Disc
 from vision.config import VisionConfig
+from vision.match import StereoMatcher
+from vision.sphere import Pinhole
 from vision.tracker import StereoTracker
+from vision.triangulate import Location
 
 BALL = Ball((0.02, 0.01, 0.8))
 FAR_SIGMAS = 5.0
@@ -24,6 +29,13 @@ def at_pixel(u: float, v: float, z: float = 0.8) -> Ball:
     """A ball whose centre the left eye sees at (u, v) [px]."""
     cx, cy = SMALL.principal_point_px
     return Ball(((u - cx) * z / SMALL.focal_px, (v - cy) * z / SMALL.focal_px, z))
+
+
+def seen_discs(ball: Ball, level: float) -> list[Disc]:
+    """The discs of a ball in the left and in the right eye."""
+    eye = Pinhole(SMALL.focal_px, SMALL.principal_point_px)
+    outlines = [eye.outline(x_eye, ball.radius_m) for x_eye in in_eyes(np.array(ball.x), SMALL)]
+    return [Disc(one.centre_px, one.radius_px, 1e-4 * np.eye(2), 0.01, level) for one in outlines if one is not None]
 
 
 def test_a_ball_before_a_wall_is_found():
@@ -115,6 +127,17 @@ def test_a_ball_beside_a_red_box_is_found():
 @pytest.mark.parametrize("other", [(0.1, 0.01, 0.8), (0.02, 0.1, 0.8), (0.08, -0.06, 0.7)])
 def test_two_balls_are_ambiguous(other):
     assert reason(answer(BALL, Ball(other))) is Reason.AMBIGUOUS
+
+
+# The second of two balls: the border of the left image cuts it at the top, that of the right one at the left, too.
+@pytest.mark.parametrize(("u", "v"), [(200, 4), (120, -3), (55, 10)])
+def test_a_second_ball_that_reaches_out_of_view_makes_the_marker_ambiguous(u, v):
+    assert reason(answer(at_pixel(220, 150), at_pixel(u, v))) is Reason.AMBIGUOUS
+
+
+def test_a_red_board_at_the_border_is_no_second_ball():
+    board = Slab((-0.3, -0.3), (-0.09, -0.05), 0.9, rgb=(0.7, 0.1, 0.1))
+    assert sigmas_off(answer(board, BALL), BALL) < FAR_SIGMAS
 
 
 def test_a_second_ball_of_another_size_is_not_taken_for_the_marker():
@@ -215,6 +238,29 @@ def test_a_dimmer_copy_farther_off_is_no_second_marker():
     assert sigmas_off(answer(BALL, mirrored), BALL) < FAR_SIGMAS
 
 
+def test_a_disc_that_one_eye_alone_measured_is_a_rival_of_what_is_above_it_in_the_other_eye():
+    matcher = StereoMatcher(SMALL, VisionConfig())
+    copy = seen_discs(Ball((0.0, -0.06, 1.6)), level=60.0)
+    found = matcher.match(*([disc] for disc in copy))
+    assert isinstance(found, Location)
+    # The marker's left image is right below the copy's.
+    marker = seen_discs(Ball((0.0, 0.0, 0.8)), level=120.0)
+    mask = np.zeros((240, 320), np.uint8)
+    u, v = np.rint(marker[0].centre_px).astype(int)
+    cv2.circle(mask, (int(u), int(v)), round(marker[0].radius_px), 255, -1)
+    assert matcher.shows_too(marker[1], [copy[0]], mask, found, in_left=False)
+
+
+def test_a_copy_beside_a_marker_that_was_not_measured_is_a_reflection():
+    matcher = StereoMatcher(SMALL, VisionConfig())
+    mirrored = seen_discs(Ball((-0.02, -0.03, 1.0)), level=80.0)
+    marker = seen_discs(BALL, level=120.0)
+    found = matcher.match(*([disc] for disc in mirrored))
+    assert isinstance(found, Location)
+    both_eyes = ([one, other] for one, other in zip(mirrored, marker, strict=True))
+    assert matcher.doubt(found, *both_eyes) is Reason.REFLECTION
+
+
 def test_the_mirrored_copy_of_a_ball_that_got_hidden_is_a_reflection():
     tracker = StereoTracker(SMALL)
     tracker.track(stage(BALL))
@@ -234,3 +280,12 @@ def test_a_second_after_the_last_fix_the_marker_may_be_anywhere():
     tracker.track(stage(BALL))
     elsewhere = Ball((-0.1, -0.1, 1.3))
     assert sigmas_off(tracker.track(stage(elsewhere, t=1.2)), elsewhere) < FAR_SIGMAS
+
+
+def test_eyes_that_disagree_on_the_size_by_more_than_noise_claim_less():
+    matcher = StereoMatcher(SMALL, VisionConfig())
+    agreeing = seen_discs(BALL, level=120.0)
+    apart = [agreeing[0], replace(agreeing[1], radius_px=1.02 * agreeing[1].radius_px)]
+    found = [matcher.match([left], [right]) for left, right in (agreeing, apart)]
+    sigmas = [np.sqrt(np.diag(one.cov)) for one in found if isinstance(one, Location)]
+    assert (sigmas[1] > 2.0 * sigmas[0]).all()

@@ -79,11 +79,17 @@ class MeasuredCluster:
     grown_sigma: float
 
 
-def measure_cluster(views: Sequence[ClusterView], calibration: StereoCalibration, side_m: float) -> MeasuredCluster:
+def measure_cluster(
+    views: Sequence[ClusterView],
+    calibration: StereoCalibration,
+    side_m: float,
+    other_sides_m: Mapping[int, float] | None = None,
+) -> MeasuredCluster:
     """Where the tags are, from rectified views.
 
     Args:
-        side_m: side of all black squares [m].
+        side_m: side of the black squares [m] ...
+        other_sides_m: ... but for tags of these numbers [m].
 
     Raises:
         CalibrationError: too few views show two tags and more, or some tags were never seen together with the others.
@@ -96,7 +102,7 @@ def measure_cluster(views: Sequence[ClusterView], calibration: StereoCalibration
         )
     left_out: list[tuple[str, int]] = []
     while True:
-        problem = _Problem(usable, calibration, side_m * TAG_CORNERS)
+        problem = _Problem(usable, calibration, side_m, other_sides_m or {})
         problem.solve()
         worst = problem.worst()
         if worst is None:
@@ -137,9 +143,16 @@ class _Block:
 class _Problem:
     """All poses: of the cluster in the views, and of the tags on it. The first tag's frame is the cluster's."""
 
-    def __init__(self, views: Sequence[ClusterView], calibration: StereoCalibration, corners: FloatArray) -> None:
-        self._views, self._calibration, self._corners = list(views), calibration, corners
+    def __init__(
+        self,
+        views: Sequence[ClusterView],
+        calibration: StereoCalibration,
+        side_m: float,
+        other_sides_m: Mapping[int, float],
+    ) -> None:
+        self._views, self._calibration, self._other_sides_m = list(views), calibration, other_sides_m
         self.ids = sorted(set[int]().union(*(view.ids for view in views)))
+        self._corners = {id: other_sides_m.get(id, side_m) * TAG_CORNERS for id in self.ids}
         self._blocks = [
             self._block(k, tags, calibration.baseline_m * right)
             for k, view in enumerate(views)
@@ -148,7 +161,7 @@ class _Problem:
         ]
         located = [self._located(view) for view in views]
         self._tags = self._first_tags(
-            [{id: fitted_motion(corners, seen) for id, seen in each.items()} for each in located]
+            [{id: fitted_motion(self._corners[id], seen) for id, seen in each.items()} for each in located]
         )
         self._bodies = [self._first_body(each) for each in located]
 
@@ -196,7 +209,7 @@ class _Problem:
     def _first_body(self, located: Mapping[int, FloatArray]) -> Motion:
         if not located:
             raise CalibrationError("a view in which no tag's corners can be located by both eyes")
-        body = [self._corners @ self._tags[id][0].T + self._tags[id][1] for id in located]
+        body = [self._corners[id] @ self._tags[id][0].T + self._tags[id][1] for id in located]
         return fitted_motion(np.concatenate(body), np.concatenate(list(located.values())))
 
     # --- the joint problem
@@ -251,7 +264,7 @@ class _Problem:
             grown = np.zeros((len(block.pixels), 2))
             for k, id in enumerate(block.ids):
                 rows = slice(4 * k, 4 * k + 4)
-                on_tag = self._corners @ self._tags[id][0].T
+                on_tag = self._corners[id] @ self._tags[id][0].T
                 arms = (on_tag + self._tags[id][1]) @ turn.T
                 points = arms + x - block.eye
                 slope = projection_slopes(self._calibration.focal_px, points)
@@ -295,7 +308,8 @@ class _Problem:
         for id in self.ids:
             rotation, xyz = self._tags[id]
             sigma = np.sqrt(np.diag(cov)[at[id] : at[id] + 6]) if id in at else np.zeros(6)
-            placed = PlacedTag(id=id, xyz=(float(xyz[0]), float(xyz[1]), float(xyz[2])), rpy=rpy_of(rotation))
+            place = float(xyz[0]), float(xyz[1]), float(xyz[2])
+            placed = PlacedTag(id=id, xyz=place, rpy=rpy_of(rotation), side_m=self._other_sides_m.get(id))
             tags.append(MeasuredTag(placed, sigma[3:], sigma[:3], sum(id in view.ids for view in self._views)))
         size = float((inverse @ full.T @ residuals)[-1]), float(np.sqrt(inverse[-1, -1] * max(misfit, 1.0)))
         return MeasuredCluster(tuple(tags), len(self._views), float(np.sqrt(misfit)), tuple(left_out), *size)

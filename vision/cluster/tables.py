@@ -18,6 +18,8 @@ def cluster_tables(dictionary: Dictionary, side_m: float, tags: Sequence[PlacedT
         note = f"  # {notes[k]}" if notes and notes[k] else ""
         lines += ["", "[[vision.cluster.tags]]", f"id = {tag.id}{note}"]
         lines += [f"xyz = {_list(tag.xyz)}", f"rpy = {_list(tag.rpy)}"]
+        if tag.side_m is not None:
+            lines.append(f"side_m = {tag.side_m:.6g}")
     return "\n".join(lines) + "\n"
 
 

@@ -1,0 +1,23 @@
+"""Least squares with few unknowns, many times a frame: NumPy's own routines cost more than the arithmetic."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from interfaces.records import FloatArray
+
+
+def inverse_of_normal(normal: FloatArray, least_determinant: float) -> FloatArray | None:
+    """Inverse of a normal matrix (k, k); None where its determinant, relative to its trace to the k, is less."""
+    if len(normal) != 3:
+        if np.linalg.det(normal) < least_determinant * np.trace(normal) ** len(normal):
+            return None
+        return np.linalg.inv(normal).astype(np.float64)
+    (a, b, c), (_, d, e), (_, _, f) = normal.tolist()
+    # Cofactors of a symmetric matrix.
+    A, B, C = d * f - e * e, c * e - b * f, b * e - c * d
+    determinant = a * A + b * B + c * C
+    if not determinant >= least_determinant * (a + d + f) ** 3 or determinant <= 0:
+        return None
+    D, E, F = a * f - c * c, b * c - a * e, a * d - b * b
+    return np.array([[A, B, C], [B, D, E], [C, E, F]]) / determinant
