@@ -38,6 +38,8 @@ log = logging.getLogger(__name__)
 
 HISTORY_LIMIT_S = 5.0
 IDLE_S = 0.2
+# Pairs may wait for so long to be judged together, for each of several robots in a process, and at most [s].
+TOGETHER_S, LONGEST_TOGETHER_S = 0.04, 1.0
 # What has to come round for the learner to be alive.
 LISTENING = "learning"
 LOOPS = (LISTENING, "background", "status")
@@ -64,7 +66,7 @@ class Learner:
         Args:
             solver: for this robot alone.
             loop: what its loop of new pairs is called for the watchdog.
-            robots: so many share the background's thread with it, itself among them.
+            robots: so many share the process with it, itself among them.
         """
         self._config, self._bus, self._clock = config, bus, clock
         self._service = Service.nobodys(clock) if service is None else service
@@ -73,7 +75,7 @@ class Learner:
         self._keys = Keys(config.robot.name)
         self._nominal = NominalModel.extended_by(config.simulation)
         self._learning, self._set_aside = go_on(
-            lambda: Learning(self._nominal, self._settings, solver), config.checkpoint_file, config.robot.name
+            lambda: Learning(self._nominal, self._settings, solver, together_s=together_s(robots)), config.checkpoint_file, config.robot.name
         )
         self._feed = PairFeed(self._learning, self._history, clock, lambda: self._service.beat(loop))
         self._findings = Findings(self._learning, config.robot, clock, robots)
@@ -298,6 +300,7 @@ class Learner:
         while not self._stop.is_set():
             self._service.beat(self._loop)
             self._feed.step(IDLE_S)
+            self._learning.judge_due(self._clock.now())
             with self._feed.lock:
                 self._changes.note(self._learning.change)
 
@@ -317,6 +320,11 @@ class Learner:
     def solve_soon(self) -> None:
         """Let the solver catch up: nothing else is left to do."""
         self._learning.solve_soon()
+
+
+def together_s(robots: int) -> float:
+    """How long pairs may wait to be judged together [s], where so many robots share a process."""
+    return 0.0 if robots == 1 else min(TOGETHER_S * robots, LONGEST_TOGETHER_S)
 
 
 def status_line(status: LearnerStatus) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from interfaces.records import FloatArray, Pair
 from kbmaps import ChainBelief, ChangeDetector, ChangeKind, KBMap, ResidualModel, SharedNoise, Suspicion
@@ -162,13 +163,14 @@ class Watch:
         if self._reference is None:
             self._renew()
 
-    def add(self, pair: Pair, *, kept: bool) -> None:
-        """One more pair, learnt or, not `kept`, doubted."""
-        turn = np.full(4, np.nan) if pair.R is None else pair.R
-        self._pairs.append(_Watched(pair.seq, pair.q, pair.x, np.diag(pair.cov), turn, kept))
+    def add(self, *pairs: Pair, kept: ArrayLike) -> None:
+        """One more pair or several, learnt or, not `kept` (n,), doubted."""
+        for pair, learnt in zip(pairs, np.broadcast_to(kept, len(pairs)).tolist(), strict=True):
+            turn = np.full(4, np.nan) if pair.R is None else pair.R
+            self._pairs.append(_Watched(pair.seq, pair.q, pair.x, np.diag(pair.cov), turn, learnt))
         if self._detector is None:
             return
-        self._feed(self._pairs[-1:])
+        self._feed(self._pairs[-len(pairs) :])
         if not self.ready:
             if self._reference is not None and len(self._pairs) >= _trial(self._reference.known):
                 self._show()
