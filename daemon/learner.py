@@ -207,7 +207,7 @@ class Learner:
         bus.answer(keys.model, answers.model, encoding=OCTETS)
         bus.answer(keys.status("learner"), lambda request: encode(self.status(), request.encoding))
         bus.answer(keys.command("learner"), self._command)
-        bus.subscribe(keys.pair, self._feed.offer)
+        bus.subscribe(keys.pair, self._feed.offer, quick=True)
         bus.watch(keys.alive("sampler"), self._sampler_changed)
         bus.token(keys.alive("learner"))
 

@@ -293,20 +293,19 @@ class Learning:
             era = self._course.eras.present
             if era is None or era.task_number != task.number:
                 return True
-            q, x, fed = era.memory.since(solving.fed, FEED_PAIRS)
-            turns = era.memory.turns_since(solving.fed, FEED_PAIRS)
-            if not len(q) and solving.due:
-                if not self._course.settled:  # the solver shall know whatever the instant learner knows
-                    self._course.judge()
+            asking = solving.due and solving.fed == era.memory.count
+            if asking:
+                self._course.judge()  # the solver shall know whatever the instant learner knows
+                if self._course.eras.present is not era:
                     return True
                 era.ask()
+            q, x, fed = era.memory.since(solving.fed, FEED_PAIRS)
+            turns = era.memory.turns_since(solving.fed, FEED_PAIRS)
         if len(q):
             solving.feed(q, x, fed, turns if np.isfinite(turns).any() else None)
-        elif solving.due:
+        if asking:
             solving.ask()
-        else:
-            return False
-        return True
+        return asking or len(q) > 0
 
     def _take_solution(self) -> bool:
         solved = self._solving.poll()

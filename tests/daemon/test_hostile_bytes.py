@@ -374,4 +374,4 @@ def test_published_bytes_that_are_no_pair_are_counted_and_learning_goes_on(paylo
         feed.offer(payload)
     for _ in payloads:
         feed.step(0.0)
-    assert isinstance(feed._waiting, queue.Queue)
+    assert feed._waiting.empty()
