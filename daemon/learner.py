@@ -20,7 +20,7 @@ from daemon.checkpoint import CheckpointError, write_checkpoint
 from daemon.config import Config
 from daemon.expected import ExpectedMarker
 from daemon.feed import PairFeed
-from daemon.findings import Findings
+from daemon.findings import Findings, FindingTurns
 from daemon.going_on import go_on
 from daemon.history import Page, read_page
 from daemon.keys import Keys
@@ -29,6 +29,7 @@ from daemon.learning.solver import LARGEST_NET, Solver
 from daemon.reload import reload
 from daemon.service import Service, with_health
 from daemon.status import LearnerStatus
+from daemon.thread_names import show_name
 from daemon.wire import OCTETS, CommandReply, CommandRequest, decode, encode
 from daemon.wiring import open_marker_topic
 from interfaces.errors import RequestError
@@ -40,6 +41,8 @@ HISTORY_LIMIT_S = 5.0
 IDLE_S = 0.2
 # Pairs may wait for so long to be judged together, for each of several robots in a process, and at most [s].
 TOGETHER_S, LONGEST_TOGETHER_S = 0.04, 1.0
+# Up to so many robots of a process tell their states and write their checkpoints as often as one alone.
+AS_OFTEN_AS_ONE = 10
 # What has to come round for the learner to be alive.
 LISTENING = "learning"
 LOOPS = (LISTENING, "background", "status")
@@ -60,6 +63,7 @@ class Learner:
         *,
         loop: str = LISTENING,
         robots: int = 1,
+        turns: FindingTurns | None = None,
     ) -> None:
         """A learner that goes on from its checkpoint; nothing is declared yet.
 
@@ -67,6 +71,7 @@ class Learner:
             solver: for this robot alone.
             loop: what its loop of new pairs is called for the watchdog.
             robots: so many share the process with it, itself among them.
+            turns: theirs to find calibration and outlook.
         """
         self._config, self._bus, self._clock = config, bus, clock
         self._service = Service.nobodys(clock) if service is None else service
@@ -75,11 +80,14 @@ class Learner:
         self._keys = Keys(config.robot.name)
         self._nominal = NominalModel.extended_by(config.simulation)
         self._learning, self._set_aside = go_on(
-            lambda: Learning(self._nominal, self._settings, solver, together_s=together_s(robots)), config.checkpoint_file, config.robot.name
+            lambda: Learning(self._nominal, self._settings, solver, together_s=together_s(robots)),
+            config.checkpoint_file,
+            config.robot.name,
         )
         self._feed = PairFeed(self._learning, self._history, clock, lambda: self._service.beat(loop))
-        self._findings = Findings(self._learning, config.robot, clock, robots)
+        self._findings = Findings(self._learning, config.robot, clock, robots, turns)
         self._answers = Answers(self._learning, config.robot, clock)
+        self._more_rarely = more_rarely(robots)
         self._sampler_alive = False
         self._started_at = clock.now()
         self._checkpointed_at: float | None = None
@@ -123,7 +131,7 @@ class Learner:
         self._service.beat("status")
         waited_s = self._clock.now() - (self._checkpointed_at or self._started_at)
         new = self._learning.counters.pairs != self._checkpointed_pairs
-        if new and waited_s >= self._settings.checkpoint_every_s:
+        if new and waited_s >= self._settings.checkpoint_every_s * self._more_rarely:
             self.checkpoint()
 
     def checkpoint(self) -> None:
@@ -291,6 +299,7 @@ class Learner:
         return found.message("learner")
 
     def _guarded(self, loop: Callable[[], None]) -> None:
+        show_name()
         try:
             loop()
         except Exception as error:
@@ -320,6 +329,11 @@ class Learner:
     def solve_soon(self) -> None:
         """Let the solver catch up: nothing else is left to do."""
         self._learning.solve_soon()
+
+
+def more_rarely(robots: int) -> float:
+    """How many times more rarely states are told and checkpoints written, where so many robots share a process."""
+    return max(1.0, robots / AS_OFTEN_AS_ONE)
 
 
 def together_s(robots: int) -> float:

@@ -7,7 +7,6 @@ of their drivers, messages of ROS 2 by tests/drivers/test_ros2_bytes.py.
 from __future__ import annotations
 
 import math
-import queue
 import tracemalloc
 from collections.abc import Callable
 from copy import deepcopy
