@@ -46,7 +46,7 @@ LIMIT_S = 240.0
 ASK_EVERY_S = 0.1
 TICKS = os.sysconf("SC_CLK_TCK")
 # Whose processor time is told apart: threads by their names, and the solvers' processes.
-PARTS = ("learn_pairs", "background", "others", "solver")
+PARTS: tuple[str, ...] = ("learn_pairs", "background", "others", "solver")
 
 
 def write_robot(folder: Path, name: str, sampler: str, learner: str) -> Path:

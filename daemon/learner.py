@@ -40,7 +40,7 @@ log = logging.getLogger(__name__)
 HISTORY_LIMIT_S = 5.0
 IDLE_S = 0.2
 # Pairs may wait for so long to be judged together, for each of several robots in a process, and at most [s].
-TOGETHER_S, LONGEST_TOGETHER_S = 0.04, 1.0
+TOGETHER_S, LONGEST_TOGETHER_S = 0.08, 1.0
 # Up to so many robots of a process tell their states and write their checkpoints as often as one alone.
 AS_OFTEN_AS_ONE = 10
 # What has to come round for the learner to be alive.
