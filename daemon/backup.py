@@ -19,6 +19,7 @@ from typing import IO
 import msgspec
 
 from interfaces.errors import BodyschemaError
+from interfaces.robot import Name
 
 from . import store_schema
 from .config import Config
@@ -55,7 +56,7 @@ class Manifest(msgspec.Struct, frozen=True, kw_only=True):
         files: by name in the archive.
     """
 
-    robot: str
+    robot: Name
     written_utc: str
     version: str
     store: str
@@ -82,7 +83,7 @@ def write_backup(config: Config, file: Path, *, utc: str, version: str, replace:
     with tempfile.TemporaryDirectory(dir=_folder_of(file), prefix=".backup-") as scratch, _explained(file):
         contents = _description(config)
         if config.checkpoint_file.exists():
-            contents[CHECKPOINT] = held = Path(scratch) / "learner.ckpt"
+            held = Path(scratch) / "learner.ckpt"
             held.write_bytes(config.checkpoint_file.read_bytes())
             contents[CHECKPOINT] = held
         contents[STORE] = copy_store(config.store_file, Path(scratch) / "pairs.sqlite")

@@ -222,7 +222,7 @@ class Bus:
     def _config(self) -> zenoh.Config:
         config = zenoh.Config()
         settings: dict[str, Any] = {
-            "mode": "client" if self._client else "peer",
+            "mode": "client" if self._client else self._lasting_mode,
             "scouting/multicast/enabled": False,
             "scouting/gossip/enabled": False,
             "listen/endpoints": [self._listen] if self._listen else [],
@@ -239,6 +239,11 @@ class Bus:
         for key, value in (settings | self._settings).items():
             config.insert_json5(key, json.dumps(value))
         return config
+
+    @property
+    def _lasting_mode(self) -> str:
+        """A peer that is linked to a process and to the router hears everything twice; routers know of each other."""
+        return "router" if self._route is not None and len(self._route.endpoints) > 1 else "peer"
 
     def _explain(self, message: str) -> str:
         if self._client and self._route is not None:

@@ -78,6 +78,12 @@ class Identity:
         )
 
     @property
+    def files(self) -> tuple[Path, ...]:
+        """All that it is read from."""
+        named = (self.ca, self.certificate, self.key, self.password_file, self.users_file)
+        return tuple(path for path in named if path is not None)
+
+    @property
     def by_user(self) -> bool:
         """Whether those who connect give passwords and not certificates."""
         return self.users_file is not None

@@ -17,17 +17,21 @@ from typing import Any
 import msgspec
 
 from interfaces.errors import ConfigError
+from interfaces.protocols import Clock
 from interfaces.robot import NAME
 from interfaces.toml_file import convert, line_of, read_toml
 
 from .access import EVERY_ROBOT, ROLES, Names, Subjects, access_control
 from .bus import LARGEST_REPLY_BYTES, LEASE_MS, Bus
 from .identity import SECURE, Identity, TlsConfig
+from .notify import Notifier
+from .service import Service
 from .zenoh_config import ENDPOINT, HOW_TO
 
 log = logging.getLogger(__name__)
 
 TICK_S = 0.1
+PASSING_ON = "passing on"
 
 
 class RouterTables(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -61,7 +65,7 @@ class RouterConfig:
         Raises:
             ConfigError: something is unknown, missing or wrong; the message names file, line, key and remedy.
         """
-        raw, text = read_toml(file)
+        raw, text = read_toml(file, written_by="docs/security.md has one to begin with")
         tables = convert(raw, RouterTables, file=file, text=text)
 
         def refuse(what: str, remedy: str, *keys: str) -> None:
@@ -112,8 +116,11 @@ class RouterConfig:
         return json.dumps(nested, indent=2)
 
 
-def run_router(config: RouterConfig, stopping: Callable[[], bool]) -> None:
+def run_router(config: RouterConfig, stopping: Callable[[], bool], notifier: Notifier, clock: Clock) -> None:
     """Pass on what is allowed until `stopping()`.
+
+    Args:
+        notifier: tells who started it that it takes connections, and that it lives.
 
     Raises:
         BusError: the port is in use, or zenoh cannot use the certificates.
@@ -121,5 +128,10 @@ def run_router(config: RouterConfig, stopping: Callable[[], bool]) -> None:
     with Bus(listen=config.tables.listen, settings=config.settings()):
         robots = ", ".join(config.tables.access)
         log.info("the router takes connections on %s; it has roles for: %s", config.tables.listen, robots)
+        service = Service(notifier, (PASSING_ON,), clock)
+        service.ready()
+        service.tell(f"takes connections on {config.tables.listen}")
         while not stopping():
+            service.beat(PASSING_ON)
             time.sleep(TICK_S)
+        service.stopping()

@@ -1,4 +1,4 @@
-"""The files of a robot's service on a machine: written, shown and removed as one."""
+"""The files of services on a machine: written, shown and removed as one."""
 
 from __future__ import annotations
 
@@ -10,54 +10,42 @@ import subprocess
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, Protocol
 
 from interfaces.errors import ConfigError
 
 from .config import Config
 from .udev import ROOT, run_quietly
-from .units import FOLDER, OWN, PROCESSES, Installed, of_robot, template
+from .units import FOLDER, LEARNER_OF, OWN, PROCESSES, ROUTER, Installed, of_host, of_robot, of_router, template
+
+if TYPE_CHECKING:
+    from .router import RouterConfig
 
 Run = Callable[[Sequence[str]], None]
 OLDEST_SYSTEMD = 252  # what is not asked is taken for this one
 
 
 @dataclass(frozen=True, slots=True)
-class ServiceFiles:
-    """The units of one robot.
+class UnitFolder:
+    """The folder of units of a machine.
 
     Attributes:
-        processes: sampler, learner or both.
         root: of the machine's file system.
         run: runs a command; only where `root` is this machine's.
     """
 
-    robot: str
-    processes: Sequence[str] = PROCESSES
     root: Path = ROOT
     run: Run = run_quietly
 
     @property
-    def units(self) -> list[str]:
-        """Names of this robot's units."""
-        return [f"bodyschema-{process}@{self.robot}.service" for process in self.processes]
+    def path(self) -> Path:
+        return self.root / FOLDER
 
-    def texts(self, config: Config, user: str, installed: Installed) -> dict[Path, str]:
-        """What is to be in which file."""
-        return {
-            file: text
-            for process in self.processes
-            for file, text in (
-                (self._template(process), template(process, installed)),
-                (self._own(process), of_robot(process, config, user, installed)),
-            )
-        }
-
-    def changes(self, texts: dict[Path, str]) -> dict[Path, str]:
-        """Those that are not there as they should be."""
-        return {file: text for file, text in texts.items() if not file.exists() or file.read_text("utf-8") != text}
-
-    def install(self, texts: dict[Path, str]) -> None:
+    def write(self, texts: dict[Path, str], command: str) -> None:
         """Write the files, and let systemd read them.
+
+        Args:
+            command: of `bodyschema`, which the remedy of an error names.
 
         Raises:
             ConfigError: one cannot be written.
@@ -67,57 +55,178 @@ class ServiceFiles:
                 file.parent.mkdir(parents=True, exist_ok=True)
                 file.write_text(text, encoding="utf-8")
             except OSError as error:
-                raise self._refused(file, error, "") from error
+                raise _refused(file, error, command) from error
         self._systemctl("daemon-reload")
 
-    def uninstall(self) -> list[Path]:
-        """Stop and remove this robot's units, and the templates with the last robot; what was removed.
+    def remove(self, units: Sequence[str], files: Sequence[Path], command: str) -> None:
+        """Stop the units, and remove the files and what folders they leave empty.
 
         Raises:
             ConfigError: a file cannot be removed.
         """
-        there = self.installed()
-        if there:
-            self._systemctl("disable", "--now", *self.units)
-        for file in there:
+        if not files:
+            return
+        self._systemctl("disable", "--now", *units)
+        for file in files:
             try:
                 file.unlink()
                 if file.name == OWN:
                     file.parent.rmdir()
             except OSError as error:
-                raise self._refused(file, error, " --uninstall") from error
-        if there:
-            self._systemctl("daemon-reload")
-        return there
-
-    def installed(self) -> list[Path]:
-        """What `uninstall` would remove."""
-        found: list[Path] = []
-        for process in self.processes:
-            own, shared = self._own(process), self._template(process)
-            others = [file for file in (self.root / FOLDER).glob(f"bodyschema-{process}@*.service.d/*") if file != own]
-            found += [file for file in (own, *([] if others else [shared])) if file.exists()]
-        return found
-
-    def _template(self, process: str) -> Path:
-        return self.root / FOLDER / f"bodyschema-{process}@.service"
-
-    def _own(self, process: str) -> Path:
-        return self.root / FOLDER / f"bodyschema-{process}@{self.robot}.service.d" / OWN
+                raise _refused(file, error, f"{command} --uninstall") from error
+        self._systemctl("daemon-reload")
 
     def _systemctl(self, *arguments: str) -> None:
         if self.root == ROOT:
             self.run(["systemctl", *arguments])
 
-    def _refused(self, file: Path, error: OSError, option: str) -> ConfigError:
-        remedy = f'Type: sudo "$(command -v bodyschema)" install service --yes{option}'
-        if os.geteuid() == 0:
-            remedy = "Look at the file system of that folder"
-        return ConfigError(f"cannot be changed: {error.strerror}", file=file, remedy=remedy)
+
+class UnitFiles(Protocol):
+    """The units of a service on a machine: written, shown and removed as one."""
+
+    @property
+    def units(self) -> list[str]:
+        """Their names."""
+        ...
+
+    def install(self, texts: dict[Path, str]) -> None:
+        """Write the files, and let systemd read them. Raises ConfigError: one cannot be written."""
+        ...
+
+    def uninstall(self) -> list[Path]:
+        """Stop and remove them; what was removed. Raises ConfigError: a file cannot be removed."""
+        ...
+
+    def installed(self) -> list[Path]:
+        """What `uninstall` would remove."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class ServiceFiles:
+    """The units of one robot, or of the learner of several.
+
+    Attributes:
+        name: of the robot, or what the learner of several is called.
+        processes: sampler, learner or both.
+        folder: where the units stand.
+    """
+
+    name: str
+    processes: Sequence[str] = PROCESSES
+    folder: UnitFolder = UnitFolder()
+
+    @property
+    def units(self) -> list[str]:
+        return [f"bodyschema-{process}@{self.name}.service" for process in self.processes]
+
+    def texts(self, config: Config, user: str, installed: Installed) -> dict[Path, str]:
+        """What is to be in which file for one robot.
+
+        Raises:
+            ConfigError: its learner is one of several robots on this machine already.
+        """
+        if "learner" in self.processes:
+            self._refuse_second_learner(config)
+        own = {process: of_robot(process, config, user, installed) for process in self.processes}
+        return self._texts(own, installed)
+
+    def texts_of_host(self, configs: Sequence[Config], user: str, installed: Installed) -> dict[Path, str]:
+        """The same for the learner of several.
+
+        Raises:
+            ConfigError: the learner is called like one of them, or one has a learner here already.
+        """
+        for config in configs:
+            if config.robot.name == self.name:
+                raise ConfigError(f"{self.name} is one of the robots", remedy="Give their learner another --name")
+            self._refuse_second_learner(config)
+        return self._texts({"learner": of_host(configs, user, installed)}, installed)
+
+    def install(self, texts: dict[Path, str]) -> None:
+        self.folder.write(texts, "install service")
+
+    def uninstall(self) -> list[Path]:
+        """This robot's units, and the templates with the last robot."""
+        there = self.installed()
+        self.folder.remove(self.units, there, "install service")
+        return there
+
+    def installed(self) -> list[Path]:
+        found: list[Path] = []
+        for process in self.processes:
+            own, shared = self._own(process, self.name), self._template(process)
+            others = [file for file in self.folder.path.glob(f"bodyschema-{process}@*.service.d/*") if file != own]
+            found += [file for file in (own, *([] if others else [shared])) if file.exists()]
+        return found
+
+    def _refuse_second_learner(self, config: Config) -> None:
+        robot = config.robot.name
+        for file in self.folder.path.glob(f"bodyschema-learner@*.service.d/{OWN}"):
+            name = file.parent.name.removeprefix("bodyschema-learner@").removesuffix(".service.d")
+            first = file.read_text("utf-8").partition("\n")[0]
+            learnt = first.removeprefix(LEARNER_OF).split() if first.startswith(LEARNER_OF) else [name]
+            if name != self.name and robot in learnt:
+                raise ConfigError(
+                    f"{robot} has a learner on this machine already, bodyschema-learner@{name}",
+                    file=file,
+                    remedy="Two would learn it: install one of them with --uninstall first",
+                )
+
+    def _texts(self, own: dict[str, str], installed: Installed) -> dict[Path, str]:
+        texts: dict[Path, str] = {}
+        for process, text in own.items():
+            texts |= {self._template(process): template(process, installed), self._own(process, self.name): text}
+        return texts
+
+    def _template(self, process: str) -> Path:
+        return self.folder.path / f"bodyschema-{process}@.service"
+
+    def _own(self, process: str, name: str) -> Path:
+        return self.folder.path / f"bodyschema-{process}@{name}.service.d" / OWN
+
+
+@dataclass(frozen=True, slots=True)
+class RouterFiles:
+    """The unit of the router."""
+
+    folder: UnitFolder = UnitFolder()
+
+    @property
+    def units(self) -> list[str]:
+        return [ROUTER]
+
+    def texts(self, config: RouterConfig, user: str, installed: Installed) -> dict[Path, str]:
+        """What is to be in its file."""
+        return {self.folder.path / ROUTER: of_router(config, user, installed)}
+
+    def install(self, texts: dict[Path, str]) -> None:
+        self.folder.write(texts, "install router")
+
+    def uninstall(self) -> list[Path]:
+        there = self.installed()
+        self.folder.remove(self.units, there, "install router")
+        return there
+
+    def installed(self) -> list[Path]:
+        file = self.folder.path / ROUTER
+        return [file] if file.exists() else []
+
+
+def missing(texts: dict[Path, str]) -> dict[Path, str]:
+    """Those of the files that are not there as they should be."""
+    return {file: text for file, text in texts.items() if not file.exists() or file.read_text("utf-8") != text}
+
+
+def _refused(file: Path, error: OSError, command: str) -> ConfigError:
+    remedy = f'Type: sudo "$(command -v bodyschema)" {command} --yes'
+    if os.geteuid() == 0:
+        remedy = "Look at the file system of that folder"
+    return ConfigError(f"cannot be changed: {error.strerror}", file=file, remedy=remedy)
 
 
 def user_for(given: str | None) -> str:
-    """Who the units are to run as: who was named, else who called sudo, else who this is.
+    """Who a service is to run as: who was named, else who called sudo, else who this is.
 
     Raises:
         ConfigError: there is no such user, or it would be root, or nobody, who owns what is nobody's.

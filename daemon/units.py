@@ -1,4 +1,4 @@
-"""The units of sampler and learner for systemd: one template for each, and for each robot what is its own."""
+"""The units of sampler, learner and router for systemd: of the first two a template each, and what is a robot's own."""
 
 from __future__ import annotations
 
@@ -8,14 +8,21 @@ import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from .config import Config
 from .identity import is_local
 from .servo_wiring import configured_ports
 
+if TYPE_CHECKING:
+    from .router import RouterConfig
+
 PROCESSES = ("sampler", "learner")
 FOLDER = Path("etc/systemd/system")
 OWN = "robot.conf"
+# Begins the drop-in of a learner of several robots; their names follow.
+LEARNER_OF = "# The learner of the robots"
+ROUTER = "bodyschema-router.service"
 # Beginnings of what `ProtectHome=tmpfs` and `PrivateTmp=yes` hide.
 HIDDEN = tuple(Path(path) for path in ("/home", "/root", "/run/user", "/tmp", "/var/tmp"))
 # Versions of systemd from which on a service that fails again and again is started less and less often.
@@ -51,6 +58,35 @@ SystemCallErrorNumber=EPERM
 SystemCallFilter=@system-service
 SystemCallFilter=~@privileged @resources
 SystemCallFilter=mbind setpriority
+"""
+_ROUTER = """\
+# Written by `bodyschema install router`; `bodyschema install router --uninstall` removes it.
+[Unit]
+Description=bodyschema: the router
+Wants=network-online.target
+After=network-online.target
+# Never give up: an address that is there late is listened on.
+StartLimitIntervalSec=0
+
+[Service]
+# Ready when it takes connections.
+Type=notify
+NotifyAccess=main
+ExecStart={command}
+WatchdogSec=30
+WatchdogSignal=SIGABRT
+TimeoutStartSec=90
+TimeoutStopSec=30
+KillMode=mixed
+Restart=on-failure
+{restart}
+User={user}
+MemoryMax=1G
+PrivateDevices=yes
+PrivateUsers=yes
+{seen}{sandbox}
+[Install]
+WantedBy=multi-user.target
 """
 _UNIT = """\
 # Written by `bodyschema install service`; `bodyschema install service --uninstall` removes it.
@@ -128,16 +164,13 @@ class Installed:
 
 def template(process: str, installed: Installed) -> str:
     """The unit `bodyschema-<process>@.service`."""
-    restart = "RestartSec=5"
-    if installed.systemd >= WITH_RESTART_STEPS:
-        restart = "RestartSec=1\nRestartSteps=6\nRestartMaxDelaySec=60"
     return _UNIT.format(
         process=process,
         own=OWN,
         ready=_READY[process],
         command=" ".join(map(_quoted, installed.command)),
         watchdog_s=_WATCHDOG_S[process],
-        restart=restart,
+        restart=_restart(installed),
         devices=_DEVICES[process],
         sandbox=_SANDBOX,
     )
@@ -147,15 +180,45 @@ def of_robot(process: str, config: Config, user: str, installed: Installed) -> s
     """What `bodyschema-<process>@<robot>.service.d/robot.conf` says: whose it is, and what it may see and use."""
     lines = [f"# {config.robot.name}, as {config.file.absolute()} described it.", "[Service]", f"User={user}"]
     lines.append(f"Environment={_quoted(f'BODYSCHEMA_ROBOT={config.file.absolute()}')}")
-    lines += [f"BindReadOnlyPaths={_quoted(path)}" for path in hidden([*installed.folders, *folders_of(config)])]
-    if config.tables.daemon.state_dir is not None:
-        kind = "BindPaths" if hidden([config.state_dir]) else "ReadWritePaths"
-        lines.append(f"{kind}={_quoted(config.state_dir)}")
+    lines += _seen([config], installed)
     if process == "sampler":
         lines += [f"DeviceAllow={_quoted(device)} rw" for device in devices_of(config)]
-    if not all(map(is_local, endpoints_of(config))):
-        lines.append("IPAddressAllow=any")
     return "\n".join(lines) + "\n"
+
+
+def of_host(configs: Sequence[Config], user: str, installed: Installed) -> str:
+    """What `bodyschema-learner@<name>.service.d/robot.conf` says where one learner serves several robots."""
+    command = " ".join(map(_quoted, [*installed.command, "learner"]))
+    robots = "".join(f" --robot {_quoted(config.file.absolute())}" for config in configs)
+    names = " ".join(config.robot.name for config in configs)
+    kept = " ".join(f"bodyschema/{config.robot.name}" for config in configs if config.tables.daemon.state_dir is None)
+    lines = [
+        f"{LEARNER_OF} {names}",
+        "[Unit]",
+        f"Description=bodyschema: the learner of {len(configs)} robots (%i)",
+        "[Service]",
+        f"User={user}",
+        "ExecStart=",
+        f"ExecStart={command}{robots}",
+        "StateDirectory=",
+        *([f"StateDirectory={kept}"] if kept else []),
+        *_seen(configs, installed),
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def of_router(config: RouterConfig, user: str, installed: Installed) -> str:
+    """The unit `bodyschema-router.service`."""
+    file = config.file.absolute()
+    command = " ".join(map(_quoted, [*installed.command, "router", file]))
+    seen = hidden([*installed.folders, file.parent, *(path.parent for path in config.identity.files)])
+    return _ROUTER.format(
+        command=command,
+        user=user,
+        restart=_restart(installed),
+        seen="".join(f"BindReadOnlyPaths={_quoted(path)}\n" for path in seen),
+        sandbox=_SANDBOX,
+    )
 
 
 def devices_of(config: Config) -> list[str]:
@@ -191,6 +254,24 @@ def hidden(folders: Iterable[Path]) -> list[Path]:
     found = sorted({Path(os.path.abspath(folder)) for folder in folders})
     seen = [folder for folder in found if any(folder.is_relative_to(hiding) for hiding in HIDDEN)]
     return [folder for folder in seen if not any(folder.is_relative_to(other) for other in seen if other != folder)]
+
+
+def _seen(configs: Sequence[Config], installed: Installed) -> list[str]:
+    """What a service of these robots may read, write and reach beyond what all may."""
+    folders = [*installed.folders, *(folder for config in configs for folder in folders_of(config))]
+    lines = [f"BindReadOnlyPaths={_quoted(path)}" for path in hidden(folders)]
+    states = [config.state_dir for config in configs if config.tables.daemon.state_dir is not None]
+    for state in dict.fromkeys(states):
+        lines.append(f"{'BindPaths' if hidden([state]) else 'ReadWritePaths'}={_quoted(state)}")
+    if not all(is_local(endpoint) for config in configs for endpoint in endpoints_of(config)):
+        lines.append("IPAddressAllow=any")
+    return lines
+
+
+def _restart(installed: Installed) -> str:
+    if installed.systemd >= WITH_RESTART_STEPS:
+        return "RestartSec=1\nRestartSteps=6\nRestartMaxDelaySec=60"
+    return "RestartSec=5"
 
 
 def _quoted(word: object) -> str:

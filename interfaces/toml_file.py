@@ -25,12 +25,16 @@ MOST_BYTES, MOST_PARTS = 2**22, 100
 _PLACE = re.compile(r"(?P<what>.*?) - at `\$(?P<path>[^`]*)`$", re.DOTALL)
 
 
-def read_toml(file: Path) -> tuple[dict[str, Any], str]:
-    """The tables of `file` and its text; ConfigError with the line when it cannot be read."""
+def read_toml(file: Path, *, written_by: str = "`bodyschema config init` writes one") -> tuple[dict[str, Any], str]:
+    """The tables of `file` and its text; ConfigError with the line when it cannot be read.
+
+    Args:
+        written_by: where one comes from, as the remedy of a file that is not there.
+    """
     try:
         data = read_at_most(file, MOST_BYTES)
     except FileNotFoundError as error:
-        raise ConfigError("there is no such file", file=file, remedy="`bodyschema config init` writes one") from error
+        raise ConfigError("there is no such file", file=file, remedy=written_by) from error
     except IsADirectoryError as error:
         raise ConfigError("a folder, not a file", file=file, remedy="Name the robot.toml in it") from error
     except OSError as error:

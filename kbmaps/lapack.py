@@ -70,6 +70,11 @@ def cholesky_solve(lower: FloatArray, rhs: FloatArray) -> FloatArray:
     return cast(FloatArray, solution)
 
 
+def lower_solve(lower: FloatArray, rhs: FloatArray) -> FloatArray:
+    """Solution of L y = rhs, of a lower triangular matrix without zeros on its diagonal."""
+    return cast(FloatArray, _dtrtrs(lower, rhs, lower=1)[0])
+
+
 def lower_inverse(lower: FloatArray) -> FloatArray:
     """The inverse of a lower triangular matrix without zeros on its diagonal."""
     # In C order it is the transpose of an upper one in Fortran order, which LAPACK takes as it is.

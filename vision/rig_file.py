@@ -74,9 +74,7 @@ def read_rig(file: Path) -> StereoRig:
     Raises:
         ConfigError: it cannot be read, is damaged or is another kind of file; names the line.
     """
-    if not file.exists():
-        raise ConfigError("there is no such file", file=file, remedy="`bodyschema calibrate cameras` writes one")
-    tables, text = read_toml(file)
+    tables, text = read_toml(file, written_by="`bodyschema calibrate cameras` writes one")
     found = tables.get("format")
     if found != FORMAT:
         what = f"of another format: {found!r}" if found is not None else "no camera calibration"

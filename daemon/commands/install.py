@@ -2,25 +2,26 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import cyclopts
 from cyclopts import Parameter
 
-from daemon.commands.options import HERE, RobotFile, flag
+from daemon.commands.options import HERE, VARIABLE, flag, several
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from daemon.service_files import ServiceFiles
+    from daemon.service_files import UnitFiles
     from daemon.udev import Rules
 
 Root = Annotated[Path, Parameter(help="Of the file system, for images of other machines.")]
 
 install = cyclopts.App(
     name="install",
-    help="""What this machine has to know: of serial adapters, and of sampler and learner as services.
+    help="""What this machine has to know: of serial adapters, and of sampler, learner and router as services.
 
     Needs: the right to write to /etc (sudo).
 
@@ -68,76 +69,139 @@ def udev(
     console.print("Written. Plug the adapter in again; `bodyschema doctor` tells whether all is well.")
 
 
+User = Annotated[str | None, Parameter(help="Who it runs as; else who called sudo.", show_default=False)]
+Yes = Annotated[bool, flag("Do not ask.")]
+DryRun = Annotated[bool, flag("Show, and change nothing.")]
+
+
 @install.command(sort_key=2)
 def service(
     *,
-    robot: RobotFile = HERE,
-    user: Annotated[
-        str | None, Parameter(help="Who the services run as; else who called sudo.", show_default=False)
-    ] = None,
+    robot: Annotated[
+        tuple[Path, ...], several(f"The robot's description, or a folder of them; else {VARIABLE} or robot.toml")
+    ] = (),
+    user: User = None,
     only: Annotated[
         Literal["sampler", "learner"] | None,
         Parameter(help="One of the two, where the other runs on another machine.", show_default=False),
     ] = None,
-    yes: Annotated[bool, flag("Do not ask.")] = False,
-    dry_run: Annotated[bool, flag("Show, and change nothing.")] = False,
-    uninstall: Annotated[bool, flag("Stop the robot's services and remove them; its pairs stay.")] = False,
+    name: Annotated[str, Parameter(help="What the learner of several robots is called.")] = "fleet",
+    yes: Yes = False,
+    dry_run: DryRun = False,
+    uninstall: Annotated[bool, flag("Stop the services and remove them; pairs stay.")] = False,
     root: Root = Path("/"),
 ) -> None:
     """Units for systemd: sampler and learner of this robot from boot on, started again when they fail, sandboxed.
 
     The sampler may open the ports and cameras that robot.toml names and nothing else: install again when they are
-    others. State is kept in /var/lib/bodyschema/ROBOT unless robot.toml says where.
+    others. State is kept in /var/lib/bodyschema/ROBOT unless robot.toml says where. Of several robots it is one
+    learner that serves them all; their samplers are installed where the robots are.
 
     Needs: robot.toml that `bodyschema run` works with, and the right to write to /etc/systemd/system, by sudo.
 
     Next: the `systemctl enable --now` that it prints; docs/operation.md has logs, upgrades and backups.
     """
+    from daemon.config import Config
+    from daemon.fleet.hosting import configs_of, descriptions
+    from daemon.learner_host import session_settings
+    from daemon.service_files import ServiceFiles, UnitFolder, systemd_version, user_for
+    from daemon.units import PROCESSES, Installed
+    from daemon.wiring import check_sources
+    from interfaces.errors import ConfigError
+
+    files, folder = descriptions(robot or (Path(os.environ.get(VARIABLE, HERE)),)), UnitFolder(root)
+    several_robots = len(files) > 1
+    if several_robots and only == "sampler":
+        raise ConfigError(
+            "each robot has a sampler of its own", remedy="Install them one by one, each with its --robot"
+        )
+    if several_robots:
+        units = ServiceFiles(name, ("learner",), folder)
+    else:
+        units = ServiceFiles(Config.load(files[0]).robot.name, PROCESSES if only is None else (only,), folder)
+    if uninstall:
+        _uninstall_units(units, "Removed. Pairs and checkpoints are where they were.", yes=yes, dry_run=dry_run)
+        return
+    installed = Installed.here(systemd_version())
+    if several_robots:
+        configs = configs_of(files, None)
+        session_settings(configs)  # refuses robots that one learner cannot serve
+        texts = units.texts_of_host(configs, user_for(user), installed)
+    else:
+        config = Config.load(files[0])
+        if only != "learner":
+            check_sources(config, sim=False)
+        if only != "sampler":
+            config.require_learnable()
+        texts = units.texts(config, user_for(user), installed)
+    _install_units(units, texts, yes=yes, dry_run=dry_run)
+
+
+@install.command(sort_key=3)
+def router(
+    file: Annotated[Path, Parameter(help="Who may connect, and do what.")] = Path("router.toml"),
+    /,
+    *,
+    user: User = None,
+    yes: Yes = False,
+    dry_run: DryRun = False,
+    uninstall: Annotated[bool, flag("Stop the router and remove its unit.")] = False,
+    root: Root = Path("/"),
+) -> None:
+    """A unit for systemd: the router where machines meet, from boot on, started again when it fails, sandboxed.
+
+    Needs: router.toml that `bodyschema router` works with, keys that --user can read, and the right to write to
+    /etc/systemd/system, by sudo.
+
+    Next: the `systemctl enable --now` that it prints; `bodyschema doctor` on the machines that connect.
+    """
+    from daemon.router import RouterConfig
+    from daemon.service_files import RouterFiles, UnitFolder, systemd_version, user_for
+    from daemon.units import Installed
+
+    units = RouterFiles(UnitFolder(root))
+    if uninstall:
+        _uninstall_units(units, "Removed. router.toml and keys are where they were.", yes=yes, dry_run=dry_run)
+        return
+    texts = units.texts(RouterConfig.load(file), user_for(user), Installed.here(systemd_version()))
+    _install_units(units, texts, yes=yes, dry_run=dry_run)
+
+
+def _install_units(units: UnitFiles, texts: dict[Path, str], *, yes: bool, dry_run: bool) -> None:
     from rich.console import Console
     from rich.prompt import Confirm
 
-    from daemon.config import Config
-    from daemon.service_files import ServiceFiles, systemd_version, user_for
-    from daemon.units import PROCESSES, Installed
-    from daemon.wiring import check_sources
+    from daemon.service_files import missing
 
     console = Console(highlight=False, soft_wrap=True)
-    config = Config.load(robot)
-    files = ServiceFiles(config.robot.name, PROCESSES if only is None else (only,), root)
-    if uninstall:
-        _uninstall_service(console, files, yes=yes, dry_run=dry_run)
-        return
-    if only != "learner":
-        check_sources(config, sim=False)
-    if only != "sampler":
-        config.require_learnable()
-    texts = files.texts(config, user_for(user), Installed.here(systemd_version()))
-    changes = files.changes(texts)
+    changes = missing(texts)
     for file, text in texts.items():
         console.print(f"{file}:{'' if file in changes else ' (there already)'}\n\n{text}", markup=False)
     if not changes:
         console.print("All of it is there already, as above.")
         return
-    if dry_run or not (yes or Confirm.ask("Write them?", console=console, default=False)):
+    if dry_run or not (yes or Confirm.ask("Write it?", console=console, default=False)):
         console.print("Nothing was changed.")
         return
-    files.install(changes)
-    console.print(f"Written. Start them, now and at every boot: sudo systemctl enable --now {' '.join(files.units)}")
+    units.install(changes)
+    console.print(f"Written. Start it, now and at every boot: sudo systemctl enable --now {' '.join(units.units)}")
 
 
-def _uninstall_service(console: Console, files: ServiceFiles, *, yes: bool, dry_run: bool) -> None:
+def _uninstall_units(units: UnitFiles, removed: str, *, yes: bool, dry_run: bool) -> None:
+    from rich.console import Console
     from rich.prompt import Confirm
 
-    there = "\n".join(map(str, files.installed()))
+    console = Console(highlight=False, soft_wrap=True)
+    there = "\n".join(map(str, units.installed()))
     if not there:
-        console.print(f"There is no service of {files.robot}. Nothing was changed.", markup=False)
+        console.print(f"There is no {' '.join(units.units)}. Nothing was changed.", markup=False)
         return
-    console.print(f"To be stopped: {' '.join(files.units)}\nTo be removed:\n{there}", markup=False)
+    console.print(f"To be stopped: {' '.join(units.units)}\nTo be removed:\n{there}", markup=False)
     if dry_run or not (yes or Confirm.ask("Go on?", console=console, default=False)):
         console.print("Nothing was changed.")
         return
-    files.uninstall()
-    console.print("Removed. Pairs and checkpoint are where they were.")
+    units.uninstall()
+    console.print(removed)
 
 
 def _uninstall(console: Console, of_machine: Rules, *, yes: bool, dry_run: bool) -> None:

@@ -19,15 +19,18 @@ def router(
 ) -> None:
     """Let machines meet: sampler, learner and viewers connect here by TLS, and each does what its role says.
 
-    Ends with SIGTERM or Ctrl-C. docs/security.md shows how certificates are made; deploy/ has files to begin with.
+    Ends with SIGTERM or Ctrl-C. docs/security.md shows how certificates are made; deploy/ has files to begin with;
+    `bodyschema install router` lets systemd keep it running.
 
     Needs: router.toml, and the certificates that it names.
 
     Next: `router` and `[zenoh.tls]` in each machine's robot.toml; `bodyschema doctor` there.
     """
     from daemon import logs
+    from daemon.notify import Notifier
     from daemon.router import RouterConfig, run_router
     from daemon.signals import Wishes, on_termination
+    from interfaces.clock import SystemClock
 
     config = RouterConfig.load(file)
     if zenohd:
@@ -36,4 +39,4 @@ def router(
     logs.set_up(verbose=verbose)
     wishes = Wishes()
     with on_termination(wishes.end):
-        run_router(config, lambda: wishes.ending)
+        run_router(config, lambda: wishes.ending, Notifier.of_environment(), SystemClock())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -16,16 +17,27 @@ from interfaces.errors import ConfigError
 def descriptions(named: Sequence[Path]) -> list[Path]:
     """Descriptions of robots, each once: files, and of a folder those in it and a robot.toml in each folder of it.
 
+    Of a folder's TOML files those count that have a table `[robot]`: calibrations and the like lie there too.
+
     Raises:
         ConfigError: a folder has none.
     """
     found: list[Path] = []
     for path in named:
-        inside = sorted([*path.glob("*.toml"), *path.glob("*/robot.toml")]) if path.is_dir() else [path]
+        inside = [path]
+        if path.is_dir():
+            inside = sorted([*filter(_describes_a_robot, path.glob("*.toml")), *path.glob("*/robot.toml")])
         if not inside:
             raise ConfigError("no robot.toml is in this folder", file=path, remedy="Name the robots' descriptions")
         found += inside
     return list(dict.fromkeys(found))
+
+
+def _describes_a_robot(file: Path) -> bool:
+    try:
+        return re.search(r"^\s*\[robot\]", file.read_text("utf-8"), re.MULTILINE) is not None
+    except (OSError, UnicodeDecodeError):
+        return True  # reading it as a description tells what is wrong
 
 
 def configs_of(files: Sequence[Path], state_dir: Path | None) -> list[Config]:

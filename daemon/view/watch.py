@@ -14,6 +14,7 @@ from daemon.bus import Bus
 from daemon.command_names import CommandName
 from daemon.config import Config
 from daemon.findings_view import outlook_sentence
+from daemon.identity import Route
 from daemon.keys import Keys
 from daemon.recorder import History
 from daemon.status import LearnerStatus, SamplerStatus
@@ -44,13 +45,11 @@ class Watch:
         """Nothing is open yet; documents go to `hub`."""
         self._config, self._hub = config, hub
         self._clock = SystemClock() if clock is None else clock
-        self._keys, zenoh = Keys(config.robot.name), config.tables.zenoh
-        self._sampler = Heard(SamplerStatus, zenoh.sampler, self._clock)
-        self._learner = Heard(LearnerStatus, zenoh.learner, self._clock)
-        self._sessions: dict[Process, Bus] = {
-            "sampler": Bus(connect=zenoh.sampler),
-            "learner": Bus(connect=zenoh.learner),
-        }
+        self._keys = Keys(config.robot.name)
+        routes: dict[Process, Route] = {"sampler": config.route("sampler"), "learner": config.route("learner")}
+        self._sampler = Heard(SamplerStatus, str(routes["sampler"]), self._clock)
+        self._learner = Heard(LearnerStatus, str(routes["learner"]), self._clock)
+        self._sessions = {process: Bus(connect=route) for process, route in routes.items()}
         self._series, self._course = Series(), Course()
         self._recent = RecentPairs()
         self._history: History | None = None

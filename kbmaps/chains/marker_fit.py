@@ -109,18 +109,20 @@ class MarkerKnowledge:
         eigenvalues, directions = np.linalg.eigh(root.T @ self.square @ root)
         left = self.inner - self.square @ centre
         misfit = max(self.errors - float(centre @ (self.inner + left)), 0.0)
+        eigenvalues = np.maximum(eigenvalues, 0.0)
+        pulled = directions.T @ root.T @ left
+        along = np.divide(pulled, np.sqrt(eigenvalues), out=np.zeros(3), where=eigenvalues > 0.0)
         noise = LinearEvidence(
             3.0 * self.count + self.noise_count,
-            misfit + self.noise_square,
-            np.maximum(eigenvalues, 0.0),
-            directions.T @ root.T @ left,
+            max(misfit - float(along @ along), 0.0) + self.noise_square,
+            eigenvalues,
+            along,
         )
         variance = noise.best_variance()
         axes = root @ directions
-        shrunk = 1.0 / (variance + noise.eigenvalues)
         return MarkerPosterior(
-            shift=centre + axes @ (shrunk * noise.components),
-            covariance=(axes * (variance * shrunk)) @ axes.T,
+            shift=centre + axes @ noise.mean(variance),
+            covariance=(axes * (variance / (variance + eigenvalues))) @ axes.T,
             noise=math.sqrt(variance),
         )
 

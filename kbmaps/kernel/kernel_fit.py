@@ -147,19 +147,20 @@ class KernelFit:
         return np.concatenate(products) * self._seen.scale[:, None]
 
     def _evidence_of_noise(self, precision: float) -> tuple[LinearEvidence, FloatArray]:
-        """Of s² at λ, with K + λ I factorised; and the eigenvectors of β's directions (p, p)."""
+        """Of s² at λ, with K + λ I factorised; and the directions V (p, p) of β that belong to it."""
         seen = self._seen
-        solved = self._gram.solve(seen.errors)
         # Whitened by (K / λ + I)^(-1/2), the pairs are H β + e with equal independent noise.
-        inner = precision * np.einsum("nip,nir->pr", seen.features, self._solved(seen.features), optimize=True)
-        eigenvalues, directions = np.linalg.eigh(0.5 * (inner + inner.T))
-        shown = precision * np.einsum("nip,ni->p", seen.features, solved)
-        square = precision * float(np.vdot(seen.errors, solved))
-        evidence = LinearEvidence(3.0 * seen.count, square, np.maximum(eigenvalues, 0.0), directions.T @ shown)
-        return evidence, directions
-
-    def _solved(self, features: FloatArray) -> FloatArray:
-        return self._gram.solve(features.reshape(len(features), -1)).reshape(features.shape)
+        scale = math.sqrt(precision)
+        errors = scale * self._gram.whiten(seen.errors).ravel()
+        features = scale * self._gram.whiten(self._flat).reshape(errors.size, -1)
+        # With fewer coordinates than features, rows of zeros: every direction of β is to have its place in V.
+        lacking = max(features.shape[1] - errors.size, 0)
+        errors, features = np.pad(errors, (0, lacking)), np.pad(features, ((0, lacking), (0, 0)))
+        # Not by Hᵀ H: of a wide prior, rounding would be more than what the pairs say of its narrow directions.
+        reach, sizes, directions = np.linalg.svd(features, full_matrices=False)
+        along = errors @ reach
+        unreached = float(np.square(errors - reach @ along).sum())
+        return LinearEvidence(3.0 * seen.count, unreached, np.square(sizes), along), directions.T
 
     def _log_evidence(self, precision: float) -> float:
         if not self._gram.factorise(precision):
@@ -184,7 +185,7 @@ class KernelFit:
         self.precision, self.noise_variance = precision, variance
         self.prior_variance = variance / precision
         self.log_evidence: float | None = self._complete(evidence, precision, variance)
-        self.change: FloatArray = directions @ (evidence.components / (variance + evidence.eigenvalues))
+        self.change: FloatArray = directions @ evidence.mean(variance)
         self.covariance: FloatArray = (directions * (variance / (variance + evidence.eigenvalues))) @ directions.T
         self._solved_features = self._gram.solve(self._flat)
         errors = self._seen.errors - self._seen.features @ self.change

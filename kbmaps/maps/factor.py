@@ -101,6 +101,10 @@ class ShiftedGram:
         """Solution of (K + shift·I) y = rhs."""
         return lapack.cholesky_solve(self._buffer, rhs)
 
+    def whiten(self, rhs: FloatArray) -> FloatArray:
+        """L⁻¹ rhs, with L Lᵀ = K + shift·I."""
+        return lapack.lower_solve(self._buffer, rhs)
+
     @property
     def rcond(self) -> float:
         """Estimated reciprocal condition number of K + shift·I, at least 1 / k of the true one."""

@@ -19,31 +19,38 @@ _LEAST_SHARE, _GREATEST_SHARE = 1e-20, 1e2
 class LinearEvidence:
     """Log evidence of y = H β + e as a function of the variance s² of the noise e, with β ~ N(0, 1).
 
-    With γ the eigenvalues of Hᵀ H and c the components of Hᵀ y along its eigenvectors,
+    With H = U diag(√γ) Vᵀ, a = Uᵀ y and y₀ what of y no β reaches,
 
-        −2 log p(y) = N log(2π s²) + Σ log(1 + γ / s²) + (yᵀ y − Σ c² / (s² + γ)) / s².
+        −2 log p(y) = N log(2π s²) + Σ log(1 + γ / s²) + y₀ᵀ y₀ / s² + Σ a² / (s² + γ).
+
+    All terms are positive: as a difference of yᵀ y and what β explains of it, the noise of a wide prior is rounding.
 
     Attributes:
         count: N, how many coordinates y has; not whole where pairs are partly forgotten.
-        square: yᵀ y.
-        eigenvalues, components: γ and c (p,).
+        unreached: y₀ᵀ y₀.
+        eigenvalues: γ (p,).
+        along: a (p,).
     """
 
     count: float
-    square: float
+    unreached: float
     eigenvalues: FloatArray
-    components: FloatArray
+    along: FloatArray
+
+    def mean(self, variance: float) -> FloatArray:
+        """Posterior mean of Vᵀ β (p,) at this s²."""
+        return np.sqrt(self.eigenvalues) * self.along / (variance + self.eigenvalues)
 
     def at(self, variances: FloatArray) -> FloatArray:
         """Log evidence (m,) at variances (m,)."""
         column = variances[:, None]
-        misfit = self.square - (np.square(self.components) / (column + self.eigenvalues)).sum(axis=1)
+        misfit = self.unreached / variances + (np.square(self.along) / (column + self.eigenvalues)).sum(axis=1)
         spread = np.log1p(self.eigenvalues / column).sum(axis=1)
-        return -0.5 * (self.count * np.log(2.0 * np.pi * variances) + spread + misfit / variances)
+        return -0.5 * (self.count * np.log(2.0 * np.pi * variances) + spread + misfit)
 
     def best_variance(self) -> float:
         """The variance of the greatest evidence, found on ever finer grids of its logarithm."""
-        mean = self.square / self.count
+        mean = (self.unreached + float(np.square(self.along).sum())) / self.count
         if not len(self.eigenvalues):
             return max(mean, VARIANCE_FLOOR)
         middle, low, high = max(mean, VARIANCE_FLOOR), _LEAST_SHARE * mean, _GREATEST_SHARE * mean

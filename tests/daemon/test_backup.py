@@ -241,6 +241,15 @@ def test_a_name_that_leads_elsewhere_is_refused(backed_up, elsewhere, name) -> N
     assert "it would be written elsewhere" in refused(altered(backed_up, lead_astray), elsewhere)
 
 
+def test_a_robot_s_name_that_leads_elsewhere_is_refused(backed_up, elsewhere) -> None:
+    def lead_astray(members: dict[str, bytes]) -> None:
+        manifest = json.loads(members[MANIFEST])
+        manifest["robot"] = "../../escaped"
+        members[MANIFEST] = json.dumps(manifest).encode()
+
+    assert "cannot be understood" in refused(altered(backed_up, lead_astray), elsewhere)
+
+
 def test_a_file_that_the_manifest_does_not_know_is_refused(backed_up, elsewhere) -> None:
     stranger = altered(backed_up, lambda members: members.update({"robot/stranger": b"x"}))
     assert "does not hold the files that its manifest.json says" in refused(stranger, elsewhere)

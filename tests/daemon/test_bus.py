@@ -9,6 +9,7 @@ from queue import Queue
 import pytest
 
 from daemon.bus import Bus, Request, client
+from daemon.identity import Route
 from daemon.wire import JSON, MSGPACK, ErrorReply, decode
 from interfaces.errors import BusError, RequestError
 
@@ -152,6 +153,28 @@ def test_who_ends_is_no_longer_alive(endpoint) -> None:
             assert changes.get(timeout=LIMIT_S)
             server.__exit__(None, None, None)
             assert not changes.get(timeout=LIMIT_S)
+
+
+def test_who_is_linked_to_a_process_and_to_the_router_hears_everything_once(endpoint, free_endpoint) -> None:
+    meeting = free_endpoint()
+    heard: Queue[bytes] = Queue()
+    behind = {"mode": "router"}
+    with (
+        Bus(listen=meeting, settings=behind),
+        Bus(listen=endpoint, connect=meeting, settings=behind) as process,
+        Bus(connect=Route((endpoint, meeting))) as onlooker,
+    ):
+        say = process.publisher("said")
+        onlooker.subscribe("said", heard.put)
+        while heard.empty() or len(onlooker._session.info.routers_zid()) < 2:
+            say(b"first")
+        said = [b"%d" % k for k in range(500)]
+        for word in said:
+            say(word)
+        words: list[bytes] = []
+        while not words or words[-1] != said[-1]:
+            words.append(heard.get(timeout=LIMIT_S))
+    assert [word for word in words if word != b"first"] == said
 
 
 def test_a_closed_session_says_so(endpoint) -> None:

@@ -16,7 +16,7 @@ from daemon import service_files
 from daemon.cli import command_line
 from daemon.config import Config
 from daemon.identity import TlsConfig
-from daemon.service_files import ServiceFiles, user_for
+from daemon.service_files import ServiceFiles, UnitFolder, user_for
 from daemon.units import FOLDER, PROCESSES, Installed, devices_of, hidden, of_robot, template
 from daemon.zenoh_config import ZenohConfig
 from interfaces.errors import ConfigError
@@ -68,7 +68,7 @@ def install(*arguments: object) -> None:
 
 def written(folder: Path, config: Config) -> dict[Path, str]:
     """The units of `config` in `folder`, as on a machine."""
-    files = ServiceFiles(config.robot.name, root=folder)
+    files = ServiceFiles(config.robot.name, folder=UnitFolder(folder))
     texts = files.texts(config, "daemon", HERE)
     files.install(texts)
     return texts
@@ -176,7 +176,7 @@ def test_the_units_in_deploy_are_those_that_are_written(process) -> None:
 
 def test_yes_writes_the_units_and_says_how_to_start_them(tmp_path, robot, capsys) -> None:
     install("--robot", robot, "--user", "daemon", "--yes", "--root", tmp_path)
-    assert len(ServiceFiles("arm", root=tmp_path).installed()) == 4
+    assert len(ServiceFiles("arm", folder=UnitFolder(tmp_path)).installed()) == 4
     enable = "sudo systemctl enable --now bodyschema-sampler@arm.service bodyschema-learner@arm.service"
     assert enable in capsys.readouterr().out
 
@@ -213,13 +213,13 @@ def test_uninstall_leaves_what_other_robots_need(tmp_path, robot, config) -> Non
 def test_a_dry_run_of_uninstall_removes_nothing(tmp_path, robot) -> None:
     install("--robot", robot, "--user", "daemon", "--yes", "--root", tmp_path)
     install("--robot", robot, "--uninstall", "--dry-run", "--root", tmp_path)
-    assert len(ServiceFiles("arm", root=tmp_path).installed()) == 4
+    assert len(ServiceFiles("arm", folder=UnitFolder(tmp_path)).installed()) == 4
 
 
 def test_a_learner_alone_needs_no_hardware(tmp_path) -> None:
     robot = write_small_arm(tmp_path)
     install("--robot", robot, "--only", "learner", "--user", "daemon", "--yes", "--root", tmp_path)
-    assert [path.parent.name for path in ServiceFiles("arm", root=tmp_path).installed()] == [
+    assert [path.parent.name for path in ServiceFiles("arm", folder=UnitFolder(tmp_path)).installed()] == [
         "bodyschema-learner@arm.service.d",
         "system",
     ]
@@ -247,8 +247,8 @@ def test_the_service_is_that_of_who_called_sudo(monkeypatch) -> None:
 
 def test_systemd_is_told_on_this_machine_alone(tmp_path, config) -> None:
     ran: list[object] = []
-    ServiceFiles("arm", root=tmp_path, run=ran.append).install({})
-    ServiceFiles("arm", run=ran.append).install({})
+    ServiceFiles("arm", folder=UnitFolder(tmp_path, ran.append)).install({})
+    ServiceFiles("arm", folder=UnitFolder(run=ran.append)).install({})
     assert ran == [["systemctl", "daemon-reload"]]
 
 

@@ -88,6 +88,11 @@ def test_a_folder_stands_for_the_robots_in_it(tmp_path: Path, robots: list[Confi
     assert descriptions([tmp_path]) == [config.file for config in robots]
 
 
+def test_what_else_lies_in_the_folder_is_no_robot(tmp_path: Path, robots: list[Config]) -> None:
+    (tmp_path / "cameras.toml").write_text('format = "bodyschema stereo rig 1"\n')
+    assert descriptions([tmp_path]) == [config.file for config in robots]
+
+
 def test_a_folder_without_robots_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"no robot\.toml is in this folder"):
         descriptions([tmp_path])

@@ -410,6 +410,11 @@ def test_a_wrong_router_file_names_what_is_wrong(pki: Path, old: str, new: str, 
         RouterConfig.load(pki / "wrong.toml")
 
 
+def test_where_a_router_file_comes_from_is_told(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"there is no such file\. docs/security.md has one"):
+        RouterConfig.load(tmp_path / "router.toml")
+
+
 def test_zenohd_gets_the_same_configuration_as_a_file(pki: Path, tmp_path: Path) -> None:
     (pki / "router.toml").write_text((SEVERAL / "router.toml").read_text())
     router = RouterConfig.load(pki / "router.toml")

@@ -57,9 +57,11 @@ def document(hub: Hub, topic: str) -> Any:
 
 
 @contextmanager
-def process(endpoint: str, name: str, status: object, answers: dict[str, Callable[..., bytes]]) -> Iterator[None]:
+def process(
+    endpoint: str, name: str, status: object, answers: dict[str, Callable[..., bytes]], router: str = ""
+) -> Iterator[None]:
     """One of the two processes, as zenoh shows it; it says its state all the while."""
-    with Bus(listen=endpoint) as bus:
+    with Bus(listen=endpoint, connect=router or None, settings={"mode": "router"} if router else None) as bus:
         for key, answer in answers.items():
             bus.answer(key, answer)
         bus.token(KEYS.alive(name))
@@ -120,6 +122,19 @@ def test_a_learner_that_goes_is_missed_and_one_that_comes_back_is_seen(config, h
     assert document(hub, "learner")["status"]["pairs"] == LEARNER.pairs  # what it knew last is still to be seen
     with learner(config):
         until(answers)
+
+
+@pytest.mark.parametrize("here", [True, False])
+def test_a_learner_at_the_router_is_seen_wherever_it_runs(tmp_path, hub, free_endpoint, here) -> None:
+    meeting, own = free_endpoint(), free_endpoint()
+    tables = f'[zenoh]\nsampler = "{free_endpoint()}"\nlearner = "{own}"\nrouter = "{meeting}"\n'
+    config = Config.load(write_small_arm(tmp_path, tables), {})
+    with (
+        Bus(listen=meeting, settings={"mode": "router"}),
+        process(own if here else free_endpoint(), "learner", LEARNER, {}, meeting),
+        Watch(config, hub),
+    ):
+        until(lambda: (found := document(hub, "learner")) and found["answers"])
 
 
 def test_residuals_and_segments_come_from_the_sampler_s_pairs_and_the_learner_s_answers(config, hub, watch) -> None:

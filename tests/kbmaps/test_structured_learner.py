@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -96,6 +97,20 @@ def test_thirty_noisy_pairs_are_enough_where_a_plain_net_needs_hundreds():
             errors.append(arm.error(learner, rng))
     assert np.mean(structured) < 0.3 * np.mean(isotropic)
     assert np.mean(isotropic) < np.mean(drawing)
+
+
+@given(seed=seeds, joint_kinds=st.text("RP", min_size=4, max_size=6), pairs=st.integers(20, 60))
+@settings(max_examples=20, deadline=None)
+def test_tolerances_without_bounds_beside_narrow_ones_leave_the_noise_as_it_is(seed, joint_kinds, pairs):
+    rng = np.random.default_rng(seed)
+    narrow = ChainTolerances(axes=math.radians(1.0), points=0.005, zeros=math.radians(1.0))
+    arm = rough_arm(rng, joint_kinds, narrow)
+    q, x = arm.pairs(rng, pairs, 0.0005)
+    unbounded = replace(narrow, tool=math.inf, base_rotation=math.inf, base_translation=math.inf)
+    learner = StructuredLearner(arm.nominal, unbounded, bases_for(joint_kinds))
+    learner.learn(q, x)
+    assert 0.0001 < learner.noise < 0.005
+    assert arm.error(learner, rng) < 0.03
 
 
 def test_what_is_not_rigid_goes_to_the_map():

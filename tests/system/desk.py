@@ -1,5 +1,7 @@
 """At a desk somewhere on the network: waits until the learner has all pairs, then asks as a viewer and as an operator.
 
+It looks on as the page does, too.
+
 Usage: python desk.py ENDPOINT PAIRS. Prints one line of JSON. A program of its own, since it runs on a host of its own.
 """
 
@@ -11,8 +13,11 @@ import time
 from pathlib import Path
 
 from daemon.bus import client
+from daemon.config import Config
 from daemon.identity import Identity, Route
 from daemon.keys import Keys
+from daemon.view.hub import Hub
+from daemon.view.watch import Watch
 from interfaces.errors import BodyschemaError, BusError
 
 LIMIT_S = 60.0
@@ -32,6 +37,19 @@ def asked(where: Route, key: str, **request: object) -> dict[str, object]:
         return {"error": str(error)}
 
 
+def shown() -> dict[str, object]:
+    """What the page knows of both processes, once they are there or at the end of its patience."""
+    hub = Hub()
+    until = time.monotonic() + LIMIT_S
+    with Watch(Config.load(Path("robot.toml"), {}), hub):
+        while True:
+            documents = json.loads(hub.all())
+            known = {process: documents.get(process) or {} for process in ("sampler", "learner")}
+            if all(each.get("answers") for each in known.values()) or time.monotonic() > until:
+                return {process: each.get("answers") for process, each in known.items()}
+            time.sleep(0.1)
+
+
 def main(endpoint: str, pairs: str) -> None:
     viewer, operator = route(endpoint, "anna"), route(endpoint, "bert")
     until = time.monotonic() + LIMIT_S
@@ -44,6 +62,7 @@ def main(endpoint: str, pairs: str) -> None:
         "viewer's command": asked(viewer, KEYS.command("learner"), command="pause"),
         "operator's command": asked(operator, KEYS.command("learner"), command="pause"),
         "sampler": asked(viewer, KEYS.status("sampler")),
+        "page": shown(),
     }
     print(json.dumps(answers))
 

@@ -14,6 +14,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import pytest
+from security_recipe import SEVERAL, carried_out
 from stalled_at import WORK
 from two_processes import KEYS, write_robot
 
@@ -84,12 +85,19 @@ def config(tmp_path: Path, free_endpoint: Callable[[], str]) -> Config:
     return write_robot(tmp_path, free_endpoint, rows=6000)
 
 
-@contextlib.contextmanager
-def started(config: Config, systemd: Systemd, process: str, *wrapper: object) -> Iterator[subprocess.Popen[bytes]]:
+def started(
+    config: Config, systemd: Systemd, process: str, *wrapper: object
+) -> contextlib.AbstractContextManager[subprocess.Popen[bytes]]:
     """A process of ours under `systemd`, its log beside robot.toml."""
+    return running(systemd, log_of(config), *(wrapper or ("-m", "daemon")), process, "--robot", config.file)
+
+
+@contextlib.contextmanager
+def running(systemd: Systemd, log_file: Path, *arguments: object) -> Iterator[subprocess.Popen[bytes]]:
+    """Python with these arguments under `systemd`."""
     environment = os.environ | {"NOTIFY_SOCKET": str(systemd.file), "WATCHDOG_USEC": str(round(1e6 * WATCHDOG_S))}
-    command = [sys.executable, *(wrapper or ("-m", "daemon")), process, "--robot", config.file]
-    with log_of(config).open("ab") as log:
+    command = [sys.executable, *arguments]
+    with log_file.open("ab") as log:
         child = subprocess.Popen(command, stdin=subprocess.DEVNULL, stderr=log, env=environment)
     try:
         yield child
@@ -100,6 +108,21 @@ def started(config: Config, systemd: Systemd, process: str, *wrapper: object) ->
 
 def log_of(config: Config) -> Path:
     return config.file.with_name("log")
+
+
+def test_a_router_is_ready_when_it_takes_connections_and_lives_until_it_is_told_to_end(
+    tmp_path: Path, systemd: Systemd, free_endpoint: Callable[[], str]
+) -> None:
+    pki, port = carried_out(tmp_path), free_endpoint().rpartition(":")[2]
+    file = pki / "router.toml"
+    file.write_text((SEVERAL / "router.toml").read_text().replace("tls/192.0.2.10:7450", f"tls/127.0.0.1:{port}"))
+    with running(systemd, tmp_path / "log", "-m", "daemon", "router", file) as router:
+        systemd.wait_for("READY=1")
+        with socket.create_connection(("127.0.0.1", int(port)), timeout=LIMIT_S):
+            systemd.wait_for("WATCHDOG=1")
+        router.send_signal(signal.SIGTERM)
+        systemd.wait_for("STOPPING=1")
+        assert router.wait(LIMIT_S) == 0
 
 
 def test_a_sampler_is_ready_when_it_reads_stores_and_answers(config: Config, systemd: Systemd) -> None:

@@ -78,6 +78,7 @@ def desk(network: Network, tmp_path_factory) -> Iterator[dict[str, Any]]:
     """What is heard at the desk, while router, sampler and learner run on their hosts."""
     pki = carried_out(tmp_path_factory.mktemp("pki"))
     shutil.copy(SEVERAL / "router.toml", pki)
+    write_small_arm(pki, (SEVERAL / "viewer.toml").read_text())
     folders = {"hub": pki}
     for host, table in (("robot", "robot"), ("learner", "learner")):
         folder = folders[host] = tmp_path_factory.mktemp(host)
@@ -105,6 +106,10 @@ def desk(network: Network, tmp_path_factory) -> Iterator[dict[str, Any]]:
 
 def test_pairs_of_the_robot_are_learnt_elsewhere_and_a_viewer_is_answered(desk: dict[str, Any]) -> None:
     assert (desk["predict"]["pairs"], desk["sampler"]["pairs"]) == (PAIRS, PAIRS)
+
+
+def test_the_page_of_a_viewer_follows_both_processes(desk: dict[str, Any]) -> None:
+    assert desk["page"] == {"sampler": True, "learner": True}
 
 
 def test_a_viewer_may_give_no_command_and_an_operator_may(desk: dict[str, Any]) -> None:
