@@ -151,7 +151,7 @@ class Watch:
 
     def asked(self) -> None:
         """The solver works on all pairs up to here."""
-        if self._reference is None:
+        if self._reference is None and self._next is None:
             self._pairs.clear()  # what comes first after the model that is the first reference counts
         self._asked_at = len(self._pairs)
 
@@ -160,11 +160,11 @@ class Watch:
         if reference.known < FEWEST_KNOWN or not self.wants_reference:
             return
         self._next, self._next_at = reference, self._asked_at
-        if self._reference is None:
-            self._renew()
 
     def add(self, *pairs: Pair, kept: ArrayLike) -> None:
         """One more pair or several, learnt or, not `kept` (n,), doubted."""
+        if self._reference is None:
+            self._renew()  # not with the offer: that comes at low priority, and this takes a while
         for pair, learnt in zip(pairs, np.broadcast_to(kept, len(pairs)).tolist(), strict=True):
             turn = np.full(4, np.nan) if pair.R is None else pair.R
             self._pairs.append(_Watched(pair.seq, pair.q, pair.x, np.diag(pair.cov), turn, learnt))
