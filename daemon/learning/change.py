@@ -49,8 +49,8 @@ class ChangeRecord(msgspec.Struct, frozen=True, kw_only=True):
     def named(self) -> KindOfChange | None:
         """What it is; None while that is not decided. What no motion tells from it counts with it."""
         best = self.kinds[0]
-        alike = sum(kind.probability for kind in self.kinds if kind.name == self.alike(best))
-        return best if best.probability + alike >= NAMED else None
+        same = [kind for kind in self.kinds[1:] if kind.name == self.alike(best) or self.alike(kind) == best.name]
+        return best if best.probability + sum(kind.probability for kind in same) >= NAMED else None
 
     def alike(self, kind: KindOfChange) -> str | None:
         """The kind that no motion tells from this one.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from interfaces.records import FloatArray, Pair
 from kbmaps import ChainBelief, ChangeDetector, ChangeKind, KBMap, ResidualModel, SharedNoise, Suspicion
+from kbmaps.changes.detector import MOST_SURPRISES
 
 from .claims import Claim
 from .learnt import LearntModel
@@ -18,12 +20,15 @@ FEWEST_KNOWN = 100
 # A newer model takes the place of the present one after half as many pairs as it knows, within these limits: a change
 # that took longer to show would be a part of it.
 SHORTEST_TRIAL, LONGEST_TRIAL = 50, 1000
+# Where no newer model comes, the older half of so many pairs is no longer held against the present one.
+MOST_WATCHED = 5000
 # So many of the pairs that a model knows show its noise.
-LOOKED_BACK = 500
-# An alarm that a bent arm explains is looked at again when the pairs since the change have grown by this factor.
-LOOK_AGAIN = 1.25
-# So many of the newest errors of pairs that a model did not know show how far these lie from it.
-SHOWN = 3000
+LOOKED_BACK = 1000
+# An alarm that a bent arm explains is looked at again when the pairs since the change have grown by this factor, or the
+# alarm's log odds by so much.
+LOOK_AGAIN, GROWN_ODDS = 1.25, 4.0
+# A model is the chain alone where it is that near to it, over the noise of a pair.
+_ALONE = 0.1
 # No measurement is more exact, whatever it says [m].
 SMALLEST_M = 1e-6
 
@@ -127,6 +132,7 @@ class Watch:
         self._detector: ChangeDetector | None = None
         self._change: Suspicion | None = None
         self._look_at = 0
+        self._odds = self._refuted_odds = -math.inf
         self._shown = np.empty((0, 3))
 
     @property
@@ -138,6 +144,11 @@ class Watch:
     def detector(self) -> ChangeDetector | None:
         """What holds the pairs against the present reference; None before there is one."""
         return self._detector
+
+    @property
+    def held(self) -> int:
+        """How many pairs are kept, at most `MOST_WATCHED` but for those since an alarm."""
+        return len(self._pairs)
 
     @property
     def alarmed(self) -> bool:
@@ -165,6 +176,8 @@ class Watch:
         """One more pair or several, learnt or, not `kept` (n,), doubted."""
         if self._reference is None:
             self._renew()  # not with the offer: that comes at low priority, and this takes a while
+        if len(self._pairs) + len(pairs) > MOST_WATCHED and not self.alarmed:
+            self._shorten()
         for pair, learnt in zip(pairs, np.broadcast_to(kept, len(pairs)).tolist(), strict=True):
             turn = np.full(4, np.nan) if pair.R is None else pair.R
             self._pairs.append(_Watched(pair.seq, pair.q, pair.x, np.diag(pair.cov), turn, learnt))
@@ -186,10 +199,13 @@ class Watch:
         """What seemed to be a change is none, as far as the pairs tell so far."""
         since = 0 if self._change is None else len(self._pairs) - self._change.onset
         self._change, self._look_at = None, len(self._pairs) + int((LOOK_AGAIN - 1.0) * since) + 1
+        self._refuted_odds = self._odds
 
     def _suspect(self, detector: ChangeDetector) -> None:
         suspicion = detector.suspicion()
-        if suspicion.alarm and self._change is None and len(self._pairs) >= self._look_at:
+        self._odds = suspicion.log_odds
+        due = len(self._pairs) >= self._look_at or self._odds > self._refuted_odds + GROWN_ODDS
+        if suspicion.alarm and self._change is None and due:
             self._change = detector.suspicion_if_it_bends()
             if not self._change.alarm:
                 self.refute()
@@ -226,7 +242,15 @@ class Watch:
     def _show(self) -> None:
         """The pairs have shown how far they lie from a model that does not know them."""
         if self._detector is not None:
-            self._shown = np.concatenate([self._shown, self._detector.surprises])[-SHOWN:]
+            self._shown = np.concatenate([self._shown, self._detector.surprises])[-MOST_SURPRISES:]
+
+    def _shorten(self) -> None:
+        """The older half of the pairs goes."""
+        gone = len(self._pairs) // 2
+        del self._pairs[:gone]
+        self._asked_at, self._next_at = max(self._asked_at - gone, 0), max(self._next_at - gone, 0)
+        if self._reference is not None:
+            self._hold(self._reference)
 
     def _renew(self) -> None:
         """The next reference takes its place."""
@@ -243,7 +267,12 @@ class Watch:
         noise_m = float(np.sqrt(noise.single * variances.mean()))
         distance_m = float(np.linalg.norm(reference.x, axis=1).mean())
         self._detector = ChangeDetector(reference.belief, noise, noise_m, distance_m)
+        if float(np.square(reference.beyond_chain(reference.q)).mean()) < (_ALONE * noise_m) ** 2:
+            # What else a model was taught of these pairs would hide how the arm bends.
+            off = reference.x - reference.belief.predict(reference.q)
+            self._detector.recall(reference.q, off, variances)
         self._change, self._look_at = None, 0
+        self._odds = self._refuted_odds = -math.inf
         self._feed(self._pairs)
 
     def _feed(self, pairs: list[_Watched]) -> None:

@@ -4,20 +4,25 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from kbmaps.arrays import FloatArray, IntArray
 from kbmaps.chains.belief import ChainBelief
-from kbmaps.changes.bending import MOST_PAIRS, log_ratios_if_it_bends
-from kbmaps.changes.kinds import ChangeKind, change_kinds
+from kbmaps.changes.bending import MOST_PAIRS, log_evidence_of_bends, log_ratios_if_it_bends
+from kbmaps.changes.bends import NOTHING_SEEN
+from kbmaps.changes.kinds import JOINT, ChangeKind, change_kinds
 from kbmaps.changes.mixture import SIZES, log_ratios
 from kbmaps.changes.onsets import Onsets
 from kbmaps.changes.shared_noise import SharedNoise
 
 # On average at least so many pairs lie between two false alarms, as far as the model's claims are true.
-PAIRS_BETWEEN_FALSE_ALARMS = 100_000.0
+PAIRS_BETWEEN_FALSE_ALARMS = 75_000.0
+# When the statistic first exceeds its limit, it often does so by far, most of all for the large changes that it allows
+# for. So the limit may be lower than that number of pairs, by this factor (`python -m benchmarks.false_alarms`).
+_OVERSHOOT = 0.33
 # No single pair counts for more than one that lies so many sigmas away: it may be an outlier.
 CLIPPED_SIGMAS = 4.0
 # So many of the newest pairs tell whether the noise has grown.
@@ -26,6 +31,8 @@ _CLEARLY = 3.0
 # While nothing is strange, it is enough to look every so many pairs: after a pair beyond so many sigmas, or when a
 # change is so probable, each pair counts.
 LOOK_EVERY, STRANGE_SIGMAS, LOOK_CLOSELY = 5, 3.0, 4.0
+# So many of the newest errors are kept.
+MOST_SURPRISES = 3000
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +80,7 @@ class ChangeDetector:
     (Willsky and Jones 1976, there maximised), averaged over sizes. Their sum over t is the statistic of
     Shiryaev and Roberts: without a change its expectation after n pairs is n, so that the first time it exceeds A
     comes after A pairs at least on average (Pollak 1987, "Average run lengths of an optimal method of detecting a
-    change in distribution"). So A is the number of pairs between two false alarms.
+    change in distribution"), and after more as it then exceeds A by far.
 
     Args:
         belief: what is believed of the chain, by pairs before the first of these.
@@ -97,18 +104,26 @@ class ChangeDetector:
         self._columns = np.concatenate([kind.columns for kind in self.kinds])
         self._units = np.concatenate([kind.units for kind in self.kinds])
         ends = np.cumsum([len(kind.columns) for kind in self.kinds])
+        self._zeros = np.array([end - 1 for end, kind in zip(ends, self.kinds, strict=True) if kind.name == JOINT])
         self._places = [slice(end - len(kind.columns), end) for kind, end in zip(self.kinds, ends, strict=True)]
         self._log_shares = np.log([kind.share for kind in self.kinds])
-        self._sizes = noise_m * np.array(SIZES)
-        self._limit = math.log(pairs_between_false_alarms)
+        self._noise_m, self._sizes = noise_m, noise_m * np.array(SIZES)
+        self._limit = self.log_limit(pairs_between_false_alarms)
         known = self._root.shape[1]
         # A root of the covariance: a difference of covariances would be none after thousands of pairs.
         self._posterior_root, self._mean = np.eye(known), np.zeros(known)
         self._onsets = Onsets(known, len(self._columns))
         self._differences: deque[float] = deque(maxlen=_RECENT)
-        self._surprises: list[FloatArray] = []
+        self._surprises: deque[FloatArray] = deque(maxlen=MOST_SURPRISES)
         self._rows: deque[tuple[FloatArray, FloatArray, FloatArray, FloatArray]] = deque(maxlen=MOST_PAIRS)
         self._strange, self._looked_at, self._log_odds = False, 0, -math.inf
+        self._fitted: tuple[FloatArray, FloatArray, FloatArray] | None = None
+        self._bends_before: list[FloatArray] | None = None
+
+    @staticmethod
+    def log_limit(pairs_between_false_alarms: float) -> float:
+        """Beyond which log odds there is an alarm."""
+        return math.log(_OVERSHOOT * pairs_between_false_alarms)
 
     @property
     def pairs(self) -> int:
@@ -122,9 +137,10 @@ class ChangeDetector:
 
     @property
     def surprises(self) -> FloatArray:
-        """Whitened errors (n, 3) of all pairs, each against what was expected after those before it.
+        """Whitened errors (n, 3) of the newest pairs, n at most `MOST_SURPRISES`.
 
-        They are in units of the noise: what was not known of the model is taken out.
+        Each is against what was expected after the pairs before it. They are in units of the noise: what was not known
+        of the model is taken out.
         """
         return np.array(self._surprises).reshape(-1, 3)
 
@@ -136,15 +152,30 @@ class ChangeDetector:
             errors: measured minus predicted (n, 3) [m].
             variances: of each coordinate: the measurement's, and what the model misses beyond its belief (n, 3) [m²].
         """
+        for row in zip(*self._whitened(q, errors, variances), strict=True):
+            self._rows.append(row)
+            self._add(*row[1:])
+
+    def recall(self, q: FloatArray, errors: FloatArray, variances: FloatArray) -> None:
+        """Pairs to which the belief was fitted, in their order: they show how the arm bends, and nothing else.
+
+        Args:
+            q: where (n, d) [rad, m].
+            errors: measured minus predicted by the believed chain (n, 3) [m].
+            variances: as of `add`.
+        """
+        self._fitted, self._bends_before = (q, errors, variances), None
+
+    def _whitened(
+        self, q: FloatArray, errors: FloatArray, variances: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Angles (n, d), derivatives by what is believed (n, 3, k) and by changes (n, 3, c), and errors (n, 3)."""
         _, jacobian = self._belief.parameters.linearised(self._belief.mean, q)
         weights = 1.0 / np.sqrt(variances)
         known = weights[..., None] * (jacobian @ self._root)
         changed = weights[..., None] * (jacobian[:, :, self._columns] * self._units)
         prismatic = self._belief.parameters.reference.prismatic
-        angles = np.where(prismatic, q / self._belief.parameters.reach, q)
-        for angle, row_known, row_changed, error in zip(angles, known, changed, weights * errors, strict=True):
-            self._rows.append((angle, error, row_known, row_changed))
-            self._add(row_known, row_changed, error)
+        return np.where(prismatic, q / self._belief.parameters.reach, q), known, changed, weights * errors
 
     def _add(self, known: FloatArray, changed: FloatArray, error: FloatArray) -> None:
         """One pair's whitened derivatives by what is believed (3, k) and by changes (3, c), and its error (3,)."""
@@ -200,16 +231,33 @@ class ChangeDetector:
 
         It costs some hundred times as much as `suspicion`: to be asked for when that is an alarm.
         """
-        rows = list(zip(*self._rows, strict=True))
-        angles, errors, known, changed = (np.array(each) for each in rows)
+        angles, known, changed, errors = (np.array(each) for each in zip(*self._rows, strict=True))
         scale = 1.0 / math.sqrt(self._noise.single)
         first = self.pairs - len(angles)
-        suspected = max(self.suspicion().onset - first, 0)
         onsets, stands_for, terms = log_ratios_if_it_bends(
-            angles, scale * errors, scale * known, scale * changed, self._places, self._sizes, suspected
+            angles,
+            scale * errors,
+            scale * known,
+            scale * self._noise_m * changed[..., self._zeros],
+            scale * changed,
+            self._places,
+            self._sizes,
+            max(self.suspicion().onset - first, 0),
+            self._seen_of_bends(),
         )
         terms = terms + self._log_shares + np.log(stands_for)[:, None]
         return self._suspected(onsets + first, terms)
+
+    def _seen_of_bends(self) -> Sequence[FloatArray | float]:
+        """What the pairs that the belief was fitted to say of bends."""
+        if self._fitted is None:
+            return NOTHING_SEEN
+        if self._bends_before is None:
+            scale = 1.0 / math.sqrt(self._noise.single)
+            angles, known, changed, errors = self._whitened(*self._fitted)
+            turning = scale * self._noise_m * changed[..., self._zeros]
+            self._bends_before = log_evidence_of_bends(angles, scale * errors, scale * known, turning)
+        return self._bends_before
 
     def _suspected(self, onsets: IntArray, terms: FloatArray) -> Suspicion:
         log_odds = float(np.logaddexp.reduce(terms, axis=None))

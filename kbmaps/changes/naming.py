@@ -14,8 +14,9 @@ from kbmaps.changes.kinds import OTHER, ChangeKind
 from kbmaps.changes.mixture import SIZES
 from kbmaps.robust import OUTLIER_SIGMAS
 
-# So many pairs, evenly spread, stand for all.
-MOST_PAIRS = 100
+# Of more pairs so many are looked at, evenly spread. They stand for themselves alone: counted for the others too, their
+# noise would look like a change of everything.
+MOST_PAIRS = 400
 _STEPS = 6
 
 
@@ -59,8 +60,7 @@ def explanations(
         shared: how many neighbours say as much as one would.
     """
     chosen = np.linspace(0, len(q) - 1, min(len(q), MOST_PAIRS)).round().astype(np.intp)
-    counted = len(q) / len(chosen) / shared
-    q, x = q[chosen], x[chosen]
+    q, x, counted = q[chosen], x[chosen], 1.0 / shared
     sizes = noise_m * np.array(SIZES)
     fits = [_fit(before, kind, q, x, noise_m, counted, float(sizes[-1])) for kind in kinds]
     # A change of everything at once that is hardly seen is what was not known before, and no change.

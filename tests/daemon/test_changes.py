@@ -88,3 +88,11 @@ def test_what_no_motion_tells_apart_is_named_together() -> None:
         kinds=[KindOfChange("joint", 2, 0.6), KindOfChange("tool", None, 0.39), KindOfChange("joint", 0, 0.0)],
     )
     assert record.named == KindOfChange("joint", 2, 0.6)
+
+
+def test_a_tool_that_the_last_zero_is_like_is_named_too() -> None:
+    record = msgspec.structs.replace(
+        UNDECIDED,
+        kinds=[KindOfChange("tool", None, 0.6), KindOfChange("joint", 2, 0.39), KindOfChange("joint", 0, 0.0)],
+    )
+    assert record.named == KindOfChange("tool", None, 0.6)

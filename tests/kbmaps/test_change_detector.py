@@ -16,6 +16,7 @@ from kbmaps import (
     change_kinds,
     explanations,
 )
+from kbmaps.changes.detector import MOST_SURPRISES
 from kbmaps.changes.mixture import log_ratios
 
 SIGMA = 0.002
@@ -52,6 +53,12 @@ class Arm:
         waves = self.rng.normal(size=(3, self.q.shape[1])) * 0.7
         self.x += size_m * np.sin(waves @ self.q.T + self.rng.uniform(0.0, 6.0, (3, 1))).T
 
+    def err(self, size_m: float) -> None:
+        """Each encoder sits beside its axis: it errs as a wave of its joint's turn, by about so much at the marker."""
+        phases = self.rng.uniform(0.0, 6.0, self.q.shape[1])
+        read_wrongly = self.q + size_m / self.parameters.reach * np.sin(self.q + phases)
+        self.x += self.parameters.positions(self.truth, read_wrongly) - self.parameters.positions(self.truth, self.q)
+
     def detector(self) -> ChangeDetector:
         return ChangeDetector(self.belief, SharedNoise(np.ones(1), 1.0), SIGMA, 0.5)
 
@@ -85,6 +92,16 @@ def test_a_change_ten_times_the_noise_is_noticed_within_ten_pairs_and_dated(seed
 def test_a_change_is_named_rightly_by_the_pairs_since(seed: int, kind: str) -> None:
     arm = Arm(seed)
     arm.change(kind, 10.0 * SIGMA)
+    kinds = (*change_kinds(arm.parameters, 0.5), any_change(arm.parameters))
+    best = explanations(arm.belief, kinds, arm.q[BEFORE:], arm.x[BEFORE:], SIGMA)[0]
+    assert (best.kind.name, best.kind.joint) == (kind, KINDS[kind])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("seed", range(3))
+def test_the_noise_of_many_pairs_is_not_taken_for_a_change_of_everything(seed: int, kind: str) -> None:
+    arm = Arm(seed, BEFORE + 400)
+    arm.change(kind, 5.0 * SIGMA)
     kinds = (*change_kinds(arm.parameters, 0.5), any_change(arm.parameters))
     best = explanations(arm.belief, kinds, arm.q[BEFORE:], arm.x[BEFORE:], SIGMA)[0]
     assert (best.kind.name, best.kind.joint) == (kind, KINDS[kind])
@@ -171,6 +188,27 @@ def test_an_arm_that_bends_raises_no_alarm_that_stands(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", range(3))
+def test_encoders_beside_their_axes_raise_no_alarm_that_stands(seed: int) -> None:
+    arm = Arm(seed, 200)
+    arm.err(8.0 * SIGMA)
+    raised, stands = alarms(arm)
+    assert raised
+    assert not stands
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_that_an_arm_did_not_bend_before_makes_a_change_more_probable(seed: int) -> None:
+    arm, earlier = Arm(seed), Arm(seed, 400)
+    arm.change("tool", 2.0 * SIGMA)
+    unaware, aware = arm.detector(), arm.detector()
+    off = earlier.x - earlier.parameters.positions(earlier.truth, earlier.q)
+    aware.recall(earlier.q, off, np.full(off.shape, SIGMA**2))
+    for detector in (unaware, aware):
+        arm.feed(detector, slice(None))
+    assert aware.suspicion_if_it_bends().log_odds > unaware.suspicion_if_it_bends().log_odds
+
+
+@pytest.mark.parametrize("seed", range(3))
 def test_a_change_of_an_arm_that_bends_is_noticed_and_dated(seed: int) -> None:
     arm = Arm(seed, speed=0.4)
     arm.bend(2.0 * SIGMA)
@@ -188,6 +226,13 @@ def test_an_alarm_of_a_rigid_arm_stands(kind: str) -> None:
     arm.change(kind, 20.0 * SIGMA)
     raised, stands = alarms(arm)
     assert BEFORE < raised[0] <= stands[0] <= raised[0] + 5
+
+
+def test_however_many_pairs_there_are_the_errors_that_are_kept_are_bounded() -> None:
+    arm = Arm(0, MOST_SURPRISES + 50)
+    detector = arm.detector()
+    arm.feed(detector, slice(None))
+    assert detector.surprises.shape == (MOST_SURPRISES, 3)
 
 
 def test_pairs_that_come_together_say_what_they_say_one_by_one() -> None:
