@@ -1,26 +1,33 @@
 """One learner host for many robots: what each costs, and whether the instant models keep up.
 
-python benchmarks/fleet.py [--robots 1,10,25,50] [--rate 20] [--seconds 20] [--processes 1]
+python benchmarks/fleet.py [--robots 1,10,25,50] [--rate 20] [--warm 20] [--seconds 20] [--processes 2]
 
 Robots of six joints, whose pairs come over real zenoh from a process that publishes them and answers from their
-history as samplers do. For each number of robots:
+history as samplers do. For each number of robots, after `--warm` seconds of pairs:
 
-    cpu    of the host's processes per robot, in % of one core: in all; the instant pass and answers; the solver
-    pairs  learnt of those published, at the end
-    lag    from a pair's publication until the learner has learnt it, at the median and in the worst robot, in pairs
-    memory of the host's processes per robot
+    pairs/s    that came, of all robots
+    cpu        processor's time of the host's processes per pair [ms]: of the threads that take, learn and judge pairs;
+               of the background's (replay, findings, the solver's orders); of all others (zenoh, answers, statuses,
+               checkpoints); of the solvers
+    cores      what that is together, in cores
+    behind     pairs published and not learnt yet by the instant model whenever a robot is asked for a prediction: at
+               the median, 99 % and at most
+    MB         memory of the host's processes per robot
+    load       of the machine, with whatever else runs on it
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 import os
 import socket
-import statistics
 import subprocess
 import sys
 import tempfile
+import threading
 import time
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -29,15 +36,17 @@ import numpy as np
 from daemon.bus import Bus, Request, client
 from daemon.config import Config
 from daemon.keys import Keys
-from daemon.status import LearnerStatus
-from daemon.wire import PairMessage, PairsReply, decode, encode
+from daemon.wire import JointsRequest, PairMessage, PairsReply, PredictReply, decode, encode
 from interfaces.errors import BodyschemaError
 
 JOINTS = 6
 SIGMA_M = 2e-3
 STEP_RAD = 0.015
 LIMIT_S = 240.0
+ASK_EVERY_S = 0.1
 TICKS = os.sysconf("SC_CLK_TCK")
+# Whose processor time is told apart: threads by their names, and the solvers' processes.
+PARTS: tuple[str, ...] = ("learn_pairs", "background", "others", "solver")
 
 
 def write_robot(folder: Path, name: str, sampler: str, learner: str) -> Path:
@@ -100,25 +109,27 @@ class Walk:
 
 @dataclass(frozen=True)
 class Usage:
-    """Of a process and its children: processor time [s] of those that solve and of the others, and memory [bytes]."""
+    """Of a process and its children: processor time [s] by `PARTS`, and memory [bytes]."""
 
-    learners_s: float
-    solvers_s: float
+    seconds: dict[str, float]
     memory: int
 
     @classmethod
     def of(cls, pid: int) -> Usage:
-        seconds, memory = {True: 0.0, False: 0.0}, 0
+        seconds, memory = dict.fromkeys(PARTS, 0.0), 0
         for one in _family(pid):
             try:
-                command = Path(f"/proc/{one}/cmdline").read_bytes()
-                fields = Path(f"/proc/{one}/stat").read_text().rpartition(")")[2].split()
+                solves = b"solver_process" in Path(f"/proc/{one}/cmdline").read_bytes()
                 shared = Path(f"/proc/{one}/statm").read_text().split()
+                threads = [file.read_text() for file in Path(f"/proc/{one}/task").glob("*/stat")]
             except OSError:
                 continue
-            seconds[b"solver_process" in command] += (int(fields[11]) + int(fields[12])) / TICKS
+            for thread in threads:
+                name, _, fields = thread.partition("(")[2].rpartition(")")
+                used = [int(ticks) for ticks in fields.split()[11:13]]
+                seconds["solver" if solves else name if name in PARTS else "others"] += sum(used) / TICKS
             memory += (int(shared[1]) - int(shared[2])) * os.sysconf("SC_PAGE_SIZE")
-        return cls(seconds[False], seconds[True], memory)
+        return cls(seconds, memory)
 
 
 def _family(pid: int) -> list[int]:
@@ -126,15 +137,42 @@ def _family(pid: int) -> list[int]:
     return [pid, *(one for child in children for one in _family(int(child)))]
 
 
-def _counted(bus: Bus, names: list[str]) -> dict[str, int]:
-    """How many pairs each robot has learnt."""
-    counts = {}
-    for name in names:
-        counts[name] = decode(bus.ask_one(Keys(name).status("learner"), timeout_s=30.0), LearnerStatus).pairs
-    return counts
+class Asker(threading.Thread):
+    """Asks one robot after the other for a prediction, and notes how many pairs its instant model is behind."""
+
+    def __init__(self, ends: list[str], walks: list[Walk]) -> None:
+        super().__init__()
+        self._ends, self._walks = ends, walks
+        self._over = threading.Event()
+        self.behind: list[int] = []
+
+    def run(self) -> None:
+        payload = encode(JointsRequest([0.0] * JOINTS))
+        with ExitStack() as stack:
+            buses = [stack.enter_context(client(end)) for end in self._ends]
+            for turn in itertools.count():
+                if self._over.wait(ASK_EVERY_S):
+                    return
+                robot = turn % len(self._walks)
+                published = len(self._walks[robot].pairs)
+                reply = buses[robot % len(buses)].ask_one(Keys(f"arm_{robot}").predict, payload, timeout_s=30.0)
+                self.behind.append(max(published - decode(reply, PredictReply).pairs, 0))
+
+    def end(self) -> None:
+        self._over.set()
+        self.join()
 
 
-def measure(robots: int, rate: float, seconds: float, processes: int) -> str:
+@dataclass(frozen=True)
+class Course:
+    """How pairs come: so many a second of each robot, for so long before and during the measurement."""
+
+    rate: float
+    warm_s: float
+    seconds: float
+
+
+def measure(robots: int, course: Course, processes: int) -> str:
     """One row of the table."""
     with tempfile.TemporaryDirectory() as folder:
         sampler, ends = free_endpoint(), [free_endpoint() for _ in range(processes)]
@@ -150,39 +188,40 @@ def measure(robots: int, rate: float, seconds: float, processes: int) -> str:
                 bus.token(Keys(f"arm_{k}").alive("sampler"))
             host = subprocess.Popen(command, stderr=subprocess.DEVNULL)
             try:
-                return _row(host.pid, ends, walks, publish, rate, seconds)
+                _await_answers(ends, [f"arm_{k}" for k in range(robots)])
+                return _row(host.pid, ends, walks, publish, course)
             finally:
                 host.terminate()
                 host.wait(60)
 
 
-def _row(pid: int, ends: list[str], walks: list[Walk], publish: list, rate: float, seconds: float) -> str:
-    names = [f"arm_{k}" for k in range(len(walks))]
-    _await_answers(ends, names)
-    before, begin, published = Usage.of(pid), time.monotonic(), 0
-    load = os.getloadavg()[0]
+def _row(pid: int, ends: list[str], walks: list[Walk], publish: list, course: Course) -> str:
+    _publish(walks, publish, course.rate, course.warm_s)
+    asker = Asker(ends, walks)
+    asker.start()
+    before, begin = Usage.of(pid), time.monotonic()
+    published = _publish(walks, publish, course.rate, course.seconds)
+    spent, after, load = time.monotonic() - begin, Usage.of(pid), os.getloadavg()[0]
+    asker.end()
+    used = {part: after.seconds[part] - before.seconds[part] for part in PARTS}
+    median, late, worst = np.quantile(asker.behind, [0.5, 0.99, 1.0])
+    per_pair = " | ".join(f"{1e3 * seconds / published:.2f}" for seconds in used.values())
+    return (
+        f"| {len(walks)} | {published / spent:.0f} | {per_pair} | {sum(used.values()) / spent:.2f} | "
+        f"{median:.0f}, {late:.0f}, {worst:.0f} | {after.memory / len(walks) / 1e6:.0f} | {load:.0f} |"
+    )
+
+
+def _publish(walks: list[Walk], publish: list, rate: float, seconds: float) -> int:
+    """Publish pairs in turns at their rate; how many."""
+    begin, published = time.monotonic(), 0
     while (now := time.monotonic() - begin) < seconds:
         while published < now * rate * len(walks):
             walk = published % len(walks)
             publish[walk](walks[walk].step())
             published += 1
         time.sleep(0.002)
-    spent, after = time.monotonic() - begin, Usage.of(pid)
-    # Asked of all ends; each knows its own robots.
-    behind = []
-    for place, end in enumerate(ends):
-        with client(end) as asked:
-            own = names[place :: len(ends)]
-            counts = _counted(asked, own)
-            behind += [len(walks[names.index(name)].pairs) - counts[name] for name in own]
-    per_robot = 100.0 / spent / len(walks)
-    memory_mb = after.memory / len(walks) / 1e6
-    learnt = 1.0 - sum(max(b, 0) for b in behind) / published
-    return (
-        f"| {len(walks)} | {per_robot * (after.learners_s - before.learners_s):.1f} | "
-        f"{per_robot * (after.solvers_s - before.solvers_s):.1f} | {published / spent / len(walks):.1f} | "
-        f"{learnt:.0%} | {statistics.median(behind):.0f}, {max(behind)} | {memory_mb:.0f} | {load:.0f} |"
-    )
+    return published
 
 
 def _await_answers(ends: list[str], names: list[str]) -> None:
@@ -206,13 +245,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--robots", default="1,10,25,50")
     parser.add_argument("--rate", type=float, default=20.0)
+    parser.add_argument("--warm", type=float, default=20.0)
     parser.add_argument("--seconds", type=float, default=20.0)
-    parser.add_argument("--processes", type=int, default=1)
+    parser.add_argument("--processes", type=int, default=2)
     asked = parser.parse_args()
-    print("| robots | CPU, learning | CPU, solver | pairs/s came | learnt | behind, worst | MB | load |")
-    print("| --- | --- | --- | --- | --- | --- | --- | --- |")
+    print(f"| robots | pairs/s | {' | '.join(f'{part}, ms' for part in PARTS)} | cores | behind | MB | load |")
+    print("| --- " * (len(PARTS) + 6) + "|")
     for robots in map(int, asked.robots.split(",")):
-        print(measure(robots, asked.rate, asked.seconds, min(asked.processes, robots)), flush=True)
+        course = Course(asked.rate, asked.warm, asked.seconds)
+        print(measure(robots, course, min(asked.processes, robots)), flush=True)
 
 
 if __name__ == "__main__":

@@ -55,9 +55,14 @@ class Background:
         self._idle_since = [clock.now()] * len(workers)
 
     def run(self) -> None:
-        """Work, at low priority."""
-        with contextlib.suppress(OSError):  # niceness is a courtesy: without it answers are a little later
-            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICENESS)
+        """Work, at low priority; within a share of a processor at the usual one.
+
+        On a busy machine a thread of low priority may be kept waiting while it holds Python's interpreter, and all
+        others of its process wait with it.
+        """
+        if self._rest == 0.0:
+            with contextlib.suppress(OSError):  # niceness is a courtesy: without it answers are a little later
+                os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICENESS)
         while not self._stop.is_set():
             self._service.beat("background")
             begin = time.thread_time()

@@ -124,8 +124,13 @@ class Bus:
         )
         return advanced.put
 
-    def subscribe(self, key: str, handler: Callable[[bytes], None]) -> None:
-        """Call `handler` with the payload of every publication under `key`, in a thread of the session's own."""
+    def subscribe(self, key: str, handler: Callable[[bytes], None], *, quick: bool = False) -> None:
+        """Call `handler` with the payload of every publication under `key`, in a thread of the session's own.
+
+        Args:
+            quick: it does no more than to put the payload somewhere. Then no thread of its own is started for it: each
+                more that wants Python's interpreter with every message costs all others time.
+        """
 
         def receive(sample: zenoh.Sample) -> None:
             try:
@@ -133,7 +138,8 @@ class Bus:
             except Exception:
                 log.exception("a message under %s could not be taken", key)
 
-        self._declared.append(self._open.declare_subscriber(key, receive))
+        received = zenoh.handlers.Callback(receive, indirect=not quick)
+        self._declared.append(self._open.declare_subscriber(key, received))
 
     def answer(self, key: str, handler: Callable[[Request], bytes], *, encoding: str | None = None) -> None:
         """Answer queries under `key`; what `handler` raises goes back as an error reply.

@@ -43,7 +43,7 @@ class PairFeed:
         self.lock = threading.Lock()
         self._learning, self._history, self._clock, self._beat = learning, history, clock, beat
         self._joints = learning.nominal.joints
-        self._waiting: queue.Queue[bytes | None] = queue.Queue(WAITING)
+        self._waiting: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
         # Set by any thread: something was not put into the queue. The rest is `step`'s own.
         self._missed = True
         self._behind, self._paused = False, False
@@ -68,18 +68,15 @@ class PairFeed:
 
     def offer(self, payload: bytes) -> None:
         """A published pair."""
-        try:
-            self._waiting.put_nowait(payload)
-        except queue.Full:
+        if self._waiting.qsize() < WAITING:
+            self._waiting.put(payload)
+        else:
             self._missed = True
 
     def wake(self) -> None:
         """The sampler has come (back): see what was missed."""
         self._missed = True
-        try:
-            self._waiting.put_nowait(None)
-        except queue.Full:
-            return  # there is enough to wake up for
+        self._waiting.put(None)
 
     def pause(self) -> None:
         """Leave pairs to history until `resume`."""

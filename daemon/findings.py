@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -27,6 +28,21 @@ SHARE = 10.0
 EVERY_S = 1.0
 
 
+class FindingTurns:
+    """Keeps what all who share the background's thread find within `SHARE` of its time. For that thread alone.
+
+    Attributes:
+        due_at: when the next of them may.
+    """
+
+    def __init__(self) -> None:
+        self.due_at = -math.inf
+
+    def took(self, begin: float, seconds: float) -> None:
+        """One of them has found something, from `begin` on."""
+        self.due_at = begin + SHARE * seconds
+
+
 class Findings:
     """Finds calibration and outlook anew when there is a new chain, or another model answers.
 
@@ -35,13 +51,22 @@ class Findings:
     What was found may be read by any thread.
     """
 
-    def __init__(self, learning: Learning, robot: RobotDescription, clock: Clock, robots: int = 1) -> None:
+    def __init__(
+        self,
+        learning: Learning,
+        robot: RobotDescription,
+        clock: Clock,
+        robots: int = 1,
+        turns: FindingTurns | None = None,
+    ) -> None:
         """Nothing is found yet.
 
         Args:
             robots: so many share the background's thread.
+            turns: theirs.
         """
         self._learning, self._robot, self._clock = learning, robot, clock
+        self._turns = turns or FindingTurns()
         self._parts = SHARE * robots
         self._found_of: tuple[ChainBelief | None, str] = None, ""
         self._due_at = clock.now()
@@ -73,7 +98,7 @@ class Findings:
         if present[0] is None:
             self._found_of, self._found = present, (None, None)  # what was found was of another tool
             return
-        if present == self._found_of or begin < self._due_at:
+        if present == self._found_of or begin < max(self._due_at, self._turns.due_at):
             return
         self._found_of, known = present, self._learning.known()
         if known is None:
@@ -84,8 +109,9 @@ class Findings:
         except (KBMapsError, np.linalg.LinAlgError) as error:
             log.warning("status has no calibration for now: %s", error)
             self._found = None, None
-        end = self._clock.now()
-        self._due_at = begin + max(self._parts * (end - begin), EVERY_S)
+        seconds = self._clock.now() - begin
+        self._turns.took(begin, seconds)
+        self._due_at = begin + max(self._parts * seconds, EVERY_S)
 
 
 def _found(robot: RobotDescription, known: Known) -> tuple[ChainCalibration, Outlook | None]:

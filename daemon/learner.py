@@ -20,7 +20,7 @@ from daemon.checkpoint import CheckpointError, write_checkpoint
 from daemon.config import Config
 from daemon.expected import ExpectedMarker
 from daemon.feed import PairFeed
-from daemon.findings import Findings
+from daemon.findings import Findings, FindingTurns
 from daemon.going_on import go_on
 from daemon.history import Page, read_page
 from daemon.keys import Keys
@@ -29,6 +29,7 @@ from daemon.learning.solver import LARGEST_NET, Solver
 from daemon.reload import reload
 from daemon.service import Service, with_health
 from daemon.status import LearnerStatus
+from daemon.thread_names import show_name
 from daemon.wire import OCTETS, CommandReply, CommandRequest, decode, encode
 from daemon.wiring import open_marker_topic
 from interfaces.errors import RequestError
@@ -38,6 +39,10 @@ log = logging.getLogger(__name__)
 
 HISTORY_LIMIT_S = 5.0
 IDLE_S = 0.2
+# Pairs may wait for so long to be judged together, for each of several robots in a process, and at most [s].
+TOGETHER_S, LONGEST_TOGETHER_S = 0.08, 1.0
+# Up to so many robots of a process tell their states and write their checkpoints as often as one alone.
+AS_OFTEN_AS_ONE = 10
 # What has to come round for the learner to be alive.
 LISTENING = "learning"
 LOOPS = (LISTENING, "background", "status")
@@ -58,13 +63,15 @@ class Learner:
         *,
         loop: str = LISTENING,
         robots: int = 1,
+        turns: FindingTurns | None = None,
     ) -> None:
         """A learner that goes on from its checkpoint; nothing is declared yet.
 
         Args:
             solver: for this robot alone.
             loop: what its loop of new pairs is called for the watchdog.
-            robots: so many share the background's thread with it, itself among them.
+            robots: so many share the process with it, itself among them.
+            turns: theirs to find calibration and outlook.
         """
         self._config, self._bus, self._clock = config, bus, clock
         self._service = Service.nobodys(clock) if service is None else service
@@ -73,11 +80,14 @@ class Learner:
         self._keys = Keys(config.robot.name)
         self._nominal = NominalModel.extended_by(config.simulation)
         self._learning, self._set_aside = go_on(
-            lambda: Learning(self._nominal, self._settings, solver), config.checkpoint_file, config.robot.name
+            lambda: Learning(self._nominal, self._settings, solver, together_s=together_s(robots)),
+            config.checkpoint_file,
+            config.robot.name,
         )
         self._feed = PairFeed(self._learning, self._history, clock, lambda: self._service.beat(loop))
-        self._findings = Findings(self._learning, config.robot, clock, robots)
+        self._findings = Findings(self._learning, config.robot, clock, robots, turns)
         self._answers = Answers(self._learning, config.robot, clock)
+        self._more_rarely = more_rarely(robots)
         self._sampler_alive = False
         self._started_at = clock.now()
         self._checkpointed_at: float | None = None
@@ -121,7 +131,7 @@ class Learner:
         self._service.beat("status")
         waited_s = self._clock.now() - (self._checkpointed_at or self._started_at)
         new = self._learning.counters.pairs != self._checkpointed_pairs
-        if new and waited_s >= self._settings.checkpoint_every_s:
+        if new and waited_s >= self._settings.checkpoint_every_s * self._more_rarely:
             self.checkpoint()
 
     def checkpoint(self) -> None:
@@ -205,7 +215,7 @@ class Learner:
         bus.answer(keys.model, answers.model, encoding=OCTETS)
         bus.answer(keys.status("learner"), lambda request: encode(self.status(), request.encoding))
         bus.answer(keys.command("learner"), self._command)
-        bus.subscribe(keys.pair, self._feed.offer)
+        bus.subscribe(keys.pair, self._feed.offer, quick=True)
         bus.watch(keys.alive("sampler"), self._sampler_changed)
         bus.token(keys.alive("learner"))
 
@@ -289,6 +299,7 @@ class Learner:
         return found.message("learner")
 
     def _guarded(self, loop: Callable[[], None]) -> None:
+        show_name()
         try:
             loop()
         except Exception as error:
@@ -298,6 +309,7 @@ class Learner:
         while not self._stop.is_set():
             self._service.beat(self._loop)
             self._feed.step(IDLE_S)
+            self._learning.judge_due(self._clock.now())
             with self._feed.lock:
                 self._changes.note(self._learning.change)
 
@@ -317,6 +329,16 @@ class Learner:
     def solve_soon(self) -> None:
         """Let the solver catch up: nothing else is left to do."""
         self._learning.solve_soon()
+
+
+def more_rarely(robots: int) -> float:
+    """How many times more rarely states are told and checkpoints written, where so many robots share a process."""
+    return max(1.0, robots / AS_OFTEN_AS_ONE)
+
+
+def together_s(robots: int) -> float:
+    """How long pairs may wait to be judged together [s], where so many robots share a process."""
+    return 0.0 if robots == 1 else min(TOGETHER_S * robots, LONGEST_TOGETHER_S)
 
 
 def status_line(status: LearnerStatus) -> str:

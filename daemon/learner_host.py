@@ -19,14 +19,16 @@ from daemon.access import Names, Subjects, access_control
 from daemon.background import Background
 from daemon.bus import Bus
 from daemon.config import Config
+from daemon.findings import FindingTurns
 from daemon.identity import SECURE
 from daemon.keys import Keys
-from daemon.learner import LISTENING, LOOPS, Learner, status_line
+from daemon.learner import LISTENING, LOOPS, Learner, more_rarely, status_line
 from daemon.notify import Notifier
 from daemon.service import Service
 from daemon.signals import Wishes
 from daemon.solver_process import SolverProcess
 from daemon.solver_seats import SharedSolver
+from daemon.thread_names import show_name
 from daemon.wire import encode
 from interfaces.errors import BodyschemaError, ConfigError
 from interfaces.protocols import Clock
@@ -35,8 +37,6 @@ log = logging.getLogger(__name__)
 
 TICK_S = 0.05
 STATUS_EVERY_S = 1.0
-# A status takes milliseconds: of more robots than these each tells less often how it is, unless it is asked.
-TOLD_EVERY_SECOND = 10
 # Of one processor: what is not urgent leaves the rest to new pairs and queries, which share the interpreter with it.
 SHARED_WORK = 0.3
 # Python hands the interpreter from thread to thread this often at least; its own 5 ms would be a query's delay.
@@ -116,9 +116,9 @@ def _learners(
 ) -> list[Learner]:
     if len(configs) == 1:
         return [Learner(configs[0], process, bus, clock, service)]
-    shared = SharedSolver(process)
+    shared, turns = SharedSolver(process), FindingTurns()
     return [
-        Learner(config, shared.seat(), bus, clock, service, loop=_loop(config), robots=len(configs))
+        Learner(config, shared.seat(), bus, clock, service, loop=_loop(config), robots=len(configs), turns=turns)
         for config in configs
     ]
 
@@ -131,6 +131,7 @@ def _working(learners: Sequence[Learner], service: Service, clock: Clock) -> Ite
     background = Background(learners, service, clock, stop, share=share)
 
     def guarded() -> None:
+        show_name()
         try:
             background.run()
         except Exception as error:
@@ -153,7 +154,7 @@ def _attend(
     failed: Sequence[Exception],
 ) -> None:
     """Statuses, checkpoints and wishes, until the end is wished for."""
-    every_s = STATUS_EVERY_S * max(1.0, len(learners) / TOLD_EVERY_SECOND)
+    every_s = STATUS_EVERY_S * more_rarely(len(learners))  # a status takes milliseconds
     begin = time.monotonic()
     due = [begin + every_s * k / len(learners) for k in range(len(learners))]
     while not wishes.ending:

@@ -56,15 +56,28 @@ class Contest:
         """How many pairs there were so far."""
         return self._pairs
 
-    def add(self, squares: Mapping[str, float]) -> None:
-        """One more pair: the squared distance [m²] of each model that predicted it. One that is not finite is none."""
-        for name in squares:
+    def add(self, squares: Mapping[str, ArrayLike]) -> None:
+        """One more pair: the squared distance [m²] of each model that predicted it. One that is not finite is none.
+
+        Or more pairs, in their order: the squared distances (n,) of each model.
+
+        Raises:
+            ShapeError: the models have squared distances of different numbers of pairs; nothing has changed.
+        """
+        added = {name: np.atleast_1d(np.asarray(values, dtype=np.float64)) for name, values in squares.items()}
+        lengths = {values.shape for values in added.values()} or {(1,)}
+        count = max(lengths)[0]
+        if lengths != {(count,)}:
+            raise ShapeError("squares", "(n,) for each model", max(lengths))
+        for name in added:
             self._errors.setdefault(name, np.full(self._length, math.nan))
-        self._pairs += 1
-        self._length = min(self._length + 1, LONGEST, int(max(SHORTEST, SHARE * self._pairs)))
+        self._pairs += count
+        self._length = min(self._length + count, LONGEST, int(max(SHORTEST, SHARE * self._pairs)))
+        none = np.full(count, math.nan)
         for name, values in self._errors.items():
-            square = squares.get(name, math.nan)
-            self._errors[name] = np.append(values, square if math.isfinite(square) else math.nan)[-self._length :]
+            more = added.get(name, none)
+            kept = np.concatenate([values, np.where(np.isfinite(more), more, math.nan)])
+            self._errors[name] = kept[-self._length :]
 
     def add_late(self, name: str, squares: ArrayLike, fresher: Sequence[str] = ()) -> None:
         """The squared distances (n,) [m²] of a model found only now for the last pairs, none of which it has learnt.

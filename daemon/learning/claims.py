@@ -160,40 +160,37 @@ class Claims:
 
     def predicted(
         self,
-        q: FloatArray,
+        where: Where,
         x: FloatArray,
-        errors: Mapping[str, FloatArray],
-        variance: FloatArray,
+        predictions: Mapping[str, FloatArray],
+        variances: FloatArray,
         delayed: FloatArray | None = None,
-        where: Where | None = None,
     ) -> None:
-        """One pair that was predicted before it is learnt.
+        """Pairs, in their order, each of which was predicted before it was learnt.
 
         Args:
-            q, x: where (d,) [rad], and what was measured (3,) [m].
-            errors: measured minus predicted (3,) [m] by model.
-            variance: the measurement's (3,) [m²].
-            delayed: the error (3,) [m] of the instant learner as old as the solutions. On a path a few pairs are far,
-                so the models are compared at the same age.
-            where: q (1, d), if other claims were asked there.
+            where: their q (n, d) [rad].
+            x: what was measured (n, 3) [m].
+            predictions: of it (n, 3) [m] by model.
+            variances: the measurements' (n, 3) [m²].
+            delayed: what the instant learner as old as the solutions predicts (n, 3) [m]. On a path a few pairs are
+                far, so the models are compared at the same age.
         """
-        where = where or Where(q[None])
-        for name, error in errors.items():
-            predicted = (x - error)[None]
-            claimed = self.of(name, lambda _, predicted=predicted: predicted).variance_there(where)[0] + variance
-            self.errors[name].add(error, variance, float(np.square(error).sum() / claimed.sum()))
-        compared = dict(errors) if delayed is None else {**errors, INSTANT: delayed}
-        self._contest.add({name: float(np.square(error).sum()) for name, error in compared.items()})
+        for name, predicted in predictions.items():
+            errors = x - predicted
+            claimed = self.of(name, lambda _, predicted=predicted: predicted).variance_there(where) + variances
+            self.errors[name].add(errors, variances, np.square(errors).sum(axis=1) / claimed.sum(axis=1))
+        compared = dict(predictions) if delayed is None else {**predictions, INSTANT: delayed}
+        self._contest.add({name: np.square(x - each).sum(axis=1) for name, each in compared.items()})
 
     def learnt(self, q: FloatArray) -> None:
-        """A pair has been learnt at q (d,) [rad]."""
+        """Pairs have been learnt at q (n, d) [rad]."""
         self._support.add(q)
 
     def replayed(self, errors: FloatArray) -> None:
         """Errors (n, 3) [m] of the instant learner at pairs that it has learnt before."""
         self._residuals = self._residuals or ErrorMemory(self._expected_m)
-        for error in errors:
-            self._residuals.add(error, self.errors[PRIOR].noise_variance)
+        self._residuals.add(errors, self.errors[PRIOR].noise_variance)
 
     def solution_asked(self) -> None:
         """The solver works on all pairs up to here."""
@@ -242,8 +239,7 @@ class Claims:
         self._contest.add_late(name, np.square(errors).sum(axis=1), fresher=(INSTANT,))
         noise = self.errors[PRIOR].noise_variance
         claimed = self.of(name, predict).variance(q) + noise
-        for error, variance in zip(errors, claimed, strict=True):
-            self.errors[name].add(error, noise, float(np.square(error).sum() / variance.sum()))
+        self.errors[name].add(errors, noise, np.square(errors).sum(axis=1) / claimed.sum(axis=1))
 
     def forget_contest(self) -> None:
         """Some pairs were no pairs of this tool after all."""
@@ -254,8 +250,7 @@ class Claims:
         noise = self.errors[PRIOR].noise_variance
         self.errors[PRIOR] = ErrorMemory(self._expected_m)
         self._contest.forget(PRIOR)
-        for error in errors:
-            self.errors[PRIOR].add(error, noise)
+        self.errors[PRIOR].add(errors, noise)
 
     def of(self, name: str, predict: Predict | None = None) -> Claim:
         """What is claimed for one model.
@@ -307,8 +302,7 @@ class Claims:
 
     def restore(self, state: ClaimsState, arrays: Mapping[str, FloatArray]) -> None:
         """Go on from a state and its `arrays`."""
-        for row in arrays[_SUPPORT]:
-            self._support.add(row)
+        self._support.add(arrays[_SUPPORT])
         self.errors, self._residuals = dict(state.errors), state.residuals
         squares = {name.removeprefix(_CONTEST): v for name, v in arrays.items() if name.startswith(_CONTEST)}
         self._contest = Contest(squares, state.judged)

@@ -37,7 +37,7 @@ class Doubts:
         """Whether to doubt the pair at q (d,), x (3,) that lies `distance_m` from its prediction."""
         doubted = self._gate.doubts(distance_m, limit_m)
         if doubted:
-            self._memory.append(q, x)
+            self._memory.append(q[None], x[None])
         else:
             self._memory.clear()
         return doubted

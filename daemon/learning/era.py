@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from functools import partial
+import math
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from daemon.config import LearnerConfig
 from interfaces.records import FloatArray, Pair
@@ -14,7 +15,7 @@ from kbmaps import ChainBelief, KBMap, follow_a_path
 from .arm import KnownArm
 from .claims import Claims
 from .doubts import Doubts
-from .gate import DOUBT, limit_m, sound
+from .gate import DOUBT, limits_m, sound
 from .learnt import LearntModel
 from .members import EXACT, INSTANT, PRIOR, RESIDUAL, RIGID, Members
 from .memory import PairMemory, Permutations
@@ -38,6 +39,9 @@ JUDGED_ANEW = 0.25
 LOOKED_BACK_IN_REPLAY = 4
 # Of so many pairs, the chain is believed before it has predicted any. Of fewer, one that is wrong would not show.
 FEWEST_TO_BELIEVE = 3
+NO_TURN = (math.nan,) * 4
+
+BoolArray = NDArray[np.bool_]
 
 
 class Era:
@@ -75,6 +79,8 @@ class Era:
         self.answering = self._answering_map = PRIOR
         self._claims, self._replays_per_pair = claims, settings.replays_per_pair
         claims.expect(arm.chain)
+        self._met: list[tuple[Pair, FloatArray]] = []
+        self._limit_m = math.inf
         self._order = Permutations(settings.seed)
         self._replays_due = 0.0
         self._solver_prior: KBMap | None = None
@@ -110,40 +116,90 @@ class Era:
         """Whether there are replay steps to do."""
         return self._replays_due >= 1.0 and len(self.memory) > 0
 
-    def limit_m(self, pair: Pair, where: Where | None = None) -> float:
-        """How far from its prediction the pair may lie before it is doubted [m].
+    @property
+    def met(self) -> Sequence[Pair]:
+        """Pairs that the instant learner has learnt and that are not judged yet."""
+        return [pair for pair, _ in self._met]
 
-        Args:
-            where: its q (1, d), if other claims are asked there.
-        """
-        variance, where = np.diag(pair.cov), where or Where(pair.q[None])
-        claimed = float(
-            np.sqrt(
-                self._claims.of(self.answering, partial(self.members.predict, self.answering))
-                .variance_there(where)
-                .sum()
-            )
-        )
-        recent = max(self._claims.errors[self.answering].rms_m, float(np.sqrt(variance.sum())))
-        return limit_m(recent, claimed)
+    def limit_m(self, pair: Pair) -> float:
+        """How far from its prediction the pair may lie before it is doubted [m]."""
+        where = Where(pair.q[None])
+        predicted = self.members.predict(self.answering, where.q)
+        return float(self._limits_m(where, predicted, np.diag(pair.cov)[None])[0])
 
     def learn(self, pair: Pair) -> bool:
-        """Learn one pair at once; False if it is doubted."""
-        where = Where(pair.q[None])
-        errors, limit = self.members.errors(pair.q, pair.x), self.limit_m(pair, where)
-        if self.doubts.doubt(pair.q, pair.x, float(np.linalg.norm(errors[self.answering])), limit):
-            self.members.learn(pair.q, errors[INSTANT], limit / DOUBT)  # a step no longer than any other
-            self.watch.add(pair, kept=False)
-            return False
-        delayed = None if self.members.delayed is None else pair.x - self.members.delayed.predict(pair.q)
-        self._claims.predicted(pair.q, pair.x, errors, np.diag(pair.cov), delayed, where)
-        self._choose()
-        self.members.learn(pair.q, errors[INSTANT], np.inf)
-        self._learn_turn(pair.q, pair.R, pair.cov_R)
-        self._keep(pair.q, pair.x, pair.R)
-        self._replays_due += self._replays_per_pair
-        self.watch.add(pair, kept=True)
-        return True
+        """Learn one pair, and judge it; False if it is doubted."""
+        predicted = self.members.predict(INSTANT, pair.q)
+        doubted = self._judged([pair], predicted[None])[0]
+        # Of a doubted pair, a step no longer than any other.
+        self.members.learn(pair.q, pair.x - predicted, self._limit_m / DOUBT if doubted else np.inf)
+        return not doubted
+
+    def meet(self, pair: Pair) -> None:
+        """Let the instant learner learn one pair, and no other model yet: `judge` will.
+
+        Whether it is to be doubted is not known yet. Where it seems so by the pairs before, its step is no longer than
+        any other.
+        """
+        predicted = self.members.predict(INSTANT, pair.q)
+        if not math.isfinite(self._limit_m):
+            self._limit_m = self.limit_m(pair)
+        far = float(np.linalg.norm(pair.x - self.map.predict(pair.q))) > self._limit_m
+        self.members.learn(pair.q, pair.x - predicted, self._limit_m / DOUBT if far else np.inf)
+        self._met.append((pair, predicted))
+
+    def judge(self) -> tuple[Sequence[Pair], BoolArray]:
+        """Learn the pairs met, as `learn` does, and which of them (n,) are doubted.
+
+        Not those after a doubted pair with which there may have been a change: these are still `met`.
+        """
+        pairs = self.met
+        doubted = self._judged(pairs, np.array([predicted for _, predicted in self._met]))
+        self._met = self._met[len(doubted) :]
+        return pairs[: len(doubted)], doubted
+
+    def _judged(self, pairs: Sequence[Pair], instant: FloatArray) -> BoolArray:
+        """Learn pairs but for the instant learner, which predicted `instant` (n, 3) [m]; which (k,) are doubted.
+
+        It ends, k < n, with a doubted pair with which there may have been a change.
+        """
+        q, x = np.array([pair.q for pair in pairs]), np.array([pair.x for pair in pairs])
+        variances = np.array([pair.cov.diagonal() for pair in pairs])
+        where, predictions = Where(q), self.members.predictions(q, instant)
+        limits = self._limits_m(where, predictions[self.answering], variances)
+        doubted = self._doubted(q, x, np.linalg.norm(x - predictions[self.answering], axis=1), limits)
+        self._limit_m = float(limits[: len(doubted)].max())
+        rows = np.flatnonzero(~doubted)
+        if len(rows):
+            delayed = None if self.members.delayed is None else self.members.delayed.predict(q[rows])
+            shown = {name: predicted[rows] for name, predicted in predictions.items()}
+            self._claims.predicted(where.at(rows), x[rows], shown, variances[rows], delayed)
+            self._choose()
+            self._keep_judged([pairs[row] for row in rows.tolist()], q[rows], x[rows])
+        self.watch.add(*pairs[: len(doubted)], kept=~doubted)
+        return doubted
+
+    def _limits_m(self, where: Where, predicted: FloatArray, variances: FloatArray) -> FloatArray:
+        """How far (n,) [m] from what was predicted (n, 3) pairs with these variances (n, 3) [m²] may lie."""
+        claimed = self._claims.of(self.answering, lambda _: predicted).variance_there(where).sum(axis=1)
+        recent = np.maximum(self._claims.errors[self.answering].rms_m, np.sqrt(variances.sum(axis=1)))
+        return limits_m(recent, np.sqrt(claimed))
+
+    def _doubted(self, q: FloatArray, x: FloatArray, distances_m: FloatArray, limits_m: FloatArray) -> BoolArray:
+        doubted: list[bool] = []
+        for pair in zip(q, x, distances_m.tolist(), limits_m.tolist(), strict=True):
+            doubted.append(self.doubts.doubt(*pair))
+            if doubted[-1] and self.doubts.perhaps_changed:
+                break
+        return np.array(doubted)
+
+    def _keep_judged(self, pairs: Sequence[Pair], q: FloatArray, x: FloatArray) -> None:
+        turned = [pair for pair in pairs if pair.R is not None]
+        turns = np.array([NO_TURN if pair.R is None else pair.R for pair in pairs]) if turned else None
+        for pair in turned:
+            self._learn_turn(pair.q, pair.R, pair.cov_R)
+        self._keep(q, x, turns)
+        self._replays_due += self._replays_per_pair * len(pairs)
 
     def learn_waiting(self, q: FloatArray, x: FloatArray, turns: FloatArray, belief: ChainBelief) -> None:
         """Learn pairs, q (n, d) and x (n, 3), that waited for the prior: each once, in their order.
@@ -153,20 +209,20 @@ class Era:
             belief: what they let believe of the chain.
         """
         self._claims.fitted(belief)
-        variance = np.full(3, belief.noise**2)
+        variances = np.full((1, 3), belief.noise**2)
         for row_q, row_x, turn in zip(q, x, turns, strict=True):
-            errors = self.members.errors(row_q, row_x)
-            self._claims.predicted(row_q, row_x, errors, variance)
-            self.members.learn(row_q, errors[INSTANT], np.inf)
+            predicted = self.members.predict(INSTANT, row_q)
+            predictions = self.members.predictions(row_q[None], predicted[None])
+            self._claims.predicted(Where(row_q[None]), row_x[None], predictions, variances)
+            self.members.learn(row_q, row_x - predicted, np.inf)
             self._learn_turn(row_q, turn)
-            self._keep(row_q, row_x, turn)
+            self._keep(row_q[None], row_x[None], turn[None])
         self._choose()
         self._replays_due += self._replays_per_pair * len(q)
 
     def begin_with(self, q: FloatArray, x: FloatArray) -> None:
         """Learn pairs, q (n, d) and x (n, 3), that were doubted until they began this era."""
-        for row_q, row_x in zip(q, x, strict=True):
-            self._keep(row_q, row_x)
+        self._keep(q, x)
         self.members.replay(q, x)
 
     def replay(self) -> int:
@@ -191,8 +247,7 @@ class Era:
         if belongs.all():
             return 0
         self.memory.clear()
-        for row_q, row_x, turn in zip(q[belongs], x[belongs], turns[belongs], strict=True):
-            self.memory.append(row_q, row_x, turn)
+        self.memory.append(q[belongs], x[belongs], turns[belongs])
         self._order.restart()
         self._claims.forget_contest()
         self.task_number = next(self._task_numbers)
@@ -286,8 +341,8 @@ class Era:
         if turn is not None and np.isfinite(turn).all():
             self.orientations.learn(q, turn, cov, self._claims.support)
 
-    def _keep(self, q: FloatArray, x: FloatArray, turn: FloatArray | None = None) -> None:
-        self.memory.append(q, x, turn)
+    def _keep(self, q: FloatArray, x: FloatArray, turns: FloatArray | None = None) -> None:
+        self.memory.append(q, x, turns)
         self._claims.learnt(q)
 
     def _choose(self) -> None:

@@ -58,11 +58,11 @@ def explained(before_m: FloatArray, after_m: FloatArray, expected_m: float) -> b
     return after <= min(TOGETHER * expected_m, LEFT_OVER * before)
 
 
-def limit_m(inside_m: float, open_m: float) -> float:
-    """How far from its prediction a pair may lie [m].
+def limits_m(inside_m: FloatArray, open_m: FloatArray) -> FloatArray:
+    """How far from their predictions pairs may lie (n,) [m].
 
     Args:
-        inside_m: RMS distance of recent pairs from their predictions.
-        open_m: RMS distance that the data so far leave open where the pair lies.
+        inside_m: RMS distance of recent pairs from their predictions (n,).
+        open_m: RMS distance that the data so far leave open where the pairs lie (n,).
     """
-    return DOUBT * max(math.hypot(inside_m, open_m), SMALLEST_M)
+    return DOUBT * np.maximum(np.hypot(inside_m, open_m), SMALLEST_M)

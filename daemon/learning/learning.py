@@ -7,22 +7,18 @@ Whoever answers queries takes `snapshot`, which needs no lock.
 from __future__ import annotations
 
 import copy
-import itertools
 import threading
 
 import numpy as np
 
 from daemon.config import LearnerConfig
 from daemon.status import CurvePoint, OrientationStatus
-from interfaces.errors import RequestError
 from interfaces.records import Pair
 from kbmaps import ChainBelief
 
 from .change import ChangeRecord
-from .curve import Curve
-from .era import LOOKED_BACK, Era
-from .eras import Eras
-from .incoming import check_pair
+from .course import Course
+from .era import LOOKED_BACK
 from .members import PRIOR, SOLVED
 from .nominal import NominalModel, chain_tolerances
 from .outlook import Known
@@ -44,15 +40,19 @@ class Learning:
     What is learnt is in its `Eras`. Here it is counted, kept apart for the two threads, and published.
     """
 
-    def __init__(self, nominal: NominalModel, settings: LearnerConfig, solver: Solver) -> None:
+    def __init__(
+        self, nominal: NominalModel, settings: LearnerConfig, solver: Solver, *, together_s: float = 0.0
+    ) -> None:
+        """Before any pair.
+
+        Args:
+            together_s: pairs wait for so long at most to be judged together [s], which costs a fraction of judging
+                each. The instant learner waits for nothing.
+        """
         self._nominal, self._settings = nominal, settings
         self._solving = Solving(solver, settings.solve_every)
-        self._task_numbers = itertools.count(1)
         self._lock = threading.Lock()
-        self._counters, self._curve = Counters(), Curve()
-        self._learnt_at: float | None = None
-        self._eras = self._at_nominal()
-        self._before: LearningState | None = None
+        self._course = Course(nominal, settings, together_s)
         self._publish()
 
     @property
@@ -63,7 +63,7 @@ class Learning:
     @property
     def belief(self) -> ChainBelief | None:
         """What the pairs with the present tool let believe of the chain; None before the first solution."""
-        return self._eras.claims.belief
+        return self._course.eras.claims.belief
 
     @property
     def nominal(self) -> NominalModel:
@@ -73,7 +73,7 @@ class Learning:
     @property
     def aligning(self) -> bool:
         """Whether the frame is not known yet."""
-        return self._eras.present is None
+        return self._course.eras.present is None
 
     @property
     def at_rest(self) -> bool:
@@ -82,8 +82,8 @@ class Learning:
         For the thread that calls `work`.
         """
         with self._lock:
-            era, count = self._eras.present, self._eras.memory.count
-            if self._eras.fitting.due(count) or self._eras.looking:
+            era, count = self._course.eras.present, self._course.eras.memory.count
+            if self._course.eras.fitting.due(count) or self._course.eras.looking or not self._course.settled:
                 return False
             return era is None or (not era.owes_replays and self._solving.has_solved(era.task_number, count))
 
@@ -91,29 +91,29 @@ class Learning:
     def counters(self) -> Counters:
         """A copy of all that is counted."""
         with self._lock:
-            return copy.copy(self._counters)
+            return copy.copy(self._course.counters)
 
     @property
     def curve(self) -> list[CurvePoint]:
         """Mean prequential error [m] of the answering model over the pairs."""
         with self._lock:
-            return self._curve.points
+            return self._course.curve.points
 
     @property
     def change(self) -> ChangeRecord | None:
         """The last change that was told or found; None: there was none, or it was rolled back."""
         with self._lock:
-            return self._eras.change
+            return self._course.eras.change
 
     @property
     def can_roll_back(self) -> bool:
         """Whether the state before the last change is kept."""
-        return self._before is not None
+        return self._course.can_roll_back
 
     def prequential_m(self) -> dict[str, float]:
         """Recent mean distance between prediction and measurement, before learning [m], by model."""
         with self._lock:
-            means = {name: memory.mean_m for name, memory in self._eras.claims.errors.items()}
+            means = {name: memory.mean_m for name, memory in self._course.eras.claims.errors.items()}
         return {name: mean for name, mean in means.items() if mean is not None}
 
     def claimed_error_m(self) -> float | None:
@@ -122,8 +122,8 @@ class Learning:
         The region: within a few degrees (`REGION_RAD` per joint) of the kept pairs.
         """
         with self._lock:
-            era, snapshot = self._eras.present, self._snapshot
-            answering = None if era is None else self._eras.claims.errors.get(era.answering)
+            era, snapshot = self._course.eras.present, self._snapshot
+            answering = None if era is None else self._course.eras.claims.errors.get(era.answering)
             if era is None or answering is None or answering.weight < FEWEST_TO_CLAIM:
                 return None
             rng = np.random.default_rng(0)
@@ -133,7 +133,7 @@ class Learning:
     def orientation_status(self) -> OrientationStatus | None:
         """How well it is known how the marker is turned; None where no pair with the present tool said it."""
         with self._lock:
-            era, model = self._eras.present, self._snapshot.orientation
+            era, model = self._course.eras.present, self._snapshot.orientation
             if era is None or model is None:
                 return None
             pairs, errors = era.orientations.pairs, era.orientations.prequential_rad()
@@ -149,7 +149,7 @@ class Learning:
         For the thread that calls `work`.
         """
         with self._lock:
-            era, claims = self._eras.present, self._eras.claims
+            era, claims = self._course.eras.present, self._course.eras.claims
             if era is None or claims.belief is None or not self._solving.fed:
                 return None
             seen, _ = era.memory.some(era.memory.count, LOOKED_BACK)
@@ -161,7 +161,7 @@ class Learning:
                 tolerances=chain_tolerances(self._settings),
                 claim=claims.of(era.answering, era.model.predict),
                 solved=era.answering in SOLVED,
-                pairs=self._counters.since_change,
+                pairs=self._course.counters.since_change,
                 seen=seen,
                 q=q,
                 x=x,
@@ -174,43 +174,35 @@ class Learning:
             RequestError: it is not a pair of this robot and store, or not newer than the last one; nothing changed.
         """
         with self._lock:
-            check_pair(pair, self._counters, self._nominal.joints)
-            self._counters.store, self._counters.last_seq = pair.store, pair.seq
-            self._counters.pairs += 1
-            self._counters.since_change += 1
-            self._learnt_at = now
-            if self._eras.present is None:
-                self._eras.waiting.append(pair.q, pair.x, pair.R)
-            else:
-                self._learn_online(self._eras.present, pair)
+            self._course.learn(pair, now)
             self._publish()
+
+    def judge_due(self, now: float) -> None:
+        """Judge the pairs that have waited for long enough."""
+        with self._lock:
+            if self._course.judge_due(now):
+                self._course.judge()
+                self._publish()
 
     def refuse(self) -> None:
         """Count a pair that could not be taken."""
         with self._lock:
-            self._counters.refused += 1
+            self._course.counters.refused += 1
 
     def recovered(self, pairs: int) -> None:
         """Count pairs that had to be fetched from history."""
         with self._lock:
-            self._counters.gaps_recovered += pairs
+            self._course.counters.gaps_recovered += pairs
 
     def missed(self, pairs: int) -> None:
         """Count pairs that nobody keeps any more."""
         with self._lock:
-            self._counters.missed += pairs
+            self._course.counters.missed += pairs
 
     def tool_changed(self) -> None:
         """From now on another tool: pairs so far no longer count, what they taught is where learning starts again."""
         with self._lock:
-            if self._eras.present is None:
-                self._eras = self._at_nominal()
-            else:
-                self._before = self._state_before(self._eras.memory.count)
-                self._eras.change_tool(self._eras.present)
-            self._eras.change = ChangeRecord.told(self._counters.last_seq)
-            self._counters.changes += 1
-            self._counters.since_change = 0
+            self._course.tool_changed()
             self._publish()
 
     def rollback(self) -> None:
@@ -220,29 +212,21 @@ class Learning:
             RequestError: there was no change, or learning began anew since; nothing is changed.
         """
         with self._lock:
-            if self._before is None:
-                raise RequestError("there was no change since learning began, so there is no older model to go back to")
-            since_change = self._before.header.counters.since_change
-            eras = Eras.restored(self._before, self._nominal, self._settings, self._task_numbers)
-            self._eras, self._before, self._counters.since_change = eras, self._before.before, since_change
+            self._course.rollback()
             self._publish()
 
     def reset_to_prior(self, *, forget_store: bool = False) -> None:
         """Forget what was learnt. With `forget_store`, pairs may come from another store, from its first one on."""
         with self._lock:
-            if forget_store:
-                self._counters = Counters(refused=self._counters.refused)
-                self._curve, self._learnt_at = Curve(), None
-            self._counters.since_change = 0
-            self._eras, self._before = self._at_nominal(), None
+            self._course.reset_to_prior(forget_store=forget_store)
             self._publish()
 
     def restart_solver(self) -> None:
         """The solver has lost its pairs: give them to it again. For the thread that calls `work`."""
         self._solving.restart()
         with self._lock:
-            if self._eras.present is not None:
-                self._eras.present.solve_from_what_is_known()
+            if self._course.eras.present is not None:
+                self._course.eras.present.solve_from_what_is_known()
 
     def solve_soon(self) -> None:
         """Let the solver catch up although fewer than `solve_every` pairs are new. For that thread too."""
@@ -255,7 +239,7 @@ class Learning:
     def state(self) -> LearningState:
         """Everything needed to go on from here."""
         with self._lock:
-            return self._eras.state(self._counters, self._curve).with_before(self._before)
+            return self._course.state()
 
     def restore(self, state: LearningState) -> None:
         """Go on from a state; the solver gets the kept pairs again in the background.
@@ -263,64 +247,34 @@ class Learning:
         Raises:
             StateError: it belongs to another nominal model, or to other tolerances.
         """
-        eras, header = Eras.restored(state, self._nominal, self._settings, self._task_numbers), state.header
         with self._lock:
-            self._eras, self._counters, self._before = eras, header.counters, state.before
-            self._curve = Curve(header.curve, header.curve_stride)
+            self._course.restore(state)
             self._publish()
-
-    def _at_nominal(self) -> Eras:
-        return Eras.at_nominal(self._nominal, self._settings, self._task_numbers)
-
-    def _learn_online(self, era: Era, pair: Pair) -> None:
-        learnt = era.learn(pair)
-        if learnt:
-            self._curve.add(self._counters.pairs, self._eras.claims.errors[era.answering].mean_m or 0.0)
-        else:
-            self._counters.doubted += 1
-        if self._followed(era, pair, learnt=learnt):
-            self._counters.changes += 1
-            self._counters.since_change = self._eras.memory.count
-
-    def _followed(self, era: Era, pair: Pair, *, learnt: bool) -> bool:
-        """Whether the pairs up to this one show a change, and another era has begun with it."""
-        noticed = self._eras.noticed(era, pair)
-        if noticed is None and (learnt or not era.doubts.perhaps_changed):
-            return False
-        since = 0 if noticed is None else sum(noticed.kept[noticed.first :])
-        before = self._state_before(era.memory.count - since)
-        followed = noticed is not None and self._eras.adapt(era, noticed)
-        if not (followed or (not learnt and self._eras.follow_change(era, pair))):
-            return False
-        self._before = before
-        return True
-
-    def _state_before(self, first: int) -> LearningState:
-        """The state without the present era's pairs from number `first` on."""
-        return self._eras.state_before(first, self._counters, self._curve)
 
     def _look_again(self) -> bool:
         """Name what changed, by more pairs."""
         with self._lock:
-            if not self._eras.looking:
+            if not self._course.eras.looking:
                 return False
-            if self._eras.look_again():
-                self._counters.since_change = self._eras.memory.count
+            self._course.judge()
+            if self._course.eras.look_again():
+                self._course.counters.since_change = self._course.eras.memory.count
                 self._publish()
         return True
 
     def _fit(self) -> bool:
         """Fit what is not known, or a changed tool, when it is due."""
         with self._lock:
-            memory = self._eras.memory
-            if not self._eras.fitting.due(memory.count):
+            memory = self._course.eras.memory
+            if not self._course.eras.fitting.due(memory.count):
                 return False
-            count, fitting = memory.count, copy.copy(self._eras.fitting)
+            count, fitting = memory.count, copy.copy(self._course.eras.fitting)
             q, x = memory.all()
         fit = fitting.fit(q, x)
         with self._lock:
-            if memory is self._eras.memory:  # else another era has begun
-                self._counters.doubted += self._eras.fitted(fit, count)
+            self._course.judge()
+            if memory is self._course.eras.memory:  # else another era has begun
+                self._course.counters.doubted += self._course.eras.fitted(fit, count)
                 self._publish()
         return True
 
@@ -328,35 +282,37 @@ class Learning:
         """Give the solver its pairs, ask it from time to time, take what it found."""
         solving = self._solving
         with self._lock:
-            if self._eras.present is None:
+            if self._course.eras.present is None:
                 return False
-            task = self._eras.present.task
+            task = self._course.eras.present.task
         if solving.busy:
             return self._take_solution()
         if solving.begin(task):
             return True
         with self._lock:
-            era = self._eras.present
+            era = self._course.eras.present
             if era is None or era.task_number != task.number:
                 return True
+            asking = solving.due and solving.fed == era.memory.count
+            if asking:
+                self._course.judge()  # the solver shall know whatever the instant learner knows
+                if self._course.eras.present is not era:
+                    return True
+                era.ask()
             q, x, fed = era.memory.since(solving.fed, FEED_PAIRS)
             turns = era.memory.turns_since(solving.fed, FEED_PAIRS)
-            if not len(q) and solving.due:
-                era.ask()
         if len(q):
             solving.feed(q, x, fed, turns if np.isfinite(turns).any() else None)
-        elif solving.due:
+        if asking:
             solving.ask()
-        else:
-            return False
-        return True
+        return asking or len(q) > 0
 
     def _take_solution(self) -> bool:
         solved = self._solving.poll()
         if solved is None:
             return False
         with self._lock:
-            era = self._eras.present
+            era = self._course.eras.present
             if era is None or solved.task != era.task_number:
                 return True
             if solved.model is not None:
@@ -368,14 +324,14 @@ class Learning:
 
     def _replay(self) -> bool:
         with self._lock:
-            replayed = 0 if self._eras.present is None else self._eras.present.replay()
+            replayed = 0 if self._course.eras.present is None else self._course.eras.present.replay()
             if replayed:
-                self._counters.replayed += replayed
+                self._course.counters.replayed += replayed
                 self._publish()
         return replayed > 0
 
     def _publish(self) -> None:
-        era, claims = self._eras.present, self._eras.claims
+        era, claims = self._course.eras.present, self._course.eras.claims
         answering = PRIOR if era is None else era.answering
         self._snapshot = Snapshot(
             answering=answering,
@@ -383,14 +339,14 @@ class Learning:
             map=None if era is None else era.map,
             claim=claims.of(answering, None if era is None else era.model.predict),
             support=claims.support,
-            pairs=self._counters.pairs,
-            learnt_at=self._learnt_at,
+            pairs=self._course.counters.pairs,
+            learnt_at=self._course.learnt_at,
             waiting_for=self._waiting_for() if era is None else "",
             orientation=None if era is None else era.orientation,
         )
 
     def _waiting_for(self) -> str:
-        needed, have = self._nominal.pairs_to_align, self._eras.waiting.count
+        needed, have = self._nominal.pairs_to_align, self._course.eras.waiting.count
         return (
             f"there is no model yet: robot.toml says {self._nominal.unknown}, so positions have no frame until about "
             f"{needed} pairs have come ({have} so far). Start the sampler with `bodyschema sampler` and guide the arm"

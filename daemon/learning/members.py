@@ -78,9 +78,9 @@ class Members:
         predicted = self._instant.predict(q)
         return predicted if np.isfinite(predicted).all() else self._begun_again().predict(q)
 
-    def errors(self, q: FloatArray, x: FloatArray) -> dict[str, FloatArray]:
-        """Measured minus predicted position (3,) [m] by model, for one pair."""
-        return {name: x - self.predict(name, q) for name in self.names}
+    def predictions(self, q: FloatArray, instant: FloatArray) -> dict[str, FloatArray]:
+        """Positions (n, 3) [m] at q (n, d) [rad] by model; those of the instant learner, another one then, as given."""
+        return {name: instant if name == INSTANT else self.predict(name, q) for name in self.names}
 
     def learn(self, q: FloatArray, error: FloatArray, limit_m: float) -> None:
         """One step of the instant learner for the pair at q (d,), where its error (3,) [m] counts up to `limit_m`."""

@@ -35,12 +35,16 @@ class PairMemory:
     def __len__(self) -> int:
         return self._count - self._oldest
 
-    def append(self, q: FloatArray, x: FloatArray, turn: FloatArray | None = None) -> None:
-        """Keep one pair, q (d,) and x (3,), and its orientation (4,) if it has one; the oldest makes room."""
-        place = self._count % len(self._q)
-        self._q[place], self._x[place] = q, x
-        self._turns[place] = np.nan if turn is None else turn
-        self._count += 1
+    def append(self, q: FloatArray, x: FloatArray, turns: FloatArray | None = None) -> None:
+        """Keep pairs, q (n, d) and x (n, 3); the oldest make room.
+
+        Args:
+            turns: their orientations, quaternions (n, 4), NaN where a pair has none; None: none has any.
+        """
+        places = np.arange(self._count, self._count + len(q)) % len(self._q)
+        self._q[places], self._x[places] = q, x
+        self._turns[places] = np.nan if turns is None else turns
+        self._count += len(q)
 
     def clear(self) -> None:
         """Forget all pairs."""
@@ -53,8 +57,7 @@ class PairMemory:
     def restore(self, q: FloatArray, x: FloatArray, count: int, turns: FloatArray | None = None) -> None:
         """Hold the pairs q (n, d), x (n, 3), with `turns` as `turns_since` gives them: the newest of `count`."""
         self._count = self._first = count - len(q)
-        for row_q, row_x, turn in zip(q, x, np.full((len(q), 4), np.nan) if turns is None else turns, strict=True):
-            self.append(row_q, row_x, turn)
+        self.append(q, x, turns)
 
     def since(self, count: int, limit: int | None = None) -> tuple[FloatArray, FloatArray, int]:
         """The kept pairs from the one numbered `count` (from 0) on: q (n, d), x (n, 3), and the count after them."""

@@ -36,20 +36,22 @@ class ErrorMemory(msgspec.Struct):
     noise: tuple[float, float, float] = (0.0, 0.0, 0.0)
     ratio: float = 0.0
 
-    def add(self, error: FloatArray, variance: FloatArray, ratio: float = 1.0) -> None:
-        """One more error.
+    def add(self, errors: FloatArray, variances: FloatArray, ratios: FloatArray | float = 1.0) -> None:
+        """More errors, in their order.
 
         Args:
-            error: prediction against measurement (3,) [m].
-            variance: the measurement's, per axis (3,) [m²].
-            ratio: the error's square over what was claimed for prediction and measurement together.
+            errors: prediction against measurement (n, 3) [m].
+            variances: the measurements', per axis (n, 3), or (3,) of all [m²].
+            ratios: the errors' squares over what was claimed for prediction and measurement together (n,), or of all.
         """
-        square = np.square(error)
-        self.weight = self.discount * self.weight + 1.0
-        self.distance = self.discount * self.distance + math.sqrt(float(square.sum()))
-        self.square = _triple(self.discount * np.array(self.square) + square)
-        self.noise = _triple(self.discount * np.array(self.noise) + variance)
-        self.ratio = self.discount * self.ratio + ratio
+        count = len(errors)
+        kept, faded = self.discount**count, self.discount ** np.arange(count - 1.0, -1.0, -1.0)
+        squares = np.square(errors)
+        self.weight = kept * self.weight + float(faded.sum())
+        self.distance = kept * self.distance + float(faded @ np.sqrt(squares.sum(axis=1)))
+        self.square = _triple(kept * np.array(self.square) + faded @ squares)
+        self.noise = _triple(kept * np.array(self.noise) + faded @ np.broadcast_to(variances, squares.shape))
+        self.ratio = kept * self.ratio + float(faded @ np.broadcast_to(ratios, count))
 
     @property
     def mean_m(self) -> float | None:

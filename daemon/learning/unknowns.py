@@ -11,6 +11,8 @@ import numpy as np
 from interfaces.records import FloatArray
 from kbmaps import ChainBelief, JointBasis, ResidualModel, SupportSet
 
+from .memory import IntArray
+
 Predict = Callable[[FloatArray], FloatArray]
 
 
@@ -22,6 +24,13 @@ class Where:
         # By identity; who is asked is kept, so that no other gets its number.
         self._left_open: dict[int, tuple[SupportSet, FloatArray]] = {}
         self._chains: dict[int, tuple[ChainBelief | ResidualModel, tuple[FloatArray, FloatArray]]] = {}
+
+    def at(self, rows: IntArray) -> Where:
+        """Some of them, with what was found there."""
+        part = Where(self.q[rows])
+        part._left_open = {k: (of, left[rows]) for k, (of, left) in self._left_open.items()}
+        part._chains = {k: (of, (x[rows], variance[rows])) for k, (of, (x, variance)) in self._chains.items()}
+        return part
 
     def unexplained(self, support: SupportSet | None) -> FloatArray:
         """As the function of that name."""
@@ -113,6 +122,8 @@ class GrowingSupport:
         return self._growing.configurations
 
     def add(self, q: FloatArray) -> None:
-        """A pair has been learnt at q (d,) [rad]."""
-        if self._growing.add(q):
+        """Pairs have been learnt at q (n, d) [rad]."""
+        # What is known already joins no more after others have joined.
+        new = q[self._growing.unexplained(q) > self._growing.threshold]
+        if sum(self._growing.add(row) for row in new):
             self._view = copy.deepcopy(self._growing)

@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from interfaces.records import FloatArray, Pair
 from kbmaps import ChainBelief, ChangeDetector, ChangeKind, KBMap, ResidualModel, SharedNoise, Suspicion
@@ -161,7 +162,7 @@ class Watch:
 
     def asked(self) -> None:
         """The solver works on all pairs up to here."""
-        if self._reference is None:
+        if self._reference is None and self._next is None:
             self._pairs.clear()  # what comes first after the model that is the first reference counts
         self._asked_at = len(self._pairs)
 
@@ -170,18 +171,19 @@ class Watch:
         if reference.known < FEWEST_KNOWN or not self.wants_reference:
             return
         self._next, self._next_at = reference, self._asked_at
-        if self._reference is None:
-            self._renew()
 
-    def add(self, pair: Pair, *, kept: bool) -> None:
-        """One more pair, learnt or, not `kept`, doubted."""
-        turn = np.full(4, np.nan) if pair.R is None else pair.R
-        if len(self._pairs) >= MOST_WATCHED and not self.alarmed:
+    def add(self, *pairs: Pair, kept: ArrayLike) -> None:
+        """One more pair or several, learnt or, not `kept` (n,), doubted."""
+        if self._reference is None:
+            self._renew()  # not with the offer: that comes at low priority, and this takes a while
+        if len(self._pairs) + len(pairs) > MOST_WATCHED and not self.alarmed:
             self._shorten()
-        self._pairs.append(_Watched(pair.seq, pair.q, pair.x, np.diag(pair.cov), turn, kept))
+        for pair, learnt in zip(pairs, np.broadcast_to(kept, len(pairs)).tolist(), strict=True):
+            turn = np.full(4, np.nan) if pair.R is None else pair.R
+            self._pairs.append(_Watched(pair.seq, pair.q, pair.x, np.diag(pair.cov), turn, learnt))
         if self._detector is None:
             return
-        self._feed(self._pairs[-1:])
+        self._feed(self._pairs[-len(pairs) :])
         if not self.ready:
             if self._reference is not None and len(self._pairs) >= _trial(self._reference.known):
                 self._show()

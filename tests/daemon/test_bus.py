@@ -80,14 +80,15 @@ def test_a_handler_with_a_bug_answers_all_the_same(server, asking) -> None:
         asking.ask_one(KEY)
 
 
-def test_a_subscriber_with_a_bug_goes_on_receiving(server, asking) -> None:
+@pytest.mark.parametrize("quick", [False, True])
+def test_a_subscriber_with_a_bug_goes_on_receiving(server, asking, quick: bool) -> None:
     received: Queue[bytes] = Queue()
 
     def take(payload: bytes) -> None:
         received.put(payload)
         raise ZeroDivisionError("a bug")
 
-    asking.subscribe(KEY, take)
+    asking.subscribe(KEY, take, quick=quick)
     server.answer("bodyschema/arm/ready", lambda _request: b"")
     publish = server.publisher(KEY)
     asking.ask_one("bodyschema/arm/ready")  # the subscription has arrived before this

@@ -9,6 +9,7 @@ from daemon.config import LearnerConfig
 from daemon.learning.claims import Claims, ClaimsState
 from daemon.learning.members import INSTANT, PRIOR, RESIDUAL, RIGID
 from daemon.learning.nominal import chain_tolerances
+from daemon.learning.unknowns import Where
 from interfaces.records import FloatArray
 from kbmaps import ChainBelief, ChainParameters, ChainTolerances
 
@@ -29,9 +30,9 @@ def new_claims(belief: ChainBelief = DRAWN) -> Claims:
 def learnt(claims: Claims, q: FloatArray, prior_error_m: float, error_m: float = 0.0) -> None:
     """Pairs at q: there the prior is wrong by the first, the instant learner by the second error on each axis."""
     for row in q:
-        errors = {PRIOR: np.full(3, prior_error_m), INSTANT: np.full(3, error_m)}
-        claims.predicted(row, MODEL.predict(row) + errors[PRIOR], errors, NOISE)
-        claims.learnt(row)
+        x = MODEL.predict(row[None]) + prior_error_m
+        claims.predicted(Where(row[None]), x, {PRIOR: x - prior_error_m, INSTANT: x - error_m}, NOISE[None])
+        claims.learnt(row[None])
 
 
 def sigma(claims: Claims, name: str, q: FloatArray) -> float:
@@ -138,12 +139,13 @@ def test_of_two_solutions_alike_the_one_that_answered_with_the_last_tool_answers
     claims = new_claims()
     claims.change_tool(0.1, answered)
     claims.expect(DRAWN)
-    far, alike = np.full(3, 0.04), np.full(3, 0.002)
+    far, alike = 0.04, 0.002
     for name in (RIGID, RESIDUAL):
         claims.solution_taken(name, np.zeros((10, 3)), None, neighbours=True)
     for row in walk[:10]:
-        errors = {PRIOR: far, INSTANT: far, RIGID: alike, RESIDUAL: alike}
-        claims.predicted(row, MODEL.predict(row) + alike, errors, NOISE)
+        x = MODEL.predict(row[None]) + alike
+        missed = {PRIOR: far, INSTANT: far, RIGID: alike, RESIDUAL: alike}
+        claims.predicted(Where(row[None]), x, {name: x - miss for name, miss in missed.items()}, NOISE[None])
     assert claims.best(PRIOR) == answered
 
 

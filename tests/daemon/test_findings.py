@@ -12,7 +12,7 @@ from test_calibration import DESK_ARM, figures_of
 import daemon.findings
 from daemon.chain_figures import is_told, no_surer_than_possible
 from daemon.config import LearnerConfig
-from daemon.findings import EVERY_S, Findings, figures
+from daemon.findings import EVERY_S, SHARE, Findings, FindingTurns, figures
 from daemon.learning import DirectSolver, Learning, NominalModel
 from daemon.learning.learning import REGION_RAD
 from daemon.learning.outlook import Known, Scatter, foreseen
@@ -37,6 +37,16 @@ class Ticking:
 
     def utc(self) -> str:
         return "2026-11-21T12:00:00.000+00:00"
+
+
+class Slow(Ticking):
+    """Whatever is done between two looks at it takes a while."""
+
+    TICK_S = 0.1
+
+    def now(self) -> float:
+        self.time += self.TICK_S
+        return self.time
 
 
 @dataclass
@@ -263,6 +273,18 @@ def test_they_are_found_again_when_a_new_chain_was_found_and_not_too_soon() -> N
     clock.time += EVERY_S
     findings.renew()
     assert findings.calibration.pairs > first.pairs
+
+
+def test_of_several_robots_one_finds_at_a_time() -> None:
+    clock, turns = Slow(), FindingTurns()
+    arms = [Planted.of(seed, 40) for seed in (1, 2)]
+    found = [Findings(arm.learning, arm.robot, clock, 2, turns) for arm in arms]
+    for findings in found:
+        findings.renew()
+    assert [findings.calibration is not None for findings in found] == [True, False]
+    clock.time += SHARE * Slow.TICK_S
+    found[1].renew()
+    assert found[1].calibration is not None
 
 
 def test_the_same_chain_is_not_gone_through_twice() -> None:

@@ -7,7 +7,6 @@ of their drivers, messages of ROS 2 by tests/drivers/test_ros2_bytes.py.
 from __future__ import annotations
 
 import math
-import queue
 import tracemalloc
 from collections.abc import Callable
 from copy import deepcopy
@@ -374,4 +373,4 @@ def test_published_bytes_that_are_no_pair_are_counted_and_learning_goes_on(paylo
         feed.offer(payload)
     for _ in payloads:
         feed.step(0.0)
-    assert isinstance(feed._waiting, queue.Queue)
+    assert feed._waiting.empty()

@@ -8,7 +8,7 @@ from daemon.learning.memory import RUN, PairMemory
 def filled(pairs: int, capacity: int) -> PairMemory:
     memory = PairMemory(1, capacity)
     for k in range(pairs):
-        memory.append(np.array([k]), np.zeros(3))
+        memory.append(np.array([[k]]), np.zeros((1, 3)))
     return memory
 
 

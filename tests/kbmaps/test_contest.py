@@ -121,3 +121,20 @@ def test_a_model_that_was_found_late_is_judged_on_pairs_that_it_had_not_learnt()
         held.add({"rigid": float(square)})
     held.add_late("bent", [1e-8] * 160)
     assert held.best(TRUSTED, "none") == "bent"
+
+
+def test_pairs_that_come_together_count_as_one_after_the_other():
+    rng = np.random.default_rng(3)
+    values = {name: rng.random(250) for name in TRUSTED}
+    together, each = Contest(), Contest()
+    for begin in range(0, 250, 25):
+        together.add({name: squared[begin : begin + 25] for name, squared in values.items()})
+    for k in range(250):
+        each.add({name: squared[k] for name, squared in values.items()})
+    assert together.pairs == each.pairs
+    np.testing.assert_array_equal(together.errors["bent"], each.errors["bent"])
+
+
+def test_as_many_pairs_are_asked_of_each_model():
+    with pytest.raises(ShapeError, match="squares"):
+        Contest().add({"rigid": [0.1, 0.2], "bent": [0.1]})

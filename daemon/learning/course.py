@@ -1,0 +1,173 @@
+"""The course of learning: pairs in, one era after another, with all that is counted. It has no lock of its own."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+
+import numpy as np
+
+from daemon.config import LearnerConfig
+from interfaces.errors import RequestError
+from interfaces.records import Pair
+
+from .change import ChangeRecord
+from .curve import Curve
+from .era import BoolArray, Era
+from .eras import Eras
+from .incoming import check_pair
+from .nominal import NominalModel
+from .state import Counters, LearningState
+
+# So many pairs are judged together at most, and as this share of those that are known: at first each tells much.
+MOST_TOGETHER, TOGETHER = 25, 0.1
+
+
+class Course:
+    """What was learnt up to now.
+
+    Args:
+        nominal: where learning starts.
+        settings: of the learner.
+        together_s: pairs wait for so long at most to be judged together [s].
+
+    Attributes:
+        eras: what is learnt.
+        counters: all that is counted; who reads it at other times than the course's own takes a copy.
+        curve: mean prequential error [m] of the answering model over the pairs.
+        learnt_at: when the last pair was learnt [s]; None: none was.
+    """
+
+    def __init__(self, nominal: NominalModel, settings: LearnerConfig, together_s: float) -> None:
+        self._nominal, self._settings, self._together_s = nominal, settings, together_s
+        self._task_numbers = itertools.count(1)
+        self._before: LearningState | None = None
+        self._met_at = 0.0
+        self.counters, self.curve = Counters(), Curve()
+        self.learnt_at: float | None = None
+        self.eras = self._at_nominal()
+
+    @property
+    def can_roll_back(self) -> bool:
+        """Whether the state before the last change is kept."""
+        return self._before is not None
+
+    @property
+    def settled(self) -> bool:
+        """Whether all pairs that came are judged."""
+        return self.eras.present is None or not self.eras.present.met
+
+    def learn(self, pair: Pair, now: float) -> None:
+        """Learn one pair at once; where pairs are judged together, with the instant learner alone.
+
+        Raises:
+            RequestError: it is not a pair of this robot and store, or not newer than the last one; nothing changed.
+        """
+        check_pair(pair, self.counters, self._nominal.joints)
+        self.counters.store, self.counters.last_seq = pair.store, pair.seq
+        self.counters.pairs += 1
+        self.counters.since_change += 1
+        self.learnt_at = now
+        era = self.eras.present
+        if era is None:
+            self.eras.waiting.append(pair.q[None], pair.x[None], None if pair.R is None else pair.R[None])
+        elif self._together_s == 0.0:
+            self._judged(era, [pair], np.array([not era.learn(pair)]))
+        else:
+            if not era.met:
+                self._met_at = now
+            era.meet(pair)
+            if len(era.met) >= min(MOST_TOGETHER, max(int(TOGETHER * era.memory.count), 1)) or self.judge_due(now):
+                self.judge()
+
+    def judge_due(self, now: float) -> bool:
+        """Whether pairs have waited for long enough to be judged."""
+        return not self.settled and now - self._met_at >= self._together_s
+
+    def judge(self) -> None:
+        """Judge all pairs that wait for it: compare models there, doubt some, look for a change; and keep them."""
+        while (era := self.eras.present) is not None and era.met:
+            self._judged(era, *era.judge())
+            if self.eras.present is not None and self.eras.present is not era:
+                for pair in era.met:
+                    self.eras.present.meet(pair)
+
+    def tool_changed(self) -> None:
+        """From now on another tool: pairs so far no longer count, what they taught is where learning starts again."""
+        self.judge()
+        if self.eras.present is None:
+            self.eras = self._at_nominal()
+        else:
+            self._before = self._state_before(self.eras.memory.count)
+            self.eras.change_tool(self.eras.present)
+        self.eras.change = ChangeRecord.told(self.counters.last_seq)
+        self.counters.changes += 1
+        self.counters.since_change = 0
+
+    def rollback(self) -> None:
+        """Go on as if the last change had not been, and the pairs since then had not come.
+
+        Raises:
+            RequestError: there was no change, or learning began anew since; nothing is changed.
+        """
+        if self._before is None:
+            raise RequestError("there was no change since learning began, so there is no older model to go back to")
+        since_change = self._before.header.counters.since_change
+        eras = Eras.restored(self._before, self._nominal, self._settings, self._task_numbers)
+        self.eras, self._before, self.counters.since_change = eras, self._before.before, since_change
+
+    def reset_to_prior(self, *, forget_store: bool) -> None:
+        """Forget what was learnt. With `forget_store`, pairs may come from another store, from its first one on."""
+        if forget_store:
+            self.counters = Counters(refused=self.counters.refused)
+            self.curve, self.learnt_at = Curve(), None
+        self.counters.since_change = 0
+        self.eras, self._before = self._at_nominal(), None
+
+    def state(self) -> LearningState:
+        """Everything needed to go on from here."""
+        self.judge()
+        return self.eras.state(self.counters, self.curve).with_before(self._before)
+
+    def restore(self, state: LearningState) -> None:
+        """Go on from a state.
+
+        Raises:
+            StateError: it belongs to another nominal model, or to other tolerances; nothing is changed.
+        """
+        eras, header = Eras.restored(state, self._nominal, self._settings, self._task_numbers), state.header
+        self.eras, self.counters, self._before = eras, header.counters, state.before
+        self.curve = Curve(header.curve, header.curve_stride)
+
+    def _at_nominal(self) -> Eras:
+        return Eras.at_nominal(self._nominal, self._settings, self._task_numbers)
+
+    def _judged(self, era: Era, pairs: Sequence[Pair], doubted: BoolArray) -> None:
+        """Count what `era` has learnt of these pairs and what it doubts, and follow a change that they show."""
+        error_m = self.eras.claims.errors[era.answering].mean_m or 0.0
+        first = self.counters.pairs - len(era.met) - len(pairs) + 1
+        for place in np.flatnonzero(~doubted).tolist():
+            self.curve.add(first + place, error_m)
+        self.counters.doubted += int(doubted.sum())
+        if self._followed(era, pairs[-1], learnt=not doubted[-1]):
+            self.counters.changes += 1
+            self.counters.since_change = self.eras.memory.count + len(era.met)
+
+    def _followed(self, era: Era, pair: Pair, *, learnt: bool) -> bool:
+        """Whether the pairs up to this one show a change, and another era has begun with it."""
+        noticed = self.eras.noticed(era, pair)
+        if noticed is None and (learnt or not era.doubts.perhaps_changed):
+            return False
+        since = 0 if noticed is None else sum(noticed.kept[noticed.first :])
+        before = self._state_before(era.memory.count - since)
+        followed = noticed is not None and self.eras.adapt(era, noticed)
+        if not (followed or (not learnt and self.eras.follow_change(era, pair))):
+            return False
+        self._before = before
+        return True
+
+    def _state_before(self, first: int) -> LearningState:
+        """The state without the present era's pairs from number `first` on."""
+        state = self.eras.state_before(first, self.counters, self.curve)
+        state.header.counters.since_change -= 0 if self.eras.present is None else len(self.eras.present.met)
+        return state

@@ -1,0 +1,133 @@
+"""Pairs that are judged together, as a host of many robots does: the instant learner waits for nothing."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+from guided_arm import JOINTS, NOW_AND_THEN, Scene, built_chain, make_pair, measured, nominal_model, path, teach
+
+from daemon.config import LearnerConfig
+from daemon.learning import DirectSolver, Learning, NominalModel
+from daemon.learning.arm import KnownArm
+from daemon.learning.claims import Claims
+from daemon.learning.course import MOST_TOGETHER
+from daemon.learning.era import Era
+from daemon.learning.members import INSTANT
+from daemon.learning.scores import ErrorMemory
+from interfaces.records import Pair
+from kbmaps import NLMS, ChainTolerances
+
+TOGETHER_S = 1.0
+SETTINGS = LearnerConfig(replays_per_pair=0.0)
+NOMINAL = nominal_model()
+TOLERANCES = ChainTolerances(axes=0.05, points=0.015, zeros=0.05, tool=0.03)
+
+
+def new_learning(together_s: float = TOGETHER_S, nominal: NominalModel = NOMINAL) -> Learning:
+    return Learning(nominal, SETTINGS, DirectSolver(), together_s=together_s)
+
+
+def taught(pairs: list[Pair], together_s: float) -> Learning:
+    learning = new_learning(together_s)
+    teach(learning, pairs, every=NOW_AND_THEN)
+    return learning
+
+
+def with_outliers(pairs: list[Pair], places: list[int]) -> list[Pair]:
+    wild = {place: make_pair(pairs[place].seq, pairs[place].q, pairs[place].x + 0.8) for place in places}
+    return [wild.get(place, pair) for place, pair in enumerate(pairs)]
+
+
+def test_the_instant_learner_knows_a_pair_before_it_is_judged() -> None:
+    scene = Scene.draw(0, 20)
+    era = Era(
+        NOMINAL.prior(),
+        KnownArm(NOMINAL.belief(NOMINAL.chain, TOLERANCES), TOLERANCES),
+        Claims(NOMINAL.bases, 0.1),
+        SETTINGS,
+        itertools.count(),
+    )
+    reference = NLMS(NOMINAL.prior(), SETTINGS.step_size)
+    for pair in scene.pairs:
+        era.meet(pair)
+        reference.learn(pair.q, pair.x)
+    assert era.memory.count == 0
+    np.testing.assert_allclose(era.members.map(INSTANT).net, reference.map.net, atol=1e-10)
+
+
+def test_together_the_same_pairs_are_doubted_as_one_by_one() -> None:
+    pairs = with_outliers(Scene.draw(1, 200).pairs, [90, 131, 150, 190])
+    assert taught(pairs, TOGETHER_S).state().header.counters.doubted == taught(pairs, 0.0).counters.doubted == 4
+
+
+def test_together_they_teach_as_much_as_one_by_one() -> None:
+    scene = Scene.draw(2, 200)
+    together, each = (scene.error_m(taught(scene.pairs, seconds)) for seconds in (TOGETHER_S, 0.0))
+    assert together < 1.1 * each
+
+
+def test_pairs_that_wait_are_a_part_of_the_state() -> None:
+    learning = new_learning()
+    teach(learning, Scene.draw(3, 57).pairs, background=False)
+    assert len(learning.state().arrays["q"]) == 57
+
+
+def test_pairs_are_judged_when_they_have_waited_although_no_more_come() -> None:
+    learning, pairs = new_learning(), Scene.draw(3, 43).pairs
+    teach(learning, pairs, background=False)
+    waiting = learning.curve[-1].pairs
+    learning.judge_due(pairs[-1].t + TOGETHER_S)
+    assert (waiting < 43, learning.curve[-1].pairs) == (True, 43)
+
+
+def test_the_solver_is_given_the_pairs_that_waited() -> None:
+    learning = new_learning()
+    teach(learning, Scene.draw(3, 57).pairs, background=False)
+    learning.solve_soon()
+    while learning.work():
+        pass
+    assert learning.at_rest
+
+
+@pytest.mark.parametrize("moved_m", [0.025, 0.3])
+def test_a_change_is_followed_as_soon_as_the_pairs_with_it_are_judged(moved_m: float) -> None:
+    rng, before = np.random.default_rng(5), 150
+    chain, q = built_chain(rng), path(rng, 200)
+    pairs = measured(chain, q[:before], rng)
+    pairs += measured(chain.with_tool([moved_m, 0.0, 0.0]), q[before:], rng, first=before + 1)
+    noticed = [taught(pairs, seconds).change for seconds in (0.0, TOGETHER_S)]
+    at_once, together = (0 if change is None else change.noticed_seq for change in noticed)
+    assert before < at_once
+    assert before < together <= at_once + MOST_TOGETHER
+
+
+def test_pairs_judged_after_a_change_are_learnt_in_the_new_era() -> None:
+    rng, before = np.random.default_rng(6), 150
+    chain, q = built_chain(rng), path(rng, 200)
+    moved = chain.with_tool([0.3, 0.0, 0.0])
+    pairs = measured(chain, q[:before], rng) + measured(moved, q[before:], rng, first=before + 1)
+    learning = taught(pairs, TOGETHER_S)
+    assert (learning.counters.changes, len(learning.state().arrays["q"])) == (1, 50)
+
+
+def test_errors_that_come_together_weigh_as_one_after_the_other() -> None:
+    rng = np.random.default_rng(7)
+    errors, variances, ratios = rng.normal(size=(9, 3)), rng.random((9, 3)), rng.random(9)
+    together, each = ErrorMemory(0.1), ErrorMemory(0.1)
+    together.add(errors, variances, ratios)
+    for row in range(9):
+        each.add(errors[row : row + 1], variances[row : row + 1], ratios[row : row + 1])
+    found = [[m.weight, m.distance, *m.square, *m.noise, m.ratio] for m in (together, each)]
+    np.testing.assert_allclose(*found, rtol=1e-12)
+
+
+def test_where_data_was_is_the_same_however_it_comes() -> None:
+    q = path(np.random.default_rng(8), 120)
+    together, each = Claims(NOMINAL.bases, 0.1), Claims(NOMINAL.bases, 0.1)
+    together.learnt(q)
+    for row in q:
+        each.learnt(row[None])
+    np.testing.assert_array_equal(together.arrays()["support_q"], each.arrays()["support_q"])
+    assert together.arrays()["support_q"].shape[1] == JOINTS
