@@ -47,6 +47,11 @@ class Limb:
     weight: FloatArray
     blur_px: float
 
+    @property
+    def noise_share(self) -> float:
+        """The part of the variances of `offset_px` that is the pixels' noise, mean of the rays that tell."""
+        return 1.0 - _BEST_SIGMA_PX**2 * float(self.weight[self.weight > 0].mean())
+
 
 def find_limb(
     image: Float32Array, gate: Gate, centre_px: FloatArray, radius_px: float, shape: FloatArray, blur_px: float

@@ -26,9 +26,8 @@ _ALIASED_PX = 0.55
 _FREEDOM, _FARTHEST_PX, _ROUNDS = 4.0, 1.0, 3
 # Below this, relative to the cubed trace, the limb does not determine centre and radius.
 _LEAST_DETERMINANT = 1e-6
-# A ray's samples share pixels with each other and with its neighbours': variance of even backgrounds, that the filters
-# take for 1; and how many waves that knowledge is worth.
-_SHARED_PIXELS, _WORTH = 1.3, 3.0
+# What a few waves leave open: this part of the pixels' noise counts again.
+_NOISE_AGAIN = 0.5
 # What covers a ball breaks its limb at sharp corners, which shows in the quick waves; what is behind it bends whole
 # arcs, in the slow ones, which the claim follows. Beyond so many times the variance of the samples it is no ball's
 # limb alone.
@@ -60,12 +59,14 @@ class Circle:
 
 @dataclass(frozen=True, slots=True)
 class _Fit:
-    """Shift (2,) and growth [px] of the circle, the inverse normal matrix (3, 3) [px²], and what the waves tell."""
+    """Shift (2,) and growth [px] of the circle, the inverse normal matrix (3, 3) [px²], what the waves tell, and the
+    part of the rays' variances that is the pixels' noise."""
 
     shift_px: FloatArray
     growth_px: float
     inverse: FloatArray
     waves: Waves
+    noise_share: float
 
 
 def fit_limb(
@@ -93,10 +94,7 @@ def fit_limb(
     aliased = blur_px < _ALIASED_PX
     if fit is None or (fit.waves.quick > _LARGEST_DENSITY and not aliased):
         return None
-    # What the waves show less than the pixels' noise alone makes is chance.
-    seen, count = fit.waves.evened().once_round(), fit.waves.count
-    cov = max(seen, (count * seen + _WORTH * _SHARED_PIXELS) / (count + _WORTH)) * fit.inverse
-    cov += np.outer(unsettled, unsettled)
+    cov = (fit.waves.evened().slow + _NOISE_AGAIN * fit.noise_share) * fit.inverse + np.outer(unsettled, unsettled)
     # A blurred disc's edge, where it is steepest, is nearer to the centre than the disc's.
     radius_px += blur_px**2 / (2.0 * radius_px)
     return Circle(centre_px, radius_px, shape @ cov[:2, :2] @ shape, math.sqrt(cov[2, 2]), aliased)
@@ -137,4 +135,4 @@ def _least_squares(limb: Limb, radius_px: float, *, oval: bool) -> _Fit | None:
     if inverse is None or np.abs(solution[3:]).max(initial=0.0) > _MOST_OVAL * radius_px:
         return None
     around = waves(np.sqrt(used) * residual, radius_px, first=3 if oval else 2)
-    return _Fit(solution[:2], float(solution[2]), inverse[:3, :3], around)
+    return _Fit(solution[:2], float(solution[2]), inverse[:3, :3], around, limb.noise_share)

@@ -19,9 +19,8 @@ from .triangulate import Location, locate
 
 # A mirror gives back less than this of the light, and its copy stands farther off.
 _MIRRORED_LIGHT = 0.8
-# What calibration leaves of a difference between the sizes that the eyes see (1-sigma, relative), and the 95 % limit of
-# the sum of two squared differences in sigmas: size and row. The claim grows with what is beyond.
-_SIZE_TOLERANCE, _USUAL_DOUBT = 0.002, 6.0
+# What calibration leaves of a difference between the sizes that the eyes see (1-sigma, relative).
+_SIZE_TOLERANCE = 0.002
 # Discs of the two eyes that may be one thing; and how much of a thing's place has to show its colour.
 _SAME_SIZE, _SAME_ROW_PX, _LEAST_SHOWN = 1.2, 2.0, 0.6
 
@@ -109,7 +108,8 @@ class StereoMatcher:
             return Reason.SIZE_MISMATCH
         apart = math.log(ratios[0] / ratios[1]) / math.hypot(size_sigma, _SIZE_TOLERANCE), (vl - vr) / sigma
         # What pulls one eye's centre does not pull both alike: it shows in the sizes and in the rows.
-        doubt = max(1.0, (apart[0] ** 2 + apart[1] ** 2) / _USUAL_DOUBT)
+        # Birge's ratio, squared.
+        doubt = max(1.0, (apart[0] ** 2 + apart[1] ** 2) / len(apart))
         return replace(location, cov=doubt * location.cov)
 
     def _size_ratios(self, location: Location, left: Disc, right: Disc) -> tuple[float, float] | None:

@@ -59,8 +59,8 @@ _ENOUGH = 60
 _TRIPLES = np.array(list(combinations(range(_ARCS), 3)))
 # What is left when all noise has averaged out [px].
 _FLOOR_PX = 0.002
-# What coverage and limb disagree by is claimed as uncertainty, to this part; beyond so many of their sigmas wholly.
-_DISTRUST, _LARGEST_CONTRADICTION = 0.2, 4.0
+# What coverage and limb disagree by beyond so many of their sigmas is claimed as uncertainty.
+_LARGEST_CONTRADICTION = 4.0
 # Below this, relative to the cubed trace, the outline points do not determine centre and radius.
 _LEAST_DETERMINANT = 1e-5
 
@@ -156,8 +156,8 @@ def _refined(image: Float32Array, gate: Gate, rough: Outline, shape: FloatArray)
     moved_px = fitted.centre_px - rough.centre_px
     cov_px = fitted.cov_px + _FLOOR_PX**2 * np.eye(2)
     contradiction = float(moved_px @ np.linalg.solve(cov_px + rough.cov_px, moved_px))
-    distrust = _DISTRUST if contradiction < _LARGEST_CONTRADICTION**2 else 1.0
-    cov_px += distrust**2 * np.outer(moved_px, moved_px)
+    if contradiction > _LARGEST_CONTRADICTION**2:
+        cov_px += np.outer(moved_px, moved_px)
     return replace(
         rough,
         centre_px=fitted.centre_px,
