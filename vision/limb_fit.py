@@ -26,8 +26,9 @@ _ALIASED_PX = 0.55
 _FREEDOM, _FARTHEST_PX, _ROUNDS = 4.0, 1.0, 3
 # Below this, relative to the cubed trace, the limb does not determine centre and radius.
 _LEAST_DETERMINANT = 1e-6
-# What a few waves leave open: this part of the pixels' noise counts again.
-_NOISE_AGAIN = 0.5
+# A few waves leave much open, so that the pixels' noise counts again; of the sum of both this part, as the larger of
+# two estimates is too large by chance.
+_CHANCE = 0.8
 # What covers a ball breaks its limb at sharp corners, which shows in the quick waves; what is behind it bends whole
 # arcs, in the slow ones, which the claim follows. Beyond so many times the variance of the samples it is no ball's
 # limb alone.
@@ -94,7 +95,7 @@ def fit_limb(
     aliased = blur_px < _ALIASED_PX
     if fit is None or (fit.waves.quick > _LARGEST_DENSITY and not aliased):
         return None
-    cov = (fit.waves.evened().slow + _NOISE_AGAIN * fit.noise_share) * fit.inverse + np.outer(unsettled, unsettled)
+    cov = _CHANCE * (fit.waves.evened().slow + fit.noise_share) * fit.inverse + np.outer(unsettled, unsettled)
     # A blurred disc's edge, where it is steepest, is nearer to the centre than the disc's.
     radius_px += blur_px**2 / (2.0 * radius_px)
     return Circle(centre_px, radius_px, shape @ cov[:2, :2] @ shape, math.sqrt(cov[2, 2]), aliased)
