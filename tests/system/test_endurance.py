@@ -19,6 +19,7 @@ from daemon.wire import JointsRequest, encode
 # By then all that is kept of pairs is full: replay, the solvers' windows, the publisher's cache.
 WARM, PART, PARTS = 24_000, 6_000, 6
 PAIRS_PER_S = 500.0
+LONG_S = 3000.0
 ASKED = 300
 MB = 2**20
 
@@ -78,11 +79,11 @@ def watched(config: Config) -> list[Look]:
     with running(config, "sampler") as sampler, running(config, "learner") as learner:
         looks: list[Look] = []
         for part in range(PARTS + 1):
-            learner_with(config, WARM + part * PART, limit_s=3000.0)
+            learner_with(config, WARM + part * PART, limit_s=LONG_S)
             with client(zenoh.sampler) as to_sampler, client(zenoh.learner) as to_learner:
                 looks.append(look((sampler.pid, learner.pid), to_sampler, to_learner))
             print(part, looks[-1], flush=True)
-        expect_each_pair_learnt_once(config)
+        expect_each_pair_learnt_once(config, LONG_S)
     return looks
 
 

@@ -147,9 +147,9 @@ def pause(config: Config) -> int:
     ).pairs
 
 
-def expect_each_pair_learnt_once(config: Config) -> LearnerStatus:
+def expect_each_pair_learnt_once(config: Config, limit_s: float = LIFE_LIMIT_S) -> LearnerStatus:
     """Stop the sampler's taking pairs: the learner then has all of them, and each once."""
     pairs = pause(config)
-    status = learner_with(config, pairs)
+    status = learner_with(config, pairs, limit_s)
     assert (status.pairs, status.last_seq, status.refused) == (pairs, pairs, 0)
     return status
