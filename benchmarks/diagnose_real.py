@@ -96,11 +96,14 @@ def taken_along(earlier: Diagnosis, arm: Arm, later: Diagnosis) -> str:
 def main(argv: Sequence[str] | None = None) -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", type=Path, required=True, help="the folder of the sets")
+    parser.add_argument("--data", type=Path, help="the folder of the sets; without it nothing is measured")
     parser.add_argument("--sets", nargs="+", default=list(SETS), choices=SETS)
     parser.add_argument("--every", type=int, default=1, help="take every so many rows of the UR10's first day")
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args(argv)
+    if args.data is None:
+        print("The real recordings are not in this repository (docs/real_data.md): give their folder as --data.")
+        return
     print("Errors on rows that were not fitted, RMS/mean [mm]; seconds are the processor's.\n")
     print("| set | rows | aligned | geometry | by blocks | at random | asked | verdict | first beside geometry | s |")
     print("| --- " * 10 + "|")

@@ -7,11 +7,18 @@ import numpy as np
 from effects import Effect
 
 from .diagnosis import Diagnosis
+from .nameless import Nameless
 from .rivals import Rival, apart_on, widened
 from .search import describe
 
 # Twice the log-likelihood by which a motion has to tell two causes apart to be worth advising.
 _TELLS = 25.0
+# What shows that something without a name is there.
+_WATCH = {
+    "joint": "compare its reading with an angle that is measured otherwise",
+    "body": "press on it, or record with a second marker on what carries it",
+    "place": "calibrate the cameras again, where they stand to each other too",
+}
 
 
 def advice(diagnosis: Diagnosis) -> tuple[str, ...]:
@@ -21,12 +28,15 @@ def advice(diagnosis: Diagnosis) -> tuple[str, ...]:
         for rival in standing.rivals:
             if not rival.is_same_anywhere:
                 told.append(_motion(diagnosis, cause, rival))
+            elif not rival.is_one:
+                told.append(
+                    f"{rival.described} can do all that {describe(cause)} does, and more: "
+                    "a longer recording of the same kind would show whether it does."
+                )
             elif rival.effect is not None:
                 told.append(f"No motion tells {describe(cause)} from {rival.described}: mend whichever is easier.")
-            if rival.effect is None:
-                told.append(
-                    f"Watch whether {rival.described}: press on it, or record with a second marker on what carries it."
-                )
+            if isinstance(rival.instead, Nameless):
+                told.append(f"Watch whether {rival.described}: {_WATCH[rival.instead.kind]}.")
     if diagnosis.left.is_there:
         joints = [diagnosis.extended.simulation.robot.joints[k] for k in diagnosis.left.joints]
         where = f" Look at {', '.join(joints)} first." if joints else ""

@@ -65,8 +65,7 @@ def _verdict(diagnosis: Diagnosis, causes: tuple[Cause, ...]) -> Verdict:
         return "unexplained"
     if not causes:
         return "nothing_found"
-    open_ones = [c for c in causes if c.probability < SURE and any(r.by == "this_motion" for r in c.rivals)]
-    return "undecided" if open_ones else "explained"
+    return "undecided" if any(c.probability < SURE and c.rivals for c in causes) else "explained"
 
 
 def _rms_mm(diagnosis: Diagnosis) -> Errors:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 from scipy import stats
@@ -16,7 +16,7 @@ from interfaces.records import FloatArray
 from .alignment import aligned
 from .alike import Alike, alike
 from .contact import doubtful
-from .explanation import changed_by_the_way, explain, without_one
+from .explanation import changed_by_the_way, explain, needs_no_more_names, without_one
 from .fit import Fit, fitted
 from .held_out import Added, Blocks, added, gain_percent, held_out_errors, is_marker
 from .hypotheses import Hypotheses
@@ -207,16 +207,19 @@ def diagnose(
     hypotheses = Hypotheses.of(simulation, observations, only=only, without=without)
     tell(f"{len(hypotheses.effects)} hypotheses")
     search = Search(hypotheses.effects, tell)
-    extended = search.run(start)
+    unknowns = Unknowns(start)
+    extended = search.run(start, partial(needs_no_more_names, unknowns=unknowns, search=search))
     factor, rows = instrument_factor(extended), doubtful(extended)
     left_out = rows if rows.mean() <= MOST_DOUBTFUL else np.zeros_like(rows)
     if abs(np.log(factor)) > _SAME_NOISE or left_out.any():
         observations = observations.with_factor(factor).without(left_out)
         start = aligned(observations, simulation)
-        extended = search.run(start.with_causes(extended.causes))
+        unknowns = Unknowns(start)
+        enough = partial(needs_no_more_names, unknowns=unknowns, search=search)
+        extended = search.run(start.with_causes(extended.causes), enough)
         search.path.insert(0, start)
     tell("asking whether something without a name is at work")
-    unknowns, blocks = Unknowns(start), blocks or Blocks.cut(len(recording))
+    blocks = blocks or Blocks.cut(len(recording))
     explanation = explain(extended, search.path, unknowns, search, tell)
     tell("asking what else it could be")
     stands = standings(explanation.beside, search, blocks, seed, None if explanation.unknown else unknowns)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,6 +17,8 @@ from .unknown import Apart, Unknowns, Way
 # What has no name is taken for so much more probability than the named causes alone [nats].
 _MARGIN = 8.0
 _MOST_UNKNOWNS = 3
+# What is said to first order of several ways may be exceeded so many times.
+_SLACK = 1.2
 # What a number of a named cause costs when sets of causes are compared [nats].
 _NUMBER = 3.0
 # What is left of large causes because their form is not quite theirs is nothing without a name: a share of them all,
@@ -27,6 +29,8 @@ _BY_THE_WAY = ("backlash", "settling", "camera_latency")
 _REST = 0.25
 # Causes that the same ways without a name can be, as probably to within this, are no causes [nats].
 _AS_GOOD = 8.0
+# So many causes more may come after the next.
+_MANY = 10
 # Of the fits on the way to all causes, these are asked whether they are better beside what has no name.
 _FIRST, _LAST = 3, 2
 # What is worth more than this no rounding of readings that stand still brings about [nats].
@@ -95,15 +99,36 @@ def explain(
         looked_at.add(causes)
         if hope - cost_of_names(fit.causes, search) < best.worth - (_AS_GOOD if best.unknown else 0.0):
             continue
-        other = _with_unknown(fit, unknowns, search)
+        other = _with_unknown(fit, unknowns, search, best.worth - (_AS_GOOD if best.unknown else 0.0))
         clearly = margin if best.fit is found and not other.is_specific else 0.0
-        better = other.worth > best.worth + clearly or _is_as_good(other, best)
+        better = other.worth > best.worth + clearly and not _is_as_good(best, other)
+        better = better or _is_as_good(other, best)
         if other.apart is not None and better and unknowns.predicts(other.apart, found):
             best = other
     if best.unknown:
         tell("something that none of the effects explains")
         best = _pruned(best, unknowns, search, rest=is_rest and best.fit is found)
     return best
+
+
+def needs_no_more_names(path: Sequence[Fit], worth: float, unknowns: Unknowns, search: Search) -> bool:
+    """Whether one of the first fits of a search has all that can be named, beside something without a name.
+
+    It has to be more probable than many more causes would be that are each worth as much as the next.
+
+    Args:
+        path: its fits, the last with all causes that it has named.
+        worth: what the next of them would be worth [nats].
+    """
+    fit = path[-1]
+    if unknowns.nearest(fit)[0][1] < _MANY * worth / _MOST_UNKNOWNS:
+        return False
+    least = fit.log_likelihood - cost_of_names(fit.causes, search) + _MANY * worth
+    for first in path[:_FIRST]:
+        other = _with_unknown(first, unknowns, search, least)
+        if other.apart is not None and other.worth > least and search.is_complete(other.beside):
+            return True
+    return False
 
 
 def _is_as_good(fewer: Explanation, explanation: Explanation) -> bool:
@@ -128,19 +153,23 @@ def _length(fit: Fit, change: FloatArray) -> float:
     return float(np.sqrt(np.square(fit.observations.whitened(change[:, :, None])).mean()))
 
 
-def _with_unknown(fit: Fit, unknowns: Unknowns, search: Search) -> Explanation:
+def _with_unknown(fit: Fit, unknowns: Unknowns, search: Search, least: float = -np.inf) -> Explanation:
+    """With the ways that are worth it, one after the other; given up where they will hardly be worth `least` [nats]."""
     apart: Apart | None = None
-    promise = -np.inf
+    promise, names = -np.inf, cost_of_names(fit.causes, search)
     while not fit.is_exact and (apart is None or len(apart.chosen) < _MOST_UNKNOWNS):
         here, chosen = (fit, ()) if apart is None else (apart.fit, apart.chosen)
         near = unknowns.nearest(here, chosen)
         way, more = near[0]
         promise = more if apart is None else promise
+        spent = 0.0 if apart is None else unknowns.cost(apart)
+        # The ways that are left are worth hardly more than this one each.
+        if here.log_likelihood - names - spent + _SLACK * (_MOST_UNKNOWNS - len(chosen)) * max(more, 0.0) < least:
+            break
         if more < NAMED or (more < _BEYOND_DOUBT and unknowns.agreed(here, chosen, way) < 0.0):
             break
         tried = [unknowns.apart(fit, (*chosen, way), apart) for way, _ in near]
         apart = max(tried, key=lambda one: one.fit.log_likelihood - unknowns.cost(one))
-    names = cost_of_names(fit.causes, search)
     if apart is None:
         return Explanation(fit, None, fit.log_likelihood - names, promise=promise)
     worth = apart.fit.log_likelihood - names - unknowns.cost(apart)

@@ -10,8 +10,11 @@ from typing import Literal
 import numpy as np
 
 from effects import Effect, Simulated
+from interfaces.camera import StereoCalibration
 from interfaces.records import FloatArray
 from kbmaps.rotations import cross_matrix
+
+from .eyes import by_turn, undone
 
 _HARMONICS, _TIMES, _JOINT_TIMES = 5, 4, (8, 32, 96)
 # So many rows there must be for each half wave over time.
@@ -21,6 +24,10 @@ _WARMING = (0.07, 0.2, 0.6)
 # One spring about all axes of a frame, and one along all of them beside it.
 _TILT = np.repeat([[0.0], [1.0]], 3, axis=0)
 _TILT_AND_SINK = np.repeat(np.eye(2), 3, axis=0)
+# One spring about both axes across a link, which lies along the third; a link shorter than this does not bend [m].
+_BEND, _SHORTEST = np.array([[0.0], [0.0], [0.0], [1.0], [1.0], [0.0]]), 0.02
+# Axes of its own optical frame about which an eye is turned: towards the other, or any.
+_TOWARDS, _ANY_WAY = np.eye(3)[1:2], np.eye(3)
 Columns = Callable[[Simulated], FloatArray]
 
 
@@ -39,6 +46,8 @@ class Family:
         ties: each of the moves is proportional to its own amount instead (b = a), by factors that are these mixtures
             (a, p) of the numbers; None for any function.
         is_specific: whether it says as much of what is wrong as an effect with a name does.
+        undone: what would be measured (n, 3) [m] without it, of what was (n, 3) and its numbers (p,); None where that
+            is as much less as its columns say.
     """
 
     what: str
@@ -50,6 +59,7 @@ class Family:
     amounts: Columns
     ties: FloatArray | None = None
     is_specific: bool = False
+    undone: Callable[[FloatArray, FloatArray], FloatArray] | None = None
 
     def columns(self, run: Simulated) -> FloatArray:
         """Derivatives (n, 3, p) of what is measured by its numbers [m], a b where none are tied."""
@@ -100,7 +110,22 @@ def families(run: Simulated) -> list[Family]:
         found.append(Family(what, "place", None, (), False, _in_depth, _places_in_image(degree)))
         what = "an error that depends on where the marker is in the image"
         found.append(Family(what, "place", None, (), False, _anywhere, _places_in_image(degree)))
+    if robot.calibration is not None:
+        found.append(_turned("the eyes are turned towards each other", robot.calibration, _TOWARDS))
+        found.append(_turned("the eyes are turned against each other", robot.calibration, _ANY_WAY))
     return found
+
+
+def _turned(what: str, calibration: StereoCalibration, axes: FloatArray) -> Family:
+    """The right eye turned about some of its axes (a, 3)."""
+
+    def moves(run: Simulated) -> FloatArray:
+        return by_turn(run.measured, calibration, axes)
+
+    def without(x: FloatArray, numbers: FloatArray) -> FloatArray:
+        return undone(x, calibration, numbers @ axes)
+
+    return Family(what, "place", None, (), False, moves, _one, is_specific=True, undone=without)
 
 
 def _giving(run: Simulated, k: int) -> list[Family]:
@@ -113,7 +138,23 @@ def _giving(run: Simulated, k: int) -> list[Family]:
     for T, ties in product(supports if run.simulation.bears_weight else (), (_TILT, _TILT_AND_SINK)):
         moves, loads = _link_about(k, T), _own_loads(k, T)
         found.append(Family(what, "body", None, (), False, moves, loads, ties, is_specific=True))
+    for T in map(_middle, supports if run.simulation.bears_weight else ()):
+        if 2.0 * np.linalg.norm(T[:3, 3]) >= _SHORTEST:
+            moves, loads = _link_about(k, T), _own_loads(k, T)
+            found.append(Family(what, "body", None, (), False, moves, loads, _BEND, is_specific=True))
     return found
+
+
+def _middle(T_link_joint: FloatArray) -> FloatArray:
+    """Pose (4, 4) of a joint's frame in one half way to it from its link's origin, with the third axis along the link.
+
+    There a beam under a moment seems to have a hinge: its end turns and shifts as if it had.
+    """
+    T, way = np.eye(4), T_link_joint[:3, 3]
+    one, other = np.linalg.svd(way[None])[2][1:]
+    R_middle_link = np.stack([one, other, np.cross(one, other)])
+    T[:3, :3], T[:3, 3] = R_middle_link @ T_link_joint[:3, :3], 0.5 * R_middle_link @ way
+    return T
 
 
 def _joint(k: int) -> Columns:
@@ -226,6 +267,10 @@ def _harmonics(run: Simulated, j: int, count: int) -> FloatArray:
     if run.simulation.robot.chain.prismatic[j]:
         q = np.pi * (q - q.min()) / max(float(np.ptp(q)), 1e-9)
     return np.concatenate([f(h * q)[:, None] for h in range(1, count + 1) for f in (np.sin, np.cos)], axis=1)
+
+
+def _one(run: Simulated) -> FloatArray:
+    return np.ones((len(run.motion), 1))
 
 
 def _with_one(amounts: FloatArray) -> FloatArray:

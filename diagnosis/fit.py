@@ -18,6 +18,8 @@ from .observations import Observations
 LARGEST = 30.0
 # Steps until the likelihood rises by less than this [nats].
 _ROUNDS, _ENOUGH = 12, 0.02
+# A fit is given up where so many times what a step promises, and so much more [nats], would not do.
+_SLACK, _LITTLE = 2.0, 5.0
 # A step that would raise it by less is not tried [nats].
 _NOT_TRIED = 1e-3
 # How far a step may take a ripple's phase over its range [rad], what is left of a settling, and a time constant, as a
@@ -70,8 +72,11 @@ class Noise:
             outlier = np.log(share) + outlier_density
             both = np.logaddexp(inlier, outlier)
             weights = np.exp(inlier - both)
-            bursts = uniform_filter1d(1.0 - weights, _WINDOW, mode="constant") > _BURST
-            weights[bursts] = 1.0
+            off = 1.0 - weights
+            bursts = np.zeros(len(off), dtype=np.bool_)
+            if off.sum() > _BURST * _WINDOW:
+                bursts = uniform_filter1d(off, _WINDOW, mode="constant") > _BURST
+                weights[bursts] = 1.0
             share = float(np.clip(1.0 - weights[trusted].mean(), _FEWEST_OUTLIERS, 0.5))
             weights[~trusted] = 0.0
             total = float(np.where(bursts, inlier, both)[trusted].sum())
@@ -154,9 +159,9 @@ class Fit:
         n, _, p = self.columns.shape
         flat = self.columns.reshape(3 * n, p)
         scales = np.linalg.norm(flat, axis=0)
-        flat = flat / np.where(scales > 0.0, scales, 1.0)
-        left, values, _ = np.linalg.svd(flat, full_matrices=False)
-        return left[:, values > 1e-9 * max(values.max(initial=0.0), 1e-300)].reshape(n, 3, -1)
+        q, r = np.linalg.qr(flat / np.where(scales > 0.0, scales, 1.0))
+        left, values, _ = np.linalg.svd(r)
+        return (q @ left[:, values > 1e-9 * max(values.max(initial=0.0), 1e-300)]).reshape(n, 3, -1)
 
     @cached_property
     def left(self) -> FloatArray:
@@ -246,8 +251,11 @@ class Fit:
 
     def with_causes(self, causes: Sequence[Effect]) -> Fit:
         """Other causes in the place of these, all refitted."""
-        effects = (*self.simulation.effects[: self.nuisances], *causes)
-        return fitted(self.observations, self.simulation.with_effects(effects), self.nuisances, self.noise)
+        return improved(self.starting(causes))
+
+    def starting(self, causes: Sequence[Effect]) -> Fit:
+        """Other causes in the place of these, all as they are."""
+        return self.at(self.simulation.with_effects((*self.simulation.effects[: self.nuisances], *causes)))
 
 
 def fitted(observations: Observations, simulation: Simulation, nuisances: int, start: Noise | None = None) -> Fit:
@@ -255,16 +263,24 @@ def fitted(observations: Observations, simulation: Simulation, nuisances: int, s
 
     Periods and time constants of the causes move along; moments stay as they are.
     """
-    fit = _at(observations, simulation, nuisances, start)
+    return improved(_at(observations, simulation, nuisances, start))
+
+
+def improved(fit: Fit, least: float = -np.inf) -> Fit:
+    """The same simulation with the most probable numbers, as `fitted` has them.
+
+    Args:
+        least: where it cannot be expected to become as probable as this it is given up, as far as it has come [nats].
+    """
     for _ in range(_ROUNDS):
         if not fit.columns.shape[2]:
             return fit
         step, promised = fit.step()
-        if promised < _NOT_TRIED:
+        if promised < _NOT_TRIED or fit.log_likelihood + _SLACK * _rise(promised, fit) + _LITTLE < least:
             return fit
         best = None
         for shortened in (1.0, 0.3, 0.05):
-            tried = _at(observations, fit.moved(shortened * step), nuisances, fit.noise)
+            tried = _at(fit.observations, fit.moved(shortened * step), fit.nuisances, fit.noise)
             if tried.log_likelihood > fit.log_likelihood:
                 best = tried
                 break
@@ -275,6 +291,12 @@ def fitted(observations: Observations, simulation: Simulation, nuisances: int, s
         if gained < _ENOUGH:
             break
     return fit
+
+
+def _rise(promised: float, fit: Fit) -> float:
+    """By how much the log-likelihood rises when the noise is smaller, too, after a step that promises so much."""
+    half_square = 1.5 * float(fit.noise.weights.sum())
+    return -half_square * float(np.log1p(-min(promised / max(half_square, 1e-300), 0.999999)))
 
 
 def _at(observations: Observations, simulation: Simulation, nuisances: int, start: Noise | None) -> Fit:

@@ -18,6 +18,7 @@ from interfaces.records import FloatArray
 from .fit import LARGEST, Fit, prior_precision, solved
 from .observations import IntArray
 from .scan import Candidate
+from .scatter import beside_scatter
 
 # Blocks of time, and how many folds they are dealt to in turn.
 _MOST_BLOCKS, _FOLDS = 80, 5
@@ -104,7 +105,7 @@ def added(fit: Fit, candidates: Sequence[Candidate], blocks: Blocks) -> list[Add
 
 
 def _added(fit: Fit, effect: Effect, folds: _Folds, before: float, blocks: Blocks) -> Added:
-    own = fit.weighted(fit.run.columns(effect)[:, :, effect.amounts])
+    own = beside_scatter(fit, effect, fit.weighted(fit.run.columns(effect)[:, :, effect.amounts]))
     usual = np.array([effect.parameters[j].usual for j in effect.amounts])
     precision = [prior_precision(fit.simulation, fit.nuisances), 1.0 / np.square(LARGEST * usual)]
     after = folds.beside(own).missed(np.concatenate(precision))
@@ -187,9 +188,9 @@ def block_p_value(fit: Fit, columns: FloatArray, blocks: Blocks) -> float:
     are not independent, as when a joint stands still and is rounded in the same way again and again (Liang and Zeger
     1986; Hotelling's T² for so few blocks).
     """
-    basis = fit.orthogonal
-    beside = columns - basis @ np.einsum("nir,nik->rk", basis, columns)
-    inner = np.einsum("nia,nib->ab", beside, beside)
+    basis, flat = fit.orthogonal.reshape(fit.left.size, -1), columns.reshape(fit.left.size, -1)
+    flat = flat - basis @ (basis.T @ flat)
+    beside, inner = flat.reshape(columns.shape), flat.T @ flat
     scales = np.sqrt(np.maximum(np.diag(inner), 1e-300))
     values, vectors = np.linalg.eigh(inner / np.outer(scales, scales))
     told = values > 1e-7

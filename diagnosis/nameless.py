@@ -50,6 +50,11 @@ class Nameless:
         return max(found, key=lambda one: one.behind, default=None)
 
     @property
+    def kind(self) -> str:
+        """What errs: a joint, a body, or the place in the image."""
+        return self.apart.chosen[0].family.kind
+
+    @property
     def what(self) -> str:
         """In words."""
         return self.apart.chosen[0].family.what

@@ -28,6 +28,8 @@ _SAME_SHARE = 1e-3
 PROBABLE = 0.02
 # What explains a smaller share of what a cause explains is none either.
 _COMES_NEAR = 0.7
+# What is so much less probable is not fitted to the end [nats].
+_HOPELESS = 40.0
 _Other = tuple[Fit | Nameless, Effect | None, str]
 # Poses of the motion over the whole range of the joints, which stands for any motion, and by how much the logarithms
 # of the times between them scatter there.
@@ -46,6 +48,7 @@ class Rival:
         difference: twice the log-likelihood that this motion is expected to tell them apart by.
         anywhere: the same for as many poses over the whole range of the joints.
         signal: what the cause itself brings there.
+        is_one: whether the cause, refitted, is also all that this is on any motion, so that both are one.
     """
 
     instead: Fit | Nameless
@@ -55,6 +58,7 @@ class Rival:
     difference: float
     anywhere: float
     signal: float
+    is_one: bool
 
     @property
     def is_same_here(self) -> bool:
@@ -73,7 +77,7 @@ class Standing:
 
     Attributes:
         itself: the cause as it would explain most there.
-        probability: of the cause, or of what no motion tells from it.
+        probability: of the cause, or of what is one with it.
         worth: how much more probable the causes are with it than without any in its place [nats].
         dof: how many of its amounts the data tell.
         gain: twice the log-likelihood that it brings.
@@ -105,14 +109,14 @@ def _standing(
     beside = search.beside(fit, cause)
     without = beside.without
     gain = 2.0 * (fit.log_likelihood - without.log_likelihood)
-    itself = beside.itself or Candidate(cause, gain, 1)
+    itself = beside.itself
     worth = nats(gain, itself.dof) - search.doubt(itself)
     nothing = Instead(without, -itself.dof, -search.doubt(itself))
     tried = []
     for candidate in beside.candidates:
         if candidate.gain < _COMES_NEAR * itself.gain:
             continue
-        rival = search.refined(without.with_causes([*without.causes, candidate.effect]), candidate.effect)
+        rival = beside.exchanged(candidate, fit.log_likelihood - _HOPELESS)
         doubt = float(np.log(max(candidate.trials / max(itself.trials, 1), 1e-3)))
         tried.append((Instead(rival, candidate.dof - itself.dof, doubt), candidate.effect))
     behind = [nats(2.0 * (one.fit.log_likelihood - fit.log_likelihood), one.dof) - one.doubt for one, _ in tried]
@@ -127,12 +131,13 @@ def _standing(
     shares = odds / odds.sum()
     wide = widened(fit, range(fit.observations.motion.q.shape[1]), uneven=_UNEVEN)
     signal = apart_on(fit, without, wide)
-    rivals = [
-        Rival(other, effect, told, float(share), _difference(fit, other), apart_on(fit, other, wide), signal)
-        for (other, effect, told), share in zip(others, shares[2:], strict=True)
-        if share >= PROBABLE
-    ]
-    same = sum(rival.probability for rival in rivals if rival.is_same_anywhere)
+    rivals = []
+    for (other, effect, told), share in zip(others, shares[2:], strict=True):
+        if share >= PROBABLE:
+            anywhere = apart_on(fit, other, wide)
+            one = anywhere < _SAME_SHARE * signal and _is_no_more(other, fit, without, wide)
+            rivals.append(Rival(other, effect, told, float(share), _difference(fit, other), anywhere, signal, one))
+    same = sum(rival.probability for rival in rivals if rival.is_one)
     ordered = tuple(sorted(rivals, key=lambda rival: rival.probability, reverse=True))
     return Standing(
         itself,
@@ -143,6 +148,13 @@ def _standing(
         ordered,
         named_again(fit, nothing, [one for one, _ in tried], blocks, seed),
     )
+
+
+def _is_no_more(other: Fit | Nameless, fit: Fit, without: Fit, wide: Motion) -> bool:
+    """Whether the cause of a fit, refitted, is all that a rival is on any motion: one of more numbers may be more."""
+    if not isinstance(other, Fit):
+        return True
+    return apart_on(other, fit, wide) < _SAME_SHARE * apart_on(other, without, wide)
 
 
 def _as_fitted(fit: Fit, effect: Effect) -> _Other:

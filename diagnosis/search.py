@@ -4,22 +4,25 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy import stats
 
 from effects import Effect, Identity
 
-from .fit import Fit
+from .fit import Fit, improved
 from .held_out import Blocks, block_p_value
 from .scan import Candidate, Scan
+from .scatter import beside_scatter
 
 # A cause has to be so much more probable than its absence [nats].
 NAMED = 3.0
 # Candidates within this share of the best gain are refitted in full, so many at most.
 _NEAR, _MOST = 0.4, 6
 _MOST_CAUSES = 20
+# After so many causes more it is asked whether these are enough.
+_ASKED_EACH = 3
 # So many sets of causes are looked at, and none twice.
 _MOST_SETS = 80
 Key = tuple[str, str | None, str | None]
@@ -27,11 +30,13 @@ Named = frozenset[tuple[Key, int]]
 # Of what begins at a moment there are so many at one place at most.
 _MOST_OF_A_KIND = 2
 # What a number costs at least [nats].
-_CHEAPEST = 1.5
+_CHEAPEST, _ROUNDS = 1.5, 30
 # What explains a smaller share of what a cause explains is no rival of it; within so much two are as probable [nats].
 _COMES_NEAR, _EQUAL = 0.8, 0.3
 # A moment or a period that seems to explain so much more than that of the fit is tried in its place.
 _ELSEWHERE = 1.0
+# A period that explains less than it did by this has gone astray [nats].
+_ASTRAY = 5.0
 # An exchange that loses no more than this may be worth it with one cause more [nats].
 _WITH_ONE_MORE = 100.0
 # The camera's pose and the marker's place are simpler than the link next to them.
@@ -51,19 +56,57 @@ def nats(gain: float, dof: int) -> float:
     return 0.5 * gain - dof * max(0.5 + 0.5 * float(np.log(max(gain, 1e-300) / dof)), _CHEAPEST)
 
 
-@dataclass(frozen=True, eq=False)
+def rise_for(worth: float, dof: int) -> float:
+    """By how much the log-likelihood has to rise for `dof` more numbers to be worth so much by `nats` [nats]."""
+    if dof < 0:
+        return -rise_for(-worth, -dof)
+    rise = worth + _CHEAPEST * dof
+    for _ in range(_ROUNDS if dof else 0):
+        rise = worth + dof * max(0.5 + 0.5 * float(np.log(max(2.0 * rise, 1e-300) / dof)), _CHEAPEST)
+    return rise
+
+
 class Beside:
     """A fit without one of its causes, and what would take its place.
 
     Attributes:
-        without: the fit.
         itself: the cause as it would explain most there.
+        gain: what it explains as it is, to first order: twice the rise of the log-likelihood.
         candidates: those of the hypotheses that no cause is, the most probable first.
     """
 
-    without: Fit
-    itself: Candidate | None
-    candidates: list[Candidate]
+    def __init__(
+        self, fit: Fit, cause: Effect, itself: Candidate | None, gain: float, candidates: list[Candidate]
+    ) -> None:
+        self._fit = fit
+        self._others = [effect for effect in fit.causes if effect is not cause]
+        self._tried: dict[Identity, Fit] = {}
+        self.itself = itself or Candidate(cause, 0.0, 1)
+        self.gain, self.candidates = gain, candidates
+
+    @cached_property
+    def without(self) -> Fit:
+        """The fit without the cause."""
+        return improved(self._fit.starting(self._others))
+
+    def is_lost_for(self, worth: float) -> bool:
+        """Whether the cause is worth less than that [nats]."""
+        least = self._fit.log_likelihood - rise_for(worth, self.itself.dof)
+        return improved(self._fit.starting(self._others), least).log_likelihood > least
+
+    def with_instead(self, *effects: Effect, least: float = -np.inf) -> Fit:
+        """With others in the place of the cause, given up where they cannot become so probable [nats]."""
+        return improved(self._fit.starting([*self._others, *effects]), least)
+
+    def exchanged(self, candidate: Candidate, least: float) -> Fit:
+        """With a candidate in the place of the cause, as it is known best."""
+        effect = candidate.effect
+        known = self._tried.get(effect.identity)
+        if known is None or known.log_likelihood < least:
+            expected = self._fit.log_likelihood + 0.5 * (candidate.gain - self.itself.gain)
+            start = known or self._fit.starting([*self._others, effect])
+            known = self._tried[effect.identity] = joined(start, effect, least, expected)
+        return known
 
 
 class Search:
@@ -78,23 +121,31 @@ class Search:
         self._hypotheses, self._tell = hypotheses, tell
         self._doubt = np.log(max(len(hypotheses), 1))
         self._trials: dict[Key, int] = {}
-        self._beside: tuple[Fit | None, dict[Identity, Beside]] = (None, {})
+        self._known: tuple[Fit | None, Scan | None, dict[Identity, Beside]] = (None, None, {})
         self.path: list[Fit] = []
         self.ended_early = False
 
-    def run(self, start: Fit) -> Fit:
+    def run(self, start: Fit, enough: Callable[[Sequence[Fit], float], bool] = lambda *_: False) -> Fit:
         """The causes on top of what `start` has fitted.
 
         `ended_early` says afterwards whether the number of steps ended the search, and not that nothing was better.
+
+        Args:
+            enough: is asked now and then, where one more cause would be worth something [nats], whether the fits on the
+                way show that no further cause is called for.
         """
-        fit, self.ended_early = start, False
+        fit, self.ended_early, asked = start, False, 0
         self._seen: set[Named] = set()
         self.path = [start]
         if start.causes:
             fit = self._reviewed(start)
             self.path.append(fit)
         while len(self.path) <= _MOST_CAUSES:
-            added = self._added(fit)[0]
+            added, worth = self._added(fit)
+            if added is not None and len(fit.causes) >= asked + _ASKED_EACH:
+                asked = len(fit.causes)
+                if enough(self.path, worth):
+                    break
             better = added or self._two_in_place_of_one(fit) or self._simpler_and_one_more(fit)
             if better is None:
                 break
@@ -112,32 +163,52 @@ class Search:
     def _added(self, fit: Fit) -> tuple[Fit | None, float]:
         """With one more cause, and what that is worth [nats]; None where nothing is probable enough."""
         best, most = None, NAMED
-        for candidate in self.shortlist(fit, self._open(fit)):
+        known = self._known[1] if self._known[0] is fit else None
+        for candidate in self.shortlist(known or Scan(fit), self._open(fit)):
             if self._agreed(fit, candidate) < NAMED:
                 continue
-            tried = self.refined(fit.with_causes([*fit.causes, candidate.effect]), candidate.effect)
-            worth = nats(2.0 * (tried.log_likelihood - fit.log_likelihood), candidate.dof) - self.doubt(candidate)
+            doubt = self.doubt(candidate)
+            least = fit.log_likelihood + rise_for(most + doubt, candidate.dof)
+            start = fit.starting([*fit.causes, candidate.effect])
+            tried = joined(start, candidate.effect, least, fit.log_likelihood + 0.5 * candidate.gain)
+            worth = nats(2.0 * (tried.log_likelihood - fit.log_likelihood), candidate.dof) - doubt
             if worth > most and tried.causes[-1].is_possible:
                 best, most = tried, worth
         return best, most
+
+    def is_complete(self, fit: Fit) -> bool:
+        """Whether no further cause is worth naming."""
+        return self._added(fit)[0] is None
 
     def _two_in_place_of_one(self, fit: Fit) -> Fit | None:
         """With two causes of one number each in the place of one of many; None where none is worth it."""
         for cause in fit.causes:
             beside = self.beside(fit, cause)
-            itself = beside.itself or Candidate(cause, 0.0, 1)
-            if itself.dof <= 2:
+            if beside.itself.dof <= 2:
                 continue
-            pair = Scan(beside.without).best_pair(effect for effect in self._open(fit) if effect.key != cause.key)
-            if pair is None or pair[0].gain < _COMES_NEAR * itself.gain:
+            open_ones = [effect for effect in self._open(fit) if effect.key != cause.key]
+            pair = self._scan(fit).without(cause).best_pair(open_ones)
+            if pair is None or pair[0].gain < _COMES_NEAR * beside.itself.gain:
                 continue
-            tried = beside.without.with_causes([*beside.without.causes, *(one.effect for one in pair)])
-            worth = nats(2.0 * (tried.log_likelihood - fit.log_likelihood), len(pair) - itself.dof)
-            worth += self.doubt(itself) - sum(self.doubt(one) for one in pair)
+            pair = self._with_moments(beside.without, pair)
+            doubts = self.doubt(beside.itself) - sum(self.doubt(one) for one in pair)
+            dof = len(pair) - beside.itself.dof
+            least = fit.log_likelihood + rise_for(-doubts, dof)
+            tried = beside.with_instead(*(one.effect for one in pair), least=least)
+            worth = nats(2.0 * (tried.log_likelihood - fit.log_likelihood), dof) + doubts
             if worth > 0.0 and named(tried.causes) not in self._seen and all(c.is_possible for c in tried.causes):
                 self._tell(f"exchanged {describe(cause)} for {' and '.join(describe(one.effect) for one in pair)}")
                 return tried
         return None
+
+    def _with_moments(self, fit: Fit, pair: tuple[Candidate, Candidate]) -> tuple[Candidate, Candidate]:
+        """Two candidates, each that begins at a moment as it would explain most beside the other."""
+        one, other = pair
+        if one.effect.kind.begins:
+            one = Scan(fit.with_causes([*fit.causes, other.effect])).candidate(one.effect) or one
+        if other.effect.kind.begins:
+            other = Scan(fit.with_causes([*fit.causes, one.effect])).candidate(other.effect) or other
+        return one, other
 
     def _simpler_and_one_more(self, fit: Fit) -> Fit | None:
         """With a simpler rival in the place of a cause and another cause beside it; None where none is worth it.
@@ -146,11 +217,10 @@ class Search:
         """
         for cause in fit.causes:
             beside = self.beside(fit, cause)
-            itself = beside.itself or Candidate(cause, 0.0, 1)
             for candidate in beside.candidates:
-                if candidate.dof >= itself.dof or candidate.gain < _COMES_NEAR * itself.gain:
+                if candidate.dof >= beside.itself.dof or candidate.gain < _COMES_NEAR * beside.itself.gain:
                     continue
-                tried, worth = self._exchanged(fit, beside, itself, candidate)
+                tried, worth = self._exchanged(fit, beside, candidate, -_WITH_ONE_MORE)
                 if worth < -_WITH_ONE_MORE or named(tried.causes) in self._seen or not tried.causes[-1].is_possible:
                     continue
                 better, more = self._added(tried)
@@ -160,12 +230,11 @@ class Search:
                     return better
         return None
 
-    def _exchanged(self, fit: Fit, beside: Beside, itself: Candidate, candidate: Candidate) -> tuple[Fit, float]:
-        """With a candidate in the place of a cause, refitted, and what that is worth [nats]."""
-        without = beside.without
-        tried = self.refined(without.with_causes([*without.causes, candidate.effect]), candidate.effect)
-        worth = nats(2.0 * (tried.log_likelihood - fit.log_likelihood), candidate.dof - itself.dof)
-        return tried, worth + self.doubt(itself) - self.doubt(candidate)
+    def _exchanged(self, fit: Fit, beside: Beside, candidate: Candidate, least: float) -> tuple[Fit, float]:
+        """With a candidate in the place of a cause, and what that is worth [nats]; roughly where below `least`."""
+        doubts, dof = self.doubt(beside.itself) - self.doubt(candidate), candidate.dof - beside.itself.dof
+        tried = beside.exchanged(candidate, fit.log_likelihood + rise_for(least - doubts, dof))
+        return tried, nats(2.0 * (tried.log_likelihood - fit.log_likelihood), dof) + doubts
 
     def _open(self, fit: Fit) -> list[Effect]:
         """The hypotheses that no cause of a fit is, and one more of those that begin at a moment."""
@@ -193,31 +262,19 @@ class Search:
     def _agreed(self, fit: Fit, candidate: Candidate) -> float:
         """What a candidate is worth by the agreement of blocks of time, which need not be white inside [nats]."""
         effect = candidate.effect
-        columns = fit.weighted(fit.run.columns(effect)[:, :, effect.amounts])
+        columns = beside_scatter(fit, effect, fit.weighted(fit.run.columns(effect)[:, :, effect.amounts]))
         chance = block_p_value(fit, columns, Blocks.cut(len(fit.observations)))
         gain = float(stats.chi2.isf(max(chance, 1e-290), candidate.dof))
         return nats(gain, candidate.dof) - self.doubt(candidate)
 
-    def shortlist(self, fit: Fit, hypotheses: Sequence[Effect]) -> list[Candidate]:
+    def shortlist(self, scan: Scan, hypotheses: Sequence[Effect]) -> list[Candidate]:
         """The candidates that may be the best when all is refitted, the most probable first."""
-        scanned = Scan(fit).candidates(hypotheses)
+        scanned = scan.candidates(hypotheses, _NEAR)
         ranked = sorted(scanned, key=lambda c: nats(c.gain, c.dof) - self.doubt(c), reverse=True)
         if not ranked:
             return []
         floor = _NEAR * ranked[0].gain
         return [c for c in ranked[: 3 * _MOST] if c.gain >= floor][:_MOST]
-
-    def refined(self, fit: Fit, sought: Effect) -> Fit:
-        """With the period or time constant of one cause sought again: as it moved along it may have gone astray."""
-        cause = next(effect for effect in fit.causes if effect.identity == sought.identity)
-        if not cause.shapes:
-            return fit
-        others = [effect for effect in fit.causes if effect is not cause]
-        again = Scan(fit.with_causes(others)).candidate(cause)
-        if again is None or np.allclose(again.effect.values, cause.values):
-            return fit
-        tried = fit.with_causes([*others, again.effect])
-        return tried if tried.log_likelihood > fit.log_likelihood else fit
 
     def _reviewed(self, fit: Fit) -> Fit:
         """Without what has become redundant, and with better ones in the place of others."""
@@ -229,40 +286,61 @@ class Search:
             self._seen.add(causes)
         return fit
 
+    def _scan(self, fit: Fit) -> Scan:
+        """Of a fit and what it is without each of its causes. That of the fit last asked about is kept."""
+        known, scan, _ = self._known
+        if known is not fit or scan is None:
+            scan = Scan(fit, fit.causes)
+            self._known = (fit, scan, {})
+        return scan
+
     def beside(self, fit: Fit, cause: Effect) -> Beside:
-        """What there is in the place of a cause. That of the fit last asked about is kept."""
-        if self._beside[0] is not fit:
-            self._beside = (fit, {})
-        known = self._beside[1]
+        """What there is in the place of a cause."""
+        scan, known = self._scan(fit).without(cause), self._known[2]
         if cause.identity not in known:
-            without = fit.without(cause)
             rivals = [effect for effect in self._open(fit) if effect.key != cause.key]
-            known[cause.identity] = Beside(without, Scan(without).candidate(cause), self.shortlist(without, rivals))
+            itself, candidates = scan.candidate(cause), self.shortlist(scan, rivals)
+            known[cause.identity] = Beside(fit, cause, itself, scan.as_it_is(cause), candidates)
         return known[cause.identity]
 
     def _second_thoughts(self, fit: Fit) -> tuple[Fit, bool]:
         for cause in fit.causes:
             beside = self.beside(fit, cause)
-            without, others = beside.without, beside.without.causes
-            itself = beside.itself or Candidate(cause, 0.0, 1)
-            gain = 2.0 * (fit.log_likelihood - without.log_likelihood)
-            if itself.gain > gain + _ELSEWHERE:
-                tried = fit.with_causes([*others, itself.effect])
+            if beside.itself.gain > beside.gain + _ELSEWHERE:
+                tried = beside.with_instead(beside.itself.effect, least=fit.log_likelihood + _ELSEWHERE)
                 if tried.log_likelihood > fit.log_likelihood + _ELSEWHERE:
                     return self._second_thoughts(tried)
-            lost = nats(gain, itself.dof)
-            if lost < NAMED + self.doubt(itself):
+            if beside.is_lost_for(NAMED + self.doubt(beside.itself)):
                 self._tell(f"dropped {describe(cause)}")
-                return without, True
+                return beside.without, True
             for candidate in beside.candidates:
-                if candidate.gain < _COMES_NEAR * itself.gain:
+                if candidate.gain < _COMES_NEAR * beside.itself.gain:
                     continue
-                tried, worth = self._exchanged(fit, beside, itself, candidate)
-                better = worth > 1.0 or (abs(worth) < _EQUAL and simplicity(candidate.effect) < simplicity(cause))
+                simpler = simplicity(candidate.effect) < simplicity(cause)
+                tried, worth = self._exchanged(fit, beside, candidate, -_EQUAL if simpler else 1.0)
+                better = worth > 1.0 or (abs(worth) < _EQUAL and simpler)
                 if better and tried.causes[-1].is_possible:
                     self._tell(f"exchanged {describe(cause)} for {describe(candidate.effect)}")
                     return tried, True
         return fit, False
+
+
+def joined(start: Fit, sought: Effect, least: float, expected: float) -> Fit:
+    """A fit with one more cause refitted, whose period or time constant may have gone astray as it moved along.
+
+    Args:
+        least, expected: what makes it worth while, and how probable it would be to first order [nats].
+    """
+    tried = improved(start, least)
+    if not sought.shapes or (tried.log_likelihood < least and tried.log_likelihood > expected - _ASTRAY):
+        return tried
+    cause = next(effect for effect in tried.causes if effect.identity == sought.identity)
+    again = Scan(tried, [cause]).without(cause).candidate(cause)
+    if again is None or np.allclose(again.effect.values, cause.values):
+        return tried
+    others = [effect for effect in tried.causes if effect is not cause]
+    other = improved(tried.starting([*others, again.effect]), tried.log_likelihood)
+    return other if other.log_likelihood > tried.log_likelihood else tried
 
 
 def named(causes: Sequence[Effect]) -> Named:

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from scipy import stats
@@ -109,14 +110,14 @@ class Apart:
         chosen: which ways to differ.
         numbers: of each of them (p,).
         fit: of the causes.
-        ridge: on these numbers, in units in which their columns are as long as one.
+        precision: of these numbers beforehand, in units in which their columns are as long as one.
     """
 
     observations: Observations
     chosen: tuple[Way, ...]
     numbers: tuple[FloatArray, ...]
     fit: Fit
-    ridge: float
+    precision: float
 
     @property
     def predicted(self) -> FloatArray:
@@ -136,10 +137,17 @@ class Unknowns:
     """
 
     def __init__(self, start: Fit) -> None:
-        self._run = start.run
-        self._ways = [Way.of(family, start) for family in families(start.run)]
-        self.count = len(self._ways)
-        self._doubt = float(np.log(self.count))
+        self._start, self._run = start, start.run
+        self._near: WeakKeyDictionary[Fit, dict[tuple[Way, ...], list[tuple[Way, float]]]] = WeakKeyDictionary()
+
+    @cached_property
+    def _ways(self) -> list[Way]:
+        return [Way.of(family, self._start) for family in families(self._run)]
+
+    @property
+    def count(self) -> int:
+        """How many there are."""
+        return len(self._ways)
 
     def beside(self, fit: Fit, others: Sequence[Way] = ()) -> tuple[FloatArray, FloatArray]:
         """An orthonormal basis (3 n, r) of what `fit` and some ways can change, and what they leave (3 n,)."""
@@ -151,6 +159,12 @@ class Unknowns:
 
     def nearest(self, fit: Fit, others: Sequence[Way] = ()) -> list[tuple[Way, float]]:
         """The ways that may be the best beside a fit and others, and their worth to first order [nats]."""
+        known = self._near.setdefault(fit, {})
+        if tuple(others) not in known:
+            known[tuple(others)] = self._ranked(fit, others)
+        return known[tuple(others)]
+
+    def _ranked(self, fit: Fit, others: Sequence[Way]) -> list[tuple[Way, float]]:
         basis, left = self.beside(fit, others)
         weights = np.repeat(fit.root_weights[:, 0], 3)
         rss, rows = float(left @ left), float(fit.noise.weights.sum())
@@ -195,7 +209,7 @@ class Unknowns:
 
     def _doubt_of(self, way: Way) -> float:
         """What having looked for it among all others costs [nats]."""
-        return self._doubt + (SPECIFIC if way.family.is_specific else _NO_NAME)
+        return float(np.log(self.count)) + (SPECIFIC if way.family.is_specific else _NO_NAME)
 
     def apart(self, fit: Fit, chosen: Sequence[Way], start: Apart | None = None) -> Apart:
         """The causes of a fit and ways to differ, fitted in turn to what the others leave.
@@ -208,8 +222,8 @@ class Unknowns:
         known = {} if start is None else dict(zip(start.chosen, start.numbers, strict=True))
         numbers = tuple(known.get(way, np.zeros(len(way.scales))) for way in chosen)
         # No function is expected to be larger than twice all that is left.
-        ridge = 0.25 * fit.noise.sigma**2 / max(float(np.square(fit.left).sum()), 1e-300)
-        here = Apart(fit.observations, tuple(chosen), numbers, fit if start is None else start.fit, ridge)
+        precision = 0.25 / max(float(np.square(fit.left).sum()), 1e-300)
+        here = Apart(fit.observations, tuple(chosen), numbers, fit if start is None else start.fit, precision)
         for _ in range(_ROUNDS):
             numbers = self._step(here)
             left = self._without(fit.observations, chosen, numbers)
@@ -252,9 +266,11 @@ class Unknowns:
         """Mean square of what causes, and ways, leave of rows that they were not fitted to, whitened."""
         columns, precision = fit.columns, prior_precision(fit.simulation, fit.nuisances)
         if apart is not None:
-            more = fit.weighted(self.told(apart))
+            # Held to what a number of each may be, as they were found: what few rows tell is not followed beyond them.
+            more = [way.columns.reshape(*fit.left.shape, -1) * fit.root_weights[:, :, None] for way in apart.chosen]
+            more = np.concatenate(more, axis=2)
             columns = np.concatenate([columns, more], axis=2)
-            precision = np.append(precision, np.full(more.shape[2], apart.ridge / fit.noise.sigma**2))
+            precision = np.append(precision, np.full(more.shape[2], apart.precision))
         square = held_out_square(fit, columns, precision, blocks)
         return square / max(float(fit.noise.weights.sum()), 1.0)
 
@@ -267,8 +283,9 @@ class Unknowns:
         columns = columns - basis @ (basis.T @ columns)
         scales = np.concatenate([way.scales for way in here.chosen])
         before = np.concatenate(here.numbers) * scales
-        normal = columns.T @ columns + here.ridge * np.eye(len(before))
-        step = solved(normal, columns.T @ fit.left.ravel() - here.ridge * before)
+        ridge = here.precision * fit.noise.sigma**2
+        normal = columns.T @ columns + ridge * np.eye(len(before))
+        step = solved(normal, columns.T @ fit.left.ravel() - ridge * before)
         return tuple(np.split((before + step) / scales, np.cumsum(counts)[:-1]))
 
     def _without(
@@ -279,6 +296,8 @@ class Unknowns:
         for family, own in ((way.family, own) for way, own in zip(chosen, numbers, strict=True)):
             if family.kind == "joint":
                 q[:, family.joint] += family.moved_by(self._run, own)[:, 0]
+            elif family.undone is not None:
+                x = family.undone(x, own)
             else:
                 x -= family.columns(self._run) @ own
         return replace(observations, motion=replace(observations.motion, q=q), x=x)

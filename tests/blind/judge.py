@@ -253,13 +253,18 @@ def cause_judged(truth: Truth, named: Named, index: int | None, whole: bool) -> 
         *named.effect.key,
         probability=cause.probability,
         is_right=index is not None,
-        open=bool(rivals & true_keys) and cause.probability < SURE,
+        open=(bool(rivals & true_keys) or _may_be_strange(truth, cause)) and cause.probability < SURE,
         listed=len(cause.indistinguishable_from),
         needless=tuple(needless),
         wrong_reach=tuple(wrong_reach),
         numbers=numbers,
         left_out=left_out,
     )
+
+
+def _may_be_strange(truth: Truth, cause: Cause) -> bool:
+    """Whether a cause is said to be perhaps something without a name, where there is such a thing."""
+    return bool(truth.strange) and any(rival.what for rival in cause.rivals)
 
 
 def _member(truth: Truth, member: Indistinguishable) -> Effect:
@@ -330,7 +335,8 @@ def outcome(
         if file.verdict == "unexplained":
             return "wrong" if any(cause.probability >= SURE for cause in false) else "right"
         unseen = all(truth.seen_chi2 < TOLD for truth in hidden)
-        return "honest" if unseen and not false else "wrong" if false else "missed"
+        left_open = all(truth.told_chi2 < TOLD for truth in hidden) and all(cause.open for cause in false)
+        return "honest" if (left_open if false else unseen) else "wrong" if false else "missed"
     if any(not cause.open for cause in false) or file.verdict == "unexplained":
         return "wrong"
     lost = [t for t in hidden if t.found_as is None and not t.among_rivals]

@@ -233,6 +233,19 @@ def test_false_fixes_where_there_are_none_are_wrong(truth_of: Hide) -> None:
     assert compared(truth_of(ELBOW), _file(_cause(ELBOW), named))[2] == "wrong"
 
 
+@pytest.mark.parametrize(
+    ("probability", "told_chi2", "said"), [(0.6, 20.0, "honest"), (0.95, 20.0, "wrong"), (0.6, 30.0, "wrong")]
+)
+def test_a_name_that_is_left_open_is_honest_where_no_oracle_tells_it_from_what_has_none(
+    truth_of: Hide, probability: float, told_chi2: float, said: str
+) -> None:
+    truth = truth_of("vergence", pose_known=True)
+    nameless = Indistinguishable("unexplained", None, None, "this_motion", 0.4, "the eyes are turned")
+    file = _file(_cause("camera_scale", nameless, probability=probability), verdict="undecided")
+    (hidden,), causes, _ = compared(truth, file)
+    assert outcome(file, [msgspec.structs.replace(hidden, told_chi2=told_chi2)], causes, False) == said
+
+
 def test_what_is_outside_the_table_is_right_when_unexplained_and_wrong_under_a_name(truth_of: Hide) -> None:
     truth = truth_of("square_of_other@elbow:shoulder_pitch")
     unexplained = _file(verdict="unexplained", depends_on=("elbow", "shoulder_pitch"))

@@ -10,7 +10,7 @@ from planted_cases import BASE, ELBOW, SHOULDER, at_rest, desk_arm, observed, st
 from scipy import stats
 
 from diagnosis.alignment import aligned
-from diagnosis.fit import Fit
+from diagnosis.fit import Fit, improved
 from diagnosis.observations import Observations, stereo_covariances
 from diagnosis.scan import Scan
 from effects import Effect, Simulation
@@ -194,3 +194,11 @@ def test_a_time_constant_of_which_little_is_told_is_not_said_to_be_sure(robot) -
     drift = Effect.at(robot, "thermal_drift", values=[0.001, 0.0, 0.0, long])
     fit = start_of(robot, way, (drift,), 5).with_causes([drift])
     assert np.sqrt(fit.covariance[-1, -1]) > 0.5 * long
+
+
+def test_a_fit_that_cannot_become_so_probable_is_given_up(robot) -> None:
+    truth = Effect.at(robot, "joint_offset", SHOULDER, values=[0.02])
+    other = start_of(robot, walk(robot, 1), (truth,), 1).starting([Effect.at(robot, "joint_scale", SHOULDER)])
+    best = improved(other).log_likelihood
+    assert improved(other, best + 1000.0) is other
+    assert improved(other, best).log_likelihood == best

@@ -126,6 +126,19 @@ def test_effects_that_are_only_small_are_not_said_to_be_the_same_in_any_motion()
     assert "of them, since the effect is small" in " ".join(conclusion(found).advice)
 
 
+def test_a_rival_that_can_do_more_than_a_cause_does_not_make_it_surer() -> None:
+    robot = surveyed_arm()
+    motion = walk(robot, 2, ROWS)
+    truth = Effect.at(robot, "encoder_jump", robot.joints[-1], values=[0.02, float(motion.clock[ROWS // 2]) + 0.01])
+    found = diagnosed(robot, motion, truth, ("encoder_jump", "tool_slip"))
+    (standing,) = found.standings
+    (rival,) = (rival for rival in standing.rivals if rival.effect is not None and rival.effect.name == "tool_slip")
+    assert rival.is_same_anywhere
+    assert not rival.is_one
+    assert standing.probability < 1.0 - rival.probability + 1e-9
+    assert any(line.startswith("tool_slip can do all that") for line in conclusion(found).advice)
+
+
 def test_a_cause_that_nothing_else_comes_near_has_no_rivals() -> None:
     robot = desk_arm()
     truth = Effect.at(robot, "joint_scale", SHOULDER, values=[0.02])

@@ -136,3 +136,32 @@ def test_the_best_pair_is_what_both_together_would_explain(robot) -> None:
 def test_one_effect_is_no_pair(robot) -> None:
     start = start_of(robot, walk(robot, 6), (), 6)
     assert Scan(start).best_pair([Effect.at(robot, "joint_offset", SHOULDER)]) is None
+
+
+def test_one_of_the_best_pair_may_begin_at_the_moment_at_which_it_would_explain_most_alone(robot) -> None:
+    planted = (
+        Effect.at(robot, "encoder_jump", ELBOW, values=[0.01, 35.1]),
+        Effect.at(robot, "joint_scale", SHOULDER, values=[0.02]),
+    )
+    kinds = ("joint_offset", "joint_scale", "encoder_jump")
+    hypotheses = [Effect.at(robot, name, joint) for name in kinds for joint in (BASE, SHOULDER, ELBOW)]
+    scan = Scan(start_of(robot, walk(robot, 3), planted, 3))
+    pair, alone = scan.best_pair(hypotheses), scan.candidate(Effect.at(robot, "encoder_jump", ELBOW))
+    assert pair is not None
+    assert alone is not None
+    assert {one.effect.key for one in pair} == {effect.key for effect in planted}
+    jump = next(one for one in pair if one.effect.name == "encoder_jump")
+    assert jump.effect.values[1] == alone.effect.values[1]
+
+
+def test_a_scan_without_a_cause_sees_what_a_fit_without_it_leaves(robot) -> None:
+    truth = [
+        Effect.at(robot, "joint_offset", SHOULDER, values=[0.004]),
+        Effect.at(robot, "joint_scale", ELBOW, values=[0.01]),
+    ]
+    fit = start_of(robot, walk(robot, 4), tuple(truth), 4).with_causes(truth)
+    asked = [Effect.at(robot, name, ELBOW) for name in ("joint_scale", "joint_eccentricity", "joint_ripple")]
+    cause = fit.causes[1]
+    here = Scan(fit, fit.causes).without(cause).candidates(asked)
+    refitted = Scan(fit.without(cause)).candidates(asked)
+    np.testing.assert_allclose([c.gain for c in here], [c.gain for c in refitted], rtol=0.02)

@@ -8,7 +8,8 @@ from hypothesis import strategies as st
 from planted_cases import BASE, ELBOW, INTERVAL_S, SHOULDER, at_rest, desk_arm, start_of, surveyed_arm, walk
 
 from diagnosis.fit import Fit
-from diagnosis.search import NAMED, Search, nats, simplicity
+from diagnosis.scan import Scan
+from diagnosis.search import NAMED, Search, nats, rise_for, simplicity
 from effects import Effect
 from interfaces.robot import RobotDescription
 
@@ -105,7 +106,7 @@ def test_the_more_hypotheses_there_are_the_more_one_of_them_has_to_explain(robot
     start = start_of(robot, walk(robot, 2), (Effect.at(robot, "joint_offset", ELBOW, values=[0.02]),), 2)
     offset = Effect.at(robot, "joint_offset", ELBOW)
     few, many = Search([offset], lambda _: None), Search([offset] * 100, lambda _: None)
-    (candidate,) = few.shortlist(start, [offset])
+    (candidate,) = few.shortlist(Scan(start), [offset])
     assert many.doubt(candidate) > few.doubt(candidate) + NAMED
 
 
@@ -191,3 +192,9 @@ def test_two_offsets_are_named_rather_than_the_link_between_them_that_can_do_bot
     hypotheses = [Effect.at(robot, "link_geometry", SHOULDER), *map(at_rest, offsets)]
     found = Search(hypotheses, lambda _: None).run(start)
     assert names(found) == {("joint_offset", BASE), ("joint_offset", SHOULDER)}
+
+
+@given(st.floats(0.0, 1e4), st.integers(0, 6))
+def test_the_rise_that_a_worth_needs_is_worth_as_much(worth, dof) -> None:
+    assert abs(nats(2.0 * rise_for(worth, dof), dof) - worth) < 1e-3
+    assert abs(nats(2.0 * rise_for(-worth, -dof), -dof) + worth) < 1e-3

@@ -55,6 +55,29 @@ def found(recording: Recording, robot: RobotDescription) -> DiagnosisFile:
     return conclusion(diagnose(recording, Simulation(robot)))
 
 
+def with_a_link_that_bends(robot: RobotDescription, times_the_noise: float, seed: int) -> Recording:
+    """Seen when the upper arm turns about its middle, across it alone, in proportion to the moment on it there."""
+    motion, k = walk(robot, seed), robot.joints.index(ELBOW)
+    run, (T, *_) = Simulation(robot).run(motion), Simulation(robot).gravity.in_supports(robot.joints.index(ELBOW))
+    moments, forces = (load[:, k] for load in Simulation(robot).gravity.loads(motion.q))
+    half = 0.5 * T[:3, 3] @ T[:3, :3]
+    along = half / np.linalg.norm(half)
+    bending = moments + np.cross(half, forces)
+    bending -= np.outer(bending @ along, along)
+    R, elbow = run.frames[:, k, :3, :3], run.frames[:, k, :3, 3]
+    lever = run.measured - elbow + R @ half
+    moved = np.cross(np.einsum("nij,nj->ni", R, bending), lever)
+    moved *= times_the_noise * SIGMA_M / np.sqrt(np.square(moved).mean())
+    noise = SIGMA_M * np.random.default_rng([seed, 1]).normal(size=moved.shape)
+    return measured(robot, motion, run.measured + moved + noise)
+
+
+def test_a_link_that_bends_is_unexplained_and_no_cause_is_named(robot) -> None:
+    file = found(with_a_link_that_bends(robot, 0.5, 1), robot)
+    assert (file.verdict, file.causes) == ("unexplained", ())
+    assert file.unexplained.what == (f"what carries {ELBOW} gives under the arm's weight",)
+
+
 @pytest.mark.parametrize("size", [1.0, 4.0])
 def test_a_mount_that_gives_alike_about_all_axes_is_unexplained_and_no_cause_is_named(robot, size) -> None:
     file = found(on_a_soft_mount(robot, size, 1), robot)

@@ -96,7 +96,7 @@ def test_the_held_out_error_is_that_of_the_stored_model(robot, diagnosis, file, 
 
 
 def test_what_wanders_with_time_is_not_in_the_model_and_that_is_told(robot) -> None:
-    motion = walk(robot, 1, rows=600)
+    motion = walk(robot, 1, rows=300)
     q = motion.q.copy()
     q[:, robot.joints.index(SHOULDER)] += 0.02 * np.sin(np.linspace(0.0, 9.0, len(q)))
     x = Simulation(robot).positions(motion_of(q))
@@ -104,6 +104,7 @@ def test_what_wanders_with_time_is_not_in_the_model_and_that_is_told(robot) -> N
     diagnosis = diagnose(measured(robot, motion, x + noise), Simulation(robot))
     left = conclusion(diagnosis).unexplained
     assert diagnosis.extended.simulation.residual is None
+    assert diagnosis.causes == ()
     assert (left.model_joints, left.not_in_model) == ((), left.what)
     assert "What changes with time is in no such model" in modelled(left)
 
@@ -127,7 +128,7 @@ def test_depth_that_errs_with_the_place_in_the_image_is_unexplained_and_learnt()
     diagnosis = diagnose(measured(robot, motion, x + noise), Simulation(robot))
     found = conclusion(diagnosis)
     assert (found.verdict, found.causes) == ("unexplained", ())
-    assert found.rms_mm.extended < 1.3 * found.rms_mm.noise_floor
+    assert found.rms_mm.extended < 1.3 * (found.rms_mm.noise_floor or 0.0)
 
 
 def test_where_nothing_is_hidden_nothing_is_found(robot) -> None:

@@ -1,0 +1,42 @@
+"""A stereo pair whose eyes are turned against each other, which no effect of the table is."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from interfaces.camera import StereoCalibration
+from interfaces.records import FloatArray
+
+# By which derivatives are taken [rad].
+_STEP = 1e-5
+# Rounds in which what was reported is undone.
+_ROUNDS = 8
+
+
+def reported(x: FloatArray, calibration: StereoCalibration, turn: FloatArray) -> FloatArray:
+    """What the calibration triangulates (n, 3) [m] of points (n, 3) [m] in the left optical frame.
+
+    Args:
+        turn: of the right eye, as a rotation vector (3,) in its own optical frame [rad].
+    """
+    baseline = np.array([calibration.baseline_m, 0.0, 0.0])
+    # A row vector times R is its transpose's: into the turned eye.
+    right = (x - baseline) @ Rotation.from_rotvec(turn).as_matrix()
+    one, other = x[:, :2] / x[:, 2:], right[:, :2] / right[:, 2:]
+    depth = calibration.baseline_m / (one[:, 0] - other[:, 0])
+    return np.stack([one[:, 0] * depth, 0.5 * (one[:, 1] + other[:, 1]) * depth, depth], axis=1)
+
+
+def undone(x: FloatArray, calibration: StereoCalibration, turn: FloatArray) -> FloatArray:
+    """The points (n, 3) [m] of which `reported` says x (n, 3) [m]."""
+    points = x
+    for _ in range(_ROUNDS):
+        points = points + (x - reported(points, calibration, turn))
+    return points
+
+
+def by_turn(x: FloatArray, calibration: StereoCalibration, axes: FloatArray) -> FloatArray:
+    """Derivatives (n, 3, a) [m/rad] of `reported` at points (n, 3) by turns about some axes (a, 3)."""
+    ends = [(reported(x, calibration, _STEP * axis), reported(x, calibration, -_STEP * axis)) for axis in axes]
+    return np.stack([(above - below) / (2.0 * _STEP) for above, below in ends], axis=2)

@@ -1,0 +1,79 @@
+"""Which causes stay beside what has no name, and what counts as predicting rows that were not fitted."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+from planted_cases import ELBOW, SHOULDER, SIGMA_M, desk_arm, measured, motion_of, start_of, walk
+
+from diagnosis import explanation
+from diagnosis.alignment import aligned
+from diagnosis.explanation import Explanation, explain
+from diagnosis.families import families
+from diagnosis.fit import Fit
+from diagnosis.observations import Observations
+from diagnosis.search import NAMED
+from diagnosis.unknown import Unknowns, Way
+from effects import Effect, Simulation
+
+
+class Believing:
+    """Takes what has no name to predict whatever it is asked about, and looking for causes to cost nothing."""
+
+    def predicts(self, *_: object) -> bool:
+        return True
+
+    def doubt_of(self, _: Effect) -> float:
+        return 0.0
+
+
+def explained_beside(fits: list[Fit], worths: list[float], monkeypatch: pytest.MonkeyPatch) -> Explanation:
+    """What is taken of fits of these worths, the last without any way and the others beside one and the same."""
+    way = SimpleNamespace(family=SimpleNamespace(what="something", is_specific=False))
+    apart = cast(Any, SimpleNamespace(chosen=(way,)))
+    known = {
+        fit: Explanation(fit, None if fit is fits[-1] else apart, worth, size=1e6, promise=1e6)
+        for fit, worth in zip(fits, worths, strict=True)
+    }
+    shorter = {len(fit.causes): one for fit, one in known.items()}
+    monkeypatch.setattr(explanation, "_with_unknown", lambda fit, *_: known.get(fit) or shorter[len(fit.causes)])
+    believing = cast(Any, Believing())
+    return explain(fits[-1], fits, believing, believing, lambda _: None)
+
+
+def fits_on_the_way() -> list[Fit]:
+    robot = desk_arm()
+    truth = tuple(Effect.at(robot, "joint_offset", joint, values=[0.02]) for joint in (SHOULDER, ELBOW))
+    start = start_of(robot, walk(robot, 1), truth, 1)
+    return [start.with_causes(truth[:count]) for count in range(3)]
+
+
+def test_fewer_causes_stay_where_one_more_is_hardly_better_beside_the_same_way(monkeypatch) -> None:
+    fits = fits_on_the_way()
+    assert explained_beside(fits, [100.0, 101.0 + NAMED, 0.0], monkeypatch).fit is fits[0]
+
+
+def test_one_more_cause_is_taken_where_it_is_clearly_better_beside_the_same_way(monkeypatch) -> None:
+    fits = fits_on_the_way()
+    assert explained_beside(fits, [100.0, 120.0, 0.0], monkeypatch).fit is fits[1]
+
+
+def test_what_few_rows_tell_of_a_way_is_no_reason_to_doubt_it() -> None:
+    # A shoulder that errs by the elbow's square, where the elbow was far out in a few rows alone.
+    robot = desk_arm()
+    shoulder, elbow = (robot.joints.index(joint) for joint in (SHOULDER, ELBOW))
+    q = walk(robot, 1, rows=200).q.copy()
+    q[:, elbow] = np.median(q[:, elbow]) + 0.25 * (q[:, elbow] - np.median(q[:, elbow]))
+    q[100:105, elbow] = q[:, elbow].max() + np.linspace(0.5, 1.0, 5)
+    errs = q.copy()
+    errs[:, shoulder] += 0.005 * np.square(q[:, elbow])
+    simulation = Simulation(robot)
+    noise = SIGMA_M * np.random.default_rng([1, 1]).normal(size=(len(q), 3))
+    recording = measured(robot, motion_of(q), simulation.positions(motion_of(errs)) + noise)
+    start = aligned(Observations.of(recording, simulation), simulation)
+    unknowns = Unknowns(start)
+    (family,) = (one for one in families(start.run) if (one.joint, one.drivers) == (shoulder, (shoulder, elbow)))
+    assert unknowns.predicts(unknowns.apart(start, (Way.of(family, start),)), start)

@@ -1,0 +1,83 @@
+"""Eyes that are turned against each other are told from a wrong scale where the data tell, and left open where not."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from planted_cases import SIGMA_M, measured, surveyed_arm, walk
+from scipy.spatial.transform import Rotation
+
+from diagnosis.conclusion import conclusion
+from diagnosis.diagnosis import diagnose
+from diagnosis.eyes import by_turn, reported, undone
+from diagnosis.result import DiagnosisFile
+from effects import Effect, Simulation
+from interfaces.records import FloatArray
+
+TURNS = st.lists(st.floats(-0.01, 0.01), min_size=3, max_size=3).map(np.array)
+ROBOT = surveyed_arm()
+assert ROBOT.calibration is not None
+CALIBRATION = ROBOT.calibration
+
+
+def points(seed: int = 0) -> FloatArray:
+    return np.random.default_rng(seed).uniform([-0.3, -0.3, 0.6], [0.3, 0.3, 1.2], size=(50, 3))
+
+
+def triangulated(x: FloatArray, turn: FloatArray) -> FloatArray:
+    """By pixels: each eye's own camera matrix, the rows averaged."""
+    c = CALIBRATION
+    K = np.array([[c.focal_px, 0.0, c.principal_point_px[0]], [0.0, c.focal_px, c.principal_point_px[1]], [0, 0, 1]])
+    left = K @ x.T
+    right = K @ Rotation.from_rotvec(turn).inv().as_matrix() @ (x - [c.baseline_m, 0.0, 0.0]).T
+    (ul, vl), (ur, vr) = left[:2] / left[2], right[:2] / right[2]
+    depth = c.focal_px * c.baseline_m / (ul - ur)
+    pixels = np.stack([ul - K[0, 2], 0.5 * (vl + vr) - K[1, 2], np.full(len(x), c.focal_px)], axis=1)
+    return pixels * (depth / c.focal_px)[:, None]
+
+
+@given(TURNS)
+def test_what_turned_eyes_report_is_what_their_pixels_triangulate(turn) -> None:
+    np.testing.assert_allclose(reported(points(), CALIBRATION, turn), triangulated(points(), turn), atol=1e-12)
+
+
+@given(TURNS)
+def test_what_turned_eyes_report_is_undone(turn) -> None:
+    np.testing.assert_allclose(undone(reported(points(), CALIBRATION, turn), CALIBRATION, turn), points(), atol=1e-6)
+
+
+def test_derivatives_by_turns_are_those_of_small_turns() -> None:
+    turn = np.array([2e-6, -1e-6, 3e-6])
+    moved = reported(points(), CALIBRATION, turn) - points()
+    np.testing.assert_allclose(by_turn(points(), CALIBRATION, np.eye(3)) @ turn, moved, atol=1e-9)
+
+
+def found(x: FloatArray, seed: int) -> DiagnosisFile:
+    noise = SIGMA_M * np.random.default_rng([seed, 1]).normal(size=x.shape)
+    return conclusion(diagnose(measured(ROBOT, walk(ROBOT, seed), x + noise), Simulation(ROBOT)))
+
+
+def with_turned_eyes(vergence: float, seed: int) -> DiagnosisFile:
+    right = Simulation(ROBOT).positions(walk(ROBOT, seed))
+    return found(reported(right, CALIBRATION, np.array([0.0, vergence, 0.0])), seed)
+
+
+@pytest.mark.parametrize("vergence", [0.002, -0.005])
+def test_eyes_that_are_turned_towards_each_other_are_unexplained_and_no_scale(vergence) -> None:
+    file = with_turned_eyes(vergence, 1)
+    assert (file.verdict, file.causes) == ("unexplained", ())
+    assert file.unexplained.what == ("the eyes are turned towards each other",)
+
+
+def test_a_turn_that_the_data_hardly_tell_from_a_scale_is_no_scale_for_sure() -> None:
+    for seed in range(1, 4):
+        file = with_turned_eyes(0.0002, seed)
+        assert not any(cause.effect == "camera_scale" and cause.probability > 0.9 for cause in file.causes)
+
+
+def test_a_wrong_scale_is_named_and_not_taken_for_turned_eyes() -> None:
+    scale = Effect.at(ROBOT, "camera_scale", values=[0.004])
+    file = found(Simulation(ROBOT, (scale,)).positions(walk(ROBOT, 1)), 1)
+    assert (file.verdict, [cause.effect for cause in file.causes]) == ("explained", ["camera_scale"])

@@ -1,0 +1,37 @@
+"""An error without a name depends on the joints that hold a twentieth of its variance or more."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from planted_cases import BASE, ELBOW, SHOULDER, desk_arm, scattered
+
+from diagnosis.families import Family
+from diagnosis.sensitivity import joints_of
+from effects import Simulated, Simulation
+from interfaces.records import FloatArray
+
+HOLDING = {0.02: {SHOULDER}, 0.1: {SHOULDER, ELBOW}}
+
+
+@pytest.mark.parametrize("share", HOLDING)
+def test_a_joint_is_told_that_holds_a_twentieth_of_the_variance(share) -> None:
+    robot = desk_arm()
+    run = Simulation(robot).run(scattered(robot, 1, rows=2000))
+    both = [robot.joints.index(joint) for joint in (SHOULDER, ELBOW)]
+    spread = run.motion.q[:, both].std(axis=0)
+
+    def amounts(run: Simulated) -> FloatArray:
+        return run.motion.q[:, both] / spread
+
+    family = Family("two joints", "place", None, (), False, lambda run: run.measured[:, :, None], amounts)
+    found = joints_of(family, np.sqrt([1.0 - share, share]), run)
+    assert {robot.joints[k] for k in found} == HOLDING[share]
+
+
+def test_the_joint_that_errs_is_told_whatever_it_holds() -> None:
+    robot = desk_arm()
+    run, base, elbow = Simulation(robot).run(scattered(robot, 1)), *(robot.joints.index(j) for j in (BASE, ELBOW))
+    moves, amounts = lambda run: run.by_joint[:, :, [base]], lambda run: run.motion.q[:, [elbow]]
+    found = joints_of(Family("an error of the base", "joint", base, (elbow,), False, moves, amounts), np.ones(1), run)
+    assert found == {base, elbow}
