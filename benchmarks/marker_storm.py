@@ -7,8 +7,8 @@ ball than 5 of its sigmas and 2 mm, or where there is no ball to be seen. A ball
 of the border, before things of other hues and without a twin: those are to be kept. The twin shows beside the ball from
 a scene's first frame on and has to be called ambiguous.
 
-Each scene has random numbers of its own: `--list` names the scenes of what is wrong and of good balls that are
-refused, `--only` shows one of them again.
+Each scene has random numbers of its own; Ctrl-C ends the storm early, with its table. `--list` names the scenes of what
+is wrong and of good balls that are refused, `--only` shows one of them again.
 """
 
 from __future__ import annotations
@@ -129,7 +129,8 @@ def shoot(scene: Scene, number: int, rng: np.random.Generator) -> tuple[StereoFr
 
 @dataclass
 class Count:
-    """What became of the frames of one kind: how many, fixes, wrong ones, good balls, those kept, reasons for none."""
+    """What became of the frames of one kind: how many, fixes, wrong ones, good balls, those kept, reasons for none, and
+    the errors (3,) of those kept in their claimed sigmas."""
 
     frames: int = 0
     fixes: int = 0
@@ -137,8 +138,9 @@ class Count:
     good: int = 0
     kept: int = 0
     reasons: Counter[Reason] = field(default_factory=Counter)
+    off_sigmas: list[FloatArray] = field(default_factory=list)
 
-    def add(self, answer: MarkerFix | MarkerMiss, *, wrong: bool, good: bool) -> None:
+    def add(self, answer: MarkerFix | MarkerMiss, x: FloatArray, *, wrong: bool, good: bool) -> None:
         self.frames += 1
         self.wrong += wrong
         self.good += good
@@ -147,6 +149,8 @@ class Count:
             return
         self.fixes += 1
         self.kept += good
+        if good:
+            self.off_sigmas.append((answer.x - x) / np.sqrt(np.diag(answer.cov)))
 
 
 def is_wrong(answer: MarkerFix | MarkerMiss, x: FloatArray, *, shown: bool) -> bool:
@@ -167,7 +171,7 @@ def run_scene(number: int, seed: int, count: Count, *, listed: bool) -> None:
         answer = tracker.track(frame)
         wrong = is_wrong(answer, x, shown=shown)
         good = shown and kind in GOOD and is_in_full_view(x)
-        count.add(answer, wrong=wrong, good=good)
+        count.add(answer, x, wrong=wrong, good=good)
         if listed and (wrong or (good and isinstance(answer, MarkerMiss))):
             said = f"off by {1e3 * (answer.x - x)} mm" if isinstance(answer, MarkerFix) else answer.reason
             print(f"scene {number} ({kind}), frame {frame_number}: {said}")
@@ -178,13 +182,18 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=5000, help="how many stereo frames in all")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--list", action="store_true", help="name the scenes of wrong fixes and of good balls refused")
+    parser.add_argument("--first", type=int, default=0, help="the number of the first scene, to go on with a storm")
     parser.add_argument("--only", type=int, help="the number of one scene")
     arguments = parser.parse_args()
     cv2.setNumThreads(1)
     counts = {kind: Count() for kind in KINDS}
-    scenes = range(arguments.frames // FRAMES_OF_A_SCENE) if arguments.only is None else [arguments.only]
-    for number in scenes:
-        run_scene(number, arguments.seed, counts[KINDS[number % len(KINDS)]], listed=arguments.list)
+    last = arguments.first + arguments.frames // FRAMES_OF_A_SCENE
+    scenes = range(arguments.first, last) if arguments.only is None else [arguments.only]
+    try:
+        for number in scenes:
+            run_scene(number, arguments.seed, counts[KINDS[number % len(KINDS)]], listed=arguments.list)
+    except KeyboardInterrupt:
+        print("Stopped; so far:")
     print("| scene | frames | fixes | wrong | good balls | kept | rejected as |\n" + "| --- " * 7 + "|")
     for kind, count in counts.items():
         said = ", ".join(f"{number} {reason}" for reason, number in count.reasons.most_common())
@@ -196,6 +205,10 @@ def main() -> None:
     bound = f", below {100 * 3 / frames:.3f} % at 95 %" if wrong == 0 else ""
     share = f" ({kept / good:.1%})" if good else ""
     print(f"\n{wrong} wrong fixes in {frames} frames{bound}; {kept} of {good} good balls kept{share}")
+    off = np.abs([each for count in counts.values() for each in count.off_sigmas])
+    if len(off):
+        within = [" ".join(f"{each:.1%}" for each in np.mean(off < sigmas, axis=0)) for sigmas in (1.0, 2.0)]
+        print(f"of these, x y z within 1 sigma {within[0]}, within 2 sigma {within[1]}")
 
 
 if __name__ == "__main__":

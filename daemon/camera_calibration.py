@@ -17,7 +17,7 @@ from vision.board.board import Pattern
 from vision.board.page import page as board_page
 from vision.calibration.calibrate import Asked, Calibrated, ModelChoice, calibrate
 from vision.calibration.check import Check, check
-from vision.calibration.gather import Gathered, gathered, require_any
+from vision.calibration.gather import Gathered, gathered, require_both
 from vision.calibration.images import ImagePair, PairFiles, pair_files, read_pairs, write_pair
 from vision.calibration.report import page as report_page
 from vision.printing.sheet import rulers_mm
@@ -112,6 +112,7 @@ class CamerasFile(msgspec.Struct):
     left_out: list[LeftOutView]
     unusable: list[UnusableImage]
     missing: list[str]
+    size_was_measured: bool
 
 
 class CheckFile(msgspec.Struct):
@@ -186,12 +187,12 @@ def from_images(images: Images, board: Board, tell: Tell) -> Gathered:
     """All views in a folder's images.
 
     Raises:
-        CalibrationError: there are no pairs, sizes differ, or no image shows a usable board.
+        CalibrationError: there are no pairs, sizes differ, or an eye never sees a usable board.
     """
     files = images.files()
     tell(f"looking for the board in {len(files)} pairs of images")
     found = gathered(read_pairs(files, side_by_side=images.side_by_side), board, tell)
-    require_any(found)
+    require_both(found)
     return found
 
 
@@ -241,8 +242,12 @@ def write_calibrated_cameras(result: Calibrated, found: Gathered, out: Path) -> 
     return report
 
 
-def figures(result: Calibrated, found: Gathered) -> CamerasFile:
-    """A calibration in figures."""
+def figures(result: Calibrated, found: Gathered, *, size_was_measured: bool) -> CamerasFile:
+    """A calibration in figures.
+
+    Args:
+        size_was_measured: whether a ruler told the board's size, or the distance of the lenses.
+    """
     rig, fitted = result.rig, result.fitted
     errors = zip(fitted.views, fitted.bundle.view_rms_px().tolist(), fitted.held_out.view_rms_px.tolist(), strict=True)
     widths = NORMAL_95 * rig.sigma
@@ -263,6 +268,7 @@ def figures(result: Calibrated, found: Gathered) -> CamerasFile:
         left_out=[LeftOutView(each.name, each.rms_px, each.usual_px) for each in fitted.left_out],
         unusable=[UnusableImage(each.name, each.eye, each.fault.why, each.fault.text) for each in found.unusable],
         missing=result.coverage.missing(),
+        size_was_measured=size_was_measured,
     )
 
 
@@ -279,8 +285,8 @@ def checked(file: Path, images: Images, board: Board) -> tuple[CheckFile, str]:
         found = gathered(read_pairs([pair], side_by_side=images.side_by_side), board)
         rig.require(found.image_size_px, rig.serials)
         if found.views and found.views[0].is_stereo:
-            return check_figures(check(rig, found.views[0], board)), pair.name
-    require_any(gathered(read_pairs(files, side_by_side=images.side_by_side), board))
+            return check_figures(check(rig, found.views[0], board)), f"view {pair.name}"
+    require_both(gathered(read_pairs(files, side_by_side=images.side_by_side), board))
     raise CalibrationError("no pair of images shows the board to both eyes. Hold it into the middle of both images")
 
 

@@ -9,6 +9,7 @@ from rich.table import Table
 from rich.text import Text
 
 from daemon.camera_calibration import AHEAD_M, CamerasFile, CheckFile
+from interfaces.interval import to_its_interval
 
 _WISHES = 3
 
@@ -21,14 +22,14 @@ def cameras_view(found: CamerasFile) -> Group:
     own = [name.removeprefix("left.") for name in values if name.startswith("left.")]
     for name in own:
         left, right = values[f"left.{name}"], values[f"right.{name}"]
-        pairs = [(f"{each.value:.5g}", f"± {each.half_width:.2g}") for each in (left, right)]
-        table.add_row(Text(_with_unit(name)), *pairs[0], *pairs[1])
+        pairs = (to_its_interval(each.value, each.half_width) for each in (left, right))
+        table.add_row(Text(_with_unit(name)), *(text for pair in pairs for text in pair))
     return Group(table, *(Padding(Text(text), (1, 0, 0, 0), expand=False) for text in _sentences(found)))
 
 
 def check_view(found: CheckFile, name: str) -> Group:
     """The figures with what they should be, then the verdict."""
-    table = _table(f"{name}, {found.corners} corners", "measured", "95 %", "should be")
+    table = _table(f"{name}: {found.corners} corners", "measured", "95 %", "should be")
     table.add_row(
         Text("rows of both eyes apart [px]"), f"{found.rows_px:+.3f}", f"± {found.rows_half_width_px:.3f}", "0"
     )
@@ -37,7 +38,12 @@ def check_view(found: CheckFile, name: str) -> Group:
     table.add_row(
         Text("square [mm]"), f"{found.square_mm:.3f}", f"± {found.square_half_width_mm:.3f}", f"{found.nominal_mm:.3f}"
     )
-    texts = ["The calibration holds."] if found.holds else [f"The calibration does not hold: {'; '.join(found.wrong)}."]
+    texts = ["The calibration holds."]
+    if not found.holds:
+        texts = [
+            f"The calibration does not hold: {'; '.join(found.wrong)}.",
+            "Put that right, or calibrate again: `bodyschema calibrate cameras`.",
+        ]
     return Group(table, *(Padding(Text(text), (1, 0, 0, 0), expand=False) for text in texts))
 
 
@@ -55,6 +61,11 @@ def _sentences(found: CamerasFile) -> list[str]:
         said.append(f"Left out, since they do not fit the others: {names}.")
     if found.unusable:
         said.append(f"{len(found.unusable)} images could not be used; the report names them.")
+    if not found.size_was_measured:
+        said.append(
+            "No image tells whether the board is as large as it says: measure the line below it and give --ruler-mm, "
+            "or the distance of the lenses and give --baseline-mm."
+        )
     if found.missing:
         more = "" if len(found.missing) <= _WISHES else f"; and {len(found.missing) - _WISHES} more, in the report"
         said.append(f"It would be better with: {'; '.join(found.missing[:_WISHES])}{more}.")

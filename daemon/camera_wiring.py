@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from time import monotonic
 
@@ -23,6 +23,7 @@ from vision.cameras.opened import eyes_of
 from vision.cameras.serials import connected
 from vision.cameras.watched import PlainEyes, WatchedCamera
 from vision.rectified import RectifiedCamera
+from vision.rig import StereoRig
 from vision.rig_file import read_rig
 
 from .config import Config
@@ -73,9 +74,10 @@ def camera_of(config: Config, eyes: LiveEyes | Film) -> StereoCamera:
     Raises:
         ConfigError: nothing says how they see, or the file cannot be read.
     """
-    named = require_cameras(config).calibration
-    if named is not None:
-        return RectifiedCamera(eyes, read_rig(config.file.parent / named))
+    cameras = require_cameras(config)
+    if cameras.calibration is not None:
+        rig = read_rig(calibration_file(config))
+        return RectifiedCamera(eyes, _of_files(rig, cameras) if isinstance(eyes, Film) else rig)
     if config.robot.calibration is None:
         raise ConfigError(
             "nothing says how the cameras see",
@@ -85,6 +87,13 @@ def camera_of(config: Config, eyes: LiveEyes | Film) -> StereoCamera:
             "stereo pair in [camera]",
         )
     return IdealCamera(eyes, config.robot.calibration)
+
+
+def _of_files(rig: StereoRig, cameras: CamerasConfig) -> StereoRig:
+    """The rig without serials, as files do not tell which cameras took them, unless it names these very files."""
+    layout = cameras.layout
+    names = {layout.left, layout.right} if isinstance(layout, ImagesConfig | VideosConfig) else set[str | None]()
+    return rig if names & set(rig.serials) else replace(rig, serials=("", ""))
 
 
 def require_usable(config: Config) -> None:
@@ -203,8 +212,9 @@ def _told(figures: CameraFigures) -> str:
     return f"{figures.frames} frames{rate}{stamps}{torn}"
 
 
-def camera_lines(cameras: CamerasConfig) -> Iterator[str]:
-    """Where images come from, in words."""
+def camera_lines(config: Config) -> Iterator[str]:
+    """Where images come from, in words; ConfigError where the calibration cannot be read."""
+    cameras = require_cameras(config)
     match cameras.layout:
         case UvcSettings() as layout:
             for name, device in cameras.devices.items():
@@ -219,7 +229,14 @@ def camera_lines(cameras: CamerasConfig) -> Iterator[str]:
     known = "" if cameras.latency_sigma_s is not None or not cameras.devices else ", not measured"
     yield f"taken {1e3 * cameras.latency_s:.1f} ms before their time stamp ± {1e3 * cameras.sigma_s:.1f} ms{known}"
     if cameras.calibration is not None:
-        yield f"calibrated by {cameras.calibration}"
+        yield _calibrated_by(cameras.calibration, calibration_file(config))
+
+
+def _calibrated_by(name: str, file: Path) -> str:
+    if not file.exists():
+        return f"calibrated by {name}, which is not there yet: `bodyschema calibrate cameras`"
+    rig = read_rig(file)
+    return f"calibrated by {name}: {rig.model} lenses, baseline {1e3 * rig.baseline_m:.1f} mm"
 
 
 def _speed(speed: float) -> str:

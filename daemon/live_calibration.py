@@ -14,7 +14,7 @@ from interfaces.protocols import Clock, StereoEyes
 from interfaces.records import StereoFrame
 from vision.calibration.calibrate import Calibrated
 from vision.calibration.check import Check, check
-from vision.calibration.gather import Gathered, require_any
+from vision.calibration.gather import Gathered, require_both
 from vision.calibration.guidance import Coverage
 from vision.calibration.images import ImagePair
 from vision.calibration.live import LiveViews, Look, Outcome
@@ -165,7 +165,7 @@ class LiveCalibration:
                     self._keep(look.pair, len(self._views.found.views))
                     if (result := self._tried()) is not None:
                         return self._views.found, result
-        require_any(self._views.found)
+        require_both(self._views.found)
         return self._views.found, self._calibration()
 
     def _look(self) -> Look | None:

@@ -12,7 +12,7 @@ from interfaces.records import FloatArray, ImageArray, Reason
 
 from .colour import Gate
 from .config import VisionConfig
-from .outline import Outline, fit_outline
+from .outline import Outline, fit_outline, refine_outline
 from .sphere import Pinhole
 
 # A patch that fills less of its enclosing circle is not the image of a ball.
@@ -76,6 +76,11 @@ class Patch:
     radius_px: float
     fill: float
 
+    @property
+    def is_whole(self) -> bool:
+        """Whether it may be a ball by itself, without something of similar hue behind it."""
+        return self.fill >= _WHOLE_DISC_FILL
+
 
 @dataclass(frozen=True, slots=True)
 class Disc:
@@ -100,16 +105,20 @@ class Disc:
         return float(np.linalg.norm(self.centre_px - other.centre_px)) < max(self.radius_px, other.radius_px)
 
 
-def find_patches(image: ImageArray, region: Region, gate: Gate, config: VisionConfig) -> list[Patch]:
-    """Patches of the marker's colour in `region` of a BGR image, the most disc-like first."""
+def find_patches(
+    image: ImageArray, region: Region, gate: Gate, config: VisionConfig, least_radius_px: float = 0.0
+) -> list[Patch]:
+    """Patches of the marker's colour in `region` of a BGR image, the most disc-like first; of discs this large."""
     pixels = region.crop(image)
-    patches = _patches(gate.mask(pixels), region, config)
+    least_pixels = max(config.min_pixels, round(_LEAST_FILL * math.pi * least_radius_px**2))
+    patches = _patches(gate.mask(pixels), region, least_pixels, config)
     for patch in list(patches):
-        if patch.fill < _WHOLE_DISC_FILL:
-            for part in _brighter_parts(image, patch, gate, config):
+        if not patch.is_whole:
+            for part in _brighter_parts(image, patch, gate, least_pixels, config):
                 if not any(part.box == other.box and abs(part.fill - other.fill) < _SAME_FILL for other in patches):
                     patches.append(part)
-    return sorted(patches, key=lambda patch: -patch.fill)[: config.max_candidates]
+    large = [patch for patch in patches if patch.radius_px >= least_radius_px]
+    return sorted(large, key=lambda patch: -patch.fill)[: config.max_candidates]
 
 
 def measure(image: ImageArray, patch: Patch, eye: Pinhole, gate: Gate, config: VisionConfig) -> Disc | Reason:
@@ -123,27 +132,25 @@ def measure(image: ImageArray, patch: Patch, eye: Pinhole, gate: Gate, config: V
         return Reason.OCCLUDED
     around = patch.box.grown(_APRON_PX, (width, height))
     corner = np.array([around.left, around.top], dtype=np.float64)
-    outline = fit_outline(
-        around.crop(image).astype(np.float32),
-        gate,
-        patch.centre_px - corner,
-        patch.radius_px,
-        eye.shape(patch.centre_px),
-    )
-    if outline is None or not _is_whole(outline, config):
+    pixels, shape = around.crop(image).astype(np.float32), eye.shape(patch.centre_px)
+    outline = fit_outline(pixels, gate, patch.centre_px - corner, patch.radius_px, shape)
+    if outline is not None:
+        outline = refine_outline(pixels, gate, outline, shape) if _is_whole(outline, config) else None
+    if outline is None or math.sqrt(float(outline.cov_px.diagonal().max())) > config.max_centre_sigma_px:
         return Reason.OCCLUDED
     centre_px = outline.centre_px + corner
     reach = outline.radius_px + config.border_margin_px
     if (centre_px - reach < 0).any() or (centre_px + reach > (width - 1, height - 1)).any():
         return Reason.AT_BORDER
-    level = _level(image, patch.box, centre_px, outline.radius_px, gate)
+    # Of all the ball: the patch may be its brighter part.
+    level = _level(image, Region(0, 0, width, height), centre_px, outline.radius_px, gate)
     return Disc(centre_px, outline.radius_px, outline.cov_px, outline.radius_sigma_px, level)
 
 
 def roughly(image: ImageArray, patch: Patch, gate: Gate) -> Disc | None:
     """The ball that a patch may be though it could not be measured, or that reaches out of view; None when it is not
     round."""
-    circle = (patch.centre_px, patch.radius_px) if patch.fill >= _WHOLE_DISC_FILL else _cut_circle(image, patch, gate)
+    circle = (patch.centre_px, patch.radius_px) if patch.is_whole else _cut_circle(image, patch, gate)
     if circle is None:
         return None
     centre_px, radius_px = circle
@@ -177,13 +184,7 @@ def _cut_circle(image: ImageArray, patch: Patch, gate: Gate) -> tuple[FloatArray
 
 
 def _is_whole(outline: Outline, config: VisionConfig) -> bool:
-    sigma_px = math.sqrt(float(outline.cov_px.diagonal().max()))
-    return (
-        outline.visible >= config.min_visible
-        and outline.uneven <= _MOST_UNEVEN
-        and outline.off <= _MOST_OFF
-        and sigma_px <= config.max_centre_sigma_px
-    )
+    return outline.visible >= config.min_visible and outline.uneven <= _MOST_UNEVEN and outline.off <= _MOST_OFF
 
 
 def _level(image: ImageArray, box: Region, centre_px: FloatArray, radius_px: float, gate: Gate) -> float:
@@ -206,9 +207,9 @@ def _clear_of_border(box: Region, margin_px: float, size: tuple[int, int]) -> bo
     )
 
 
-def _patches(mask: ImageArray, region: Region, config: VisionConfig) -> list[Patch]:
+def _patches(mask: ImageArray, region: Region, least_pixels: int, config: VisionConfig) -> list[Patch]:
     _, _, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=4)
-    large = np.flatnonzero(stats[1:, cv2.CC_STAT_AREA] >= config.min_pixels) + 1
+    large = np.flatnonzero(stats[1:, cv2.CC_STAT_AREA] >= least_pixels) + 1
     by_size = large[np.argsort(-stats[large, cv2.CC_STAT_AREA], kind="stable")]
     patches = (_patch(mask, stats[label], region) for label in by_size[: 4 * config.max_candidates])
     return [patch for patch in patches if patch is not None]
@@ -236,7 +237,9 @@ def _patch(mask: ImageArray, stats: np.ndarray, region: Region) -> Patch | None:
     return Patch(whole, np.array([left + x, top + y]), radius, fill)
 
 
-def _brighter_parts(image: ImageArray, patch: Patch, gate: Gate, config: VisionConfig) -> list[Patch]:
+def _brighter_parts(
+    image: ImageArray, patch: Patch, gate: Gate, least_pixels: int, config: VisionConfig
+) -> list[Patch]:
     """What is left of a patch when only pixels with much of its strongest colour count: the ball before brick."""
     pixels = patch.box.crop(image)
     amount = gate.amount(pixels)
@@ -246,5 +249,5 @@ def _brighter_parts(image: ImageArray, patch: Patch, gate: Gate, config: VisionC
     return [
         part
         for share in _STRONG_SHARES
-        for part in _patches((own & (amount > share * strongest)).astype(np.uint8), patch.box, config)
+        for part in _patches((own & (amount > share * strongest)).astype(np.uint8), patch.box, least_pixels, config)
     ]

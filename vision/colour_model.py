@@ -71,7 +71,7 @@ def colour_of_the_moving(images: Iterable[ImageArray]) -> HueBand:
     """
     frames = list(images)
     if len(frames) < 3:
-        raise ColourUnlearnt(f"there are {len(frames)} images; a motion needs three or more of them")
+        raise ColourUnlearnt(f"a motion needs three images or more, not {len(frames)}")
     behind = np.median(np.stack(frames[:: max(1, len(frames) // 15)]), axis=0).astype(np.uint8)
     moved = [_colourful(_moving_pixels(frame, behind)) for frame in frames]
     pixels = np.concatenate(moved)

@@ -5,10 +5,10 @@ Samples at t [px] along a ray, t = 0 where the outline is thought to be, are
     ball(t) · S(t) + background(t) · (1 − S(t)) + shift · contrast · g(t) + noise,
 
 with S the blurred step from 1 on the ball to 0 beyond it and g its slope. What neither filter nor likelihood may take
-for known has a prior as a Gaussian process, in units of the noise: the background's level is free, its slope moderate,
-and its texture a random walk from the outline on. Towards its own colour the ball's level and its shading are free (a
-sphere's depends on the normal's part along the ray, √(1 − ρ²)); across that colour a ball shows nothing but gloss,
-which fades towards the limb. The rougher the background, the less a filter trusts samples far from the edge.
+for known has a prior as a Gaussian process, in units of the noise: the background's level is free, its slope none or
+moderate, and its texture a random walk from the outline on. Towards its own colour the ball's level and its shading are
+free (a sphere's depends on the normal's part along the ray, √(1 − ρ²)); across that colour a ball shows nothing but
+gloss, which fades towards the limb. The rougher the background, the less a filter trusts samples far from the edge.
 """
 
 from __future__ import annotations
@@ -24,11 +24,12 @@ from interfaces.records import FloatArray
 STEP_PX = 0.5
 # Half-widths of what is looked at, on the ball and beyond [px], for a blur of USUAL_BLUR_PX; more needs more room.
 _INSIDE_PX, _OUTSIDE_PX, USUAL_BLUR_PX = 4.0, 8.0, 0.86
-# Textures that are told apart: 1-sigma of the random walk over 1 px, in units of the noise.
-_ROUGHNESS = (0.05, 0.5, 2.0, 8.0, 30.0)
-# Priors' variances, in units of the noise: what is free, the background's slope [1/px²], the ball's level across its
-# own colour, and a blur that is not quite the true one, times the contrast.
-_FREE, _SLOPE, _ACROSS, _BLUR = 1e4, 1.0, 0.3, 100.0
+# Textures that are told apart: 1-sigma of the random walk over 1 px, and the slope's variance [1/px²], in units of the
+# noise.
+_TEXTURES = ((0.02, 0.003), (0.5, 1.0), (2.0, 1.0), (8.0, 1.0), (30.0, 1.0))
+# Priors' variances, in units of the noise: what is free, the ball's level across its own colour, and a blur that is not
+# quite the true one, times the contrast.
+_FREE, _ACROSS, _BLUR = 1e4, 0.1, 300.0
 # Gloss and uneven light: 1-sigma that a sample on the ball gets for each px² from where the edge's blur ends.
 _GLOSS, _EDGE_BLURS = 2.0, 1.4
 # Integration step of what the lens blurs [px].
@@ -95,8 +96,8 @@ def _filters(at: tuple[float, ...], radius_px: float, blur_px: float, own_colour
     # Of a random walk from 0 to both sides.
     walk = 0.5 * (np.abs(t)[:, None] + np.abs(t) - np.abs(t[:, None] - t))
     rows: list[tuple[FloatArray | float, ...]] = []
-    for roughness in _ROUGHNESS:
-        background = _FREE + _SLOPE * np.outer(t, t) + roughness**2 * walk
+    for roughness, slope_variance in _TEXTURES:
+        background = _FREE + slope_variance * np.outer(t, t) + roughness**2 * walk
         cov: FloatArray = (known + np.outer(beyond, beyond) * background).astype(np.float64)
         shift, shift_variance = _best_filter(cov + _BLUR * np.outer(wider, wider), slope)
         widening, widening_variance = _best_filter(cov + _FREE * np.outer(slope, slope), wider)

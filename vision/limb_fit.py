@@ -26,13 +26,17 @@ _ALIASED_PX = 0.55
 _FREEDOM, _FARTHEST_PX, _ROUNDS = 4.0, 1.0, 3
 # Below this, relative to the cubed trace, the limb does not determine centre and radius.
 _LEAST_DETERMINANT = 1e-6
-# A few waves leave much open, so that the pixels' noise counts again; of the sum of both this part, as the larger of
-# two estimates is too large by chance.
-_CHANCE = 0.8
+# The claim is what the pixels' noise makes, and this part of what the few waves tell; where they tell of more than
+# noise it grows with the square, over this: a bend that shows is a sign of one that the fit has removed.
+_TOLD, _USUAL_DENSITY = 0.5, 12.0
+# Of an estimate's slope by its residuals (1 where none is far off, 0 where all are) at least this part counts.
+_LEAST_SLOPE = 0.4
 # What covers a ball breaks its limb at sharp corners, which shows in the quick waves; what is behind it bends whole
 # arcs, in the slow ones, which the claim follows. Beyond so many times the variance of the samples it is no ball's
 # limb alone.
 _LARGEST_DENSITY = 18.0
+# What leaves the circle by more of its radius (RMS, noise apart) is angular: a small square, whose corners blur rounds.
+_MOST_ANGULAR = 0.05
 # What a lens leaves of its distortion makes a limb oval, by this part of its radius at most, but fits all around.
 _MOST_OVAL, _CLEAN_DENSITY = 0.015, 3.0
 # An oval is tried where the slow waves are this large.
@@ -60,14 +64,16 @@ class Circle:
 
 @dataclass(frozen=True, slots=True)
 class _Fit:
-    """Shift (2,) and growth [px] of the circle, the inverse normal matrix (3, 3) [px²], what the waves tell, and the
-    part of the rays' variances that is the pixels' noise."""
+    """Shift (2,) and growth [px] of the circle, the inverse normal matrix (3, 3) [px²], the waves of its residuals,
+    what the rays pull it by, shape (n,), with the slowest wave left in, and the RMS residual, noise apart [px]."""
 
     shift_px: FloatArray
     growth_px: float
     inverse: FloatArray
     waves: Waves
-    noise_share: float
+    pulls: FloatArray
+    first: int
+    off_px: float
 
 
 def fit_limb(
@@ -79,13 +85,14 @@ def fit_limb(
     """
     blur_px = USUAL_BLUR_PX
     fit: _Fit | None = None
-    unsettled = np.zeros(3)
+    unsettled, noise_share = np.zeros(3), 1.0
     for _ in range(_LOOKS):
         limb = find_limb(image, gate, centre_px, radius_px, shape, blur_px)
         fit = None if limb is None else _fit(limb, radius_px)
         if limb is None or fit is None:
             return None
         centre_px, radius_px = centre_px + shape @ fit.shift_px, radius_px + fit.growth_px
+        noise_share = limb.noise_share
         last_blur_px, blur_px = blur_px, min(max(limb.blur_px, _SHARPEST_PX), _WIDEST_PX)
         moved_px = max(float(np.linalg.norm(fit.shift_px)), abs(fit.growth_px))
         if moved_px < _SETTLED_PX and abs(blur_px - last_blur_px) < _SETTLED_BLUR_PX:
@@ -93,9 +100,14 @@ def fit_limb(
             break
         unsettled = np.array([*fit.shift_px, fit.growth_px])
     aliased = blur_px < _ALIASED_PX
-    if fit is None or (fit.waves.quick > _LARGEST_DENSITY and not aliased):
+    if fit is None:
         return None
-    cov = _CHANCE * (fit.waves.evened().slow + fit.noise_share) * fit.inverse + np.outer(unsettled, unsettled)
+    is_angular = fit.off_px > _MOST_ANGULAR * radius_px
+    if (is_angular or fit.waves.quick > _LARGEST_DENSITY) and not aliased:
+        return None
+    told = waves(fit.pulls, radius_px, fit.first).mean
+    density = noise_share + (_TOLD + told / _USUAL_DENSITY) * told
+    cov = density * fit.inverse + np.outer(unsettled, unsettled)
     # A blurred disc's edge, where it is steepest, is nearer to the centre than the disc's.
     radius_px += blur_px**2 / (2.0 * radius_px)
     return Circle(centre_px, radius_px, shape @ cov[:2, :2] @ shape, math.sqrt(cov[2, 2]), aliased)
@@ -135,5 +147,23 @@ def _least_squares(limb: Limb, radius_px: float, *, oval: bool) -> _Fit | None:
         weight = np.where(np.abs(residual) < _FARTHEST_PX, limb.weight / (1.0 + square / usual / _FREEDOM), 0.0)
     if inverse is None or np.abs(solution[3:]).max(initial=0.0) > _MOST_OVAL * radius_px:
         return None
-    around = waves(np.sqrt(used) * residual, radius_px, first=3 if oval else 2)
-    return _Fit(solution[:2], float(solution[2]), inverse[:3, :3], around, limb.noise_share)
+    first = 3 if oval else 2
+    around = waves(np.sqrt(used) * residual, radius_px, first)
+    pulls = _pulls(limb.weight, weight, residual)
+    off = np.minimum(np.abs(residual[told]), _FARTHEST_PX)
+    off_px = math.sqrt(max(0.0, float(np.mean(off**2 - 1.0 / limb.weight[told]))))
+    return _Fit(solution[:2], float(solution[2]), inverse[:3, :3], around, pulls, first, off_px)
+
+
+def _pulls(full: FloatArray, used: FloatArray, residual: FloatArray) -> FloatArray:
+    """What the rays pull the circle by, shape (n,): their influence on an M-estimate, in sigmas of `used`.
+
+    What is far off has less weight, so that the residuals under the weights tell less than the truth, and so does the
+    inverse normal matrix. With the weights' share f = 1/(1 + z²/ν) of a residual z the influence is z·f over the mean
+    of its slope 2f² − f (Huber 1981, Robust Statistics, section 7.6).
+    """
+    share = np.divide(used, full, out=np.zeros_like(full), where=full > 0)
+    told = np.count_nonzero(full)
+    mean = float(share.sum()) / told
+    slope = max(float(np.sum(2.0 * share**2 - share)) / told, _LEAST_SLOPE * mean)
+    return np.sqrt(full) * residual * share * (math.sqrt(mean) / slope)

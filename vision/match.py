@@ -14,7 +14,6 @@ from interfaces.records import ImageArray, Reason
 
 from .blob import Disc
 from .config import VisionConfig
-from .sphere import Pinhole
 from .triangulate import Location, locate
 
 # A mirror gives back less than this of the light, and its copy stands farther off.
@@ -30,7 +29,6 @@ class StereoMatcher:
 
     def __init__(self, calibration: StereoCalibration, config: VisionConfig) -> None:
         self._calibration, self._config = calibration, config
-        self._eye = Pinhole(calibration.focal_px, calibration.principal_point_px)
 
     def match(self, left: Sequence[Disc], right: Sequence[Disc]) -> Location | Reason:
         """The one pair that fits, or why there is none; both sequences hold at least one disc."""
@@ -101,28 +99,20 @@ class StereoMatcher:
         sigma = math.sqrt(location.variances_px[1] + location.variances_px[3])
         if abs(vl - vr) > self._config.epipolar_px + self._config.epipolar_sigmas * sigma:
             return Reason.EPIPOLAR
-        ratios = self._size_ratios(location, left, right)
         # How far apart noise may bring the sizes that the two eyes see.
-        size_sigma = math.hypot(*(disc.radius_sigma_px / disc.radius_px for disc in (left, right)))
-        if ratios is None or not self._sizes_fit(ratios, size_sigma):
+        size_sigma = math.hypot(*location.size_sigmas.tolist())
+        sizes: list[float] = location.sizes.tolist()
+        if not self._sizes_fit(sizes, size_sigma):
             return Reason.SIZE_MISMATCH
-        apart = math.log(ratios[0] / ratios[1]) / math.hypot(size_sigma, _SIZE_TOLERANCE), (vl - vr) / sigma
+        apart = math.log(sizes[0] / sizes[1]) / math.hypot(size_sigma, _SIZE_TOLERANCE), (vl - vr) / sigma
         # What pulls one eye's centre does not pull both alike: it shows in the sizes and in the rows.
-        # Birge's ratio, squared.
-        doubt = max(1.0, (apart[0] ** 2 + apart[1] ** 2) / len(apart))
+        # Birge's ratio, squared, less the 1 that chance makes of it.
+        doubt = max(1.0, (apart[0] ** 2 + apart[1] ** 2) / len(apart) - 1.0)
         return replace(location, cov=doubt * location.cov)
 
-    def _size_ratios(self, location: Location, left: Disc, right: Disc) -> tuple[float, float] | None:
-        """How large the two eyes see the ball, as parts of what they have to."""
-        baseline = np.array([self._calibration.baseline_m, 0.0, 0.0])
-        outlines = [self._eye.outline(x_eye, self._config.radius_m) for x_eye in (location.x, location.x - baseline)]
-        if outlines[0] is None or outlines[1] is None:
-            return None
-        return left.radius_px / outlines[0].radius_px, right.radius_px / outlines[1].radius_px
-
-    def _sizes_fit(self, ratios: tuple[float, float], sigma: float) -> bool:
-        between_eyes = max(ratios) / min(ratios) / (1.0 + self._config.epipolar_sigmas * sigma)
-        against_depth = max(*ratios, 1.0 / min(ratios))
+    def _sizes_fit(self, sizes: Sequence[float], sigma: float) -> bool:
+        between_eyes = max(sizes) / min(sizes) / (1.0 + self._config.epipolar_sigmas * sigma)
+        against_depth = max(*sizes, 1.0 / min(sizes))
         return between_eyes <= self._config.eye_size_ratio and against_depth <= self._config.depth_size_ratio
 
 

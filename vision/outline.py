@@ -58,7 +58,7 @@ _AGREED_PX = 0.4
 _ENOUGH = 60
 _TRIPLES = np.array(list(combinations(range(_ARCS), 3)))
 # What is left when all noise has averaged out [px].
-_FLOOR_PX = 0.002
+_FLOOR_PX = 0.001
 # What coverage and limb disagree by beyond so many of their sigmas is claimed as uncertainty.
 _LARGEST_CONTRADICTION = 4.0
 # Below this, relative to the cubed trace, the outline points do not determine centre and radius.
@@ -110,7 +110,7 @@ class _Edges:
 def fit_outline(
     image: Float32Array, gate: Gate, centre_px: FloatArray, radius_px: float, shape: FloatArray
 ) -> Outline | None:
-    """Refine a rough circle to the outline of the ball; None when there is no outline near it.
+    """Refine a rough circle to the outline of the ball, by coverage; None when there is no outline near it.
 
     Args:
         image: BGR, shape (height, width, 3), grey levels.
@@ -132,22 +132,11 @@ def fit_outline(
         outline, moved_px = _step(image, gate, outline.centre_px, radius_px, shape, _NARROW_PX)
         if moved_px > max(2.0, 0.5 * radius_px):
             return None
-    return None if outline is None else _refined(image, gate, outline, shape)
+    return outline
 
 
-def _step(
-    image: Float32Array, gate: Gate, centre_px: FloatArray, radius_px: float, shape: FloatArray, window_px: float
-) -> tuple[Outline | None, float]:
-    """The outline within a ring of half-width `window_px` about a circle, and how far it is from that circle [px]."""
-    edges = _find_edges(image, gate, centre_px, radius_px, shape, min(window_px, 0.6 * radius_px))
-    outline = None if edges is None else _fit_circle(edges, centre_px, shape)
-    if outline is None:
-        return None, math.inf
-    return outline, float(np.linalg.norm(outline.centre_px - centre_px)) + abs(outline.radius_px - radius_px)
-
-
-def _refined(image: Float32Array, gate: Gate, rough: Outline, shape: FloatArray) -> Outline | None:
-    """`rough` with the centre, radius and covariance that the limb tells; None when that is no ball's limb."""
+def refine_outline(image: Float32Array, gate: Gate, rough: Outline, shape: FloatArray) -> Outline | None:
+    """An outline with the centre, radius and covariance that the limb tells; None when that is no ball's limb."""
     fitted = fit_limb(image, gate, rough.centre_px, rough.radius_px, shape)
     if fitted is None:
         return None
@@ -165,6 +154,17 @@ def _refined(image: Float32Array, gate: Gate, rough: Outline, shape: FloatArray)
         cov_px=cov_px,
         radius_sigma_px=fitted.radius_sigma_px,
     )
+
+
+def _step(
+    image: Float32Array, gate: Gate, centre_px: FloatArray, radius_px: float, shape: FloatArray, window_px: float
+) -> tuple[Outline | None, float]:
+    """The outline within a ring of half-width `window_px` about a circle, and how far it is from that circle [px]."""
+    edges = _find_edges(image, gate, centre_px, radius_px, shape, min(window_px, 0.6 * radius_px))
+    outline = None if edges is None else _fit_circle(edges, centre_px, shape)
+    if outline is None:
+        return None, math.inf
+    return outline, float(np.linalg.norm(outline.centre_px - centre_px)) + abs(outline.radius_px - radius_px)
 
 
 def _find_edges(

@@ -74,12 +74,16 @@ def read_rig(file: Path) -> StereoRig:
     Raises:
         ConfigError: it cannot be read, is damaged or is another kind of file; names the line.
     """
-    tables, text = read_toml(file, written_by="`bodyschema calibrate cameras` writes one")
-    found = tables.get("format")
-    if found != FORMAT:
-        what = f"of another format: {found!r}" if found is not None else "no camera calibration"
+    tables, text = read_toml(file, written_by="`bodyschema calibrate cameras` writes one", damaged=_AGAIN)
+    form = tables.get("format")
+    if form != FORMAT:
+        what = f"of another format: {form!r}" if form is not None else "no camera calibration"
         raise ConfigError(f"{what}, not {FORMAT!r}", file=file, line=line_of(text, ("format",)), remedy=_AGAIN)
-    return _checked(convert(tables, _File, file=file, text=text), file, text)
+    try:
+        found = convert(tables, _File, file=file, text=text)
+    except ConfigError as error:
+        raise ConfigError(error.what, file=file, line=error.line, remedy=error.remedy or _AGAIN) from error
+    return _checked(found, file, text)
 
 
 def write_rig(rig: StereoRig, file: Path) -> None:

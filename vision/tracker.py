@@ -11,6 +11,7 @@ import numpy as np
 from interfaces.camera import StereoCalibration
 from interfaces.records import FloatArray, ImageArray, MarkerFix, MarkerMiss, Reason, StereoFrame, frozen_array
 
+from .ball_size import BallSize
 from .blob import Disc, Region, find_patches, measure, roughly
 from .colour import gate_of
 from .config import VisionConfig
@@ -23,11 +24,19 @@ _log = logging.getLogger(__name__)
 
 # Half the side of the region searched around the predicted centre: radii, plus pixels, plus steps between frames.
 _REGION_RADII, _REGION_PX, _REGION_STEPS = 1.6, 14.0, 0.7
+# What is smaller than this part of the marker that is followed is something else near it, such as part of a brick.
+_LEAST_SIZE = 0.5
+# A disc is where the marker was expected when it is nearer than this, and its size as near, in radii of the marker.
+_AS_EXPECTED = 0.25
 # After a longer pause the last fixes predict nothing [s].
 _LONGEST_PAUSE_S = 0.5
 # So long after the last fix the marker is expected within reach of it [s], if it moved on for no longer than this [s];
 # the reach is so many radii larger. Without a fix, what is left of two is the marker after that time.
 _LONGEST_MEMORY_S, _FAIR_PAUSE_S, _JUMP_RADII = 0.9, 0.1, 2.0
+# What looks like the marker's copy in a mirror is the marker in the shade where it is no more radii from the last fix.
+_COPY_RADII = 4.0
+# Of two things one after the other that are one thing, the brighter is not brighter than this times the other.
+_ALIKE_LEVELS = 1.25
 
 # Fixes between two looks at the ball's colour.
 _COLOUR_EVERY = 5
@@ -44,12 +53,36 @@ class _Track:
 
 
 @dataclass(frozen=True, slots=True)
+class _Expected:
+    """Where an eye looks for the marker that is followed: centre (2,) [px] and radius [px]."""
+
+    region: Region
+    centre_px: FloatArray
+    radius_px: float
+
+    def fits(self, disc: Disc) -> bool:
+        """Whether a disc is the marker as far as one eye can tell."""
+        apart_px = max(float(np.linalg.norm(disc.centre_px - self.centre_px)), abs(disc.radius_px - self.radius_px))
+        return apart_px < _AS_EXPECTED * self.radius_px
+
+
+@dataclass(frozen=True, slots=True)
 class _Last:
     """The last fix: time [s], place (3,) [m], level of its colour [grey levels]."""
 
     t: float
     x: FloatArray
     level: float
+
+
+@dataclass(frozen=True, slots=True)
+class _Refused:
+    """What was found last, but cannot have been the marker: time [s], place (3,) [m], level [grey levels], and why."""
+
+    t: float
+    x: FloatArray
+    level: float
+    reason: Reason
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,10 +109,12 @@ class StereoTracker:
         self._gate = gate_of(self.config)
         self._eye = Pinhole(calibration.focal_px, calibration.principal_point_px)
         self._matcher = StereoMatcher(calibration, self.config)
+        self._size = BallSize(calibration)
         width, height = calibration.image_size_px
         self._whole = Region(0, 0, width, height)
         self._track: _Track | None = None
         self._last: _Last | None = None
+        self._refused: _Refused | None = None
         self._ambiguous_t = -math.inf
         self._sighted: tuple[_Sighting, ...] = ()
         self._fixes = 0
@@ -91,10 +126,10 @@ class StereoTracker:
             SourceError: the images are not uint8 BGR of the calibration's size.
         """
         check_images(frame, self.calibration)
-        regions = self._predicted_regions(frame.t)
-        found = self._look(frame, regions) if regions else None
+        expected = self._predicted(frame.t)
+        found = self._look(frame, *expected) if expected else None
         if not isinstance(found, Location):
-            found = self._look(frame, (self._whole, self._whole))
+            found = self._look(frame, None, None)
             if found is Reason.AMBIGUOUS:
                 self._ambiguous_t = frame.t
         if isinstance(found, Location):
@@ -105,6 +140,8 @@ class StereoTracker:
             self._track = None
             return MarkerMiss(frame.t, found)
         self._ambiguous_t = -math.inf
+        found = self._size.doubted(found)
+        self._size.learn(found)
         self._remember(frame.t, found)
         self._follow_colour(frame, found)
         ul, vl, ur, vr = (float(value) for value in found.centres_px)
@@ -112,15 +149,17 @@ class StereoTracker:
 
     def forget(self) -> None:
         """Look for the marker in the whole images next time."""
-        self._track = self._last = None
+        self._track = self._last = self._refused = None
         self._ambiguous_t, self._sighted = -math.inf, ()
         self._gate.reset()
+        self._size.forget()
 
-    def _look(self, frame: StereoFrame, regions: tuple[Region, Region]) -> Location | Reason:
-        left, left_rough = self._discs(frame.left, regions[0])
+    def _look(self, frame: StereoFrame, in_left: _Expected | None, in_right: _Expected | None) -> Location | Reason:
+        """The marker where it is expected, else anywhere in view."""
+        left, left_rough = self._discs(frame.left, in_left)
         if left is Reason.NO_MARKER:
             return left
-        right, right_rough = self._discs(frame.right, regions[1])
+        right, right_rough = self._discs(frame.right, in_right)
         lefts, rights = (
             rough if isinstance(discs, Reason) else discs + rough
             for discs, rough in ((left, left_rough), (right, right_rough))
@@ -153,14 +192,21 @@ class StereoTracker:
                 return Reason.AMBIGUOUS
         return None
 
-    def _discs(self, image: ImageArray, region: Region) -> tuple[list[Disc] | Reason, list[Disc]]:
+    def _discs(self, image: ImageArray, expected: _Expected | None) -> tuple[list[Disc] | Reason, list[Disc]]:
         """The discs in one eye; when there is none, why the most disc-like patch is none. And what is round, but could
-        not be measured."""
+        not be measured.
+
+        Beside a marker that is where it was expected, what is not round is not looked at closely.
+        """
+        region = self._whole if expected is None else expected.region
+        least_radius_px = 0.0 if expected is None else _LEAST_SIZE * expected.radius_px
         discs: list[Disc] = []
         rough: list[Disc] = []
         reason: Reason | None = None
-        for patch in find_patches(image, region, self._gate, self.config):
+        for patch in find_patches(image, region, self._gate, self.config, least_radius_px):
             if any(np.linalg.norm(patch.centre_px - disc.centre_px) < disc.radius_px for disc in discs):
+                continue
+            if expected is not None and not patch.is_whole and any(expected.fits(disc) for disc in discs):
                 continue
             outcome = measure(image, patch, self._eye, self._gate, self.config)
             if isinstance(outcome, Reason):
@@ -171,14 +217,17 @@ class StereoTracker:
                 discs.append(outcome)
         return discs or reason or Reason.NO_MARKER, rough
 
-    def _predicted_regions(self, t: float) -> tuple[Region, Region] | None:
+    def _predicted(self, t: float) -> tuple[_Expected, _Expected] | None:
         track = self._track
         if track is None or not 0 < t - track.t <= _LONGEST_PAUSE_S:
             return None
         step = track.velocity_px_s * (t - track.t)
         half = _REGION_RADII * track.radius_px + _REGION_PX + _REGION_STEPS * float(np.abs(step).max())
-        left, right = (self._region(centre, half) for centre in (track.centres_px + step).reshape(2, 2))
-        return None if left is None or right is None else (left, right)
+        centres = (track.centres_px + step).reshape(2, 2)
+        left, right = (self._region(centre, half) for centre in centres)
+        if left is None or right is None:
+            return None
+        return _Expected(left, centres[0], track.radius_px), _Expected(right, centres[1], track.radius_px)
 
     def _region(self, centre_px: FloatArray, half_px: float) -> Region | None:
         width, height = self.calibration.image_size_px
@@ -191,12 +240,31 @@ class StereoTracker:
         last = self._last
         if last is None or not 0 <= t - last.t <= _LONGEST_MEMORY_S:
             return self._doubt_without_track(t, found)
-        away_m = float(np.linalg.norm(found.x - last.x))
-        if away_m <= _JUMP_RADII * self.config.radius_m + self.config.max_speed_m_s * min(t - last.t, _FAIR_PAUSE_S):
+        reason = self._size.contradicts(found)
+        if reason is not None:
+            return reason
+        reason = self._refused_again(t, found)
+        if reason is None:
+            is_copy = is_reflection_of(found, last.level, float(np.linalg.norm(last.x)))
+            goes_on = float(np.linalg.norm(found.x - last.x)) <= _COPY_RADII * self.config.radius_m
+            if self._within_reach(found.x, last.x, t - last.t) and (goes_on or not is_copy):
+                return None
+            reason = Reason.REFLECTION if is_copy else Reason.IMPLAUSIBLE_SPEED
+        self._refused = _Refused(t, found.x, found.level, reason)
+        return reason
+
+    def _refused_again(self, t: float, found: Location) -> Reason | None:
+        """Why it was refused a moment ago, if this is the same thing: time alone brings it no nearer to the marker."""
+        refused = self._refused
+        if refused is None or not 0 <= t - refused.t <= _LONGEST_PAUSE_S:
             return None
-        if is_reflection_of(found, last.level, float(np.linalg.norm(last.x))):
-            return Reason.REFLECTION
-        return Reason.IMPLAUSIBLE_SPEED
+        alike = max(found.level, refused.level) < _ALIKE_LEVELS * min(found.level, refused.level)
+        return refused.reason if alike and self._within_reach(found.x, refused.x, t - refused.t) else None
+
+    def _within_reach(self, x: FloatArray, from_x: FloatArray, seconds: float) -> bool:
+        """Whether a thing may have gone from one place (3,) [m] to another in that time."""
+        reach_m = _JUMP_RADII * self.config.radius_m + self.config.max_speed_m_s * min(seconds, _FAIR_PAUSE_S)
+        return float(np.linalg.norm(x - from_x)) <= reach_m
 
     def _doubt_without_track(self, t: float, found: Location) -> Reason | None:
         """Why what was found may not be the marker though nothing was, a moment ago."""
@@ -219,7 +287,7 @@ class StereoTracker:
         if self._track is not None and 0 < t - self._track.t <= _LONGEST_PAUSE_S:
             velocity = (found.centres_px - self._track.centres_px) / (t - self._track.t)
         radius_px = self.calibration.focal_px * self.config.radius_m / float(found.x[2])
-        self._last = _Last(t, found.x, found.level)
+        self._last, self._refused = _Last(t, found.x, found.level), None
         self._track = _Track(t, found.centres_px, velocity, radius_px)
 
     def _follow_colour(self, frame: StereoFrame, found: Location) -> None:

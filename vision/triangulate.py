@@ -23,6 +23,9 @@ class Location:
         centres_px: image of its centre as (ul, vl, ur, vr), shape (4,) [px].
         variances_px: variances of `centres_px`, shape (4,) [px²].
         level: how bright the marker's colour is on it, mean of the eyes [grey levels].
+        radii_px: of the two discs, shape (2,) [px].
+        sizes, size_sigmas: the radii as parts of what they have to be at this depth, and the 1-sigma of that which the
+            images leave, shape (2,) each.
     """
 
     x: FloatArray
@@ -30,6 +33,9 @@ class Location:
     centres_px: FloatArray
     variances_px: FloatArray
     level: float
+    radii_px: FloatArray
+    sizes: FloatArray
+    size_sigmas: FloatArray
 
 
 def triangulate(
@@ -59,7 +65,8 @@ def triangulate(
 
 
 def locate(calibration: StereoCalibration, radius_m: float, left: Disc, right: Disc) -> Location | None:
-    """The ball of `radius_m` whose images are the two discs; None when its rays do not meet before the eyes.
+    """The ball of `radius_m` whose images are the two discs; None when its rays do not meet so far before the eyes that
+    both can see it.
 
     How far the sphere's centre is from the ellipse's depends on its distance: first the one its size tells, then
     the triangulated one.
@@ -75,7 +82,20 @@ def locate(calibration: StereoCalibration, radius_m: float, left: Disc, right: D
     distances = [max(1.1, float(np.linalg.norm(x)) / radius_m) for x in (point[0], point[0] - to_right_eye)]
     centres = _centres(eye, left, right, distances)
     point = triangulate(calibration, centres, variances)
-    return None if point is None else Location(*point, centres, variances, (left.level + right.level) / 2)
+    outlines = [] if point is None else [eye.outline(x, radius_m) for x in (point[0], point[0] - to_right_eye)]
+    expected_px = [outline.radius_px for outline in outlines if outline is not None]
+    if point is None or len(expected_px) < len(outlines):
+        return None
+    radii_px = np.array([left.radius_px, right.radius_px])
+    return Location(
+        *point,
+        centres_px=centres,
+        variances_px=variances,
+        level=(left.level + right.level) / 2,
+        radii_px=radii_px,
+        sizes=radii_px / expected_px,
+        size_sigmas=np.array([left.radius_sigma_px, right.radius_sigma_px]) / radii_px,
+    )
 
 
 def _centres(eye: Pinhole, left: Disc, right: Disc, distances_over_radius: list[float]) -> FloatArray:

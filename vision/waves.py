@@ -7,7 +7,7 @@ better.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -33,9 +33,10 @@ class Waves:
     quick: float
     count: float
 
-    def evened(self) -> Waves:
-        """The same where nothing but chance makes the quick waves larger than the slow ones: both tell one noise."""
-        return replace(self, slow=max(self.slow, 0.5 * (self.slow + self.quick)))
+    @property
+    def mean(self) -> float:
+        """Of slow and quick ones, where both tell one noise."""
+        return 0.5 * (self.slow + self.quick)
 
     def once_round(self) -> float:
         """Variance in the wave that goes once round.

@@ -81,11 +81,12 @@ def cameras(
         found, result = _live(config, board, wanted, save)
         out, named = out or calibration_file(config), names_calibration(config)
     report = write_calibrated_cameras(result, found, out)
+    told = figures(result, found, size_was_measured=printed.ruler_mm is not None or baseline_mm is not None)
     if as_json:
-        sys.stdout.write(encode(figures(result, found)).decode() + "\n")
+        sys.stdout.write(encode(told).decode() + "\n")
         return
     console = Console(highlight=False)
-    console.print(cameras_view(figures(result, found)))
+    console.print(cameras_view(told))
     console.print(f"\n{out} written. Open {report}.", markup=False, soft_wrap=True)
     if not named:
         console.print(f'In [vision.cameras] write\ncalibration = "{out.name}"', markup=False, soft_wrap=True)

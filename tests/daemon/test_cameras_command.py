@@ -16,6 +16,7 @@ from shown_board import photographed
 from daemon.camera_calibration import CamerasFile, CheckFile
 from daemon.cli import app
 from interfaces.errors import ConfigError
+from interfaces.interval import to_its_interval
 from vision.rig import CalibrationError
 from vision.rig_file import read_rig
 
@@ -69,7 +70,7 @@ def test_the_check_of_a_bumped_camera_ends_with_exit_code_1(folder, tmp_path, ca
     truth, _, poses = photographed()
     tilt = cv2.Rodrigues(np.radians([0.3, 0.0, 0.0]))[0]
     bumped = type(truth)(truth.left, truth.right, tilt @ truth.R, tilt @ truth.t_m)
-    frame = Photographer(bumped, Printed(), Taken(samples=3), np.random.default_rng(1)).pair(*poses[4])
+    frame = Photographer(bumped, Printed(), Taken(), np.random.default_rng(1)).pair(*poses[4])
     cv2.imwrite(str(tmp_path / "left1.png"), frame.left)
     cv2.imwrite(str(tmp_path / "right1.png"), frame.right)
     with pytest.raises(SystemExit, match="1"):
@@ -77,6 +78,39 @@ def test_the_check_of_a_bumped_camera_ends_with_exit_code_1(folder, tmp_path, ca
     said = " ".join(capsys.readouterr().out.split())
     assert "The calibration does not hold" in said
     assert "turned up or down by 0.3" in said
+
+
+@pytest.mark.parametrize(
+    ("left", "right", "said"),
+    [
+        (lambda pair: pair.right, lambda pair: pair.left, "left and right are exchanged"),
+        (lambda pair: pair.left, lambda pair: pair.right[::-1, ::-1], "the right image is upside down"),
+        (lambda pair: pair.left[::-1, ::-1], lambda pair: pair.right, "the left image is upside down"),
+    ],
+)
+def test_the_check_names_images_that_are_exchanged_or_upside_down(folder, tmp_path, capsys, left, right, said) -> None:
+    pair = photographed()[1][4]
+    cv2.imwrite(str(tmp_path / "left1.png"), left(pair))
+    cv2.imwrite(str(tmp_path / "right1.png"), right(pair))
+    with pytest.raises(SystemExit, match="1"):
+        called("calibrate", "check", tmp_path, "--calibration", folder / "cameras.toml", "--json")
+    wrong = msgspec.json.decode(capsys.readouterr().out, type=CheckFile).wrong
+    assert len(wrong) == 1
+    assert said in wrong[0]
+
+
+def test_the_newest_view_is_checked_whatever_the_digits_of_its_number(folder, tmp_path, capsys) -> None:
+    pair = photographed()[1][4]
+    for number in (2, 9, 10):
+        cv2.imwrite(str(tmp_path / f"left{number}.png"), pair.left)
+        cv2.imwrite(str(tmp_path / f"right{number}.png"), pair.right)
+    called("calibrate", "check", tmp_path, "--calibration", folder / "cameras.toml")
+    assert capsys.readouterr().out.startswith("view 10: ")
+
+
+def test_that_no_ruler_was_measured_is_said(folder) -> None:
+    said = " ".join((folder / "said.txt").read_text(encoding="utf-8").split())
+    assert "No image tells whether the board is as large as it says" in said
 
 
 def test_images_side_by_side_are_split(tmp_path, folder, capsys) -> None:
@@ -132,6 +166,20 @@ def test_the_ruler_on_the_print_scales_the_baseline(folder, tmp_path, capsys) ->
     found = msgspec.json.decode(capsys.readouterr().out, type=CamerasFile)
     assert found.baseline_mm == pytest.approx(970 * read_rig(folder / "cameras.toml").baseline_m, rel=1e-6)
     assert (len(found.parameters), len(found.held_out_by_model_px)) == (24, 1)
+
+
+@pytest.mark.parametrize(
+    ("value", "half_width", "shown"),
+    [
+        (592.4, 0.15, ("592.40", "± 0.15")),
+        (-0.00035163, 5.5e-5, ("-0.000352", "± 0.000055")),
+        (0.013662, 0.018, ("0.014", "± 0.018")),
+        (1234.5, 120.0, ("1234", "± 120")),
+        (3.0, 0.0, ("3", "± 0")),
+    ],
+)
+def test_a_value_has_as_many_places_as_its_interval(value, half_width, shown) -> None:
+    assert to_its_interval(value, half_width) == shown
 
 
 @pytest.mark.parametrize("ending", ["pdf", "svg"])

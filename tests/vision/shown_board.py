@@ -67,7 +67,7 @@ def photographed(
     """A rig, its images of the board, and the board's poses in them."""
     rng = np.random.default_rng(seed)
     rig = webcams(rng)
-    photographer = Photographer(rig, Printed(), Taken(samples=3), rng)
+    photographer = Photographer(rig, Printed(), Taken(), rng)
     shown = tuple(poses(rng, rig, Printed(), count))
     frames = [photographer.pair(*pose) for pose in shown]
     return rig, tuple(ImagePair(f"{k:02d}", f.left, f.right) for k, f in enumerate(frames)), shown

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -99,7 +98,7 @@ def shown(taken: Taken, printed: Printed | None = None, turned: float = 0.2) -> 
     """The left eye's image of a board about half a metre away, and where its corners are."""
     rng = np.random.default_rng(3)
     rig = webcams(rng)
-    photographer = Photographer(rig, printed or Printed(), replace(taken, samples=3), rng)
+    photographer = Photographer(rig, printed or Printed(), taken, rng)
     R = Rotation.from_euler("xyz", [0.3, turned, 0.1]).as_matrix()
     pose = R, np.array([0.0, 0.0, 0.55]) - R @ np.array([0.12, 0.09, 0.0])
     return photographer.left(*pose), photographer.corners(*pose)[0]
@@ -124,7 +123,7 @@ def test_a_plain_chessboards_corners_are_in_one_order_however_it_is_turned(turne
     rng = np.random.default_rng(3)
     rig = webcams(rng)
     printed = Printed(8, 5, 0.025, dictionary=None)
-    photographer = Photographer(rig, printed, Taken(samples=3), rng)
+    photographer = Photographer(rig, printed, Taken(), rng)
     R = Rotation.from_euler("zxy", [turned, 0.3, 0.1]).as_matrix()
     pose = R, np.array([0.0, 0.0, 0.55]) - R @ np.array([0.1, 0.0625, 0.0])
     found = BoardDetector(Board(8, 5, 0.025, pattern="chessboard")).find(photographer.left(*pose))
@@ -163,7 +162,7 @@ def test_blur_is_measured(sigma) -> None:
 def test_another_dictionary_is_named() -> None:
     found = fault(shown(Taken(), Printed(dictionary="5X5_50", marker_share=7 / 9))[0])
     assert found.why == "other_dictionary"
-    assert "the markers are 5X5_1000, not 4X4_50" in found.text
+    assert "the markers are 5X5_50, not 4X4_50. Give --dictionary 5X5_50" in found.text
 
 
 @pytest.mark.parametrize(("columns", "rows"), [(10, 7), (6, 6), (9, 6)])

@@ -12,11 +12,13 @@ from board_renderer import Photographer, Printed, Taken, poses, webcams
 from scipy.spatial.transform import Rotation
 from shown_board import BOARD, NOISE_PX, SIZE, corner_views, photographed, true_vector, view_of
 
-from vision.board import Corners
-from vision.calibration.calibrate import Asked, calibrate, fit
-from vision.calibration.gather import gathered, require_any
+from interfaces.records import FloatArray
+from vision.board import Corners, NotFound
+from vision.calibration.calibrate import Asked, Fitted, calibrate, fit
+from vision.calibration.gather import Unusable, gathered, require_both, summarised
 from vision.calibration.guidance import Coverage
 from vision.calibration.images import ImagePair
+from vision.calibration.influence import covariance
 from vision.calibration.view import View
 from vision.rig import CalibrationError
 
@@ -26,6 +28,10 @@ PINHOLE = replace(ASKED, model="pinhole")
 
 def swapped(view: View) -> View:
     return View(view.name, view.right, view.left)
+
+
+def sigmas(found: Fitted) -> FloatArray:
+    return np.sqrt(np.diag(covariance(found.views, BOARD.corners_m, found.bundle)))
 
 
 def upside_down(corners: Corners | None) -> Corners | None:
@@ -61,8 +67,8 @@ def test_intervals_cover_over_many_rigs() -> None:
     for seed in range(10):
         rng = np.random.default_rng(seed)
         rig = webcams(rng, fisheye=seed % 2 == 1)
-        bundle = fit(corner_views(rig, rng, 14), BOARD.corners_m, SIZE, "fisheye" if seed % 2 else "pinhole").bundle
-        misses.append((bundle.vector - true_vector(rig)) / np.sqrt(np.diag(bundle.covariance())))
+        found = fit(corner_views(rig, rng, 14), BOARD.corners_m, SIZE, "fisheye" if seed % 2 else "pinhole")
+        misses.append((found.bundle.vector - true_vector(rig)) / sigmas(found))
     z = np.abs(np.concatenate(misses))
     # Parameters of one rig are not independent: 10 rigs are worth about sixty.
     assert 0.55 < np.mean(z < 1.0) < 0.81
@@ -72,12 +78,13 @@ def test_intervals_cover_over_many_rigs() -> None:
 def test_opencvs_stereo_calibration_agrees(planted) -> None:
     _, views = planted
     views = [view for view in views if len(view.left) == len(view.right) == len(BOARD.corners_m)]
-    ours = fit(views, BOARD.corners_m, SIZE, "pinhole").bundle
+    found = fit(views, BOARD.corners_m, SIZE, "pinhole")
+    ours = found.bundle
     model = [BOARD.corners_m.astype(np.float32)] * len(views)
     eyes = [[getattr(view, eye).px.astype(np.float32) for view in views] for eye in ("left", "right")]
     start = [cv2.calibrateCamera(model, px, SIZE, np.eye(3), np.zeros(5))[1:3] for px in eyes]
     theirs = cv2.stereoCalibrate(model, *eyes, *start[0], *start[1], SIZE, flags=cv2.CALIB_USE_INTRINSIC_GUESS)
-    sigma = np.sqrt(np.diag(ours.covariance()))
+    sigma = sigmas(found)
     assert abs(ours.vector[0] - theirs[1][0, 0]) < 0.5 * sigma[0]
     np.testing.assert_array_less(np.abs(ours.vector[-3:] - theirs[6].ravel()), 0.5 * sigma[-3:])
 
@@ -86,10 +93,8 @@ def test_views_of_one_eye_alone_count_too(planted) -> None:
     _, views = planted
     alone = [replace(view, right=None) if k % 3 == 0 else view for k, view in enumerate(views)]
     without = [view for view in alone if view.is_stereo]
-    sigmas = [
-        np.sqrt(np.diag(fit(each, BOARD.corners_m, SIZE, "pinhole").bundle.covariance())) for each in (alone, without)
-    ]
-    assert sigmas[0][0] < sigmas[1][0]
+    all_of_them, pairs_alone = (sigmas(fit(each, BOARD.corners_m, SIZE, "pinhole")) for each in (alone, without))
+    assert all_of_them[0] < pairs_alone[0]
 
 
 @pytest.mark.parametrize("fisheye", [False, True])
@@ -113,6 +118,29 @@ def test_a_view_that_moved_between_the_eyes_is_left_out_and_named(planted) -> No
     found = fit([*views[:6], moved, *views[7:]], BOARD.corners_m, SIZE, "pinhole")
     assert [each.name for each in found.left_out] == [moved.name]
     assert found.left_out[0].rms_px > 5 * found.left_out[0].usual_px
+
+
+def test_a_corner_that_was_mistaken_is_left_out_and_its_view_kept(planted) -> None:
+    _, views = planted
+    px = views[6].right.px.copy()
+    px[3] += np.array([1.0, 0.6])
+    found = fit(
+        [*views[:6], replace(views[6], right=replace(views[6].right, px=px)), *views[7:]],
+        BOARD.corners_m,
+        SIZE,
+        "pinhole",
+    )
+    assert found.left_out == ()
+    assert np.flatnonzero(found.bundle.weights[6] == 0.0).tolist() == [len(views[6].left) + 3]
+
+
+def test_views_that_were_found_less_exactly_count_less(planted) -> None:
+    rig, _ = planted
+    rng = np.random.default_rng(21)
+    views = [*corner_views(rig, rng, 10, 0.02), *corner_views(rig, rng, 10, 0.08)]
+    weights = fit(views, BOARD.corners_m, SIZE, "pinhole").bundle.weights
+    good, poor = (np.mean(np.concatenate(each)) for each in (weights[:10], weights[10:]))
+    assert 8.0 < good / poor < 24.0
 
 
 def test_a_board_of_unsure_size_makes_the_baseline_as_unsure(planted) -> None:
@@ -195,7 +223,24 @@ def test_when_no_image_can_be_used_the_usual_reason_is_said() -> None:
     black = np.zeros((480, 640, 3), np.uint8)
     found = gathered([ImagePair(str(k), black, black) for k in range(3)], BOARD)
     with pytest.raises(CalibrationError, match=r"6 of 6: the image is black. Take the lens cap off"):
-        require_any(found)
+        require_both(found)
+
+
+def test_an_eye_that_never_sees_the_board_is_named_with_the_reason() -> None:
+    _, pairs, _ = photographed()
+    found = gathered([ImagePair(pair.name, pair.left, np.zeros_like(pair.right)) for pair in pairs[:3]], BOARD)
+    with pytest.raises(CalibrationError, match=r"no right image .*; 3 of 3: the image is black. Take the lens cap off"):
+        require_both(found)
+
+
+def test_images_with_the_same_fault_are_told_in_one_line() -> None:
+    blurred = NotFound("blurred", "the sharpest edge has 3.7 px"), NotFound("blurred", "the sharpest edge has 2.9 px")
+    unusable = [Unusable(f"{k:02d}", "left", blurred[k == 2]) for k in range(6)]
+    unusable.append(Unusable("03", "right", NotFound("not_found", "no board")))
+    assert summarised(unusable) == [
+        "00, 01, 02 and 3 more, left image: the sharpest edge has 3.7 px",
+        "03, right image: no board",
+    ]
 
 
 # --- guidance

@@ -51,6 +51,21 @@ def test_a_followed_ball_is_not_confused_with_another_one_farther_off():
     assert sigmas_off(tracker.track(stage(NEAR, ELSEWHERE, t=FRAME_S)), NEAR) < FAR_SIGMAS
 
 
+def test_a_copy_in_a_mirror_is_refused_however_near_when_the_ball_has_gone():
+    tracker = tracker_that_saw(NEAR)
+    copy = Ball((0.06, 0.0, 1.0), rgb=(0.45, 0.04, 0.04))
+    for number in range(1, 6):
+        assert reason(tracker.track(stage(copy, t=number * FRAME_S))) is Reason.REFLECTION
+
+
+def test_a_ball_that_goes_away_into_the_shade_is_followed():
+    tracker = tracker_that_saw(NEAR)
+    for number in range(1, 8):
+        shade = 1.0 - 0.07 * number
+        ball = Ball((0.05, 0.0, 0.8 + 0.04 * number), rgb=(0.85 * shade, 0.08 * shade, 0.08 * shade))
+        assert sigmas_off(tracker.track(stage(ball, t=number * FRAME_S)), ball) < FAR_SIGMAS
+
+
 def test_a_tracker_told_to_forget_searches_the_whole_images():
     tracker = tracker_that_saw(NEAR)
     tracker.forget()

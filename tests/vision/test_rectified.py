@@ -26,7 +26,7 @@ def test_rectified_images_are_those_of_two_pinholes_in_the_stated_frame(fisheye)
     rng = np.random.default_rng(6)
     truth = webcams(rng, fisheye=fisheye)
     rig = known_rig(truth)
-    photographer = Photographer(truth, Printed(square_m=0.04), Taken(samples=3), rng)
+    photographer = Photographer(truth, Printed(square_m=0.04), Taken(), rng)
     R = Rotation.from_euler("xyz", [0.2, -0.3, 0.1]).as_matrix()
     pose = R, np.array([0.02, 0.0, 0.5]) - R @ np.array([0.16, 0.12, 0.0])
     with RectifiedCamera(Eyes([photographer.pair(*pose)]), rig) as camera:

@@ -5,12 +5,13 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from ball_renderer import SMALL, VGA, Look, in_eyes
+from ball_renderer import SMALL, VGA, Look, in_eyes, take
 from scenes import Ball, Slab, reason, sigmas_off, stage
 
 from interfaces.errors import SourceError
 from interfaces.records import MarkerFix, Reason, StereoFrame
-from vision.blob import Disc
+from vision.blob import Disc, Region, find_patches, measure
+from vision.colour import gate_of
 from vision.config import VisionConfig
 from vision.match import StereoMatcher
 from vision.sphere import Pinhole
@@ -40,6 +41,19 @@ def seen_discs(ball: Ball, level: float) -> list[Disc]:
 
 def test_a_ball_before_a_wall_is_found():
     assert sigmas_off(answer(BALL), BALL) < FAR_SIGMAS
+
+
+@pytest.mark.parametrize("side_px", [9, 10, 11, 12, 14, 18])
+def test_a_square_of_the_ball_s_hue_is_no_ball(side_px):
+    rng = np.random.default_rng(side_px)
+    images = []
+    for u in (150, 110):
+        picture = np.full((240, 320, 3), 0.3)
+        picture[100 : 100 + side_px, u : u + side_px] = (0.85, 0.1, 0.1)
+        images.append(take(picture, Look(blur_px=0.9, noise_sd=1.5), rng))
+    radius_m = 0.06 * side_px / 2 / 40.0  # a ball of this size would fit the depth
+    found = StereoTracker(SMALL, VisionConfig(radius_m=radius_m)).track(StereoFrame(0.0, *images))
+    assert reason(found) is Reason.OCCLUDED
 
 
 def test_no_ball_is_no_marker():
@@ -261,6 +275,18 @@ def test_a_copy_beside_a_marker_that_was_not_measured_is_a_reflection():
     assert matcher.doubt(found, *both_eyes) is Reason.REFLECTION
 
 
+def test_a_ball_found_by_its_brighter_part_is_as_bright_as_when_found_whole():
+    image, config, gate = stage(BALL).left, VisionConfig(), gate_of(VisionConfig())
+    eye = Pinhole(SMALL.focal_px, SMALL.principal_point_px)
+    (patch,) = find_patches(image, Region(0, 0, *SMALL.image_size_px), gate, config)
+    # Light falls from above on the left.
+    part = replace(patch, box=replace(patch.box, right=patch.box.right - 12, bottom=patch.box.bottom - 12))
+    whole, again = (measure(image, one, eye, gate, config) for one in (patch, part))
+    assert isinstance(whole, Disc)
+    assert isinstance(again, Disc)
+    assert again.level == pytest.approx(whole.level, rel=0.02)
+
+
 def test_the_mirrored_copy_of_a_ball_that_got_hidden_is_a_reflection():
     tracker = StereoTracker(SMALL)
     tracker.track(stage(BALL))
@@ -273,6 +299,20 @@ def test_a_twin_out_of_reach_is_not_taken_for_a_ball_that_got_hidden():
     tracker.track(stage(BALL))
     twin = Ball((-0.1, -0.1, 1.3))
     assert reason(tracker.track(stage(twin, t=0.1))) is Reason.IMPLAUSIBLE_SPEED
+
+
+@pytest.mark.parametrize(
+    ("other", "said"),
+    [
+        (Ball((0.02, -0.05, 1.1), rgb=(0.45, 0.04, 0.04)), Reason.REFLECTION),
+        (Ball((0.02, -0.05, 1.1)), Reason.IMPLAUSIBLE_SPEED),
+    ],
+)
+def test_what_cannot_have_been_the_marker_does_not_become_it_while_it_stays_where_it_is(other, said):
+    tracker = StereoTracker(SMALL)
+    tracker.track(stage(BALL))
+    # 0.3 m away, which the marker itself might go in 0.1 s.
+    assert [reason(tracker.track(stage(other, t=number / 30))) for number in range(1, 7)] == [said] * 6
 
 
 def test_a_second_after_the_last_fix_the_marker_may_be_anywhere():
@@ -289,3 +329,14 @@ def test_eyes_that_disagree_on_the_size_by_more_than_noise_claim_less():
     found = [matcher.match([left], [right]) for left, right in (agreeing, apart)]
     sigmas = [np.sqrt(np.diag(one.cov)) for one in found if isinstance(one, Location)]
     assert (sigmas[1] > 2.0 * sigmas[0]).all()
+
+
+def test_rows_that_differ_by_less_than_two_sigmas_leave_the_claim_as_it_is():
+    matcher = StereoMatcher(SMALL, VisionConfig())
+    left, right = seen_discs(BALL, level=120.0)
+    sigma_px = float(np.sqrt(left.cov_px[1, 1] + right.cov_px[1, 1]))
+    lower = replace(right, centre_px=right.centre_px + np.array([0.0, 1.9 * sigma_px]))
+    same, other = (matcher.match([left], [one]) for one in (right, lower))
+    assert isinstance(same, Location)
+    assert isinstance(other, Location)
+    assert np.diag(other.cov) == pytest.approx(np.diag(same.cov), rel=0.01)

@@ -88,6 +88,7 @@ def test_damage_is_named_with_its_line(rig, tmp_path, what, by, said) -> None:
     file.write_text(damaged)
     with pytest.raises(ConfigError, match=said) as raised:
         read_rig(file)
+    assert raised.value.remedy
     if what != 'format = ".*"\\n':
         assert raised.value.line is not None
 
@@ -98,8 +99,15 @@ def test_a_file_cut_short_is_refused_wherever_it_was_cut(rig, tmp_path) -> None:
     data = file.read_bytes()
     for end in range(0, len(data) - 2, 211):
         file.write_bytes(data[:end])
-        with pytest.raises(ConfigError):
+        with pytest.raises(ConfigError, match="Take the file from a copy, or calibrate again"):
             read_rig(file)
+
+
+def test_bytes_that_are_no_text_are_told_to_be_calibrated_again(tmp_path) -> None:
+    file = tmp_path / "cameras.toml"
+    file.write_bytes(b"\x8d\xff\x00")
+    with pytest.raises(ConfigError, match=r"not UTF-8 text. Take the file from a copy, or calibrate again"):
+        read_rig(file)
 
 
 def test_no_file_says_what_writes_one(tmp_path) -> None:

@@ -16,7 +16,7 @@ from interfaces.records import FloatArray
 Pattern = Literal["charuco", "chessboard"]
 
 MARKER_SHARE = 0.75
-_SIZES = (50, 100, 250, 1000)
+SIZES = (50, 100, 250, 1000)
 _DICTIONARY = re.compile(r"(?:[4-7]X[4-7]_(?:50|100|250|1000)|ARUCO_ORIGINAL|APRILTAG_(?:16h5|25h9|36h10|36h11))")
 
 
@@ -82,7 +82,7 @@ class Board:
         if self.dictionary is not None:
             return self.dictionary
         needed = len(self.marker_squares)
-        return f"4X4_{next((size for size in _SIZES if size >= needed), _SIZES[-1])}"
+        return f"4X4_{smallest_size(needed)}"
 
     @cached_property
     def marker_squares(self) -> list[tuple[int, int]]:
@@ -106,6 +106,11 @@ class Board:
         return cv2.aruco.CharucoBoard(
             (self.columns, self.rows), self.square_m, self.marker_side_m, dictionary(self.dictionary_name)
         )
+
+
+def smallest_size(markers: int) -> int:
+    """Of the smallest dictionary with so many markers; the largest one's where none has."""
+    return next((size for size in SIZES if size >= markers), SIZES[-1])
 
 
 def dictionary(name: str) -> Any:

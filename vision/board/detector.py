@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from interfaces.records import FloatArray, ImageArray
 
-from .board import Board, dictionary
+from .board import SIZES, Board, dictionary, smallest_size
 from .exposure import image_fault
 from .refine import refined
 from .sharpness import blur_px
@@ -104,7 +104,8 @@ class BoardDetector:
             return NotFound("not_found", f"too little of the board: {markers} of its markers. Bring it into view")
         other = _other_dictionary(grey, self.board.dictionary_name)
         if other is not None:
-            text = f"the markers are {other}, not {self.board.dictionary_name}. Give --dictionary, or the right board"
+            wanted = self.board.dictionary_name
+            text = f"the markers are {other}, not {wanted}. Give --dictionary {other}, or take the right board"
             return NotFound("other_dictionary", text)
         return NotFound("not_found", "no board. Bring it into view, larger, and not mirrored or in glare")
 
@@ -121,15 +122,19 @@ class BoardDetector:
 def _other_dictionary(grey: ImageArray, wanted: str) -> str | None:
     """The family of markers that are in the image in the place of those wanted."""
     families = [name for name in _FAMILIES if name.split("_")[0] != wanted.split("_")[0] or "APRILTAG" in name]
-    counts = {name: _marker_count(grey, name) for name in families if name != wanted}
-    best = max(counts, key=lambda name: counts[name])
-    return best if counts[best] >= 3 else None
+    seen = {name: _markers(grey, name) for name in families if name != wanted}
+    best = max(seen, key=lambda name: len(seen[name]))
+    if len(seen[best]) < 3:
+        return None
+    bits, _, size = best.partition("_")
+    return f"{bits}_{smallest_size(max(seen[best]) + 1)}" if size == str(SIZES[-1]) else best
 
 
-def _marker_count(grey: ImageArray, family: str) -> int:
+def _markers(grey: ImageArray, family: str) -> list[int]:
+    """Numbers of the markers of a family."""
     detector: Any = cv2.aruco.ArucoDetector(dictionary(family))
     numbers: Sequence[int] | None = detector.detectMarkers(grey)[1]
-    return 0 if numbers is None else len(numbers)
+    return [] if numbers is None else np.ravel(numbers).tolist()
 
 
 def _in_order(grey: ImageArray, grid: FloatArray, board: Board) -> FloatArray:

@@ -4,6 +4,10 @@ At a corner two edges cross. Every gradient on them is at right angles to the li
 as a least-squares solution (Förstner & Gülch 1987; OpenCV's cornerSubPix). What disturbs that are the markers' edges.
 So the pixels are chosen in the board's own directions: a cross of two strips along the edges, which markers leave
 white. A square window has to be so small, where squares are seen aslant, that half of the edges are lost.
+
+A lens bends the edges. Both arms of an edge leave the corner to the same side then, and a straight cross would be
+drawn there: through a fisheye all corners of a board off the axis by some 0.03 px the same way. How edges bend is told
+by the neighbours: the second differences of their places.
 """
 
 from __future__ import annotations
@@ -20,6 +24,7 @@ IntArray = NDArray[np.int64]
 
 _REACH = 0.35  # of a square: how far along the edges
 _NEIGHBOURS = 1.6  # squares: what tells the board's directions at a corner
+_BENDING_STEPS = 2  # squares to each side: what tells how the edges at a corner bend
 _ITERATIONS = 8
 _CONVERGED_PX = 1e-3
 _MOST_MOVED = 0.2  # of a square
@@ -42,8 +47,9 @@ def refined(grey: ImageArray, board: Board, numbers: IntArray, px: FloatArray) -
     slopes = np.asarray(np.stack(both, axis=-1) / 32.0, dtype=np.float64)
     frames = _frames(board, numbers, px)
     usable = np.isfinite(frames).all(axis=(1, 2)) & (np.abs(np.linalg.det(np.nan_to_num(frames))) > 1.0)
+    bends = _bends(board, numbers, px)[usable]
     numbers, px, frames = numbers[usable], px[usable], frames[usable]
-    moved = _crossings(slopes, px, frames, board)
+    moved = _crossings(slopes, px, frames, bends, board)
     squares = np.linalg.norm(np.linalg.solve(frames, (moved - px)[..., None])[..., 0], axis=1)
     size = np.array([levels.shape[1], levels.shape[0]])
     inside = ((moved > _BORDER_PX) & (moved < size - 1 - _BORDER_PX)).all(axis=1)
@@ -74,7 +80,35 @@ def _frames(board: Board, numbers: IntArray, px: FloatArray) -> FloatArray:
     return found
 
 
-def _crossings(slopes: FloatArray, start: FloatArray, frames: FloatArray, board: Board) -> FloatArray:
+def _bends(board: Board, numbers: IntArray, px: FloatArray) -> FloatArray:
+    """How far the edges across and down bend away from their tangents one square from each corner, as columns.
+
+    Shape (n, 2, 2) [px]; 0 where fewer than three corners of an edge are known.
+    """
+    steps = np.arange(-_BENDING_STEPS, _BENDING_STEPS + 1)
+    powers = np.stack([np.ones(len(steps)), steps, steps**2], axis=-1)
+    # With a margin, so that neighbours beyond the board are unknown corners.
+    places = np.rint(board.corners_m[numbers, :2] / board.square_m).astype(int) + _BENDING_STEPS
+    grid = np.full((board.columns + 2 * _BENDING_STEPS, board.rows + 2 * _BENDING_STEPS, 2), np.nan)
+    grid[places[:, 0], places[:, 1]] = px
+    bends = np.zeros((len(px), 2, 2))
+    for axis in range(2):
+        offsets = np.outer(steps, np.eye(2, dtype=int)[axis])
+        near = places[:, None] + offsets
+        seen = grid[near[..., 0], near[..., 1]]
+        known = np.isfinite(seen[..., 0])
+        told = known.sum(axis=1) >= 3
+        weighed = powers * known[told, :, None]
+        normal = np.einsum("nki,kj->nij", weighed, powers)
+        # From the corner itself: small numbers lose no digits.
+        moments = np.einsum("nki,nkj->nij", weighed, np.nan_to_num(seen[told] - px[told, None]))
+        bends[told, :, axis] = np.linalg.solve(normal, moments)[:, 2]
+    return bends
+
+
+def _crossings(
+    slopes: FloatArray, start: FloatArray, frames: FloatArray, bends: FloatArray, board: Board
+) -> FloatArray:
     """Where the edges cross near `start`, shape (n, 2) [px]; not a number where nothing tells."""
     into_squares = np.linalg.inv(frames)
     # What is left white of a square beside its marker.
@@ -92,12 +126,15 @@ def _crossings(slopes: FloatArray, start: FloatArray, frames: FloatArray, board:
         p = (middle[:, None] + window) - at[:, None]
         pixels = middle[:, None] + window + reach
         g = padded[pixels[..., 1], pixels[..., 0]]
-        weights = _cross(np.abs(np.einsum("nij,nkj->nki", into_squares, p)), half_widths[:, None])
+        squares = np.einsum("nij,nkj->nki", into_squares, p)
+        weights = _cross(np.abs(squares), half_widths[:, None])
         weighed = g * weights[..., None]
         G = np.einsum("nki,nkj->nij", weighed, g)
         # Edges of one direction alone tell no crossing.
         told = np.linalg.cond(G) < _MOST_CONDITION
-        h = np.einsum("nki,nk->ni", weighed, np.einsum("nki,nki->nk", g, p))
+        # The tangent where an edge has bent away by b passes the corner at -b.
+        tangents = p + np.einsum("nij,nkj->nki", bends, squares**2)
+        h = np.einsum("nki,nk->ni", weighed, np.einsum("nki,nki->nk", g, tangents))
         step = np.full_like(at, np.nan)
         step[told] = np.linalg.solve(G[told], h[told][..., None])[..., 0]
         at = at + step

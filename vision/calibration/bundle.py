@@ -31,6 +31,7 @@ class Bundle:
         poses: the board's pose in the left eye's frame for each view, as rotation vector [rad] and position [m],
             shape (views, 6).
         residuals: of each view, seen minus expected, shape (corners, 2) [px], the left eye's before the right one's.
+        weights: of each view's corners, shape (corners,), of `corner_weights`; 0 where it was left out.
         normal: the normal matrix of `vector` with the poses eliminated, for residuals of 1 px.
     """
 
@@ -38,50 +39,55 @@ class Bundle:
     vector: FloatArray
     poses: FloatArray
     residuals: tuple[FloatArray, ...]
+    weights: tuple[FloatArray, ...]
     normal: FloatArray
 
     @property
-    def squares(self) -> float:
-        """Sum of squared residuals [px²]."""
-        return float(sum(np.sum(each**2) for each in self.residuals))
+    def kept(self) -> tuple[FloatArray, ...]:
+        """The residuals of each view without the corners that were left out."""
+        return tuple(each[w > 0.0] for each, w in zip(self.residuals, self.weights, strict=True))
 
     @property
     def freedom(self) -> int:
         """Image coordinates less unknowns."""
-        return sum(each.size for each in self.residuals) - len(self.vector) - self.poses.size
+        return sum(each.size for each in self.kept) - len(self.vector) - self.poses.size
 
     @property
     def sigma_px(self) -> float:
-        """1-sigma of an image coordinate, as the residuals tell it [px]."""
-        return float(np.sqrt(self.squares / max(self.freedom, 1)))
+        """1-sigma of an image coordinate, as the residuals tell it: the RMS over all views [px]."""
+        return float(np.sqrt(sum(np.sum(each**2) for each in self.kept) / max(self.freedom, 1)))
 
     def view_rms_px(self) -> FloatArray:
         """RMS residual per image coordinate of each view [px]."""
-        return np.array([np.sqrt(np.mean(each**2)) for each in self.residuals])
-
-    def covariance(self) -> FloatArray:
-        """Of `vector`, to first order: the inverse normal matrix times the residuals' variance."""
-        scale = 1.0 / np.sqrt(np.diag(self.normal))
-        return self.sigma_px**2 * np.linalg.inv(self.normal * np.outer(scale, scale)) * np.outer(scale, scale)
+        return np.array([np.sqrt(np.mean(each**2)) for each in self.kept])
 
 
-def solve(views: Sequence[View], corners_m: FloatArray, model: Model, vector: FloatArray, poses: FloatArray) -> Bundle:
+def solve(
+    views: Sequence[View],
+    corners_m: FloatArray,
+    model: Model,
+    vector: FloatArray,
+    poses: FloatArray,
+    weights: Sequence[FloatArray] | None = None,
+) -> Bundle:
     """The least-squares solution from a start, by Levenberg and Marquardt's method.
 
     Args:
         corners_m: the board's corners, shape (n, 3) [m].
         vector, poses: the start, as `Bundle` has them.
+        weights: as `Bundle` has them; None: all corners count alike.
 
     Raises:
         CalibrationError: the views do not determine the parameters.
     """
     damping = _FIRST_DAMPING
-    linear = _linearised(views, corners_m, model, vector, poses)
+    weighed = tuple(np.ones(view.corner_count) for view in views) if weights is None else tuple(weights)
+    linear = _linearised(views, corners_m, model, vector, poses, weighed)
     for _ in range(_ITERATIONS):
         while damping < _MOST_DAMPING:
             step = linear.step(damping)
             if step is not None:
-                stepped = _linearised(views, corners_m, model, vector + step[0], poses + step[1])
+                stepped = _linearised(views, corners_m, model, vector + step[0], poses + step[1], weighed)
                 if stepped.squares <= linear.squares:
                     break
             damping *= 10.0
@@ -94,18 +100,25 @@ def solve(views: Sequence[View], corners_m: FloatArray, model: Model, vector: Fl
             break
     if not np.isfinite(linear.squares):
         raise CalibrationError("the views do not determine the lenses. Take more views, tilted and all over the image")
-    return Bundle(model, vector, poses, tuple(linear.residuals), linear.reduced(0.0)[0])
+    return Bundle(model, vector, poses, tuple(linear.residuals), weighed, linear.reduced(0.0)[0])
 
 
-def view_pose(view: View, corners_m: FloatArray, model: Model, vector: FloatArray, start: FloatArray) -> Bundle:
-    """The best pose of the board in one view for a rig that is held fixed, from a start of shape (6,)."""
+def view_residuals(
+    view: View, corners_m: FloatArray, model: Model, vector: FloatArray, start: FloatArray, weights: FloatArray
+) -> FloatArray:
+    """What is left of a view with the board's best pose in it for a rig that is held fixed, shape (corners, 2) [px].
+
+    Args:
+        start: the pose to start from, shape (6,).
+        weights: of the corners, shape (corners,).
+    """
     pose = start[None]
-    linear = _linearised([view], corners_m, model, vector, pose)
+    linear = _linearised([view], corners_m, model, vector, pose, [weights])
     damping = _FIRST_DAMPING
     for _ in range(_ITERATIONS):
         H = linear.pose_normals[0]
         step = np.linalg.solve(H + damping * np.diag(np.diag(H)), linear.pose_gradients[0])
-        stepped = _linearised([view], corners_m, model, vector, pose + step)
+        stepped = _linearised([view], corners_m, model, vector, pose + step, [weights])
         if stepped.squares > linear.squares:
             damping *= 10.0
             if damping > _MOST_DAMPING:
@@ -115,7 +128,7 @@ def view_pose(view: View, corners_m: FloatArray, model: Model, vector: FloatArra
         pose, linear, damping = pose + step, stepped, 0.1 * damping
         if gained <= _CONVERGED * linear.squares:
             break
-    return Bundle(model, vector, pose, tuple(linear.residuals), linear.reduced(0.0)[0])
+    return linear.residuals[0]
 
 
 def eye_of(
@@ -136,11 +149,37 @@ def eye_of(
     return right, r.ravel(), t.ravel(), (by_rig, by_pose)
 
 
+def seen_with_slopes(
+    view: View, corners_m: FloatArray, model: Model, vector: FloatArray, pose: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Residuals (corners, 2) [px] of a view, and how what is expected depends on the rig and on the board's pose.
+
+    The slopes have two rows a corner, u and v: shapes (2 corners, p) and (2 corners, 6).
+    """
+    p = len(vector)
+    n = (p - _POSE) // 2
+    residuals, by_rig_and_lens, by_board = [], [], []
+    for eye in EYES:
+        corners = view.eye(eye)
+        if corners is None:
+            continue
+        lens, rotation, translation, (by_rig, by_pose) = eye_of(eye, model, vector, pose)
+        px, J_pose, J_lens = lens.project_posed(corners_m[corners.numbers], rotation, translation)
+        J = np.zeros((len(J_lens), p))
+        J[:, slice(0, n) if eye == "left" else slice(n, 2 * n)] = J_lens
+        J[:, 2 * n :] = J_pose @ by_rig
+        residuals.append(corners.px - px)
+        by_rig_and_lens.append(J)
+        by_board.append(J_pose @ by_pose)
+    return np.concatenate(residuals), np.concatenate(by_rig_and_lens), np.concatenate(by_board)
+
+
 @dataclass
 class _Linear:
     """Residuals and normal equations at a point: of the rig, of each pose, and mixed."""
 
     residuals: list[FloatArray]
+    weights: Sequence[FloatArray]
     normal: FloatArray
     gradient: FloatArray
     pose_normals: FloatArray
@@ -149,7 +188,7 @@ class _Linear:
 
     @property
     def squares(self) -> float:
-        return float(sum(np.sum(each**2) for each in self.residuals))
+        return _weighted(self.residuals, self.weights)
 
     def reduced(self, damping: float) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Normal matrix and gradient of the rig with the poses eliminated, and the poses' normal matrices."""
@@ -172,30 +211,31 @@ class _Linear:
             return None
 
 
+def _weighted(residuals: Sequence[FloatArray], weights: Sequence[FloatArray]) -> float:
+    """Weighted sum of squared residuals [px²]."""
+    return float(sum(np.sum(w[:, None] * each**2) for each, w in zip(residuals, weights, strict=True)))
+
+
 def _linearised(
-    views: Sequence[View], corners_m: FloatArray, model: Model, vector: FloatArray, poses: FloatArray
+    views: Sequence[View],
+    corners_m: FloatArray,
+    model: Model,
+    vector: FloatArray,
+    poses: FloatArray,
+    weights: Sequence[FloatArray],
 ) -> _Linear:
     p, m = len(vector), len(views)
-    n = (p - _POSE) // 2
-    linear = _Linear([], np.zeros((p, p)), np.zeros(p), np.zeros((m, 6, 6)), np.zeros((m, 6)), np.zeros((m, p, 6)))
+    linear = _Linear(
+        [], weights, np.zeros((p, p)), np.zeros(p), np.zeros((m, 6, 6)), np.zeros((m, 6)), np.zeros((m, p, 6))
+    )
     for k, (view, pose) in enumerate(zip(views, poses, strict=True)):
-        residuals = []
-        for eye in EYES:
-            corners = view.eye(eye)
-            if corners is None:
-                continue
-            lens, rotation, translation, (by_rig, by_pose) = eye_of(eye, model, vector, pose)
-            px, J_pose, J_lens = lens.project_posed(corners_m[corners.numbers], rotation, translation)
-            J = np.zeros((len(J_lens), p))
-            J[:, slice(0, n) if eye == "left" else slice(n, 2 * n)] = J_lens
-            J[:, 2 * n :] = J_pose @ by_rig
-            K = J_pose @ by_pose
-            residual = corners.px - px
-            residuals.append(residual)
-            linear.normal += J.T @ J
-            linear.gradient += J.T @ residual.ravel()
-            linear.pose_normals[k] += K.T @ K
-            linear.pose_gradients[k] += K.T @ residual.ravel()
-            linear.mixed[k] += J.T @ K
-        linear.residuals.append(np.concatenate(residuals))
+        residual, J, K = seen_with_slopes(view, corners_m, model, vector, pose)
+        w = np.repeat(weights[k], 2)
+        weighed = w * residual.ravel()
+        linear.normal += J.T @ (w[:, None] * J)
+        linear.gradient += J.T @ weighed
+        linear.pose_normals[k] += K.T @ (w[:, None] * K)
+        linear.pose_gradients[k] += K.T @ weighed
+        linear.mixed[k] += J.T @ (w[:, None] * K)
+        linear.residuals.append(residual)
     return linear

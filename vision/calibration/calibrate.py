@@ -17,15 +17,18 @@ from vision.rig import CalibrationError, Made, StereoRig, split
 from .bundle import Bundle, solve
 from .guidance import Coverage
 from .held_out import HeldOut, held_out
+from .influence import covariance
 from .requirements import contradicts, lacking, misplaced, together, unsure
 from .start import start
 from .view import View
+from .weights import corner_weights
 
 ModelChoice = Literal["auto", "pinhole", "fisheye"]
 
 _OUTLIER_SPREADS = 8.0
 _OUTLIER_RATIO = 3.0
 _MOST_LEFT_OUT = 0.35
+_REWEIGHTED = 3
 
 
 @dataclass(frozen=True)
@@ -140,7 +143,7 @@ def fit(views: Sequence[View], corners_m: FloatArray, image_size_px: tuple[int, 
     left_out: list[LeftOut] = []
     vector, poses = start(kept, corners_m, image_size_px, model)
     while True:
-        bundle = solve(kept, corners_m, model, vector, poses)
+        bundle = _weighed(kept, corners_m, solve(kept, corners_m, model, vector, poses))
         worst = _outlier(bundle.view_rms_px())
         if worst is None:
             break
@@ -155,6 +158,14 @@ def fit(views: Sequence[View], corners_m: FloatArray, image_size_px: tuple[int, 
         vector, poses = bundle.vector, np.delete(bundle.poses, worst, axis=0)
     _require_places(model, bundle.vector)
     return Fitted(tuple(kept), tuple(left_out), bundle, held_out(kept, corners_m, bundle))
+
+
+def _weighed(views: Sequence[View], corners_m: FloatArray, bundle: Bundle) -> Bundle:
+    """The fit in which each image's corners count as exactly as they were found."""
+    for _ in range(_REWEIGHTED):
+        weights = corner_weights(views, corners_m, bundle)
+        bundle = solve(views, corners_m, bundle.model, bundle.vector, bundle.poses, weights)
+    return bundle
 
 
 def _chosen(fits: dict[Model, Fitted]) -> Model:
@@ -191,8 +202,8 @@ def _rig(fitted: Fitted, board: Board, asked: Asked) -> StereoRig:
     bundle = fitted.bundle
     left, right, rotation, translation = split(bundle.model, bundle.vector)
     # A board of another size makes all lengths as much longer, and nothing else.
-    covariance = bundle.covariance()
-    covariance[-3:, -3:] += asked.scale_sigma**2 * np.outer(translation, translation)
+    unsure_by = covariance(fitted.views, board.corners_m, bundle)
+    unsure_by[-3:, -3:] += asked.scale_sigma**2 * np.outer(translation, translation)
     made = Made(
         date=asked.date,
         board=board.name,
@@ -202,4 +213,4 @@ def _rig(fitted: Fitted, board: Board, asked: Asked) -> StereoRig:
         held_out_px=fitted.held_out.rms_px,
         scale_sigma=asked.scale_sigma,
     )
-    return StereoRig(left, right, rotation, translation, asked.image_size_px, asked.serials, covariance, made)
+    return StereoRig(left, right, rotation, translation, asked.image_size_px, asked.serials, unsure_by, made)

@@ -22,6 +22,9 @@ _SIGMAS = 4.0
 _FREE_ROWS_PX = 0.15
 _FREE_SQUARE = 0.002
 _STEP_PX = 1e-3
+# Images that are exchanged or upside down are told by rows that agree so much better when they are put right, and by
+# squares that are then right to this share.
+_MISPLACED_ROWS, _MISPLACED_SIZE = 0.1, 0.03
 
 
 @dataclass(frozen=True)
@@ -75,12 +78,15 @@ def check(rig: StereoRig, view: View, board: Board) -> Check:
     units = np.array([focal, np.degrees(1.0), board.square_m])
     found = units * _figures(rig, left, right, model)
     sigma = units * np.sqrt(np.diag(covariance))
+    wrong = _wrong(found, sigma, focal, rig.image_size_px[0], board.square_m)
+    if wrong and (misplaced := _misplaced(rig, left, right, model)) is not None:
+        wrong = [misplaced]
     return Check(
         len(numbers),
-        focal * float(np.sqrt(np.mean(_rows(rig, left, right)[0] ** 2))),
+        focal * _rows_apart(rig, left, right),
         *(float(each) for pair in zip(found, sigma, strict=True) for each in pair),
         nominal_m=board.square_m,
-        wrong=tuple(_wrong(found, sigma, focal, rig.image_size_px[0], board.square_m)),
+        wrong=tuple(wrong),
     )
 
 
@@ -97,6 +103,27 @@ def _rows(rig: StereoRig, left: FloatArray, right: FloatArray) -> tuple[FloatArr
     rectification = Rectification(rig)
     here, there = rectification.directions(left, 0), rectification.directions(right, 1)
     return there[:, 1] - here[:, 1], there[:, 0]
+
+
+def _rows_apart(rig: StereoRig, left: FloatArray, right: FloatArray) -> float:
+    """RMS difference of the rows, in focal lengths."""
+    return float(np.sqrt(np.mean(_rows(rig, left, right)[0] ** 2)))
+
+
+def _misplaced(rig: StereoRig, left: FloatArray, right: FloatArray, model: FloatArray) -> str | None:
+    """What is said where the calibration would hold for images exchanged or turned upside down, else None."""
+    turned_left, turned_right = (np.array(rig.image_size_px) - 1.0 - px for px in (left, right))
+    placed = (
+        ("left and right are exchanged: exchange the cameras, or their names where they are configured", right, left),
+        ("the left image is upside down: turn that camera, or its images", turned_left, right),
+        ("the right image is upside down: turn that camera, or its images", left, turned_right),
+    )
+    most = _MISPLACED_ROWS * _rows_apart(rig, left, right)
+    for text, one, other in placed:
+        size = _figures(rig, one, other, model)[2]
+        if _rows_apart(rig, one, other) < most and abs(size - 1.0) < _MISPLACED_SIZE:
+            return text
+    return None
 
 
 def _figures(rig: StereoRig, left: FloatArray, right: FloatArray, model: FloatArray) -> FloatArray:
@@ -128,6 +155,11 @@ def _wrong(found: FloatArray, sigma: FloatArray, focal_px: float, width_px: int,
         f"{np.degrees(abs(rows_px) / focal_px):.2f}°",
         f"a camera has been turned about its line of sight by {abs(roll_deg):.2f}°",
         f"a square of {1e3 * nominal_m:g} mm is measured as {1e3 * square_m:.2f} mm: a camera has been turned inwards "
-        "or outwards, moved or refocused, or this is another board",
+        f"or outwards, moved or refocused, or the board is another one, or printed at {square_m / nominal_m:.1%}",
     )
-    return [text for text, is_off in zip(texts, off, strict=True) if is_off]
+    wrong = [text for text, is_off in zip(texts, off, strict=True) if is_off]
+    return (
+        [*wrong, "all at once, so that these may be other cameras than those that were calibrated"]
+        if off.all()
+        else wrong
+    )

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+import re
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -13,6 +15,9 @@ from vision.rig import CalibrationError
 from .guidance import Coverage
 from .images import ImagePair, require_equal_sizes
 from .view import EYES, Eye, View
+
+_MOST_NAMES = 4
+_NUMBERS = re.compile(r"\d+(\.\d+)?")
 
 
 class Detector(Protocol):
@@ -58,7 +63,7 @@ def gathered(pairs: Iterable[ImagePair], board: Board, tell: Callable[[str], Non
     """All views in images.
 
     Args:
-        tell: is told of every image that cannot be used.
+        tell: is told which images cannot be used, and why: one line a reason and eye.
 
     Raises:
         CalibrationError: the two eyes' images are of different sizes.
@@ -69,11 +74,37 @@ def gathered(pairs: Iterable[ImagePair], board: Board, tell: Callable[[str], Non
         view, unusable = looked_at(pair, detector)
         found.image_size_px = pair.size_px
         found.unusable += unusable
-        for each in unusable:
-            tell(f"{each.name}, {each.eye}: {each.fault.text}")
         if view.left is not None or view.right is not None:
             found.add(view, pair)
+    for line in summarised(found.unusable):
+        tell(line)
     return found
+
+
+def summarised(unusable: Sequence[Unusable]) -> list[str]:
+    """Which images cannot be used, and why: one line for each eye and reason, numbers in it apart."""
+    alike: dict[tuple[Eye, str], list[Unusable]] = {}
+    for each in unusable:
+        alike.setdefault((each.eye, _kind(each)), []).append(each)
+    return [
+        f"{_named(group)}, {eye} image: {_usual([each.fault.text for each in group])}"
+        for (eye, _), group in alike.items()
+    ]
+
+
+def _kind(unusable: Unusable) -> str:
+    return _NUMBERS.sub("#", unusable.fault.text)
+
+
+def _named(group: Sequence[Unusable]) -> str:
+    names = [each.name for each in group]
+    if len(names) <= _MOST_NAMES:
+        return ", ".join(names)
+    return f"{', '.join(names[: _MOST_NAMES - 1])} and {len(names) - _MOST_NAMES + 1} more"
+
+
+def _usual(texts: Sequence[str]) -> str:
+    return Counter(texts).most_common(1)[0][0]
 
 
 def looked_at(pair: ImagePair, detector: Detector) -> tuple[View, tuple[Unusable, ...]]:
@@ -93,12 +124,15 @@ def looked_at(pair: ImagePair, detector: Detector) -> tuple[View, tuple[Unusable
     return View(pair.name, *seen), tuple(unusable)
 
 
-def require_any(found: Gathered) -> None:
-    """CalibrationError where no image shows a usable board, with the reason that most have."""
-    if found.views:
-        return
-    texts = [each.fault.text for each in found.unusable]
-    if not texts:
+def require_both(found: Gathered) -> None:
+    """CalibrationError where an eye sees no usable board in any image, with the reason that most of its images have."""
+    if not found.views and not found.unusable:
         raise CalibrationError("there are no images")
-    usual = max(set(texts), key=texts.count)
-    raise CalibrationError(f"no image shows a board that can be used; {texts.count(usual)} of {len(texts)}: {usual}")
+    blind = [eye for eye in EYES if all(view.eye(eye) is None for view in found.views)]
+    if not blind:
+        return
+    faults = [each for each in found.unusable if each.eye in blind]
+    kind = _usual([_kind(each) for each in faults])
+    alike = [each.fault.text for each in faults if _kind(each) == kind]
+    who = "no image" if len(blind) == len(EYES) else f"no {blind[0]} image"
+    raise CalibrationError(f"{who} shows a board that can be used; {len(alike)} of {len(faults)}: {_usual(alike)}")

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from interfaces.records import FloatArray
 
-from .bundle import Bundle, solve, view_pose
+from .bundle import Bundle, solve, view_residuals
 from .view import View
 
 _FOLDS = 10
@@ -49,14 +49,17 @@ def held_out(views: Sequence[View], corners_m: FloatArray, whole: Bundle) -> Hel
     """Cross-validation by views: a tenth of them is left out in turn and then foretold.
 
     Args:
-        whole: the fit of all views, from which each part's fit starts.
+        whole: the fit of all views, from which each part's fit starts. Corners that it left out do not count here.
     """
     groups = np.arange(len(views)) % min(_FOLDS, len(views))
     squares = np.zeros(len(views))
     for group in range(groups.max() + 1):
         kept = np.flatnonzero(groups != group).tolist()
-        part = solve([views[k] for k in kept], corners_m, whole.model, whole.vector, whole.poses[kept])
+        weights = [whole.weights[k] for k in kept]
+        part = solve([views[k] for k in kept], corners_m, whole.model, whole.vector, whole.poses[kept], weights)
         for k in np.flatnonzero(groups == group).tolist():
-            squares[k] = view_pose(views[k], corners_m, whole.model, part.vector, whole.poses[k]).squares
-    freedom = np.array([2 * view.corner_count - _POSE_FREEDOM for view in views])
+            own = whole.weights[k]
+            left = view_residuals(views[k], corners_m, whole.model, part.vector, whole.poses[k], own)
+            squares[k] = np.sum(left[own > 0.0] ** 2)
+    freedom = np.array([each.size - _POSE_FREEDOM for each in whole.kept])
     return HeldOut(squares, freedom)

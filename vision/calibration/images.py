@@ -15,6 +15,7 @@ from vision.rig import CalibrationError
 
 _ENDINGS = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".webp"}
 _EYE = re.compile(r"(?<![a-z])(left|right|l|r)(?![a-z])", re.IGNORECASE)
+_NUMBER = re.compile(r"(\d+)")
 _WILDCARD = re.compile(r"(\*|\?|\[[^\]]*\])")
 
 
@@ -45,7 +46,7 @@ def pair_files(folder: Path, left: str | None, right: str | None, *, side_by_sid
     """Which files of a folder belong together, in the order of their names.
 
     Without patterns, left and right are told apart by `left`, `right`, `l` or `r` in the names of files or of their
-    folders; what else the names have is the view's.
+    folders; what else the names have is the view's. Numbers in names count as numbers.
 
     Args:
         left, right: patterns of the eyes' files, as in left*.png; equal texts for the star
@@ -57,7 +58,7 @@ def pair_files(folder: Path, left: str | None, right: str | None, *, side_by_sid
     if not folder.is_dir():
         raise CalibrationError(f"{folder}: there is no such folder")
     if side_by_side:
-        files = _images(folder, "*")
+        files = sorted(_images(folder, "*"), key=_in_order)
         pairs = [PairFiles(file.stem, file, file) for file in files]
     elif left is not None and right is not None:
         pairs = _matched(*({_varied(file, each): file for file in _images(folder, each)} for each in (left, right)))
@@ -132,7 +133,17 @@ def _by_eye(folder: Path) -> tuple[dict[str, Path], dict[str, Path]]:
 
 
 def _matched(left: dict[str, Path], right: dict[str, Path]) -> list[PairFiles]:
-    return [PairFiles(left[key].stem, left[key], right[key]) for key in sorted(left.keys() & right.keys())]
+    keys = sorted(left.keys() & right.keys(), key=lambda key: _in_order(left[key]))
+    names = [Path(key).stem.strip("_-. ") or left[key].stem for key in keys]
+    if len(set(names)) < len(names):
+        names = keys
+    return [PairFiles(name, left[key], right[key]) for name, key in zip(names, keys, strict=True)]
+
+
+def _in_order(file: Path) -> tuple[list[tuple[float, str]], str]:
+    """Files are in the order of their names, numbers in them as numbers."""
+    parts = _NUMBER.split(file.as_posix())
+    return [(float(part), "") if k % 2 else (0.0, part) for k, part in enumerate(parts)], file.as_posix()
 
 
 def _read(file: Path) -> ImageArray:

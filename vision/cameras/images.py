@@ -45,7 +45,7 @@ class ImageRoll:
         if left.shape != right.shape:
             raise SourceError(
                 f"the eyes' images are of different sizes: {_size(left)} in {self._left[0]}, {_size(right)} in "
-                f"{self._right[0]}"
+                f"{self._right[0]}. Set both cameras to one resolution"
             )
         self.image_size_px = (left.shape[1], left.shape[0])
         self._next = 0

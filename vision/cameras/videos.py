@@ -35,7 +35,11 @@ class VideoRoll:
         sizes, counts, rates = zip(*(_measured(file) for file in self._files), strict=True)
         if len(set(sizes)) > 1:
             said = " and ".join(f"{width}x{height}" for width, height in sizes)
-            raise ConfigError(f"the two films are of different sizes: {said} pixels", file=self._files[1])
+            raise ConfigError(
+                f"the two films are of different sizes: {said} pixels",
+                file=self._files[1],
+                remedy="Set both cameras to one resolution",
+            )
         width, height = sizes[0]
         if both and width % 2:
             raise ConfigError(f"{width} pixels cannot be two images side by side", file=self._files[0])

@@ -8,6 +8,7 @@ from importlib.resources import files
 
 import numpy as np
 
+from interfaces.interval import to_its_interval
 from interfaces.records import FloatArray
 from vision.calibration.calibrate import Calibrated
 from vision.calibration.gather import Gathered
@@ -25,7 +26,7 @@ def page(found: Calibrated, gathered: Gathered) -> str:
     style = files("vision.calibration.report").joinpath("page.css").read_text(encoding="utf-8")
     head = (
         f"<h1>Cameras calibrated: views that were not fitted are foretold to {rig.made.held_out_px:.2f} px</h1>"
-        f'<p class="of">{escape(rig.made.board)} · {escape(rig.made.date)} '
+        f'<p class="of">{escape(rig.made.board)} · {escape(rig.made.date[:10])} '
         f"· left {escape(rig.serials[0] or 'not named')} · right {escape(rig.serials[1] or 'not named')}</p>"
     )
     parts = (_tiles(found), _coverage(found), _residuals(found), _parameters(found), _views(found, gathered))
@@ -85,8 +86,8 @@ def _residuals(found: Calibrated) -> str:
 def _parameters(found: Calibrated) -> str:
     rig = found.rig
     rows = "".join(
-        f"<tr><td>{name}<td>{value:.6g}<td>± {_NORMAL_95 * sigma:.2g}"
-        for name, value, sigma in zip(rig.names, rig.vector, rig.sigma, strict=True)
+        "<tr><td>{}<td>{}<td>{}".format(name, *to_its_interval(value, _NORMAL_95 * sigma))
+        for name, value, sigma in zip(rig.names, rig.vector.tolist(), rig.sigma.tolist(), strict=True)
     )
     return (
         "<section><h2>Every parameter</h2><p>With 95 % intervals from the joint least-squares problem of both eyes. "
@@ -108,7 +109,9 @@ def _views(found: Calibrated, gathered: Gathered) -> str:
             each = left_out[view.name]
             text = f"left out: {each.rms_px:.2f} px, the others have {each.usual_px:.2f}"
         figures.append(_view(view, gathered, text, is_bad=view.name in left_out))
-    faults = "".join(f"<li>{escape(each.name)}, {each.eye}: {escape(each.fault.text)}" for each in gathered.unusable)
+    faults = "".join(
+        f"<li>{escape(each.name)}, {each.eye} image: {escape(each.fault.text)}" for each in gathered.unusable
+    )
     unusable = f"<h2>Images that could not be used</h2><ul>{faults}</ul>" if faults else ""
     return (
         f"<section><h2>The views</h2><p>Circles are the corners that were found; the first one is red.</p>"

@@ -1,0 +1,89 @@
+"""The ball's size, learnt while it is followed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from ball_renderer import SMALL, in_eyes
+from scenes import RADIUS_M, Ball, reason, stage
+
+from interfaces.records import MarkerFix, Reason
+from vision.ball_size import BallSize
+from vision.blob import Disc
+from vision.sphere import Pinhole
+from vision.tracker import StereoTracker
+from vision.triangulate import Location, locate
+
+X = np.array([0.02, 0.01, 0.8])
+CENTRE_SIGMA_PX = 0.01
+FRAME_S = 1 / 30
+
+
+def located(smaller: float = 0.0, pulled_px: float = 0.0, radius_m: float = RADIUS_M) -> Location:
+    """A ball whose discs both seem smaller by this share and are pulled to the right by so much."""
+    eye = Pinhole(SMALL.focal_px, SMALL.principal_point_px)
+    discs = []
+    for x_eye in in_eyes(X, SMALL):
+        outline = eye.outline(x_eye, RADIUS_M)
+        assert outline is not None
+        centre_px = outline.centre_px + np.array([0.0, pulled_px])
+        discs.append(Disc(centre_px, (1.0 - smaller) * outline.radius_px, CENTRE_SIGMA_PX**2 * np.eye(2), 0.01, 100.0))
+    found = locate(SMALL, radius_m, *discs)
+    assert found is not None
+    return found
+
+
+def size_after(fixes: int, radius_m: float = RADIUS_M) -> BallSize:
+    size = BallSize(SMALL)
+    for _ in range(fixes):
+        size.learn(located(radius_m=radius_m))
+    return size
+
+
+def test_a_size_that_fits_leaves_the_claim_as_it_is() -> None:
+    found = located()
+    assert size_after(5).doubted(found) is found
+
+
+def test_what_makes_both_eyes_see_a_smaller_ball_makes_their_centres_as_unsure() -> None:
+    found = located(smaller=0.04, pulled_px=0.5)
+    doubted = size_after(5).doubted(found)
+    off = doubted.x - X
+    assert off @ np.linalg.solve(found.cov, off) > 20.0**2
+    assert off @ np.linalg.solve(doubted.cov, off) < 2.0**2
+
+
+def test_the_first_fix_is_held_against_the_configured_radius() -> None:
+    found = located(smaller=0.1, pulled_px=0.5)
+    assert BallSize(SMALL).doubted(found).cov[1, 1] > 100.0 * found.cov[1, 1]
+
+
+def test_a_radius_that_was_measured_badly_is_learnt() -> None:
+    wrong_m = 1.08 * RADIUS_M
+    found = located(radius_m=wrong_m)
+    assert BallSize(SMALL).doubted(found) is not found
+    assert size_after(3, wrong_m).doubted(found) is found
+
+
+def test_a_fix_of_another_size_hardly_changes_what_is_known() -> None:
+    size = size_after(10)
+    size.learn(located(smaller=0.2))
+    assert size.doubted(located()).cov[2, 2] == located().cov[2, 2]
+
+
+def test_a_ball_of_another_size_in_the_marker_s_place_is_refused_and_the_marker_found_again() -> None:
+    marker, tracker = Ball((0.02, 0.01, 0.8)), StereoTracker(SMALL)
+    other = replace(marker, radius_m=0.85 * RADIUS_M)
+    for number in range(6):
+        assert isinstance(tracker.track(stage(marker, t=number * FRAME_S, seed=number)), MarkerFix)
+    assert reason(tracker.track(stage(other, t=6 * FRAME_S))) is Reason.SIZE_MISMATCH
+    assert isinstance(tracker.track(stage(marker, t=7 * FRAME_S)), MarkerFix)
+
+
+def test_a_tracker_told_to_forget_takes_a_ball_of_another_size() -> None:
+    marker, tracker = Ball((0.02, 0.01, 0.8)), StereoTracker(SMALL)
+    for number in range(6):
+        tracker.track(stage(marker, t=number * FRAME_S, seed=number))
+    tracker.forget()
+    assert isinstance(tracker.track(stage(replace(marker, radius_m=0.85 * RADIUS_M), t=0.2)), MarkerFix)

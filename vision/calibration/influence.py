@@ -1,0 +1,66 @@
+"""What each corner does to a joint fit, and how sure its rig is by that."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from interfaces.records import FloatArray
+
+from .bundle import Bundle, seen_with_slopes
+from .view import View
+
+_LEAST_FREE = 0.2
+
+
+@dataclass(frozen=True)
+class Influence:
+    """Of one view's corners, the left eye's before the right one's.
+
+    Attributes:
+        residual: seen minus expected, shape (corners, 2) [px].
+        scores: how each coordinate pulls the rig, its pose adapted, shape (2 corners, p).
+        by_pose: how what is expected depends on the board's pose, shape (2 corners, 6).
+        free: the share of its variance that the fit leaves each corner, shape (corners,).
+    """
+
+    residual: FloatArray
+    scores: FloatArray
+    by_pose: FloatArray
+    free: FloatArray
+
+
+def influences(views: Sequence[View], corners_m: FloatArray, bundle: Bundle) -> Iterator[Influence]:
+    """Of each view that was fitted."""
+    rig = _inverse(bundle.normal)
+    for view, pose, weights in zip(views, bundle.poses, bundle.weights, strict=True):
+        residual, J, K = seen_with_slopes(view, corners_m, bundle.model, bundle.vector, pose)
+        w = np.repeat(weights, 2)[:, None]
+        of_pose = np.linalg.inv(K.T @ (w * K))
+        J = J - K @ of_pose @ (K.T @ (w * J))
+        # The diagonal of the hat matrix (Huber & Ronchetti 2009, section 7.1).
+        taken = w[:, 0] * (np.einsum("ij,jk,ik->i", J, rig, J) + np.einsum("ij,jk,ik->i", K, of_pose, K))
+        free = np.maximum(1.0 - taken.reshape(-1, 2).mean(axis=1), _LEAST_FREE)
+        yield Influence(residual, w * J, K, free)
+
+
+def covariance(views: Sequence[View], corners_m: FloatArray, bundle: Bundle) -> FloatArray:
+    """Of the rig's parameters, shape (p, p), whatever the noise of each corner is.
+
+    Each corner's own residuals stand for its variance (HC3 of MacKinnon & White 1985), so that corners with much noise
+    and much influence, as those at a fisheye's border, count as much as they do.
+    """
+    middle = np.zeros_like(bundle.normal)
+    for each in influences(views, corners_m, bundle):
+        pulls = each.scores * (each.residual / each.free[:, None]).reshape(-1, 1)
+        pulls = pulls.reshape(len(each.free), 2, -1).sum(axis=1)
+        middle += pulls.T @ pulls
+    inverse = _inverse(bundle.normal)
+    return inverse @ middle @ inverse
+
+
+def _inverse(normal: FloatArray) -> FloatArray:
+    scale = 1.0 / np.sqrt(np.diag(normal))
+    return np.linalg.inv(normal * np.outer(scale, scale)) * np.outer(scale, scale)

@@ -1,0 +1,96 @@
+"""How much each corner counts in the joint fit.
+
+Corners are found to 0.01 px where squares are large, and to 0.1 px where they are small or seen aslant: far off, and
+through a fisheye towards the border, which is where its lens is learnt from. Taken as equal, the good ones count too
+little. So the variance of a corner is taken from the residuals of those whose squares
+are as wide, times what its own image's residuals are larger or smaller.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import isotonic_regression
+from scipy.spatial.transform import Rotation
+
+from interfaces.records import FloatArray
+
+from .bundle import Bundle
+from .influence import influences
+from .view import View
+
+_FARTHEST = 5.0  # 1-sigmas: farther off, a corner was mistaken for something else
+_MOST_MISTAKEN = 0.2  # of an image's corners
+_GROUP = 60  # corners whose squares are as wide
+_SHARED = 6.0  # corners that the usual spread counts for, against an image's own
+_ROUNDS = 3
+# Of a squared distance in the plane, by twice the variance of a coordinate: the median of an exponential distribution.
+_MEDIAN = np.log(2.0)
+
+
+@dataclass(frozen=True)
+class _Spread:
+    """Of all corners: their variance as their own residuals tell it [px²], how wide squares are there, their images."""
+
+    own: FloatArray
+    width: FloatArray
+    image: NDArray[np.int64]
+
+    def usual(self, share: FloatArray, kept: NDArray[np.bool_], *, robust: bool) -> FloatArray:
+        """The variance of corners whose squares are as wide, of what is left when an image's share is taken out."""
+        order = np.flatnonzero(kept)[np.argsort(self.width[kept], kind="stable")]
+        groups = np.array_split(order, max(len(order) // _GROUP, 1))
+        left = self.own / share
+        level = [float(np.median(left[each])) / _MEDIAN if robust else float(left[each].mean()) for each in groups]
+        falling = np.asarray(isotonic_regression(level, increasing=False).x, dtype=np.float64)
+        middle = [float(np.median(np.log(self.width[each]))) for each in groups]
+        return np.exp(np.interp(np.log(self.width), middle, np.log(np.maximum(falling, 1e-12))))
+
+    def shares(self, usual: FloatArray, kept: NDArray[np.bool_]) -> FloatArray:
+        """By how much each image's corners vary more than the usual, for each corner."""
+        among = kept.astype(np.float64)
+        count, total = np.bincount(self.image, among), np.bincount(self.image, among * self.own / usual)
+        return ((total + _SHARED) / (count + _SHARED))[self.image]
+
+    def fitting(self, usual: FloatArray) -> NDArray[np.bool_]:
+        """Which corners were not mistaken for something else."""
+        fits = np.ones(len(self.own), dtype=bool)
+        for number in range(int(self.image.max()) + 1):
+            mine = np.flatnonzero(self.image == number)
+            off = self.own[mine] / usual[mine]
+            most = 0.5 * _FARTHEST**2 * max(float(np.median(off)) / _MEDIAN, 1.0)
+            fits[mine] = off <= max(most, float(np.quantile(off, 1.0 - _MOST_MISTAKEN)))
+        return fits
+
+
+def corner_weights(views: Sequence[View], corners_m: FloatArray, bundle: Bundle) -> tuple[FloatArray, ...]:
+    """The weight of each view's corners after a fit, the left eye's before the right one's; 0 for what was mistaken.
+
+    The mean over all corners is 1, so that weighted residuals remain pixels.
+    """
+    spread = _spread(views, corners_m, bundle)
+    everything = np.ones(len(spread.own), dtype=bool)
+    usual = spread.usual(np.ones(len(spread.own)), everything, robust=True)
+    kept = spread.fitting(usual)
+    for _ in range(_ROUNDS):
+        share = spread.shares(usual, kept)
+        usual = spread.usual(share, kept, robust=False)
+    weights = np.where(kept, 1.0 / (usual * spread.shares(usual, kept)), 0.0)
+    weights /= weights.mean()
+    return tuple(np.split(weights, np.cumsum([view.corner_count for view in views])[:-1]))
+
+
+def _spread(views: Sequence[View], corners_m: FloatArray, bundle: Bundle) -> _Spread:
+    own, width, image = [], [], []
+    for k, (view, pose, each) in enumerate(zip(views, bundle.poses, influences(views, corners_m, bundle), strict=True)):
+        own.append(0.5 * np.sum(each.residual**2, axis=1) / each.free)
+        # Pixels that a step along the board's axes takes, and so how wide a square is across its narrower direction.
+        steps = each.by_pose[:, 3:].reshape(-1, 2, 3) @ Rotation.from_rotvec(pose[:3]).as_matrix()[:, :2]
+        width.append(1.0 / np.linalg.norm(np.linalg.inv(steps), axis=2).max(axis=1))
+        left = 0 if view.left is None else len(view.left)
+        image.append(2 * k + (np.arange(len(each.residual)) >= left))
+    numbers = np.unique(np.concatenate(image), return_inverse=True)[1]
+    return _Spread(np.concatenate(own), np.concatenate(width), numbers.astype(np.int64))
