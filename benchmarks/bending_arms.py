@@ -35,7 +35,7 @@ def stream(truth: str, seed: int, pairs: int, sigma: float, every: int) -> tuple
     learning = Learning(NominalModel(arm.drawing, -limit, limit, True, True), settings, DirectSolver())
     answered: Counter[str] = Counter()
     for k in range(pairs):
-        learning.learn(pair_of(k, q[k], x[k], sigma), k / 30.0)
+        learning.learn(pair_of(k, q[k], x[k], sigma**2 * np.eye(3)), k / 30.0)
         while (k + 1) % every == 0 and learning.work():
             pass
         answered[learning.snapshot.answering] += 1

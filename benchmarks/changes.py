@@ -10,8 +10,9 @@ change, but not its direction. Each with its mean, its own share within 30, and 
 Then the shares that are named rightly, called undecided, and named wrongly 30, 100 and 300 pairs after the change; what
 is missing was not noticed by then.
 
-With --quiet: walks without a change, with 1 % gross outliers, of arms that are rigid and of arms that are not, with
-nothing but a chain to follow them; the false alarms among them.
+With --quiet: walks without a change, with 1 % gross outliers, of arms that are rigid, of arms that are not, with
+nothing but a chain to follow them, and of rigid ones whose noise is a real arm's: encoders of 4,096 ticks a turn, and a
+stereo camera that is worse along its view; the false alarms among them.
 """
 
 from __future__ import annotations
@@ -62,6 +63,9 @@ REFIT, FITTED = 500, 2000
 OUTLIERS, OUTLIER_M = 0.01, 0.3
 # An arm that is no chain: by how much, at most, in how many waves over a turn.
 BENT_M, WAVES = 0.004, 2.0
+RIGID, BENT, TICKS = "rigid", "not rigid", "ticks"
+# What an arm's encoders tell apart [rad], and how much worse a stereo camera is along its view.
+TICK_RAD, DEPTH = 2.0 * math.pi / 4096, 8.0
 
 
 @dataclass(frozen=True)
@@ -142,14 +146,14 @@ def direction(rng: np.random.Generator) -> FloatArray:
     return vector / np.linalg.norm(vector)
 
 
-def reference(arm: RoughArm, q: FloatArray, x: FloatArray, sigma: float) -> Reference:
-    """The chain of pairs q (n, d) [rad] and x (n, 3) [m]."""
+def reference(arm: RoughArm, q: FloatArray, x: FloatArray, covs: FloatArray) -> Reference:
+    """The chain of pairs q (n, d) [rad], x (n, 3) [m] and their covariances (n, 3, 3) [m²]."""
     belief = fitted_belief(ChainBelief.from_tolerances(ChainParameters(arm.drawing), TOLERANCES), q, x)
     bases = learning_bases(np.full(q.shape[1], -np.pi), np.full(q.shape[1], np.pi), [False] * q.shape[1])
     kbmap = belief.chain.to_kbmap(bases)
-    variance = np.full(3, sigma**2)
     known, good = len(q), np.linalg.norm(x - belief.predict(q), axis=1) < OUTLIER_SIGMAS * belief.noise
-    q, x = q[good][-LOOKED_BACK:], x[good][-LOOKED_BACK:]
+    q, x, covs = (each[good][-LOOKED_BACK:] for each in (q, x, covs))
+    variance = covs.diagonal(axis1=1, axis2=2).mean(axis=0)
     return Reference(kbmap, kbmap, belief, belief, None, Claim(np.zeros(3)), known, q, x, variance)
 
 
@@ -181,7 +185,8 @@ def outcome(case: Case, joints: int, sigma: float, seed: int, known_pairs: int) 
     after, theta, joint = changed(arm, case, q[known_pairs + at :], rng)
     moved = after.positions(q[known_pairs + at :]) - arm.positions(q[known_pairs + at :])
     x[known_pairs + at :] += moved
-    known = reference(arm, q[:known_pairs], x[:known_pairs], sigma)
+    cov = sigma**2 * np.eye(3)
+    known = reference(arm, q[:known_pairs], x[:known_pairs], np.broadcast_to(cov, (known_pairs, 3, 3)))
     watch = Watch()
     watch.asked()
     watch.offer(known)
@@ -192,7 +197,7 @@ def outcome(case: Case, joints: int, sigma: float, seed: int, known_pairs: int) 
     with_model, undirected, delay, early, origin = math.inf, math.inf, math.inf, False, None
     named = dict.fromkeys(NAMED_AFTER, "not noticed")
     for k in range(at + LONGEST):
-        watch.add(pair_of(k, q[known_pairs + k], x[known_pairs + k], sigma), kept=True)
+        watch.add(pair_of(k, q[known_pairs + k], x[known_pairs + k], cov), kept=True)
         since = k - at + 1
         if since > 0 and math.isinf(with_model + undirected):
             told, of_all = statistics_if_told(watch, theta, case, joint)
@@ -253,20 +258,23 @@ def delay_of(statistic: FloatArray, threshold: float) -> float:
     return float(reached[0] + 1) if len(reached) else math.inf
 
 
-def pair_of(number: int, q: FloatArray, x: FloatArray, sigma: float) -> Pair:
-    cov = frozen_array(sigma**2 * np.eye(3))
-    return Pair("simulated", number + 1, 1, number / 30.0, "", frozen_array(q), frozen_array(x), cov)
+def pair_of(number: int, q: FloatArray, x: FloatArray, cov: FloatArray) -> Pair:
+    where, seen, covariance = map(frozen_array, (q, x, cov))
+    return Pair("simulated", number + 1, 1, number / 30.0, "", where, seen, covariance)
 
 
-def quiet(joints: int, sigma: float, seed: int, pairs: int, *, bent: bool) -> int:
+def quiet(kind: str, joints: int, sigma: float, seed: int, pairs: int) -> int:
     """False alarms along a walk where nothing changes; after one the watch begins anew."""
-    rng = np.random.default_rng([seed, joints, round(1e4 * sigma), bent, 99])
+    rng = np.random.default_rng([seed, joints, round(1e4 * sigma), (RIGID, BENT, TICKS).index(kind), 99])
     arm = rough_arm(joints, rng, TOLERANCES)
     q = walk(joints, KNOWN + pairs, rng)
-    x = arm.measured(q, sigma, rng)
-    if bent:
+    x, covs = arm.measured(q, sigma, rng), np.broadcast_to(sigma**2 * np.eye(3), (len(q), 3, 3))
+    if kind == BENT:
         waves = rng.normal(size=(joints, 3)) * WAVES / math.sqrt(joints)
         x += BENT_M * np.sin(q @ waves + rng.uniform(0.0, 2.0 * np.pi, 3))
+    elif kind == TICKS:
+        x, covs = seen_in_stereo(arm.positions(q), sigma, rng)
+        q = TICK_RAD * np.round(q / TICK_RAD)
     wild = rng.random(len(q)) < OUTLIERS
     x[wild] += OUTLIER_M * rng.normal(size=(int(wild.sum()), 3))
     alarms, watch = 0, Watch()
@@ -275,13 +283,20 @@ def quiet(joints: int, sigma: float, seed: int, pairs: int, *, bent: bool) -> in
             watch.asked()
             if watch.wants_reference:
                 first = max(0, k - FITTED)
-                watch.offer(reference(arm, q[first:k], x[first:k], sigma))
-        watch.add(pair_of(k, q[k], x[k], sigma), kept=not wild[k])
+                watch.offer(reference(arm, q[first:k], x[first:k], covs[first:k]))
+        watch.add(pair_of(k, q[k], x[k], covs[k]), kept=not wild[k])
         if watch.alarmed:
-            alarms, watch = alarms + 1, Watch()
+            first, alarms, watch = max(0, k - FITTED), alarms + 1, Watch()
             watch.asked()
-            watch.offer(reference(arm, q[max(0, k - FITTED) : k], x[max(0, k - FITTED) : k], sigma))
+            watch.offer(reference(arm, q[first:k], x[first:k], covs[first:k]))
     return alarms
+
+
+def seen_in_stereo(x: FloatArray, sigma: float, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+    """Positions (n, 3) [m] with noise, and its covariances (n, 3, 3) [m²]: sigma across the view, more along it."""
+    view = x / np.linalg.norm(x, axis=1)[:, None]
+    noise = sigma * (rng.normal(size=x.shape) + DEPTH * rng.normal(size=(len(x), 1)) * view)
+    return x + noise, sigma**2 * (np.eye(3) + DEPTH**2 * view[:, :, None] * view[:, None, :])
 
 
 def row(case: Case, found: list[Outcome]) -> str:
@@ -309,14 +324,14 @@ def row(case: Case, found: list[Outcome]) -> str:
 
 
 def print_quiet(arguments: argparse.Namespace) -> None:
-    for bent in (False, True):
+    for kind in (RIGID, BENT, TICKS):
         for joints in arguments.joints:
             for sigma in arguments.sigmas:
                 began = time.process_time()
-                alarms = [quiet(joints, 1e-3 * sigma, seed, arguments.pairs, bent=bent) for seed in seeds_of(arguments)]
+                alarms = [quiet(kind, joints, 1e-3 * sigma, seed, arguments.pairs) for seed in seeds_of(arguments)]
                 pairs, cpu = arguments.pairs * len(alarms), time.process_time() - began
                 print(
-                    f"{'not rigid' if bent else 'rigid':9s} d = {joints}, sigma {sigma:g} mm: {sum(alarms)} false "
+                    f"{kind:9s} d = {joints}, sigma {sigma:g} mm: {sum(alarms)} false "
                     f"alarms in {pairs} pairs; {1e3 * cpu / pairs:.2f} ms a pair",
                     flush=True,
                 )

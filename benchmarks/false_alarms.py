@@ -37,7 +37,7 @@ def inverse_statistics(joints: int, sigma: float, seed: int, draws: int) -> list
     rng = np.random.default_rng([seed, joints, round(1e4 * sigma), 17])
     arm = rough_arm(joints, rng, TOLERANCES)
     known = walk(joints, KNOWN, rng)
-    belief = reference(arm, known, arm.measured(known, sigma, rng), sigma).belief
+    belief = reference(arm, known, arm.measured(known, sigma, rng), noise_of(sigma, KNOWN)).belief
     found: list[float] = []
     for _ in range(draws):
         # A belief that is true: what the arm is like is drawn from it, and positions are linear in that.
@@ -61,12 +61,17 @@ def drawn_change(detector: ChangeDetector, size: int, sigma: float, rng: np.rand
 
 def log_statistic(detector: ChangeDetector, q: FloatArray, errors: FloatArray, sigma: float, first: int) -> float:
     """log R when it first is beyond the limit after pair `first`; infinite if it is not."""
-    variance = np.full((1, 3), sigma**2)
+    covariance = noise_of(sigma, 1)
     for k in range(min(first + LONGEST, len(q))):
-        detector.add(q[k : k + 1], errors[k : k + 1], variance)
+        detector.add(q[k : k + 1], errors[k : k + 1], covariance)
         if k >= first and detector.due and (suspicion := detector.suspicion()).alarm:
             return suspicion.log_odds
     return math.inf
+
+
+def noise_of(sigma: float, pairs: int) -> FloatArray:
+    """Covariances of so many pairs (pairs, 3, 3)."""
+    return np.broadcast_to(sigma**2 * np.eye(3), (pairs, 3, 3))
 
 
 def main() -> None:

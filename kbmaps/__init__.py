@@ -20,6 +20,7 @@ from kbmaps.changes.detector import ChangeDetector, Suspicion
 from kbmaps.changes.kinds import ChangeKind, any_change, change_kinds
 from kbmaps.changes.naming import Explanation, explanations
 from kbmaps.changes.shared_noise import SharedNoise
+from kbmaps.changes.white_noise import WhiteNoise
 from kbmaps.contest import Contest
 from kbmaps.errors import (
     BasisError,
@@ -125,6 +126,7 @@ __all__ = [
     "TensorSettings",
     "TensorTrain",
     "ToolLayer",
+    "WhiteNoise",
     "align",
     "any_change",
     "blockwise_precision",

@@ -150,7 +150,7 @@ class Learning:
         """
         with self._lock:
             era, claims = self._course.eras.present, self._course.eras.claims
-            if era is None or claims.belief is None or not self._solving.fed:
+            if era is None or claims.belief is None or not self._solving.works_on(era.task_number):
                 return None
             seen, _ = era.memory.some(era.memory.count, LOOKED_BACK)
             q, x, _ = era.memory.since(self._solving.fed - LOOKED_BACK, LOOKED_BACK)  # those that the solver knows

@@ -37,6 +37,10 @@ class Solving:
         enough = min(self._every, max(GROWTH * self._solved_at, 1.0))
         return self._fed > 0 and (self._soon or self._fed - self._solved_at >= enough)
 
+    def works_on(self, task: int) -> bool:
+        """Whether it was given pairs of this task, and of no other since."""
+        return self._task == task and self._fed > 0
+
     def has_solved(self, task: int, pairs: int) -> bool:
         """Whether so many pairs of the task were given, asked for and answered."""
         return self._task == task and not self._busy and self._fed == self._solved_at == pairs

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import math
+from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from interfaces.records import FloatArray, Pair
-from kbmaps import ChainBelief, ChangeDetector, ChangeKind, KBMap, ResidualModel, SharedNoise, Suspicion
+from kbmaps import ChainBelief, ChangeDetector, ChangeKind, KBMap, ResidualModel, SharedNoise, Suspicion, WhiteNoise
 from kbmaps.changes.detector import MOST_SURPRISES
+from kbmaps.changes.white_noise import inverse_roots
 
 from .claims import Claim
 from .learnt import LearntModel
@@ -46,7 +49,7 @@ class Reference:
         claim: what was claimed of the model.
         known: how many pairs it knows.
         q, x: some of the last of these, in their order (n, d) [rad] and (n, 3) [m].
-        variance: of these measurements (3,) [m²].
+        variance: of these measurements, as claimed (3,) [m²].
     """
 
     model: LearntModel
@@ -64,16 +67,30 @@ class Reference:
         """Positions (n, 3) [m] of the model at q (n, d) [rad] minus those of the chain."""
         return self.model.predict(q) - self.belief.predict(q)
 
-    def errors(self, q: FloatArray, x: FloatArray, variance: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Errors of pairs q (n, d), x (n, 3) and their variance but for the chain's numbers, (n, 3) [m, m²]."""
-        return x - self.model.predict(q), np.maximum(variance + self.claim.beyond_chain(q), SMALLEST_M**2)
+    def derivatives(self, q: FloatArray) -> FloatArray:
+        """Of the position by the joints' readings at q (n, d), shape (n, 3, d) [m/rad, or 1 for a sliding joint]."""
+        parameters = self.belief.parameters
+        return parameters.linearised(self.belief.mean, q)[1][:, :, parameters.zeros]
 
-    def noise(self) -> SharedNoise:
-        """Of its whitened errors, as the pairs show it that it knows."""
-        errors, variances = self.errors(self.q, self.x, self.variance)
+    def covariances(self, q: FloatArray, white: FloatArray, claimed: FloatArray) -> FloatArray:
+        """Of errors at q (n, d) but for the chain's numbers (n, 3, 3) [m²].
+
+        What seemed to be missed by the model is noise as far as that is more than was claimed.
+
+        Args:
+            white: of the noise (n, 3, 3).
+            claimed: of the measurements (n, 3, 3).
+        """
+        more = np.maximum((white - claimed).diagonal(axis1=1, axis2=2), 0.0)
+        missed = np.maximum(self.claim.beyond_chain(q) - more, 0.0)
+        return white + np.eye(3) * np.maximum(missed, SMALLEST_M**2)[:, None, :]
+
+    def noise(self, covariances: FloatArray, white: FloatArray) -> SharedNoise:
+        """Of its whitened errors, as the pairs show it that it knows; their covariances and noise (n, 3, 3) [m²]."""
+        errors = np.matvec(inverse_roots(covariances), self.x - self.model.predict(self.q))
         used = (4 * self.q.shape[1] + 3) * len(self.q) / self.known
-        share = float((1.0 - self.variance / variances).mean())
-        return SharedNoise.of(errors / np.sqrt(variances), used).at_least(SharedNoise.claimed(share))
+        share = 1.0 - float((_traces(white) / _traces(covariances)).mean())
+        return SharedNoise.of(errors, used).at_least(SharedNoise.claimed(share))
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,9 +129,33 @@ class _Watched:
     seq: int
     q: FloatArray
     x: FloatArray
-    variance: FloatArray
+    cov: FloatArray
     turn: FloatArray
     kept: bool
+
+
+@dataclass(frozen=True, eq=False)
+class _Shown:
+    """How far pairs lay from models that did not know them.
+
+    Attributes:
+        q: where (n, d) [rad].
+        claimed: covariances of the measurements (n, 3, 3) [m²].
+        off: each against what was expected after the pairs before it (n, 3) [m], but for what was not known.
+    """
+
+    q: FloatArray
+    claimed: FloatArray
+    off: FloatArray
+
+    def with_newer(self, other: _Shown) -> _Shown:
+        """The newest of both."""
+        return _Shown(
+            *(
+                np.concatenate([getattr(self, name), getattr(other, name)])[-MOST_SURPRISES:]
+                for name in ("q", "claimed", "off")
+            )
+        )
 
 
 class Watch:
@@ -129,16 +170,18 @@ class Watch:
         self._next: Reference | None = None
         self._next_at = self._asked_at = 0
         self._pairs: list[_Watched] = []
+        self._earlier: deque[_Watched] = deque(maxlen=LOOKED_BACK)
         self._detector: ChangeDetector | None = None
+        self._white = WhiteNoise.as_claimed(0)
         self._change: Suspicion | None = None
         self._look_at = 0
         self._odds = self._refuted_odds = -math.inf
-        self._shown = np.empty((0, 3))
+        self._shown: _Shown | None = None
 
     @property
     def ready(self) -> bool:
         """Whether there is a model that pairs are held against, and it was tried out."""
-        return self._detector is not None and len(self._shown) > 0
+        return self._detector is not None and self._shown is not None
 
     @property
     def detector(self) -> ChangeDetector | None:
@@ -163,7 +206,7 @@ class Watch:
     def asked(self) -> None:
         """The solver works on all pairs up to here."""
         if self._reference is None and self._next is None:
-            self._pairs.clear()  # what comes first after the model that is the first reference counts
+            self._drop(len(self._pairs))  # what comes first after the model that is the first reference counts
         self._asked_at = len(self._pairs)
 
     def offer(self, reference: Reference) -> None:
@@ -180,7 +223,7 @@ class Watch:
             self._shorten()
         for pair, learnt in zip(pairs, np.broadcast_to(kept, len(pairs)).tolist(), strict=True):
             turn = np.full(4, np.nan) if pair.R is None else pair.R
-            self._pairs.append(_Watched(pair.seq, pair.q, pair.x, np.diag(pair.cov), turn, learnt))
+            self._pairs.append(_Watched(pair.seq, pair.q, pair.x, pair.cov, turn, learnt))
         if self._detector is None:
             return
         self._feed(self._pairs[-len(pairs) :])
@@ -223,7 +266,7 @@ class Watch:
         if self._change is not None:
             first, (earliest, latest) = self._change.onset, self._change.interval()
         pairs = self._pairs
-        variance = float(np.mean([each.variance for each in pairs]) + reference.claim.beyond_chain(reference.q).mean())
+        variance = float(_traces(self._measured(reference, pairs)[2]).mean()) / 3.0
         return Noticed(
             reference,
             detector.kinds,
@@ -241,13 +284,25 @@ class Watch:
 
     def _show(self) -> None:
         """The pairs have shown how far they lie from a model that does not know them."""
-        if self._detector is not None:
-            self._shown = np.concatenate([self._shown, self._detector.surprises])[-MOST_SURPRISES:]
+        if self._detector is None or self._reference is None:
+            return
+        surprises = self._detector.surprises
+        pairs = self._pairs[-len(surprises) :]
+        q, _, covariances = self._measured(self._reference, pairs)
+        # In metres: how pairs are weighted next is not how they were.
+        off = np.matvec(np.linalg.inv(inverse_roots(covariances)), surprises)
+        shown = _Shown(q, _stacked(pairs)[2], off)
+        self._shown = shown if self._shown is None else self._shown.with_newer(shown)
+
+    def _drop(self, count: int) -> None:
+        """So many of the first pairs are watched no longer; they still show the noise."""
+        self._earlier.extend(self._pairs[:count])
+        del self._pairs[:count]
 
     def _shorten(self) -> None:
         """The older half of the pairs goes."""
         gone = len(self._pairs) // 2
-        del self._pairs[:gone]
+        self._drop(gone)
         self._asked_at, self._next_at = max(self._asked_at - gone, 0), max(self._next_at - gone, 0)
         if self._reference is not None:
             self._hold(self._reference)
@@ -255,31 +310,63 @@ class Watch:
     def _renew(self) -> None:
         """The next reference takes its place."""
         if self._next is not None:
-            self._pairs = self._pairs[self._next_at :]
+            self._drop(self._next_at)
             self._asked_at, self._next_at = max(self._asked_at - self._next_at, 0), 0
             self._reference, self._next = self._next, None
             self._hold(self._reference)
 
     def _hold(self, reference: Reference) -> None:
         """Hold all pairs against this reference, with the noise that was shown."""
-        noise = SharedNoise.of(self._shown) if len(self._shown) else reference.noise()
-        variances = reference.errors(reference.q, reference.x, reference.variance)[1]
-        noise_m = float(np.sqrt(noise.single * variances.mean()))
+        known = [each for each in (*self._earlier, *self._pairs) if each.kept][-LOOKED_BACK:]
+        self._white = WhiteNoise.as_claimed(reference.q.shape[1])
+        if known:
+            q, x, claimed = _stacked(known)
+            self._white = WhiteNoise.of(x - reference.model.predict(q), claimed, reference.derivatives(q))
+        q, claimed = reference.q, np.broadcast_to(np.diag(reference.variance), (len(reference.q), 3, 3))
+        derivatives = reference.derivatives(q)
+        white = self._white.covariances(claimed, derivatives)
+        covariances = reference.covariances(q, white, claimed)
+        seen = reference.noise(covariances, white) if self._shown is None else self._shown_noise(reference, self._shown)
+        roots = inverse_roots(covariances)
+        read = float(_traces(roots @ self._white.of_readings(derivatives) @ roots).mean()) / 3.0
+        noise = seen.at_least(SharedNoise.repeated(read).times(seen.single))
+        noise_m = float(np.sqrt(noise.single * _traces(covariances).mean() / 3.0))
         distance_m = float(np.linalg.norm(reference.x, axis=1).mean())
         self._detector = ChangeDetector(reference.belief, noise, noise_m, distance_m)
-        if float(np.square(reference.beyond_chain(reference.q)).mean()) < (_ALONE * noise_m) ** 2:
+        if float(np.square(reference.beyond_chain(q)).mean()) < (_ALONE * noise_m) ** 2:
             # What else a model was taught of these pairs would hide how the arm bends.
-            off = reference.x - reference.belief.predict(reference.q)
-            self._detector.recall(reference.q, off, variances)
+            self._detector.recall(q, reference.x - reference.belief.predict(q), covariances)
         self._change, self._look_at = None, 0
         self._odds = self._refuted_odds = -math.inf
         self._feed(self._pairs)
 
-    def _feed(self, pairs: list[_Watched]) -> None:
-        if self._reference is None or self._detector is None or not pairs:
-            return
-        q, x, variance = (np.array([getattr(each, name) for each in pairs]) for name in ("q", "x", "variance"))
-        self._detector.add(q, *self._reference.errors(q, x, variance))
+    def _shown_noise(self, reference: Reference, shown: _Shown) -> SharedNoise:
+        white = self._white.covariances(shown.claimed, reference.derivatives(shown.q))
+        covariances = reference.covariances(shown.q, white, shown.claimed)
+        return SharedNoise.of(np.matvec(inverse_roots(covariances), shown.off))
+
+    def _feed(self, pairs: Sequence[_Watched]) -> None:
+        if self._reference is not None and self._detector is not None and pairs:
+            self._detector.add(*self._measured(self._reference, pairs))
+
+    def _measured(self, reference: Reference, pairs: Sequence[_Watched]) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Joint values (n, d), errors (n, 3) [m] and the covariances of these (n, 3, 3) [m²]."""
+        q, x, claimed = _stacked(pairs)
+        white = self._white.covariances(claimed, reference.derivatives(q))
+        return q, x - reference.model.predict(q), reference.covariances(q, white, claimed)
+
+
+def _stacked(pairs: Sequence[_Watched]) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Joint values (n, d), positions (n, 3) and their covariances (n, 3, 3) as claimed."""
+    return (
+        np.array([each.q for each in pairs]),
+        np.array([each.x for each in pairs]),
+        np.array([each.cov for each in pairs]),
+    )
+
+
+def _traces(covariances: FloatArray) -> FloatArray:
+    return np.trace(covariances, axis1=1, axis2=2)
 
 
 def _trial(known: int) -> int:

@@ -117,7 +117,8 @@ class RigidChain:
         Raises:
             ShapeError, NonFiniteError
         """
-        return np.stack(self._frames(rows_or_vector("q", q, self.joints)), axis=-3)
+        checked = rows_or_vector("q", q, self.joints)
+        return self._frames_of_rows(checked) if checked.ndim == 2 else np.stack(self._frames(checked), axis=-3)
 
     def jacobian(self, q: ArrayLike) -> FloatArray:
         """Derivative (3, d) of the position [m/rad, or m/m], or (n, 3, d) for q (n, d).
@@ -213,6 +214,18 @@ class RigidChain:
             pose = pose @ links[..., k, :, :]
             frames.append(pose)
         return frames
+
+    def _frames_of_rows(self, q: FloatArray) -> FloatArray:
+        """`_frames` (n, d+1, 4, 4) of many q (n, d): number by number over all rows, which is several times as fast."""
+        constant, first, second = self._moved_links[..., None]
+        cosines, sines = np.where(self.prismatic, q, np.cos(q)).T.copy(), np.sin(q).T.copy()
+        frames = np.zeros((self.joints + 1, 4, 4, len(q)))
+        frames[0] = self.fixed[0][:, :, None]
+        frames[:, 3, 3] = 1.0
+        for k in range(self.joints):
+            link = constant[k] + cosines[k] * first[k] + sines[k] * second[k]
+            np.einsum("ijn,jkn->ikn", frames[k, :3], link, out=frames[k + 1, :3])
+        return np.ascontiguousarray(frames.transpose(3, 0, 1, 2))
 
     @cached_property
     def _moved_links(self) -> FloatArray:

@@ -17,6 +17,7 @@ from kbmaps.changes.kinds import JOINT, ChangeKind, change_kinds
 from kbmaps.changes.mixture import SIZES, log_ratios
 from kbmaps.changes.onsets import Onsets
 from kbmaps.changes.shared_noise import SharedNoise
+from kbmaps.changes.white_noise import inverse_roots
 
 # On average at least so many pairs lie between two false alarms, as far as the model's claims are true.
 PAIRS_BETWEEN_FALSE_ALARMS = 75_000.0
@@ -144,38 +145,38 @@ class ChangeDetector:
         """
         return np.array(self._surprises).reshape(-1, 3)
 
-    def add(self, q: FloatArray, errors: FloatArray, variances: FloatArray) -> None:
+    def add(self, q: FloatArray, errors: FloatArray, covariances: FloatArray) -> None:
         """Pairs that came after those that the model knows, in their order.
 
         Args:
             q: where (n, d) [rad, m].
             errors: measured minus predicted (n, 3) [m].
-            variances: of each coordinate: the measurement's, and what the model misses beyond its belief (n, 3) [m²].
+            covariances: of these: the measurement's, and what the model misses beyond its belief (n, 3, 3) [m²].
         """
-        for row in zip(*self._whitened(q, errors, variances), strict=True):
+        for row in zip(*self._whitened(q, errors, covariances), strict=True):
             self._rows.append(row)
             self._add(*row[1:])
 
-    def recall(self, q: FloatArray, errors: FloatArray, variances: FloatArray) -> None:
+    def recall(self, q: FloatArray, errors: FloatArray, covariances: FloatArray) -> None:
         """Pairs to which the belief was fitted, in their order: they show how the arm bends, and nothing else.
 
         Args:
             q: where (n, d) [rad, m].
             errors: measured minus predicted by the believed chain (n, 3) [m].
-            variances: as of `add`.
+            covariances: as of `add`.
         """
-        self._fitted, self._bends_before = (q, errors, variances), None
+        self._fitted, self._bends_before = (q, errors, covariances), None
 
     def _whitened(
-        self, q: FloatArray, errors: FloatArray, variances: FloatArray
+        self, q: FloatArray, errors: FloatArray, covariances: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """Angles (n, d), derivatives by what is believed (n, 3, k) and by changes (n, 3, c), and errors (n, 3)."""
         _, jacobian = self._belief.parameters.linearised(self._belief.mean, q)
-        weights = 1.0 / np.sqrt(variances)
-        known = weights[..., None] * (jacobian @ self._root)
-        changed = weights[..., None] * (jacobian[:, :, self._columns] * self._units)
+        weights = inverse_roots(covariances)
+        known = weights @ (jacobian @ self._root)
+        changed = weights @ (jacobian[:, :, self._columns] * self._units)
         prismatic = self._belief.parameters.reference.prismatic
-        return np.where(prismatic, q / self._belief.parameters.reach, q), known, changed, weights * errors
+        return np.where(prismatic, q / self._belief.parameters.reach, q), known, changed, np.matvec(weights, errors)
 
     def _add(self, known: FloatArray, changed: FloatArray, error: FloatArray) -> None:
         """One pair's whitened derivatives by what is believed (3, k) and by changes (3, c), and its error (3,)."""

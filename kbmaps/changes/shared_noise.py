@@ -60,6 +60,15 @@ class SharedNoise:
         return cls(alike, 1.0 + share * (USUALLY_SHARED - 1))
 
     @classmethod
+    def repeated(cls, share: float) -> SharedNoise:
+        """That of residuals of unit variance, of which this share may be the same for some neighbours, and no longer.
+
+        A joint that turns by whole ticks from pair to pair, or hardly at all, is rounded in the same way each time.
+        """
+        alike = 1.0 + share * np.arange(USUALLY_SHARED, dtype=np.float64)
+        return cls(alike, float(alike[-1]))
+
+    @classmethod
     def of(cls, residuals: FloatArray, used: float = 0.0) -> SharedNoise:
         """That of residuals (n, 3), n at least 2, in their order, as large as it may well be.
 

@@ -25,6 +25,11 @@ BEFORE, AFTER = 60, 80
 KINDS = {"tool": None, "camera": None, "joint": 2}
 
 
+def isotropic(sigma_m: float, pairs: int) -> np.ndarray:
+    """Covariances of so many errors (pairs, 3, 3) [m²]."""
+    return np.broadcast_to(sigma_m**2 * np.eye(3), (pairs, 3, 3))
+
+
 class Arm:
     """An arm that is as drawn within its tolerances, along a smooth path that it goes on with after a change."""
 
@@ -64,7 +69,7 @@ class Arm:
 
     def feed(self, detector: ChangeDetector, pairs: slice) -> None:
         q, x = self.q[pairs], self.x[pairs]
-        detector.add(q, x - self.belief.predict(q), np.full((len(q), 3), SIGMA**2))
+        detector.add(q, x - self.belief.predict(q), isotropic(SIGMA, len(q)))
 
     def noticed(self) -> tuple[ChangeDetector, int]:
         """The detector when it raised an alarm, and how many pairs it had seen."""
@@ -201,7 +206,7 @@ def test_that_an_arm_did_not_bend_before_makes_a_change_more_probable(seed: int)
     arm.change("tool", 2.0 * SIGMA)
     unaware, aware = arm.detector(), arm.detector()
     off = earlier.x - earlier.parameters.positions(earlier.truth, earlier.q)
-    aware.recall(earlier.q, off, np.full(off.shape, SIGMA**2))
+    aware.recall(earlier.q, off, isotropic(SIGMA, len(off)))
     for detector in (unaware, aware):
         arm.feed(detector, slice(None))
     assert aware.suspicion_if_it_bends().log_odds > unaware.suspicion_if_it_bends().log_odds
@@ -217,6 +222,18 @@ def test_a_change_of_an_arm_that_bends_is_noticed_and_dated(seed: int) -> None:
     suspicion = detector.suspicion_if_it_bends()
     assert suspicion.alarm
     assert abs(suspicion.onset - BEFORE) <= 1
+
+
+def test_errors_that_the_axes_share_count_once() -> None:
+    """A camera is thrice as bad along one direction: a pair that is off along it by two sigmas is nothing strange."""
+    arm, along = Arm(0), np.array([2.0, -1.0, 2.0]) / 3.0
+    covariances = isotropic(SIGMA, len(arm.q)) + 8.0 * SIGMA**2 * np.outer(along, along)
+    turned, plain = arm.detector(), arm.detector()
+    error = 6.0 * SIGMA * along
+    turned.add(arm.q[:1], error[None], covariances[:1])
+    plain.add(arm.q[:1], np.array([[2.0 * SIGMA, 0.0, 0.0]]), isotropic(SIGMA, 1))
+    lengths = [float(np.linalg.norm(each.surprises)) for each in (turned, plain)]
+    assert lengths[0] == pytest.approx(lengths[1], rel=0.2)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -247,7 +264,7 @@ def test_however_exact_thousands_of_pairs_are_what_is_not_known_never_becomes_le
     arm = Arm(0, pairs=3000)
     arm.x = arm.parameters.positions(arm.truth, arm.q)
     detector = ChangeDetector(arm.belief, SharedNoise(np.ones(1), 1.0), sigma_m, 0.5)
-    detector.add(arm.q, arm.x - arm.belief.predict(arm.q), np.full(arm.x.shape, sigma_m**2))
+    detector.add(arm.q, arm.x - arm.belief.predict(arm.q), isotropic(sigma_m, len(arm.x)))
     assert np.isfinite(detector.surprises).all()
     assert np.isfinite(detector.suspicion().log_odds)
 
@@ -256,3 +273,9 @@ def test_residuals_that_are_nothing_have_a_variance_all_the_same() -> None:
     noise = SharedNoise.of(np.zeros((200, 3)))
     assert noise.single > 0.0
     assert np.isfinite(noise.variances).all()
+
+
+def test_readings_that_are_rounded_alike_say_no_more_than_one_for_ten_neighbours_and_more_from_then_on() -> None:
+    noise = SharedNoise.repeated(1.0)
+    of_means = noise.of_runs(np.array([1.0, 5.0, 10.0, 40.0])) / np.array([1.0, 5.0, 10.0, 40.0])
+    np.testing.assert_allclose(of_means, [1.0, 1.0, 1.0, 0.25])

@@ -48,6 +48,17 @@ def test_poses_are_the_product_of_the_transforms(joint_kinds, seed):
 
 @given(joint_kinds=kinds, seed=seeds)
 @settings(max_examples=30)
+def test_the_frames_of_many_rows_are_those_of_each(joint_kinds, seed):
+    rng = np.random.default_rng(seed)
+    chain = random_chain(rng, joint_kinds)
+    q = random_q(rng, joint_kinds, 3, 180)
+    frames = chain.frames(q)
+    np.testing.assert_allclose(frames, [chain.frames(row) for row in q], rtol=0, atol=1e-13)
+    np.testing.assert_allclose(frames[:, -1], chain.poses(q), rtol=0, atol=1e-13)
+
+
+@given(joint_kinds=kinds, seed=seeds)
+@settings(max_examples=30)
 def test_the_jacobian_agrees_with_finite_differences(joint_kinds, seed):
     rng = np.random.default_rng(seed)
     chain = random_chain(rng, joint_kinds)
