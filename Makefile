@@ -5,6 +5,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 export OPENBLAS_NUM_THREADS ?= 1
 
+BENCH_BUDGET_S ?= 120
 PEERS_BUDGET_S ?= 240
 GOALS_BUDGET_S ?= 3600
 
@@ -40,10 +41,15 @@ docs: setup     ## The docs as a site, into site/; look at it with: python -m ht
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
 
 soak: setup     ## The long tests: many seeds, many kills
-	@$(BIN)/python -m pytest -m soak --timeout 3600
+	@$(BIN)/python -m pytest -m soak --timeout 3600 -o faulthandler_timeout=3600
 
-bench: setup    ## Side-by-side figures, as ratios within one run
-	@set -e; for file in benchmarks/[a-z]*.py; do echo; echo "== $$file"; $(BIN)/python $$file; done
+bench: setup    ## Side-by-side figures, as ratios within one run; each for BENCH_BUDGET_S at most, an hour in all
+	@for file in $$(grep -l __main__ benchmarks/[a-z]*.py); do \
+		echo; echo "== $$file"; \
+		timeout $(BENCH_BUDGET_S) $(BIN)/python -u $$file; code=$$?; \
+		if [ $$code -eq 124 ]; then echo "-- stopped after $(BENCH_BUDGET_S) s; all of it: $(BIN)/python $$file"; \
+		elif [ $$code -ne 0 ]; then exit $$code; fi; \
+	done
 	@$(MAKE) --no-print-directory peers
 
 peers: setup    ## Our learners beside others on one page, peers.html; goes on where the last run stopped

@@ -53,6 +53,7 @@ def main() -> None:
         deadline,
         arguments.fit_limit_s,
         arguments.most_pairs,
+        arguments.fewest_pairs,
     )
     saved = begin
 
@@ -72,7 +73,8 @@ def main() -> None:
         | {
             "when": time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime()),
             "seconds": round(time.monotonic() - begin),
-            "arguments": f"{arguments.seeds} seeds, {len(chosen)} tasks, up to {arguments.most_pairs} pairs",
+            "arguments": f"{arguments.seeds} seeds, {len(chosen)} tasks, "
+            f"{arguments.fewest_pairs} to {arguments.most_pairs} pairs",
         }
     )
     results.save(arguments.json)
@@ -91,6 +93,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--budget-s", type=float, default=float("inf"), help="stop after so many seconds")
     parser.add_argument("--fit-limit-s", type=float, default=30.0, help="give up a fit that takes the processor longer")
+    parser.add_argument("--fewest-pairs", type=int, default=0)
     parser.add_argument("--most-pairs", type=int, default=3000)
     parser.add_argument("--again", nargs="*", default=[], metavar="MODEL", help="forget what was measured of these")
     parser.add_argument("--growth", action=argparse.BooleanOptionalAction, default=True, help="time against size")

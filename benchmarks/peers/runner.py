@@ -40,6 +40,7 @@ class Plan:
     deadline_s: float
     fit_limit_s: float
     most_pairs: int
+    fewest_pairs: int = 0
     clock: Callable[[], float] = time.monotonic
 
 
@@ -52,7 +53,7 @@ class Job:
 
 def jobs(plan: Plan) -> Iterator[Job]:
     """Every task at few pairs first, then the next seed; sizes that cost more come once the cheap ones are done."""
-    counts = sorted({n for task in plan.tasks for n in task.counts if n <= plan.most_pairs})
+    counts = sorted({n for task in plan.tasks for n in task.counts if plan.fewest_pairs <= n <= plan.most_pairs})
     for cheap in (True, False):
         for seed in range(plan.seeds):
             for pairs in counts:
