@@ -10,6 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from interfaces.plugins import PluginConfig
+
 from .config import Config
 from .identity import is_local
 from .servo_wiring import configured_ports
@@ -25,6 +27,7 @@ LEARNER_OF = "# The learner of the robots"
 ROUTER = "bodyschema-router.service"
 # Beginnings of what `ProtectHome=tmpfs` and `PrivateTmp=yes` hide.
 HIDDEN = tuple(Path(path) for path in ("/home", "/root", "/run/user", "/tmp", "/var/tmp"))
+EVERY_ADDRESS = "IPAddressAllow=any"
 # Versions of systemd from which on a service that fails again and again is started less and less often.
 WITH_RESTART_STEPS = 254
 
@@ -74,12 +77,7 @@ Type=notify
 NotifyAccess=main
 ExecStart={command}
 WatchdogSec=30
-WatchdogSignal=SIGABRT
-TimeoutStartSec=90
-TimeoutStopSec=30
-KillMode=mixed
-Restart=on-failure
-{restart}
+{kept_running}
 User={user}
 MemoryMax=1G
 PrivateDevices=yes
@@ -105,12 +103,7 @@ ExecStart={command} {process}
 ExecReload=/bin/kill -HUP $MAINPID
 # Fed by the loops that work, so that one which hangs starves it; the abort leaves every thread's place in the journal.
 WatchdogSec={watchdog_s}
-WatchdogSignal=SIGABRT
-TimeoutStartSec=90
-TimeoutStopSec=30
-KillMode=mixed
-Restart=on-failure
-{restart}
+{kept_running}
 # The store and the checkpoint.
 StateDirectory=bodyschema/%i
 StateDirectoryMode=0750
@@ -170,7 +163,7 @@ def template(process: str, installed: Installed) -> str:
         ready=_READY[process],
         command=" ".join(map(_quoted, installed.command)),
         watchdog_s=_WATCHDOG_S[process],
-        restart=_restart(installed),
+        kept_running=_kept_running(installed),
         devices=_DEVICES[process],
         sandbox=_SANDBOX,
     )
@@ -183,6 +176,8 @@ def of_robot(process: str, config: Config, user: str, installed: Installed) -> s
     lines += _seen([config], installed)
     if process == "sampler":
         lines += [f"DeviceAllow={_quoted(device)} rw" for device in devices_of(config)]
+        if any(plugin.network for plugin in _plugins(config)) and EVERY_ADDRESS not in lines:
+            lines.append(EVERY_ADDRESS)
     return "\n".join(lines) + "\n"
 
 
@@ -215,17 +210,23 @@ def of_router(config: RouterConfig, user: str, installed: Installed) -> str:
     return _ROUTER.format(
         command=command,
         user=user,
-        restart=_restart(installed),
+        kept_running=_kept_running(installed),
         seen="".join(f"BindReadOnlyPaths={_quoted(path)}\n" for path in seen),
         sandbox=_SANDBOX,
     )
 
 
 def devices_of(config: Config) -> list[str]:
-    """The ports and cameras that robot.toml names, each once."""
+    """The ports and cameras that robot.toml names, each once, and what drivers and trackers of other packages open."""
     cameras = config.tables.vision.cameras
     named = [*configured_ports(config).values(), *({} if cameras is None else cameras.devices).values()]
+    named += [device for plugin in _plugins(config) for device in plugin.devices]
     return list(dict.fromkeys(name for name in named if name.startswith("/dev/")))
+
+
+def _plugins(config: Config) -> list[PluginConfig]:
+    tables = config.tables
+    return [plugin for plugin in (tables.drivers.plugin, tables.vision.plugin) if plugin is not None]
 
 
 def endpoints_of(config: Config) -> list[str]:
@@ -264,14 +265,17 @@ def _seen(configs: Sequence[Config], installed: Installed) -> list[str]:
     for state in dict.fromkeys(states):
         lines.append(f"{'BindPaths' if hidden([state]) else 'ReadWritePaths'}={_quoted(state)}")
     if not all(is_local(endpoint) for config in configs for endpoint in endpoints_of(config)):
-        lines.append("IPAddressAllow=any")
+        lines.append(EVERY_ADDRESS)
     return lines
 
 
-def _restart(installed: Installed) -> str:
+def _kept_running(installed: Installed) -> str:
+    """What is done with a process that hangs, or that ended."""
+    steps = ["RestartSec=5"]
     if installed.systemd >= WITH_RESTART_STEPS:
-        return "RestartSec=1\nRestartSteps=6\nRestartMaxDelaySec=60"
-    return "RestartSec=5"
+        steps = ["RestartSec=1", "RestartSteps=6", "RestartMaxDelaySec=60"]
+    times = ["TimeoutStartSec=90", "TimeoutStopSec=30"]
+    return "\n".join(["WatchdogSignal=SIGABRT", *times, "KillMode=mixed", "Restart=on-failure", *steps])
 
 
 def _quoted(word: object) -> str:

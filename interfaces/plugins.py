@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
 
@@ -25,10 +25,14 @@ class PluginConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     Attributes:
         name: of the entry point.
         settings: handed to it as they are.
+        devices: the files in /dev that it opens; the service lets it open no others.
+        network: whether it hears or reaches other machines; the service lets it only then.
     """
 
     name: str
     settings: dict[str, Any] = {}
+    devices: tuple[Annotated[str, msgspec.Meta(pattern="^/dev/.")], ...] = ()
+    network: bool = False
 
     def check(self, _: Sequence[str], file: Path, text: str) -> None:
         """ConfigError when no installed package has such a driver."""

@@ -25,29 +25,34 @@ MOST_BYTES, MOST_PARTS = 2**22, 100
 _PLACE = re.compile(r"(?P<what>.*?) - at `\$(?P<path>[^`]*)`$", re.DOTALL)
 
 
-def read_toml(file: Path, *, written_by: str = "`bodyschema config init` writes one") -> tuple[dict[str, Any], str]:
+def read_toml(
+    file: Path, *, written_by: str = "`bodyschema config init` writes one", damaged: str = ""
+) -> tuple[dict[str, Any], str]:
     """The tables of `file` and its text; ConfigError with the line when it cannot be read.
 
     Args:
         written_by: where one comes from, as the remedy of a file that is not there.
+        damaged: the remedy of a file whose text is none, if nobody wrote it by hand; else robot.toml is meant.
     """
     try:
         data = read_at_most(file, MOST_BYTES)
     except FileNotFoundError as error:
         raise ConfigError("there is no such file", file=file, remedy=written_by) from error
     except IsADirectoryError as error:
-        raise ConfigError("a folder, not a file", file=file, remedy="Name the robot.toml in it") from error
+        raise ConfigError("a folder, not a file", file=file, remedy=damaged or "Name the robot.toml in it") from error
     except OSError as error:
         raise ConfigError(f"cannot be read: {error.strerror}", file=file, remedy="Mend its permissions") from error
     if data is None:
-        raise ConfigError("larger than 4 MiB", file=file, remedy="Name a robot.toml")
-    text = _decoded(data, file)
+        raise ConfigError("larger than 4 MiB", file=file, remedy=damaged or "Name a robot.toml")
+    text = _decoded(data, file, damaged or "Name a robot.toml, or save it as UTF-8")
     _check_keys(text, file)
     try:
         return tomllib.loads(text), text
     except tomllib.TOMLDecodeError as error:
         line = re.search(r"line (\d+)", str(error))
-        raise ConfigError(f"not TOML: {error}", file=file, line=int(line[1]) if line else None) from error
+        raise ConfigError(
+            f"not TOML: {error}", file=file, line=int(line[1]) if line else None, remedy=damaged
+        ) from error
     except RecursionError as error:
         raise ConfigError("not TOML: nested too deeply", file=file, remedy="Close the brackets") from error
     except ValueError as error:  # a whole number of thousands of digits
@@ -75,7 +80,7 @@ def _not_finite(value: object, keys: tuple[str, ...] = ()) -> Iterator[tuple[str
             yield from _not_finite(inner, keys)
 
 
-def _decoded(data: bytes, file: Path) -> str:
+def _decoded(data: bytes, file: Path, remedy: str) -> str:
     try:
         return data.decode("utf-8-sig").replace("\r\n", "\n")
     except UnicodeDecodeError as error:
@@ -83,7 +88,7 @@ def _decoded(data: bytes, file: Path) -> str:
             f"the byte 0x{data[error.start]:02x} is not UTF-8 text",
             file=file,
             line=data.count(b"\n", 0, error.start) + 1,
-            remedy="Name a robot.toml, or save it as UTF-8",
+            remedy=remedy,
         ) from error
 
 

@@ -20,6 +20,7 @@ from daemon.service_files import ServiceFiles, UnitFolder, user_for
 from daemon.units import FOLDER, PROCESSES, Installed, devices_of, hidden, of_robot, template
 from daemon.zenoh_config import ZenohConfig
 from interfaces.errors import ConfigError
+from interfaces.plugins import PluginConfig
 
 ROOT = Path(__file__).parents[2]
 EXPOSURE = 2.0
@@ -123,6 +124,17 @@ def test_the_sampler_may_open_the_named_ports_and_cameras_and_nothing_else(confi
     assert values(own, "DeviceAllow") == [f"{PORT} rw", f"{EYES[0]} rw", f"{EYES[1]} rw"]
     assert values(template("sampler", HERE), "DevicePolicy") == ["closed"]
     assert values(template("sampler", HERE), "DeviceAllow") == []
+
+
+def test_what_a_driver_of_another_package_opens_or_hears_is_allowed_to_the_sampler_alone(config) -> None:
+    plugin = PluginConfig("field_bus", devices=("/dev/field_bus0",), network=True)
+    drivers = config.tables.drivers.__class__(plugin=plugin)
+    config = config.with_tables(config.tables.__class__(**{**_fields(config.tables), "drivers": drivers}))
+    own = of_robot("sampler", config, "daemon", HERE)
+    assert "/dev/field_bus0 rw" in values(own, "DeviceAllow")
+    assert values(own, "IPAddressAllow") == ["any"]
+    learner = of_robot("learner", config, "daemon", HERE)
+    assert values(learner, "DeviceAllow") == values(learner, "IPAddressAllow") == []
 
 
 def test_the_learner_may_open_no_device(config) -> None:
