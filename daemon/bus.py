@@ -9,7 +9,6 @@ import contextlib
 import json
 import logging
 import queue
-import socket
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -24,13 +23,13 @@ from interfaces.errors import BodyschemaError, BusError, RequestError
 
 from .identity import Route
 from .reception import Reception
+from .unreached import unreached
 from .wire import JSON, MSGPACK, ErrorReply, decode, encode
 
 log = logging.getLogger(__name__)
 
 LEASE_MS = 2000
 FIRST_TRY_MS = 100  # how long opening waits for a peer that is not there; trying goes on in the background
-ACCEPT_LIMIT_S = 1.0
 OPEN_TIMEOUT_S = 5.0
 # What clients call a payload when nobody told them: taken for JSON.
 PLAIN = ("zenoh/", "text/")
@@ -247,7 +246,7 @@ class Bus:
 
     def _explain(self, message: str) -> str:
         if self._client and self._route is not None:
-            return _unreached(self._route)
+            return unreached(self._route)
         listen = self._listen or " or ".join(self._settings.get("listen/endpoints", ())) or "nothing"
         if "in use" in message:
             return (
@@ -338,25 +337,6 @@ def _source(query: zenoh.Query) -> str:
     return "" if query.source_info is None else str(query.source_info.source_id.zid)
 
 
-def _unreached(route: Route) -> str:
-    """Why none of a route's endpoints could be reached."""
-    last = route.endpoints[-1]
-    if not _accepts(last):
-        return (
-            f"nobody listens on {route}. Start the daemon with `bodyschema run`, "
-            "or mend the table [zenoh] of robot.toml"
-        )
-    if route.secured:
-        return (
-            f"{last} is there, but the connection was refused: your certificate or password is not accepted there, "
-            "or its certificate is not for that name or not of your authority. docs/security.md shows how to look"
-        )
-    return (
-        f"somebody listens on {last} but does not answer: it is stopped, very busy, or no bodyschema. "
-        "`ps` shows what it is"
-    )
-
-
 @contextmanager
 def client(route: str | Route, open_timeout_s: float = OPEN_TIMEOUT_S) -> Iterator[Bus]:
     """A short-lived session to a process; BusError when there is none."""
@@ -391,16 +371,3 @@ def _taken_apart(reply: zenoh.Reply) -> Reply:
         return Reply(payload, decode(payload, ErrorReply, str(reply.err.encoding)).error)
     except RequestError:
         return Reply(payload, payload.decode(errors="replace"))
-
-
-def _accepts(endpoint: str) -> bool:
-    """Whether a connection to a TCP endpoint is taken, be it by a process that never answers."""
-    protocol, _, address = endpoint.partition("/")
-    host, _, port = address.rpartition(":")
-    if protocol not in ("tcp", "tls") or not port.isdigit():
-        return False
-    try:
-        with socket.create_connection((host.strip("[]"), int(port)), ACCEPT_LIMIT_S):
-            return True
-    except OSError:
-        return False

@@ -68,7 +68,7 @@ def run_learners(configs: Sequence[Config], clock: Clock, wishes: Wishes, notifi
             stack.enter_context(learner.serving())
             log.info("the learner of %s answers on %s", config.robot.name, config.tables.zenoh.learner)
         service.ready()
-        _attend(
+        attend(
             learners, [bus.publisher(Keys(c.robot.name).status("learner")) for c in configs], wishes, service, failed
         )
         service.stopping()
@@ -146,7 +146,7 @@ def _working(learners: Sequence[Learner], service: Service, clock: Clock) -> Ite
         thread.join()
 
 
-def _attend(
+def attend(
     learners: Sequence[Learner],
     publishers: Sequence[Any],
     wishes: Wishes,

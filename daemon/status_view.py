@@ -162,7 +162,8 @@ def _elsewhere(status: LearnerStatus) -> str:
 def _change(status: LearnerStatus) -> Iterator[str]:
     since, change = f"{status.pairs_since_change} pairs since", status.last_change
     if change is None:
-        yield f"changed {status.changes} time{'' if status.changes == 1 else 's'}; {since}"
+        # Rolled back, or learning began anew.
+        yield f"none in force of {status.changes} told or found; {status.pairs_since_change} pairs count"
         return
     when = f"at pair {change.first_seq}"
     if change.earliest_seq < change.latest_seq:

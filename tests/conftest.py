@@ -3,23 +3,18 @@
 from __future__ import annotations
 
 import os
-import socket
 import subprocess
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import free_ports
 import pytest
 
 
 @pytest.fixture(scope="session")
 def free_endpoint() -> Callable[[], str]:
     """A function that gives zenoh endpoints on this machine that nobody listens on."""
-
-    def endpoint() -> str:
-        with socket.create_server(("127.0.0.1", 0)) as server:
-            return f"tcp/127.0.0.1:{server.getsockname()[1]}"
-
-    return endpoint
+    return free_ports.free_endpoint
 
 
 @pytest.fixture

@@ -13,6 +13,7 @@ from cyclopts import Parameter
 from daemon.commands.options import HERE, RobotFile, flag
 
 if TYPE_CHECKING:
+    from daemon.config import Config
     from effects import Effect
     from interfaces.robot import RobotDescription
 
@@ -72,6 +73,8 @@ def check(*, robot: RobotFile = HERE) -> None:
     checked = Config.load(robot)
     checked.require_learnable()
     description, zenoh = checked.robot, checked.tables.zenoh
+    cameras = checked.tables.vision.cameras
+    camera_lines = _camera_lines(checked)
     say(f"{robot} is in order: robot {description.name}, {len(description.joints)} joints")
     for name, lower, upper in zip(description.joints, description.lower, description.upper, strict=True):
         unit, scale = ("°", 57.29577951) if description.tree.joint(name).kind in REVOLUTE else (" m", 1.0)
@@ -87,12 +90,8 @@ def check(*, robot: RobotFile = HERE) -> None:
         f"  camera on {camera.parent_link} at {_numbers(camera.xyz)} m, roll, pitch, yaw "
         f"{_numbers(map(math.degrees, camera.rpy))}°, {known[camera.pose_known]}"
     )
-    cameras = checked.tables.vision.cameras
-    if cameras is not None:
-        from daemon.camera_wiring import camera_lines
-
-        for line in camera_lines(cameras):
-            say(f"  {line}")
+    for line in camera_lines:
+        say(f"  {line}")
     if cameras is None or cameras.calibration is None:
         stereo = "described" if description.calibration else "not described: no images can be used, recordings can"
         say(f"  stereo calibration {stereo}")
@@ -135,6 +134,14 @@ def _effect_line(effect: Effect) -> str:
 
 def _numbers(values: Iterable[float]) -> str:
     return ", ".join(f"{round(value, 4) + 0.0:.4g}" for value in values)
+
+
+def _camera_lines(config: Config) -> list[str]:
+    if config.tables.vision.cameras is None:
+        return []
+    from daemon.camera_wiring import camera_lines
+
+    return list(camera_lines(config))
 
 
 def _standing_still(description: RobotDescription) -> list[str]:

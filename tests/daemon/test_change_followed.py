@@ -174,3 +174,15 @@ def test_a_model_that_predicts_new_pairs_no_better_does_not_take_the_old_one_s_p
     noticed = Noticed(reference, kinds, SIGMA, 1.0, 0, 0, 0, seqs, kept, q, x, turns)
     origin = Origin(noticed, KnownArm(belief, tolerances))
     assert origin.is_better(origin.explain(q, x), q, x) == (moved_m > 0.0)
+
+
+def test_of_the_arm_since_a_change_nothing_is_known_before_the_solver_has_its_pairs() -> None:
+    rng = np.random.default_rng(7)
+    chain, q = built_chain(rng), path(rng, TAUGHT + SINCE)
+    learning = new_learning()
+    teach(learning, measured(chain, q[:TAUGHT], rng, sigma_m=SIGMA), every=NOW_AND_THEN)
+    assert learning.known() is not None
+    after = measured(with_camera_moved(chain), q[TAUGHT:], rng, first=TAUGHT + 1, sigma_m=SIGMA)
+    while not learning.counters.changes:
+        teach(learning, [after.pop(0)], background=False)
+    assert learning.known() is None

@@ -6,18 +6,21 @@ import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import pytest
 from guided_arm import JOINTS, nominal_model
 from small_arm import write_small_arm
+from told_statuses import LEARNER
 
 from daemon.background import Background
 from daemon.bus import client
 from daemon.config import Config
 from daemon.fleet.hosting import configs_of, descriptions, shares
 from daemon.keys import Keys
-from daemon.learner_host import run_learners, session_settings
+from daemon.learner import Learner
+from daemon.learner_host import attend, run_learners, session_settings
 from daemon.learning import Solved, Task
 from daemon.notify import Notifier
 from daemon.service import Service
@@ -71,6 +74,35 @@ def test_every_robot_is_answered_for_by_the_one_process(robots: list[Config]) ->
         host.join()
     assert [status.robot for status in said] == ["left", "right"]
     assert all(config.checkpoint_file.exists() for config in robots)
+
+
+class Attended:
+    """A learner that has a wish come in while it is attended to, and the process end two rounds later."""
+
+    def __init__(self, wishes: Wishes, wishing: bool) -> None:
+        self.wishes, self.wishing, self.rounds, self.reloads = wishes, wishing, 0, 0
+
+    def status(self) -> LearnerStatus:
+        return LEARNER
+
+    def reload(self) -> str:
+        self.reloads += 1
+        return "in force"
+
+    def tick(self) -> None:
+        self.rounds += 1
+        if self.wishing and self.rounds == 1:
+            self.wishes.reloading = True
+        if self.rounds == 3:
+            self.wishes.end()
+
+
+def test_a_reload_that_is_wished_for_in_mid_round_is_done_once_for_every_robot() -> None:
+    wishes, clock = Wishes(), SystemClock()
+    learners = [Attended(wishes, wishing) for wishing in (False, True, False)]
+    service = Service(Notifier(), (), clock)
+    attend(cast("list[Learner]", learners), [lambda _: None] * 3, wishes, service, [])
+    assert [learner.reloads for learner in learners] == [1, 1, 1]
 
 
 def test_two_robots_of_one_name_are_refused(robots: list[Config]) -> None:

@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import os
 import signal
-import socket
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -44,13 +43,6 @@ class FakeSampler:
         first = int(request.parameters["from"])
         page = [pair_to_wire(pair) for pair in self.pairs if pair.seq >= first][:PAGE]
         return encode(PairsReply(self.store, len(self.pairs), page))
-
-
-@pytest.fixture
-def endpoint() -> str:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
 
 
 @pytest.fixture

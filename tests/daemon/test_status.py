@@ -7,10 +7,12 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import msgspec
 import pytest
 from rich.console import Console
 from scripted_sources import Walk
 from small_arm import write_small_arm
+from told_statuses import LEARNER, SAMPLER
 
 from daemon.bus import Bus
 from daemon.cli import app
@@ -18,101 +20,11 @@ from daemon.config import Config
 from daemon.keys import Keys
 from daemon.sampler import Sampler
 from daemon.session import session_of
-from daemon.status import (
-    ChainCalibration,
-    Change,
-    JointRange,
-    JointZero,
-    LearnerStatus,
-    LearntFigure,
-    Outlook,
-    SamplerStatus,
-)
 from daemon.status_view import Seen, Watcher, as_json, screen
 from daemon.store import PairStore
 from interfaces.clock import SystemClock
 
 LIMIT_S = 60.0
-SAMPLER = SamplerStatus(
-    robot="arm",
-    store="2f9a",
-    state="paused",
-    pairs=612,
-    segment=3,
-    uptime_s=75.2,
-    frames=700,
-    frames_per_s=29.9,
-    readings_per_s=119.6,
-    pairs_per_s=12.3,
-    rejected={"too_near": 80, "at_border": 8},
-    coverage={"waist": JointRange(-0.5, 0.5, -3.0, 3.0)},
-    disk_free_bytes=12_300_000_000,
-    health=["the disk is nearly full"],
-    version="0.1.0",
-)
-CALIBRATION = ChainCalibration(
-    pairs=612,
-    camera_link="base_link",
-    camera_xyz=[LearntFigure(1.1, 1.08892, 0.0113), LearntFigure(0.0, 0.0195, 0.033), LearntFigure(0.3, 0.31, 0.043)],
-    camera_rpy=[LearntFigure(-1.57, -1.61, 0.04), LearntFigure(0.0, -0.003, 0.019), LearntFigure(1.57, 1.587, 0.03)],
-    marker_link="hand",
-    marker_xyz=[LearntFigure(0.0, 0.0, 0.0003), LearntFigure(0.0, 0.0003, 0.0007), LearntFigure(0.03, 0.043, 0.0097)],
-    zeros={"waist": None, "shoulder": JointZero(0.0647, 0.0615)},
-    axes_rad=0.01,
-    points_m=0.003,
-    noise_m=0.00126,
-    outliers=2,
-)
-OUTLOOK = Outlook(
-    pairs=612,
-    error_m=0.0006,
-    least_error_m=0.0,
-    anywhere_m=0.0042,
-    further_pairs=[100, 300],
-    like_so_far_m=[0.00055, 0.0005],
-    best_motion="moving shoulder over its range",
-    best_motion_m=[0.00045, 0.0003],
-    enough=False,
-)
-CHANGE = Change(
-    first_seq=601,
-    earliest_seq=598,
-    latest_seq=602,
-    noticed_seq=606,
-    found=True,
-    kind="undecided",
-    probabilities={"tool": 0.612, "joint shoulder": 0.385},
-    alike=None,
-    moved_m=0.0104,
-    can_roll_back=True,
-)
-LEARNER = LearnerStatus(
-    robot="arm",
-    store="2f9a",
-    state="learning",
-    pairs=612,
-    last_seq=612,
-    pairs_since_change=12,
-    sampler_alive=True,
-    replayed=4896,
-    answering="exact",
-    prequential_m={"prior": 0.0401, "exact": 0.002},
-    claimed_error_m=0.0066,
-    curve=[],
-    model="6b6f",
-    calibration=CALIBRATION,
-    outlook=OUTLOOK,
-    gaps_recovered=0,
-    refused=0,
-    doubted=0,
-    changes=1,
-    last_change=CHANGE,
-    at_rest=False,
-    checkpoint_age_s=None,
-    uptime_s=4000.0,
-    health=[],
-    version="0.1.0",
-)
 
 
 @pytest.fixture
@@ -172,6 +84,13 @@ def sampler_running(config: Config) -> Iterator[None]:
 )
 def test_the_screen_shows_both_processes(config, said) -> None:
     assert said in " ".join(shown(Seen(SAMPLER, LEARNER), config).split())
+
+
+def test_a_change_that_was_rolled_back_is_none_in_force(config) -> None:
+    learner = msgspec.structs.replace(LEARNER, changes=2, last_change=None, pairs_since_change=600)
+    assert "change none in force of 2 told or found; 600 pairs count" in " ".join(
+        shown(Seen(None, learner), config).split()
+    )
 
 
 def test_a_process_that_does_not_answer_is_named_with_the_command_that_starts_it(config) -> None:

@@ -6,7 +6,7 @@ from typing import Any
 
 import msgspec
 import numpy as np
-from test_status import LEARNER
+from told_statuses import LEARNER
 
 from daemon.status import Change, LearnerStatus
 from daemon.view.course import LARGEST_SERIES, Course, Series

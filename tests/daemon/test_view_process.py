@@ -27,7 +27,7 @@ def robot(tmp_path: Path, free_endpoint) -> Path:
 
 def page(port: int) -> str | None:
     """The page; None while nobody answers."""
-    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=60)
     try:
         connection.request("GET", "/")
         return connection.getresponse().read().decode()

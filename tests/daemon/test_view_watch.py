@@ -13,7 +13,7 @@ from typing import Any
 import msgspec
 import pytest
 from small_arm import write_small_arm
-from test_status import LEARNER, SAMPLER
+from told_statuses import LEARNER, SAMPLER
 
 from daemon.bus import Bus
 from daemon.config import Config

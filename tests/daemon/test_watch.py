@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
+import pytest
+from guided_arm import NOW_AND_THEN, built_chain, measured, new_learning, path, teach
 
 from daemon.learning.watch import MOST_WATCHED, Watch
 from interfaces.records import Pair, frozen_array
+
+COARSE_RAD = np.radians(1.0)
 
 
 def test_where_no_model_comes_the_newest_pairs_alone_are_kept() -> None:
@@ -15,3 +21,15 @@ def test_where_no_model_comes_the_newest_pairs_alone_are_kept() -> None:
             Pair("simulated", seq, 1, 0.0, "", frozen_array(np.zeros(2)), frozen_array(np.zeros(3)), cov), kept=True
         )
     assert 0 < watch.held <= MOST_WATCHED
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_joints_that_are_read_coarsely_are_no_change(seed: int) -> None:
+    """Ticks of a degree move the predicted marker by far more than the camera is said to err."""
+    rng = np.random.default_rng([seed, 5])
+    q = path(rng, 600)
+    learning = new_learning()
+    pairs = measured(built_chain(rng), q, rng, sigma_m=0.0002)
+    read = [replace(pair, q=frozen_array(COARSE_RAD * np.round(pair.q / COARSE_RAD))) for pair in pairs]
+    teach(learning, read, every=NOW_AND_THEN)
+    assert learning.counters.changes == 0

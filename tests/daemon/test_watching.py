@@ -9,6 +9,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from board_renderer import webcams
+from shown_board import known_rig
 from small_arm import write_small_arm
 
 from daemon.camera_wiring import camera_checks
@@ -18,6 +20,7 @@ from daemon.mjpeg import MjpegServer
 from daemon.robot_template import EXAMPLE, robot_toml
 from daemon.wiring import check_sources
 from interfaces.errors import ConfigError
+from vision.rig_file import write_rig
 
 STEREO = """
 focal_px = 300.0
@@ -127,6 +130,26 @@ def test_a_misspelt_key_is_named_with_its_line(tmp_path) -> None:
 def test_config_check_says_where_images_come_from(tmp_path, capsys) -> None:
     run("config", "check", "--robot", str(write_robot(tmp_path, IMAGES.format(speed=1.0))))
     assert "images l_*.png and r_*.png, at 1 times their speed" in capsys.readouterr().out
+
+
+def test_config_check_names_a_damaged_calibration(tmp_path, capsys) -> None:
+    calibrated = IMAGES.format(speed=1.0).replace("[vision", '[vision.cameras]\ncalibration = "c.toml"\n[vision', 1)
+    file = write_robot(tmp_path, calibrated)
+    run("config", "check", "--robot", str(file))
+    assert "calibrated by c.toml, which is not there yet" in capsys.readouterr().out
+    (tmp_path / "c.toml").write_text('format = "bodyschema stereo rig 1"\n[left', encoding="utf-8")
+    with pytest.raises(ConfigError, match=r"c.toml: not TOML: .* calibrate again"):
+        app(["config", "check", "--robot", str(file)], exit_on_error=False, result_action="return_value")
+    assert "is in order" not in capsys.readouterr().out
+
+
+def test_images_that_calibrated_cameras_took_are_rectified_whatever_the_cameras_serials(tmp_path, capsys) -> None:
+    write_images(tmp_path)
+    rig = known_rig(webcams(np.random.default_rng(1), size_px=(320, 240)), serials=("A1", "B2"))
+    write_rig(rig, tmp_path / "c.toml")
+    calibrated = IMAGES.format(speed=0.0).replace("[vision", '[vision.cameras]\ncalibration = "c.toml"\n[vision', 1)
+    run("watch", "cameras", "--robot", str(write_robot(tmp_path, calibrated)), "--out", str(tmp_path / "seen"))
+    assert capsys.readouterr().out.startswith("4 frames, the marker in ")
 
 
 def test_doctor_names_a_camera_that_is_not_there(tmp_path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import socket
 import time
 from collections.abc import Iterator
 
@@ -25,13 +24,6 @@ from interfaces.errors import SourceLost
 
 LIMIT_S = 20.0
 NAMES = ("pan", "lift", "elbow")
-
-
-@pytest.fixture
-def endpoint() -> str:
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{free.getsockname()[1]}"
 
 
 def robot(endpoint: str, **settings) -> ZenohRobot:

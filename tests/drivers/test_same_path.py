@@ -3,7 +3,6 @@ resolution."""
 
 from __future__ import annotations
 
-import socket
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -15,6 +14,7 @@ import numpy as np
 import pytest
 from bench_arm import Arm
 from feetech_arm import FeetechArm
+from free_ports import free_endpoint
 from servo_arm import TICK
 from test_serial_lines import BoardArm
 
@@ -101,8 +101,7 @@ class PacedLink:
 def ros2(arm: Guided) -> Iterator[tuple[JointSource, float]]:
     clock = VirtualClock()
     node = Node(dict(zip(arm.robot.joints, arm.angles(BEGIN_S), strict=True)), RATE_HZ)
-    with socket.create_server(("127.0.0.1", 0)) as free:
-        endpoint = f"tcp/127.0.0.1:{free.getsockname()[1]}"
+    endpoint = free_endpoint()
     with ZenohRobot([node], endpoint) as robot:
         yield (
             Ros2Joints(

@@ -5,12 +5,12 @@ unshare --net python kernel_network.py down|slow FOLDER PAIRS
 
 from __future__ import annotations
 
-import socket
 import subprocess
 import sys
 import time
 from pathlib import Path
 
+from free_ports import free_endpoint
 from two_processes import LIFE_LIMIT_S, expect_each_pair_learnt_once, learner_with, running, sampler_with, write_robot
 
 from daemon.config import Config
@@ -23,11 +23,6 @@ LEASE_S = 3.0
 
 def ip(*words: str) -> None:
     subprocess.run(["ip", *words], check=True)
-
-
-def free_endpoint() -> str:
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        return f"tcp/127.0.0.1:{server.getsockname()[1]}"
 
 
 def stored(config: Config, pairs: int) -> int:

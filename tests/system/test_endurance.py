@@ -14,6 +14,7 @@ from two_processes import KEYS, expect_each_pair_learnt_once, learner_with, runn
 
 from daemon.bus import Bus, client
 from daemon.config import Config
+from daemon.keys import Keys
 from daemon.wire import JointsRequest, encode
 
 # By then all that is kept of pairs is full: replay, the solvers' windows, the publisher's cache.
@@ -21,6 +22,7 @@ WARM, PART, PARTS = 24_000, 6_000, 6
 PAIRS_PER_S = 500.0
 LONG_S = 3000.0
 ASKED = 300
+NOTHING = Keys("nobody").status("sampler")
 MB = 2**20
 
 
@@ -56,32 +58,40 @@ def latency_s(ask: Callable[[], object]) -> float:
 
 @dataclass(frozen=True)
 class Look:
-    """Both processes at one moment; first the sampler, then the learner."""
+    """Both processes at one moment; first the sampler, then the learner.
+
+    Attributes:
+        memory: resident [bytes].
+        cpu: processor time so far [s].
+        latency: of an answer, in round trips at that moment to who knows nothing and answers at once.
+    """
 
     memory: tuple[int, int]
     cpu: tuple[float, float]
     latency: tuple[float, float]
 
 
-def look(pids: tuple[int, int], sampler: Bus, learner: Bus) -> Look:
+def look(pids: tuple[int, int], sampler: Bus, learner: Bus, idle: Bus) -> Look:
     question = encode(JointsRequest([0.1, 0.2]))
     asked = (
         latency_s(lambda: sampler.ask_one(KEYS.status("sampler"))),
         latency_s(lambda: learner.ask_one(KEYS.predict, question)),
     )
+    round_trip = latency_s(lambda: idle.ask_one(NOTHING))
     memory, cpu = (tuple(map(of, pids)) for of in (resident_bytes, cpu_s))
-    return Look(memory, cpu, asked)
+    return Look(memory, cpu, (asked[0] / round_trip, asked[1] / round_trip))
 
 
-def watched(config: Config) -> list[Look]:
-    """After warming up, and after each further part."""
+def watched(config: Config, endpoint: str) -> list[Look]:
+    """After warming up, and after each further part; `endpoint` is free."""
     zenoh = config.tables.zenoh
-    with running(config, "sampler") as sampler, running(config, "learner") as learner:
+    with Bus(listen=endpoint) as idle, running(config, "sampler") as sampler, running(config, "learner") as learner:
+        idle.answer(NOTHING, lambda _: b"")
         looks: list[Look] = []
         for part in range(PARTS + 1):
             learner_with(config, WARM + part * PART, limit_s=LONG_S)
-            with client(zenoh.sampler) as to_sampler, client(zenoh.learner) as to_learner:
-                looks.append(look((sampler.pid, learner.pid), to_sampler, to_learner))
+            with client(zenoh.sampler) as to_sampler, client(zenoh.learner) as to_learner, client(endpoint) as to_idle:
+                looks.append(look((sampler.pid, learner.pid), to_sampler, to_learner, to_idle))
             print(part, looks[-1], flush=True)
         expect_each_pair_learnt_once(config, LONG_S)
     return looks
@@ -90,7 +100,8 @@ def watched(config: Config) -> list[Look]:
 @pytest.mark.soak
 @pytest.mark.timeout(3600)
 def test_many_hours_of_pairs_leave_memory_and_latency_as_they_are(tmp_path, free_endpoint) -> None:
-    looks = watched(write_robot(tmp_path, free_endpoint, rows=WARM + (PARTS + 4) * PART, pairs_per_s=PAIRS_PER_S))
+    config = write_robot(tmp_path, free_endpoint, rows=WARM + (PARTS + 4) * PART, pairs_per_s=PAIRS_PER_S)
+    looks = watched(config, free_endpoint())
     memory, latency = (np.array([getattr(each, name) for each in looks], dtype=float) for name in ("memory", "latency"))
     work = np.diff([each.cpu for each in looks], axis=0)
     half = len(looks) // 2
