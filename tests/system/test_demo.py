@@ -104,8 +104,11 @@ def test_the_demo_over_servos_learns_as_well(tmp_path: Path) -> None:
     done = subprocess.run(command, check=False, capture_output=True, text=True, timeout=LIMIT_S)
     assert done.returncode == 0, done.stderr
     assert "7 servos, torque verified off" in (tmp_path / "out" / "daemon.log").read_text()
+    with (tmp_path / "out" / "first_tool.csv").open(newline="") as stream:
+        changed_at = len(list(csv.DictReader(stream)))
     with (tmp_path / "out" / "learning_curve.csv").open(newline="") as stream:
-        last = [row for row in csv.DictReader(stream) if int(row["pairs"]) <= FIRST][-1]  # then the tool is changed
+        last = [row for row in csv.DictReader(stream) if int(row["pairs"]) <= changed_at][-1]
+    assert int(last["pairs"]) >= FIRST
     assert float(last["held_out_error_mm"]) < 0.7 * float(last["nominal_error_mm"])
 
 
