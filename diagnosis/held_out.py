@@ -18,7 +18,7 @@ from interfaces.records import FloatArray
 from .fit import LARGEST, Fit, prior_precision, solved
 from .observations import IntArray
 from .scan import Candidate
-from .scatter import beside_scatter
+from .scatter import instruments
 
 # Blocks of time, and how many folds they are dealt to in turn.
 _MOST_BLOCKS, _FOLDS = 80, 5
@@ -105,7 +105,7 @@ def added(fit: Fit, candidates: Sequence[Candidate], blocks: Blocks) -> list[Add
 
 
 def _added(fit: Fit, effect: Effect, folds: _Folds, before: float, blocks: Blocks) -> Added:
-    own = beside_scatter(fit, effect, fit.weighted(fit.run.columns(effect)[:, :, effect.amounts]))
+    own = instruments(fit, effect)
     usual = np.array([effect.parameters[j].usual for j in effect.amounts])
     precision = [prior_precision(fit.simulation, fit.nuisances), 1.0 / np.square(LARGEST * usual)]
     after = folds.beside(own).missed(np.concatenate(precision))

@@ -15,6 +15,7 @@ from .fit import Fit, amount_columns
 from .held_out import Blocks
 from .nameless import Nameless
 from .scan import Candidate
+from .scatter import remembers
 from .search import Search, describe, nats
 from .stability import Instead, named_again
 from .unknown import Unknowns
@@ -111,6 +112,8 @@ def _standing(
     gain = 2.0 * (fit.log_likelihood - without.log_likelihood)
     itself = beside.itself
     worth = nats(gain, itself.dof) - search.doubt(itself)
+    if remembers(cause):
+        worth = min(worth, search.agreed(without, itself))
     nothing = Instead(without, -itself.dof, -search.doubt(itself))
     tried = []
     for candidate in beside.candidates:

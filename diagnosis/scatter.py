@@ -2,35 +2,60 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
-from effects import Effect
+from effects import Effect, Motion
 from interfaces.records import FloatArray
 
 from .fit import Fit
 
-# Where these say that a joint is, is read off its own last readings.
-_OF_ITS_WAY = ("backlash", "settling")
+# What says where a joint is by its last readings, and beside moves of how many times their scatter this does not
+# matter: to a play it is which way the joint came, to a lag how far.
+_FAR = {"backlash": 4.0, "settling": 20.0}
 
 
-def beside_scatter(fit: Fit, effect: Effect, columns: FloatArray) -> FloatArray:
-    """Weighted columns (n, 3, k) of an effect, less what looks like the scatter of its joint's single readings.
+def remembers(effect: Effect) -> bool:
+    """Whether an effect says where a joint is by its last readings, so that their scatter looks like it."""
+    return effect.name in _FAR and effect.where is not None
 
-    A play or a lag takes the joint to be nearer to the reading before, which is right of a reading that is off by
-    itself, and a gain that no gear has. Of readings with white errors eᵢ, whatever depends on qᵢ − qᵢ₋₁ has as much in
-    common with eᵢ as with −eᵢ₋₁, and nothing with eᵢ once its part along qᵢ₋₁ − 2 qᵢ + qᵢ₊₁ is gone. What follows the
-    direction of motion stays.
+
+def instruments(fit: Fit, effect: Effect) -> FloatArray:
+    """Weighted columns (n, 3, k) of an effect's amounts, by which a test of it does not fall for readings' scatter.
+
+    A play or a lag takes a joint to be nearer to the reading before, which is right of a reading that is off by itself,
+    and a gain that no gear has. What an effect does at a row is therefore worked out from its neighbours' readings and
+    not from its own, which is in the row's residual: an instrumental variable (Durbin 1954), whose product with the
+    residual has no expectation where there is no such effect, however large the scatter, as long as readings are off
+    independently. Only where the joint has come from far, its own reading tells the way as well.
     """
-    if effect.name not in _OF_ITS_WAY or effect.where is None:
-        return columns
-    motion, joint = fit.observations.motion, fit.simulation.robot.joints.index(effect.where)
-    inside = np.flatnonzero(~motion.begins[1:-1] & ~motion.begins[2:]) + 1
-    bends = np.zeros(len(motion.q))
-    bends[inside] = np.diff(motion.q[:, joint], 2)[inside - 1]
-    basis = fit.orthogonal
-    scatter = fit.weighted(fit.run.by_joint[:, :, [joint]] * bends[:, None, None])
-    scatter, columns = (each - basis @ np.einsum("nir,nik->rk", basis, each) for each in (scatter, columns))
-    square = float(np.square(scatter).sum())
-    if square <= 0.0:
-        return columns
-    return columns - scatter * (np.einsum("nir,nik->rk", scatter, columns) / square)
+    if not remembers(effect):
+        return fit.weighted(fit.run.columns(effect)[:, :, effect.amounts])
+    motion, joint = fit.observations.motion, fit.simulation.robot.joints.index(str(effect.where))
+    between = _between(fit, motion, joint, _FAR[effect.name])
+    columns = np.empty((len(motion), 3, len(effect.amounts)))
+    # Of each two rows one is replaced at a time, so that its neighbours are as they were read.
+    for every_other in (slice(0, None, 2), slice(1, None, 2)):
+        q = motion.q.copy()
+        q[every_other, joint] = between[every_other]
+        run = fit.simulation.run(replace(motion, q=q))
+        columns[every_other] = run.columns(effect)[every_other][:, :, effect.amounts]
+    return fit.weighted(columns)
+
+
+def _between(fit: Fit, motion: Motion, joint: int, far: float) -> FloatArray:
+    """Where a joint is by the readings before and after each (n,) [rad, m]; its own where it has come from far."""
+    q, after = motion.q[:, joint], np.append(~motion.begins[1:], False)
+    before = np.where(motion.begins, q, np.roll(q, 1))
+    before = np.where(motion.begins & after, np.roll(q, -1), before)
+    between = 0.5 * (before + np.where(after, np.roll(q, -1), before))
+    return np.where(np.abs(motion.moves[:, joint]) > far * _most_scatter(fit, joint), q, between)
+
+
+def _most_scatter(fit: Fit, joint: int) -> float:
+    """What a joint's readings can scatter at most, 1-sigma [rad, m]: as if all that is left came from it."""
+    by_joint = fit.weighted(fit.run.by_joint[:, :, [joint]])[:, :, 0]
+    lengths = np.square(by_joint).sum(axis=1)
+    along = np.einsum("ni,ni->n", by_joint, fit.left)
+    return float(np.sqrt((np.square(along) / np.maximum(lengths, 1e-300)).sum() / max(lengths.sum(), 1e-300)))

@@ -14,7 +14,7 @@ from effects import Effect, Identity
 from .fit import Fit, improved
 from .held_out import Blocks, block_p_value
 from .scan import Candidate, Scan
-from .scatter import beside_scatter
+from .scatter import instruments, remembers
 
 # A cause has to be so much more probable than its absence [nats].
 NAMED = 3.0
@@ -165,7 +165,7 @@ class Search:
         best, most = None, NAMED
         known = self._known[1] if self._known[0] is fit else None
         for candidate in self.shortlist(known or Scan(fit), self._open(fit)):
-            if self._agreed(fit, candidate) < NAMED:
+            if self.agreed(fit, candidate) < NAMED:
                 continue
             doubt = self.doubt(candidate)
             least = fit.log_likelihood + rise_for(most + doubt, candidate.dof)
@@ -259,11 +259,10 @@ class Search:
         """The same of an effect that was a candidate."""
         return float(self._doubt + np.log(self._trials.get(effect.key, 1)))
 
-    def _agreed(self, fit: Fit, candidate: Candidate) -> float:
+    def agreed(self, fit: Fit, candidate: Candidate) -> float:
         """What a candidate is worth by the agreement of blocks of time, which need not be white inside [nats]."""
         effect = candidate.effect
-        columns = beside_scatter(fit, effect, fit.weighted(fit.run.columns(effect)[:, :, effect.amounts]))
-        chance = block_p_value(fit, columns, Blocks.cut(len(fit.observations)))
+        chance = block_p_value(fit, instruments(fit, effect), Blocks.cut(len(fit.observations)))
         gain = float(stats.chi2.isf(max(chance, 1e-290), candidate.dof))
         return nats(gain, candidate.dof) - self.doubt(candidate)
 
@@ -310,7 +309,8 @@ class Search:
                 tried = beside.with_instead(beside.itself.effect, least=fit.log_likelihood + _ELSEWHERE)
                 if tried.log_likelihood > fit.log_likelihood + _ELSEWHERE:
                     return self._second_thoughts(tried)
-            if beside.is_lost_for(NAMED + self.doubt(beside.itself)):
+            lost = beside.is_lost_for(NAMED + self.doubt(beside.itself))
+            if lost or (remembers(cause) and self.agreed(beside.without, beside.itself) < NAMED):
                 self._tell(f"dropped {describe(cause)}")
                 return beside.without, True
             for candidate in beside.candidates:

@@ -30,6 +30,31 @@ Size = float | str | Sequence[float]
 
 
 @dataclass(frozen=True)
+class Encoders:
+    """What becomes of shaft positions.
+
+    Attributes:
+        ticks: of each joint [rad or m], shape (d,).
+        scatter: 1-sigma of each reading before it is rounded [ticks].
+    """
+
+    ticks: FloatArray
+    scatter: float
+    rng: np.random.Generator
+
+    @classmethod
+    def of(cls, arm: Arm, scatter: float, rng: np.random.Generator) -> Encoders:
+        return cls(np.array([arm.quantum(name) for name in arm.read]), scatter, rng)
+
+    def read(self, shaft: FloatArray) -> FloatArray:
+        """Readings (n, d) in whole ticks."""
+        exact = shaft / self.ticks
+        if self.scatter:
+            exact = exact + self.scatter * self.rng.normal(size=exact.shape)
+        return np.asarray(np.rint(exact) * self.ticks)
+
+
+@dataclass(frozen=True)
 class Taken:
     """One recording, and what it would be without noise.
 
@@ -40,7 +65,7 @@ class Taken:
         x: measured marker positions [m], shape (n, 3).
         x_noise_free: what the described cameras would report without pixel noise and without false fixes, shape (n, 3).
         covariance: of x for the pixel noise [m²], which the recording may tell, shape (n, 3, 3).
-        noise: that and what rounding to ticks adds to a residual at the readings [m²], shape (n, 3, 3).
+        noise: that and what the encoders add to a residual at the readings [m²], shape (n, 3, 3).
         outlier: which fixes are not the marker, shape (n,).
     """
 
@@ -65,7 +90,8 @@ class HiddenCase:
         nuisances: what is wrong but not a finding, since robot.toml calls it not known.
         measured, fresh: the recording, and another one of the same arm on another way. Moments (t0) count from the
             start of either.
-        sigma_m: RMS length of the noise of a residual, that of ticks included.
+        sigma_m: RMS length of the noise of a residual, that of encoders included.
+        scatter: 1-sigma of what the encoders scatter before they round [ticks].
     """
 
     folder: Path
@@ -78,6 +104,7 @@ class HiddenCase:
     measured: Taken
     fresh: Taken
     sigma_m: float
+    scatter: float
 
     @property
     def robot_file(self) -> Path:
@@ -101,6 +128,7 @@ def hide(
     marker_known: bool = True,
     pose_known: bool = True,
     rendered: bool = False,
+    scatter: tuple[float, float] | None = None,
 ) -> HiddenCase:
     """Write a case into `folder`; everything is drawn from `seed`.
 
@@ -117,12 +145,15 @@ def hide(
         marker_known, pose_known: False writes a rough marker or camera pose into robot.toml and says so there.
         rendered: paint every image and look for the marker in it with the tracker (some tenths of a second a pair);
             a pair whose marker is not found is left out.
+        scatter: between what the encoders scatter before they round, 1-sigma [ticks], drawn; joints that do not lead
+            then stand still. None for encoders that only round.
 
     Raises:
         ValueError: an effect cannot sit there, or does not show in this motion.
     """
-    streams = [np.random.default_rng(child) for child in np.random.SeedSequence(seed).spawn(6)]
-    choosing, building, moving, freshly, noising, rough = streams
+    streams = [np.random.default_rng(child) for child in np.random.SeedSequence(seed).spawn(7)]
+    choosing, building, moving, freshly, noising, rough, scattering = streams
+    ticks = 0.0 if scatter is None else float(scattering.uniform(*scatter))
     nuisances = _rough(rough, marker_known=marker_known, pose_known=pose_known)
     wished = wishes(effects, hold, [nuisance.effect for nuisance in nuisances], choosing)
     described = chosen_arm(arm, wished, building)
@@ -136,14 +167,15 @@ def hide(
         spare = int(np.ceil(SPARE * pairs)) + 2
         visible = _visibility(nominal)
         ranges = narrowed(moving, described.ranges, visible, reach, [described.read.index(name) for name in still])
-        motion = move(moving, style, ranges, pairs + spare, visible)
-        truth = _hidden(wished, size, outliers, Sizer(client, nominal, motion), motion, described, choosing)
+        motion = move(moving, style, ranges, pairs + spare, visible, rests=scatter is not None)
+        truth = _hidden(wished, size, outliers, Sizer(client, nominal, motion, ticks), motion, described, choosing)
         world = World(client, described, [*truth, *nuisances])
         fraction = sum(hidden.parameters["fraction"] for hidden in truth if hidden.effect == "outliers")
-        measured = _taken(nominal, world, motion, pairs, fraction, noising, rendered=rendered)
+        encoders = Encoders.of(described, ticks, scattering)
+        measured = _taken(nominal, world, motion, pairs, fraction, noising, encoders, rendered=rendered)
         again = fresh_pairs or pairs
-        other = move(freshly, style, ranges, again + spare, visible)
-        fresh = _taken(nominal, world, other, again, fraction, noising, rendered=rendered)
+        other = move(freshly, style, ranges, again + spare, visible, rests=scatter is not None)
+        fresh = _taken(nominal, world, other, again, fraction, noising, encoders, rendered=rendered)
     write_robot(folder, described, hold, marker_known=marker_known, pose_known=pose_known)
     tells_noise = bool(choosing.random() < 0.6)
     for name, taken in (("measured", measured), ("fresh", fresh)):
@@ -157,7 +189,7 @@ def hide(
             taken.covariance if tells_noise else None,
         )
     sigma_m = float(np.sqrt(np.mean(np.trace(measured.noise, axis1=1, axis2=2))))
-    return HiddenCase(folder, seed, described, hold, style, truth, nuisances, measured, fresh, sigma_m)
+    return HiddenCase(folder, seed, described, hold, style, truth, nuisances, measured, fresh, sigma_m, ticks)
 
 
 def _visibility(nominal: World) -> Callable[[FloatArray], BoolArray]:
@@ -252,6 +284,7 @@ def _taken(
     pairs: int,
     fraction: float,
     rng: np.random.Generator,
+    encoders: Encoders,
     *,
     rendered: bool,
 ) -> Taken:
@@ -267,8 +300,7 @@ def _taken(
     else:
         found, x, told = _fixed(world, points, rng)
     kept, sight, outlier, x, told = kept[found], sight.of(np.flatnonzero(found)), outlier[found], x[found], told[found]
-    ticks = np.array([arm.quantum(name) for name in arm.read])
-    q = np.rint(sight.readings / ticks) * ticks
+    q = encoders.read(sight.readings)
     step = np.linalg.norm(np.diff(q, axis=0), axis=1)
     torn = (np.diff(motion.segment[kept]) > 0) | (step > SEGMENT_RAD[1])
     return Taken(
@@ -278,7 +310,7 @@ def _taken(
         x=x,
         x_noise_free=sight.x,
         covariance=told,
-        noise=noise(nominal, q, sight.pixels),
+        noise=noise(nominal, q, sight.pixels, encoders.scatter),
         outlier=outlier,
     )
 

@@ -17,7 +17,7 @@ HALF_THE_NOISE = 0.5
 GAIN_WANTED = 0.95
 SMOOTH_WANTED = 1.3
 SECONDS_WANTED, MEGABYTES_WANTED = 3.0, 1024.0
-NAMED_WANTED = {"one": 0.99, "outliers": 0.96, "two": 0.97, "three": 0.95, "five": 0.85, "few": 0.85}
+NAMED_WANTED = {"one": 0.99, "outliers": 0.96, "two": 0.97, "three": 0.95, "five": 0.85, "few": 0.85, "scattered": 0.97}
 Test = Callable[[Judgement], bool]
 
 
@@ -72,6 +72,7 @@ def goals(cases: Sequence[Judgement]) -> str:
 def _goals(scenario: str, cases: Sequence[Judgement]) -> list[tuple[str, str, str]]:
     rows = {
         "none": _of_nothing,
+        "scattered-none": _of_nothing,
         "outside": _of_strange,
     }.get(scenario, lambda c: _of_named(scenario, c))(cases)
     for what, seconds in (("clock", [c.seconds for c in cases]), ("processor", [c.cpu_seconds for c in cases])):

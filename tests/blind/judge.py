@@ -57,7 +57,7 @@ class Truth:
     @classmethod
     def of(cls, case: HiddenCase, robot: RobotDescription, motion: Motion) -> Truth:
         """From a case and the motion that was recorded."""
-        scene = Scene.of(robot, motion, case.measured.covariance)
+        scene = Scene.of(robot, motion, case.measured.covariance, case.scatter)
         usual_s = float(np.median(np.diff(motion.clock)[motion.segment[1:] == motion.segment[:-1]]))
         nuisances = tuple(m.effect for h in case.nuisances if (m := meant(h, robot, usual_s)) is not None)
         both = [(h, m) for h in case.truth if (m := meant(h, robot, usual_s)) is not None]

@@ -53,16 +53,25 @@ class Motion:
         return np.column_stack([np.interp(t, self.t, column) for column in values.T])
 
 
-def move(rng: np.random.Generator, style: Style, ranges: FloatArray, pairs: int, visible: Visible) -> Motion:
+def move(
+    rng: np.random.Generator,
+    style: Style,
+    ranges: FloatArray,
+    pairs: int,
+    visible: Visible,
+    *,
+    rests: bool = False,
+) -> Motion:
     """A motion with `pairs` pairs that are all visible.
 
     Args:
         ranges: lower and upper end of each joint's range [rad or m], shape (d, 2).
         visible: whether the cameras see the marker at shaft positions (n, d).
+        rests: of a walk, whether joints that do not lead stand still.
     """
     if style == "held":
         return _held(rng, ranges, pairs, visible)
-    return _Walk(rng, ranges, visible).motion(style, pairs)
+    return _Walk(rng, ranges, visible, rests).motion(style, pairs)
 
 
 def narrowed(
@@ -95,8 +104,8 @@ class _Postures:
 class _Walk:
     """Knots of a walk: the hand leads the arm from posture to posture, a few joints at a time."""
 
-    def __init__(self, rng: np.random.Generator, ranges: FloatArray, visible: Visible) -> None:
-        self._rng, self._ranges, self._visible = rng, ranges, visible
+    def __init__(self, rng: np.random.Generator, ranges: FloatArray, visible: Visible, rests: bool) -> None:
+        self._rng, self._ranges, self._visible, self._rests = rng, ranges, visible, rests
         self._postures = _Postures(rng, ranges, visible)
         self._q: list[FloatArray] = []
         self._segment: list[int] = []  # -1 where no pair is read
@@ -146,6 +155,8 @@ class _Walk:
         reach = np.cumsum(self._rng.uniform(STEP_RAD[0], STEP_RAD[1], int(distance / STEP_RAD[0]) + 2))
         s = np.append(reach[reach < distance - STEP_RAD[0]], distance) / distance
         bow = self._rng.normal(0.0, 0.12 * distance, len(here)) / np.sqrt(len(here))
+        if self._rests:
+            bow[target == here] = 0.0
         way = here + s[:, None] * (target - here) + np.sin(np.pi * s)[:, None] * bow
         return np.clip(way, self._ranges[:, 0], self._ranges[:, 1])
 

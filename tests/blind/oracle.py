@@ -42,7 +42,7 @@ class Scene:
 
     Attributes:
         whitening: of each position (n, 3, 3) [1/m].
-        rounding: covariance (n, 3, 3) [m²] that comes from readings in whole ticks.
+        rounding: covariance (n, 3, 3) [m²] that comes from readings in whole ticks, and what they scatter before.
     """
 
     simulation: Simulation
@@ -51,10 +51,14 @@ class Scene:
     rounding: FloatArray
 
     @classmethod
-    def of(cls, robot: RobotDescription, motion: Motion, covariance: FloatArray) -> Scene:
-        """A motion seen with noise of this covariance (n, 3, 3) [m²], and that of readings in whole ticks."""
+    def of(cls, robot: RobotDescription, motion: Motion, covariance: FloatArray, scatter: float) -> Scene:
+        """A motion seen with noise of this covariance (n, 3, 3) [m²], and that of readings.
+
+        Args:
+            scatter: 1-sigma of readings before they are rounded to whole ticks [ticks].
+        """
         simulation = Simulation(robot)
-        moved = simulation.run(motion).by_joint * (_ticks(motion.q) / np.sqrt(12.0))
+        moved = simulation.run(motion).by_joint * (_ticks(motion.q) * np.sqrt(1.0 / 12.0 + scatter**2))
         rounding = moved @ np.swapaxes(moved, 1, 2)
         return cls(simulation, motion, np.linalg.inv(np.linalg.cholesky(covariance + rounding)), rounding)
 

@@ -29,6 +29,7 @@ from .sizing import NoEffect
 GROSS = (3.0, 15.0)
 FALSE_FIXES = 0.1
 FEW = 200
+SCATTERED = (0.2, 1.5)
 Record = Judgement | Crash
 
 
@@ -41,12 +42,14 @@ class Scenario:
         pairs: of the recording.
         outliers: share of false fixes.
         gross: whether effects are all of gross size.
+        scatter: between what the encoders scatter before they round, 1-sigma [ticks]; None for nothing.
     """
 
     effects: int | str
     pairs: int = 1600
     outliers: float = 0.0
     gross: bool = False
+    scatter: tuple[float, float] | None = None
 
     def size(self, seed: int) -> float | str:
         """Of the effects, in units of the noise."""
@@ -64,6 +67,8 @@ SCENARIOS = {
     "outside": Scenario("outside"),
     "outliers": Scenario(1, outliers=FALSE_FIXES),
     "few": Scenario(1, pairs=FEW, gross=True),
+    "scattered": Scenario(1, scatter=SCATTERED),
+    "scattered-none": Scenario(0, scatter=SCATTERED),
 }
 
 
@@ -127,6 +132,7 @@ def run(case: Case) -> Record | None:
                 pairs=case.pairs or scenario.pairs,
                 size=scenario.size(seed),
                 outliers=scenario.outliers,
+                scatter=scenario.scatter,
             )
         except NoEffect:
             return None

@@ -22,13 +22,13 @@ class NoEffect(ValueError):
 
 
 class Sizer:
-    """Effects of a size, on one motion of one arm."""
+    """Effects of a size, on one motion of one arm whose encoders scatter by `scatter` ticks."""
 
-    def __init__(self, bullet: Bullet, nominal: World, motion: Motion) -> None:
+    def __init__(self, bullet: Bullet, nominal: World, motion: Motion, scatter: float) -> None:
         self._bullet, self._nominal = bullet, nominal
         self._motion = motion.thinned(PAIRS_LOOKED_AT)
         plain = nominal.measure(self._motion)
-        self._noise = noise(nominal, plain.readings, plain.pixels)
+        self._noise = noise(nominal, plain.readings, plain.pixels, scatter)
 
     def scaled(self, hidden: Hidden, kind: Kind, size: float) -> Hidden:
         """The effect with parameters scaled so that the whitened RMS of its residual is about `size`.

@@ -160,15 +160,20 @@ def residuals(nominal: World, sight: Sight) -> FloatArray:
     return sight.x - nominal.marker(sight.readings, np.zeros(len(sight.readings)))
 
 
-def noise(nominal: World, q: FloatArray, pixels: FloatArray) -> FloatArray:
-    """Covariance [m²] of residuals at readings (n, d), pixels (n, 4) and ticks adding to it, shape (n, 3, 3)."""
+def noise(nominal: World, q: FloatArray, pixels: FloatArray, scatter: float) -> FloatArray:
+    """Covariance [m²] of residuals at readings (n, d), pixels (n, 4) and encoders adding to it, shape (n, 3, 3).
+
+    Args:
+        scatter: 1-sigma of what encoders scatter before they round [ticks].
+    """
     arm, t = nominal.arm, np.zeros(len(q))
     total, here = covariance(arm.eyes, pixels), nominal.marker(q, t)
     for index, name in enumerate(arm.read):
         tick, beside = arm.quantum(name), q.copy()
         beside[:, index] += tick
         step = nominal.marker(beside, t) - here
-        total = total + step[:, :, None] * step[:, None, :] / 12.0  # a rounding error is even over one tick
+        # A rounding error is even over one tick.
+        total = total + step[:, :, None] * step[:, None, :] * (1.0 / 12.0 + scatter**2)
     return total
 
 
