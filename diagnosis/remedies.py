@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from effects import KINDS, corrected_file
-from effects.simulation import transforms
+from effects.poses import transforms
 from interfaces.records import FloatArray
 from interfaces.robot import RobotDescription
 from interfaces.rpy import rpy_of

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from effects import Effect
-from effects.simulation import settled
+from effects.moments import settled
 from interfaces.records import FloatArray
 
 from .fit import LARGEST, SHORTEST_DRIFT, Fit

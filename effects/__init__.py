@@ -11,7 +11,8 @@ from .kinds import KINDS, Kind
 from .live import LiveEncoders
 from .motion import Motion
 from .parameter import Parameter
-from .simulation import Residual, Simulated, Simulation
+from .simulated import Simulated
+from .simulation import Residual, Simulation
 from .smooth_map import place_map, smooth_map
 from .unexplained import StoredModel, Unexplained
 

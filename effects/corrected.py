@@ -16,7 +16,8 @@ from interfaces.records import FloatArray
 from interfaces.robot import RobotDescription
 
 from .effect import Effect
-from .simulation import RIGID, Simulation, transforms
+from .poses import transforms
+from .simulation import RIGID, Simulation
 
 
 def corrected_file(robot: RobotDescription) -> str:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from effects import Effect, Motion
-from effects.simulation import after
+from effects.moments import after
 from interfaces.records import FloatArray
 
 from .panels import Panel
