@@ -15,7 +15,7 @@ from interfaces.records import FloatArray
 from .observations import Observations
 
 # An effect is not expected to be larger than so many times its usual size; what cannot be told stays near nothing.
-LARGEST = 30.0
+LARGEST = 10.0
 # Steps until the likelihood rises by less than this [nats].
 _ROUNDS, _ENOUGH = 12, 0.02
 # A fit is given up where so many times what a step promises, and so much more [nats], would not do.
