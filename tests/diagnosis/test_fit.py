@@ -202,3 +202,13 @@ def test_a_fit_that_cannot_become_so_probable_is_given_up(robot) -> None:
     best = improved(other).log_likelihood
     assert improved(other, best + 1000.0) is other
     assert improved(other, best).log_likelihood == best
+
+
+def test_of_what_the_data_do_not_tell_twenty_times_the_usual_size_is_clearly_less_probable_than_none(robot) -> None:
+    start = start_of(robot, walk(robot, 1), (), 1)
+    # Guided torque-free: no weight bends a joint.
+    none = Effect.at(robot, "joint_compliance", ELBOW)
+    large = none.with_values(np.array([20.0 * parameter.usual for parameter in none.parameters]))
+    one, other = (start.starting([effect]) for effect in (none, large))
+    np.testing.assert_array_equal(one.run.measured, other.run.measured)
+    assert one.log_likelihood - other.log_likelihood > 1.5
