@@ -84,4 +84,5 @@ def cameras(
                 tell_at = time.monotonic() + TELL_EVERY_S
                 for line in (watching.said, *watched.eyes.health):
                     console.print(line, markup=False)
-    console.print(watching.said, markup=False)
+    for line in (watching.said, *watched.eyes.health):
+        console.print(line, markup=False)
