@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 
 from interfaces.errors import ConfigError
-from interfaces.records import ImageArray
+from interfaces.records import ImageArray, Reason
 from vision.calibration.images import read_pairs
 from vision.cluster.measure import ClusterView, MeasuredCluster, measure_cluster
 from vision.cluster.tables import cluster_tables
@@ -21,7 +21,7 @@ from vision.rig import CalibrationError
 from vision.rig_file import read_rig
 from vision.tag_config import Dictionary, TagConfig
 from vision.tag_dictionary import tags_of
-from vision.tag_finder import TagFinder
+from vision.tag_finder import Seen, TagFinder
 from vision.tag_image import TagImage
 
 from .camera_calibration import Images
@@ -76,10 +76,15 @@ def measured(images: Images, calibration: Path, wanted: Wanted, tell: Callable[[
     finder = TagFinder(config, wanted.ids or range(len(tags_of(wanted.dictionary).bytesList)))
     tell(f"looking for tags in {len(files)} pairs of images")
     views: list[ClusterView] = []
+    twice: dict[int, list[str]] = {}
     for pair in read_pairs(files, side_by_side=images.side_by_side):
         rig.require(pair.size_px, rig.serials)
-        eyes = [_tags(finder, image, maps[eye]) for eye, image in enumerate((pair.left, pair.right))]
-        views.append(ClusterView(pair.name, *eyes))
+        seen = [_seen(finder, image, maps[eye]) for eye, image in enumerate((pair.left, pair.right))]
+        for id in sorted({id for tags in seen for id, tag in tags.items() if tag is Reason.AMBIGUOUS}):
+            twice.setdefault(id, []).append(pair.name)
+        left, right = ({id: tag for id, tag in tags.items() if isinstance(tag, TagImage)} for tags in seen)
+        views.append(ClusterView(pair.name, left, right))
+    _require_tags(views, twice, wanted)
     found = measure_cluster(views, rectification.calibration, wanted.side_m, wanted.other_sides_m)
     if abs(found.grown) > _MOST_GROWN + _SIGMAS * found.grown_sigma:
         raise CalibrationError(
@@ -100,10 +105,28 @@ def sides_of(text: str) -> dict[int, float]:
     return found
 
 
-def _tags(finder: TagFinder, image: ImageArray, maps: tuple[ImageArray, ImageArray]) -> dict[int, TagImage]:
+def _seen(finder: TagFinder, image: ImageArray, maps: tuple[ImageArray, ImageArray]) -> Seen:
     rectified = cv2.remap(image, *maps, cv2.INTER_LINEAR)
-    seen = finder.find(np.asarray(cv2.cvtColor(rectified, cv2.COLOR_BGR2GRAY), dtype=np.uint8))
-    return {id: tag for id, tag in seen.items() if isinstance(tag, TagImage)}
+    return finder.find(np.asarray(cv2.cvtColor(rectified, cv2.COLOR_BGR2GRAY), dtype=np.uint8))
+
+
+def _require_tags(views: Sequence[ClusterView], twice: Mapping[int, Sequence[str]], wanted: Wanted) -> None:
+    """CalibrationError where a number is seen twice in one image, more than once, or wanted ones are in none."""
+    for id, names in twice.items():
+        if len(names) > 1:
+            raise CalibrationError(
+                f"tag {id} is there twice in one image ({', '.join(names)}): each number may be there once. Print "
+                "another number, or cover one of them"
+            )
+    seen = set[int]().union(*(view.ids for view in views))
+    missing = [id for id in wanted.ids or () if id not in seen]
+    if not seen or missing:
+        which = "no tag" if not seen else f"not tag {', '.join(map(str, missing))}"
+        there = f"; there are {', '.join(map(str, sorted(seen)))}" if seen else ""
+        raise CalibrationError(
+            f"{which} of {wanted.dictionary} is in the {len(views)} pairs of images{there}. Are --family and --ids "
+            "right, and are the tags sharp, with sides of 20 pixels and more, and a white margin?"
+        )
 
 
 def tables(found: MeasuredCluster, wanted: Wanted) -> str:
@@ -147,7 +170,8 @@ def _scaled(values: object, by: float) -> tuple[float, float, float]:
 def said(found: MeasuredCluster) -> str:
     """The fit in a sentence or two."""
     text = (
-        f"{len(found.tags)} tags in {found.views} pairs of images; what is left is {found.misfit:.2f} times what the "
+        f"{len(found.tags)} tags in {found.views} pairs of images that show two or more to both eyes; what "
+        f"is left is {found.misfit:.2f} times what the "
         f"corners claim. Squares seem {100.0 * found.grown:+.2f} ± {100.0 * found.grown_sigma:.2f} % larger than told."
     )
     if found.left_out:

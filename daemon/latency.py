@@ -9,10 +9,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import BSpline
 from scipy.optimize import minimize_scalar
 
 from interfaces.errors import BodyschemaError
@@ -27,7 +29,12 @@ RIVAL = 1.15  # a second minimum whose residual is less than this many times the
 APART_S = 0.03  # from the first
 SMALL = 1e-3  # of the largest motion: a direction in which nothing moved
 RIDGE = 1e-6
+FINER = 8
 LARGEST_SIGMA_S = 0.0025
+SHORTEST_S = 3.0
+LEAST_TURN_RAD, LEAST_SLIDE_M = np.radians(1.0), 0.005  # of the joint that moves most
+FOLLOWS = 4.0  # RMS motion of the marker, over what of it does not go with the joints
+LITTLE_M = 0.01
 
 
 class LatencyError(BodyschemaError):
@@ -57,8 +64,32 @@ class Wiggle:
         return replace(self, t_marker=self.t_marker + by_s)
 
     def angles(self, t: FloatArray) -> FloatArray:
-        """Joint angles at times (m,), interpolated, shape (m, d)."""
-        return np.stack([np.interp(t, self.t_joints, column) for column in self.q.T], axis=1)
+        """Joint angles at times (m,), shape (m, d).
+
+        By a cubic B-spline that has the readings for coefficients, not through them. Between two readings a straight
+        line has half the noise that it has at one: of all latencies those would fit best that bring the images between
+        readings. The spline's noise is nearly the same everywhere, and as it weighs before and after alike, it is not
+        late.
+        """
+        return self._spline(np.interp(t, *self._places))
+
+    @cached_property
+    def _spline(self) -> BSpline:
+        """Of the angles, over the readings' numbers."""
+        return _smooth(self.q)
+
+    @cached_property
+    def _places(self) -> tuple[FloatArray, FloatArray]:
+        """Times [s], and the readings' numbers at these."""
+        numbers = np.linspace(0.0, len(self.q) - 1.0, FINER * (len(self.q) - 1) + 1)
+        return np.asarray(_smooth(self.t_joints)(numbers), dtype=np.float64), numbers
+
+
+def _smooth(values: FloatArray) -> BSpline:
+    """The uniform cubic B-spline with these coefficients; the first and the last one count on beyond the ends."""
+    edge = np.repeat(values[[0, -1]], 2, axis=0)
+    padded = np.concatenate([edge[:2], values, edge[2:]])
+    return BSpline(np.arange(len(padded) + 4) - 4.0, padded, 3)
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,15 +119,14 @@ def latency_of(wiggle: Wiggle, chain: RigidChain) -> Latency:
     Raises:
         LatencyError: too few fixes, too little motion, or motion that repeats itself.
     """
+    _require_motion(wiggle, chain)
     fit = _Fit.of(wiggle, chain)
     grid = np.arange(EARLIEST_S, LATEST_S + STEP_S, STEP_S)
     cost = np.array([fit.cost(lag) for lag in grid])
     best = int(np.argmin(cost))
+    _require_following(fit, cost[best])
     if best in (0, len(grid) - 1):
-        raise LatencyError(
-            f"no latency between {1e3 * EARLIEST_S:.0f} and {1e3 * LATEST_S:.0f} ms fits. Were encoders and camera "
-            "looking at the same motion?"
-        )
+        raise LatencyError(_strange(fit, cost[best]))
     _require_one(grid, cost, best)
     residual_m = math.sqrt(fit.cost(grid[best]) / len(fit.x))
     fit = fit.whitened(grid[best])
@@ -104,8 +134,8 @@ def latency_of(wiggle: Wiggle, chain: RigidChain) -> Latency:
     sigma_s = _sigma(fit, lag)
     if sigma_s > LARGEST_SIGMA_S:
         raise LatencyError(
-            f"the latency is known to {1e3 * sigma_s:.1f} ms only. Move the arm faster, to and fro, "
-            "the marker in sight of both eyes"
+            f"the latency is known to {1e3 * sigma_s:.1f} ms only. Move the arm faster, to and fro, or longer "
+            "(--seconds), the marker in sight of both eyes"
         )
     speed = float(np.sqrt(np.mean(np.sum(np.gradient(wiggle.x, wiggle.t_marker, axis=0) ** 2, axis=1))))
     return Latency(lag, sigma_s, len(fit.x), residual_m, speed)
@@ -124,23 +154,21 @@ class _Fit:
 
     @classmethod
     def of(cls, wiggle: Wiggle, chain: RigidChain) -> _Fit:
-        if len(wiggle.t_joints) < 2:
-            raise LatencyError("there are no encoder readings")
         t = wiggle.t_marker
         inside = (t - LATEST_S - STEP_S >= wiggle.t_joints[0]) & (t - EARLIEST_S + STEP_S <= wiggle.t_joints[-1])
         if inside.sum() < FEWEST_FIXES:
-            raise LatencyError(
-                f"the marker was seen {int(inside.sum())} times, {FEWEST_FIXES} are needed: keep it in sight of both "
-                "eyes for all 5 s"
-            )
+            raise LatencyError(_too_few(wiggle, int(inside.sum())))
         centre = wiggle.q.mean(axis=0)
         _, size, directions = np.linalg.svd(wiggle.q - centre, full_matrices=False)
         size = size / math.sqrt(len(wiggle.q))
-        if not size[0] > 0:
-            raise LatencyError("the joints did not move")
         moving = size > SMALL * size[0]
         axes = directions[moving].T / size[moving]
         return cls(wiggle, chain, t[inside], wiggle.x[inside], centre, axes)
+
+    @property
+    def motion_m(self) -> float:
+        """RMS distance of the positions from their middle."""
+        return math.sqrt(float(np.mean(np.sum((self.x - self.x.mean(axis=0)) ** 2, axis=1))))
 
     def terms(self, lag: float) -> FloatArray:
         """The nominal position, and a polynomial of second degree in the angles, at all fixes: (m, p)."""
@@ -169,6 +197,61 @@ class _Fit:
     def cost(self, lag: float, keep: NDArray[np.bool_] | slice = slice(None)) -> float:
         """Sum of squares of the residual [m²], or in units of the noise."""
         return float(np.sum(self.residual(lag, keep) ** 2))
+
+
+def _require_motion(wiggle: Wiggle, chain: RigidChain) -> None:
+    """LatencyError when there are hardly any readings, or the joints hardly moved in them."""
+    if len(wiggle.t_joints) < 2:
+        raise LatencyError("there are no encoder readings")
+    span = np.ptp(wiggle.q, axis=0)
+    if not (span > np.where(chain.prismatic, LEAST_SLIDE_M, LEAST_TURN_RAD)).any():
+        turned = np.degrees(span[~chain.prismatic])
+        most = f"{turned.max():.1f}° at most" if len(turned) else f"{1e3 * span.max():.1f} mm at most"
+        raise LatencyError(
+            f"the joints hardly moved: {most}. Move the arm while the time runs; `bodyschema joints` shows whether "
+            "the encoders follow"
+        )
+
+
+def _require_following(fit: _Fit, cost: float) -> None:
+    """LatencyError when the marker hardly moves with the joints."""
+    residual_m = math.sqrt(cost / len(fit.x))
+    moved_m = fit.motion_m
+    if moved_m > FOLLOWS * residual_m:
+        return
+    if moved_m < LITTLE_M:
+        raise LatencyError(
+            f"the marker moved by {1e3 * moved_m:.1f} mm only (RMS), hardly more than its noise. Move joints that "
+            "bring it far: not one that turns it on the spot"
+        )
+    raise LatencyError(_strange(fit, cost))
+
+
+def _strange(fit: _Fit, cost: float) -> str:
+    """What to say of a marker that moves otherwise than the joints."""
+    moved_m, residual_m = fit.motion_m, math.sqrt(cost / len(fit.x))
+    return (
+        f"the marker does not follow the joints: of {1e3 * moved_m:.0f} mm of motion (RMS) {1e3 * residual_m:.0f} mm "
+        f"do not go with them at any latency from {1e3 * EARLIEST_S:.0f} to {1e3 * LATEST_S:.0f} ms. Is it the marker "
+        "that is found (`bodyschema watch cameras`), are the joints in the order of robot.toml (`bodyschema joints`), "
+        "and do the cameras stand still?"
+    )
+
+
+def _too_few(wiggle: Wiggle, fixes: int) -> str:
+    """Why there are so few fixes whose angles are known at every latency: short, slow or out of sight."""
+    t, usable = wiggle.t_marker, f"the marker was seen {fixes} times, {FEWEST_FIXES} are needed"
+    span_s = min(t[-1], wiggle.t_joints[-1]) - max(t[0], wiggle.t_joints[0])
+    if span_s < SHORTEST_S:
+        return f"{usable}: encoders and cameras looked on together for {max(span_s, 0.0):.1f} s only. Move for 5 s"
+    rate_hz = 1.0 / max(float(np.quantile(np.diff(t), 0.1)), 1e-3)
+    if rate_hz * (span_s - LATEST_S + EARLIEST_S) < 1.2 * FEWEST_FIXES:
+        seconds = math.ceil(1.2 * FEWEST_FIXES / rate_hz + LATEST_S - EARLIEST_S)
+        return (
+            f"{usable}: the cameras give {rate_hz:.1f} images a second. Give --seconds {seconds}, or make them faster: "
+            "a shorter exposure, or buffers = 2 (docs/cameras.md)"
+        )
+    return f"{usable}: keep it in sight of both eyes all the time; `bodyschema watch cameras` shows why it is not found"
 
 
 def _minimum(fit: _Fit, near_s: float, keep: NDArray[np.bool_] | slice = slice(None)) -> float:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Protocol, Self
 
@@ -13,7 +13,7 @@ import cv2
 from interfaces.clock import SystemClock
 from interfaces.errors import ConfigError, SourceEnded
 from interfaces.protocols import Clock, Source
-from interfaces.records import ImageArray, Reason
+from interfaces.records import ImageArray
 
 QUALITY = 85
 
@@ -22,11 +22,7 @@ class Pictures(Source, Protocol):
     """Pictures of cameras; see `vision.cameras.watched.WatchedCamera`."""
 
     @property
-    def frames(self) -> int: ...
-    @property
-    def fixes(self) -> int: ...
-    @property
-    def reasons(self) -> Mapping[Reason, int]: ...
+    def said(self) -> str: ...
     def read(self, timeout_s: float) -> ImageArray | None: ...
 
 
@@ -92,11 +88,7 @@ class Watching:
     @property
     def said(self) -> str:
         """In how many frames the marker was found, and why not in the others."""
-        pictures = self._pictures
-        text = f"{pictures.frames} frames"
-        if pictures.fixes or pictures.reasons:
-            text += f", the marker in {pictures.fixes}"
-        return text + "".join(f"; {reason}: {count}" for reason, count in sorted(pictures.reasons.items()))
+        return self._pictures.said
 
 
 def _write(file: Path, data: bytes) -> None:

@@ -4,36 +4,66 @@ from __future__ import annotations
 
 import csv
 import threading
+from collections import Counter
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from interfaces.clock import SystemClock
 from interfaces.errors import RecordingError, SourceEnded
-from interfaces.records import JointReading, MarkerFix
+from interfaces.records import JointReading, MarkerFix, MarkerMiss
 
 from .latency import LATEST_S, LatencyError, Wiggle
 from .sources import Sources
 
 READ_S = 0.2
-LIMIT_S = 30.0  # beyond the asked time, for sources that are slow or silent
+LIMIT_S = 30.0  # without a fix
 POSITION = ("x", "y", "z")
 
 
-def collected(sources: Sources, duration_s: float, tell: Callable[[float], None]) -> Wiggle:
+@dataclass(frozen=True, slots=True)
+class Collected:
+    """What the sources said.
+
+    Attributes:
+        missed: images without a fix, by why.
+        health: what is wrong with the cameras, and what to do.
+    """
+
+    wiggle: Wiggle
+    missed: Counter[str]
+    health: tuple[str, ...] = ()
+
+    @property
+    def said(self) -> str:
+        """What became of the images, where one in five gave no fix; else empty."""
+        fixes, missed = len(self.wiggle.t_marker), self.missed.total()
+        if missed < 0.2 * (fixes + missed):
+            return ""
+        return f"the marker was found in {fixes} of {fixes + missed} images: {_reasons(self.missed)}"
+
+
+def _reasons(missed: Counter[str]) -> str:
+    return ", ".join(f"{count} {reason.replace('_', ' ')}" for reason, count in missed.most_common())
+
+
+def collected(sources: Sources, duration_s: float, tell: Callable[[float], None]) -> Collected:
     """What the sources say during so long [s], on their own clock, and a little more, for the largest latency.
 
     Args:
         tell: called with the time [s] since the first fix.
 
     Raises:
-        LatencyError: they say nothing.
+        LatencyError: they say nothing, or the marker is not found.
         SourceError: they cannot be opened, or are lost.
     """
     readings: list[JointReading] = []
     fixes: list[MarkerFix] = []
     failures: list[Exception] = []
+    missed: Counter[str] = Counter()
+    health: tuple[str, ...] = ()
     ending = threading.Event()
 
     def read_joints() -> None:
@@ -52,13 +82,16 @@ def collected(sources: Sources, duration_s: float, tell: Callable[[float], None]
         thread = threading.Thread(target=read_joints, name="encoders")
         thread.start()
         try:
-            until = clock.now() + last + LIMIT_S
+            until = clock.now() + LIMIT_S
             while clock.now() < until and not failures:
                 try:
                     seen = sources.marker.read(READ_S)
                 except SourceEnded:
                     break
-                if isinstance(seen, MarkerFix):
+                if isinstance(seen, MarkerMiss):
+                    missed[seen.reason] += 1
+                elif seen is not None:
+                    until = clock.now() + LIMIT_S
                     fixes.append(seen)
                     tell(seen.t - fixes[0].t)
                     if seen.t - fixes[0].t >= last:
@@ -66,9 +99,16 @@ def collected(sources: Sources, duration_s: float, tell: Callable[[float], None]
         finally:
             ending.set()
             thread.join()
+        if sources.cameras is not None:
+            health = tuple(sources.cameras.health)
     if failures:
         raise failures[0]
-    return wiggle_of(readings, fixes)
+    if missed and not fixes:
+        raise LatencyError(
+            f"the marker was found in none of {missed.total()} images: {_reasons(missed)}. "
+            "`bodyschema watch cameras` shows what they see"
+        )
+    return Collected(wiggle_of(readings, fixes), missed, health)
 
 
 def wiggle_of(readings: Sequence[JointReading], fixes: Sequence[MarkerFix]) -> Wiggle:

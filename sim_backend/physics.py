@@ -61,9 +61,7 @@ class Physics:
             roles = JointRoles.of(robot)
             self._gazing = list(roles.gaze)
             self._gaze = Gaze(robot, self._calibration, roles.gaze, config.guide.gaze_speed_rad_s)
-            self.sight = Sight(
-                self._truth, self._calibration, roles, self._gaze, watched, config.camera.marker_radius_m
-            )
+            self.sight = Sight(self._truth, self._calibration, roles, self._gaze, watched, config.camera)
             self._path = GuidePath(
                 self.sight,
                 robot.lower,

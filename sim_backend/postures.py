@@ -43,7 +43,7 @@ def visible_postures(
     found: list[FloatArray] = []
     with Body(physics_urdf(truth), robot.joints) as body:
         looking = Gaze(robot, calibration, roles.gaze, config.guide.gaze_speed_rad_s)
-        sight = Sight(truth, calibration, roles, looking, body, config.camera.marker_radius_m)
+        sight = Sight(truth, calibration, roles, looking, body, config.camera)
         for _ in range(_MOST_BATCHES):
             q = np.tile((robot.lower + robot.upper) / 2, (_BATCH, 1))
             q[:, guided] = rng.uniform(robot.lower[guided], robot.upper[guided], (_BATCH, len(guided)))

@@ -1,21 +1,25 @@
-"""Whether both cameras really see the ball at a posture, and whether the arm is clear of the body there."""
+"""Whether both cameras really see the marker at a posture, and whether the arm is clear of the body there."""
 
 from __future__ import annotations
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from interfaces.camera import StereoCalibration
 from interfaces.records import FloatArray
 
 from .bullet import Body
+from .config import CameraConfig
 from .gaze import Gaze
 from .roles import JointRoles
 from .truth import TrueRobot
 
-# The ball stays this far inside the images [px], and between these distances from the eyes [m].
+# The marker stays this far inside the images [px], and between these distances from the eyes [m].
 _MARGIN_PX = 12.0
 _NEAREST_M = 0.25
 _FARTHEST_M = 2.0
+# A tag is shown to the eyes by up to this angle from its normal, so that it can be measured.
+_MOST_OBLIQUE = np.radians(50.0)
 # Rays begin this far from the eye [m], outside of the head's own shape, and go to the ball's middle and rim.
 _RAY_START_M = 0.06
 _RIM = 0.8
@@ -35,11 +39,14 @@ class Sight:
         roles: JointRoles,
         gaze: Gaze,
         body: Body,
-        marker_radius_m: float,
+        camera: CameraConfig,
     ) -> None:
         self._truth, self._calibration, self._roles, self._gaze = truth, calibration, roles, gaze
         self._body = body
-        self._radius = marker_radius_m
+        self._radius = camera.marker_radius_m
+        # Where the tags face, in the chain's last frame, shape (tags, 3); a ball has none.
+        turns = [truth.tool_turn @ Rotation.from_euler("xyz", tag.rpy).as_matrix() for tag in camera.tags]
+        self._facing = np.array([turn[:, 2] for turn in turns]).reshape(-1, 3)
         self._near_pairs = self._clearance_pairs()
         self._chain = truth.chain(np.array(truth.robot.robot.marker_xyz))
 
@@ -52,14 +59,27 @@ class Sight:
         return self._gaze.solve(q)
 
     def in_images(self, q: FloatArray) -> np.ndarray:
-        """Which of the postures (n, d) have the whole ball inside both images, at a sensible distance."""
-        x = self._chain.positions(q)
+        """Which of the postures (n, d) have the whole marker inside both images, at a sensible distance.
+
+        Of tags one has to face the eyes, as a person shows it to them.
+        """
+        T = self._chain.poses(q)
+        x = T[:, :3, 3]
         deep = np.maximum(x[:, 2], 1e-3)
         pixels = self._calibration.project(np.column_stack([x[:, :2], deep]))
         border = _MARGIN_PX + self._calibration.focal_px * self._radius / deep
         size = np.tile(self._calibration.image_size_px, 2)
         inside = ((pixels > border[:, None]) & (pixels < size - 1 - border[:, None])).all(axis=1)
-        return inside & (x[:, 2] > _NEAREST_M) & (x[:, 2] < _FARTHEST_M)
+        return inside & (x[:, 2] > _NEAREST_M) & (x[:, 2] < _FARTHEST_M) & self._faced(T)
+
+    def _faced(self, T: FloatArray) -> np.ndarray:
+        """At which poses (n, 4, 4) of the marker one of its tags faces the middle between the eyes."""
+        if not len(self._facing):
+            return np.ones(len(T), dtype=bool)
+        away = T[:, :3, 3] - [0.5 * self._calibration.baseline_m, 0.0, 0.0]
+        to_eyes = -away / np.linalg.norm(away, axis=1, keepdims=True)
+        cosines = np.einsum("nij,kj,ni->nk", T[:, :3, :3], self._facing, to_eyes)
+        return cosines.max(axis=1) > np.cos(_MOST_OBLIQUE)
 
     def clear(self, q: FloatArray) -> bool:
         """Whether nothing stands between the eyes and the ball at one posture (d,), and the arm touches no body."""

@@ -7,7 +7,7 @@ from collections.abc import Collection
 import cv2
 import numpy as np
 
-from interfaces.records import ImageArray, Reason
+from interfaces.records import FloatArray, ImageArray, Reason
 
 from .tag_config import TagConfig
 from .tag_dictionary import tags_of
@@ -34,18 +34,18 @@ class TagFinder:
 
     def find(self, grey: ImageArray, region: Region | None = None) -> Seen:
         """The tags in a region (left, top, right, bottom) of one eye's grey image, or why they are none."""
+        tags: Seen = {}
+        for id, rough in self.squares(grey, region):
+            if id in self._ids:
+                tags[id] = Reason.AMBIGUOUS if id in tags else measure_tag(grey, id, rough, self._config)
+        return tags
+
+    def squares(self, grey: ImageArray, region: Region | None = None) -> list[tuple[int, FloatArray]]:
+        """Numbers and rough corners (4, 2) [px] of all tags of the dictionary in a region."""
         x0, y0, x1, y1 = region or (0, 0, grey.shape[1], grey.shape[0])
         corners, ids, _ = self._detector.detectMarkers(np.ascontiguousarray(grey[y0:y1, x0:x1]))
-        tags: Seen = {}
-        for quad, id in zip(corners, _numbers(ids), strict=True):
-            if id not in self._ids:
-                continue
-            if id in tags:
-                tags[id] = Reason.AMBIGUOUS
-                continue
-            rough = np.asarray(quad, dtype=np.float64).reshape(4, 2) + np.array([x0, y0])
-            tags[id] = measure_tag(grey, id, rough, self._config)
-        return tags
+        rough = [np.asarray(quad, dtype=np.float64).reshape(4, 2) + np.array([x0, y0]) for quad in corners]
+        return list(zip(_numbers(ids), rough, strict=True))
 
 
 def _numbers(ids: object) -> list[int]:

@@ -39,8 +39,8 @@ def demo(
     A humanoid's arm is guided by a virtual hand, its head cameras see a red ball on the tool. The sampler and the
     learner run as the two real processes; half-way the tool becomes 250 mm longer.
 
-    With --marker cluster the ball is a cube of AprilTags, and how it is turned is learnt too. One tag alone is seen
-    only while it faces the cameras, so that its pairs take longer to come.
+    With --marker cluster the ball is a cube of AprilTags, and how it is turned is learnt too. With --marker
+    tag it is one tag alone, seen only while it faces the cameras: the hand turns it to them.
 
     With --bus the joints are read as on a real arm, by the driver: from Dynamixel or Feetech servos or a board of
     encoders (serial) on a serial port, or from a ROS 2 robot behind a zenoh router. All of these are a bench at the

@@ -28,6 +28,7 @@ def latency(
     seconds: Annotated[
         float, Parameter(help="How long the arm is moved [s].", validator=Number(gte=3, lte=120))
     ] = SECONDS,
+    sim: Annotated[bool, flag("The simulated robot in the place of the hardware: to see it done.")] = False,
     save: Annotated[Path | None, Parameter(help="Keep readings and positions in this CSV file.")] = None,
     as_json: Annotated[bool, flag("Print the figures as JSON.", name="--json")] = False,
 ) -> None:
@@ -37,7 +38,7 @@ def latency(
     is looked for at which the marker follows the joint angles best. No calibrated model is needed: how the real arm
     differs from the drawn one is fitted along.
 
-    Needs: robot.toml with encoders and cameras, and no sampler that runs; or a recording.
+    Needs: robot.toml with encoders and cameras, and no sampler that runs; or a recording; or --sim.
 
     Next: put the two lines that are printed into [vision.cameras].
     """
@@ -50,7 +51,7 @@ def latency(
 
     config = Config.load(robot)
     console = Console(highlight=False, soft_wrap=True)
-    wiggle = _wiggle(config, recording, seconds)
+    wiggle = _wiggle(config, recording, seconds, sim=sim)
     if save is not None:
         write_wiggle(wiggle, config.robot.joints, save)
     found = latency_of(wiggle, config.robot.chain)
@@ -67,17 +68,23 @@ def latency(
     console.print(f"latency_sigma_s = {found.sigma_s:.4f}", markup=False)
 
 
-def _wiggle(config: Config, recording: Path | None, seconds: float) -> Wiggle:
+def _wiggle(config: Config, recording: Path | None, seconds: float, *, sim: bool) -> Wiggle:
     from rich.console import Console
 
     from daemon.wiggling import collected, read_wiggle
     from daemon.wiring import open_sources
+    from interfaces.errors import BodyschemaError
 
+    if recording is not None and sim:
+        raise BodyschemaError("give a recording or --sim, not both")
     if recording is not None:
         return read_wiggle(recording, config.robot.joints)
     console = Console(stderr=True, highlight=False)
-    cameras = config.tables.vision.cameras
+    cameras = None if sim else config.tables.vision.cameras
     known_s = 0.0 if cameras is None else cameras.latency_s
-    with open_sources(config, sim=False) as sources, console.status("move the arm to and fro, unevenly") as status:
+    with open_sources(config, sim=sim) as sources, console.status("move the arm to and fro, unevenly") as status:
         seen = collected(sources, seconds, lambda t: status.update(f"go on moving: {max(seconds - t, 0):.0f} s"))
-    return seen.with_stamps_later(known_s)  # as the camera gave them, before robot.toml's latency was taken off
+    for text in (*seen.health, seen.said):
+        if text:
+            console.print(text, markup=False, soft_wrap=True)
+    return seen.wiggle.with_stamps_later(known_s)  # as the camera gave them, before robot.toml's latency was taken off

@@ -80,7 +80,7 @@ def print_tags(
     tags = drawn if ruler_mm is None else as_printed(drawn, across, ruler_mm)
     said = f"{out} written. Print it at 100 %, then measure: the line below is {across:g} mm, the other {upright:g} mm."
     if drawn.body is not None:
-        said += f" Each face is {face_mm(tags):g} mm wide."
+        said += f" Each face is {face_mm(tags):.1f} mm wide."
     Console(stderr=True, highlight=False).print(said, markup=False, soft_wrap=True)
     sys.stdout.write(tables(tags))
 

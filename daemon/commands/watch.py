@@ -48,8 +48,8 @@ def cameras(
     """Both eyes' images with what was found in them: in a browser on this machine, or as files.
 
     Yellow: a disc of the marker's colour. Green: the marker, with the other eye's row through it in yellow, and how far
-    the rows differ as a red bar, ten times as long. Red: what was refused, and why. While nothing says how the cameras
-    see, the images as they come.
+    the rows differ as a red bar, ten times as long. Red: what was refused, and why. Tags have their numbers, the marker
+    made of them its axes x, y, z in red, green, blue. While nothing says how the cameras see, the images as they come.
 
     Needs: robot.toml with cameras, and no sampler that runs: a camera can be opened once.
 
@@ -84,4 +84,5 @@ def cameras(
                 tell_at = time.monotonic() + TELL_EVERY_S
                 for line in (watching.said, *watched.eyes.health):
                     console.print(line, markup=False)
-    console.print(watching.said, markup=False)
+    for line in (watching.said, *watched.eyes.health):
+        console.print(line, markup=False)

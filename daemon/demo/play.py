@@ -13,6 +13,7 @@ import numpy as np
 from daemon.bus import Bus
 from daemon.config import Config
 from daemon.keys import Keys
+from daemon.screen import rejected
 from daemon.status import LearnerStatus, Outlook, SamplerStatus
 from daemon.wire import CommandRequest, decode, encode
 from interfaces.errors import BusError
@@ -101,6 +102,13 @@ def play(scene: Scene, *, first: int, second: int, seed: int, show: Callable[[Sn
         return Outcome(stage.rows, before, after, changed_at, asker.answers, asker.unanswered)
 
 
+def stalled(sampler: SamplerStatus) -> str:
+    """What to say when no pair has come for too long."""
+    why = ", ".join(f"{count} rejected: {reason}" for reason, count in rejected(sampler))
+    seen = f"the sampler has seen {sampler.frames} frames" + (f", {why}" if why else "")
+    return f"no new pair for {STALL_LIMIT_S:.0f} s; {seen}. More may be in daemon.log. Try another --seed or marker"
+
+
 @dataclass
 class _Stage:
     config: Config
@@ -138,7 +146,7 @@ class _Stage:
                 claimed_rad = None if told.orientation is None else told.orientation.claimed_rad
                 return Chapter(told.pairs - begin, snapshot.verdict, told.claimed_error_m, claimed_rad, told.outlook)
             if time.monotonic() - progress_at > STALL_LIMIT_S:
-                raise BusError(f"no new pair for {STALL_LIMIT_S:.0f} s; the scene's daemon.log says why")
+                raise BusError(stalled(snapshot.sampler))
             time.sleep(GLANCE_S)
 
     def change_tool(self) -> int:

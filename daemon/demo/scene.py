@@ -15,21 +15,13 @@ from daemon.wiring import demonstration_model
 from interfaces.errors import ConfigError
 from interfaces.robot import RobotDescription
 
-from .cube import cube_tables
+from .tags import cube_tables, tag_tables
 
 STATE = "state"
 # A folder with this file is a demo's, and may be emptied by the next one.
 MARK = ".bodyschema-demo"
 Bus = Literal["dynamixel", "feetech", "serial", "ros2"]
 Marker = Literal["ball", "tag", "cluster"]
-# One tag, which looks at what is in front of the robot when the arm hangs.
-TAG = """
-[vision]
-marker = "tag"
-
-[vision.tag]
-side_m = 0.06
-"""
 # Light ones in the neck, strong ones in the shoulder.
 DYNAMIXEL = {
     "neck_yaw": "XL330-M288",
@@ -136,13 +128,14 @@ seed = {seed}
 
 def _marker(marker: Marker, model: Path) -> str:
     """The table [vision] for what is in the hand."""
+    towards_hand = -np.array(RobotDescription.load(model).robot.marker_xyz)
     match marker:
         case "ball":
             return ""
         case "tag":
-            return TAG
+            return tag_tables(towards_hand)
         case "cluster":
-            return cube_tables(-np.array(RobotDescription.load(model).robot.marker_xyz))
+            return cube_tables(towards_hand)
 
 
 def _joints(bus: Bus) -> str:

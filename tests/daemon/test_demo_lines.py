@@ -8,7 +8,8 @@ import pytest
 from rich.console import Console
 
 from daemon.demo import view
-from daemon.demo.play import Snapshot
+from daemon.demo.play import Snapshot, stalled
+from daemon.status import SamplerStatus
 
 
 def snapshot(pairs: int, angle_rad: float | None = None) -> Snapshot:
@@ -44,3 +45,8 @@ def test_the_demos_lines_have_the_held_out_angle_where_orientations_are_learnt(l
     said = lines(900, angle_rad=0.0123)
     assert "held out 123 mm 0.705°" in said[-1]
     assert max(len(line) for line in said) < 80
+
+
+def test_a_demo_that_stands_still_says_what_became_of_the_frames() -> None:
+    sampler = cast(SamplerStatus, SimpleNamespace(frames=217, rejected={"not_new": 2, "no_marker": 215}))
+    assert "has seen 217 frames, 215 rejected: no marker, 2 rejected: not new." in stalled(sampler)

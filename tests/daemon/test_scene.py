@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 
 from daemon.config import Config
-from daemon.demo.cube import CUBE_M
 from daemon.demo.scene import prepare
+from daemon.demo.tags import CUBE_M
 from interfaces.errors import ConfigError
 from vision.tag_body import TagBody
+
+STICK_RADIUS_M = 0.005
 
 
 def everything(folder: Path) -> dict[str, bytes]:
@@ -47,6 +49,16 @@ def test_the_cube_in_the_demos_hand_looks_to_all_sides_and_stands_on_its_corner(
     assert np.linalg.matrix_rank(np.round(normals, 6)) == 3
 
 
-@pytest.mark.parametrize("marker", ["ball", "tag", "cluster"])
-def test_the_demo_looks_for_what_is_in_the_hand(tmp_path, marker) -> None:
-    assert Config.load(prepare(tmp_path / "demo", seed=0, marker=marker).robot_file).tables.vision.marker == marker
+def test_the_tool_meets_the_demos_single_tag_from_behind(tmp_path) -> None:
+    """It would cover the tag from the front, and no frame would give a pair."""
+    config = Config.load(prepare(tmp_path / "demo", seed=0, marker="tag").robot_file)
+    ((corners,),) = [list(TagBody.cluster(config.tables.vision.cluster, config.tables.vision.tag).corners.values())]
+    normal = np.cross(corners[1] - corners[0], corners[0] - corners[3])
+    normal = normal / np.linalg.norm(normal)
+    along_tool = np.linspace(0.0, 1.0, 50)[:, None] * -np.array(config.robot.robot.marker_xyz)
+    assert ((along_tool - corners.mean(axis=0)) @ normal).max() < -STICK_RADIUS_M
+
+
+@pytest.mark.parametrize(("marker", "looked_for"), [("ball", "ball"), ("tag", "cluster"), ("cluster", "cluster")])
+def test_the_demo_looks_for_what_is_in_the_hand(tmp_path, marker, looked_for) -> None:
+    assert Config.load(prepare(tmp_path / "demo", seed=0, marker=marker).robot_file).tables.vision.marker == looked_for

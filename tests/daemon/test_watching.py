@@ -64,7 +64,7 @@ def test_pictures_are_written_with_what_was_seen_in_them(tmp_path, capsys) -> No
     write_images(tmp_path)
     file = write_robot(tmp_path, IMAGES.format(speed=0.0))
     run("watch", "cameras", "--robot", str(file), "--out", str(tmp_path / "seen"), "--every", "0")
-    assert "4 frames, the marker in 3; epipolar: 1" in capsys.readouterr().out
+    assert "4 frames, the marker in 3; rows differ: 1" in capsys.readouterr().out
     pictures = sorted((tmp_path / "seen").iterdir())
     assert [picture.name for picture in pictures] == [f"{number:06}.jpg" for number in (1, 2, 3, 4)]
     picture = cv2.imread(str(pictures[0]))
@@ -174,3 +174,29 @@ def test_without_cameras_the_tables_are_an_example_that_does_nothing() -> None:
     lines = robot_toml(EXAMPLE).split("docs/cameras.md tells the rest.\n")[1].splitlines()
     assert all(line.startswith("#") for line in lines)
     assert json.dumps("/dev/v4l/by-id/usb-LEFT-video-index0") in "\n".join(lines)
+
+
+def swapped(folder: Path) -> None:
+    write_images(folder)
+    for left in sorted(folder.glob("l_*.png")):
+        right = left.with_name(left.name.replace("l_", "r_"))
+        images = cv2.imread(str(left)), cv2.rotate(cv2.imread(str(right)), cv2.ROTATE_180)
+        cv2.imwrite(str(left), np.roll(images[0], 30, axis=0))
+        cv2.imwrite(str(right), images[1])
+
+
+def test_what_is_the_matter_in_most_frames_is_said_in_words_with_a_remedy(tmp_path, capsys) -> None:
+    swapped(tmp_path)
+    robot = write_robot(tmp_path, IMAGES.format(speed=0.0))
+    run("watch", "cameras", "--robot", str(robot), "--out", str(tmp_path / "out"), "--every", "0")
+    said = " ".join(capsys.readouterr().out.split())
+    assert "the marker in 0; rows differ: 4. Are the cameras exchanged, one upside down, or moved?" in said
+
+
+def test_files_of_a_camera_with_its_cap_on_are_said_to_be_black(tmp_path, capsys) -> None:
+    write_images(tmp_path)
+    for right in tmp_path.glob("r_*.png"):
+        cv2.imwrite(str(right), np.full((240, 320, 3), 5, np.uint8))
+    robot = write_robot(tmp_path, IMAGES.format(speed=0.0))
+    run("watch", "cameras", "--robot", str(robot), "--out", str(tmp_path / "out"), "--every", "0")
+    assert "the right eye's image is black: is the lens cap on?" in " ".join(capsys.readouterr().out.split())

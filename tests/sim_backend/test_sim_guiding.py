@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 from guided_run import guide, learning, shipped, shipped_run, step_degrees
 
-from sim_backend import SimConfig
+from sim_backend import SimConfig, true_chain
 from sim_backend.arm import TorqueFreeArm
 from sim_backend.bullet import Body
+from sim_backend.config import CameraConfig, SimTag
 from sim_backend.physics_urdf import physics_urdf
 from sim_backend.roles import JointRoles
 from sim_backend.truth import TrueRobot
@@ -85,6 +86,18 @@ def test_the_same_seed_guides_the_same_way():
 def test_the_ball_stays_visible_with_a_tool_that_is_250_mm_longer(seed):
     run = guide(shipped(), SimConfig(seed=seed), 8.0, tool=(0.23, 0.0, -0.37), settle=2.0)
     assert run.visible.mean() > 0.8
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_a_single_tag_is_turned_to_the_eyes_in_nine_frames_of_ten(seed):
+    robot = shipped()
+    tag = SimTag(id=0, xyz=(0.0, 0.0, 0.0), rpy=(0.0, 0.0, 0.0), side_m=0.06)
+    config = SimConfig(seed=seed, camera=CameraConfig(tags=(tag,)))
+    T = true_chain(robot, config).poses(guide(robot, config, 10.0).q)
+    normals = T[:, :3, :3] @ TrueRobot.draw(robot, config).tool_turn[:, 2]
+    to_eye = -T[:, :3, 3] / np.linalg.norm(T[:, :3, 3], axis=1, keepdims=True)
+    oblique_deg = np.degrees(np.arccos(np.sum(normals * to_eye, axis=1)))
+    assert (oblique_deg < 55.0).mean() > 0.9
 
 
 @pytest.mark.parametrize(

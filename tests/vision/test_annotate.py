@@ -5,11 +5,15 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
+from ball_renderer import SMALL, Look
+from tag_renderer import Sheet, photograph
 
 from interfaces.camera import StereoCalibration
 from interfaces.records import MarkerFix, StereoFrame
-from vision.cameras.annotate import Annotator
+from vision.cameras.annotate import GREEN, RED, Annotator
 from vision.config import VisionConfig
+from vision.tag_config import TagConfig
+from vision.trackers import tracker_of
 
 CAMERAS = StereoCalibration(
     focal_px=700.0, principal_point_px=(160.0, 120.0), baseline_m=0.12, image_size_px=(320, 240), pixel_sigma=0.2
@@ -44,3 +48,34 @@ def test_a_ball_is_circled_and_a_tag_is_not(marker, circled) -> None:
     above = AT[1] - round(700.0 * VisionConfig().radius_m / 0.5) - 2
     drawn = Annotator(CAMERAS, VisionConfig(marker=marker)).drawn(StereoFrame(0.0, grey, grey), fix)
     assert bool((drawn[above - 1 : above + 2, AT[0]] != 40).any()) == circled
+
+
+FACING = np.diag([1.0, -1.0, -1.0])
+
+
+def shown(ids: tuple[int, ...], wanted: int) -> tuple[np.ndarray, MarkerFix | None]:
+    """The left half of the picture of tags side by side of which one is looked for, and the fix."""
+    tags = [Sheet(id, FACING, np.array([0.06 * k - 0.02, 0.0, 0.5]), 0.04) for k, id in enumerate(ids)]
+    frame = photograph(tags, SMALL, Look(wall=0.4, samples=2), np.random.default_rng(0))
+    config = VisionConfig(marker="tag", tag=TagConfig(id=wanted, side_m=0.04))
+    seen = tracker_of(SMALL, config).track(frame)
+    picture = Annotator(SMALL, config).drawn(frame, seen)
+    return picture[30:, : SMALL.image_size_px[0]], seen if isinstance(seen, MarkerFix) else None
+
+
+def has(picture: np.ndarray, colour: tuple[int, int, int]) -> bool:
+    return bool((np.abs(picture.astype(int) - colour).max(axis=2) < 12).any())
+
+
+def test_a_tag_that_was_found_is_outlined_where_the_fix_has_it() -> None:
+    picture, fix = shown((3,), wanted=3)
+    assert fix is not None
+    corner = SMALL.project(np.array([-0.04, -0.02, 0.5]))[:2].round().astype(int) - (0, 30)
+    assert has(picture[corner[1] - 3 : corner[1] + 4, corner[0] - 3 : corner[0] + 4], GREEN)
+
+
+def test_a_tag_that_nobody_looks_for_is_outlined_in_red() -> None:
+    picture, fix = shown((7,), wanted=3)
+    assert fix is None
+    assert has(picture, RED)
+    assert not has(picture, GREEN)

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from tag_renderer import Sheet, photograph
 
 from daemon.cli import app
-from daemon.cluster_wiring import ClusterFile, sides_of
+from daemon.cluster_wiring import ClusterFile, Wanted, _require_tags, sides_of
 from interfaces.camera import StereoCalibration
 from interfaces.errors import ConfigError
 from interfaces.records import FloatArray
@@ -139,6 +139,27 @@ def test_a_tag_that_moved_in_one_view_is_left_out_and_named() -> None:
     assert np.abs(errors(found, places)[0]).max() < 4e-4
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_a_number_that_is_there_twice_is_no_rigid_body_and_named(seed: int) -> None:
+    """On opposite faces, so that no image shows both."""
+    rng = np.random.default_rng(seed)
+    places = built(rng)
+    views = [renumbered(view, {4: 7}) for view in looked({id: places[id] for id in (3, 4, 7, 8)}, rng)]
+    with pytest.raises(CalibrationError, match=r"do not fit one rigid body, and without tag 7 .*there twice"):
+        measure_cluster(views, EYES, SIDE_M)
+
+
+def renumbered(view: ClusterView, numbers: Mapping[int, int]) -> ClusterView:
+    """With other numbers of some tags; where both are seen, neither is."""
+
+    def eye(tags: Mapping[int, TagImage]) -> dict[int, TagImage]:
+        both = {new for old, new in numbers.items() if old in tags and new in tags}
+        kept = {numbers.get(id, id): tag for id, tag in tags.items()}
+        return {id: tag for id, tag in kept.items() if id not in both}
+
+    return ClusterView(view.name, eye(view.left), eye(view.right))
+
+
 def test_squares_of_another_size_than_told_are_noticed() -> None:
     rng = np.random.default_rng(2)
     found = measure_cluster(looked(built(rng), rng), EYES, 0.97 * SIDE_M)
@@ -161,6 +182,23 @@ def test_views_of_single_tags_are_too_few() -> None:
     rng = np.random.default_rng(4)
     with pytest.raises(CalibrationError, match="0 of 20 pairs of images show two tags or more"):
         measure_cluster([only(view, [3]) for view in looked(built(rng), rng)], EYES, SIDE_M)
+
+
+def test_a_tag_that_should_be_there_and_is_in_no_image_is_named() -> None:
+    views = looked(built(np.random.default_rng(0)), np.random.default_rng(0))
+    with pytest.raises(CalibrationError, match=r"not tag 5, 6 of apriltag_36h11 .* there are 3, 4, 7, 8, 9"):
+        _require_tags(views, {}, Wanted("apriltag_36h11", SIDE_M, (3, 4, 5, 6)))
+
+
+def test_images_without_tags_of_the_family_are_told_so() -> None:
+    with pytest.raises(CalibrationError, match=r"no tag of aruco_6x6_50 .* Are --family"):
+        _require_tags([ClusterView("00", {}, {})], {}, Wanted("aruco_6x6_50", SIDE_M))
+
+
+def test_a_number_that_images_show_twice_is_named_with_them() -> None:
+    views = looked(built(np.random.default_rng(0)), np.random.default_rng(0))
+    with pytest.raises(CalibrationError, match=r"tag 3 is there twice in one image \(04, 07\)"):
+        _require_tags(views, {3: ["04", "07"]}, Wanted("apriltag_36h11", SIDE_M))
 
 
 def test_rendered_images_of_a_cluster_become_its_tables(tmp_path, capsys) -> None:

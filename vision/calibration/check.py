@@ -117,6 +117,7 @@ def _misplaced(rig: StereoRig, left: FloatArray, right: FloatArray, model: Float
         ("left and right are exchanged: exchange the cameras, or their names where they are configured", right, left),
         ("the left image is upside down: turn that camera, or its images", turned_left, right),
         ("the right image is upside down: turn that camera, or its images", left, turned_right),
+        ("both images are upside down: turn both cameras, or their images", turned_left, turned_right),
     )
     most = _MISPLACED_ROWS * _rows_apart(rig, left, right)
     for text, one, other in placed:

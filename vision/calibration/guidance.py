@@ -119,7 +119,7 @@ class Coverage:
 
     def _views_missing(self) -> list[str]:
         lacking = WANTED_VIEWS - self.stereo_views
-        return [f"{lacking} more views, tilted and anywhere"] if lacking > 0 else []
+        return [f"{lacking} more view{'s' if lacking > 1 else ''}, tilted and anywhere"] if lacking > 0 else []
 
 
 def cell_name(row: int, column: int) -> str:

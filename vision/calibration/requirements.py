@@ -67,7 +67,7 @@ def misplaced(R_right_left: FloatArray, translation_m: FloatArray) -> str | None
     if right_eye[0] < 0.0:
         return (
             f"the cameras are swapped: the right one is {-1e3 * right_eye[0]:.0f} mm to the left of the left one. "
-            "Exchange left and right"
+            "Exchange left and right; or, if both stand upside down, turn both"
         )
     return None
 

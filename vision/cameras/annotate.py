@@ -14,6 +14,8 @@ from vision.colour import gate_of
 from vision.config import VisionConfig
 from vision.sphere import Pinhole
 
+from .annotate_tags import TagDrawing, TagSight, outline
+
 GREEN, YELLOW, RED, BLACK = (80, 220, 80), (0, 220, 255), (110, 110, 255), (0, 0, 0)
 FONT, LETTERS, LINE_PX = cv2.FONT_HERSHEY_SIMPLEX, 0.5, 18
 SUBPIXEL_BITS = 4
@@ -54,6 +56,7 @@ class Annotator:
         self._calibration, self._config = calibration, config
         self._gate = gate_of(config)
         self._is_ball = config.marker in ("ball", "bright_ball")
+        self._tags = TagDrawing(calibration, config) if config.marker in ("tag", "cluster") else None
         self._eye = Pinhole(calibration.focal_px, calibration.principal_point_px)
         width, height = calibration.image_size_px
         self._whole = Region(0, 0, width, height)
@@ -75,6 +78,10 @@ class Annotator:
         """Both images side by side (height, 2 width, 3), with what was seen in them."""
         eyes = [np.ascontiguousarray(image).copy() for image in (frame.left, frame.right)]
         sights = [self.sights(image) for image in (frame.left, frame.right)]
+        if self._tags is not None:
+            for eye, image in zip(eyes, (frame.left, frame.right), strict=True):
+                for tag in self._tags.sights(image):
+                    _draw_tag(eye, tag)
         for place, eye in enumerate(eyes):
             for sight in sights[place]:
                 self._draw_sight(eye, sight)
@@ -84,6 +91,8 @@ class Annotator:
                         _row(eye, sight.centre_px[1], YELLOW)
         if isinstance(seen, MarkerFix):
             self._draw_fix(eyes, seen)
+            if self._tags is not None:
+                self._tags.draw_fix(eyes, seen, GREEN)
         joined = np.hstack(eyes)
         _write(joined, self._headline(frame, seen), (6, LINE_PX), GREEN if isinstance(seen, MarkerFix) else RED)
         return joined
@@ -118,6 +127,16 @@ class Annotator:
         sigma = 1e3 * float(np.sqrt(np.linalg.eigvalsh(seen.cov)[-1]))
         rows = "" if seen.centres_px is None else f"  rows differ {seen.centres_px[3] - seen.centres_px[1]:+.2f} px"
         return f"{frame.t:.3f} s  x {x:.1f} y {y:.1f} z {z:.1f} mm +- {sigma:.2f}{rows}"
+
+
+def _draw_tag(image: ImageArray, tag: TagSight) -> None:
+    """A tag's outline and number: yellow where it is measured, red where it is not, with the reason."""
+    why = WORDS.get(tag.reason, "") if tag.reason is not None else ""
+    why = why if tag.is_wanted else "not the marker's"
+    colour = RED if why else YELLOW
+    outline(image, tag.corners_px, colour)
+    left, top = tag.corners_px.min(axis=0)
+    _write(image, f"{tag.id}: {why}" if why else str(tag.id), (round(left), round(top) - 8), colour)
 
 
 def _pair(centre_px: FloatArray) -> tuple[float, float]:

@@ -14,6 +14,8 @@ from interfaces.errors import ConfigError, SourceEnded, SourceError
 from interfaces.protocols import Clock
 from interfaces.records import FloatArray, ImageArray, StereoFrame, frozen_array
 
+from .look import of_image
+
 
 class Roll(Protocol):
     """Stereo images in order."""
@@ -76,6 +78,7 @@ class Film:
         self._roll: Roll | None = None
         self._is_open = False
         self._next, self._start_s = 0, 0.0
+        self._shown: tuple[ImageArray, ...] = ()
         self.dropped = 0
 
     @property
@@ -90,8 +93,9 @@ class Film:
 
     @property
     def health(self) -> tuple[str, ...]:
-        """Files have no complaints: what is wrong with them is an error."""
-        return ()
+        """What is wrong with the light in the last pair; all else that is wrong with files is an error."""
+        light = (of_image(image, f"{name} eye") for name, image in zip(("left", "right"), self._shown, strict=False))
+        return tuple(text for text in light if text is not None)
 
     @property
     def _made(self) -> Roll:
@@ -130,7 +134,7 @@ class Film:
         images = roll.next()
         if self._speed:
             images = self._caught_up(images)
-        place, self._next = self._next, self._next + 1
+        place, self._next, self._shown = self._next, self._next + 1, images
         t = self._due_s(place) if self._speed else float(roll.t[place])
         return StereoFrame(t - self._latency_s, *images, float(np.hypot(roll.t_sigma[place], self._sigma_s)))
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,6 +26,10 @@ _STEPS, _CONVERGED = 60, 1e-9
 _FIRST_DAMPING, _MOST_DAMPING = 1e-4, 1e8
 # A tag in a view whose corners are this many sigmas off (RMS) is none: covered, bent, or another of its number.
 _MOST_OFF = 6.0
+# ... in units of what is usual, which calibrated cameras bring to so much at most.
+_MOST_USUAL = 5.0
+# In so many of the views, and of one tag's, something may be left out, where these are more than one.
+_MOST_LEFT_OUT, _MOST_OF_A_TAG = 0.25, 0.34
 _LEAST_VIEWS = 3
 
 Motion = tuple[FloatArray, FloatArray]  # rotation (3, 3) and place (3,) [m]
@@ -94,34 +100,88 @@ def measure_cluster(
     Raises:
         CalibrationError: too few views show two tags and more, or some tags were never seen together with the others.
     """
-    usable = [view for view in views if len(view.ids) >= 2 and view.left.keys() & view.right.keys()]
+    usable = _usable(views)
     if len(usable) < _LEAST_VIEWS:
         raise CalibrationError(
             f"{len(usable)} of {len(views)} pairs of images show two tags or more to both eyes, at least "
             f"{_LEAST_VIEWS} are needed, 20 are good. Turn the cluster slowly, all its edges towards the cameras"
         )
-    left_out: list[tuple[str, int]] = []
+    every, left_out = usable, list[tuple[str, int]]()
     while True:
-        problem = _Problem(usable, calibration, side_m, other_sides_m or {})
-        problem.solve()
+        problem = _solved(usable, calibration, side_m, other_sides_m)
         worst = problem.worst()
         if worst is None:
             return problem.result(left_out)
         left_out.append(worst)
-        usable = [_without(view, worst) for view in usable]
-        usable = [view for view in usable if len(view.ids) >= 2 and view.left.keys() & view.right.keys()]
-        if len(usable) < _LEAST_VIEWS:
-            raise CalibrationError(
-                "the tags do not fit one rigid body: their places differ from view to view. Is the cluster stiff, "
-                f"--side-mm right, and no number there twice? First did not fit: tag {left_out[0][1]} in "
-                f"{left_out[0][0]}"
-            )
+        usable = _usable([_without(view, worst) for view in usable])
+        if len(usable) < _LEAST_VIEWS or _is_odd(left_out, every):
+            odd = _odd_one(every, calibration, side_m, other_sides_m)
+            raise CalibrationError(_not_rigid(left_out, odd))
+
+
+def _usable(views: Sequence[ClusterView]) -> list[ClusterView]:
+    return [view for view in views if len(view.ids) >= 2 and view.left.keys() & view.right.keys()]
+
+
+def _solved(
+    views: Sequence[ClusterView],
+    calibration: StereoCalibration,
+    side_m: float,
+    other_sides_m: Mapping[int, float] | None,
+) -> _Problem:
+    problem = _Problem(views, calibration, side_m, other_sides_m or {})
+    problem.solve()
+    return problem
+
+
+def _odd_one(
+    views: Sequence[ClusterView],
+    calibration: StereoCalibration,
+    side_m: float,
+    other_sides_m: Mapping[int, float] | None,
+) -> int | None:
+    """The tag without which all others fit, where there is one."""
+    fits: dict[int, float] = {}
+    for id in sorted(set[int]().union(*(view.ids for view in views))):
+        rest = _usable([_only(view, lambda other, id=id: other != id) for view in views])
+        if len(rest) < _LEAST_VIEWS:
+            continue
+        with suppress(CalibrationError):
+            problem = _solved(rest, calibration, side_m, other_sides_m)
+            if problem.worst() is None:
+                fits[id] = problem.misfit
+    best = min(fits, key=lambda id: fits[id], default=None)
+    return best if best is not None and fits[best] < _MOST_USUAL else None
+
+
+def _is_odd(left_out: Sequence[tuple[str, int]], views: Sequence[ClusterView]) -> bool:
+    """Whether so much is left out of so many views, or a tag so often, that it cannot be by chance."""
+    shown, times = Counter(id for view in views for id in view.ids), Counter(id for _, id in left_out)
+    if len({name for name, _ in left_out}) > max(1.0, _MOST_LEFT_OUT * len(views)):
+        return True
+    return any(count > max(1.0, _MOST_OF_A_TAG * shown[id]) for id, count in times.items())
+
+
+def _not_rigid(left_out: Sequence[tuple[str, int]], odd: int | None) -> str:
+    """What to say of tags that differ from view to view."""
+    if odd is not None:
+        return (
+            f"the tags do not fit one rigid body, and without tag {odd} all others do. Is its number there twice, does "
+            "it hang loose, and is its side right (--side-mm, --other-sides-mm)? Else leave it out: --ids"
+        )
+    first = ", ".join(f"tag {id} in {name}" for name, id in left_out[:4])
+    return (
+        f"the tags do not fit one rigid body: their places differ from view to view, first {first}. Is the cluster "
+        "stiff, are the sides right (--side-mm, --other-sides-mm), and is no number there twice?"
+    )
 
 
 def _without(view: ClusterView, worst: tuple[str, int]) -> ClusterView:
-    if view.name != worst[0]:
-        return view
-    left, right = ({id: tag for id, tag in eye.items() if id != worst[1]} for eye in (view.left, view.right))
+    return _only(view, lambda id: id != worst[1]) if view.name == worst[0] else view
+
+
+def _only(view: ClusterView, is_kept: Callable[[int], bool]) -> ClusterView:
+    left, right = ({id: tag for id, tag in eye.items() if is_kept(id)} for eye in (view.left, view.right))
     return ClusterView(view.name, left, right)
 
 
@@ -283,6 +343,12 @@ class _Problem:
 
     # --- what comes out
 
+    @property
+    def misfit(self) -> float:
+        """RMS of what is left, in units of the corners' own sigmas."""
+        residuals, J, _ = self._linearised()
+        return float(np.sqrt(residuals @ residuals / max(len(residuals) - J.shape[1], 1)))
+
     def worst(self) -> tuple[str, int] | None:
         """Name of the view and number of the tag in it that fits worst, where that is too bad."""
         residuals = self._linearised()[0]
@@ -295,12 +361,12 @@ class _Problem:
         off = {key: float(np.sqrt(np.mean(np.concatenate(each)))) for key, each in squares.items()}
         key = max(off, key=lambda each: off[each])
         usual = float(np.median(list(off.values())))
-        return key if off[key] > _MOST_OFF * max(usual, 1.0) else None
+        return key if off[key] > _MOST_OFF * min(max(usual, 1.0), _MOST_USUAL) else None
 
     def result(self, left_out: Sequence[tuple[str, int]]) -> MeasuredCluster:
         """The solution with its uncertainty: what the claimed noise does not explain is taken for more noise."""
         residuals, J, grown = self._linearised()
-        misfit = float(residuals @ residuals) / max(len(residuals) - J.shape[1], 1)
+        misfit = self.misfit**2
         cov = np.linalg.inv(J.T @ J) * max(misfit, 1.0)
         full = np.column_stack([J, grown])
         inverse = np.linalg.inv(full.T @ full)

@@ -1,0 +1,61 @@
+"""`bodyschema calibrate latency`: what is collected, and as it is typed."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scripted_sources import Walk
+from small_arm import write_small_arm
+
+from daemon.cli import app
+from daemon.latency import LatencyError
+from daemon.sources import Sources
+from daemon.wiggling import collected
+from interfaces.errors import BodyschemaError
+from interfaces.records import MarkerFix, MarkerMiss
+from interfaces.robot import RobotDescription
+
+
+def seen(folder: Path, every: int) -> Sources:
+    """A walk of which every so manieth image has the marker in it; the others are at the border."""
+    walk = Walk(RobotDescription.load(write_small_arm(folder)), 40)
+    steps = [
+        fix if k % every == 0 or not isinstance(fix, MarkerFix) else MarkerMiss(fix.t, "at_border")
+        for k, fix in enumerate(walk.fixes, 1)
+    ]
+    return walk.sources(fixes=steps)
+
+
+def test_where_the_marker_is_often_missed_it_is_said_why(tmp_path) -> None:
+    found = collected(seen(tmp_path, 2), 5.0, lambda _: None)
+    assert found.said == "the marker was found in 20 of 40 images: 20 at border"
+
+
+def test_nothing_is_said_of_a_marker_that_is_found(tmp_path) -> None:
+    assert collected(seen(tmp_path, 1), 5.0, lambda _: None).said == ""
+
+
+def test_a_marker_that_is_never_found_is_named_with_the_reasons(tmp_path) -> None:
+    with pytest.raises(LatencyError, match="found in none of 40 images: 40 at border"):
+        collected(seen(tmp_path, 1000), 5.0, lambda _: None)
+
+
+def test_a_recording_and_the_simulation_are_not_both_taken(tmp_path) -> None:
+    words = ["calibrate", "latency", str(tmp_path / "w.csv"), "--sim", "--robot", str(write_small_arm(tmp_path))]
+    with pytest.raises(BodyschemaError, match="not both"):
+        app(words, exit_on_error=False, result_action="return_value")
+
+
+@pytest.mark.timeout(240)
+def test_the_simulated_robot_has_no_latency(tmp_path, monkeypatch, capsys) -> None:
+    pytest.importorskip("pybullet")
+    monkeypatch.chdir(tmp_path)
+    app(["config", "init", "--sim"], exit_on_error=False, result_action="return_value")
+    capsys.readouterr()
+    app(["calibrate", "latency", "--sim", "--json"], exit_on_error=False, result_action="return_value")
+    found = json.loads(capsys.readouterr().out)
+    assert np.abs(found["latency_s"]) < 3 * found["sigma_s"]
+    assert found["sigma_s"] < 2.5e-3

@@ -1,0 +1,85 @@
+"""Tags drawn into the images: those that are seen, and those of the marker where a fix has it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from interfaces.camera import StereoCalibration
+from interfaces.records import FloatArray, ImageArray, MarkerFix, Reason
+from vision.config import VisionConfig
+from vision.tag_body import TagBody
+from vision.tag_dictionary import tags_of
+from vision.tag_finder import TagFinder
+from vision.tag_image import measure_tag
+
+SUBPIXEL_BITS = 4
+AXES = ((60, 60, 255), (60, 220, 60), (255, 140, 60))  # x, y, z
+
+
+@dataclass(frozen=True, slots=True)
+class TagSight:
+    """A tag in one eye's image.
+
+    Attributes:
+        corners_px: (4, 2), roughly where it was refused.
+        reason: why it is not measured, or None. is_wanted: whether the marker has it.
+    """
+
+    id: int
+    corners_px: FloatArray
+    reason: Reason | None
+    is_wanted: bool
+
+
+class TagDrawing:
+    """Of the tags that [vision] looks for, and of others of their dictionary."""
+
+    def __init__(self, calibration: StereoCalibration, config: VisionConfig) -> None:
+        self._calibration, self._config = calibration, config.tag
+        single = config.marker == "tag"
+        self._body = TagBody.single(config.tag) if single else TagBody.cluster(config.cluster, config.tag)
+        self._finder = TagFinder(config.tag, range(len(tags_of(config.tag.dictionary).bytesList)))
+
+    def sights(self, image: ImageArray) -> Iterator[TagSight]:
+        """All tags of the dictionary in one eye's image."""
+        grey = np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8)
+        for id, rough in self._finder.squares(grey):
+            found = measure_tag(grey, id, rough, self._config)
+            corners, reason = (rough, found) if isinstance(found, Reason) else (found.corners_px, None)
+            yield TagSight(id, corners, reason, id in self._body.corners)
+
+    def draw_fix(self, eyes: list[ImageArray], fix: MarkerFix, colour: tuple[int, int, int]) -> None:
+        """Outlines of the marker's tags that face the left eye, and the marker's axes."""
+        if fix.R is None:
+            return
+        turn = Rotation.from_quat(fix.R).as_matrix()
+        shown = [corners @ turn.T + fix.x for corners in self._body.corners.values()]
+        for corners in shown:
+            if np.cross(corners[1] - corners[0], corners[3] - corners[0]) @ corners.mean(axis=0) > 0.0:
+                for image, px in zip(eyes, self._seen(corners), strict=True):
+                    outline(image, px, colour)
+        ends = fix.x + 0.75 * self._config.side_m * np.vstack([np.zeros(3), turn.T])
+        for image, px in zip(eyes, self._seen(ends), strict=True):
+            for end, shade in zip(px[1:], AXES, strict=True):
+                cv2.line(image, _fixed(px[0]), _fixed(end), shade, 2, cv2.LINE_AA, SUBPIXEL_BITS)
+
+    def _seen(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Where both eyes see points (n, 3), (n, 2) each [px]."""
+        px = self._calibration.project(x)
+        return px[:, :2], px[:, 2:]
+
+
+def outline(image: ImageArray, px: FloatArray, colour: tuple[int, int, int]) -> None:
+    """A closed line through points (n, 2)."""
+    points = [np.round(px * 2**SUBPIXEL_BITS).astype(np.int32)]
+    cv2.polylines(image, points, True, colour, 2, cv2.LINE_AA, SUBPIXEL_BITS)
+
+
+def _fixed(px: FloatArray) -> tuple[int, int]:
+    scaled = np.round(px * 2**SUBPIXEL_BITS).astype(int)
+    return int(scaled[0]), int(scaled[1])
