@@ -27,8 +27,8 @@ _ASKED_EACH = 3
 _MOST_SETS = 80
 Key = tuple[str, str | None, str | None]
 Named = frozenset[tuple[Key, int]]
-# Of what begins at a moment there are so many at one place at most.
-_MOST_OF_A_KIND = 2
+# Of what begins at a moment, and of ripples, which differ in their periods, there are so many at one place at most.
+_MOST_MOMENTS, _MOST_RIPPLES = 2, 4
 # What a number costs at least [nats].
 _CHEAPEST, _ROUNDS = 1.5, 30
 # What explains a smaller share of what a cause explains is no rival of it; within so much two are as probable [nats].
@@ -245,7 +245,7 @@ class Search:
             count = present[effect.key]
             if count == 0:
                 others.append(effect)
-            elif effect.kind.begins and count < _MOST_OF_A_KIND:
+            elif count < most_of_a_kind(effect):
                 more = (effect.one_more(ordinal) for ordinal in range(count + 1))
                 others.append(next(one for one in more if one.identity not in taken))
         return others
@@ -346,6 +346,13 @@ def joined(start: Fit, sought: Effect, least: float, expected: float) -> Fit:
 def named(causes: Sequence[Effect]) -> Named:
     """Which causes these are, whatever their numbers: how many of each kind at each place."""
     return frozenset(Counter(effect.key for effect in causes).items())
+
+
+def most_of_a_kind(effect: Effect) -> int:
+    """How many effects of a kind there may be at one place."""
+    if effect.kind.begins:
+        return _MOST_MOMENTS
+    return _MOST_RIPPLES if effect.name == "joint_ripple" else 1
 
 
 def simplicity(effect: Effect) -> int:
