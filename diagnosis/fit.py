@@ -18,7 +18,7 @@ from .observations import Observations
 LARGEST = 10.0
 # Steps until the likelihood rises by less than this [nats].
 _ROUNDS, _ENOUGH = 12, 0.02
-# A fit is given up where so many times what a step promises, and so much more [nats], would not do.
+# A fit is given up after a step where so many times what the next promises, and so much more [nats], would not do.
 _SLACK, _LITTLE = 2.0, 5.0
 # A step that would raise it by less is not tried [nats].
 _NOT_TRIED = 1e-3
@@ -272,11 +272,12 @@ def improved(fit: Fit, least: float = -np.inf) -> Fit:
     Args:
         least: where it cannot be expected to become as probable as this it is given up, as far as it has come [nats].
     """
-    for _ in range(_ROUNDS):
+    for done in range(_ROUNDS):
         if not fit.columns.shape[2]:
             return fit
         step, promised = fit.step()
-        if promised < _NOT_TRIED or fit.log_likelihood + _SLACK * _rise(promised, fit) + _LITTLE < least:
+        hopeless = fit.log_likelihood + _SLACK * _rise(promised, fit) + _LITTLE < least
+        if promised < _NOT_TRIED or (done and hopeless):
             return fit
         best = None
         for shortened in (1.0, 0.3, 0.05):

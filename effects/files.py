@@ -102,10 +102,11 @@ def read_effects(robot: RobotDescription, tables: Mapping[str, Any], text: str, 
     if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
         remedy = "Write each effect under a heading [[effects]]"
         raise ConfigError("effects is not a list of tables", file=file, line=line_of(text, (EFFECTS,)), remedy=remedy)
-    effects = []
+    effects: list[Effect] = []
     for place, entry in enumerate(entries):
         try:
-            effects.append(_effect(robot, entry))
+            effect = _effect(robot, entry)
+            effects.append(effect.one_more(sum(other.key == effect.key for other in effects)))
         except _WrongEntry as wrong:
             line = line_in_entry(text, EFFECTS, place, wrong.key)
             what = f"effect {place + 1}: {wrong.what}"

@@ -196,12 +196,23 @@ def test_a_time_constant_of_which_little_is_told_is_not_said_to_be_sure(robot) -
     assert np.sqrt(fit.covariance[-1, -1]) > 0.5 * long
 
 
-def test_a_fit_that_cannot_become_so_probable_is_given_up(robot) -> None:
+def test_a_fit_that_cannot_become_so_probable_is_given_up(robot, monkeypatch) -> None:
     truth = Effect.at(robot, "joint_offset", SHOULDER, values=[0.02])
     other = start_of(robot, walk(robot, 1), (truth,), 1).starting([Effect.at(robot, "joint_scale", SHOULDER)])
     best = improved(other).log_likelihood
-    assert improved(other, best + 1000.0) is other
     assert improved(other, best).log_likelihood == best
+    taken, step = [], Fit.step
+    monkeypatch.setattr(Fit, "step", lambda fit: taken.append(fit) or step(fit))
+    improved(other, best + 1000.0)
+    assert len(taken) == 2
+
+
+def test_a_fit_that_begins_far_off_among_outliers_is_not_given_up_before_a_step(robot) -> None:
+    clean = observed(robot, walk(robot, 5), planted(robot), 5)
+    rows = np.random.default_rng(6).choice(len(clean), len(clean) // 10, replace=False)
+    best = refitted(robot, with_outliers(clean, rows))
+    far = best.starting([e.with_values(np.asarray(e.values) + 0.1) for e in best.causes])
+    assert improved(far, best.log_likelihood - 1.0).log_likelihood > best.log_likelihood - 1.0
 
 
 def test_of_what_the_data_do_not_tell_twenty_times_the_usual_size_is_clearly_less_probable_than_none(robot) -> None:

@@ -161,6 +161,17 @@ def test_a_tool_that_slipped_twice_is_named_twice(robot) -> None:
     assert moments == pytest.approx([30.0, 70.0], abs=2.0 * INTERVAL_S)
 
 
+def test_ripples_of_two_periods_at_one_joint_are_both_named_and_no_third(robot) -> None:
+    ripples = (
+        Effect.at(robot, "joint_ripple", SHOULDER, values=[3e-3, 0.0, 9.0]),
+        Effect.at(robot, "joint_ripple", SHOULDER, values=[0.0, 2e-3, 14.0]),
+    )
+    start = start_of(robot, walk(robot, 3), ripples, 3)
+    found = Search([Effect.at(robot, "joint_ripple", SHOULDER)], lambda _: None).run(start)
+    periods = sorted(effect.value("cycles_per_turn") for effect in found.causes)
+    assert periods == pytest.approx([9.0, 14.0], rel=0.02)
+
+
 def test_there_is_one_offset_at_a_joint_and_no_second(robot) -> None:
     offset = Effect.at(robot, "joint_offset", ELBOW, values=[0.02])
     start = start_of(robot, walk(robot, 3), (offset,), 3)

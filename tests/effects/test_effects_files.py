@@ -84,6 +84,13 @@ def test_an_extended_robot_is_extended_again_with_what_was_found_then(robot, tmp
     assert [effect.name for effect in twice.effects] == ["joint_offset", "backlash"]
 
 
+def test_two_ripples_of_one_joint_are_stored_and_read_back(robot, tmp_path) -> None:
+    ripples = [Effect.at(robot, "joint_ripple", "elbow", values=[0.001, 0.0, cycles]) for cycles in (9.0, 14.0)]
+    again = load_simulation(write_extended(Simulation(robot, (ripples[0], ripples[1].one_more(1))), tmp_path, HEADING))
+    assert [effect.value("cycles_per_turn") for effect in again.effects] == [9.0, 14.0]
+    assert len({effect.identity for effect in again.effects}) == 2
+
+
 def test_a_file_that_is_there_is_not_replaced_unasked(robot, tmp_path) -> None:
     write_extended(Simulation(robot), tmp_path, HEADING)
     with pytest.raises(ConfigError, match="is there already"):
