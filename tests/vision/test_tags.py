@@ -182,7 +182,8 @@ def test_a_cluster_is_found_where_and_as_it_is() -> None:
 
 
 def test_a_cluster_of_which_one_tag_is_hidden_is_found_as_well() -> None:
-    rotation = tilted([0.0, 1.0, 0.0], 40.0)
+    # No edge along the pixels: there the renderer, which blurs after pixels, unlike a lens, is off by 0.015 px.
+    rotation = tilted([0.2, 1.0, 0.3], 40.0)
     frame = seen(cube_at(rotation, MIDDLE)[0])
     assert max(off(TagTracker(SMALL, CUBE, CONFIG).track(frame), rotation, MIDDLE)) < 4.0
 
