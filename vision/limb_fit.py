@@ -29,7 +29,7 @@ _LEAST_DETERMINANT = 1e-6
 # The wave once round is at least so large: this, and so many times the pixels' noise; that the other waves are small is
 # no sign that it is. Beside that it is this part of what the few waves tell, and where they tell of far more it is
 # the square, over the last: a bend that shows is a sign of one that the fit has removed.
-_LEAST_DENSITY, _NOISE, _TOLD, _USUAL_DENSITY = 0.5, 2.0, 0.4, 10.0
+_LEAST_DENSITY, _NOISE, _TOLD, _USUAL_DENSITY = 0.5, 2.0, 0.4, 12.0
 # Of an estimate's slope by its residuals (1 where none is far off, 0 where all are) at least this part counts.
 _LEAST_SLOPE = 0.4
 # What covers a ball breaks its limb at sharp corners, which shows in the quick waves; what is behind it bends whole
