@@ -26,9 +26,10 @@ _ALIASED_PX = 0.55
 _FREEDOM, _FARTHEST_PX, _ROUNDS = 4.0, 1.0, 3
 # Below this, relative to the cubed trace, the limb does not determine centre and radius.
 _LEAST_DETERMINANT = 1e-6
-# The claim is what the pixels' noise makes, and this part of what the few waves tell; where they tell of more than
-# noise it grows with the square, over this: a bend that shows is a sign of one that the fit has removed.
-_TOLD, _USUAL_DENSITY = 0.5, 12.0
+# The wave once round is at least so large: this, and so many times the pixels' noise; that the other waves are small is
+# no sign that it is. Beside that it is this part of what the few waves tell, and where they tell of far more it is
+# the square, over the last: a bend that shows is a sign of one that the fit has removed.
+_LEAST_DENSITY, _NOISE, _TOLD, _USUAL_DENSITY = 0.5, 2.0, 0.4, 12.0
 # Of an estimate's slope by its residuals (1 where none is far off, 0 where all are) at least this part counts.
 _LEAST_SLOPE = 0.4
 # What covers a ball breaks its limb at sharp corners, which shows in the quick waves; what is behind it bends whole
@@ -106,7 +107,8 @@ def fit_limb(
     if (is_angular or fit.waves.quick > _LARGEST_DENSITY) and not aliased:
         return None
     told = waves(fit.pulls, radius_px, fit.first).mean
-    density = noise_share + (_TOLD + told / _USUAL_DENSITY) * told
+    usual = _LEAST_DENSITY + _NOISE * noise_share
+    density = math.hypot(usual, (_TOLD + told / _USUAL_DENSITY) * told)
     cov = density * fit.inverse + np.outer(unsettled, unsettled)
     # A blurred disc's edge, where it is steepest, is nearer to the centre than the disc's.
     radius_px += blur_px**2 / (2.0 * radius_px)

@@ -53,8 +53,12 @@ def ball_colour(inside: Float32Array, gate: Gate) -> FloatArray | None:
 
 def mean_of_three(values: NDArray[np.floating]) -> FloatArray:
     """Mean over three neighbours along the closed first axis."""
-    wrapped = np.concatenate([values[-1:], values, values[:1]]).astype(np.float64)
-    return (wrapped[:-2] + wrapped[1:-1] + wrapped[2:]) / 3.0
+    wrapped = np.empty((len(values) + 2, *values.shape[1:]))
+    wrapped[0], wrapped[1:-1], wrapped[-1] = values[-1], values, values[0]
+    sums = wrapped[:-2] + wrapped[1:-1]
+    sums += wrapped[2:]
+    sums /= 3.0
+    return sums
 
 
 def median(values: NDArray[np.floating]) -> float:

@@ -11,7 +11,7 @@ from interfaces.errors import ConfigError
 from interfaces.records import FloatArray
 
 from .tag_config import Dictionary
-from .tag_image import MODULES
+from .tag_edge import MODULES
 
 # OpenCV's numbers of the dictionaries.
 DICTIONARIES: dict[Dictionary, int] = {

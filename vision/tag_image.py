@@ -1,41 +1,31 @@
 """One eye's image of a tag: its four corners to hundredths of a pixel, with their covariance.
 
-The four edges of the black square are measured where they are straight, between the corners: along lines across an
-edge, the share of black tells where the edge is. That needs no model of the blur, and an anti-aliased edge counts by
-its coverage. The corners are where the edges' lines meet.
+The four edges of the black square are measured where they are straight, between the corners, see `tag_edge`; how wide
+the blur is they tell themselves. The corners are where the edges' lines meet.
 """
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.fft import dct
 
 from interfaces.records import FloatArray, ImageArray, Reason
 
 from .tag_config import TagConfig
+from .tag_edge import LONGEST_REACH_PX, SHARPEST_PX, Edge, find_edge
 
-# Black border, data and border of all dictionaries that are offered: 6 + 2 modules.
-MODULES = 8.0
-# The black border and the white margin are one module wide each. Lines across an edge stay so far from where they end:
-# blur mixes what is beyond into them.
-_CLEAR_PX = 1.8
-_LONGEST_REACH_PX, _SHORTEST_REACH_PX = 6.0, 1.0
-_SAMPLE_PX = 0.5
-# Ends of the lines across, as a share of their reach, which show plain black and plain white.
-_PLAIN = 0.35
-# Free of the corners, whose blur rounds the edges off.
-_CORNER_PX, _CORNER_SHARE = 2.0, 0.08
-_FEWEST_POINTS, _MOST_POINTS = 6, 80
-_ROUNDS = 3
-# Interpolation between pixels takes up to this factor from the variance of a point, and gives it to its neighbours.
-_SMOOTHED = 1.5
-# What is left of an edge's place when all noise has averaged out [px].
-_FLOOR_PX = 0.006
-# Points so many (robust) standard deviations off their line are no part of it.
-_STRAY = 3.5
-_MAD_TO_SIGMA = 1.4826
+# So many looks at most; the last one moved no corner by more [px], and the blur by no more than this part.
+_ROUNDS, _SETTLED_PX, _SETTLED_BLUR = 8, 0.01, 0.02
+# Blur of lens and interpolation (1-sigma) as it is thought to be at first [px] ...
+_USUAL_BLUR_PX, _WIDEST_PX = 0.85, 3.0
+# ... and the weight of that, where an edge whose lines reach twice as far as its blur has 1.
+_USUAL_WEIGHT = 0.1
+# Interpolation between pixels takes this factor from the variance of a point, and gives it to its neighbours: so it is
+# thought at first, with the weight of so many waves along the edges. Slow ones are as long as so many points, or more.
+_SMOOTHED, _SMOOTHED_WAVES = 1.5, 10
+_SLOW, _LEAST_QUICKEST = 4, 4
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,147 +43,64 @@ class TagImage:
     cov_px: FloatArray
 
 
-@dataclass(frozen=True, slots=True)
-class _Edge:
-    """A line u·normal = place + slope·s, s from −1 to 1 between the edge's ends, and the covariance of both."""
-
-    origin: FloatArray
-    along: FloatArray
-    normal: FloatArray
-    half_length: float
-    place: float
-    slope: float
-    cov: FloatArray
-
-    @property
-    def point(self) -> FloatArray:
-        return self.origin + self.place * self.normal
-
-    @property
-    def direction(self) -> FloatArray:
-        return self.along * self.half_length + self.slope * self.normal
-
-
 def measure_tag(grey: ImageArray, id: int, corners_px: FloatArray, config: TagConfig) -> TagImage | Reason:
     """The tag whose corners are about at `corners_px` (4, 2) in a grey image, or why it is doubtful."""
-    edges: list[_Edge] = []
+    edges: list[Edge] = []
+    blur_px = _USUAL_BLUR_PX
     for _ in range(_ROUNDS):
-        found = [_edge(grey, corners_px, side, config) for side in range(4)]
+        found = [find_edge(grey, corners_px, side, blur_px, config) for side in range(4)]
         reasons = [edge for edge in found if isinstance(edge, Reason)]
         if reasons:
             return reasons[0]
-        edges = [edge for edge in found if isinstance(edge, _Edge)]
+        edges = [edge for edge in found if isinstance(edge, Edge)]
         moved = np.array([_meeting(edges[side - 1], edges[side]) for side in range(4)])
-        if np.abs(moved - corners_px).max() > _LONGEST_REACH_PX:
+        moved_px, before_px = float(np.abs(moved - corners_px).max()), blur_px
+        if moved_px > LONGEST_REACH_PX:
             return Reason.OCCLUDED
-        corners_px = moved
+        corners_px, blur_px = moved, _blur(edges, blur_px)
+        if moved_px < _SETTLED_PX and abs(blur_px - before_px) < _SETTLED_BLUR * blur_px:
+            break
     return TagImage(id, corners_px, _corner_covariance(edges))
 
 
-def _edge(grey: ImageArray, corners_px: FloatArray, side: int, config: TagConfig) -> _Edge | Reason:
-    """The edge from corner `side` to the next one."""
-    begin, end = corners_px[side], corners_px[(side + 1) % 4]
-    length = float(np.linalg.norm(end - begin))
-    if length < config.min_side_px:
-        return Reason.NO_MARKER
-    along = (end - begin) / length
-    normal = np.array([along[1], -along[0]])  # corners go round clockwise: out of the tag
-    depth = min(float(-normal @ (corners_px[side - 1] - begin)), float(-normal @ (corners_px[(side + 2) % 4] - end)))
-    reach = min(depth / MODULES - _CLEAR_PX, _LONGEST_REACH_PX)
-    free = max(_CORNER_PX, _CORNER_SHARE * length)
-    count = min(int(length - 2.0 * free), _MOST_POINTS)
-    if reach < _SHORTEST_REACH_PX or count < _FEWEST_POINTS:
-        return Reason.NO_MARKER
-    s = np.linspace(2.0 * free / length - 1.0, 1.0 - 2.0 * free / length, count)
-    origin = (begin + end) / 2.0
-    points = origin + 0.5 * length * s[:, None] * along
-    profiles = _profiles(grey, points, normal, reach)
-    if profiles is None:
-        return Reason.AT_BORDER
-    offsets = _offsets(profiles, reach, config.min_contrast)
-    if offsets is None:
-        return Reason.OCCLUDED
-    line = _line(s, *offsets, config)
-    return line if isinstance(line, Reason) else _Edge(origin, along, normal, 0.5 * length, *line)
+def _blur(edges: list[Edge], before_px: float) -> float:
+    """The blur (1-sigma) [px] of all edges, which was thought to be `before_px`.
 
-
-def _profiles(grey: ImageArray, points: FloatArray, normal: FloatArray, reach: float) -> FloatArray | None:
-    """Grey levels (n, m) across the edge at points (n, 2), from inside out; None where they leave the image."""
-    count = 2 * math.ceil(reach / _SAMPLE_PX)
-    steps = (np.arange(count) + 0.5) * (2.0 * reach / count) - reach
-    places = points[:, None] + steps[:, None] * normal
-    height, width = grey.shape
-    if (places < 1.0).any() or (places > (width - 2.0, height - 2.0)).any():
-        return None
-    # By hand: cv2.remap would round places to 1/32 px.
-    whole = np.floor(places).astype(np.intp)
-    part = places - whole
-    u, v = whole[..., 0], whole[..., 1]
-    top = grey[v, u] * (1.0 - part[..., 0]) + grey[v, u + 1] * part[..., 0]
-    bottom = grey[v + 1, u] * (1.0 - part[..., 0]) + grey[v + 1, u + 1] * part[..., 0]
-    return top * (1.0 - part[..., 1]) + bottom * part[..., 1]
-
-
-def _offsets(profiles: FloatArray, reach: float, min_contrast: float) -> tuple[FloatArray, float] | None:
-    """Where the edge is on each line across (n,) [px], outward, and the variance [px²] that all have in common.
-
-    None where there is no black inside or no white outside.
+    An edge whose lines end where its blur does hardly tells.
     """
-    count = profiles.shape[1]
-    plain = max(1, round(_PLAIN * count / 2.0))
-    inside, outside = profiles[:, :plain], profiles[:, -plain:]
-    black, white = float(inside.mean()), float(outside.mean())
-    contrast = white - black
-    if contrast < min_contrast:
-        return None
-    share = (white - profiles) / contrast
-    places = share.sum(axis=1) * (2.0 * reach / count) - reach
-    # A wrong level moves all points alike, by what lies between the plain ends: there it cancels with their noise.
-    level = float(inside.var() + outside.var()) / max(inside.size * _SAMPLE_PX, 1.0)
-    return places, ((1.0 - _PLAIN) * reach / contrast) ** 2 * level
+    weights = [max(edge.reach_px / before_px - 1.0, 0.0) ** 2 for edge in edges]
+    ratios = [edge.area_px / edge.expected_area_px for edge in edges]
+    change = (_USUAL_WEIGHT * _USUAL_BLUR_PX / before_px + np.dot(weights, ratios)) / (_USUAL_WEIGHT + sum(weights))
+    return min(max(before_px * float(change), SHARPEST_PX), _WIDEST_PX)
 
 
-def _line(
-    s: FloatArray, places: FloatArray, common: float, config: TagConfig
-) -> tuple[float, float, FloatArray] | Reason:
-    """Place, slope and their covariance (2, 2) of the line through points at s (n,); a reason where there is none."""
-    design = np.column_stack([np.ones_like(s), s])
-    kept, scatter, solution = np.ones(len(s), dtype=bool), 0.0, np.zeros(2)
-    for _ in range(3):
-        chosen = design[kept]
-        solution = np.linalg.solve(chosen.T @ chosen, chosen.T @ places[kept])
-        residuals = places - design @ solution
-        scatter = max(_MAD_TO_SIGMA * float(np.median(np.abs(residuals[kept]))), _FLOOR_PX)
-        agreeing = np.abs(residuals) <= _STRAY * scatter
-        if agreeing.sum() < _FEWEST_POINTS - 1:
-            return Reason.OCCLUDED
-        if (agreeing == kept).all():
-            break
-        kept = agreeing
-    residuals = places - design @ solution
-    count = int(kept.sum())
-    freedom = count - 2
-    if count < max(config.min_visible * len(s), _FEWEST_POINTS - 1) or scatter > config.max_edge_px:
-        return Reason.OCCLUDED
-    # With few points the scatter may be larger than it seems: Student's t has this variance.
-    variance = float(np.square(residuals[kept]).sum()) / max(freedom - 2.0, 1.0)
-    cov = np.asarray(_SMOOTHED * variance * np.linalg.inv(design[kept].T @ design[kept]), dtype=np.float64)
-    cov += np.diag([common + _FLOOR_PX**2, _FLOOR_PX**2])
-    return float(solution[0]), float(solution[1]), cov
+def _likeness(edges: list[Edge]) -> float:
+    """By how much neighbouring points err alike: variance of their mean, in units of what independent ones make.
+
+    Interpolation and blur give a part of a pixel's noise to its neighbours. So slow waves along the edges, which place
+    and slope are but the slowest of, have more of it than the quick ones.
+    """
+    power, count = _SMOOTHED_WAVES * _SMOOTHED, float(_SMOOTHED_WAVES)
+    for edge in edges:
+        quickest = max(len(edge.residuals) // _SLOW, _LEAST_QUICKEST)
+        slow = np.asarray(dct(edge.residuals, norm="ortho"))[2:quickest]
+        power, count = power + float(np.square(slow).sum()), count + len(slow)
+    return power / count
 
 
-def _meeting(one: _Edge, other: _Edge) -> FloatArray:
+def _meeting(one: Edge, other: Edge) -> FloatArray:
     """Where two edges' lines meet (2,) [px]."""
     steps = np.linalg.solve(np.column_stack([one.direction, -other.direction]), other.point - one.point)
     return one.point + steps[0] * one.direction
 
 
-def _corner_covariance(edges: list[_Edge]) -> FloatArray:
+def _corner_covariance(edges: list[Edge]) -> FloatArray:
     """Covariance (8, 8) of the corners: each belongs to the edge before it and to its own.
 
     A corner x on both lines n·x = place moves by dx with n₁·dx = dp₁ and n₂·dx = dp₂, where dp is the line's shift
     there: that of its place, and of its slope times s.
     """
+    likeness = _likeness(edges)
     by_edge = np.zeros((8, 8))
     for corner in range(4):
         before, after = edges[corner - 1], edges[corner]
@@ -205,10 +112,10 @@ def _corner_covariance(edges: list[_Edge]) -> FloatArray:
             by_edge[rows, 2 * edge_number + 1] += s * solve[:, column]
     cov = np.zeros((8, 8))
     for number, edge in enumerate(edges):
-        cov[2 * number : 2 * number + 2, 2 * number : 2 * number + 2] = edge.cov
+        cov[2 * number : 2 * number + 2, 2 * number : 2 * number + 2] = likeness * edge.scatter + edge.shared
     return by_edge @ cov @ by_edge.T
 
 
-def _unit_normal(edge: _Edge) -> FloatArray:
+def _unit_normal(edge: Edge) -> FloatArray:
     direction = edge.direction / np.linalg.norm(edge.direction)
     return np.array([direction[1], -direction[0]])

@@ -147,8 +147,9 @@ class TagTracker:
             return Reason.REPROJECTION
         if len(poses) > 1 and (poses[1].squares - best.squares) / max(misfit, 1.0) < _CLEARLY_WORSE:
             return Reason.AMBIGUOUS
-        # What the claimed noise does not explain is taken for more noise.
-        return Pose(best.rotation, best.x, best.cov * max(misfit, 1.0), best.squares, best.by_sighting)
+        # What the claimed noise does not explain, nor chance (1-sigma), is taken for more noise.
+        unexplained = max(misfit - math.sqrt(2.0 / freedom), 1.0)
+        return Pose(best.rotation, best.x, best.cov * unexplained, best.squares, best.by_sighting)
 
     def _minima(self, estimator: PoseEstimator, seen: list[dict[int, TagImage]]) -> list[Pose]:
         """The different poses that squares are least at, the most likely first."""

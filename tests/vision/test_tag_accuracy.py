@@ -25,6 +25,8 @@ LOOKS = {
     "usual": Look(),
     "noisy": Look(noise_sd=8.0),
     "defocused": Look(blur_px=1.0, noise_sd=4.0),
+    "sharp": Look(blur_px=0.4, noise_sd=2.0),
+    "blurred": Look(blur_px=1.4, noise_sd=2.0),
 }
 pytestmark = pytest.mark.soak
 
@@ -71,5 +73,6 @@ def test_place_and_turn_of_a_tag_are_as_sure_as_claimed(name, capsys) -> None:
             f"{dict(misses)} |"
         )
     assert len(errors) > 0.85 * FRAMES
-    assert 58.0 < within.mean() < 78.0
-    assert twice.mean() > 88.0
+    # Two standard errors of the mean of six that are not independent are 6.
+    assert 60.0 < within.mean() < 76.0
+    assert twice.mean() > 90.0

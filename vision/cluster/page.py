@@ -9,7 +9,7 @@ from interfaces.errors import ConfigError
 from vision.printing.sheet import AROUND_MM, LINE_MM, Page, Rectangle, Text, page, pattern, sheets
 from vision.tag_config import Dictionary
 from vision.tag_dictionary import tag_modules
-from vision.tag_image import MODULES
+from vision.tag_edge import MODULES
 
 from .shapes import Cell, Shape
 
