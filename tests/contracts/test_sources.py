@@ -22,7 +22,7 @@ from scripted_sources import COV, Scripted
 
 from daemon.bench_wiring import through_bench
 from daemon.config import Config
-from daemon.demo.cube import cube_tables
+from daemon.demo.tags import cube_tables
 from daemon.wiring import driver_of
 from drivers.bench.device import Faults
 from drivers.bench.virtual_port import VirtualClock, VirtualPort

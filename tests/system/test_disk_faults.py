@@ -26,11 +26,13 @@ from two_processes import (
     write_robot,
 )
 
+from daemon.bus import client
 from daemon.checkpoint import generations
 from daemon.config import Config
 from daemon.status import LearnerStatus, SamplerStatus
 from daemon.store import PairReader
 from daemon.wire import CommandRequest, encode
+from interfaces.errors import BodyschemaError
 
 pytestmark = pytest.mark.timeout(600)
 SOME, MORE = 20, 20
@@ -45,6 +47,12 @@ def health(config: Config, process: str, kind: type, said: str) -> str:
 def healthy_again(config: Config, process: str, kind: type, said: str) -> None:
     """Wait until the process no longer says so."""
     status_when(config, process, kind, lambda status: not any(said in text for text in status.health))
+
+
+def refuses_a_checkpoint(config: Config) -> None:
+    """Ask the learner for a checkpoint that it cannot write: by itself it writes none where it has learnt nothing."""
+    with client(config.tables.zenoh.learner) as bus, pytest.raises(BodyschemaError, match="checkpoint"):
+        bus.ask_one(KEYS.command("learner"), encode(CommandRequest("checkpoint")))
 
 
 def fill(file: Path) -> None:
@@ -72,6 +80,7 @@ def test_a_disk_that_takes_nothing_is_told_by_both_processes_and_gone_on_with(
             text = health(config, "sampler", SamplerStatus, "No pairs are taken until the disk does")
             assert said in text
             assert str(config.store_file) in text
+            refuses_a_checkpoint(config)
             health(config, "learner", LearnerStatus, "the checkpoint")
             stopped = sampler_with(config, 0)
             assert json.loads(answer(config, "learner", KEYS.predict, b'{"q": [0.1, 0.2]}'))["pairs"] >= SOME
