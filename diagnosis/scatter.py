@@ -11,14 +11,14 @@ from interfaces.records import FloatArray
 
 from .fit import Fit
 
-# What says where a joint is by its last readings, and beside moves of how many times their scatter this does not
-# matter: to a play it is which way the joint came, to a lag how far.
-_FAR = {"backlash": 4.0, "settling": 20.0}
+# Beside a move of how many times the readings' scatter that does not matter: to a play it is which way the joint came,
+# to anything else how far.
+_PLAY_FAR, _FAR = 4.0, 20.0
 
 
 def remembers(effect: Effect) -> bool:
     """Whether an effect says where a joint is by its last readings, so that their scatter looks like it."""
-    return effect.name in _FAR and effect.where is not None
+    return effect.kind.encoder is not None and effect.kind.encoder.remembers
 
 
 def instruments(fit: Fit, effect: Effect) -> FloatArray:
@@ -33,7 +33,7 @@ def instruments(fit: Fit, effect: Effect) -> FloatArray:
     if not remembers(effect):
         return fit.weighted(fit.run.columns(effect)[:, :, effect.amounts])
     motion, joint = fit.observations.motion, fit.simulation.robot.joints.index(str(effect.where))
-    between = _between(fit, motion, joint, _FAR[effect.name])
+    between = _between(fit, motion, joint, _PLAY_FAR if effect.name == "backlash" else _FAR)
     columns = np.empty((len(motion), 3, len(effect.amounts)))
     # Of each two rows one is replaced at a time, so that its neighbours are as they were read.
     for every_other in (slice(0, None, 2), slice(1, None, 2)):

@@ -39,7 +39,7 @@ class EncoderEffect(ABC):
     Attributes:
         name: as in `diagnosis.json`.
         takes_source: whether another joint causes it.
-        remembers: whether it depends on the order of the readings.
+        remembers: whether what it does to a reading depends on the readings before.
         turns_only: whether only a joint that turns can have it.
     """
 
@@ -156,7 +156,6 @@ class EncoderJump(EncoderEffect):
     """The zero changes at a moment: true angle = reading + jump from then on."""
 
     name = "encoder_jump"
-    remembers = True
 
     def parameters(self, prismatic: bool) -> tuple[Parameter, ...]:
         return (

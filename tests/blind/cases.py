@@ -179,17 +179,14 @@ def hide(
     write_robot(folder, described, hold, marker_known=marker_known, pose_known=pose_known)
     tells_noise = bool(choosing.random() < 0.6)
     for name, taken in (("measured", measured), ("fresh", fresh)):
-        write_recording(
-            folder / f"{name}.csv",
-            described.read,
-            taken.t,
-            None if style == "held" else taken.segment,
-            taken.q,
-            taken.x,
-            taken.covariance if tells_noise else None,
-        )
+        _write(folder / f"{name}.csv", described, taken, in_runs=style != "held", tells_noise=tells_noise)
     sigma_m = float(np.sqrt(np.mean(np.trace(measured.noise, axis1=1, axis2=2))))
     return HiddenCase(folder, seed, described, hold, style, truth, nuisances, measured, fresh, sigma_m, ticks)
+
+
+def _write(file: Path, arm: Arm, taken: Taken, *, in_runs: bool, tells_noise: bool) -> None:
+    segment, covariance = taken.segment if in_runs else None, taken.covariance if tells_noise else None
+    write_recording(file, arm.read, taken.t, segment, taken.q, taken.x, covariance)
 
 
 def _visibility(nominal: World) -> Callable[[FloatArray], BoolArray]:

@@ -110,6 +110,13 @@ def test_a_memory_is_seen_on_ways_with_rests_and_from_pose_to_pose(robot, name, 
     assert max(chance(fit_of(robot, seed, effect, way=way), effect, beside=True) for seed in SEEDS) < CLEARLY
 
 
+def test_what_another_package_says_a_joint_remembers_is_asked_for_in_the_same_way(robot) -> None:
+    lag = remembers(robot, "settling")
+    other = dataclasses.replace(lag, kind=dataclasses.replace(lag.kind, name="lag_of_another_package"))
+    fit = fit_of(robot, 0)
+    np.testing.assert_array_equal(instruments(fit, other), instruments(fit, lag))
+
+
 def test_what_has_no_memory_is_left_as_it_is(robot) -> None:
     fit, offset = fit_of(robot, 0), Effect.at(robot, "joint_offset", ELBOW, values=[0.001])
     columns = fit.weighted(fit.run.columns(offset)[:, :, offset.amounts])
