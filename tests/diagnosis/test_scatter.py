@@ -13,7 +13,9 @@ from diagnosis.alignment import aligned
 from diagnosis.fit import Fit
 from diagnosis.held_out import Blocks, block_p_value
 from diagnosis.observations import Observations
+from diagnosis.rivals import standings
 from diagnosis.scatter import instruments
+from diagnosis.search import NAMED, Search, nats
 from effects import Effect, Motion, Simulation
 from interfaces.robot import RobotDescription
 
@@ -108,6 +110,27 @@ def test_a_memory_is_seen_on_ways_with_rests_and_from_pose_to_pose(robot, name, 
     }
     effect = Effect.at(robot, name, ELBOW, values=values[name])
     assert max(chance(fit_of(robot, seed, effect, way=way), effect, beside=True) for seed in SEEDS) < CLEARLY
+
+
+def with_false_play(robot: RobotDescription, seed: int) -> tuple[Fit, Search]:
+    """A play that the joint has not, fitted to readings that scatter: the likelihood speaks for it."""
+    fit, search = fit_of(robot, seed), Search([Effect.at(robot, "backlash", ELBOW)], lambda _: None)
+    false = fit.with_causes([Effect.at(robot, "backlash", ELBOW, values=[0.3 * SCATTER_RAD])])
+    assert nats(2.0 * (false.log_likelihood - fit.log_likelihood), 1) > NAMED
+    return false, search
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_a_play_that_only_the_scatter_speaks_for_is_taken_away_again(robot, seed) -> None:
+    false, search = with_false_play(robot, seed)
+    assert not search.run(false).causes
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_a_play_that_only_the_scatter_speaks_for_is_not_said_to_be_sure(robot, seed) -> None:
+    false, search = with_false_play(robot, seed)
+    (standing,) = standings(false, search, Blocks.cut(ROWS), 0)
+    assert standing.probability < 0.9
 
 
 def test_what_another_package_says_a_joint_remembers_is_asked_for_in_the_same_way(robot) -> None:
