@@ -121,6 +121,22 @@ def find_patches(
     return sorted(large, key=lambda patch: -patch.fill)[: config.max_candidates]
 
 
+def patch_at(image: ImageArray, centre_px: FloatArray, radius_px: float, gate: Gate) -> Patch | None:
+    """What of a circle in a BGR image has the marker's colour, as a patch of that circle; None when that is too little
+    for a ball."""
+    height, width = image.shape[:2]
+    low, high = np.rint(centre_px - radius_px).astype(int), np.rint(centre_px + radius_px).astype(int) + 1
+    low, high = np.clip(low, 0, (width, height)), np.clip(high, 0, (width, height))
+    if not (high > low).all():
+        return None
+    box = Region(*low.tolist(), *high.tolist())
+    mask = gate.mask(box.crop(image))
+    rows, columns = np.ogrid[box.top : box.bottom, box.left : box.right]
+    inside = (columns - centre_px[0]) ** 2 + (rows - centre_px[1]) ** 2 <= radius_px**2
+    fill = float(mask[inside].mean()) / 255.0
+    return Patch(box, centre_px, radius_px, fill) if fill >= _LEAST_FILL else None
+
+
 def measure(image: ImageArray, patch: Patch, eye: Pinhole, gate: Gate, config: VisionConfig) -> Disc | Reason:
     """The ball's image at `patch`, or why it is none."""
     height, width = image.shape[:2]

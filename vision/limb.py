@@ -3,6 +3,10 @@
 The filters are those of `limb_filters`. Which texture a ray's background has is what its samples make likeliest.
 Colours are turned so that the first channel is the ball's own colour: its shading is unknown there, while the other
 two channels show nothing of the ball but its gloss.
+
+Each channel tells the edge by itself. Where something narrow lies along the limb, a bar or the rest of a box that the
+ball hides, each channel mixes its light into the edge differently, and they tell different edges. No residual of the
+fit shows that, as whole arcs are off alike; but the channels' disagreement does, and such rays count little.
 """
 
 from __future__ import annotations
@@ -27,6 +31,9 @@ _LEAST_NOISE, _EVEN_RAYS = 1.0, 0.3
 _BEYOND_BLURS = 2.0
 # No ray tells its edge better than this, and one that tells it worse tells nothing [px].
 _BEST_SIGMA_PX, _WORST_SIGMA_PX = 0.03, 0.5
+# The channels' disagreement (chi-squared, 2 degrees of freedom): more than this, and than this times the median of the
+# ball's rays, is no noise, and makes a ray's variance larger by that power of it; what its median is of noise alone.
+_LEAST_DISAGREEMENT, _USUAL_DISAGREEMENT, _DISAGREEMENT_POWER, _OF_NOISE = 2.0, 1.5, 3, 3.0
 # The blur changes by this factor at most from one look to the next.
 _LARGEST_WIDENING = 1.5
 
@@ -40,12 +47,14 @@ class Limb:
         offset_px: how far beyond the outline that was thought of the edge is, shape (n,) [px].
         weight: inverse variances of `offset_px`, shape (n,) [1/px²]; 0 where a ray does not tell.
         blur_px: 1-sigma of lens and interpolation, as the edge shows it [px].
+        excess: the variance of what the channels disagree by, over the one that the pixels' noise makes; 1 or more.
     """
 
     rays: FloatArray
     offset_px: FloatArray
     weight: FloatArray
     blur_px: float
+    excess: float
 
     @property
     def noise_share(self) -> float:
@@ -79,27 +88,51 @@ def find_limb(
 def _filtered(rays: FloatArray, channels: FloatArray, both: tuple[Filters, Filters], blur_px: float) -> Limb:
     """What the filters make of the samples (3, n, m) of n rays in units of the noise, the ball's own colour first."""
     own, across = both
-    information, moved = np.zeros((2, len(rays)))
+    informations, shifts = np.zeros((2, len(channels), len(rays)))
     widening, widening_information = 0.0, 1e-9
     likeliest = np.concatenate([_likeliest(channels[:1], own), _likeliest(channels[1:], across)])
-    for channel, one, texture in zip(channels, (own, across, across), likeliest, strict=True):
+    for number, (channel, one, texture) in enumerate(zip(channels, (own, across, across), likeliest, strict=True)):
         contrast, shift = (np.einsum("nm,nm->n", part[texture], channel) for part in (one.contrast, one.shift))
         contrast = mean_of_three(contrast)
         inverse = 1.0 / one.shift_variance[texture]
-        information += contrast**2 * inverse
-        moved += contrast * shift * inverse
+        informations[number] = contrast**2 * inverse
+        shifts[number] = contrast * shift * inverse
         if one is across:
             inverse = 1.0 / one.widening_variance[texture]
             widening += float(np.sum(contrast * inverse * np.einsum("nm,nm->n", one.widening[texture], channel)))
             widening_information += float(np.sum(contrast**2 * inverse))
+    information, moved = informations.sum(axis=0), shifts.sum(axis=0)
+    mean = np.divide(moved, information, out=np.zeros_like(moved), where=information > 0)
+    doubt, excess = _doubt(informations, shifts, mean, information > _WORST_SIGMA_PX**-2)
+    information /= doubt
     told = information > _WORST_SIGMA_PX**-2
     information[~told] = 1.0
     return Limb(
         rays,
-        np.where(told, moved / information, 0.0),
+        np.where(told, mean, 0.0),
         told / (1.0 / information + _BEST_SIGMA_PX**2),
         blur_px * min(max(1.0 + widening / widening_information / blur_px, 1 / _LARGEST_WIDENING), _LARGEST_WIDENING),
+        excess,
     )
+
+
+def _doubt(
+    informations: FloatArray, shifts: FloatArray, mean: FloatArray, told: NDArray[np.bool_]
+) -> tuple[FloatArray, float]:
+    """By how much the variances of the rays are larger, shape (n,), as their channels disagree; and `Limb.excess`.
+
+    Args:
+        informations: inverse variances of what each channel tells, shape (3, n) [1/px²].
+        shifts: what it tells, times those, shape (3, n) [1/px].
+        mean: what they tell together, shape (n,) [px].
+        told: which rays tell anything, shape (n,).
+    """
+    off = shifts - informations * mean
+    chi_squared = np.divide(off**2, informations, out=np.zeros_like(off), where=informations > 0).sum(axis=0)
+    disagreement = mean_of_three(chi_squared)
+    middle = median(disagreement[told]) if told.any() else 0.0
+    usual = max(_LEAST_DISAGREEMENT, _USUAL_DISAGREEMENT * middle)
+    return np.maximum(1.0, disagreement / usual) ** _DISAGREEMENT_POWER, max(1.0, middle / _OF_NOISE)
 
 
 def _likeliest(channels: FloatArray, one: Filters) -> NDArray[np.intp]:

@@ -26,9 +26,9 @@ _ALIASED_PX = 0.55
 _FREEDOM, _FARTHEST_PX, _ROUNDS = 4.0, 1.0, 3
 # Below this, relative to the cubed trace, the limb does not determine centre and radius.
 _LEAST_DETERMINANT = 1e-6
-# The wave once round is at least so large: this, and so many times the pixels' noise; that the other waves are small is
-# no sign that it is. Beside that it is this part of what the few waves tell, and where they tell of far more it is
-# the square, over the last: a bend that shows is a sign of one that the fit has removed.
+# The wave once round is at least so large: this, and so many times the noise that the channels show; that the other
+# waves are small is no sign that it is. Beside that it is this part of what the few waves tell, and where they tell of
+# far more it is the square, over the last: a bend that shows is a sign of one that the fit has removed.
 _LEAST_DENSITY, _NOISE, _TOLD, _USUAL_DENSITY = 0.5, 2.0, 0.4, 12.0
 # Of an estimate's slope by its residuals (1 where none is far off, 0 where all are) at least this part counts.
 _LEAST_SLOPE = 0.4
@@ -86,14 +86,14 @@ def fit_limb(
     """
     blur_px = USUAL_BLUR_PX
     fit: _Fit | None = None
-    unsettled, noise_share = np.zeros(3), 1.0
+    unsettled, noise = np.zeros(3), 1.0
     for _ in range(_LOOKS):
         limb = find_limb(image, gate, centre_px, radius_px, shape, blur_px)
         fit = None if limb is None else _fit(limb, radius_px)
         if limb is None or fit is None:
             return None
         centre_px, radius_px = centre_px + shape @ fit.shift_px, radius_px + fit.growth_px
-        noise_share = limb.noise_share
+        noise = limb.noise_share * limb.excess
         last_blur_px, blur_px = blur_px, min(max(limb.blur_px, _SHARPEST_PX), _WIDEST_PX)
         moved_px = max(float(np.linalg.norm(fit.shift_px)), abs(fit.growth_px))
         if moved_px < _SETTLED_PX and abs(blur_px - last_blur_px) < _SETTLED_BLUR_PX:
@@ -107,7 +107,7 @@ def fit_limb(
     if (is_angular or fit.waves.quick > _LARGEST_DENSITY) and not aliased:
         return None
     told = waves(fit.pulls, radius_px, fit.first).mean
-    usual = _LEAST_DENSITY + _NOISE * noise_share
+    usual = _LEAST_DENSITY + _NOISE * noise
     density = math.hypot(usual, (_TOLD + told / _USUAL_DENSITY) * told)
     cov = density * fit.inverse + np.outer(unsettled, unsettled)
     # A blurred disc's edge, where it is steepest, is nearer to the centre than the disc's.

@@ -12,7 +12,7 @@ from interfaces.camera import StereoCalibration
 from interfaces.records import FloatArray, ImageArray, MarkerFix, MarkerMiss, Reason, StereoFrame, frozen_array
 
 from .ball_size import BallSize
-from .blob import Disc, Region, find_patches, measure, roughly
+from .blob import Disc, Patch, Region, find_patches, measure, patch_at, roughly
 from .colour import gate_of
 from .config import VisionConfig
 from .images import check_calibration, check_images
@@ -60,7 +60,7 @@ class _Expected:
     centre_px: FloatArray
     radius_px: float
 
-    def fits(self, disc: Disc) -> bool:
+    def fits(self, disc: Disc | Patch) -> bool:
         """Whether a disc is the marker as far as one eye can tell."""
         apart_px = max(float(np.linalg.norm(disc.centre_px - self.centre_px)), abs(disc.radius_px - self.radius_px))
         return apart_px < _AS_EXPECTED * self.radius_px
@@ -200,10 +200,14 @@ class StereoTracker:
         """
         region = self._whole if expected is None else expected.region
         least_radius_px = 0.0 if expected is None else _LEAST_SIZE * expected.radius_px
+        patches = find_patches(image, region, self._gate, self.config, least_radius_px)
         discs: list[Disc] = []
         rough: list[Disc] = []
         reason: Reason | None = None
-        for patch in find_patches(image, region, self._gate, self.config, least_radius_px):
+        if expected is not None and not any(patch.is_whole and expected.fits(patch) for patch in patches):
+            # What is behind the ball has its colour, too.
+            discs += self._where_expected(image, expected)
+        for patch in patches:
             if any(np.linalg.norm(patch.centre_px - disc.centre_px) < disc.radius_px for disc in discs):
                 continue
             if expected is not None and not patch.is_whole and any(expected.fits(disc) for disc in discs):
@@ -216,6 +220,12 @@ class StereoTracker:
             elif not any(outcome.is_same_as(disc) for disc in discs):
                 discs.append(outcome)
         return discs or reason or Reason.NO_MARKER, rough
+
+    def _where_expected(self, image: ImageArray, expected: _Expected) -> list[Disc]:
+        """The marker, if it can be measured from the circle on that it was expected to be."""
+        patch = patch_at(image, expected.centre_px, expected.radius_px, self._gate)
+        outcome = None if patch is None else measure(image, patch, self._eye, self._gate, self.config)
+        return [outcome] if isinstance(outcome, Disc) and expected.fits(outcome) else []
 
     def _predicted(self, t: float) -> tuple[_Expected, _Expected] | None:
         track = self._track
