@@ -75,6 +75,23 @@ def test_a_ball_in_full_view_is_found_nearly_always(errors):
     assert len(errors.misses) <= most, errors.misses
 
 
+def test_a_bar_behind_the_ball_along_its_limb_hardly_pulls_its_centre():
+    x = np.array([0.01, 0.0, SMALL.focal_px * RADIUS_M / 12.0])
+    u = SMALL.project(x)[0]
+    pictures = np.full((2, *SMALL.image_size_px[::-1], 3), 0.6)
+    pictures[0, :, round(u - 12.0) : round(u - 6.0)] = (0.1, 0.1, 0.12)
+    off_px = []
+    for seed in range(12):
+        frame = render_pair(
+            x, RADIUS_M, Look(noise_sd=2.0), (pictures[0], pictures[1]), np.random.default_rng(seed), SMALL
+        )
+        fix = StereoTracker(SMALL).track(frame)
+        assert isinstance(fix, MarkerFix)
+        off_px.append(fix.centres_px[0] - u)
+    # 0.07 px where all rays that tell an edge are believed alike.
+    assert abs(np.mean(off_px)) < 0.05, off_px
+
+
 def test_more_image_noise_makes_the_claimed_sigma_larger():
     quiet, loud = (measure_errors(SMALL, Look(noise_sd=sd), 25, 7).sigma for sd in (1.0, 12.0))
     assert np.median(loud) > 1.5 * np.median(quiet)

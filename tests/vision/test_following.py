@@ -66,6 +66,31 @@ def test_a_ball_that_goes_away_into_the_shade_is_followed():
         assert sigmas_off(tracker.track(stage(ball, t=number * FRAME_S)), ball) < FAR_SIGMAS
 
 
+def test_a_followed_ball_is_found_before_a_box_of_nearly_its_colour():
+    ball = Ball((0.05, 0.0, 1.4))
+    box = Slab((0.05, -0.06), (0.13, 0.02), 1.4, (0.8, 0.2, 0.15))
+    frame = stage(box, ball, t=FRAME_S)
+    assert sigmas_off(tracker_that_saw(ball).track(frame), ball) < FAR_SIGMAS
+    # By its colour alone the box and the ball are one patch.
+    assert reason(StereoTracker(SMALL).track(frame)) is Reason.OCCLUDED
+
+
+def test_a_box_of_the_ball_s_colour_where_the_ball_was_expected_is_no_ball():
+    tracker = tracker_that_saw(NEAR)
+    box = Slab((0.01, -0.04), (0.09, 0.04), 0.8, NEAR.rgb)
+    assert reason(tracker.track(stage(box, t=FRAME_S))) is Reason.OCCLUDED
+
+
+def test_a_ball_that_is_expected_out_of_view_is_missed_with_a_reason():
+    tracker = StereoTracker(SMALL)
+    edge_m = 0.8 * SMALL.principal_point_px[0] / SMALL.focal_px
+    for number in (3, 2):
+        ball = Ball((edge_m - 0.05 * number, 0.0, 0.8))
+        assert isinstance(tracker.track(stage(ball, t=(3 - number) * FRAME_S)), MarkerFix)
+    assert reason(tracker.track(stage(NEAR, t=3 * FRAME_S))) is not Reason.NO_MARKER
+    assert reason(tracker.track(stage(t=4 * FRAME_S))) is Reason.NO_MARKER
+
+
 def test_a_tracker_told_to_forget_searches_the_whole_images():
     tracker = tracker_that_saw(NEAR)
     tracker.forget()
