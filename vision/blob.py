@@ -92,6 +92,7 @@ class Disc:
         cov_px: covariance of the centre, shape (2, 2) [px²].
         radius_sigma_px: 1-sigma of the radius [px].
         level: how bright the marker's colour is on it [grey levels].
+        unrest: how far its limb leaves the ellipse, in variances of its samples; 0 where that was not looked at.
     """
 
     centre_px: FloatArray
@@ -99,6 +100,7 @@ class Disc:
     cov_px: FloatArray
     radius_sigma_px: float
     level: float
+    unrest: float = 0.0
 
     def is_same_as(self, other: Disc) -> bool:
         """Whether two discs, of overlapping patches, show the same ball."""
@@ -160,7 +162,7 @@ def measure(image: ImageArray, patch: Patch, eye: Pinhole, gate: Gate, config: V
         return Reason.AT_BORDER
     # Of all the ball: the patch may be its brighter part.
     level = _level(image, Region(0, 0, width, height), centre_px, outline.radius_px, gate)
-    return Disc(centre_px, outline.radius_px, outline.cov_px, outline.radius_sigma_px, level)
+    return Disc(centre_px, outline.radius_px, outline.cov_px, outline.radius_sigma_px, level, outline.unrest)
 
 
 def roughly(image: ImageArray, patch: Patch, gate: Gate) -> Disc | None:

@@ -33,9 +33,9 @@ _LEAST_DENSITY, _NOISE, _TOLD, _USUAL_DENSITY = 0.5, 2.0, 0.4, 12.0
 # Of an estimate's slope by its residuals (1 where none is far off, 0 where all are) at least this part counts.
 _LEAST_SLOPE = 0.4
 # What covers a ball breaks its limb at sharp corners, which shows in the quick waves; what is behind it bends whole
-# arcs, in the slow ones, which the claim follows. Beyond so many times the variance of the samples it is no ball's
-# limb alone.
-_LARGEST_DENSITY = 18.0
+# arcs, in the slow ones, which the claim follows. Beyond so many times the variance of the samples, as far as the
+# channels agree on that, it is no ball's limb alone.
+_LARGEST_DENSITY = 10.0
 # What leaves the circle by more of its radius (RMS, noise apart) is angular: a small square, whose corners blur rounds.
 _MOST_ANGULAR = 0.05
 # What a lens leaves of its distortion makes a limb oval, by this part of its radius at most, but fits all around.
@@ -53,6 +53,7 @@ class Circle:
         radius_px: [px].
         cov_px: covariance of the centre, shape (2, 2) [px²].
         radius_sigma_px: 1-sigma of the radius [px].
+        unrest: how far the limb leaves the circle, slowly and quickly, in variances of its samples.
         aliased: whether the image was not anti-aliased, so that all this is worth little.
     """
 
@@ -60,6 +61,7 @@ class Circle:
     radius_px: float
     cov_px: FloatArray
     radius_sigma_px: float
+    unrest: float
     aliased: bool
 
 
@@ -86,14 +88,15 @@ def fit_limb(
     """
     blur_px = USUAL_BLUR_PX
     fit: _Fit | None = None
-    unsettled, noise = np.zeros(3), 1.0
+    unsettled, noise, excess = np.zeros(3), 1.0, 1.0
     for _ in range(_LOOKS):
         limb = find_limb(image, gate, centre_px, radius_px, shape, blur_px)
         fit = None if limb is None else _fit(limb, radius_px)
         if limb is None or fit is None:
             return None
         centre_px, radius_px = centre_px + shape @ fit.shift_px, radius_px + fit.growth_px
-        noise = limb.noise_share * limb.excess
+        excess = limb.excess
+        noise = limb.noise_share * excess
         last_blur_px, blur_px = blur_px, min(max(limb.blur_px, _SHARPEST_PX), _WIDEST_PX)
         moved_px = max(float(np.linalg.norm(fit.shift_px)), abs(fit.growth_px))
         if moved_px < _SETTLED_PX and abs(blur_px - last_blur_px) < _SETTLED_BLUR_PX:
@@ -104,7 +107,7 @@ def fit_limb(
     if fit is None:
         return None
     is_angular = fit.off_px > _MOST_ANGULAR * radius_px
-    if (is_angular or fit.waves.quick > _LARGEST_DENSITY) and not aliased:
+    if (is_angular or fit.waves.quick > _LARGEST_DENSITY * excess) and not aliased:
         return None
     told = waves(fit.pulls, radius_px, fit.first).mean
     usual = _LEAST_DENSITY + _NOISE * noise
@@ -112,7 +115,8 @@ def fit_limb(
     cov = density * fit.inverse + np.outer(unsettled, unsettled)
     # A blurred disc's edge, where it is steepest, is nearer to the centre than the disc's.
     radius_px += blur_px**2 / (2.0 * radius_px)
-    return Circle(centre_px, radius_px, shape @ cov[:2, :2] @ shape, math.sqrt(cov[2, 2]), aliased)
+    unrest = math.sqrt(fit.waves.slow * fit.waves.quick) / excess
+    return Circle(centre_px, radius_px, shape @ cov[:2, :2] @ shape, math.sqrt(cov[2, 2]), unrest, aliased)
 
 
 def _fit(limb: Limb, radius_px: float) -> _Fit | None:

@@ -18,6 +18,9 @@ from .triangulate import Location, locate
 
 # A mirror gives back less than this of the light, and its copy stands farther off.
 _MIRRORED_LIGHT = 0.8
+# Fingertips over a limb show in both eyes: where both limbs leave their ellipses by more, in variances of the samples,
+# something covers the ball. What is behind it is not the same in both.
+_MOST_UNREST = 4.2
 # What calibration leaves of a difference between the sizes that the eyes see (1-sigma, relative).
 _SIZE_TOLERANCE = 0.002
 # Discs of the two eyes that may be one thing; and how much of a thing's place has to show its colour.
@@ -35,7 +38,7 @@ class StereoMatcher:
         outcomes = [self._check(one, other) for one, other in product(left, right)]
         found = _without_reflections([outcome for outcome in outcomes if isinstance(outcome, Location)])
         if len(found) == 1:
-            return found[0]
+            return found[0] if found[0].unrest < _MOST_UNREST else Reason.OCCLUDED
         if found:
             return Reason.AMBIGUOUS
         # The check that the best pair failed at.

@@ -77,6 +77,7 @@ class Outline:
         visible: share of the outline that nothing hides.
         uneven: share of the outline at which the background is too uneven to tell.
         off: share of the fit's weights where the outline leaves the ellipse in whole arcs.
+        unrest: how far the limb leaves the ellipse, in variances of its samples; 0 where that was not looked at.
     """
 
     centre_px: FloatArray
@@ -86,6 +87,7 @@ class Outline:
     visible: float
     uneven: float
     off: float
+    unrest: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,6 +155,7 @@ def refine_outline(image: Float32Array, gate: Gate, rough: Outline, shape: Float
         radius_px=fitted.radius_px,
         cov_px=cov_px,
         radius_sigma_px=fitted.radius_sigma_px,
+        unrest=fitted.unrest,
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,6 +25,7 @@ class Location:
         variances_px: variances of `centres_px`, shape (4,) [px²].
         level: how bright the marker's colour is on it, mean of the eyes [grey levels].
         radii_px: of the two discs, shape (2,) [px].
+        unrest: how far the limbs leave their ellipses, geometric mean of the two discs', in variances of their samples.
         sizes, size_sigmas: the radii as parts of what they have to be at this depth, and the 1-sigma of that which the
             images leave, shape (2,) each.
     """
@@ -33,6 +35,7 @@ class Location:
     centres_px: FloatArray
     variances_px: FloatArray
     level: float
+    unrest: float
     radii_px: FloatArray
     sizes: FloatArray
     size_sigmas: FloatArray
@@ -92,6 +95,7 @@ def locate(calibration: StereoCalibration, radius_m: float, left: Disc, right: D
         centres_px=centres,
         variances_px=variances,
         level=(left.level + right.level) / 2,
+        unrest=math.sqrt(left.unrest * right.unrest),
         radii_px=radii_px,
         sizes=radii_px / expected_px,
         size_sigmas=np.array([left.radius_sigma_px, right.radius_sigma_px]) / radii_px,

@@ -5,8 +5,9 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from ball_renderer import SMALL, VGA, Look, in_eyes, take
-from scenes import Ball, Slab, reason, sigmas_off, stage
+from ball_renderer import SMALL, VGA, Look, clutter, in_eyes, paint_ball, random_light, take
+from hand import paint_fingers
+from scenes import RADIUS_M, Ball, Slab, place, reason, sigmas_off, stage
 
 from interfaces.errors import SourceError
 from interfaces.records import MarkerFix, Reason, StereoFrame
@@ -121,6 +122,30 @@ def test_however_much_of_the_ball_is_covered_a_fix_is_right_or_there_is_none(cov
 def test_an_arm_that_touches_the_ball_s_outline_does_not_pull_the_centre():
     beside = Slab((BALL.x[0] + 1.02 * BALL.radius_m, -0.1), (0.2, 0.1), BALL.x[2], rgb=(0.15, 0.15, 0.2))
     assert sigmas_off(answer(beside, BALL), BALL) < FAR_SIGMAS
+
+
+def test_fingertips_a_tenth_of_the_radius_over_a_small_ball_do_not_pass():
+    rng = np.random.default_rng(3)
+    tracker = StereoTracker(SMALL)
+    passed = 0
+    for _ in range(60):
+        tracker.forget()
+        look = random_light(rng, Look(noise_sd=1.5, shot=0.03, samples=4))
+        x, turn = place(SMALL, float(rng.uniform(7.0, 9.0)), rng), float(rng.uniform(0.0, 2.0 * np.pi))
+        images = []
+        for x_eye in in_eyes(x, SMALL):
+            ball = paint_ball(clutter(rng, SMALL.image_size_px), x_eye, RADIUS_M, look, SMALL)
+            images.append(take(paint_fingers(ball, x_eye, RADIUS_M, turn, 0.9, SMALL), look, rng))
+        passed += isinstance(tracker.track(StereoFrame(0.0, *images)), MarkerFix)
+    # 8 of 180 pass where each eye is looked at by itself.
+    assert passed <= 1
+
+
+def test_a_limb_uneven_in_both_eyes_is_covered_and_in_one_eye_it_is_what_is_behind():
+    matcher = StereoMatcher(SMALL, VisionConfig())
+    left, right = (replace(disc, unrest=6.0) for disc in seen_discs(BALL, level=120.0))
+    assert matcher.match([left], [right]) is Reason.OCCLUDED
+    assert isinstance(matcher.match([left], [replace(right, unrest=1.0)]), Location)
 
 
 def test_a_red_box_is_no_ball():
