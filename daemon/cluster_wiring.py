@@ -59,6 +59,7 @@ class ClusterFile(msgspec.Struct):
     grown_percent: float
     grown_sigma_percent: float
     left_out: list[tuple[str, int]]
+    unused: list[str]
     tags: list[TagFigures]
 
 
@@ -148,6 +149,7 @@ def figures(found: MeasuredCluster) -> ClusterFile:
         grown_percent=100.0 * found.grown,
         grown_sigma_percent=100.0 * found.grown_sigma,
         left_out=list(found.left_out),
+        unused=list(found.unused),
         tags=[
             TagFigures(
                 id=tag.placed.id,
@@ -176,4 +178,6 @@ def said(found: MeasuredCluster) -> str:
     )
     if found.left_out:
         text += f" Left out: {', '.join(f'tag {id} in {name}' for name, id in found.left_out)}."
+    if found.unused:
+        text += f" Not used, as they do not show two tags to both eyes: {', '.join(found.unused)}."
     return text

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -163,6 +164,12 @@ def test_another_dictionary_is_named() -> None:
     found = fault(shown(Taken(), Printed(dictionary="5X5_50", marker_share=7 / 9))[0])
     assert found.why == "other_dictionary"
     assert "the markers are 5X5_50, not 4X4_50. Give --dictionary 5X5_50" in found.text
+
+
+def test_a_board_with_markers_is_no_plain_chessboard() -> None:
+    found = fault(shown(Taken())[0], replace(BOARD, pattern="chessboard"))
+    assert found.why == "other_pattern"
+    assert "has 4X4_50 markers in its squares. Leave out --pattern, and give --dictionary 4X4_50" in found.text
 
 
 @pytest.mark.parametrize(("columns", "rows"), [(10, 7), (6, 6), (9, 6)])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from dataclasses import replace
 
 import cv2
@@ -231,6 +232,28 @@ def test_an_eye_that_never_sees_the_board_is_named_with_the_reason() -> None:
     found = gathered([ImagePair(pair.name, pair.left, np.zeros_like(pair.right)) for pair in pairs[:3]], BOARD)
     with pytest.raises(CalibrationError, match=r"no right image .*; 3 of 3: the image is black. Take the lens cap off"):
         require_both(found)
+
+
+def test_three_pairs_of_another_board_are_enough_to_say_so() -> None:
+    _, pairs, _ = photographed()
+    taken: list[str] = []
+
+    def counted() -> Iterator[ImagePair]:
+        for pair in pairs:
+            taken.append(pair.name)
+            yield pair
+
+    found = gathered(counted(), replace(BOARD, dictionary="5X5_50"))
+    assert len(taken) == 3
+    with pytest.raises(CalibrationError, match=r"6 of 6: the markers are 4X4_50, not 5X5_50. Give --dictionary 4X4_50"):
+        require_both(found)
+
+
+def test_how_far_the_search_for_the_board_is_shows_as_it_goes() -> None:
+    black = np.zeros((480, 640), np.uint8)
+    told: list[str] = []
+    gathered([ImagePair(str(k), black, black) for k in range(20)], BOARD, told.append)
+    assert told[:2] == ["10 pairs looked at; the board is in 0", "20 pairs looked at; the board is in 0"]
 
 
 def test_images_with_the_same_fault_are_told_in_one_line() -> None:

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from tag_renderer import Sheet, photograph
 
 from daemon.cli import app
-from daemon.cluster_wiring import ClusterFile, Wanted, _require_tags, sides_of
+from daemon.cluster_wiring import ClusterFile, Wanted, _require_tags, figures, said, sides_of
 from interfaces.camera import StereoCalibration
 from interfaces.errors import ConfigError
 from interfaces.records import FloatArray
@@ -115,9 +115,20 @@ def test_tags_of_other_sides_are_found_where_they_were_glued() -> None:
 
 def test_the_tables_name_the_side_of_tags_that_have_their_own() -> None:
     tags = [PlacedTag(id=3), PlacedTag(id=4, side_m=0.025)]
-    said = tomllib.loads(cluster_tables("apriltag_36h11", SIDE_M, tags))
-    assert said["vision"]["tag"]["side_m"] == SIDE_M
-    assert [tag.get("side_m") for tag in said["vision"]["cluster"]["tags"]] == [None, 0.025]
+    written = tomllib.loads(cluster_tables("apriltag_36h11", SIDE_M, tags))
+    assert written["vision"]["tag"]["side_m"] == SIDE_M
+    assert [tag.get("side_m") for tag in written["vision"]["cluster"]["tags"]] == [None, 0.025]
+
+
+def test_views_that_show_one_tag_alone_are_named_as_unused() -> None:
+    rng = np.random.default_rng(4)
+    views = looked(built(rng), rng)
+    alone = {min(views[5].left): views[5].left[min(views[5].left)]}
+    views[5] = ClusterView(views[5].name, alone, {})
+    found = measure_cluster(views, EYES, SIDE_M)
+    assert found.unused == ("05",)
+    assert said(found).endswith("Not used, as they do not show two tags to both eyes: 05.")
+    assert figures(found).unused == ["05"]
 
 
 @pytest.mark.parametrize("text", ["7", "7=", "=25", "seven=25", "7=-25", "7=nan", "7=25,"])

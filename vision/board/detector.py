@@ -19,7 +19,9 @@ from .sharpness import blur_px
 from .squares import squares_seen
 
 IntArray = NDArray[np.int64]
-Why = Literal["dark", "over_exposed", "blurred", "other_dictionary", "other_squares", "not_found"]
+Why = Literal["dark", "over_exposed", "blurred", "other_dictionary", "other_pattern", "other_squares", "not_found"]
+# The board itself is not the one that is looked for.
+OTHER_BOARD: tuple[Why, ...] = ("other_dictionary", "other_pattern", "other_squares")
 
 _LEAST_CORNERS = 6
 # A corner's place is known to a small part of its edges' width; from here on it gets too large a part.
@@ -113,15 +115,20 @@ class BoardDetector:
         size = (self.board.columns - 1, self.board.rows - 1)
         found, px = cv2.findChessboardCornersSB(grey, size, flags=cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY)
         if not found:
+            markers = _other_dictionary(grey, None)
+            if markers is not None:
+                remedy = f"Leave out --pattern, and give --dictionary {markers}"
+                return NotFound("other_pattern", f"the board has {markers} markers in its squares. {remedy}")
             text = f"no chessboard of {self.board.columns}x{self.board.rows} squares. All of it has to be in view"
             return NotFound("not_found", text)
         corners = _in_order(grey, np.reshape(px, (size[1], size[0], 2)).astype(np.float64), self.board)
         return Corners(np.arange(len(self.board.corners_m)), corners.reshape(-1, 2))
 
 
-def _other_dictionary(grey: ImageArray, wanted: str) -> str | None:
-    """The family of markers that are in the image in the place of those wanted."""
-    families = [name for name in _FAMILIES if name.split("_")[0] != wanted.split("_")[0] or "APRILTAG" in name]
+def _other_dictionary(grey: ImageArray, wanted: str | None) -> str | None:
+    """The family of markers that are in the image in the place of those wanted, if any are."""
+    bits = "" if wanted is None else wanted.split("_")[0]
+    families = [name for name in _FAMILIES if name.split("_")[0] != bits or "APRILTAG" in name]
     seen = {name: _markers(grey, name) for name in families if name != wanted}
     best = max(seen, key=lambda name: len(seen[name]))
     if len(seen[best]) < 3:

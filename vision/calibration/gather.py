@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 from interfaces.records import ImageArray
-from vision.board import Board, BoardDetector, Corners, NotFound
+from vision.board import OTHER_BOARD, Board, BoardDetector, Corners, NotFound
 from vision.rig import CalibrationError
 
 from .guidance import Coverage
@@ -17,6 +17,8 @@ from .images import ImagePair, require_equal_sizes
 from .view import EYES, Eye, View
 
 _MOST_NAMES = 4
+# So many pairs that show another board, and none the one looked for, say enough; progress is told after so many.
+_SURE_PAIRS, _TOLD_PAIRS = 3, 10
 _NUMBERS = re.compile(r"\d+(\.\d+)?")
 
 
@@ -60,22 +62,26 @@ class Gathered:
 
 
 def gathered(pairs: Iterable[ImagePair], board: Board, tell: Callable[[str], None] = lambda _: None) -> Gathered:
-    """All views in images.
+    """All views in images; where the first ones show another board, the others are not looked at.
 
     Args:
-        tell: is told which images cannot be used, and why: one line a reason and eye.
+        tell: is told how far it is, and which images cannot be used, and why: one line a reason and eye.
 
     Raises:
         CalibrationError: the two eyes' images are of different sizes.
     """
     detector = BoardDetector(board)
     found = Gathered(board)
-    for pair in pairs:
+    for number, pair in enumerate(pairs, start=1):
         view, unusable = looked_at(pair, detector)
         found.image_size_px = pair.size_px
         found.unusable += unusable
         if view.left is not None or view.right is not None:
             found.add(view, pair)
+        if number == _SURE_PAIRS and not found.views and all(one.fault.why in OTHER_BOARD for one in found.unusable):
+            break
+        if number % _TOLD_PAIRS == 0:
+            tell(f"{number} pairs looked at; the board is in {len(found.views)}")
     for line in summarised(found.unusable):
         tell(line)
     return found

@@ -74,6 +74,7 @@ class MeasuredCluster:
         views: how many pairs of images it was made of.
         misfit: RMS of what is left, in units of the corners' own sigmas.
         left_out: names of views, and numbers of the tags in them that did not fit.
+        unused: names of views that do not show two tags to both eyes.
         grown, grown_sigma: by how much the printed squares seem larger than told, as a share, and its 1-sigma.
     """
 
@@ -81,6 +82,7 @@ class MeasuredCluster:
     views: int
     misfit: float
     left_out: tuple[tuple[str, int], ...]
+    unused: tuple[str, ...]
     grown: float
     grown_sigma: float
 
@@ -111,7 +113,8 @@ def measure_cluster(
         problem = _solved(usable, calibration, side_m, other_sides_m)
         worst = problem.worst()
         if worst is None:
-            return problem.result(left_out)
+            used = {view.name for view in usable}
+            return problem.result(left_out, [view.name for view in views if view.name not in used])
         left_out.append(worst)
         usable = _usable([_without(view, worst) for view in usable])
         if len(usable) < _LEAST_VIEWS or _is_odd(left_out, every):
@@ -363,7 +366,7 @@ class _Problem:
         usual = float(np.median(list(off.values())))
         return key if off[key] > _MOST_OFF * min(max(usual, 1.0), _MOST_USUAL) else None
 
-    def result(self, left_out: Sequence[tuple[str, int]]) -> MeasuredCluster:
+    def result(self, left_out: Sequence[tuple[str, int]], unused: Sequence[str]) -> MeasuredCluster:
         """The solution with its uncertainty: what the claimed noise does not explain is taken for more noise."""
         residuals, J, grown = self._linearised()
         misfit = self.misfit**2
@@ -378,7 +381,8 @@ class _Problem:
             placed = PlacedTag(id=id, xyz=place, rpy=rpy_of(rotation), side_m=self._other_sides_m.get(id))
             tags.append(MeasuredTag(placed, sigma[3:], sigma[:3], sum(id in view.ids for view in self._views)))
         size = float((inverse @ full.T @ residuals)[-1]), float(np.sqrt(inverse[-1, -1] * max(misfit, 1.0)))
-        return MeasuredCluster(tuple(tags), len(self._views), float(np.sqrt(misfit)), tuple(left_out), *size)
+        views, rest = len(self._views), (tuple(left_out), tuple(unused))
+        return MeasuredCluster(tuple(tags), views, float(np.sqrt(misfit)), *rest, *size)
 
 
 def _after(outer: Motion, inner: Motion) -> Motion:
