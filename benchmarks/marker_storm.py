@@ -129,20 +129,23 @@ def shoot(scene: Scene, number: int, rng: np.random.Generator) -> tuple[StereoFr
 
 @dataclass
 class Count:
-    """What became of the frames of one kind: how many, fixes, wrong ones, good balls, those kept, reasons for none, and
-    the errors (3,) of those kept in their claimed sigmas."""
+    """What became of the frames of one kind: how many, fixes, wrong ones, those of other things, good balls, those kept,
+    reasons for none, and the errors (3,) of those kept in their claimed sigmas."""
 
     frames: int = 0
     fixes: int = 0
     wrong: int = 0
+    elsewhere: int = 0
     good: int = 0
     kept: int = 0
     reasons: Counter[Reason] = field(default_factory=Counter)
     off_sigmas: list[FloatArray] = field(default_factory=list)
 
-    def add(self, answer: MarkerFix | MarkerMiss, x: FloatArray, *, wrong: bool, good: bool) -> None:
+    def add(self, answer: MarkerFix | MarkerMiss, x: FloatArray, *, shown: bool, good: bool) -> None:
+        wrong = is_wrong(answer, x, shown=shown)
         self.frames += 1
         self.wrong += wrong
+        self.elsewhere += wrong and isinstance(answer, MarkerFix) and is_elsewhere(answer, x, shown=shown)
         self.good += good
         if isinstance(answer, MarkerMiss):
             self.reasons[answer.reason] += 1
@@ -161,6 +164,11 @@ def is_wrong(answer: MarkerFix | MarkerMiss, x: FloatArray, *, shown: bool) -> b
     return not shown or bool(off @ np.linalg.solve(answer.cov, off) > SIGMAS**2 and np.linalg.norm(off) > WRONG_M)
 
 
+def is_elsewhere(fix: MarkerFix, x: FloatArray, *, shown: bool) -> bool:
+    """Whether a fix is of something else than the ball, which is at `x` (3,) [m], if it is shown at all."""
+    return not shown or float(np.linalg.norm(fix.x - x)) > RADIUS_M
+
+
 def run_scene(number: int, seed: int, count: Count, *, listed: bool) -> None:
     """Track the frames of one scene."""
     rng = np.random.default_rng((seed, number))
@@ -171,7 +179,7 @@ def run_scene(number: int, seed: int, count: Count, *, listed: bool) -> None:
         answer = tracker.track(frame)
         wrong = is_wrong(answer, x, shown=shown)
         good = shown and kind in GOOD and is_in_full_view(x)
-        count.add(answer, x, wrong=wrong, good=good)
+        count.add(answer, x, shown=shown, good=good)
         if listed and (wrong or (good and isinstance(answer, MarkerMiss))):
             said = f"off by {1e3 * (answer.x - x)} mm" if isinstance(answer, MarkerFix) else answer.reason
             print(f"scene {number} ({kind}), frame {frame_number}: {said}")
@@ -194,17 +202,22 @@ def main() -> None:
             run_scene(number, arguments.seed, counts[KINDS[number % len(KINDS)]], listed=arguments.list)
     except KeyboardInterrupt:
         print("Stopped; so far:")
-    print("| scene | frames | fixes | wrong | good balls | kept | rejected as |\n" + "| --- " * 7 + "|")
+    print(
+        "| scene | frames | fixes | wrong | of other things | good balls | kept | rejected as |\n" + "| --- " * 8 + "|"
+    )
     for kind, count in counts.items():
         said = ", ".join(f"{number} {reason}" for reason, number in count.reasons.most_common())
-        print(f"| {kind} | {count.frames} | {count.fixes} | {count.wrong} | {count.good} | {count.kept} | {said} |")
-    frames, wrong, good, kept = (
-        sum(getattr(count, part) for count in counts.values()) for part in ("frames", "wrong", "good", "kept")
+        told = count.frames, count.fixes, count.wrong, count.elsewhere, count.good, count.kept
+        print(f"| {kind} | {' | '.join(map(str, told))} | {said} |")
+    frames, wrong, elsewhere, good, kept = (
+        sum(getattr(count, part) for count in counts.values())
+        for part in ("frames", "wrong", "elsewhere", "good", "kept")
     )
     # No wrong one among n: the rate is below 3/n with 95 % confidence.
     bound = f", below {100 * 3 / frames:.3f} % at 95 %" if wrong == 0 else ""
     share = f" ({kept / good:.1%})" if good else ""
-    print(f"\n{wrong} wrong fixes in {frames} frames{bound}; {kept} of {good} good balls kept{share}")
+    print(f"\n{wrong} wrong fixes in {frames} frames{bound}, {elsewhere} of other things")
+    print(f"{kept} of {good} good balls kept{share}")
     off = np.abs([each for count in counts.values() for each in count.off_sigmas])
     if len(off):
         within = [" ".join(f"{each:.1%}" for each in np.mean(off < sigmas, axis=0)) for sigmas in (1.0, 2.0)]

@@ -57,6 +57,11 @@ class Limb:
     excess: float
 
     @property
+    def evenness(self) -> float:
+        """1 where all rays count alike, k/n where k of n rays do and the others tell nothing."""
+        return float(self.weight.sum()) ** 2 / (len(self.weight) * float(self.weight @ self.weight))
+
+    @property
     def noise_share(self) -> float:
         """The part of the variances of `offset_px` that is the pixels' noise, mean of the rays that tell."""
         return 1.0 - _BEST_SIGMA_PX**2 * float(self.weight[self.weight > 0].mean())
