@@ -129,8 +129,8 @@ def shoot(scene: Scene, number: int, rng: np.random.Generator) -> tuple[StereoFr
 
 @dataclass
 class Count:
-    """What became of the frames of one kind: how many, fixes, wrong ones, those of other things, good balls, those kept,
-    reasons for none, and the errors (3,) of those kept in their claimed sigmas."""
+    """What became of the frames of one kind: how many, fixes, wrong ones, those of other things, good balls, those
+    kept, reasons for none, and the errors (3,) of those kept in their claimed sigmas."""
 
     frames: int = 0
     fixes: int = 0
