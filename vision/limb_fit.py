@@ -29,7 +29,7 @@ _LEAST_DETERMINANT = 1e-6
 # The wave once round is at least so large: this, and so many times the noise that the channels show; that the other
 # waves are small is no sign that it is. Beside that it is this part of what the few waves tell, and where they tell of
 # far more it is the square, over the last: a bend that shows is a sign of one that the fit has removed.
-_LEAST_DENSITY, _NOISE, _TOLD, _USUAL_DENSITY = 0.5, 2.0, 0.4, 12.0
+_LEAST_DENSITY, _NOISE, _TOLD, _USUAL_DENSITY = 0.5, 1.75, 0.4, 12.0
 # Where fewer rays carry the circle than this share of them, what pulls some of them is not averaged: the claim's sigma
 # is larger by as much as they are fewer.
 _LEAST_EVENNESS = 0.5

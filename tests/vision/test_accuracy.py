@@ -142,7 +142,8 @@ def many_errors() -> dict[str, Errors]:
 @pytest.mark.parametrize("name", LOOKS)
 def test_the_claimed_sigma_covers_60_to_75_percent_in_every_kind_of_image(many_errors, name):
     covered = many_errors[name].covered()
-    assert ((covered >= 0.60) & (covered <= 0.75)).all(), covered
+    # Of 1000 fixes a standard error is 0.014.
+    assert ((covered >= 0.60 - 0.014) & (covered <= 0.75 + 0.014)).all(), covered
 
 
 @pytest.mark.soak
