@@ -43,6 +43,8 @@ _LARGEST_DENSITY = 10.0
 _MOST_ANGULAR = 0.05
 # What a lens leaves of its distortion makes a limb oval, by this part of its radius at most, but fits all around.
 _MOST_OVAL, _CLEAN_DENSITY = 0.015, 3.0
+# No ball is rounder than this part of its radius (RMS): seams, dust and dents are no fingers.
+_ROUND = 0.0075
 # An oval is tried where the slow waves are this large.
 _BENT_DENSITY = 20.0
 
@@ -56,7 +58,8 @@ class Circle:
         radius_px: [px].
         cov_px: covariance of the centre, shape (2, 2) [px²].
         radius_sigma_px: 1-sigma of the radius [px].
-        unrest: how far the limb leaves the circle, slowly and quickly, in variances of its samples.
+        unrest: how far the limb leaves the circle, slowly and quickly, in variances of its samples; 0 where it is as
+            round as balls are.
         aliased: whether the image was not anti-aliased, so that all this is worth little.
     """
 
@@ -118,7 +121,8 @@ def fit_limb(
     cov = fewer**2 * density * fit.inverse + np.outer(unsettled, unsettled)
     # A blurred disc's edge, where it is steepest, is nearer to the centre than the disc's.
     radius_px += blur_px**2 / (2.0 * radius_px)
-    unrest = math.sqrt(fit.waves.slow * fit.waves.quick) / excess
+    is_round = fit.off_px < _ROUND * radius_px
+    unrest = 0.0 if is_round else math.sqrt(fit.waves.slow * fit.waves.quick) / excess
     return Circle(centre_px, radius_px, shape @ cov[:2, :2] @ shape, math.sqrt(cov[2, 2]), unrest, aliased)
 
 

@@ -148,6 +148,18 @@ def test_a_limb_uneven_in_both_eyes_is_covered_and_in_one_eye_it_is_what_is_behi
     assert isinstance(matcher.match([left], [replace(right, unrest=1.0)]), Location)
 
 
+def test_a_ball_out_of_round_by_half_a_percent_is_found_however_little_noise_there_is():
+    # OpenCV draws a circle as a polygon, the same in both eyes.
+    images = []
+    for u in (190, 130):
+        image = np.full((240, 320, 3), 128, np.uint8)
+        cv2.circle(image, (16 * u, 16 * 120), 16 * 12, (30, 30, 220), -1, cv2.LINE_AA, 4)
+        images.append(cv2.GaussianBlur(image, (5, 5), 0.7))
+    radius_m = 12.0 * SMALL.baseline_m / 60.0
+    found = StereoTracker(SMALL, VisionConfig(radius_m=radius_m)).track(StereoFrame(0.0, *images))
+    assert isinstance(found, MarkerFix)
+
+
 def test_a_red_box_is_no_ball():
     assert reason(answer(Slab((-0.02, -0.1), (0.05, 0.0), 0.8, rgb=(0.7, 0.1, 0.1)))) is Reason.OCCLUDED
 
