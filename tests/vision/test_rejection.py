@@ -9,6 +9,7 @@ from ball_renderer import SMALL, VGA, Look, clutter, in_eyes, paint_ball, random
 from hand import paint_fingers
 from scenes import RADIUS_M, Ball, Slab, place, reason, sigmas_off, stage
 
+from interfaces.camera import StereoCalibration
 from interfaces.errors import SourceError
 from interfaces.records import MarkerFix, Reason, StereoFrame
 from vision.blob import Disc, Region, find_patches, measure
@@ -151,13 +152,12 @@ def test_a_limb_uneven_in_both_eyes_is_covered_and_in_one_eye_it_is_what_is_behi
 def test_a_ball_out_of_round_by_half_a_percent_is_found_however_little_noise_there_is():
     # OpenCV draws a circle as a polygon, the same in both eyes.
     images = []
-    for u in (190, 130):
+    for u in (160, 100):
         image = np.full((240, 320, 3), 128, np.uint8)
         cv2.circle(image, (16 * u, 16 * 120), 16 * 12, (30, 30, 220), -1, cv2.LINE_AA, 4)
         images.append(cv2.GaussianBlur(image, (5, 5), 0.7))
-    radius_m = 12.0 * SMALL.baseline_m / 60.0
-    found = StereoTracker(SMALL, VisionConfig(radius_m=radius_m)).track(StereoFrame(0.0, *images))
-    assert isinstance(found, MarkerFix)
+    calibration = StereoCalibration(300.0, (159.5, 119.5), 0.1, (320, 240))
+    assert isinstance(StereoTracker(calibration).track(StereoFrame(0.0, *images)), MarkerFix)
 
 
 def test_a_red_box_is_no_ball():
