@@ -206,7 +206,8 @@ class StereoTracker:
         reason: Reason | None = None
         if expected is not None and not any(patch.is_whole and expected.fits(patch) for patch in patches):
             # What is behind the ball has its colour, too.
-            discs += self._where_expected(image, expected)
+            found = self._where_expected(image, expected)
+            discs += [] if found is None else [found]
         for patch in patches:
             if any(np.linalg.norm(patch.centre_px - disc.centre_px) < disc.radius_px for disc in discs):
                 continue
@@ -221,11 +222,11 @@ class StereoTracker:
                 discs.append(outcome)
         return discs or reason or Reason.NO_MARKER, rough
 
-    def _where_expected(self, image: ImageArray, expected: _Expected) -> list[Disc]:
+    def _where_expected(self, image: ImageArray, expected: _Expected) -> Disc | None:
         """The marker, if it can be measured from the circle on that it was expected to be."""
         patch = patch_at(image, expected.centre_px, expected.radius_px, self._gate)
         outcome = None if patch is None else measure(image, patch, self._eye, self._gate, self.config)
-        return [outcome] if isinstance(outcome, Disc) and expected.fits(outcome) else []
+        return outcome if isinstance(outcome, Disc) and expected.fits(outcome) else None
 
     def _predicted(self, t: float) -> tuple[_Expected, _Expected] | None:
         track = self._track
