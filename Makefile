@@ -4,6 +4,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 export OPENBLAS_NUM_THREADS ?= 1
+# Without bytecode on the disk, each of the hundreds of processes that tests start compiles everything: twice the time.
+TESTS := PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest
 
 BENCH_BUDGET_S ?= 120
 PEERS_BUDGET_S ?= 240
@@ -29,7 +31,7 @@ demo: setup     ## Watch the whole thing learn in simulation, about a minute
 	@$(BIN)/bodyschema demo
 
 test: setup     ## Run the tests
-	@$(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder
+	@$(TESTS) -n auto --dist loadfile --no-loadscope-reorder
 
 check: setup    ## Lint: ruff, pyright, import-linter
 	@$(BIN)/ruff check .
@@ -40,8 +42,8 @@ check: setup    ## Lint: ruff, pyright, import-linter
 docs: setup     ## The docs as a site, into site/; look at it with: python -m http.server -d site
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
 
-soak: setup     ## The long tests: many seeds, many kills
-	@$(BIN)/python -m pytest -m soak --timeout 3600 -o faulthandler_timeout=3600
+soak: setup     ## The long tests: many seeds, many kills, properties with other examples
+	@$(TESTS) -m "soak or hypothesis" --hypothesis-profile soak --timeout 3600 -o faulthandler_timeout=3600
 
 bench: setup    ## Side-by-side figures, as ratios within one run; each for BENCH_BUDGET_S at most, an hour in all
 	@for file in $$(grep -l __main__ benchmarks/[a-z]*.py); do \

@@ -7,8 +7,18 @@ import subprocess
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # read when numpy is imported; more threads only spin
+
 import free_ports
 import pytest
+from hypothesis import HealthCheck, settings
+
+# No time limits: a busy machine is no failure. The same examples in every run, so that a red test is red again;
+# `make soak` draws others (its profile) and keeps what failed in .hypothesis.
+TIMELESS = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.register_profile("suite", TIMELESS, derandomize=True)
+settings.register_profile("soak", TIMELESS, print_blob=True)
+settings.load_profile("suite")
 
 
 @pytest.fixture(scope="session")
