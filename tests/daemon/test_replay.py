@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import json
-import os
 import subprocess
 import sys
 from dataclasses import replace
@@ -10,6 +9,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
+import warm
 from small_arm import JOINTS, write_small_arm
 
 from daemon.cli import app
@@ -53,9 +53,7 @@ def replay(*arguments: object) -> None:
 
 
 def command_line(*arguments: object) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "daemon", "replay", *map(str, arguments)]
-    environment = os.environ | {"OPENBLAS_NUM_THREADS": "1"}
-    return subprocess.run(command, capture_output=True, text=True, timeout=LIMIT_S, check=False, env=environment)
+    return warm.run("-m", "daemon", "replay", *arguments)
 
 
 def test_a_guided_path_is_one() -> None:
@@ -221,8 +219,7 @@ def test_ending_the_replay_ends_its_two_processes(tmp_path: Path, robot: Path) -
     guided(robot).write_csv(tmp_path / "a.csv")
     kept = str(tmp_path / "kept")
     command = [sys.executable, "-m", "daemon", "replay", str(tmp_path / "a.csv"), "--keep", kept]
-    environment = os.environ | {"OPENBLAS_NUM_THREADS": "1"}
-    with subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, env=environment) as process:
+    with subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL) as process:
         assert process.stderr is not None
         process.stderr.readline()
         assert len(processes_naming(f"--state-dir {kept}")) >= 2
@@ -248,8 +245,7 @@ def test_a_real_eye_in_hand_recording_is_learnt_in_a_frame_that_nobody_knew() ->
 @pytest.mark.parametrize("name", ["panda_eyeinhand", "ur5_laser", "wam_laser", "ur10_laser_a", "ur10_laser_b"])
 @pytest.mark.timeout(900)
 def test_real_recordings_are_predicted_better_than_by_the_aligned_model(name: str) -> None:
-    command = [sys.executable, "-m", "daemon", "replay", str(REAL_DATA / name / "measured.csv"), "--any-step", "--json"]
-    ended = subprocess.run(command, capture_output=True, text=True, timeout=800, check=False)
+    ended = command_line(REAL_DATA / name / "measured.csv", "--any-step", "--json")
     assert ended.returncode == 0, ended.stderr
     report = json.loads(ended.stdout)
     assert report["after"]["mean_mm"] < report["before"]["mean_mm"]

@@ -28,8 +28,6 @@ from contextlib import suppress
 from pathlib import Path
 from typing import IO
 
-# Only ends what hangs.
-LIMIT_S = 500.0
 RARELY_NEEDED = ("daemon.view", "daemon.fleet", "daemon.reproduce", "daemon.rerun", "daemon.__main__")
 PR_SET_PDEATHSIG = 1
 LONGEST_REQUEST = 1 << 17
@@ -95,7 +93,7 @@ def run(
     with tempfile.TemporaryFile("w+") as out, tempfile.TemporaryFile("w+") as err:
         child = Child(*arguments, cwd=cwd, env=env, stdout=out, stderr=err)
         try:
-            code = child.wait(LIMIT_S)
+            code = child.wait()
         finally:
             child.kill()
         for file in (out, err):

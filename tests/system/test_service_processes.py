@@ -6,14 +6,13 @@ import contextlib
 import os
 import signal
 import socket
-import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator
 from itertools import pairwise
 from pathlib import Path
 
 import pytest
+import warm
 from security_recipe import SEVERAL, carried_out
 from stalled_at import WORK
 from two_processes import KEYS, write_robot
@@ -87,18 +86,17 @@ def config(tmp_path: Path, free_endpoint: Callable[[], str]) -> Config:
 
 def started(
     config: Config, systemd: Systemd, process: str, *wrapper: object
-) -> contextlib.AbstractContextManager[subprocess.Popen[bytes]]:
+) -> contextlib.AbstractContextManager[warm.Child]:
     """A process of ours under `systemd`, its log beside robot.toml."""
     return running(systemd, log_of(config), *(wrapper or ("-m", "daemon")), process, "--robot", config.file)
 
 
 @contextlib.contextmanager
-def running(systemd: Systemd, log_file: Path, *arguments: object) -> Iterator[subprocess.Popen[bytes]]:
+def running(systemd: Systemd, log_file: Path, *arguments: object) -> Iterator[warm.Child]:
     """Python with these arguments under `systemd`."""
     environment = os.environ | {"NOTIFY_SOCKET": str(systemd.file), "WATCHDOG_USEC": str(round(1e6 * WATCHDOG_S))}
-    command = [sys.executable, *arguments]
     with log_file.open("ab") as log:
-        child = subprocess.Popen(command, stdin=subprocess.DEVNULL, stderr=log, env=environment)
+        child = warm.Child(*arguments, stderr=log, env=environment)
     try:
         yield child
     finally:

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
+import warm
 from killed_at import NOWHERE
 from small_arm import URDF
 
@@ -29,6 +30,7 @@ KEYS = Keys("arm")
 PAIRS_PER_S = 60.0
 CHECKPOINT_EVERY_S = 0.2
 S = TypeVar("S", SamplerStatus, LearnerStatus)
+Process = subprocess.Popen[bytes] | warm.Child
 ROBOT = """[robot]
 name = "arm"
 urdf = "arm.urdf"
@@ -79,7 +81,7 @@ def running(
     journal: Path | None = None,
     environment: Mapping[str, str] | None = None,
     prefix: tuple[str, ...] = (),
-) -> Iterator[subprocess.Popen[bytes]]:
+) -> Iterator[Process]:
     """A process of ours; it is gone after the with statement, if it has not ended before.
 
     Args:
@@ -89,10 +91,13 @@ def running(
         prefix: what the command begins with.
     """
     wrapper, notes = Path(__file__).with_name("killed_at.py"), journal or config.file.with_name("journal")
-    command = [*prefix, sys.executable, wrapper, *fate, notes, process, "--robot", config.file]
+    words = [wrapper, *fate, notes, process, "--robot", config.file]
     with (config.file.parent / f"{process}.log").open("ab") as log:
-        variables = {**os.environ, **(environment or {})}
-        child = subprocess.Popen(command, stdin=subprocess.DEVNULL, stderr=log, env=variables)
+        if environment or prefix:  # they work on what starts
+            command, variables = [*prefix, sys.executable, *words], {**os.environ, **(environment or {})}
+            child = subprocess.Popen(command, stdin=subprocess.DEVNULL, stderr=log, env=variables)
+        else:
+            child = warm.Child(*words, stderr=log)
     try:
         yield child
     finally:
@@ -100,7 +105,7 @@ def running(
         child.wait()
 
 
-def ended_well(child: subprocess.Popen[bytes]) -> bool:
+def ended_well(child: Process) -> bool:
     """Let it come to its end, and whether that was a good one."""
     child.terminate()
     return child.wait(LIFE_LIMIT_S) == 0
