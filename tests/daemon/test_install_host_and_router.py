@@ -20,7 +20,7 @@ from interfaces.errors import ConfigError
 
 EXPOSURE = 2.0
 analyze = pytest.mark.skipif(
-    shutil.which("systemd-analyze") is None, reason="systemd-analyze (Debian: systemd) is not installed"
+    shutil.which("systemd-analyze") is None, reason="no systemd-analyze; to run it: apt-get install systemd"
 )
 
 

@@ -45,7 +45,7 @@ model = "XM430-W350"
 STEREO = "focal_px = 600.0\nprincipal_point_px = [319.5, 239.5]\nbaseline_m = 0.2\nimage_size_px = [640, 480]\n"
 HERE = Installed(("/bin/true",), (Path("/home/pi/arm/.venv"), Path("/usr")), 252)
 analyze = pytest.mark.skipif(
-    shutil.which("systemd-analyze") is None, reason="systemd-analyze (Debian: systemd) is not installed"
+    shutil.which("systemd-analyze") is None, reason="no systemd-analyze; to run it: apt-get install systemd"
 )
 
 

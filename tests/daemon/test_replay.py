@@ -25,6 +25,7 @@ from interfaces.robot import RobotDescription
 # The limit only ends a replay that would never end; on a busy machine it takes longer, and passes.
 LIMIT_S = 300
 pytestmark = pytest.mark.timeout(LIMIT_S + 60)
+NO_REAL_DATA = "no measured recordings; to run it: put them into ../shared/data"
 REAL_DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 
 
@@ -228,7 +229,7 @@ def test_ending_the_replay_ends_its_two_processes(tmp_path: Path, robot: Path) -
     assert processes_naming(f"--state-dir {kept}") == []
 
 
-@pytest.mark.skipif(not REAL_DATA.is_dir(), reason="the measured recordings are not here")
+@pytest.mark.skipif(not REAL_DATA.is_dir(), reason=NO_REAL_DATA)
 def test_a_real_eye_in_hand_recording_is_learnt_in_a_frame_that_nobody_knew() -> None:
     folder = REAL_DATA / "panda_eyeinhand"
     ended = command_line(folder / "measured.csv", "--any-step", "--json", "--sigma-mm", 1, "--speed", 1)
@@ -241,7 +242,7 @@ def test_a_real_eye_in_hand_recording_is_learnt_in_a_frame_that_nobody_knew() ->
 
 
 @pytest.mark.soak
-@pytest.mark.skipif(not REAL_DATA.is_dir(), reason="the measured recordings are not here")
+@pytest.mark.skipif(not REAL_DATA.is_dir(), reason=NO_REAL_DATA)
 @pytest.mark.parametrize("name", ["panda_eyeinhand", "ur5_laser", "wam_laser", "ur10_laser_a", "ur10_laser_b"])
 @pytest.mark.timeout(900)
 def test_real_recordings_are_predicted_better_than_by_the_aligned_model(name: str) -> None:

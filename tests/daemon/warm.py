@@ -31,6 +31,7 @@ from typing import IO
 RARELY_NEEDED = ("daemon.view", "daemon.fleet", "daemon.reproduce", "daemon.rerun", "daemon.__main__")
 PR_SET_PDEATHSIG = 1
 LONGEST_REQUEST = 1 << 17
+_ASKING = threading.Lock()
 
 
 class Child:
@@ -54,7 +55,8 @@ class Child:
         self._fate, fate = os.pipe()
         with open(os.devnull, "wb") as nowhere:
             files = [fate, (stdout or nowhere).fileno(), (stderr or nowhere).fileno()]
-            socket.send_fds(_server(), [request.encode()], files)
+            with _ASKING:  # two threads must not start two servers
+                socket.send_fds(_server(), [request.encode()], files)
         os.close(fate)
         self.pid = int(os.read(self._fate, 64))
 

@@ -58,13 +58,14 @@ class Network:
     def _ip(self, *arguments: str) -> None:
         done = subprocess.run(["ip", *arguments], capture_output=True, text=True, check=False)
         if done.returncode:
-            pytest.skip(f"this machine makes no network namespaces: ip {' '.join(arguments)}: {done.stderr.strip()}")
+            said = f"ip {' '.join(arguments)}: {done.stderr.strip()}"
+            pytest.skip(f"no network namespaces ({said}); to run it: leave the container")
 
 
 @pytest.fixture(scope="module")
 def network() -> Iterator[Network]:
     if os.geteuid() != 0 or shutil.which("ip") is None:
-        pytest.skip("network namespaces need root and iproute2")
+        pytest.skip("no network namespaces; to run it: be root, apt-get install iproute2")
     network = Network(f"bs{os.getpid()}-")
     try:
         network.build()

@@ -31,7 +31,7 @@ QUIET += ["--disable-component-update", "--disable-sync"]
 # On a busy machine everything takes longer, and passes.
 LIMIT_MS = 90_000
 pytestmark = [
-    pytest.mark.skipif(CHROMIUM is None, reason="no chromium is installed (Debian's package chromium)"),
+    pytest.mark.skipif(CHROMIUM is None, reason="no browser; to run it: apt-get install chromium"),
     pytest.mark.timeout(400),
 ]
 SIZES = {"desktop": {"width": 1280, "height": 900}, "phone": {"width": 360, "height": 740}}

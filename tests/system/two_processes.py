@@ -29,6 +29,7 @@ LIFE_LIMIT_S = 100.0
 KEYS = Keys("arm")
 PAIRS_PER_S = 60.0
 CHECKPOINT_EVERY_S = 0.2
+_walks: dict[tuple[int, float], bytes] = {}  # text of recordings: it takes half a second to write
 S = TypeVar("S", SamplerStatus, LearnerStatus)
 Process = subprocess.Popen[bytes] | warm.Child
 ROBOT = """[robot]
@@ -55,7 +56,7 @@ checkpoint_every_s = {checkpoint_every_s}
 def write_robot(
     folder: Path,
     endpoint: Callable[[], str],
-    rows: int = 60_000,
+    rows: int = 30_000,
     pairs_per_s: float = PAIRS_PER_S,
     state_dir: Path = Path("state"),
 ) -> Config:
@@ -65,10 +66,14 @@ def write_robot(
     values = {"state_dir": state_dir, "checkpoint_every_s": CHECKPOINT_EVERY_S}
     robot_file.write_text(ROBOT.format(sampler=endpoint(), learner=endpoint(), **values))
     config = Config.load(robot_file, {})
-    t = np.arange(rows) / pairs_per_s
-    q = np.stack([1.5 * np.sin(0.3 * t), 1.2 * np.sin(0.17 * t + 1.0)], axis=1)
-    x = config.robot.chain.with_tool([0.03, 0.01, -0.02]).positions(q)
-    Recording(config.robot.joints, q, x, t).write_csv(folder / "walk.csv")
+    file = folder / "walk.csv"
+    if (rows, pairs_per_s) not in _walks:
+        t = np.arange(rows) / pairs_per_s
+        q = np.stack([1.5 * np.sin(0.3 * t), 1.2 * np.sin(0.17 * t + 1.0)], axis=1)
+        x = config.robot.chain.with_tool([0.03, 0.01, -0.02]).positions(q)
+        Recording(config.robot.joints, q, x, t).write_csv(file)
+        _walks[rows, pairs_per_s] = file.read_bytes()
+    file.write_bytes(_walks[rows, pairs_per_s])
     return config
 
 
