@@ -67,7 +67,7 @@ from vision.tracked_camera import TrackedCamera
 from vision.tracker import StereoTracker
 from vision.trackers import tracker_of
 
-LIMIT_S = 60.0
+LIMIT_S = 500.0
 WAIT_S = 0.005
 SOME = 10
 ROWS = 60

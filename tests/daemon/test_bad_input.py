@@ -27,7 +27,7 @@ from daemon.status import LearnerStatus
 from daemon.wire import decode
 from interfaces.errors import BusError, RequestError
 
-LIMIT_S = 60.0
+LIMIT_S = 500.0
 DAEMON = ("-m", "daemon")
 PROCESSES = ("sampler", "learner", "run")
 KEYS = Keys("arm")

@@ -17,7 +17,7 @@ from daemon.config import Config
 from daemon.screen import two_digits
 from interfaces.errors import BusError, ConfigError
 
-LIMIT_S = 60.0
+LIMIT_S = 500.0
 
 
 def run(*arguments: object, cwd: Path, environment: dict[str, str] | None = None) -> subprocess.CompletedProcess[str]:

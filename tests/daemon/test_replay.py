@@ -24,7 +24,6 @@ from interfaces.robot import RobotDescription
 
 # The limit only ends a replay that would never end; on a busy machine it takes longer, and passes.
 LIMIT_S = 300
-pytestmark = pytest.mark.timeout(LIMIT_S + 60)
 NO_REAL_DATA = "no measured recordings; to run it: put them into ../shared/data"
 REAL_DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 

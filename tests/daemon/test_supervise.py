@@ -17,7 +17,7 @@ import warm
 from daemon.supervise import Child, Supervisor
 from interfaces.errors import BodyschemaError
 
-LIMIT_S = 60.0
+LIMIT_S = 500.0
 # Writes its process id, then waits for SIGTERM to end it.
 WAITING = "import os, signal, sys; print(os.getpid(), file=open(sys.argv[1], 'a'), flush=True); signal.pause()"
 STUBBORN = "import signal; signal.signal(signal.SIGTERM, signal.SIG_IGN); " + WAITING

@@ -37,7 +37,7 @@ from interfaces.records import Reason
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "zenoh.md").read_text(encoding="utf-8")
-LIMIT_S = 60.0
+LIMIT_S = 500.0
 MESSAGES = {
     name: kind
     for module in (wire, status, simulation)

@@ -27,7 +27,7 @@ from drivers.bench.dry_run import DryRun
 from interfaces.errors import BodyschemaError
 from interfaces.records import FloatArray, Pair
 
-LIMIT_S = 90.0
+LIMIT_S = 500.0
 
 
 def limb(x: FloatArray, radius_m: float) -> FloatArray:

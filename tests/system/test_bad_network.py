@@ -32,7 +32,6 @@ from daemon.status import LearnerStatus
 from daemon.wire import JointsRequest, encode
 from interfaces.errors import BodyschemaError
 
-pytestmark = pytest.mark.timeout(600)
 SOME, MORE = 20, 60
 
 

@@ -34,7 +34,6 @@ from daemon.store import PairReader
 from daemon.wire import CommandRequest, encode
 from interfaces.errors import BodyschemaError
 
-pytestmark = pytest.mark.timeout(600)
 SOME, MORE = 20, 20
 
 

@@ -17,7 +17,7 @@ import pytest
 from security_recipe import SEVERAL, carried_out
 from small_arm import write_small_arm
 
-LIMIT_S = 90.0
+LIMIT_S = 500.0
 HOSTS = {"hub": "192.0.2.10", "robot": "192.0.2.20", "learner": "192.0.2.30", "desk": "192.0.2.40"}
 PAIRS = 20
 DESK = Path(__file__).with_name("desk.py")
