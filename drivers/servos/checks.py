@@ -17,6 +17,7 @@ from .config import ServosConfig
 from .handshake import Finding, FittedServo, identify
 from .joints import OpenPort
 from .make import Make
+from .plan import Plan
 
 READ_S = 1.0
 IDENTIFY_S = 1.0  # then who was not asked yet is not asked any more
@@ -109,24 +110,27 @@ def _pace(
 ) -> Iterator[Check]:
     """Read for a while, as fast as it goes."""
     plans = {
-        name: make.block_requests(bus, [s for s in servos if s.bus == name], config.buses[name])
+        name: Plan(bus, make.ways(bus, [s for s in servos if s.bus == name], config.buses[name]))
         for name, bus in buses.items()
     }
+    requests = {name: plan.requests for name, plan in plans.items()}
     before = {name: (bus.counts.exchanges, dict(bus.counts.troubles)) for name, bus in buses.items()}
     end, times = clock.now() + read_s, [clock.now()]
     while clock.now() < end:
-        if _read_all(buses, plans):
+        if _read_all(buses, requests):
             times.append(clock.now())
     yield _rate(times, read_s, config.rate_hz)
+    for name, plan in plans.items():
+        yield from (Check(TYPE, "warning", f"{name}: {complaint}") for complaint in plan.complaints)
     for name, bus in buses.items():
         exchanges, troubles = before[name]
         new = {t.value: n - troubles.get(t, 0) for t, n in bus.counts.troubles.items() if n > troubles.get(t, 0)}
         yield _troubles(name, bus.counts.exchanges - exchanges, new)
 
 
-def _read_all(buses: dict[str, Bus], plans: dict[str, list[Request]]) -> bool:
+def _read_all(buses: dict[str, Bus], requests: dict[str, list[Request]]) -> bool:
     is_whole = True
-    for questions in zip_longest(*plans.values()):
+    for questions in zip_longest(*requests.values()):
         asked = [(bus, question) for bus, question in zip(buses.values(), questions, strict=True) if question]
         for bus, question in asked:
             bus.send(question)

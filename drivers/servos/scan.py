@@ -206,10 +206,10 @@ def _with_state(bus: Bus, servo: FoundServo, kind: Kind, model: Model) -> FoundS
 
 
 def _asked(bus: Bus, kind: Kind, id: int, register: Register) -> Exchange:
-    packet = kind.packets.read(id, register.address, register.size)
+    request = Request(lambda n: kind.packets.read(id, register.address, n), (id,), register.size, kind.version)
     exchange = Exchange(())
     for _ in range(ATTEMPTS):
-        exchange = bus.ask(Request(packet, (id,), register.size, kind.version))
+        exchange = bus.ask(request)
         if exchange.trouble is None:
             break
     return exchange

@@ -58,7 +58,7 @@ def test_any_bytes_are_a_packet_or_incomplete_or_refused(data, at) -> None:
 def test_only_intact_answers_of_who_was_asked_are_believed_whatever_comes(pieces) -> None:
     clock = VirtualClock()
     bus = Bus("arm", TalkingPort(clock, list(pieces)), clock, 0.0)
-    exchange = bus.ask(Request(PACKETS.sync_read((1, 2), 56, 15), (1, 2), 15, 0))
+    exchange = bus.ask(Request(lambda n: PACKETS.sync_read((1, 2), 56, n), (1, 2), 15, 0))
     said = b"".join(pieces)
     for answer, id in zip(exchange.answers, (1, 2), strict=False):
         assert answer.status.id == id
