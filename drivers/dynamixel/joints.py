@@ -34,7 +34,6 @@ DYNAMIXEL = Make(
     HARDWARE_ERRORS,
     Bus,
     Channel,
-    "DYNAMIXEL Wizard",
     ways_of,
     settings_of,
     1,

@@ -70,7 +70,7 @@ def _one_by_one(bus: ServoBus, servos: Sequence[FittedServo]) -> Way:
     return Way("one by one", tuple(requests))
 
 
-FEETECH = Make(FeetechConfig.table, BY_NUMBER, HARDWARE_ERRORS, Bus, Channel, "Feetech's FD", ways_of, settings_of, -1)
+FEETECH = Make(FeetechConfig.table, BY_NUMBER, HARDWARE_ERRORS, Bus, Channel, ways_of, settings_of, -1)
 
 
 class FeetechJoints(ServoJoints):

@@ -253,11 +253,11 @@ class Bus(ABC):
         return at - begun
 
     def _deadline(self, request: Request) -> float:
-        """Return when all answers are there: after their time on the wire, and that for which the adapter waits."""
+        """Return when all answers are there: after their time on the wire, and what adapter and system may add."""
         overhead = self.packets_of(request.protocol).overhead
         wire = self._question_size + len(request.ids) * (overhead + self._asked_size)
         delays = sum(self.return_delay_s.get(id, SLOWEST_DELAY_S) for id in request.ids)
-        return self._sent + wire * self._byte_s + delays + self._latency_s + HOST_MARGIN_S
+        return self._sent + wire * self._byte_s + delays + 2 * self._latency_s + HOST_MARGIN_S
 
     def _collect(self, request: Request) -> Exchange:
         """Hear the servos to the last, also where one is missing. Only answers before that one count."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 from interfaces.errors import SourceError, SourceLost
 
-from .bus import Bus, Exchange, Trouble
+from .bus import Bus, Exchange, Request, Trouble
 from .config import ServoConfig
 from .model import Model, Register
 
@@ -197,13 +197,18 @@ def restore_torque(bus: Bus, servo: FittedServo) -> None:
 
 def read_register(bus: Bus, model: Model, id: int, register: Register) -> tuple[bytes | None, Trouble | None]:
     """Its bytes; without them what was wrong the last time of several."""
-    request = bus.read_request(model, id, register)
+    exchange = ask_again(bus, bus.read_request(model, id, register))
+    return (exchange.answers[0].status.data if exchange.trouble is None else None), exchange.trouble
+
+
+def ask_again(bus: Bus, request: Request) -> Exchange:
+    """Ask until it is answered, several times at most."""
     exchange = Exchange(())
     for _ in range(ATTEMPTS):
         exchange = bus.ask(request)
         if exchange.trouble is None:
-            return exchange.answers[0].status.data, None
-    return None, exchange.trouble
+            break
+    return exchange
 
 
 def _read_surely(bus: Bus, model: Model, id: int, register: Register) -> tuple[bytes | None, Trouble | None]:
@@ -222,7 +227,7 @@ def _read_surely(bus: Bus, model: Model, id: int, register: Register) -> tuple[b
 def _absence(bus: Bus, model: Model, id: int, trouble: Trouble | None) -> str:
     if trouble is Trouble.TIMEOUT:
         if bus.ping(model, id).trouble is None:
-            return "answers PING but no READ: its Status Return Level is 0"
+            return bus.packets_of(model.protocol).pinged_only
         return "no answer"
     if trouble is Trouble.GARBLED:
         return GARBLED

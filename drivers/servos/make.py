@@ -24,7 +24,6 @@ class Make:
         errors: what each bit of the hardware error means, and what to do.
         bus: a bus of its protocols.
         channel: one servo's answers.
-        software: its maker's program with which its servos are set up.
         ways: of each group of servos of a bus, how it can be read, the quickest first.
         settings: what a command may change in a model's EEPROM.
         homing_sign: 1 where the homing offset is added to what the sensor tells, −1 where it is taken off.
@@ -36,7 +35,6 @@ class Make:
     errors: Mapping[int, str]
     bus: type[Bus]
     channel: Callable[[FittedServo], Channel]
-    software: str
     ways: Callable[[Bus, Sequence[FittedServo], Any], Sequence[Sequence[Way]]]
     settings: Callable[[Model], Sequence[Setting]]
     homing_sign: Literal[1, -1]
