@@ -131,7 +131,8 @@ def _sampler(status: SamplerStatus) -> list[RenderableType]:
 
 def _bus(bus: BusStatus) -> str:
     wrong = ", ".join(f"{count} × {name}" for name, count in sorted(bus.troubles.items(), key=lambda item: -item[1]))
-    return f"{bus.answered:.2%} of {bus.exchanges} questions answered{f': {wrong}' if wrong else ''}"
+    way = f"{bus.way}; " if bus.way else ""
+    return f"{way}{bus.answered:.2%} of {bus.exchanges} questions answered{f': {wrong}' if wrong else ''}"
 
 
 def _learner(status: LearnerStatus) -> list[RenderableType]:
