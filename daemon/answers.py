@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 from daemon.bus import Request
 from daemon.learning import Learning, LearntModel
 from daemon.wire import (
@@ -14,10 +12,10 @@ from daemon.wire import (
     PredictReply,
     decode,
     encode,
-    finite_vector,
     joint_angles,
+    joint_vector,
+    position,
 )
-from interfaces.errors import RequestError
 from interfaces.protocols import Clock
 from interfaces.robot import RobotDescription
 from kbmaps import InverseKinematics
@@ -59,9 +57,8 @@ class Answers:
     def ik(self, request: Request) -> bytes:
         """Joint angles that put the marker where it is wanted; RequestError as for `predict`."""
         wanted = decode(request.payload, IkRequest, request.encoding)
-        if not all(map(math.isfinite, wanted.x)):
-            raise RequestError("x is not finite")
-        start = None if wanted.start is None else finite_vector("start", wanted.start, self._joints)
+        x = position("x", wanted.x)
+        start = None if wanted.start is None else joint_vector("start", wanted.start, self._joints)
         snapshot = self._learning.snapshot
         inverse = self._inverse_of(snapshot.require_model())
         if wanted.posture is None:
@@ -69,8 +66,8 @@ class Answers:
         elif wanted.posture == "middle":
             posture = inverse.middle
         else:
-            posture = finite_vector("posture", wanted.posture, self._joints)
-        found = inverse.solve(wanted.x, start=start, posture=posture)
+            posture = joint_vector("posture", wanted.posture, self._joints)
+        found = inverse.solve(x, start=start, posture=posture)
         there = snapshot.predict(found.q[None])
         reply = IkReply(
             q=found.q.tolist(),
