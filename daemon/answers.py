@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from daemon.bus import Request
 from daemon.learning import Learning, LearntModel
 from daemon.wire import (
@@ -16,7 +18,6 @@ from daemon.wire import (
     joint_vector,
     position,
 )
-from interfaces.protocols import Clock
 from interfaces.robot import RobotDescription
 from kbmaps import InverseKinematics
 
@@ -24,8 +25,15 @@ from kbmaps import InverseKinematics
 class Answers:
     """Handlers for the learner's queries. They take no lock, so that learning never delays them."""
 
-    def __init__(self, learning: Learning, robot: RobotDescription, clock: Clock) -> None:
-        self._learning, self._robot, self._clock = learning, robot, clock
+    def __init__(
+        self, learning: Learning, robot: RobotDescription, age_s: Callable[[str | None], float | None]
+    ) -> None:
+        """Answer from what `learning` has learnt.
+
+        Args:
+            age_s: how old what was learnt is [s], given when the newest pair of it was stored (`PairFeed.age_s`).
+        """
+        self._learning, self._robot, self._age_s = learning, robot, age_s
         self._joints = robot.joints
         self._inverse: tuple[LearntModel, InverseKinematics] | None = None
 
@@ -34,14 +42,13 @@ class Answers:
         q = joint_angles(decode(request.payload, JointsRequest, request.encoding), self._joints)
         snapshot = self._learning.snapshot
         prediction = snapshot.predict(q)
-        age = None if snapshot.learnt_at is None else self._clock.now() - snapshot.learnt_at
         reply = PredictReply(
             x=prediction.x.tolist(),
             sigma=prediction.sigma.tolist(),
             in_support=prediction.in_support.tolist(),
             model=snapshot.digest,
             pairs=snapshot.pairs,
-            age_s=age,
+            age_s=self._age_s(snapshot.newest_utc),
             R=None if prediction.R is None else prediction.R.tolist(),
             sigma_R=None if prediction.sigma_R is None else prediction.sigma_R.tolist(),
         )
