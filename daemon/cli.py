@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import sys
-from importlib.metadata import version
 
 import cyclopts
 
@@ -48,6 +47,15 @@ COMMANDS = {
 }
 
 
+# Each paragraph is one line: the terminal's width breaks it.
+_HELP = """Calibrate a robot arm by moving it by hand in front of a camera.
+
+Joint encoders and a stereo camera give samples. A learner turns them into the forward kinematics that the camera \
+sees, hand-eye and tool included.
+
+New here? Type: bodyschema demo. Each command's --help says what it needs and what comes next."""
+
+
 def command_line(called: str | None = None) -> cyclopts.App:
     """The command line.
 
@@ -57,19 +65,20 @@ def command_line(called: str | None = None) -> cyclopts.App:
     """
     line = cyclopts.App(
         name="bodyschema",
-        help="""Robot kinematics that calibrates itself.
-
-        Guide the arm by hand: encoders and a stereo camera give pairs, a learner turns them into the forward
-        kinematics that the cameras see. New here? `bodyschema demo`. Then each command's --help says what it needs
-        and what comes next.
-        """,
-        version=lambda: version("bodyschema"),
-        help_format="markdown",
+        help=_HELP,
+        version=_version,
+        help_format="markdown" if called in COMMANDS else "plaintext",  # rendering markdown takes 0.1 s of CPU
     )
     for place, (name, summary) in enumerate(COMMANDS.items()):
         own = None if name == called else summary
         line.command(f"daemon.commands.{name}:{name}", name=name, help=own, sort_key=place)
     return line
+
+
+def _version() -> str:
+    from importlib.metadata import version
+
+    return version("bodyschema")
 
 
 app = command_line()

@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from kbmaps import RigidChain
 
@@ -117,5 +116,7 @@ def _joint_motion(chain: RigidChain, k: int, value: float) -> FloatArray:
     if chain.prismatic[k]:
         motion[:3, 3] = value * chain.axes[k]
     else:
+        from scipy.spatial.transform import Rotation
+
         motion[:3, :3] = Rotation.from_rotvec(value * chain.axes[k]).as_matrix()
     return motion
