@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import os
 import sys
+from typing import NoReturn
 
 import cyclopts
 
+from daemon.extras import missing_module
 from daemon.remedies import as_typed
 from daemon.signals import end_with_parent
 from interfaces.errors import BodyschemaError
@@ -84,6 +86,11 @@ def _version() -> str:
 app = command_line()
 
 
+def _fail(error: BodyschemaError) -> NoReturn:
+    print(f"bodyschema: {as_typed(str(error))}", file=sys.stderr)  # noqa: T201
+    sys.exit(1)
+
+
 def main() -> None:
     """Run the command line; errors of ours become one line and exit code 1."""
     # Threads of BLAS spin on the small matrices of tracker and learner, and take twice the time.
@@ -93,8 +100,12 @@ def main() -> None:
     try:
         command_line(arguments[0] if arguments else None)(arguments)
     except BodyschemaError as error:
-        print(f"bodyschema: {as_typed(str(error))}", file=sys.stderr)  # noqa: T201
-        sys.exit(1)
+        _fail(error)
+    except ModuleNotFoundError as error:
+        missing = missing_module(error)
+        if missing is None:
+            raise
+        _fail(missing)
     except KeyboardInterrupt:
         sys.exit(130)
     except BrokenPipeError:  # whoever read our output has had enough, as `head` has
