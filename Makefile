@@ -25,7 +25,7 @@ setup: $(STAMP) ## Set up .venv with everything; the command is then .venv/bin/b
 $(DEMO_STAMP): $(SOURCES) requirements-demo.lock
 	@$(PYTHON) -c 'import sys; sys.exit(0 if sys.version_info[:2] == (3, 11) else "bodyschema is developed with Python 3.11 (its simulator, pybullet, has wheels for no newer one). Install python3.11, or name it: make PYTHON=/path/to/python3.11 ...")'
 	@echo "Setting up $(VENV) (about 230 MB are downloaded the first time; half a minute)"
-	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	@test -x $(BIN)/python || { $(PYTHON) -m venv $(VENV) && $(BIN)/python -m pip uninstall --quiet --yes setuptools; }
 	@$(PIP) --no-compile -r requirements-demo.lock
 	@$(BIN)/python -m pip install --disable-pip-version-check --quiet --no-deps --no-build-isolation -e .
 	@$(BIN)/python -c 'import kbmaps; print("kernels of kbmaps:", kbmaps.kernels_in_use())'

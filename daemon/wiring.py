@@ -157,6 +157,13 @@ def _require_source(config: Config, *, sim: bool) -> None:
     require_usable(config)
 
 
+def connected_cameras() -> list[str]:
+    """Return the cameras of this machine, by the names that stay."""
+    from vision.cameras.serials import connected
+
+    return connected()
+
+
 def _recording(config: Config) -> Path | None:
     recording = config.tables.drivers.recording
     return None if recording is None else config.file.parent / recording
