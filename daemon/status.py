@@ -183,6 +183,9 @@ class OrientationStatus(msgspec.Struct, frozen=True):
     claimed_rad: float | None
 
 
+UNDECIDED = "undecided"  # a change whose kind is not known yet
+
+
 class Change(msgspec.Struct, frozen=True, kw_only=True):
     """The last change of the tool, of the camera or of a joint's zero.
 

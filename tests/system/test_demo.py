@@ -8,6 +8,7 @@ import subprocess
 import sys
 from dataclasses import dataclass
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -56,7 +57,8 @@ def test_the_demo_plots_the_curve_it_measured(demo: Demo) -> None:
     with (demo.folder / "learning_curve.csv").open(newline="") as stream:
         rows = list(csv.DictReader(stream))
     assert len(rows) >= 2
-    assert (demo.folder / "learning_curve.png").read_bytes().startswith(b"\x89PNG")
+    picture = ElementTree.parse(demo.folder / "learning_curve.svg").getroot()
+    assert len(picture.findall(".//{*}polyline")) == 4
 
 
 def test_the_learnt_model_beats_the_nominal_one(demo: Demo) -> None:
