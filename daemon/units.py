@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from interfaces.interpreter import module_command
 from interfaces.plugins import PluginConfig
 
 from .config import Config
@@ -152,7 +153,7 @@ class Installed:
     def here(cls, systemd: int) -> Installed:
         """The one that runs."""
         folders = (Path(sys.prefix), Path(sys.base_prefix), Path(__file__).parents[1])
-        return cls((os.path.abspath(sys.executable), "-P", "-m", "daemon"), folders, systemd)
+        return cls(module_command("daemon"), folders, systemd)
 
 
 def template(process: str, installed: Installed) -> str:
