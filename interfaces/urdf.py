@@ -16,13 +16,12 @@ import numpy as np
 from kbmaps import RigidChain
 
 from .errors import RobotError
-from .limited import read_at_most
+from .limited import UnfitFile, read_at_most
 from .records import FloatArray, frozen_array
 from .suggest import did_you_mean
 
 REVOLUTE = frozenset({"revolute", "continuous"})
 MOVING = REVOLUTE | {"prismatic"}
-LARGEST_FILE_BYTES = 16 * 2**20
 MOST_LINKS = 2000  # a humanoid with hands has some hundred
 
 
@@ -303,13 +302,15 @@ def _parse(file: Path) -> Any:
     from lxml import etree  # pyright: ignore[reportAttributeAccessIssue]
 
     try:
-        data = read_at_most(file, LARGEST_FILE_BYTES)
+        data = read_at_most(file)
+    except UnfitFile as error:
+        raise RobotError(
+            f"the URDF is {error.strerror}", file=file, remedy="Keep meshes in files of their own"
+        ) from error
     except OSError as error:
         raise RobotError(
             f"cannot read the URDF: {error.strerror}", file=file, remedy="Mend [robot] urdf, or --urdf"
         ) from error
-    if data is None:
-        raise RobotError("the URDF is larger than 16 MiB", file=file, remedy="Keep meshes in files of their own")
     parser = etree.XMLParser(resolve_entities=False, no_network=True, load_dtd=False, huge_tree=False)
     try:
         root = etree.fromstring(data, parser)

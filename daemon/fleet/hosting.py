@@ -12,6 +12,7 @@ from daemon.signals import on_termination
 from daemon.supervise import Child, Supervisor
 from interfaces.errors import ConfigError
 from interfaces.interpreter import module_command
+from interfaces.limited import read_at_most
 
 
 def descriptions(named: Sequence[Path]) -> list[Path]:
@@ -35,7 +36,7 @@ def descriptions(named: Sequence[Path]) -> list[Path]:
 
 def _describes_a_robot(file: Path) -> bool:
     try:
-        return re.search(r"^\s*\[robot\]", file.read_text("utf-8"), re.MULTILINE) is not None
+        return re.search(r"^\s*\[robot\]", read_at_most(file).decode("utf-8"), re.MULTILINE) is not None
     except (OSError, UnicodeDecodeError):
         return True  # reading it as a description tells what is wrong
 
