@@ -76,16 +76,18 @@ def line_of_endless_key(text: str) -> int | None:
     return None
 
 
-def _not_finite(value: object, keys: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
-    """The keys under which a float is infinite or no number at all."""
+def _unusable(value: object, keys: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], str]]:
+    """Keys with what no key of ours can be, and what it is."""
     if isinstance(value, float) and not math.isfinite(value):
-        yield keys
+        yield keys, "not a finite number"
+    elif isinstance(value, str) and "\0" in value:
+        yield keys, "has the character U+0000, which no name or path has"
     elif isinstance(value, dict):
         for key, inner in value.items():
-            yield from _not_finite(inner, (*keys, key))
+            yield from _unusable(inner, (*keys, key))
     elif isinstance(value, list):
         for inner in value:
-            yield from _not_finite(inner, keys)
+            yield from _unusable(inner, keys)
 
 
 def _decoded(data: bytes, file: Path, remedy: str) -> str:
@@ -106,8 +108,8 @@ def convert(tables: object, kind: type[T], *, file: Path, text: str, prefix: tup
     Args:
         prefix: the keys under which `tables` stands in the file.
     """
-    for keys in _not_finite(tables, prefix):
-        raise ConfigError(f"{'.'.join(keys)}: not a finite number", file=file, line=line_of(text, keys))
+    for keys, what in _unusable(tables, prefix):
+        raise ConfigError(f"{'.'.join(keys)}: {what}", file=file, line=line_of(text, keys))
     try:
         return msgspec.convert(tables, kind)
     except msgspec.ValidationError as error:
