@@ -95,6 +95,8 @@ def main() -> None:
     """Run the command line; errors of ours become one line and exit code 1."""
     # Threads of BLAS spin on the small matrices of tracker and learner, and take twice the time.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    # OpenCV would take 3 GiB for what a few kilobytes of PNG call an image; the largest cameras have 100 megapixels.
+    os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(2**27))
     end_with_parent()
     arguments = sys.argv[1:]
     try:

@@ -33,7 +33,7 @@ class PluginConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     name: str
     settings: dict[str, Any] = {}
-    devices: tuple[Annotated[str, msgspec.Meta(pattern="^/dev/.")], ...] = ()
+    devices: tuple[Annotated[str, msgspec.Meta(pattern=r"^/dev/.+\Z")], ...] = ()
     network: bool = False
 
     def check(self, _: Sequence[str], file: Path, text: str) -> None:

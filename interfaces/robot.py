@@ -17,7 +17,7 @@ from msgspec import Meta
 
 from kbmaps import RigidChain
 
-from .camera import StereoCalibration
+from .camera import LARGEST_SIDE_PX, StereoCalibration
 from .errors import ConfigError, RobotError
 from .records import FloatArray, frozen_array
 from .rpy import rotation_of, rpy_of
@@ -26,10 +26,12 @@ from .urdf import MOVING, UrdfJoint, UrdfTree, chain_between
 
 Vector3 = tuple[float, float, float]
 Positive = Annotated[float, Meta(gt=0)]
+Side = Annotated[int, Meta(ge=1, le=LARGEST_SIDE_PX)]
+ImageSize = tuple[Side, Side]
 # Beyond these a number is of another unit: degrees, millimetres.
 LARGEST_TURN_RAD, LONGEST_TOOL_M, FARTHEST_CAMERA_M = 2.0 * math.pi, 2.0, 50.0
 # One chunk of a zenoh key: no separators, no wild cards, and not the @ that hides a chunk from wild cards.
-NAME = r"^[A-Za-z0-9_][A-Za-z0-9_.-]*$"
+NAME = r"^[A-Za-z0-9_][A-Za-z0-9_.-]*\Z"  # `$` would let a line break follow
 Name = Annotated[str, Meta(pattern=NAME)]
 
 
@@ -75,7 +77,7 @@ class CameraSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     focal_px: Positive | None = None
     principal_point_px: tuple[float, float] | None = None
     baseline_m: Positive | None = None
-    image_size_px: tuple[int, int] | None = None
+    image_size_px: ImageSize | None = None
     pixel_sigma: Positive = 0.2
 
     @property

@@ -5,6 +5,7 @@ Only kinematics, limits and masses are read. Meshes are never opened.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -15,15 +16,16 @@ from kbmaps import RigidChain
 from kbmaps.rotations import exponentials
 
 from .errors import RobotError
-from .limited import read_at_most
+from .limited import UnfitFile, read_at_most
 from .records import FloatArray, frozen_array
 from .rpy import rotation_of
 from .suggest import did_you_mean
 
 REVOLUTE = frozenset({"revolute", "continuous"})
 MOVING = REVOLUTE | {"prismatic"}
-LARGEST_FILE_BYTES = 16 * 2**20
 MOST_LINKS = 2000  # a humanoid with hands has some hundred
+# Sane ones are 1 long and some metres away; squares of these are far from where floats end.
+SHORTEST_AXIS, LARGEST_PLACE_M = 1e-9, 1e6
 MOST_QUOTED = 60  # characters of a wrong attribute in a message: one line of a terminal
 
 
@@ -263,10 +265,11 @@ def _joint(element: Any, file: Path) -> UrdfJoint:
             f"joint {name!r} mimics another joint", file=file, line=line, remedy="Replace it by a fixed joint"
         )
     axis = _numbers(element.find("axis"), "xyz", (1.0, 0.0, 0.0), file)
-    length = float(np.linalg.norm(axis))
-    if kind != "fixed" and not length > 0:
+    length = math.hypot(*axis)  # which does not overflow on the way
+    if kind != "fixed" and not SHORTEST_AXIS < length < 1.0 / SHORTEST_AXIS:
+        what = "no length" if length == 0 else f"the length {length:.3g}"
         raise RobotError(
-            f"the axis of joint {name!r} has no length", file=file, line=line, remedy='Write <axis xyz="0 0 1"/>'
+            f"the axis of joint {name!r} has {what}", file=file, line=line, remedy='Write <axis xyz="0 0 1"/>'
         )
     lower, upper = _limits(element, kind, file)
     if lower > upper:
@@ -312,6 +315,13 @@ def _origin(element: Any, file: Path) -> FloatArray:
     T = np.eye(4)
     T[:3, :3] = rotation_of(_numbers(origin, "rpy", (0.0, 0.0, 0.0), file))
     T[:3, 3] = _numbers(origin, "xyz", (0.0, 0.0, 0.0), file)
+    if np.abs(T[:3, 3]).max() > LARGEST_PLACE_M:
+        raise RobotError(
+            f"the <origin> of {_owner(origin)} is {np.abs(T[:3, 3]).max():.3g} m away",
+            file=file,
+            line=origin.sourceline,
+            remedy="Give metres",
+        )
     return T
 
 
@@ -380,13 +390,15 @@ def _parse(file: Path) -> Any:
     from lxml import etree  # pyright: ignore[reportAttributeAccessIssue]
 
     try:
-        data = read_at_most(file, LARGEST_FILE_BYTES)
+        data = read_at_most(file)
+    except UnfitFile as error:
+        raise RobotError(
+            f"the URDF is {error.strerror}", file=file, remedy="Keep meshes in files of their own"
+        ) from error
     except OSError as error:
         raise RobotError(
             f"cannot read the URDF: {error.strerror}", file=file, remedy="Mend [robot] urdf, or --urdf"
         ) from error
-    if data is None:
-        raise RobotError("the URDF is larger than 16 MiB", file=file, remedy="Keep meshes in files of their own")
     parser = etree.XMLParser(resolve_entities=False, no_network=True, load_dtd=False, huge_tree=False)
     try:
         root = etree.fromstring(data, parser)

@@ -9,6 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from interfaces.errors import RobotError
+from interfaces.limited import read_at_most
 from interfaces.urdf import UrdfJoint
 
 from .roles import root_link
@@ -29,7 +30,7 @@ def physics_urdf(truth: TrueRobot) -> str:
         RobotError: a mesh file is missing, or is none.
     """
     file = truth.tree.file
-    root = ElementTree.fromstring(file.read_bytes())  # `UrdfTree.load` has refused entities and the like
+    root = ElementTree.fromstring(read_at_most(file))  # `UrdfTree.load` has refused entities and the like
     for element in root.iterfind("joint"):
         _set_joint(element, truth.tree.joints[element.attrib["name"]])
     for mesh in root.iter("mesh"):

@@ -20,6 +20,7 @@ from daemon.config import Config
 from daemon.diagnosis_run import Asked, Found, Source, measured, require_folder, run, written
 from diagnosis.result import DiagnosisFile
 from interfaces.errors import BodyschemaError, ConfigError
+from interfaces.interpreter import safe_children
 
 from .recordings import Job
 
@@ -130,7 +131,7 @@ def workers(scheduler: str | None, jobs: int, count: int | None = None) -> Itera
     from distributed import Client, LocalCluster
 
     logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what matters comes as errors of the diagnoses
-    with config.set({"distributed.scheduler.allowed-failures": WORKERS_LOST}):
+    with safe_children(), config.set({"distributed.scheduler.allowed-failures": WORKERS_LOST}):
         if scheduler is not None:
             with _client_of(scheduler) as client:
                 yield client
