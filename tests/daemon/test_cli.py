@@ -45,7 +45,7 @@ def test_help_loads_nothing_that_takes_long(tmp_path) -> None:
     )  # fmt: skip
     loaded = {line.split("|")[-1].strip().split(".")[0] for line in shown.stderr.splitlines()}
     assert "cyclopts" in loaded
-    assert not loaded & {"numpy", "scipy", "cv2", "zenoh", "msgspec", "serial", "pybullet", "matplotlib", "yourdfpy"}
+    assert not loaded & {"numpy", "scipy", "cv2", "zenoh", "msgspec", "serial", "pybullet", "matplotlib"}
 
 
 def test_help_names_every_command(tmp_path) -> None:

@@ -39,7 +39,7 @@ def test_every_dependency_is_justified() -> None:
 
 
 FOREIGN = ("msgspec", "cv2", "zenoh", "interfaces", "logging.handlers")
-HEAVY = ("pybullet", "matplotlib", "cv2", "scipy", "numpy", "zenoh", "yourdfpy")
+HEAVY = ("pybullet", "matplotlib", "cv2", "scipy", "numpy", "zenoh")
 
 
 def test_help_imports_nothing_heavy() -> None:
