@@ -11,13 +11,18 @@ from interfaces.records import FloatArray
 
 from .mesh_file import LARGEST_MESH_BYTES, MESHES, MeshError, read_mesh, stl_bytes
 
-LARGEST_M = 10.0  # no link of an arm is larger; one of 10 mm is, if its mesh is in millimetres
+# No link of an arm is larger; one of 10 mm is, if its mesh is in millimetres. No part that is drawn is as small.
+LARGEST_M, SMALLEST_M = 10.0, 1e-6
 # TinyRenderer takes 0.3 µs for a triangle, and a stereo frame is four pictures: 8,000 cost some 10 ms of CPU a frame.
 MOST_TRIANGLES = 8_000
 _MOST_BYTES = 4 * LARGEST_MESH_BYTES
 _FIRST_CELL_M, _GROWTH = 0.001, 1.4
-# A hull's corners are merged within this share of its size: it only tells what is in the way.
-_HULL_CELLS = 24
+# A hull tells what is in the way. It is that of the outermost points in these directions (Fibonacci's sphere).
+_TURNS, _HEIGHTS = np.pi * (1.0 + 5.0**0.5) * np.arange(100), np.linspace(-1.0, 1.0, 100)
+_RADII = np.sqrt(1.0 - _HEIGHTS**2)
+_DIRECTIONS = np.vstack(
+    [np.column_stack([_RADII * np.cos(_TURNS), _RADII * np.sin(_TURNS), _HEIGHTS]), np.eye(3), -np.eye(3)]
+)
 
 
 class Meshes:
@@ -50,11 +55,15 @@ class Meshes:
             triangles = self._triangles(name)
             if triangles is None:
                 return None
-            scaled = triangles * np.array(scale)
+            with np.errstate(over="ignore"):
+                scaled = triangles * np.array(scale)
             low, high = scaled.min(axis=(0, 1)), scaled.max(axis=(0, 1))
             size = float((high - low).max())
-            if not 0.0 < size <= LARGEST_M or max(np.abs(low).max(), np.abs(high).max()) > LARGEST_M:
-                self.unusable[name] = f"it is {size:.3g} m large, or as far from its frame; is it in millimetres?"
+            if not SMALLEST_M <= size <= LARGEST_M or max(np.abs(low).max(), np.abs(high).max()) > LARGEST_M:
+                self.unusable[name] = (
+                    f"it is {size:.3g} m large, or lies too far from its link. A mesh in millimetres needs "
+                    'scale="0.001 0.001 0.001"'
+                )
                 return None
             self._shapes[key] = scaled if np.prod(scale) > 0.0 else scaled[:, ::-1]
         if drawn:
@@ -145,10 +154,10 @@ def _keys(points: FloatArray, cell: float) -> np.ndarray:
 
 
 def _hull(triangles: FloatArray) -> FloatArray:
-    """Return the convex hull of triangles as triangles (m, 3, 3); of what is flat its box, a millimetre thick."""
+    """Return about the convex hull of triangles as triangles (m, 3, 3); of what is flat its box, 1 mm thick."""
     points = triangles.reshape(-1, 3)
     low, high = points.min(axis=0), points.max(axis=0)
-    corners = points[np.unique(_keys(points, float((high - low).max()) / _HULL_CELLS), return_index=True)[1]]
+    corners = points[np.unique((points @ _DIRECTIONS.T).argmax(axis=0))]
     try:
         return corners[ConvexHull(corners).simplices]
     except (QhullError, ValueError):

@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 from interfaces.errors import RobotError
 from interfaces.limited import read_at_most
 from interfaces.records import FloatArray
+from interfaces.rpy import rpy_of
 from interfaces.urdf import LARGEST_FILE_BYTES, UrdfJoint
 
 from .meshes import LARGEST_M, Meshes
@@ -189,7 +190,7 @@ class _Writer:
             if joint.parent != link or length < _SHORTEST_ROD_M:
                 continue
             turn = Rotation.align_vectors(end[None] / length, [[0.0, 0.0, 1.0]])[0]
-            rod = _shape_at(kind, (end / 2).tolist(), turn.as_euler("xyz").tolist())
+            rod = _shape_at(kind, (end / 2).tolist(), rpy_of(turn.as_matrix()).tolist())
             radius = float(np.clip(_ROD_SHARE * length, *_ROD_RADII_M))
             ElementTree.SubElement(
                 ElementTree.SubElement(rod, "geometry"), "cylinder", radius=repr(radius), length=repr(length)
@@ -209,8 +210,7 @@ class _Writer:
         element = ElementTree.SubElement(robot, "joint", name=joint.name, type=joint.kind)
         ElementTree.SubElement(element, "parent", link=joint.parent)
         ElementTree.SubElement(element, "child", link=joint.child)
-        rotation = Rotation.from_matrix(joint.T_parent_joint[:3, :3])
-        _add_origin(element, place.tolist(), rotation.as_euler("xyz").tolist())
+        _add_origin(element, place.tolist(), rpy_of(joint.T_parent_joint[:3, :3]).tolist())
         ElementTree.SubElement(element, "axis", xyz=_numbers(joint.axis))
         if joint.kind in ("revolute", "prismatic"):
             limits = {"lower": repr(joint.lower), "upper": repr(joint.upper), "effort": "1000", "velocity": "10"}
