@@ -238,7 +238,8 @@ def test_a_name_that_leads_elsewhere_is_refused(backed_up, elsewhere, name) -> N
         manifest["files"][name] = manifest["files"][ROBOT_TOML]
         members[MANIFEST], members[name] = json.dumps(manifest).encode(), members[ROBOT_TOML]
 
-    assert "it would be written elsewhere" in refused(altered(backed_up, lead_astray), elsewhere)
+    said = refused(altered(backed_up, lead_astray), elsewhere)
+    assert f"has {name!r}, which its robot.toml does not name so. Nothing was changed" in said
 
 
 def test_a_robot_s_name_that_leads_elsewhere_is_refused(backed_up, elsewhere) -> None:
