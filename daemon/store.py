@@ -117,7 +117,8 @@ class PairReader:
                 meta = store_schema.meta(self._connection)
             except ValueError as error:
                 self._close()
-                raise StoreError(damaged(self.file, str(error))) from error
+                what = f"{self.file} is damaged ({error}). Start the sampler: it puts the pairs into a new file"
+                raise StoreError(what) from error
             except BaseException:
                 self._close()
                 raise
@@ -181,6 +182,11 @@ class PairReader:
     def present_damage(self) -> Damage:
         """Return the part of `damage` that has not been deleted with the oldest pairs."""
         return self.damage.since(self.first_seq()) if self.damage.count else self.damage
+
+    def trouble(self) -> str | None:
+        """Return what is wrong with the pages of the file; None when nothing is."""
+        with self._reading() as connection:
+            return store_schema.trouble(connection)
 
     def audit(self) -> Audit:
         """Look at each row. What cannot be read is among `damage` from then on.

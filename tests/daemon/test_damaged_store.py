@@ -88,11 +88,11 @@ CHANGED = {
 }
 
 
-@pytest.mark.parametrize("column", CHANGED)
-@pytest.mark.parametrize("seq", [1, 7, PAIRS])
+@pytest.mark.parametrize(
+    ("column", "seq"),
+    [("seq", PAIRS), *((column, seq) for column in CHANGED for seq in (1, 7, PAIRS) if column != "seq")],
+)
 def test_one_changed_value_costs_one_pair(file, column, seq) -> None:
-    if column == "seq" and seq != PAIRS:
-        pytest.skip("in the middle SQLite itself finds it")
     alter(file, f"UPDATE pairs SET {column} = {CHANGED[column]} WHERE seq = ?", seq)
     with PairReader(file) as reader:
         assert numbers(reader) == [k for k in range(1, PAIRS + 1) if k != seq]
@@ -213,7 +213,7 @@ def test_several_lost_pages_cost_their_own_pairs(long) -> None:
 
 def test_a_lost_identity_is_replaced_and_every_pair_kept(file) -> None:
     alter(file, "UPDATE meta SET value = replace(value, '-', '+') WHERE key = 'store'")
-    with pytest.raises(StoreError, match="its identity or its joints cannot be read"), PairReader(file):
+    with pytest.raises(StoreError, match="its identity or its joints cannot be read.. Start the sampler"), PairReader(file):
         pass
     with PairStore(file, SESSION) as store:
         assert numbers(store) == list(range(1, PAIRS + 1))
