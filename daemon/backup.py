@@ -20,7 +20,7 @@ from typing import IO, Any
 
 import msgspec
 
-from interfaces.errors import BodyschemaError
+from interfaces.errors import BodyschemaError, StoreError
 from interfaces.robot import Name
 from interfaces.toml_file import read_toml
 
@@ -141,7 +141,10 @@ def copy_store(store: Path, copy: Path, joints: Sequence[str]) -> Audit:
         store_schema.check_kind(source, store)
         source.backup(target)
         target.execute("PRAGMA journal_mode = DELETE")
-    return leave_out_damage(copy, joints)
+    try:
+        return leave_out_damage(copy, joints)
+    except StoreError as error:
+        raise StoreError(str(error).replace(str(copy), str(store))) from error
 
 
 class Backup:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from interfaces.errors import ConfigError
+from interfaces.errors import ConfigError, StoreError
 from interfaces.toml_file import convert, read_toml
 
 from . import store_schema
@@ -73,19 +73,21 @@ def restore(backup: Backup, robot_file: Path, state_dir: Path | None = None, *, 
     _require_room(backup, targets, force=force)
     _require_at_rest(backup, tables)
     aside: list[Path] = []
-    with _writable(robot_file.parent), ExitStack() as held, ExitStack() as undo:
+    with _writable(robot_file.parent), ExitStack() as undo:
         for target in targets:
             _make_folder(target.parent, undo)
-        held.callback(os.close, _locked(folder / Path(STORE).name, undo))
-        staged = _staged(backup, targets, held)
-        identity, unreadable = _give_identity(backup, tables, *(staged.get(target) for target in _state_files(folder)))
-        for target in targets:
-            aside += _move_aside(target, undo)
-            os.replace(staged[target], target)
-            undo.callback(target.unlink)
-        for parent in {target.parent for target in targets}:
-            sync_folder(parent)
+        lock_held = _locked(folder / Path(STORE).name, undo)
+        with ExitStack() as scratch:
+            staged = _staged(backup, targets, scratch)
+            identity, unreadable = _give_identity(backup, tables, *map(staged.get, _state_files(folder)))
+            for target in targets:
+                aside += _move_aside(target, undo)
+                os.replace(staged[target], target)
+                undo.callback(target.unlink)
+            for parent in {target.parent for target in targets}:
+                sync_folder(parent)
         undo.pop_all()
+        os.close(lock_held)
     elsewhere = {
         backup.manifest.files[name].origin: target
         for name, target in described.items()
@@ -102,7 +104,9 @@ def _tables(backup: Backup) -> dict[str, Any]:
         try:
             return read_toml(file)[0]
         except ConfigError as error:
-            raise BackupError(f"the robot.toml in {backup.file} cannot be read: {error.what}") from error
+            raise BackupError(
+                f"the robot.toml in {backup.file} cannot be read: {error.what}. {NOTHING_CHANGED}"
+            ) from error
 
 
 def _targets(backup: Backup, tables: Mapping[str, Any], robot_file: Path) -> dict[str, Path]:
@@ -148,7 +152,10 @@ def _require_room(backup: Backup, targets: Iterable[Path], *, force: bool) -> No
 def _require_at_rest(backup: Backup, tables: Mapping[str, Any]) -> None:
     zenoh, robot = tables.get("zenoh"), backup.manifest.robot
     given = {key: zenoh[key] for key in ("sampler", "learner") if key in zenoh} if isinstance(zenoh, dict) else {}
-    endpoints = convert(given, ZenohConfig, file=backup.file, text="", prefix=("zenoh",))
+    try:
+        endpoints = convert(given, ZenohConfig, file=backup.file, text="", prefix=("zenoh",))
+    except ConfigError as error:
+        raise BackupError(f"the robot.toml in {error}. {NOTHING_CHANGED}") from error
     for process in ("sampler", "learner"):
         if is_alive(getattr(endpoints, process), Keys(robot).alive(process)):
             raise BackupError(
@@ -177,10 +184,12 @@ def _locked(store: Path, undo: ExitStack) -> int:
     file = store.with_name(store.name + ".lock")
     if not file.exists():
         undo.callback(file.unlink, missing_ok=True)
-    return lock(store)
+    descriptor = lock(store)
+    undo.callback(os.close, descriptor)
+    return descriptor
 
 
-def _staged(backup: Backup, targets: Mapping[Path, str], held: ExitStack) -> dict[Path, Path]:
+def _staged(backup: Backup, targets: Mapping[Path, str], scratch: ExitStack) -> dict[Path, Path]:
     """Write the files into new folders beside their places."""
     staged: dict[Path, Path] = {}
     for parent in dict.fromkeys(target.parent for target in targets):
@@ -190,10 +199,10 @@ def _staged(backup: Backup, targets: Mapping[Path, str], held: ExitStack) -> dic
             raise BackupError(
                 f"{parent} has {free / 1e6:.0f} MB free, and {needed / 1e6:.0f} MB are needed. {NOTHING_CHANGED}"
             )
-        scratch = Path(tempfile.mkdtemp(prefix=".restore-", dir=parent))
-        held.callback(shutil.rmtree, scratch, ignore_errors=True)
+        place = Path(tempfile.mkdtemp(prefix=".restore-", dir=parent))
+        scratch.callback(shutil.rmtree, place, ignore_errors=True)
         for number, (target, name) in enumerate(here.items()):
-            staged[target] = scratch / str(number)
+            staged[target] = place / str(number)
             backup.extract(name, staged[target])
     return staged
 
@@ -209,14 +218,18 @@ def _give_identity(
     assert store is not None
     robot = tables.get("robot")
     joints = robot.get("joints") if isinstance(robot, dict) else None
-    audit = leave_out_damage(store, joints if isinstance(joints, list) else ())
-    identity = str(uuid.uuid4())
-    with explained(store), closing(store_schema.connect(store)) as connection:
-        contents = store_schema.meta(connection)
-        before = contents["store"]
-        with store_schema.transaction(connection):
-            store_schema.write_meta(connection, {**contents, "store": identity, "restored_from": before})
-        connection.execute("PRAGMA journal_mode = DELETE")  # all of it in one file
+    try:
+        audit = leave_out_damage(store, joints if isinstance(joints, list) else ())
+        identity = str(uuid.uuid4())
+        with explained(store), closing(store_schema.connect(store)) as connection:
+            contents = store_schema.meta(connection)
+            before = contents["store"]
+            with store_schema.transaction(connection):
+                store_schema.write_meta(connection, {**contents, "store": identity, "restored_from": before})
+            connection.execute("PRAGMA journal_mode = DELETE")  # all of it in one file
+    except (StoreError, ValueError) as error:
+        what = str(error).replace(str(store), STORE)
+        raise BackupError(f"the store in {backup.file} cannot be put back: {what}") from error
     try:
         state = None if checkpoint is None else read_checkpoint(checkpoint, robot=backup.manifest.robot)
     except CheckpointError:
