@@ -197,19 +197,18 @@ class PairReader:
         newest = self.last_seq()
         with self._reading() as connection:
             numbers: list[int] = []
-            session, low, high = 0, None, None
+            session, ends = 0, np.empty((0, len(self.joints)))
             rows = scan(connection, self._columns, self._check)
             while some := list(islice(rows, AUDITED_AT_ONCE)):
                 numbers += [pair.seq for pair in some]
-                session, angles = some[-1].session, np.array([pair.q for pair in some])
-                least, most = angles.min(axis=0), angles.max(axis=0)
-                low, high = (least, most) if low is None else (np.minimum(low, least), np.maximum(high, most))
+                session, angles = some[-1].session, np.vstack([ends, [pair.q for pair in some]])
+                ends = np.stack([angles.min(axis=0), angles.max(axis=0)])
             first = oldest(connection)
             before = [first - 1] if numbers and first < numbers[0] else []
             self.damage |= Damage.between([*before, *numbers, newest + 1])
             lost = connection.execute("SELECT count(*) FROM pairs").fetchone()[0] - len(numbers)
             lost += sum(row is None for table in ("sessions", "devices") for row in records(connection, table))
-        ranges = None if low is None else (frozen_array(low), frozen_array(high))
+        ranges = (frozen_array(ends[0]), frozen_array(ends[1])) if numbers else None
         return Audit(len(numbers), newest, session, self.damage, lost, ranges)
 
     def devices(self) -> list[Devices]:

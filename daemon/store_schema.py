@@ -160,7 +160,8 @@ def meta(connection: sqlite3.Connection) -> dict[str, str]:
         sealed = version(connection) < WITH_CHECKSUMS or found.pop(CHECKSUM) == str(_checksum_of(found))
         if not (sealed and found["store"].isprintable() and 0 < len(found["store"]) <= LONGEST_IDENTITY):
             raise ValueError
-        joints_of(found), given_up_to(found)
+        joints_of(found)
+        given_up_to(found)
     except (AttributeError, KeyError, ValueError) as error:
         raise ValueError("its identity or its joints cannot be read") from error
     return found

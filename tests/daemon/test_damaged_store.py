@@ -282,7 +282,8 @@ class Flips:
     def _read(self, file: Path) -> int:
         with PairReader(file) as reader:
             assert reader.last_seq() >= PAIRS - 1
-            reader.last(), reader.devices()
+            reader.last()
+            reader.devices()
             return self._lost(reader)
 
     def _export(self, file: Path) -> int:
