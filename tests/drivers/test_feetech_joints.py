@@ -247,6 +247,13 @@ def test_times_are_those_of_the_sampling_to_half_a_millisecond() -> None:
     assert np.percentile(off, 99) < 0.5e-3
 
 
+def test_a_reading_tells_how_sure_its_time_is() -> None:
+    with (arm := FeetechArm(("STS3215",) * 6, latency_s=4e-3)).joints:
+        readings = read(arm, 50)
+        assert all(1e-4 < reading.t_sigma < 4e-3 for reading in readings)
+        assert abs(readings[-1].t - arm.sampled()) < 3 * readings[-1].t_sigma
+
+
 def test_a_reading_that_was_held_up_is_dropped_where_no_clock_tells_its_time() -> None:
     with (arm := FeetechArm(("STS3215",) * 6)).joints:
         read(arm, 60)
