@@ -11,6 +11,7 @@ from pathlib import Path
 import msgspec
 
 from interfaces.errors import ConfigError
+from interfaces.limited import read_at_most
 
 from .servo_wiring import KnownModel, known_models
 
@@ -174,7 +175,7 @@ def read_scan(file: Path) -> list[Candidate]:
         ConfigError: it cannot be read, or is none.
     """
     try:
-        return candidates_in(file.read_bytes(), file)
+        return candidates_in(read_at_most(file), file)
     except OSError as error:
         remedy = "Write one: bodyschema scan --json > FILE.json"
         raise ConfigError(f"cannot be read: {error.strerror}", file=file, remedy=remedy) from error

@@ -16,7 +16,6 @@ from rich.text import Text
 from interfaces.errors import BusError, RequestError
 
 from .bus import Bus
-from .changes import UNDECIDED
 from .config import Config
 from .findings_view import calibration_table, outlook_lines
 from .identity import Route
@@ -24,7 +23,7 @@ from .keys import Keys
 from .remedies import as_typed
 from .screen import coverage_table, degrees, mm, rejected
 from .servos_view import servos_table
-from .status import BusStatus, LearnerStatus, OrientationStatus, SamplerStatus
+from .status import UNDECIDED, BusStatus, LearnerStatus, OrientationStatus, SamplerStatus
 from .wire import decode
 from .zenoh_config import PROCESSES
 
