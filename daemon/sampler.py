@@ -263,7 +263,10 @@ class Sampler:
                 return moved
             if self._gate.is_too_fast(moved):
                 return Reason.MOVING
-        return self._buffer.at(fix.t, JOINTS_TIMEOUT_S)
+        q = self._buffer.at(fix.t, JOINTS_TIMEOUT_S)
+        if not isinstance(q, Reason) and self._gate.is_too_fast(self._buffer.slack(fix.t)):
+            return Reason.LATE_JOINTS
+        return q
 
     def _accept(self, verdict: Accepted, q: FloatArray, fix: MarkerFix) -> Reason | None:
         pair = self._storing.append(verdict.segment, q, fix)
