@@ -223,6 +223,25 @@ class RouterFiles:
         return [file] if file.exists() else []
 
 
+def make_state_folders(configs: Sequence[Config], user: str, root: Path = ROOT) -> None:
+    """Make the `state_dir` of each robot.toml that has one, for `user`: systemd makes the others alone.
+
+    Raises:
+        ConfigError: one cannot be made.
+    """
+    for config in configs:
+        folder = root / os.path.abspath(config.state_dir).lstrip("/")
+        if config.tables.daemon.state_dir is None or folder.exists():
+            continue
+        made = [path for path in (folder, *folder.parents) if not path.exists()]
+        try:
+            folder.mkdir(0o750, parents=True)
+            for path in made if os.geteuid() == 0 else ():
+                shutil.chown(path, user)
+        except OSError as error:
+            raise _refused(folder, error, "install service") from error
+
+
 def missing(texts: dict[Path, str]) -> dict[Path, str]:
     """Those of the files that are not there as they should be."""
     return {file: text for file, text in texts.items() if not file.exists() or file.read_text("utf-8") != text}

@@ -77,6 +77,7 @@ StartLimitIntervalSec=0
 # Ready when it takes connections.
 Type=notify
 NotifyAccess=main
+SyslogIdentifier=%N
 ExecStart={command}
 WatchdogSec=30
 {kept_running}
@@ -101,6 +102,7 @@ StartLimitIntervalSec=0
 # Ready when {ready}.
 Type=notify
 NotifyAccess=main
+SyslogIdentifier=%N
 ExecStart={command} {process}
 ExecReload=/bin/kill -HUP $MAINPID
 # Fed by the loops that work, so that one which hangs starves it; the abort leaves every thread's place in the journal.
@@ -217,7 +219,7 @@ def of_router(config: RouterConfig, user: str, installed: Installed) -> str:
         command=_command([*installed.command, "router", file]),
         user=user,
         kept_running=_kept_running(installed),
-        seen="".join(f"BindReadOnlyPaths={_quoted(path)}\n" for path in seen),
+        seen="".join(f"BindReadOnlyPaths={_bound(path)}\n" for path in seen),
         sandbox=_SANDBOX,
     )
 
@@ -266,13 +268,18 @@ def hidden(folders: Iterable[Path]) -> list[Path]:
 def _seen(configs: Sequence[Config], installed: Installed) -> list[str]:
     """What a service of these robots may read, write and reach beyond what all may."""
     folders = [*installed.folders, *(folder for config in configs for folder in folders_of(config))]
-    lines = [f"BindReadOnlyPaths={_quoted(path)}" for path in hidden(folders)]
+    lines = [f"BindReadOnlyPaths={_bound(path)}" for path in hidden(folders)]
     states = [config.state_dir for config in configs if config.tables.daemon.state_dir is not None]
     for state in dict.fromkeys(states):
-        lines.append(f"{'BindPaths' if hidden([state]) else 'ReadWritePaths'}={_quoted(state)}")
+        lines.append(f"{'BindPaths' if hidden([state]) else 'ReadWritePaths'}={_bound(state)}")
     if not all(is_local(endpoint) for config in configs for endpoint in endpoints_of(config)):
         lines.append(EVERY_ADDRESS)
     return lines
+
+
+def _bound(path: Path) -> str:
+    """A path that may be missing: the process then says so, where systemd would say 226/NAMESPACE."""
+    return _quoted(f"-{path}")
 
 
 def _kept_running(installed: Installed) -> str:

@@ -104,7 +104,7 @@ def service(
     from daemon.config import Config
     from daemon.fleet.hosting import configs_of, descriptions
     from daemon.learner_host import session_settings
-    from daemon.service_files import ServiceFiles, UnitFolder, systemd_version, user_for
+    from daemon.service_files import ServiceFiles, UnitFolder, make_state_folders, systemd_version, user_for
     from daemon.units import PROCESSES, Installed
     from daemon.wiring import check_sources
     from interfaces.errors import ConfigError
@@ -128,13 +128,14 @@ def service(
         session_settings(configs)  # refuses robots that one learner cannot serve
         texts = units.texts_of_host(configs, user_for(user), installed)
     else:
-        config = Config.load(files[0])
+        configs = [config := Config.load(files[0])]
         if only != "learner":
             check_sources(config, sim=False)
         if only != "sampler":
             config.require_learnable()
         texts = units.texts(config, user_for(user), installed)
-    _install_units(units, texts, yes=yes, dry_run=dry_run)
+    if _install_units(units, texts, yes=yes, dry_run=dry_run):
+        make_state_folders(configs, user_for(user), root)
 
 
 @install.command(sort_key=3)
@@ -167,7 +168,8 @@ def router(
     _install_units(units, texts, yes=yes, dry_run=dry_run)
 
 
-def _install_units(units: UnitFiles, texts: dict[Path, str], *, yes: bool, dry_run: bool) -> None:
+def _install_units(units: UnitFiles, texts: dict[Path, str], *, yes: bool, dry_run: bool) -> bool:
+    """Return whether they are installed now."""
     from rich.console import Console
     from rich.prompt import Confirm
 
@@ -179,12 +181,13 @@ def _install_units(units: UnitFiles, texts: dict[Path, str], *, yes: bool, dry_r
         console.print(f"{file}:{'' if file in changes else ' (there already)'}\n\n{text}", markup=False)
     if not changes:
         console.print("All of it is there already, as above.")
-        return
+        return not dry_run
     if dry_run or not (yes or Confirm.ask("Write it?", console=console, default=False)):
         console.print("Nothing was changed.")
-        return
+        return False
     units.install(changes)
     console.print(f"Written. Start it, now and at every boot: sudo systemctl enable --now {' '.join(units.units)}")
+    return True
 
 
 def _uninstall_units(units: UnitFiles, removed: str, *, yes: bool, dry_run: bool) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -26,7 +27,7 @@ def descriptions(named: Sequence[Path]) -> list[Path]:
     found: list[Path] = []
     for path in named:
         inside = [path]
-        if path.is_dir():
+        if os.path.isdir(path):  # False also where it may not be looked at: reading it tells why
             inside = sorted([*filter(_describes_a_robot, path.glob("*.toml")), *path.glob("*/robot.toml")])
         if not inside:
             raise ConfigError("no robot.toml is in this folder", file=path, remedy="Name the robots' descriptions")

@@ -156,7 +156,7 @@ def test_certificates_are_seen_and_the_router_on_another_machine_is_reached(conf
     zenoh = ZenohConfig(router="tls/192.0.2.1:7447", tls=TlsConfig(ca="/home/pi/keys/ca.pem"))
     tables = config.tables.__class__(**{**_fields(config.tables), "zenoh": zenoh})
     own = of_robot("learner", config.with_tables(tables), "daemon", HERE)
-    assert "/home/pi/keys" in values(own, "BindReadOnlyPaths")
+    assert "-/home/pi/keys" in values(own, "BindReadOnlyPaths")
     assert values(own, "IPAddressAllow") == ["any"]
 
 
@@ -168,7 +168,7 @@ def test_what_a_home_holds_is_seen_as_far_as_it_is_needed() -> None:
 def test_a_state_dir_of_one_s_own_can_be_written(tmp_path) -> None:
     robot = write_small_arm(tmp_path, '[daemon]\nstate_dir = "/srv/pairs of 100 %"\n')
     own = of_robot("sampler", Config.load(robot, {}), "daemon", HERE)
-    assert values(own, "ReadWritePaths") == ['"/srv/pairs of 100 %%"']
+    assert values(own, "ReadWritePaths") == ['"-/srv/pairs of 100 %%"']
 
 
 def test_a_new_systemd_starts_a_service_that_fails_again_less_and_less_often() -> None:
@@ -181,6 +181,13 @@ def test_a_new_systemd_starts_a_service_that_fails_again_less_and_less_often() -
 def test_the_units_in_deploy_are_those_that_are_written(process) -> None:
     shown = (ROOT / "deploy" / "systemd" / f"bodyschema-{process}@.service").read_text(encoding="utf-8")
     assert shown == template(process, Installed(("/opt/bodyschema/bin/bodyschema",), (), 252))
+
+
+def test_documented_patterns_of_units_end_in_service() -> None:
+    shown = (ROOT / "docs" / "operation.md").read_text(encoding="utf-8")
+    patterns = re.findall(r"(?:systemctl|journalctl) .*'(bodyschema-\*[^']*)'", shown)
+    assert len(patterns) >= 4
+    assert [pattern for pattern in patterns if not pattern.endswith(".service")] == []
 
 
 # --- the command
@@ -197,6 +204,19 @@ def test_a_dry_run_shows_them_and_writes_nothing(tmp_path, robot, capsys) -> Non
     install("--robot", robot, "--user", "daemon", "--dry-run", "--root", tmp_path)
     assert not (tmp_path / "etc").exists()
     assert f"DeviceAllow={PORT} rw" in capsys.readouterr().out
+
+
+def test_installing_makes_the_state_dir(tmp_path, robot) -> None:
+    with robot.open("a", encoding="utf-8") as toml:
+        toml.write('[daemon]\nstate_dir = "/srv/arms/pairs"\n')
+    words = ("--robot", robot, "--user", "daemon", "--root", tmp_path)
+    install(*words, "--dry-run")
+    assert not (tmp_path / "srv").exists()
+    install(*words, "--yes")
+    folder = tmp_path / "srv" / "arms" / "pairs"
+    assert folder.stat().st_mode & 0o777 == 0o750
+    if os.geteuid() == 0:
+        assert folder.owner() == folder.parent.owner() == "daemon"
 
 
 def test_units_that_are_there_are_left_as_they_are(tmp_path, robot, capsys) -> None:

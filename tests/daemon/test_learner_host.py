@@ -130,6 +130,13 @@ def test_a_folder_without_robots_is_refused(tmp_path: Path) -> None:
         descriptions([tmp_path])
 
 
+def test_a_description_out_of_reach_is_named(tmp_path: Path) -> None:
+    beyond = tmp_path / ("too long " * 40)
+    assert descriptions([beyond]) == [beyond]
+    with pytest.raises(ConfigError, match="cannot be read"):
+        configs_of([beyond], None)
+
+
 def test_each_of_several_robots_has_a_folder_of_its_own_for_its_state(tmp_path: Path, robots: list[Config]) -> None:
     configs = configs_of([config.file for config in robots], tmp_path / "states")
     assert [config.state_dir for config in configs] == [tmp_path / "states" / name for name in ("left", "right")]
