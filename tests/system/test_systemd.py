@@ -149,7 +149,7 @@ def test_a_hung_service_is_aborted_and_restarted(machine, robot, unit) -> None:
     machine.systemctl("restart", unit)
     gets_pairs(machine, unit)
     machine.run("kill", "-STOP", machine.show(unit, "MainPID"))
-    machine.until(lambda: restarts(machine, unit) == 1)
+    machine.until(lambda: restarts(machine, unit) >= 1)
     machine.until(lambda: machine.is_active(unit))
     assert "Fatal Python error: Aborted" in machine.journal(unit)
     assert gets_pairs(machine, SAMPLER, LEARNER)
@@ -162,8 +162,29 @@ def test_a_killed_service_is_restarted_alone(machine, robot, unit) -> None:
     other = LEARNER if unit == SAMPLER else SAMPLER
     running, killed = machine.show(other, "MainPID"), machine.show(unit, "MainPID")
     machine.run("kill", "-KILL", killed)
-    machine.until(lambda: restarts(machine, unit) == 1 and machine.is_active(unit))
+    machine.until(lambda: restarts(machine, unit) >= 1 and machine.is_active(unit))
     assert machine.show(other, "MainPID") == running
+    assert gets_pairs(machine, SAMPLER, LEARNER)
+
+
+def test_a_service_over_its_memory_is_restarted(machine, robot) -> None:
+    if "memory" not in machine.run("cat", "/sys/fs/cgroup/cgroup.controllers").stdout.split():
+        pytest.skip("cgroup2 has no memory controller here; to run it: boot with cgroup_no_v1=all")
+    started(machine, robot)
+    machine.drop_in(LEARNER, "[Service]\nMemoryMax=60M\n")
+    machine.systemctl("restart", "--no-block", LEARNER)
+    machine.until(lambda: restarts(machine, LEARNER) >= 1)
+    assert gets_pairs(machine, SAMPLER)
+
+
+def test_a_robot_out_of_reach_is_named_and_awaited(machine, robot) -> None:
+    started(machine, robot)
+    away = robot.parent.rename(robot.parent.with_name("away"))
+    for unit in (SAMPLER, LEARNER):
+        machine.run("systemctl", "restart", unit, check=False)
+        assert f"{robot}: " in machine.journal(unit)
+    away.rename(robot.parent)
+    machine.until(lambda: machine.is_active(SAMPLER) and machine.is_active(LEARNER))
     assert gets_pairs(machine, SAMPLER, LEARNER)
 
 
@@ -271,7 +292,7 @@ def test_the_router_waits_for_a_slow_network(machine, tmp_path) -> None:
     assert machine.is_active(ROUTER)
     assert restarts(machine, ROUTER) == 0
     machine.run("kill", "-STOP", machine.show(ROUTER, "MainPID"))
-    machine.until(lambda: restarts(machine, ROUTER) == 1 and machine.is_active(ROUTER))  # after its 30 s
+    machine.until(lambda: restarts(machine, ROUTER) >= 1 and machine.is_active(ROUTER))  # after its 30 s
     machine.systemctl("stop", ROUTER)
     assert machine.show(ROUTER, "Result") == "success"
 
