@@ -263,6 +263,12 @@ def test_missing_meshes_become_rods_and_are_named(tmp_path, name) -> None:
     assert said.startswith(f"missing meshes: {name or 'one without a file name'}. The simulation goes on")
 
 
+def test_no_rod_leads_to_a_tool(tmp_path) -> None:
+    tool = frame("tool").replace("</joint>", '<origin xyz="0.2 0.2 0"/></joint>')
+    shapes, _, _ = shapes_of(robot_of(tmp_path, mesh("base.stl"), tool))
+    assert [shape[1][0] for shape in shapes] == [pytest.approx(np.hypot(0.3, 0.1), abs=0.03)]
+
+
 def test_many_missing_meshes_make_one_sentence(tmp_path) -> None:
     said = written(robot_of(tmp_path, "".join(mesh(f"part_{k}.stl") for k in range(9)))).said
     assert [sentence.split(". ")[0] for sentence in said] == [
