@@ -25,6 +25,7 @@ from drivers.ros2.config import Ros2Config
 from drivers.serial_lines.config import SerialLinesConfig
 from interfaces.clock import SystemClock
 from interfaces.errors import ConfigError
+from interfaces.limited import read_at_most
 from interfaces.protocols import JointSource
 from interfaces.records import JointReading
 from interfaces.toml_file import read_toml
@@ -196,7 +197,7 @@ def bench_robot_file(config: Config, bench: DryRun, port: Path) -> Path:
     if "unexplained" in tables:
         tables["unexplained"]["model"] = str((config.file.parent / tables["unexplained"]["model"]).resolve())
     try:
-        if file.exists() and not file.read_text(encoding="utf-8").startswith(MARK):
+        if file.exists() and not read_at_most(file).startswith(MARK.encode()):
             raise ConfigError("is there already, and no bench wrote it", file=file, remedy="Give another --port")
         file.write_text(f"{MARK}\n{toml_text(tables)}", encoding="utf-8")
     except OSError as error:

@@ -18,7 +18,7 @@ from interfaces.errors import RobotError
 from interfaces.limited import read_at_most
 from interfaces.records import FloatArray
 from interfaces.rpy import rpy_of
-from interfaces.urdf import LARGEST_FILE_BYTES, MOVING, UrdfJoint, UrdfTree
+from interfaces.urdf import MOVING, UrdfJoint, UrdfTree
 
 from .meshes import LARGEST_M, Meshes
 from .roles import root_link
@@ -82,8 +82,8 @@ _SMALL = _Inertia(0.1, (0.0003, 0.0, 0.0, 0.0003, 0.0, 0.0003), _ZERO, _ZERO)
 class _Writer:
     def __init__(self, truth: TrueRobot) -> None:
         self._truth, self._file = truth, truth.tree.file
-        source = read_at_most(self._file, LARGEST_FILE_BYTES) or b""
-        self._source = ElementTree.fromstring(source)  # `UrdfTree.load` has refused entities and the like
+        # `UrdfTree.load` has refused entities and the like.
+        self._source = ElementTree.fromstring(read_at_most(self._file))
         self._meshes = Meshes(self._file)
         self._left_out: dict[str, None] = {}  # in order, each once
         self._rods: set[str] = set()

@@ -6,9 +6,7 @@ import mmap
 import os
 import select
 import subprocess
-import sys
 from contextlib import ExitStack
-from pathlib import Path
 from types import TracebackType
 from typing import Self
 
@@ -16,6 +14,7 @@ import numpy as np
 
 from interfaces.camera import StereoCalibration
 from interfaces.errors import SourceLost
+from interfaces.interpreter import module_command
 from interfaces.records import ImageArray
 
 from .config import SimConfig
@@ -132,14 +131,11 @@ class RenderProcess:
 
 
 def _start(memory: int, requests: int, answers: int) -> subprocess.Popen[bytes]:
-    """Start the renderer with this very copy of the package, whatever the working directory."""
-    here = str(Path(__file__).resolve().parents[1])
-    path = os.pathsep.join(part for part in (here, os.environ.get("PYTHONPATH", "")) if part)
     return subprocess.Popen(
-        [sys.executable, "-m", "sim_backend.renderer", str(memory), str(requests), str(answers)],
+        module_command("sim_backend.renderer", str(memory), str(requests), str(answers)),
         pass_fds=(memory, requests, answers),
         stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,
-        env={**os.environ, "PYTHONPATH": path, "OPENBLAS_NUM_THREADS": "1"},
+        env=os.environ | {"OPENBLAS_NUM_THREADS": "1"},
         process_group=0,  # a signal to the group is the parent's to handle
     )

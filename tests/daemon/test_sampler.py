@@ -28,7 +28,7 @@ from interfaces.errors import BusError, ConfigError, RequestError, SourceError, 
 from interfaces.records import JointReading, MarkerFix, MarkerMiss, Pair, Reason, frozen_array
 from interfaces.rejections import REMEDIES
 
-LIMIT_S = 60.0
+LIMIT_S = 500.0
 KEYS = Keys("arm")
 
 

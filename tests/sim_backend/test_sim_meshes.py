@@ -117,8 +117,10 @@ def test_malformed_files_are_told_apart(tmp_path, name) -> None:
 def test_files_beyond_the_limit_are_not_read(tmp_path, monkeypatch) -> None:
     monkeypatch.setattr(mesh_file, "LARGEST_MESH_BYTES", 1 << 20)
     (tmp_path / "endless.stl").symlink_to("/dev/zero")
-    with pytest.raises(MeshError, match="larger than 1 MiB"):
-        read_mesh(tmp_path / "endless.stl")
+    (tmp_path / "large.stl").write_bytes(bytes(2 << 20))
+    for name, why in (("endless.stl", "a device"), ("large.stl", "larger than 1 MiB")):
+        with pytest.raises(MeshError, match=why):
+            read_mesh(tmp_path / name)
 
 
 def test_too_many_triangles_are_refused(tmp_path, monkeypatch) -> None:
