@@ -78,6 +78,7 @@ class Learner:
         self._loop = loop
         self._settings, self._robot = config.tables.learner, config.robot
         self._keys = Keys(config.robot.name)
+        self._version = version("bodyschema")  # a file that is read: once, while there are descriptors for it
         self._nominal = NominalModel.extended_by(config.simulation)
         self._learning, self._set_aside = go_on(
             lambda: Learning(self._nominal, self._settings, solver, together_s=together_s(robots)),
@@ -183,7 +184,7 @@ class Learner:
             health=list(self._health()),
             orientation=self._learning.orientation_status(),
             missed=counters.missed,
-            version=version("bodyschema"),
+            version=self._version,
         )
 
     def _state(self, pairs: int) -> str:
