@@ -6,10 +6,11 @@ import errno
 import os
 import resource
 import sys
-from importlib.metadata import version
+from typing import NoReturn
 
 import cyclopts
 
+from daemon.extras import missing_module
 from daemon.remedies import as_typed
 from daemon.signals import end_with_parent
 from interfaces.errors import BodyschemaError, ConfigError
@@ -50,6 +51,15 @@ COMMANDS = {
 }
 
 
+# Each paragraph is one line: the terminal's width breaks it.
+_HELP = """Calibrate a robot arm by moving it by hand in front of a camera.
+
+Joint encoders and a stereo camera give samples. A learner turns them into the forward kinematics that the camera \
+sees, hand-eye and tool included.
+
+New here? Type: bodyschema demo. Each command's --help says what it needs and what comes next."""
+
+
 def command_line(called: str | None = None) -> cyclopts.App:
     """The command line.
 
@@ -59,19 +69,20 @@ def command_line(called: str | None = None) -> cyclopts.App:
     """
     line = cyclopts.App(
         name="bodyschema",
-        help="""Robot kinematics that calibrates itself.
-
-        Guide the arm by hand: encoders and a stereo camera give pairs, a learner turns them into the forward
-        kinematics that the cameras see. New here? `bodyschema demo`. Then each command's --help says what it needs
-        and what comes next.
-        """,
-        version=lambda: version("bodyschema"),
-        help_format="markdown",
+        help=_HELP,
+        version=_version,
+        help_format="markdown" if called in COMMANDS else "plaintext",  # rendering markdown takes 0.1 s of CPU
     )
     for place, (name, summary) in enumerate(COMMANDS.items()):
         own = None if name == called else summary
         line.command(f"daemon.commands.{name}:{name}", name=name, help=own, sort_key=place)
     return line
+
+
+def _version() -> str:
+    from importlib.metadata import version
+
+    return version("bodyschema")
 
 
 app = command_line()
@@ -95,6 +106,11 @@ def allow_enough_files() -> None:
         resource.setrlimit(resource.RLIMIT_NOFILE, (allowed, hard))
 
 
+def _fail(error: BodyschemaError) -> NoReturn:
+    print(f"bodyschema: {as_typed(str(error))}", file=sys.stderr)  # noqa: T201
+    sys.exit(1)
+
+
 def main() -> None:
     """Run the command line; errors of ours become one line and exit code 1."""
     # Threads of BLAS spin on the small matrices of tracker and learner, and take twice the time.
@@ -107,8 +123,12 @@ def main() -> None:
         allow_enough_files()
         command_line(arguments[0] if arguments else None)(arguments)
     except BodyschemaError as error:
-        print(f"bodyschema: {as_typed(str(error))}", file=sys.stderr)  # noqa: T201
-        sys.exit(1)
+        _fail(error)
+    except ModuleNotFoundError as error:
+        missing = missing_module(error)
+        if missing is None:
+            raise
+        _fail(missing)
     except KeyboardInterrupt:
         sys.exit(130)
     except BrokenPipeError:  # whoever read our output has had enough, as `head` has

@@ -7,24 +7,15 @@ import os
 import subprocess
 from collections.abc import Iterator
 from contextlib import contextmanager
-from importlib.util import find_spec
 from pathlib import Path
 
 from daemon.signals import with_parent
-from interfaces.errors import ConfigError
 from interfaces.interpreter import module_command
 
 log = logging.getLogger(__name__)
 
 END_LIMIT_S = 5.0
 PORT = 8420
-NEEDED = ("starlette", "uvicorn")
-
-
-def require_extra() -> None:
-    """ConfigError unless the extra `view` is installed."""
-    if any(find_spec(name) is None for name in NEEDED):
-        raise ConfigError("the page needs the extra `view`", remedy="Install it: `pip install 'bodyschema[view]'`")
 
 
 @contextmanager

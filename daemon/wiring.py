@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -23,6 +22,7 @@ from kbmaps import RigidChain
 
 from .bench_wiring import require_bench, through_bench
 from .config import Config
+from .extras import require_extra
 from .joints_watch import EncoderJoints, ServoJoints
 from .powered_wiring import open_drives
 from .sources import Head, MarkerTopic, Powered, Sources, StampedJoints
@@ -157,17 +157,21 @@ def _require_source(config: Config, *, sim: bool) -> None:
     require_usable(config)
 
 
+def connected_cameras() -> list[str]:
+    """Return the cameras of this machine, by the names that stay."""
+    from vision.cameras.serials import connected
+
+    return connected()
+
+
 def _recording(config: Config) -> Path | None:
     recording = config.tables.drivers.recording
     return None if recording is None else config.file.parent / recording
 
 
 def require_simulation() -> None:
-    """ConfigError with the command to type when the simulation's packages are not installed."""
-    if find_spec("pybullet") is None:
-        raise ConfigError(
-            "the simulation needs pybullet, which is not installed", remedy="Type: pip install 'bodyschema[sim]'"
-        )
+    """Raise ConfigError with the command to type when the simulation's packages are not installed."""
+    require_extra("sim", "the simulation")
 
 
 def demonstration_model() -> Path:

@@ -14,14 +14,13 @@ from typing import Annotated, Any, Literal
 import msgspec
 import numpy as np
 from msgspec import Meta
-from scipy.spatial.transform import Rotation
 
 from kbmaps import RigidChain
 
 from .camera import LARGEST_SIDE_PX, StereoCalibration
 from .errors import ConfigError, RobotError
 from .records import FloatArray, frozen_array
-from .rpy import rpy_of
+from .rpy import rotation_of, rpy_of
 from .toml_file import convert, line_of, read_toml
 from .urdf import MOVING, UrdfJoint, UrdfTree, chain_between
 
@@ -85,7 +84,7 @@ class CameraSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     def pose(self) -> FloatArray:
         """Pose of the left optical frame in the parent link, shape (4, 4)."""
         T = np.eye(4)
-        T[:3, :3] = Rotation.from_euler("xyz", self.rpy).as_matrix()
+        T[:3, :3] = rotation_of(np.array(self.rpy))
         T[:3, 3] = self.xyz
         return T
 

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from kbmaps import RigidChain
+from kbmaps.rotations import exponentials
 
 from .errors import RobotError
 from .limited import UnfitFile, read_at_most
@@ -233,11 +234,9 @@ def standing(joint: UrdfJoint, upward: bool, position: float) -> FloatArray:
 
 
 def _motion(joint: UrdfJoint, position: float) -> FloatArray:
-    from scipy.spatial.transform import Rotation
-
     T = np.eye(4)
     if joint.kind in REVOLUTE:
-        T[:3, :3] = Rotation.from_rotvec(joint.axis * position).as_matrix()
+        T[:3, :3] = exponentials((joint.axis * position)[None])[0][0]
     elif joint.kind == "prismatic":
         T[:3, 3] = joint.axis * position
     return T

@@ -28,14 +28,15 @@ def run(
 
     from daemon import logs
     from daemon.config import Config
+    from daemon.extras import require_extra
     from daemon.signals import on_termination
     from daemon.supervise import Child, Supervisor
-    from daemon.view_process import require_extra, shown
+    from daemon.view_process import shown
     from daemon.wiring import check_sources
     from interfaces.interpreter import module_command
 
     if view:
-        require_extra()
+        require_extra("view", "the page")
     logs.set_up(verbose=verbose)
     config = Config.load(robot)
     config.require_learnable()

@@ -11,7 +11,6 @@ import signal
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -64,14 +63,6 @@ class _Read:
 
 Told = Callable[[str, str], None]
 Done = Callable[[Diagnosed], None]
-
-
-def require_extra() -> None:
-    """ConfigError unless the extra `fleet` is installed."""
-    if find_spec("distributed") is None:
-        raise ConfigError(
-            "many diagnoses at once need the extra `fleet`", remedy="Install it: `pip install 'bodyschema[fleet]'`"
-        )
 
 
 def diagnose_all(

@@ -22,7 +22,10 @@ from kbmaps.maps import kernels
 
 seeds = st.integers(0, 2**32 - 1)
 kinds = st.text("RP", min_size=1, max_size=6)
-needs_both = pytest.mark.skipif(len(kernels.available()) < 2, reason="kbmaps was installed without a C compiler")
+needs_both = pytest.mark.skipif(
+    len(kernels.available()) < 2,
+    reason="no compiled kernels; to run it: apt-get install gcc",
+)
 
 
 def on_both_paths(make: Callable[[], object]) -> list[object]:
