@@ -81,8 +81,11 @@ def bench_motion(config: Config, tell: Callable[[float], None]) -> Motion:
         return Motion(dict(zip(joints, angles, strict=True)), f"each joint swings slowly by itself ({why})")
     from sim_backend.guided_path import guided_path
 
-    path = guided_path(config.robot, config.tables.sim, PATH_S, config.simulation, lambda done_s: tell(done_s / PATH_S))
-    angles = played(path, config.tables.sim.encoders.rate_hz, monotonic())
+    from .wiring import simulation_settings
+
+    sim = simulation_settings(config)
+    path = guided_path(config.robot, sim, PATH_S, config.simulation, lambda done_s: tell(done_s / PATH_S))
+    angles = played(path, sim.encoders.rate_hz, monotonic())
     words = f"guided by the simulated hand, {PATH_S:.0f} s of path to and fro"
     return Motion(dict(zip(joints, angles, strict=True)), words)
 

@@ -38,6 +38,7 @@ class UrdfJoint:
         T_parent_joint: pose of the joint's frame in its parent link at zero, shape (4, 4).
         axis: unit axis in the joint's frame, shape (3,).
         lower, upper: limits [rad or m]; ±π where a revolute joint has none.
+        mimics: it moves with another joint, as the second finger of a gripper does.
     """
 
     name: str
@@ -48,6 +49,7 @@ class UrdfJoint:
     axis: FloatArray
     lower: float
     upper: float
+    mimics: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -185,6 +187,11 @@ def chain_between(
         RobotError: a joint does not lie between the links, or the order along the way is another one.
     """
     way = tree.path(start, end)
+    mimicking = next((joint for joint, _ in way if joint.mimics), None)
+    if mimicking is not None:
+        raise RobotError(
+            f"joint {mimicking.name!r} mimics another joint", file=tree.file, remedy="Replace it by a fixed joint"
+        )
     on_way = [joint.name for joint, _ in way if joint.name in joints]
     for name in joints:
         tree.joint(name)
@@ -260,10 +267,6 @@ def _joint(element: Any, file: Path) -> UrdfJoint:
             line=line,
             remedy="Use revolute, continuous, prismatic or fixed joints",
         )
-    if element.find("mimic") is not None:
-        raise RobotError(
-            f"joint {name!r} mimics another joint", file=file, line=line, remedy="Replace it by a fixed joint"
-        )
     axis = _numbers(element.find("axis"), "xyz", (1.0, 0.0, 0.0), file)
     length = math.hypot(*axis)  # which does not overflow on the way
     if kind != "fixed" and not SHORTEST_AXIS < length < 1.0 / SHORTEST_AXIS:
@@ -285,6 +288,7 @@ def _joint(element: Any, file: Path) -> UrdfJoint:
         axis=frozen_array(axis / (length or 1.0)),
         lower=lower,
         upper=upper,
+        mimics=element.find("mimic") is not None,
     )
 
 

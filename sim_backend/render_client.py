@@ -18,6 +18,7 @@ from interfaces.interpreter import module_command
 from interfaces.records import ImageArray
 
 from .config import SimConfig
+from .physics_urdf import PhysicsUrdf
 from .render_messages import SLOTS, Frame, Setup, Tool, frame_bytes, send, slot_images
 from .scene import Scene
 
@@ -32,7 +33,12 @@ class RenderProcess:
     """
 
     def __init__(
-        self, urdf: str, joints: tuple[str, ...], marker_link: str, calibration: StereoCalibration, config: SimConfig
+        self,
+        urdf: PhysicsUrdf,
+        joints: tuple[str, ...],
+        marker_link: str,
+        calibration: StereoCalibration,
+        config: SimConfig,
     ) -> None:
         self._setup = Setup(
             urdf=urdf,
