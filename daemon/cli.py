@@ -11,7 +11,7 @@ from typing import NoReturn
 import cyclopts
 
 from daemon.extras import missing_module
-from daemon.remedies import as_typed
+from daemon.remedies import as_typed, printable
 from daemon.signals import end_with_parent
 from interfaces.errors import BodyschemaError, ConfigError
 
@@ -107,7 +107,7 @@ def allow_enough_files() -> None:
 
 
 def _fail(error: BodyschemaError) -> NoReturn:
-    print(f"bodyschema: {as_typed(str(error))}", file=sys.stderr)  # noqa: T201
+    print(f"bodyschema: {as_typed(printable(str(error)))}", file=sys.stderr)  # noqa: T201
     sys.exit(1)
 
 

@@ -74,3 +74,9 @@ def test_doctor_and_the_log_say_it(monkeypatch, capsys) -> None:
     assert "bodyschema joints --robot arm/left.toml    # live" in capsys.readouterr().out
     record = logging.LogRecord("x", logging.INFO, "", 0, "see `bodyschema status`", None, None)
     assert PlainFormatter("%(message)s").format(record) == "see `bodyschema status --robot arm/left.toml`"
+
+
+def test_no_name_in_a_message_steers_the_terminal() -> None:
+    assert printable("a joint '\x1b[2J\rwaist\x00'\nis not there: Gelenk ä") == (
+        "a joint '\\x1b[2J\\rwaist\\x00'\nis not there: Gelenk ä"
+    )
