@@ -10,7 +10,7 @@ from rich.console import Console
 
 from daemon.doctor_view import show
 from daemon.logs import PlainFormatter
-from daemon.remedies import WITH_ROBOT, as_typed, given_robot
+from daemon.remedies import WITH_ROBOT, as_typed, given_robot, printable
 from daemon.servo_wiring import Check
 
 GIVEN = ["doctor", "--robot", "arm/left.toml"]
