@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import os
-import struct
-import zlib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -87,9 +85,7 @@ def test_no_image_is_read_from_a_file_without_end(tmp_path: Path, make: Callable
 
 
 def test_an_image_of_more_pixels_than_memory_is_none(tmp_path: Path) -> None:
-    size = struct.pack(">IIBBBBB", 40_000, 40_000, 8, 2, 0, 0, 0)
-    header = b"IHDR" + size + struct.pack(">I", zlib.crc32(b"IHDR" + size))
-    (tmp_path / "a.png").write_bytes(b"\x89PNG\r\n\x1a\n" + struct.pack(">I", len(size)) + header)
+    (tmp_path / "a.png").write_bytes(b"P6\n40000 40000\n255\n" + bytes(100))
     assert read_image(tmp_path / "a.png") is None
 
 
