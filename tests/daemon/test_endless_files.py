@@ -131,7 +131,7 @@ def test_texts_with_many_full_stops_are_no_keys(tmp_path: Path) -> None:
     ("data", "said"),
     [
         (bytes(3 * 2**20), "line 1: the line is longer than 1 MiB"),
-        (bytes(100), r"line 1: the first line has the character '\\x00'"),
+        (bytes(100), r"line 1: this is not a text file: its first line has the character '\\x00'"),
         (HEADER + b"0,0,1,2,3\n" * 3 + bytes(3 * 2**20), "line 5: the line is longer than 1 MiB"),
         (HEADER + b"0,0,1,2,3\n" * 3 + b"\0,0,1,2,3\n", r"line 5, column waist: '\\x00' is not a number"),
         (b"a" * 10_000 + b"," + HEADER, "a column's name has 10,000 characters"),
