@@ -153,7 +153,7 @@ class Learner:
         """The learner's state."""
         counters = self._learning.counters
         at_rest = self._rested_with == counters.pairs  # before what is said below: it is final then
-        snapshot = self._learning.snapshot
+        snapshot, recent = self._learning.snapshot, self._learning.recent()
         now = self._clock.now()
         written = self._checkpointed_at if self._checkpoint_problem is None else None
         return LearnerStatus(
@@ -166,7 +166,9 @@ class Learner:
             sampler_alive=self._sampler_alive,
             replayed=counters.replayed,
             answering=snapshot.answering,
-            prequential_m=self._learning.prequential_m(),
+            prequential_m=dict(recent.means),
+            prequential_pairs=recent.pairs,
+            noise_m=self._learning.noise_m(),
             claimed_error_m=self._learning.claimed_error_m(),
             curve=self._learning.curve,
             model=snapshot.digest,

@@ -21,7 +21,7 @@ from kbmaps.changes.kinds import ChangeKind, any_change, change_kinds
 from kbmaps.changes.naming import Explanation, explanations
 from kbmaps.changes.shared_noise import SharedNoise
 from kbmaps.changes.white_noise import WhiteNoise
-from kbmaps.contest import Contest
+from kbmaps.contest import Contest, Recent
 from kbmaps.errors import (
     BasisError,
     ChainError,
@@ -106,6 +106,7 @@ __all__ = [
     "PoseModel",
     "PositionModel",
     "Posterior",
+    "Recent",
     "RecursiveRigidLearner",
     "ResidualLearner",
     "ResidualModel",

@@ -14,7 +14,6 @@ from daemon.chain_figures import is_told, no_surer_than_possible
 from daemon.config import LearnerConfig
 from daemon.findings import EVERY_S, SHARE, Findings, FindingTurns, figures
 from daemon.learning import DirectSolver, Learning, NominalModel
-from daemon.learning.learning import REGION_RAD
 from daemon.learning.outlook import Known, Scatter, foreseen
 from daemon.status import Outlook
 from interfaces.records import FloatArray
@@ -186,7 +185,7 @@ def test_the_noise_is_the_scatter_of_the_pairs() -> None:
 def outlook_of(learning: Learning) -> Outlook:
     known = learning.known()
     assert known is not None
-    return foreseen(known, Scatter.of(known), NAMES, REGION_RAD)
+    return foreseen(known, Scatter.of(known), NAMES)
 
 
 def guided(seed: int, pairs: int) -> tuple[Learning, Scene]:
