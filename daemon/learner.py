@@ -284,7 +284,10 @@ class Learner:
             self._learning.tool_changed()
             self._changes.note(self._learning.change)
         self.checkpoint()
-        return "pairs with the old tool no longer count; what they taught is where learning starts again"
+        return (
+            "pairs with the old tool no longer count; what they taught is where learning starts again. "
+            "`bodyschema command rollback` takes it back"
+        )
 
     def _rollback(self) -> str:
         with self._feed.lock:
