@@ -23,8 +23,8 @@ def learner(pairs: int, **changed: Any) -> LearnerStatus:
 
 def change(kind: str, *, noticed_seq: int = 105, found: bool = True) -> Change:
     return Change(
-        first_seq=101, earliest_seq=100, latest_seq=102, noticed_seq=noticed_seq, found=found, kind=kind, probabilities={},
-        alike=None, moved_m=None, can_roll_back=True,
+        first_seq=101, earliest_seq=100, latest_seq=102, noticed_seq=noticed_seq, found=found, kind=kind,
+        probabilities={}, alike=None, moved_m=None, can_roll_back=True,
     )  # fmt: skip
 
 
