@@ -168,7 +168,6 @@ class Learner:
             answering=snapshot.answering,
             prequential_m=dict(recent.means),
             prequential_pairs=recent.pairs,
-            noise_m=self._learning.noise_m(),
             claimed_error_m=self._learning.claimed_error_m(),
             curve=self._learning.curve,
             model=snapshot.digest,

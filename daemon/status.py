@@ -237,8 +237,6 @@ class LearnerStatus(msgspec.Struct, frozen=True, kw_only=True):
         health: sentences about what is wrong; empty when all is well.
         orientation: null where no pair with the present tool said how the marker is turned.
         prequential_pairs: on how many of the last pairs `prequential_m` was seen.
-        noise_m: mean distance between measurement and truth [m] in these errors, as the pairs state it; null before
-            any.
         missed: pairs that the sampler no longer kept when this learner asked for them.
         behind: pairs that are known to be stored and are not learnt yet.
         age_s: how old the newest learnt pair is, counted from the newest stored one; null before any since the start.
@@ -271,7 +269,6 @@ class LearnerStatus(msgspec.Struct, frozen=True, kw_only=True):
     version: str
     orientation: OrientationStatus | None = None
     prequential_pairs: int = 0
-    noise_m: float | None = None
     missed: int = 0
     behind: int = 0
     age_s: float | None = None

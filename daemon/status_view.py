@@ -146,8 +146,7 @@ def _learner(status: LearnerStatus) -> list[RenderableType]:
         facts.add_row("", f"{status.behind} stored and not learnt yet{age}")
     facts.add_row("new pairs", f"missed by: {errors}")
     if status.prequential_pairs:
-        noise = "" if status.noise_m is None else f" of about {mm(status.noise_m)}"
-        facts.add_row("", f"mean of the last {status.prequential_pairs}, measurement noise{noise} included")
+        facts.add_row("", f"mean of the last {status.prequential_pairs}, measurement noise included")
     facts.add_row("claimed", f"{mm(status.claimed_error_m)} from the truth where data is{_elsewhere(status)}")
     if status.orientation is not None:
         facts.add_row("orientation", _orientation(status.orientation))

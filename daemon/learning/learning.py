@@ -22,7 +22,7 @@ from .era import LOOKED_BACK, Era
 from .members import PRIOR, SOLVED
 from .nominal import NominalModel, chain_tolerances
 from .outlook import Known
-from .snapshot import MEAN_OVER_RMS, Snapshot
+from .snapshot import Snapshot
 from .solver import Solver
 from .solving import Solving
 from .state import Counters, LearningState
@@ -115,11 +115,6 @@ class Learning:
         with self._lock:
             era = self._course.eras.present
             return Recent(0, {}) if era is None else era.recent
-
-    def noise_m(self) -> float | None:
-        """Mean distance between measurement and truth [m], as the last pairs state it; None before any."""
-        with self._lock:
-            return MEAN_OVER_RMS * self._course.eras.claims.noise_m or None
 
     def claimed_error_m(self) -> float | None:
         """Mean distance to the truth [m] that is claimed in the data's region; None while there are too few pairs.

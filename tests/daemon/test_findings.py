@@ -216,6 +216,11 @@ def test_the_expected_error_is_the_true_one(after_60) -> None:
     assert 0.6 < np.exp(np.mean(np.log(ratios))) < 1.7
 
 
+def test_the_expected_error_is_the_claimed_one(after_60) -> None:
+    for learning, _, outlook in after_60:
+        assert outlook.error_m == pytest.approx(learning.claimed_error_m(), rel=1e-12)
+
+
 def test_what_is_foreseen_of_further_pairs_comes(after_60) -> None:
     ratios = []
     for learning, scene, outlook in after_60:

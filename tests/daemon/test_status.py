@@ -72,7 +72,7 @@ def sampler_running(config: Config) -> Iterator[None]:
         "prior 40.1 mm, exact 2.0 mm",
         "exact, model 6b6f",
         "none yet",
-        "missed by: prior 40.1 mm, exact 2.0 mm mean of the last 50, measurement noise of about 0.70 mm included",
+        "missed by: prior 40.1 mm, exact 2.0 mm mean of the last 50, measurement noise included",
         "claimed 6.6 mm from the truth where data is, 4.2 mm over all joints' ranges",
         "4120 stored and not learnt yet; the newest learnt is 2 min 17 s old",
         "`bodyschema command rollback` goes back to the model before it",

@@ -93,7 +93,6 @@ LEARNER = LearnerStatus(
     health=[],
     version="0.1.0",
     prequential_pairs=50,
-    noise_m=0.0007,
     behind=4120,
     age_s=137.0,
 )

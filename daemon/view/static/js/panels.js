@@ -21,7 +21,7 @@ export function tiles({ sampler, learner, series }) {
 }
 
 const lastPairs = (status) => `last ${whole(status.prequential_pairs)} pairs`;
-const noise = (status) => (status.noise_m ? ` (about ${mm(status.noise_m)})` : "");
+const noise = (status) => (status.calibration ? ` (${mm(status.calibration.noise_m)} a coordinate)` : "");
 
 export function pills({ sampler, learner }) {
   for (const [name, process] of [["sampler", sampler], ["learner", learner]]) {
@@ -41,7 +41,7 @@ export function outlook({ learner, outlook: sentence }) {
   table.hidden = !found;
   if (!found) return;
   const differs = found.best_motion_m.some((error, k) => error !== found.like_so_far_m[k]);
-  table.tHead.replaceChildren(row(element("th", {}, ""), ...[found.pairs === learner.status.pairs_since_change ? "now" : `at ${whole(found.pairs)} pairs`, ...found.further_pairs.map((pairs) => `+${pairs} pairs`)].map((name) => element("th", { scope: "col" }, name))));
+  table.tHead.replaceChildren(row(element("th", {}, ""), ...[found.error_m === learner.status.claimed_error_m ? "now" : `after ${whole(found.pairs)} pairs`, ...found.further_pairs.map((pairs) => `+${pairs} pairs`)].map((name) => element("th", { scope: "col" }, name))));
   const rows = [row("as so far", mm(found.error_m), ...found.like_so_far_m.map(mm))];
   if (differs) {
     rows.push(row(found.best_motion, mm(found.error_m), ...found.best_motion_m.map(mm)));
