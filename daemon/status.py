@@ -46,11 +46,13 @@ class BusStatus(msgspec.Struct, frozen=True):
         exchanges: questions that were asked.
         answered: the share of them that was answered as it should be.
         troubles: the others, by what was wrong.
+        way: with which questions its servos are read, such as Sync Read.
     """
 
     exchanges: int
     answered: float
     troubles: dict[str, int]
+    way: str = ""
 
 
 class SamplerStatus(msgspec.Struct, frozen=True, kw_only=True):
@@ -179,6 +181,9 @@ class OrientationStatus(msgspec.Struct, frozen=True):
     answering: str
     prequential_rad: dict[str, float]
     claimed_rad: float | None
+
+
+UNDECIDED = "undecided"  # a change whose kind is not known yet
 
 
 class Change(msgspec.Struct, frozen=True, kw_only=True):

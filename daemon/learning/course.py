@@ -146,8 +146,9 @@ class Course:
         """Count what `era` has learnt of these pairs and what it doubts, and follow a change that they show."""
         error_m = era.recent.means.get(era.answering)
         first = self.counters.pairs - len(era.met) - len(pairs) + 1
-        for place in [] if error_m is None else np.flatnonzero(~doubted).tolist():
-            self.curve.add(first + place, error_m)
+        if error_m is not None:
+            for place in np.flatnonzero(~doubted).tolist():
+                self.curve.add(first + place, error_m)
         self.counters.doubted += int(doubted.sum())
         if self._followed(era, pairs[-1], learnt=not doubted[-1]):
             self.counters.changes += 1

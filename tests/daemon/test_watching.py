@@ -86,7 +86,7 @@ def test_a_browser_gets_the_newest_picture() -> None:
     with MjpegServer(0) as server:
         server.show(b"old")
         server.show(b"newest")
-        connection = http.client.HTTPConnection(server.address.split("/")[2], timeout=30)
+        connection = http.client.HTTPConnection(server.address.split("/")[2])
         connection.request("GET", "/stream")
         answer = connection.getresponse()
         assert answer.headers["Content-Type"].startswith("multipart/x-mixed-replace")
