@@ -154,7 +154,7 @@ class Learner:
         """The learner's state."""
         counters = self._learning.counters
         at_rest = self._rested_with == counters.pairs  # before what is said below: it is final then
-        snapshot = self._learning.snapshot
+        snapshot, recent = self._learning.snapshot, self._learning.recent()
         now = self._clock.now()
         written = self._checkpointed_at if self._checkpoint_problem is None else None
         return LearnerStatus(
@@ -167,7 +167,8 @@ class Learner:
             sampler_alive=self._sampler_alive,
             replayed=counters.replayed,
             answering=snapshot.answering,
-            prequential_m=self._learning.prequential_m(),
+            prequential_m=dict(recent.means),
+            prequential_pairs=recent.pairs,
             claimed_error_m=self._learning.claimed_error_m(),
             curve=self._learning.curve,
             model=snapshot.digest,
@@ -283,7 +284,10 @@ class Learner:
             self._learning.tool_changed()
             self._changes.note(self._learning.change)
         self.checkpoint()
-        return "pairs with the old tool no longer count; what they taught is where learning starts again"
+        return (
+            "pairs with the old tool no longer count; what they taught is where learning starts again. "
+            "`bodyschema command rollback` takes it back"
+        )
 
     def _rollback(self) -> str:
         with self._feed.lock:

@@ -14,7 +14,6 @@ from daemon.chain_figures import is_told, no_surer_than_possible
 from daemon.config import LearnerConfig
 from daemon.findings import EVERY_S, SHARE, Findings, FindingTurns, figures
 from daemon.learning import DirectSolver, Learning, NominalModel
-from daemon.learning.learning import REGION_RAD
 from daemon.learning.outlook import Known, Scatter, foreseen
 from daemon.status import Outlook
 from interfaces.records import FloatArray
@@ -186,7 +185,7 @@ def test_the_noise_is_the_scatter_of_the_pairs() -> None:
 def outlook_of(learning: Learning) -> Outlook:
     known = learning.known()
     assert known is not None
-    return foreseen(known, Scatter.of(known), NAMES, REGION_RAD)
+    return foreseen(known, Scatter.of(known), NAMES)
 
 
 def guided(seed: int, pairs: int) -> tuple[Learning, Scene]:
@@ -215,6 +214,11 @@ def true_error_m(learning: Learning, scene: Scene, pairs: int) -> float:
 def test_the_expected_error_is_the_true_one(after_60) -> None:
     ratios = [outlook.error_m / true_error_m(learning, scene, 60) for learning, scene, outlook in after_60]
     assert 0.6 < np.exp(np.mean(np.log(ratios))) < 1.7
+
+
+def test_the_expected_error_is_the_claimed_one(after_60) -> None:
+    for learning, _, outlook in after_60:
+        assert outlook.error_m == pytest.approx(learning.claimed_error_m(), rel=1e-12)
 
 
 def test_what_is_foreseen_of_further_pairs_comes(after_60) -> None:

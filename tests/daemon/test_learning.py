@@ -28,6 +28,7 @@ from daemon.learning.members import SOLVED
 from interfaces.errors import RequestError
 from interfaces.records import Pair
 from kbmaps import NLMS
+from kbmaps.contest import LISTED
 
 SEEDS = range(4)
 MANY_SEEDS = range(12)
@@ -177,6 +178,21 @@ def test_a_gross_outlier_is_counted_as_doubted_and_as_learnt() -> None:
     wrong = make_pair(100, scene.q[99], scene.pairs[99].x + np.array([0.0, 1.0, 0.0]))
     teach(learning, [*scene.pairs[:99], wrong])
     assert (learning.counters.doubted, learning.counters.pairs) == (1, 100)
+
+
+def test_no_listed_model_beats_the_one_that_answers() -> None:
+    """By more than a fifth, on the pairs that are shown, while another tool is learnt."""
+    scene, learning = Taught.draw(1).half, Taught.draw(1).copy()
+    rng = np.random.default_rng(1)
+    q = scene.q[-1] + path(rng, 40)
+    learning.tool_changed()
+    beaten = []
+    for pair in measured(scene.chain.with_tool([0.0, 0.15, 0.2]), q, rng, first=HALF + 1):
+        teach(learning, [pair])
+        recent = learning.recent()
+        shown = recent.means.get(learning.snapshot.answering)
+        beaten.append(recent.pairs >= LISTED and shown is not None and shown > 1.21 * min(recent.means.values()))
+    assert sum(beaten) <= 1
 
 
 @pytest.mark.parametrize("told", [True, False], ids=["told", "not told"])
