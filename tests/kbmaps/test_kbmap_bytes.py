@@ -24,7 +24,7 @@ def forged(header: bytes, net: bytes = b"") -> bytes:
 
 
 @given(kinds=st.text("RP", min_size=1, max_size=5), seed=st.integers(0, 1000), text=st.text(max_size=20))
-@settings(max_examples=30)
+@settings(max_examples=12)
 def test_a_map_survives_the_round_trip_bit_by_bit(kinds, seed, text):
     kbmap = random_map(np.random.default_rng(seed), bases_for(kinds)).with_metadata({"note": text})
     back = KBMap.from_bytes(kbmap.to_bytes())
