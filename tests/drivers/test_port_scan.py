@@ -21,6 +21,7 @@ from drivers.feetech.bench.chain import Chain as FeetechChain
 from drivers.feetech.bench.servo import Servo as FeetechServo
 from drivers.feetech.models import BAUDS as FEETECH_BAUDS
 from drivers.feetech.models import BY_NAME as FEETECH
+from drivers.feetech.packets import FeetechPackets
 from drivers.scan import FoundServo, ScannedBus, scan_port, serial_ports
 from drivers.scanners import SCANNERS
 from interfaces.clock import SystemClock
@@ -177,7 +178,14 @@ def test_two_servos_of_two_models_with_one_id_are_told(one, other) -> None:
 def test_a_servo_that_answers_no_read_is_told_with_its_register() -> None:
     silent = servo("XM430-W350", 3)
     silent["status_return"] = 0
-    assert "Status Return Level (68)" in found(silent)[0].troubles[0]
+    assert "Status Return Level (68" in found(silent)[0].troubles[0]
+
+
+def test_a_feetech_servo_without_read_is_not_told_of_its_level() -> None:
+    assert "Status Return" not in FeetechPackets.pinged_only
+    level_0 = feetech("STS3215", 3)
+    level_0["status_return"] = 0
+    assert found(level_0)[0].troubles == ()
 
 
 class XL320(Servo):

@@ -32,7 +32,7 @@ from kbmaps import ExactLearner, JointBasis, KBMap
 from sim_backend import SimConfig, SimWorld
 from sim_backend.guided_path import guided_path
 
-pytestmark = pytest.mark.skipif(find_spec("pybullet") is None, reason="pybullet is not installed")
+pytestmark = pytest.mark.skipif(find_spec("pybullet") is None, reason="no pybullet; to run it: pip install -e '.[sim]'")
 
 ROBOT = Path(__file__).parents[2] / "examples" / "desk_arm" / "robot.toml"
 CONFIG = SimConfig()
