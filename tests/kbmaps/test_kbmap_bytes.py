@@ -40,7 +40,7 @@ def test_a_map_with_orientation_survives_the_round_trip():
 
 
 @given(position=st.integers(0, len(STORED) - 1), flip=st.integers(1, 255))
-@settings(max_examples=200)
+@settings(max_examples=100)
 def test_a_single_changed_byte_is_noticed(position, flip):
     damaged = bytearray(STORED)
     damaged[position] ^= flip
@@ -74,7 +74,7 @@ json_values = st.recursive(
 
 
 @given(bases=json_values, outputs=json_values, metadata=json_values, net=st.binary(max_size=80))
-@settings(max_examples=200)
+@settings(max_examples=100)
 def test_a_header_of_arbitrary_values_is_refused(bases, outputs, metadata, net):
     header = json.dumps({"bases": bases, "outputs": outputs, "metadata": metadata}).encode()
     with pytest.raises(ModelFormatError):
