@@ -5,6 +5,7 @@ Only kinematics, limits and masses are read. Meshes are never opened.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -12,17 +13,19 @@ from typing import Any
 import numpy as np
 
 from kbmaps import RigidChain
+from kbmaps.rotations import exponentials
 
 from .errors import RobotError
-from .limited import read_at_most
+from .limited import UnfitFile, read_at_most
 from .records import FloatArray, frozen_array
 from .rpy import rotation_of
 from .suggest import did_you_mean
 
 REVOLUTE = frozenset({"revolute", "continuous"})
 MOVING = REVOLUTE | {"prismatic"}
-LARGEST_FILE_BYTES = 16 * 2**20
 MOST_LINKS = 2000  # a humanoid with hands has some hundred
+# Sane ones are 1 long and some metres away; squares of these are far from where floats end.
+SHORTEST_AXIS, LARGEST_PLACE_M = 1e-9, 1e6
 MOST_QUOTED = 60  # characters of a wrong attribute in a message: one line of a terminal
 
 
@@ -35,6 +38,7 @@ class UrdfJoint:
         T_parent_joint: pose of the joint's frame in its parent link at zero, shape (4, 4).
         axis: unit axis in the joint's frame, shape (3,).
         lower, upper: limits [rad or m]; ±π where a revolute joint has none.
+        mimics: it moves with another joint, as the second finger of a gripper does.
     """
 
     name: str
@@ -45,6 +49,7 @@ class UrdfJoint:
     axis: FloatArray
     lower: float
     upper: float
+    mimics: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -182,6 +187,11 @@ def chain_between(
         RobotError: a joint does not lie between the links, or the order along the way is another one.
     """
     way = tree.path(start, end)
+    mimicking = next((joint for joint, _ in way if joint.mimics), None)
+    if mimicking is not None:
+        raise RobotError(
+            f"joint {mimicking.name!r} mimics another joint", file=tree.file, remedy="Replace it by a fixed joint"
+        )
     on_way = [joint.name for joint, _ in way if joint.name in joints]
     for name in joints:
         tree.joint(name)
@@ -231,11 +241,9 @@ def standing(joint: UrdfJoint, upward: bool, position: float) -> FloatArray:
 
 
 def _motion(joint: UrdfJoint, position: float) -> FloatArray:
-    from scipy.spatial.transform import Rotation
-
     T = np.eye(4)
     if joint.kind in REVOLUTE:
-        T[:3, :3] = Rotation.from_rotvec(joint.axis * position).as_matrix()
+        T[:3, :3] = exponentials((joint.axis * position)[None])[0][0]
     elif joint.kind == "prismatic":
         T[:3, 3] = joint.axis * position
     return T
@@ -259,15 +267,12 @@ def _joint(element: Any, file: Path) -> UrdfJoint:
             line=line,
             remedy="Use revolute, continuous, prismatic or fixed joints",
         )
-    if element.find("mimic") is not None:
-        raise RobotError(
-            f"joint {name!r} mimics another joint", file=file, line=line, remedy="Replace it by a fixed joint"
-        )
     axis = _numbers(element.find("axis"), "xyz", (1.0, 0.0, 0.0), file)
-    length = float(np.linalg.norm(axis))
-    if kind != "fixed" and not length > 0:
+    length = math.hypot(*axis)  # which does not overflow on the way
+    if kind != "fixed" and not SHORTEST_AXIS < length < 1.0 / SHORTEST_AXIS:
+        what = "no length" if length == 0 else f"the length {length:.3g}"
         raise RobotError(
-            f"the axis of joint {name!r} has no length", file=file, line=line, remedy='Write <axis xyz="0 0 1"/>'
+            f"the axis of joint {name!r} has {what}", file=file, line=line, remedy='Write <axis xyz="0 0 1"/>'
         )
     lower, upper = _limits(element, kind, file)
     if lower > upper:
@@ -283,6 +288,7 @@ def _joint(element: Any, file: Path) -> UrdfJoint:
         axis=frozen_array(axis / (length or 1.0)),
         lower=lower,
         upper=upper,
+        mimics=element.find("mimic") is not None,
     )
 
 
@@ -313,6 +319,13 @@ def _origin(element: Any, file: Path) -> FloatArray:
     T = np.eye(4)
     T[:3, :3] = rotation_of(_numbers(origin, "rpy", (0.0, 0.0, 0.0), file))
     T[:3, 3] = _numbers(origin, "xyz", (0.0, 0.0, 0.0), file)
+    if np.abs(T[:3, 3]).max() > LARGEST_PLACE_M:
+        raise RobotError(
+            f"the <origin> of {_owner(origin)} is {np.abs(T[:3, 3]).max():.3g} m away",
+            file=file,
+            line=origin.sourceline,
+            remedy="Give metres",
+        )
     return T
 
 
@@ -381,13 +394,15 @@ def _parse(file: Path) -> Any:
     from lxml import etree  # pyright: ignore[reportAttributeAccessIssue]
 
     try:
-        data = read_at_most(file, LARGEST_FILE_BYTES)
+        data = read_at_most(file)
+    except UnfitFile as error:
+        raise RobotError(
+            f"the URDF is {error.strerror}", file=file, remedy="Keep meshes in files of their own"
+        ) from error
     except OSError as error:
         raise RobotError(
             f"cannot read the URDF: {error.strerror}", file=file, remedy="Mend [robot] urdf, or --urdf"
         ) from error
-    if data is None:
-        raise RobotError("the URDF is larger than 16 MiB", file=file, remedy="Keep meshes in files of their own")
     parser = etree.XMLParser(resolve_entities=False, no_network=True, load_dtd=False, huge_tree=False)
     try:
         root = etree.fromstring(data, parser)

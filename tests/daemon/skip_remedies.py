@@ -10,7 +10,8 @@ Report = pytest.TestReport | pytest.CollectReport
 # Where a package comes from that a test imports or is skipped without; all others are of the extra `dev`.
 EXTRAS = {
     "pybullet": "sim",
-    "matplotlib": "sim",
+    "matplotlib": "plots",
+    "cv2": "cameras",
     "pyarrow": "export",
     "mcap": "export",
     "starlette": "view",

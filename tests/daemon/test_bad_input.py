@@ -140,7 +140,7 @@ def test_a_folder_for_robot_toml_is_refused(robot) -> None:
     [
         ("a.csv", b"hello\n", "a.csv, line 1, column waist: there is no column for the joint 'waist'"),
         ("a.csv", b"", "a.csv: the file is empty"),
-        ("a.csv", b"waist,shoulder\n\xff\xfe\x00\x01\n", "a.csv, line 2: the byte 0xff is not UTF-8 text"),
+        ("a.csv", b"waist,shoulder,x,y,z\n\xff\xfe\x00\x01\n", "a.csv, line 2: the byte 0xff is not UTF-8 text"),
         ("a.csv", b"waist,shoulder,x,y,z\n0,0,1,2,3\n0,nan,1,2,3\n", "a.csv, line 3, column shoulder: nan is not"),
         ("a.csv", b"waist,shoulder,x,y,z\n0,0,1,2,3\n0,0,1,2\n", "a.csv, line 3, column z: 4 fields where the header"),
         ("a.parquet", b"PAR1" + bytes(100), "a.parquet: not a whole Parquet file"),

@@ -25,7 +25,7 @@ from daemon.bus import Bus, client
 from daemon.cli import app
 from daemon.config import Config
 from daemon.keys import Keys
-from daemon.learning import curve, incoming
+from daemon.learning import curve
 from daemon.sampler import Sampler
 from daemon.session import session_of
 from daemon.sources import Sources
@@ -33,7 +33,7 @@ from daemon.store import PairStore
 from daemon.wire import MSGPACK, IkReply, IkRequest, JointsRequest, PredictReply, decode, encode
 from interfaces.clock import SystemClock
 from interfaces.errors import RequestError
-from interfaces.records import Reason
+from interfaces.records import FARTHEST_M, Reason
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "zenoh.md").read_text(encoding="utf-8")
@@ -90,7 +90,7 @@ def test_the_page_s_limits_are_the_code_s() -> None:
     assert f"| rows in a request | {wire.LARGEST_BATCH:,} |" in limits
     assert f"| pairs in a reply | {history.LARGEST_REPLY} |" in limits
     assert f"| points of the learning curve | {curve.LARGEST} |" in limits
-    assert f"| within {incoming.FARTHEST_M:.0f} m, else" in limits
+    assert f"| within {FARTHEST_M:.0f} m, else" in limits
 
 
 def test_the_page_shows_the_example_as_it_is() -> None:

@@ -57,7 +57,7 @@ def compiled_reader(tmp_path_factory) -> Path:
     if compiler is None:
         pytest.skip("no g++; to run it: apt-get install g++")
     program = tmp_path_factory.mktemp("reader") / "read_model"
-    flags = ["-std=c++17", "-O1", "-Wall", "-Wextra", "-Werror"]
+    flags = ["-std=c++17", "-O0", "-Wall", "-Wextra", "-Werror"]
     subprocess.run([compiler, *flags, str(COMPILED_READER), "-o", str(program)], check=True, timeout=100.0)
     return program
 
