@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator
 from colorsys import hsv_to_rgb
 from contextlib import contextmanager
@@ -17,7 +18,7 @@ from drivers.serial_lines.config import SerialLinesConfig
 from drivers.serial_lines.joints import SerialLineJoints
 from interfaces.camera import StereoCalibration
 from interfaces.clock import SystemClock
-from interfaces.errors import ConfigError
+from interfaces.errors import ConfigError, StoreError
 from interfaces.plugins import PluginConfig, load
 from interfaces.protocols import Clock, JointSource
 from interfaces.records import MarkerMiss, StereoFrame
@@ -36,6 +37,8 @@ if TYPE_CHECKING:
     from drivers.ros2.joints import Ros2Joints
     from sim_backend.config import CameraConfig, SimConfig, SimTag
     from vision.config import VisionConfig
+
+log = logging.getLogger(__name__)
 
 # A painted ball. Hues that the room does not have reach beyond its band by so much [deg], and are at least so many.
 _SATURATION, _VALUE, _ROOM_DEG, _GAP_DEG = 0.93, 0.86, 6.0, 36.0
@@ -77,7 +80,6 @@ def open_joints(config: Config, clock: Clock) -> EncoderJoints:
 
     Raises:
         ConfigError: no servos and no ROS 2 robot are configured, or zero-force or gaze do not fit the robot.
-        StoreError: the store, which tells where they were last, cannot be read.
     """
     hardware = config.tables.drivers.hardware
     if hardware is None:
@@ -139,8 +141,12 @@ def _last_pose(config: Config) -> list[float] | None:
     """Where the joints were at the newest pair [rad]."""
     if not config.store_file.exists():
         return None
-    with PairReader(config.store_file) as pairs:
-        last = pairs.last()
+    try:
+        with PairReader(config.store_file) as pairs:
+            last = pairs.last()
+    except StoreError as error:  # the sampler says so, too, and mends what can be mended
+        log.warning("where the joints were last is not known: %s", error)
+        return None
     return None if last is None or len(last.q) != len(config.robot.joints) else last.q.tolist()
 
 

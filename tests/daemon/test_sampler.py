@@ -423,6 +423,15 @@ def test_silent_sources_are_reported(config, monkeypatch) -> None:
 # --- how sure the time is
 
 
+def test_joints_too_fast_for_their_readings_make_no_pairs(config) -> None:
+    walk = Walk(config.robot, 20)
+    late = [replace(reading, t_sigma=0.01) for reading in walk.readings]
+    pairs, status = sample(config, walk.sources(readings=late, fixes=walk.fixes[2:-2]))
+    assert (pairs, status.rejected) == ([], {"late_joints": 16})
+    sure = [replace(reading, t_sigma=1e-4) for reading in walk.readings]
+    assert len(sample(config, walk.sources(readings=sure, fixes=walk.fixes[2:-2]))[0]) == 16
+
+
 def uncertain(walk: Walk, t_sigma: float) -> list[MarkerFix]:
     return [replace(fix, t_sigma=t_sigma) for fix in walk.fixes[2:-2]]
 
