@@ -9,21 +9,26 @@ from __future__ import annotations
 import hashlib
 import os
 import sqlite3
+import struct
 import tempfile
 import zipfile
-from collections.abc import Iterator, Mapping
+import zlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from pathlib import Path, PurePosixPath
-from typing import IO
+from typing import IO, Any
 
 import msgspec
 
-from interfaces.errors import BodyschemaError
+from interfaces.errors import BodyschemaError, StoreError
+from interfaces.limited import check_regular
 from interfaces.robot import Name
+from interfaces.toml_file import read_toml
 
 from . import store_schema
+from .checkpoint import checkpoint_bytes
 from .config import Config
-from .store import PairReader
+from .store import Audit, PairReader, leave_out_damage, require_store
 from .store_file import explained
 
 SCHEMA = 1
@@ -32,7 +37,17 @@ STATE, ROBOT = "state", "robot"
 STORE, CHECKPOINT, ROBOT_TOML = f"{STATE}/pairs.sqlite", f"{STATE}/learner.ckpt", f"{ROBOT}/robot.toml"
 # Of files that lie outside robot.toml's folder, which is not restored into other folders.
 ELSEWHERE = "elsewhere"
-CHUNK = 2**20
+# By its keys in robot.toml, how a file that it names may end.
+NAMED_FILES = {
+    ("robot", "urdf"): (".urdf", ".xml"),
+    ("vision", "cameras", "calibration"): (".toml",),
+    ("unexplained", "model"): (".kbmap",),
+}
+CHUNK, CHECKSUM_BYTES = 2**20, 32
+# What zipfile raises of bytes that are not an archive; RuntimeError where a bit says that it is encrypted.
+NOT_AN_ARCHIVE = (
+    OSError, EOFError, RuntimeError, ValueError, LookupError, struct.error, zlib.error, zipfile.BadZipFile
+)  # fmt: skip
 
 
 class BackupError(BodyschemaError):
@@ -54,6 +69,7 @@ class Manifest(msgspec.Struct, frozen=True, kw_only=True):
         store: identity of the pair store.
         pairs: how many pairs there are, up to the number `last_seq`.
         files: by name in the archive.
+        unreadable: how many pairs between the oldest and the newest could not be read, and are not in it.
     """
 
     robot: Name
@@ -63,6 +79,7 @@ class Manifest(msgspec.Struct, frozen=True, kw_only=True):
     pairs: int
     last_seq: int
     files: dict[str, Entry]
+    unreadable: int = 0
     schema: int = SCHEMA
 
 
@@ -84,19 +101,21 @@ def write_backup(config: Config, file: Path, *, utc: str, version: str, replace:
         contents = _description(config)
         if config.checkpoint_file.exists():
             held = Path(scratch) / "learner.ckpt"
-            held.write_bytes(config.checkpoint_file.read_bytes())
+            held.write_bytes(checkpoint_bytes(config.checkpoint_file))
             contents[CHECKPOINT] = held
-        contents[STORE] = copy_store(config.store_file, Path(scratch) / "pairs.sqlite")
+        contents[STORE] = Path(scratch) / "pairs.sqlite"
+        found = copy_store(config.store_file, contents[STORE], config.robot.joints)
         with PairReader(contents[STORE]) as pairs:
-            store, first, last = pairs.identity, pairs.first_seq(), pairs.last_seq()
+            store = pairs.identity
         origins = {CHECKPOINT: config.checkpoint_file, STORE: config.store_file}
         manifest = Manifest(
             robot=config.robot.name,
             written_utc=utc,
             version=version,
             store=store,
-            pairs=last - first + 1,
-            last_seq=last,
+            pairs=found.pairs,
+            last_seq=found.newest,
+            unreadable=found.damage.count,
             files={name: _entry(path, origins.get(name, path)) for name, path in contents.items()},
         )
         whole = Path(scratch) / "backup"
@@ -105,22 +124,28 @@ def write_backup(config: Config, file: Path, *, utc: str, version: str, replace:
     return manifest
 
 
-def copy_store(store: Path, copy: Path) -> Path:
-    """A copy of the store as it is at one moment, in one file, sound; also while a sampler writes it.
+def copy_store(store: Path, copy: Path, joints: Sequence[str]) -> Audit:
+    """Copy the store as it is at one moment into one file, without what cannot be read; also while a sampler writes it.
+
+    Args:
+        joints: for a store that lost theirs.
 
     Raises:
-        StoreError: there is no store, it is damaged, or the disk is full.
+        StoreError: there is no store, nothing of it can be read, or the disk is full.
     """
+    require_store(store)
     with (
-        PairReader(store),
         explained(store),
         closing(store_schema.connect(store, readonly=True)) as source,
         closing(sqlite3.connect(copy, isolation_level=None)) as target,
     ):
+        store_schema.check_kind(source, store)
         source.backup(target)
         target.execute("PRAGMA journal_mode = DELETE")
-        store_schema.check_health(target, store)
-    return copy
+    try:
+        return leave_out_damage(copy, joints)
+    except StoreError as error:
+        raise StoreError(str(error).replace(str(copy), str(store))) from error
 
 
 class Backup:
@@ -134,13 +159,10 @@ class Backup:
 
     def __enter__(self) -> Backup:
         try:
-            self._archive = zipfile.ZipFile(self.file)
-            self._manifest = self._checked(self._archive)
-        except FileNotFoundError as error:
-            raise BackupError(f"there is no file {self.file}") from error
-        except (OSError, zipfile.BadZipFile, EOFError, NotImplementedError) as error:
-            self._close()
-            raise BackupError(f"{self.file} is no backup, or is damaged: {error}") from error
+            with self._explained():
+                check_regular(self.file)
+                self._archive = zipfile.ZipFile(self.file)
+                self._manifest = self._checked(self._archive)
         except BaseException:
             self._close()
             raise
@@ -161,15 +183,20 @@ class Backup:
         entry = self.manifest.files[name]
         return file.exists() and _entry(file, file).blake2b == entry.blake2b
 
-    def text(self, name: str) -> str:
-        """One of its files as text."""
-        return self._open.read(name).decode()
-
     def extract(self, name: str, target: Path) -> None:
-        """Write one of its files to `target`, which is whole and on the disk afterwards."""
-        with self._open.open(name) as source, target.open("wb") as stream:
-            while part := source.read(CHUNK):
-                stream.write(part)
+        """Write one of its files to `target`, which is new, and whole and on the disk afterwards.
+
+        Raises:
+            BackupError: the archive has changed since it was opened.
+            OSError: `target` cannot be written.
+        """
+        entry = self.manifest.files[name]
+        with target.open("wb") as stream:
+            with self._explained():
+                source = self._open.open(name)
+            with source:
+                if self._copied(source, entry.size, stream.write) != entry.blake2b:
+                    raise BackupError(f"{name} in {self.file} is damaged: its checksum does not match")
             stream.flush()
             os.fsync(stream.fileno())
 
@@ -181,12 +208,18 @@ class Backup:
 
     def _checked(self, archive: zipfile.ZipFile) -> Manifest:
         """The manifest, when every file is there as it says, and no other."""
-        sizes = {info.filename: info.file_size for info in archive.infolist()}
+        infos = archive.infolist()
+        names = {info.filename for info in infos}
+        sizes = {info.filename: info.file_size for info in infos}
         if sizes.pop(MANIFEST, CHUNK + 1) > CHUNK:
             raise BackupError(f"{self.file} is no backup of bodyschema: it has no {MANIFEST}")
+        if len({name.casefold() for name in names}) < len(infos):
+            raise BackupError(f"{self.file} has two files of the same name")
+        if any(info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED) for info in infos):
+            raise BackupError(f"{self.file} is packed in another way than a backup")
         try:
             manifest = msgspec.json.decode(archive.read(MANIFEST), type=Manifest)
-        except msgspec.DecodeError as error:
+        except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
             raise BackupError(f"the {MANIFEST} of {self.file} cannot be understood: {error}") from error
         if manifest.schema != SCHEMA:
             raise BackupError(
@@ -195,12 +228,50 @@ class Backup:
             )
         if {STORE, ROBOT_TOML} - manifest.files.keys() or sizes.keys() != manifest.files.keys():
             raise BackupError(f"{self.file} does not hold the files that its {MANIFEST} says")
+        told = (manifest.written_utc, manifest.version, *(entry.origin for entry in manifest.files.values()))
+        if not all(text.isprintable() for text in told):
+            raise BackupError(f"the {MANIFEST} of {self.file} has characters that cannot be shown")
         for name, entry in manifest.files.items():
-            _require_inside(name)
             with archive.open(name) as stream:
-                if sizes[name] != entry.size or _checksum(stream, entry.size) != entry.blake2b:
+                if sizes[name] != entry.size or self._copied(stream, entry.size) != entry.blake2b:
                     raise BackupError(f"{name} in {self.file} is damaged: its checksum does not match")
         return manifest
+
+    def _copied(self, source: IO[bytes], size: int, write: Callable[[bytes], object] = len) -> str:
+        """Give at most one byte more than `size` to `write`: an archive can unpack to more than the disk holds.
+
+        Returns:
+            Their checksum.
+        """
+        digest, left = hashlib.blake2b(digest_size=CHECKSUM_BYTES), size + 1
+        while left > 0:
+            with self._explained():
+                part = source.read(min(CHUNK, left))
+            if not part:
+                break
+            digest.update(part)
+            write(part)
+            left -= len(part)
+        return digest.hexdigest()
+
+    @contextmanager
+    def _explained(self) -> Iterator[None]:
+        """What zipfile raises of a file that is not an archive, or of one that is not whole, as BackupErrors."""
+        try:
+            yield
+        except FileNotFoundError as error:
+            raise BackupError(f"there is no file {self.file}") from error
+        except (
+            OSError,
+            EOFError,
+            RuntimeError,
+            ValueError,
+            LookupError,
+            struct.error,
+            zlib.error,
+            zipfile.BadZipFile,
+        ) as error:
+            raise BackupError(f"{self.file} is no backup, or is damaged: {error}") from error
 
     def _close(self) -> None:
         if self._archive is not None:
@@ -208,35 +279,36 @@ class Backup:
             self._archive = None
 
 
+def description_files(tables: Mapping[str, Any]) -> dict[str, str]:
+    """Return the files that a robot.toml with these tables names, by their names in an archive."""
+    named: dict[str, str] = {}
+    for keys, endings in NAMED_FILES.items():
+        value: object = tables
+        for key in keys:
+            value = value.get(key) if isinstance(value, dict) else None
+        if isinstance(value, str):
+            named[f"{ROBOT}/{_inside(value, endings)}"] = value
+    return named
+
+
 def _description(config: Config) -> dict[str, Path]:
     """robot.toml and the files that it names, by their names in the archive."""
-    home, cameras = config.file.absolute().parent, config.tables.vision.cameras
-    named = [config.robot.robot.urdf, None if cameras is None else cameras.calibration, _model_of(config)]
-    contents = {ROBOT_TOML: config.file}
-    for name in named:
-        if name is not None:
-            contents[f"{ROBOT}/{_inside(name)}"] = home / name
-    return contents
+    home, (tables, _) = config.file.absolute().parent, read_toml(config.file)
+    return {ROBOT_TOML: config.file} | {name: home / file for name, file in description_files(tables).items()}
 
 
-def _model_of(config: Config) -> str | None:
-    """The file of what is unexplained, as robot.toml names it."""
-    unexplained = config.tables.unexplained
-    return None if unexplained is None else unexplained["model"]
+def _inside(name: str, endings: tuple[str, ...]) -> str:
+    """Return a file's name as robot.toml has it where it can be put back there; else one elsewhere.
 
-
-def _inside(name: str) -> str:
-    """A file's name as robot.toml has it, where that is in robot.toml's folder; else one that is."""
+    It can where it stays in robot.toml's folder, is not hidden (`.git/hooks/…`), and ends as files of its kind do: no
+    program takes it for something to run.
+    """
     path = PurePosixPath(os.path.normpath(name))
-    if path.is_absolute() or ".." in path.parts:
-        return f"{ELSEWHERE}/{path.name}"
-    return str(path)
-
-
-def _require_inside(name: str) -> None:
-    path = PurePosixPath(name)
-    if path.is_absolute() or ".." in path.parts or str(path) != name or path.parts[0] not in (STATE, ROBOT):
-        raise BackupError(f"{name!r} is no name for a file in a backup: it would be written elsewhere")
+    plain = not path.is_absolute() and not any(part.startswith(".") for part in path.parts)
+    if plain and path.suffix.lower() in endings and str(path).isprintable() and str(path) != Path(ROBOT_TOML).name:
+        return str(path)
+    stem = "".join(char if char.isalnum() or char in "-_" else "_" for char in path.stem)
+    return f"{ELSEWHERE}/{stem or 'file'}{endings[0]}"
 
 
 def _write_archive(file: Path, manifest: Manifest, contents: Mapping[str, Path]) -> None:
@@ -252,18 +324,9 @@ def _write_archive(file: Path, manifest: Manifest, contents: Mapping[str, Path])
 
 
 def _entry(file: Path, origin: Path) -> Entry:
-    size = file.stat().st_size
     with file.open("rb") as stream:
-        return Entry(size, _checksum(stream, size), str(origin.absolute()))
-
-
-def _checksum(stream: IO[bytes], size: int) -> str:
-    """Of at most one byte more than `size`: an archive can unpack to more than the disk holds."""
-    digest, left = hashlib.blake2b(digest_size=32), size + 1
-    while left > 0 and (part := stream.read(min(CHUNK, left))):
-        digest.update(part)
-        left -= len(part)
-    return digest.hexdigest()
+        digest = hashlib.file_digest(stream, lambda: hashlib.blake2b(digest_size=CHECKSUM_BYTES))
+        return Entry(stream.tell(), digest.hexdigest(), str(origin.absolute()))
 
 
 def _folder_of(file: Path) -> Path:

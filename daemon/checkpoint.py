@@ -21,19 +21,24 @@ import math
 import os
 import struct
 from pathlib import Path
+from typing import Annotated
 
 import msgspec
 import numpy as np
 
+from daemon.kept_files import sync_folder, unused_name
 from daemon.learning import LearningState
 from daemon.learning.state import LearningHeader
 from interfaces.errors import BodyschemaError
+from interfaces.limited import read_at_most
 from interfaces.records import FloatArray
 
 MAGIC = b"BSCKPT\r\n"
 VERSION = 3
 _PREFIX = struct.Struct("<8sII")
 _CHECKSUM_BYTES = 16
+# The largest that there can be, with the exact map of 2187 nodes and the state before a change, has 200 MB.
+LARGEST_BYTES = 2**29
 
 
 class CheckpointError(BodyschemaError):
@@ -42,7 +47,7 @@ class CheckpointError(BodyschemaError):
 
 class _ArrayEntry(msgspec.Struct, frozen=True):
     name: str
-    shape: tuple[int, ...]
+    shape: tuple[Annotated[int, msgspec.Meta(ge=0)], ...]
 
 
 class _Header(msgspec.Struct, frozen=True):
@@ -68,7 +73,7 @@ def write_checkpoint(file: Path, state: LearningState, *, robot: str, utc: str) 
         _write_through(temporary, data)
         _keep_previous(file)
         os.replace(temporary, file)
-        _sync_folder(file.parent)
+        sync_folder(file.parent)
     except OSError as error:
         with contextlib.suppress(OSError):
             temporary.unlink(missing_ok=True)
@@ -81,21 +86,32 @@ def read_checkpoint(file: Path, *, robot: str) -> LearningState | None:
     Raises:
         CheckpointError: it cannot be read, is damaged, or belongs to another robot.
     """
-    try:
-        data = file.read_bytes()
-    except FileNotFoundError:
+    if not os.path.lexists(file):
         return None
-    except OSError as error:
-        raise CheckpointError(f"cannot read the checkpoint {file}: {error.strerror}") from error
-    header, payload = _decode(file, data)
+    header, payload = _decode(file, checkpoint_bytes(file))
     if header.robot != robot:
         raise CheckpointError(f"the checkpoint {file} belongs to the robot {header.robot!r}, this one is {robot!r}")
     arrays: dict[str, FloatArray] = {}
-    for entry in header.arrays:
-        size = 8 * math.prod(entry.shape)
-        arrays[entry.name] = np.frombuffer(payload[:size], dtype="<f8").astype(np.float64).reshape(entry.shape)
-        payload = payload[size:]
+    try:
+        for entry in header.arrays:
+            size = 8 * math.prod(entry.shape)
+            arrays[entry.name] = np.frombuffer(payload[:size], dtype="<f8").astype(np.float64).reshape(entry.shape)
+            payload = payload[size:]
+    except ValueError as error:  # more dimensions than numpy has
+        raise CheckpointError(f"the checkpoint {file} has an array that cannot be: {error}") from error
     return LearningState(header.learning, arrays)
+
+
+def checkpoint_bytes(file: Path) -> bytes:
+    """Return what is in the file.
+
+    Raises:
+        CheckpointError: it cannot be read, or is larger than a checkpoint can be.
+    """
+    try:
+        return read_at_most(file, LARGEST_BYTES)
+    except OSError as error:
+        raise CheckpointError(f"cannot read the checkpoint {file}: {error.strerror}") from error
 
 
 def generations(file: Path) -> tuple[Path, Path]:
@@ -105,9 +121,7 @@ def generations(file: Path) -> tuple[Path, Path]:
 
 def set_aside(file: Path) -> Path:
     """Rename a checkpoint that is of no use, so that it is kept and not in the way; the new path."""
-    number = 1
-    while (aside := file.with_name(f"{file.name}.unusable-{number}")).exists():
-        number += 1
+    aside = unused_name(file, "unusable")
     try:
         file.rename(aside)
     except OSError as error:
@@ -135,7 +149,7 @@ def _decode(file: Path, data: bytes) -> tuple[_Header, memoryview]:
     end = _PREFIX.size + length
     try:
         header = msgspec.msgpack.decode(body[_PREFIX.size : end], type=_Header)
-    except msgspec.DecodeError as error:
+    except (msgspec.DecodeError, RecursionError, UnicodeDecodeError) as error:
         raise CheckpointError(f"the checkpoint {file} cannot be understood: {error}") from error
     payload = memoryview(body)[end:]
     if len(payload) != sum(8 * math.prod(entry.shape) for entry in header.arrays):
@@ -160,15 +174,6 @@ def _write_through(file: Path, data: bytes) -> None:
         stream.write(data)
         stream.flush()
         os.fsync(stream.fileno())
-
-
-def _sync_folder(folder: Path) -> None:
-    """Without this, a power cut may undo the renaming."""
-    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
 
 
 def _checksum(body: bytes) -> bytes:

@@ -32,6 +32,7 @@ from .servo_wiring import (
     servos_of,
 )
 from .status import SamplerStatus
+from .store import PairReader
 from .wire import decode
 from .zenoh_config import PROCESSES
 
@@ -61,6 +62,8 @@ def steps(config: Config) -> Iterator[Step]:
     if config.tables.drivers.ros2 is not None:
         yield "router", lambda: joint_state_checks(config)
     yield "disk", lambda: disk_checks(config.state_dir)
+    if config.store_file.exists():
+        yield "store", lambda: store_checks(config.store_file)
     yield "clock", clock_checks
     yield "zenoh", lambda: _zenoh(config)
 
@@ -146,6 +149,24 @@ def disk_checks(folder: Path) -> Iterator[Check]:
         yield Check("disk", state, said, f"du -xh {there} | sort -h | tail    # what could go")
     else:
         yield Check("disk", "ok", said)
+
+
+def store_checks(file: Path) -> Iterator[Check]:
+    """Whether the disk gives back every pair as it was written."""
+    with PairReader(file) as pairs:
+        trouble, audit = pairs.trouble(), pairs.audit()
+    if trouble is not None:
+        said = f"{file} is damaged ({trouble}). The sampler puts what can be read into a new file when it starts"
+        yield Check("store", "wrong", said, "bodyschema backup before.zip")
+    elif audit.damage.count:
+        yield Check(
+            "store", "warning", audit.damage.told(file), f"sudo smartctl -a $(df --output=source {file} | tail -1)"
+        )
+    elif audit.lost_rows:
+        said = f"{audit.lost_rows} notes on runs or servos in {file} cannot be read: the disk changed them"
+        yield Check("store", "warning", said, "bodyschema backup before.zip")
+    else:
+        yield Check("store", "ok", f"all {audit.pairs} pairs in {file} are as they were written")
 
 
 def clock_checks(is_synchronised: Callable[[], bool | None] | None = None) -> Iterator[Check]:

@@ -208,15 +208,14 @@ class PairFeed:
             self._foreign, self._behind = reply.store, False
             return True
         self._problem = self._foreign = None
-        self._skip_gone(reply)
-        before = self._cursor
-        for message in reply.pairs:
+        new = [message for message in reply.pairs if message.seq > self._cursor]
+        for message in new:
             self._beat()
-            if message.seq == self._cursor + 1:
-                self._learnt(message)
-                self._store, self._cursor = reply.store, message.seq
-        self._learning.recovered(self._cursor - before)
-        self._behind = self._cursor < reply.last_seq and self._cursor > before
+            self._pass_over(message.seq - self._cursor - 1)
+            self._learnt(message)
+            self._store, self._cursor = reply.store, message.seq
+        self._learning.recovered(len(new))
+        self._behind = self._cursor < reply.last_seq and bool(new)
         return not self._behind
 
     def _look_ahead(self) -> _Stored | None:
@@ -247,18 +246,16 @@ class PairFeed:
         utc = pairs[-1].utc if pairs and isinstance(pairs[-1], PairMessage) else ""
         self._newest = _Stored(reply.last_seq, utc, self._clock.now())
 
-    def _skip_gone(self, reply: Page) -> None:
-        """Go on with the oldest pair that is left where those before it are no longer kept."""
-        gone = reply.pairs[0].seq - self._cursor - 1 if reply.pairs else 0
-        if gone > 0:
+    def _pass_over(self, missing: int) -> None:
+        """Go on where the sampler has no such pairs: it numbers without gaps, so it had them once."""
+        if missing > 0:
             log.warning(
-                "the sampler no longer keeps the pairs %d to %d ([daemon] keep_days, keep_mb); learning goes on with "
-                "the next",
+                "the sampler has no pairs %d to %d any more: they were deleted ([daemon] keep_days, keep_mb) or its "
+                "disk changed them (its health tells); learning goes on with the next",
                 self._cursor + 1,
-                self._cursor + gone,
+                self._cursor + missing,
             )
-            self._learning.missed(gone)
-            self._store, self._cursor = reply.store, self._cursor + gone
+            self._learning.missed(missing)
 
     def _learnt(self, message: PairMessage | Unreadable) -> bool:
         try:

@@ -78,6 +78,7 @@ class Learner:
         self._loop = loop
         self._settings, self._robot = config.tables.learner, config.robot
         self._keys = Keys(config.robot.name)
+        self._version = version("bodyschema")  # a file that is read: once, while there are descriptors for it
         self._nominal = NominalModel.extended_by(config.simulation)
         self._learning, self._set_aside = go_on(
             lambda: Learning(self._nominal, self._settings, solver, together_s=together_s(robots)),
@@ -186,7 +187,7 @@ class Learner:
             missed=counters.missed,
             behind=self._feed.behind,
             age_s=self._feed.age_s(snapshot.newest_utc),
-            version=version("bodyschema"),
+            version=self._version,
         )
 
     def _state(self, pairs: int) -> str:

@@ -33,15 +33,16 @@ class Keep:
         """As the table [daemon] says."""
         return cls(rules.keep_days, None if rules.keep_mb is None else 1e6 * rules.keep_mb, rules.keep_newest)
 
-    def last_to_delete(self, connection: sqlite3.Connection, utc: str) -> int | None:
-        """The newest pair that can go now, with all before it; None when all are to be kept.
+    def last_to_delete(self, connection: sqlite3.Connection, utc: str, newest: int) -> int | None:
+        """Return the newest pair that can go now, with all before it; None when all are to be kept.
 
         Args:
             utc: now.
+            newest: number of the newest pair, which a damaged row may not tell.
         """
         if self.days is None and self.size is None:
             return None
-        oldest, newest = connection.execute("SELECT min(seq), max(seq) FROM pairs").fetchone()
+        oldest = connection.execute("SELECT min(seq) FROM pairs").fetchone()[0]
         if oldest is None or newest - self.newest < oldest:
             return None
         end = min(newest - self.newest, oldest + AT_ONCE - 1)
@@ -57,8 +58,9 @@ def delete_until(connection: sqlite3.Connection, last: int) -> int:
     connection.execute(
         "DELETE FROM devices WHERE from_seq < (SELECT max(from_seq) FROM devices WHERE from_seq <= ?)", (last + 1,)
     )
+    # Of several rows: the disk may have changed one.
     connection.execute(
-        "DELETE FROM sessions WHERE id < (SELECT session FROM pairs ORDER BY seq LIMIT 1) "
+        "DELETE FROM sessions WHERE id < (SELECT min(session) FROM (SELECT session FROM pairs ORDER BY seq LIMIT 10)) "
         "AND id NOT IN (SELECT session FROM devices)"
     )
     return deleted

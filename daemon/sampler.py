@@ -90,6 +90,7 @@ class Sampler:
         self._wall = SystemClock() if wall is None else wall
         self._service = Service.nobodys(self._wall) if service is None else service
         self._keys = Keys(config.robot.name)
+        self._version = version("bodyschema")  # a file that is read: once, while there are descriptors for it
         self._powered = {drive.name: drive for drive in sources.powered}
         held = config.robot.robot.hold == "zero_force"
         self._bears = self._powered.get(ZERO_FORCE) if held else None
@@ -103,8 +104,8 @@ class Sampler:
         self._buffer = JointBuffer(prismatic, rules.max_reading_gap_s, live=sources.live, kept_s=AROUND_S)
         self._gate = Gate(rules, prismatic, store.last())
         self._storing = Storing(store, self._wall)
-        self._tally = Tally(config.robot, self._wall, store.reader.joint_ranges())
-        self._seq = store.reader.last_seq()
+        self._tally = Tally(config.robot, self._wall, store.audit.joint_ranges)
+        self._seq = store.audit.newest
         self._publish = bus.publisher(self._keys.pair, cache=PAIR_CACHE)
         self._publish_status = bus.publisher(self._keys.status("sampler"))
         self._stopping = self._reloading = False
@@ -180,7 +181,8 @@ class Sampler:
             health=self._health(),
             servos=servos_of(self._encoders),
             buses=buses_of(self._encoders),
-            version=version("bodyschema"),
+            version=self._version,
+            unreadable=self._store.reader.present_damage().count,
         )
 
     def _serve(self) -> None:
@@ -262,7 +264,10 @@ class Sampler:
                 return moved
             if self._gate.is_too_fast(moved):
                 return Reason.MOVING
-        return self._buffer.at(fix.t, JOINTS_TIMEOUT_S)
+        q = self._buffer.at(fix.t, JOINTS_TIMEOUT_S)
+        if not isinstance(q, Reason) and self._gate.is_too_fast(self._buffer.slack(fix.t)):
+            return Reason.LATE_JOINTS
+        return q
 
     def _accept(self, verdict: Accepted, q: FloatArray, fix: MarkerFix) -> Reason | None:
         pair = self._storing.append(verdict.segment, q, fix)
@@ -383,6 +388,7 @@ class Sampler:
             said.append(f"{self._bad_readings} encoder readings were not finite and were not used")
         if disk_free(self._store.file) < LOW_DISK_BYTES:
             said.append(f"the disk of {self._store.file} is nearly full")
+        said += self._store.complaints
         return list(dict.fromkeys(said))  # servos tell what their drives say, too
 
     def _silences(self) -> list[str]:

@@ -61,7 +61,7 @@ class SamplerStatus(msgspec.Struct, frozen=True, kw_only=True):
     Attributes:
         store: identity of the store.
         state: running, paused, ended (the source is through) or failed.
-        pairs: accepted pairs in the store, which is also the newest sequence number.
+        pairs: sequence number of the newest pair in the store: so many were accepted.
         segment: number of the current segment.
         frames: frames taken since the start.
         rejected: frames that did not become pairs, by reason.
@@ -69,6 +69,7 @@ class SamplerStatus(msgspec.Struct, frozen=True, kw_only=True):
         health: sentences about what is wrong; empty when all is well.
         servos: by joint; empty where the joints are no servos.
         buses: by name; the same.
+        unreadable: pairs in the store that the disk changed, which are left out.
     """
 
     robot: str
@@ -88,6 +89,7 @@ class SamplerStatus(msgspec.Struct, frozen=True, kw_only=True):
     version: str
     servos: dict[str, ServoStatus] = {}
     buses: dict[str, BusStatus] = {}
+    unreadable: int = 0
     schema: int = SCHEMA
 
 

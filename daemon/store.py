@@ -2,25 +2,33 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import sqlite3
-import uuid
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
+from itertools import islice, takewhile
 from pathlib import Path
 from threading import Lock
 from types import TracebackType
 from typing import Any, Self
 
 import msgspec
+import numpy as np
 
-from interfaces.errors import StoreError
+from interfaces.errors import StoreError, StoreUnwritable
 from interfaces.records import FloatArray, MarkerFix, Pair, frozen_array
 
 from . import store_schema
 from .retention import Keep, delete_until
-from .store_file import NOTHING_CHANGED, explained, lock
-from .store_rows import COLUMNS, COLUMNS_BEFORE_ORIENTATION, as_json, pair_of, row_of
+from .store_damage import Damage, oldest, rebuild, records, scan, scan_back
+from .store_file import NOTHING_CHANGED, damaged, explained, is_damage, lock, unwritable
+from .store_rows import Checked, as_json, checked, pair_of, require_sound, row_of, sealed
+
+log = logging.getLogger(__name__)
+
+AUDITED_AT_ONCE = 1000  # rows: so many joint angles are compared in one go
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,36 +66,65 @@ class Devices:
     record: tuple[dict[str, Any], ...]
 
 
+@dataclass(frozen=True, slots=True)
+class Audit:
+    """What a look at each row of a store found.
+
+    Attributes:
+        pairs: sound ones.
+        newest: number of the newest pair, sound or not; 0 when there is none.
+        session: of the newest sound pair; 0 when there is none.
+        damage: numbers of pairs that cannot be read.
+        lost_rows: how many rows, of pairs and of what is kept beside them, are there and cannot be read.
+        joint_ranges: smallest and largest joint angles, each shape (d,) [rad or m]; None when there is no pair.
+    """
+
+    pairs: int
+    newest: int
+    session: int
+    damage: Damage
+    lost_rows: int
+    joint_ranges: tuple[FloatArray, FloatArray] | None
+
+
 class PairReader:
     """Reads a pair store, also while a sampler writes it. Use as a context manager; any thread may read.
+
+    A row that the disk changed is passed over, and so is what SQLite cannot read.
 
     Attributes:
         identity: UUID of the store.
         joints: names in the order of q.
+        damage: numbers of pairs that could not be read so far.
     """
 
     def __init__(self, file: Path) -> None:
         self.file = file
         self.identity = ""
         self.joints: tuple[str, ...] = ()
+        self.damage = Damage()
         self._connection: sqlite3.Connection | None = None
-        self._columns = COLUMNS
+        self._columns, self._with_checksums, self._given_up_to = "", True, 0
         self._lock = Lock()
 
     def __enter__(self) -> Self:
-        if not self.file.exists():
-            raise StoreError(f"there is no store {self.file}. The sampler makes it: start it with `bodyschema sampler`")
+        require_store(self.file)
         with explained(self.file):
             self._connection = store_schema.connect(self.file, readonly=True)
             try:
                 store_schema.check_kind(self._connection, self.file)
+                schema = store_schema.version(self._connection)
                 meta = store_schema.meta(self._connection)
-                if store_schema.version(self._connection) < 3:
-                    self._columns = COLUMNS_BEFORE_ORIENTATION
+            except ValueError as error:
+                self._close()
+                what = f"{self.file} is damaged ({error}). Start the sampler: it puts the pairs into a new file"
+                raise StoreError(what) from error
             except BaseException:
                 self._close()
                 raise
-        self.identity, self.joints = meta["store"], tuple(msgspec.json.decode(meta["joints"]))
+        self._columns, self._with_checksums = store_schema.columns(schema), schema >= store_schema.WITH_CHECKSUMS
+        self.identity, self.joints = meta["store"], store_schema.joints_of(meta)
+        self._given_up_to = store_schema.given_up_to(meta)
         return self
 
     def __exit__(
@@ -96,50 +133,114 @@ class PairReader:
         self._close()
 
     def read(self, from_seq: int = 1, to_seq: int | None = None, limit: int | None = None) -> list[Pair]:
-        """Pairs `from_seq` to `to_seq` (inclusive; None: the newest) in order, at most `limit` of them.
+        """Return sound pairs `from_seq` to `to_seq` (inclusive; None: the newest) in order, at most `limit` of them.
 
         Raises:
             StoreError: the file cannot be read.
         """
-        rows = self._rows(
-            f"SELECT {self._columns} FROM pairs WHERE seq BETWEEN ? AND ? ORDER BY seq LIMIT ?",
-            (from_seq, 2**62 if to_seq is None else to_seq, -1 if limit is None else limit),
-        )
-        return [pair_of(self.identity, row) for row in rows]
+        with self._reading() as connection:
+            found = scan(connection, self._columns, self._pair, from_seq)
+            wanted = found if to_seq is None else takewhile(lambda pair: pair.seq <= to_seq, found)
+            pairs = list(islice(wanted, limit))
+            if pairs and pairs[-1].seq - from_seq >= len(pairs):
+                before = [from_seq - 1] if from_seq > oldest(connection) else []
+                self.damage |= Damage.between([*before, *(pair.seq for pair in pairs)])
+        return pairs
 
     def last(self) -> Pair | None:
-        """The newest pair, or None when there is none."""
-        rows = self._rows(f"SELECT {self._columns} FROM pairs ORDER BY seq DESC LIMIT 1", ())
-        return pair_of(self.identity, rows[0]) if rows else None
+        """Return the newest sound pair, or None when there is none."""
+        with self._reading() as connection:
+            try:
+                back = scan_back(connection, self._columns, self._pair)
+                return next((pair for pair in back if pair is not None), None)
+            except sqlite3.DatabaseError as error:
+                if not is_damage(error):
+                    raise
+            return max(scan(connection, self._columns, self._pair), key=lambda pair: pair.seq, default=None)
 
     def last_seq(self) -> int:
-        """Sequence number of the newest pair; 0 when there is none."""
-        return self._rows("SELECT coalesce(max(seq), 0) FROM pairs", ())[0][0]
+        """Return the sequence number of the newest pair, sound or not; 0 when there is none."""
+        with self._reading() as connection:
+            behind, newest = 0, 0
+            try:
+                for pair in scan_back(connection, self._columns, self._check):
+                    if pair is not None:
+                        newest = pair.seq
+                        break
+                    behind += 1
+            except sqlite3.DatabaseError as error:
+                if not is_damage(error):
+                    raise
+                newest = max((pair.seq for pair in scan(connection, self._columns, self._check)), default=0)
+            return max(newest + behind, self._given_up_to)
 
     def first_seq(self) -> int:
-        """Sequence number of the oldest pair; 1 when there is none."""
-        return self._rows("SELECT coalesce(min(seq), 1) FROM pairs", ())[0][0]
+        """Return the sequence number of the oldest pair; 1 when there is none."""
+        with self._reading() as connection:
+            return oldest(connection)
 
-    def joint_ranges(self) -> tuple[FloatArray, FloatArray] | None:
-        """Smallest and largest joint angles over all pairs, each shape (d,) [rad or m]; None when there is none."""
-        columns = ", ".join(
-            f"min(json_extract(q, '$[{i}]')), max(json_extract(q, '$[{i}]'))" for i in range(len(self.joints))
-        )
-        ranges = self._rows(f"SELECT {columns} FROM pairs", ())[0]
-        return None if ranges[0] is None else (frozen_array(ranges[0::2]), frozen_array(ranges[1::2]))
+    def present_damage(self) -> Damage:
+        """Return the part of `damage` that has not been deleted with the oldest pairs."""
+        return self.damage.since(self.first_seq()) if self.damage.count else self.damage
+
+    def trouble(self) -> str | None:
+        """Return what is wrong with the pages of the file; None when nothing is."""
+        with self._reading() as connection:
+            return store_schema.trouble(connection)
+
+    def audit(self) -> Audit:
+        """Look at each row. What cannot be read is among `damage` from then on.
+
+        Raises:
+            StoreError: the file cannot be read.
+        """
+        newest = self.last_seq()
+        with self._reading() as connection:
+            numbers: list[int] = []
+            session, ends = 0, np.empty((0, len(self.joints)))
+            rows = scan(connection, self._columns, self._check)
+            while some := list(islice(rows, AUDITED_AT_ONCE)):
+                numbers += [pair.seq for pair in some]
+                session, angles = some[-1].session, np.vstack([ends, [pair.q for pair in some]])
+                ends = np.stack([angles.min(axis=0), angles.max(axis=0)])
+            first = oldest(connection)
+            before = [first - 1] if numbers and first < numbers[0] else []
+            self.damage |= Damage.between([*before, *numbers, newest + 1])
+            lost = connection.execute("SELECT count(*) FROM pairs").fetchone()[0] - len(numbers)
+            lost += sum(row is None for table in ("sessions", "devices") for row in records(connection, table))
+        ranges = (frozen_array(ends[0]), frozen_array(ends[1])) if numbers else None
+        return Audit(len(numbers), newest, session, self.damage, lost, ranges)
 
     def devices(self) -> list[Devices]:
-        """What the joints were read with, in the order of the pairs; empty in a store that an older version wrote."""
-        if not self._rows("SELECT 1 FROM sqlite_schema WHERE name = 'devices'", ()):
-            return []
-        rows = self._rows("SELECT session, from_seq, utc, record FROM devices ORDER BY id", ())
-        return [Devices(session, seq, utc, tuple(msgspec.json.decode(record))) for session, seq, utc, record in rows]
+        """Return what the joints were read with, in the order of the pairs; empty in a store of an older version."""
+        with self._reading() as connection:
+            rows = [row[1:] for row in records(connection, "devices") if row is not None]
+        try:
+            return [
+                Devices(session, seq, utc.decode(), tuple(msgspec.json.decode(record, type=list[dict[str, Any]])))
+                for session, seq, utc, record in rows
+            ]
+        except (msgspec.DecodeError, UnicodeDecodeError, AttributeError, TypeError) as error:
+            raise StoreError(damaged(self.file, f"what the joints were read with is not a record: {error}")) from error
 
-    def _rows(self, statement: str, values: tuple[Any, ...]) -> list[Any]:
+    def _pair(self, row: tuple[Any, ...]) -> Pair:
+        if self._with_checksums:
+            require_sound(row)
+        return pair_of(self.identity, row[:-1], len(self.joints))
+
+    def _check(self, row: tuple[Any, ...]) -> Checked:
+        if self._with_checksums:
+            require_sound(row)
+            return checked(row, len(self.joints))
+        pair = pair_of(self.identity, row[:-1], len(self.joints))
+        return Checked(pair.seq, row[1], pair.q.tolist())
+
+    @contextmanager
+    def _reading(self) -> Iterator[sqlite3.Connection]:
         with self._lock, explained(self.file):
             if self._connection is None:
                 raise StoreError(f"the store {self.file} is closed; use it in a with statement")
-            return self._connection.execute(statement, values).fetchall()
+            yield self._connection
 
     def _close(self) -> None:
         with self._lock:
@@ -163,12 +264,28 @@ class PairStore:
         self._lock_file: int | None = None
         self._connection: sqlite3.Connection | None = None
         self._seq = 0
-        self._session_id = 0
+        self._session_id = self._newest_session = 0
+        self._audit: Audit | None = None
+        self._rebuilt: str | None = None
 
     @property
     def identity(self) -> str:
         """UUID of the store."""
         return self.reader.identity
+
+    @property
+    def audit(self) -> Audit:
+        """What a look at each row found when the store was opened."""
+        if self._audit is None:
+            raise StoreError(f"the store {self.file} is closed; use it in a with statement")
+        return self._audit
+
+    @property
+    def complaints(self) -> list[str]:
+        """What is wrong with the file, in sentences; from any thread."""
+        said = [] if self._rebuilt is None else [self._rebuilt]
+        damage = self.reader.present_damage()
+        return [*said, damage.told(self.file)] if damage.count else said
 
     def __enter__(self) -> Self:
         try:
@@ -193,11 +310,8 @@ class PairStore:
         measured = (fix.x, fix.cov, fix.centres_px, fix.R, fix.cov_R)
         pair = Pair(self.identity, self._seq + 1, segment, fix.t, utc, q, *measured)
         with explained(self.file), store_schema.transaction(connection):
-            connection.execute(
-                f"INSERT INTO pairs (session, {COLUMNS}) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
-                (self._session_id, *row_of(pair)),
-            )
-        self._seq = pair.seq
+            connection.execute(store_schema.INSERT["pairs"], sealed(row_of(pair, self._session_id)))
+        self._seq, self._newest_session = pair.seq, self._session_id
         return pair
 
     def note_devices(self, utc: str, record: Sequence[Mapping[str, object]]) -> None:
@@ -210,10 +324,9 @@ class PairStore:
         with explained(self.file), store_schema.transaction(connection):
             # What no pair was measured with tells nothing of the pairs.
             connection.execute("DELETE FROM devices WHERE from_seq > ?", (self._seq,))
-            connection.execute(
-                "INSERT INTO devices (session, from_seq, utc, record) VALUES (?, ?, ?, ?)",
-                (self._session_id, self._seq + 1, utc, as_json(record)),
-            )
+            number = connection.execute("SELECT coalesce(max(id), 0) + 1 FROM devices").fetchone()[0]
+            told = (number, self._session_id, self._seq + 1, utc, as_json(record))
+            connection.execute(store_schema.INSERT["devices"], sealed(told))
 
     def go_on_with(self, session: Session) -> None:
         """What the sampler works with from the next pair on.
@@ -237,7 +350,7 @@ class PairStore:
         """
         connection = self._require_open()
         with explained(self.file):
-            last = keep.last_to_delete(connection, utc)
+            last = keep.last_to_delete(connection, utc, self._seq)
             if last is None:
                 return 0
             with store_schema.transaction(connection):
@@ -257,16 +370,34 @@ class PairStore:
         with explained(self.file):
             self._connection = store_schema.connect(self.file)
             if not self._connection.execute("SELECT count(*) FROM sqlite_schema").fetchone()[0]:
-                self._create(self._connection)
+                store_schema.create(self._connection, self._fresh())
             store_schema.check_kind(self._connection, self.file)
-            store_schema.check_health(self._connection, self.file)
+            what = store_schema.trouble(self._connection)
+            if what is not None:
+                self._rebuild(what)
             store_schema.migrate(self._connection)
-            self._check_joints(tuple(msgspec.json.decode(store_schema.meta(self._connection)["joints"])))
+            self._check_joints(store_schema.joints_of(store_schema.meta(self._connection)))
             self._connection.execute("PRAGMA journal_mode = WAL")
             self._connection.execute("PRAGMA synchronous = FULL")
+            self.reader.__enter__()
+            self._audit = self.reader.audit()
+            self._seq, self._newest_session = self._audit.newest, self._audit.session
             self._begin_session(self._connection)
-        self.reader.__enter__()
-        self._seq = self.reader.last_seq()
+        for said in self.complaints:
+            log.error("%s", said)
+
+    def _rebuild(self, what: str) -> None:
+        """Go on with a new file that has all that can be read."""
+        self._require_open().close()
+        try:
+            kept = rebuild(self.file, self._fresh())
+        except OSError as error:
+            raise StoreUnwritable(unwritable(self.file, error.errno, error.strerror)) from error
+        self._connection = store_schema.connect(self.file)
+        self._rebuilt = (
+            f"{self.file} was damaged ({what}). What could be read was put into a new file, and the damaged one was "
+            f"kept as {kept}. Check the disk"
+        )
 
     def _require_open(self) -> sqlite3.Connection:
         if self._connection is None:
@@ -282,30 +413,19 @@ class PairStore:
                 "or as state_dir in the table [daemon] of robot.toml"
             ) from error
 
-    def _create(self, connection: sqlite3.Connection) -> None:
-        meta = {"store": str(uuid.uuid4()), "created_utc": self._session.started_utc}
-        meta["joints"] = msgspec.json.encode(self._session.joints).decode()
-        with store_schema.transaction(connection):
-            for statement in store_schema.TABLES:
-                connection.execute(statement)
-            connection.executemany("INSERT INTO meta VALUES (?, ?)", meta.items())
-            connection.execute(f"PRAGMA application_id = {store_schema.APPLICATION_ID}")
-            connection.execute(f"PRAGMA user_version = {store_schema.SCHEMA_VERSION}")
+    def _fresh(self) -> dict[str, str]:
+        return store_schema.new_meta(self._session.joints, self._session.started_utc)
 
     def _begin_session(self, connection: sqlite3.Connection) -> None:
         session = self._session
         with store_schema.transaction(connection):
-            newest = connection.execute("SELECT coalesce(max(seq), 0) FROM pairs").fetchone()[0]
-            connection.execute("DELETE FROM devices WHERE from_seq > ?", (newest,))
+            connection.execute("DELETE FROM devices WHERE from_seq > ?", (self._seq,))
             # A sampler that is started again and again without seeing a pair must not fill the disk.
-            connection.execute(
-                "DELETE FROM sessions WHERE id > coalesce((SELECT session FROM pairs ORDER BY seq DESC LIMIT 1), 0)"
-            )
-            done = connection.execute(
-                "INSERT INTO sessions (started_utc, robot_toml, urdf, config, version, host) VALUES (?, ?, ?, ?, ?, ?)",
-                (session.started_utc, session.robot_toml, session.urdf, session.config, session.version, session.host),
-            )
-        self._session_id = int(done.lastrowid or 0)
+            connection.execute("DELETE FROM sessions WHERE id > ?", (self._newest_session,))
+            number = connection.execute("SELECT coalesce(max(id), 0) + 1 FROM sessions").fetchone()[0]
+            told = (session.started_utc, session.robot_toml, session.urdf, session.config, session.version)
+            connection.execute(store_schema.INSERT["sessions"], sealed((number, *told, session.host)))
+        self._session_id = number
 
     def _check_joints(self, stored: tuple[str, ...]) -> None:
         if stored != self._session.joints:
@@ -323,3 +443,32 @@ class PairStore:
         if self._lock_file is not None:
             os.close(self._lock_file)
             self._lock_file = None
+
+
+def require_store(file: Path) -> None:
+    """Raise StoreError when there is no such file."""
+    if not file.is_file():
+        raise StoreError(f"there is no store {file}. The sampler makes it: start it with `bodyschema sampler`")
+
+
+def leave_out_damage(file: Path, joints: Sequence[str]) -> Audit:
+    """Rebuild a store that nobody uses where it has something that cannot be read; what is in it then.
+
+    Args:
+        joints: for a store that lost theirs.
+
+    Raises:
+        StoreError: it is not a pair store, or nothing can be read.
+    """
+    with explained(file):
+        with closing(store_schema.connect(file)) as connection:
+            store_schema.check_kind(connection, file)
+            what = store_schema.trouble(connection)
+        if what is None:
+            with PairReader(file) as reader:
+                audit = reader.audit()
+            if not audit.lost_rows:
+                return audit
+        rebuild(file, store_schema.new_meta(joints, "")).unlink()
+    with PairReader(file) as reader:
+        return reader.audit()

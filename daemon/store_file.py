@@ -36,9 +36,14 @@ def explanation(file: Path, error: sqlite3.Error) -> str:
         return unwritable(file, errno.EROFS, str(error))
     if name.startswith("SQLITE_NOTADB"):
         return f"{file} is not a pair store. Move it away, or give another --state-dir. {NOTHING_CHANGED}"
-    if name.startswith("SQLITE_CORRUPT") or isinstance(error, sqlite3.DataError):
+    if is_damage(error):
         return damaged(file, str(error))
     return f"{file}: {error} ({name or type(error).__name__}). Check the disk"
+
+
+def is_damage(error: sqlite3.Error) -> bool:
+    """Return True when SQLite found that the file is not as it was written."""
+    return _name(error).startswith(("SQLITE_CORRUPT", "SQLITE_TOOBIG")) or isinstance(error, sqlite3.DataError)
 
 
 def _name(error: sqlite3.Error) -> str:
@@ -54,8 +59,8 @@ def unwritable(file: Path, number: int | None, what: str | None) -> str:
 
 def damaged(file: Path, what: str) -> str:
     return (
-        f"{file} is damaged ({what}). Keep it, save what can be read with `sqlite3 {file.name} .recover`, "
-        f"and give another --state-dir. {NOTHING_CHANGED}"
+        f"{file} is damaged ({what}). Put a backup back (`bodyschema restore --force` keeps this one), or keep it and "
+        f"give another --state-dir; `sqlite3 {file.name} .recover` shows what can be read. {NOTHING_CHANGED}"
     )
 
 

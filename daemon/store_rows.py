@@ -1,47 +1,123 @@
-"""A pair as a row of the store: numbers as JSON, which gives every one of them back exactly."""
+"""A pair as a row of the store: numbers as JSON, which gives each of them back exactly, and a checksum of the row."""
 
 from __future__ import annotations
 
-from typing import Any
+import math
+import zlib
+from typing import Any, NamedTuple
 
 import msgspec
 
-from interfaces.covariance import from_upper, upper_triangle
-from interfaces.records import Pair, frozen_array
+from interfaces.covariance import Upper, upper_triangle
+from interfaces.records import FloatArray, Pair, frozen_array
 
-# Stores of schemas 1 and 2 have these alone.
-COLUMNS_BEFORE_ORIENTATION = "seq, segment, t, utc, q, x, cov, centres_px"
-COLUMNS = f"{COLUMNS_BEFORE_ORIENTATION}, R, cov_R"
+# The columns of each table that a checksum covers, in its order.
+COLUMNS = {
+    "pairs": "seq, session, segment, t, utc, q, x, cov, centres_px, R, cov_R",
+    "devices": "id, session, from_seq, utc, record",
+    "sessions": "id, started_utc, robot_toml, urdf, config, version, host",
+}
+# The angles of 60 joints take 1.5 kB. Longer texts were not written by a sampler, and are not decoded.
+LARGEST_ANGLES_BYTES = 2**16
+
+_angles = msgspec.json.Decoder(list[float])
+_three = msgspec.json.Decoder(tuple[float, float, float])
+_four = msgspec.json.Decoder(tuple[float, float, float, float])
+_six = msgspec.json.Decoder(Upper)
+_packed = msgspec.msgpack.Encoder()
 
 
-def row_of(pair: Pair) -> tuple[Any, ...]:
-    """The values of `COLUMNS`."""
+class DamagedRow(ValueError):
+    """The disk gave back something else than was written."""
+
+
+class Checked(NamedTuple):
+    """What the check of a whole store needs of a pair."""
+
+    seq: int
+    session: int
+    q: list[float]
+
+
+def row_of(pair: Pair, session: int) -> tuple[Any, ...]:
+    """The values of the columns of `pairs`."""
     arrays = (as_json(pair.q.tolist()), as_json(pair.x.tolist()), as_json(upper_triangle(pair.cov)))
     centres = None if pair.centres_px is None else as_json(pair.centres_px)
     turn = None if pair.R is None else as_json(pair.R.tolist())
     cov_turn = None if pair.cov_R is None else as_json(upper_triangle(pair.cov_R))
-    return (pair.seq, pair.segment, pair.t, pair.utc, *arrays, centres, turn, cov_turn)
+    # SQLite does not keep the sign of a zero.
+    return (pair.seq, session, pair.segment, pair.t + 0.0, pair.utc, *arrays, centres, turn, cov_turn)
 
 
-def pair_of(store: str, row: tuple[Any, ...]) -> Pair:
-    """The pair of a row of `COLUMNS`, or of `COLUMNS_BEFORE_ORIENTATION`."""
-    seq, segment, t, utc, q, x, upper, centres, *turned = row
-    turn, cov_turn = turned or (None, None)
-    return Pair(
-        store=store,
-        seq=seq,
-        segment=segment,
-        t=t,
-        utc=utc,
-        q=frozen_array(msgspec.json.decode(q)),
-        x=frozen_array(msgspec.json.decode(x)),
-        cov=frozen_array(from_upper(msgspec.json.decode(upper))),
-        centres_px=None if centres is None else tuple(msgspec.json.decode(centres)),
-        R=None if turn is None else frozen_array(msgspec.json.decode(turn)),
-        cov_R=None if cov_turn is None else frozen_array(from_upper(msgspec.json.decode(cov_turn))),
-    )
+def sealed(row: tuple[Any, ...]) -> tuple[Any, ...]:
+    """The row and its checksum."""
+    return *row, checksum(tuple(value.encode() if isinstance(value, str) else value for value in row))
+
+
+def checksum(row: tuple[Any, ...]) -> int:
+    """CRC-32 of a row whose texts are bytes.
+
+    It finds each single flipped bit and each changed character for certain; a hash finds them with a probability.
+    """
+    return zlib.crc32(_packed.encode(row))
+
+
+def require_sound(row: tuple[Any, ...]) -> None:
+    """Raise DamagedRow when the last value is not the checksum of the others, which are as SQLite has them."""
+    if checksum(row[:-1]) != row[-1]:
+        raise DamagedRow
+
+
+def pair_of(store: str, row: tuple[Any, ...], joints: int) -> Pair:
+    """Return the pair of a row of `pairs` without its checksum, texts as bytes.
+
+    Raises:
+        DamagedRow: it is not a row that a sampler with so many joints writes.
+    """
+    seq, _, segment, t, utc, q, x, upper, centres, turn, cov_turn = row
+    try:
+        if len(q) > LARGEST_ANGLES_BYTES or seq < 1:
+            raise DamagedRow
+        pair = Pair(
+            store=store,
+            seq=seq,
+            segment=segment,
+            t=t,
+            utc=utc.decode(),
+            q=frozen_array(_angles.decode(q)),
+            x=frozen_array(_three.decode(x)),
+            cov=_covariance(upper),
+            centres_px=None if centres is None else _four.decode(centres),
+            R=None if turn is None else frozen_array(_four.decode(turn)),
+            cov_R=None if cov_turn is None else _covariance(cov_turn),
+        )
+    except (AttributeError, TypeError, UnicodeDecodeError, msgspec.DecodeError, RecursionError) as error:
+        raise DamagedRow from error
+    if len(pair.q) != joints or type(segment) is not int or type(t) is not float or not math.isfinite(t):
+        raise DamagedRow
+    return pair
+
+
+def checked(row: tuple[Any, ...], joints: int) -> Checked:
+    """As `pair_of` of a row that is sound by its checksum, at a fifth of the time.
+
+    Raises:
+        DamagedRow: it has another number of joint angles.
+    """
+    try:
+        q = _angles.decode(row[5])
+    except (TypeError, msgspec.DecodeError, RecursionError) as error:
+        raise DamagedRow from error
+    if len(q) != joints:
+        raise DamagedRow
+    return Checked(row[0], row[1], q)
 
 
 def as_json(numbers: object) -> str:
     """Numbers, or what holds them, in a column."""
     return msgspec.json.encode(numbers).decode()
+
+
+def _covariance(upper: bytes) -> FloatArray:
+    xx, xy, xz, yy, yz, zz = _six.decode(upper)
+    return frozen_array(((xx, xy, xz), (xy, yy, yz), (xz, yz, zz)))

@@ -1,19 +1,28 @@
-"""How a pair store is laid out: its tables, the way from each older schema to this one, and what makes it sound."""
+"""The layout of a pair store: its tables, the migration of each older schema, and what a pair store has to be."""
 
 from __future__ import annotations
 
 import contextlib
 import sqlite3
-from collections.abc import Iterator
+import uuid
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
+import msgspec
+
 from interfaces.errors import StoreError
 
-from .store_file import NOTHING_CHANGED, damaged
+from .store_file import NOTHING_CHANGED, damaged, is_damage
+from .store_rows import COLUMNS, DamagedRow, checksum, pair_of
 
-SCHEMA_VERSION = 4
-MAY_BE_TRIMMED = 4
+SCHEMA_VERSION = 5
+WITH_DEVICES, WITH_ORIENTATION, WITH_CHECKSUMS = 2, 3, 5
+CHECKSUM = "checksum"  # a column of each table, and a key of `meta`
+GIVEN_UP_TO = "given_up_to"  # a key of `meta`: pairs up to this number may have been given, and are lost
+NUMBERS = ("seq", "id", "session", "segment", "t", "from_seq")  # columns that are not texts
+LONGEST_IDENTITY = 100  # characters; a UUID has 36
+LARGEST_VALUE_BYTES = 2**26  # of one row; URDF and robot.toml of a session are the largest
 APPLICATION_ID = 0x42534348  # "BSCH": how `file` and we tell a pair store from another SQLite file
 
 _TABLES = """
@@ -29,7 +38,7 @@ CREATE TABLE pairs (
 """
 # The statements that lead to each schema from the one before. Those of schema 2: what the joints were read with from
 # pair `from_seq` on. Of schema 3: how the marker is turned. Of schema 4 none: its oldest pairs may have been deleted,
-# which an older bodyschema takes for damage.
+# which an older bodyschema takes for damage. Of schema 5: a checksum of each row.
 _MIGRATIONS = {
     2: """
 CREATE TABLE devices (
@@ -40,14 +49,35 @@ CREATE TABLE devices (
 ALTER TABLE pairs ADD COLUMN R TEXT;
 ALTER TABLE pairs ADD COLUMN cov_R TEXT""",
     4: "",
+    5: """
+ALTER TABLE pairs ADD COLUMN checksum INTEGER;
+ALTER TABLE devices ADD COLUMN checksum INTEGER;
+ALTER TABLE sessions ADD COLUMN checksum INTEGER""",
 }
+# By table, the statement that inserts a sealed row. A row that has the number already was damaged: a store never gives
+# a number twice.
+INSERT = {
+    table: f"INSERT OR REPLACE INTO {table} ({names}, {CHECKSUM}) VALUES ({'?, ' * len(names.split(', '))}?)"
+    for table, names in COLUMNS.items()
+}
+# Pairs that cannot be read when an older store is brought to schema 5 get no checksum.
+_SEAL = "UPDATE {table} SET checksum = sealed_{table}({columns})"
 TABLES = ";".join([_TABLES, *_MIGRATIONS.values()]).split(";")
 
 
 def connect(file: Path, *, readonly: bool = False) -> sqlite3.Connection:
-    """A connection for any thread, without transactions of its own."""
+    """Return a connection for any thread, without transactions of its own. Texts come as bytes.
+
+    What the file itself defines (triggers, generated columns) may not call functions with side effects.
+    """
+    if file.exists() and not file.is_file():  # SQLite would wait for what a pipe never says
+        raise StoreError(f"{file} is not a file. Move it away, or give another --state-dir. {NOTHING_CHANGED}")
     uri = f"{file.absolute().as_uri()}?mode={'ro' if readonly else 'rwc'}"
-    return sqlite3.connect(uri, uri=True, isolation_level=None, check_same_thread=False)
+    connection = sqlite3.connect(uri, uri=True, isolation_level=None, check_same_thread=False)
+    connection.text_factory = bytes  # a text that is not UTF-8 spoils its own row alone
+    connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, LARGEST_VALUE_BYTES)
+    connection.execute("PRAGMA trusted_schema = OFF")
+    return connection
 
 
 @contextmanager
@@ -64,7 +94,7 @@ def transaction(connection: sqlite3.Connection) -> Iterator[None]:
 
 
 def check_kind(connection: sqlite3.Connection, file: Path) -> None:
-    """StoreError when `file` is no pair store, or one of a newer version."""
+    """Raise StoreError when `file` is not a pair store, is one of a newer version, or has other tables."""
     if connection.execute("PRAGMA application_id").fetchone()[0] != APPLICATION_ID:
         raise StoreError(
             f"{file} is not a pair store but another SQLite file. Move it away, or give another --state-dir. "
@@ -76,36 +106,157 @@ def check_kind(connection: sqlite3.Connection, file: Path) -> None:
             f"{file} was written by a newer bodyschema (schema {found}, this one knows {SCHEMA_VERSION}). "
             f"Install the newer bodyschema, or give another --state-dir. {NOTHING_CHANGED}"
         )
+    odd = _unlike(connection, found)
+    if odd is not None:
+        raise StoreError(damaged(file, odd))
 
 
 def version(connection: sqlite3.Connection) -> int:
-    """The schema of the file."""
+    """Return the schema of the file."""
     return int(connection.execute("PRAGMA user_version").fetchone()[0])
 
 
+def columns(schema: int) -> str:
+    """Return the columns of `pairs` and its checksum, as far as a store of this schema has them."""
+    have = _pair_columns(schema)
+    return ", ".join(name if name in have else "NULL" for name in [*COLUMNS["pairs"].split(", "), CHECKSUM])
+
+
 def migrate(connection: sqlite3.Connection) -> None:
-    """Bring a store of an older version to this one; its pairs stay as they are."""
+    """Bring a store of an older version to this one in one transaction; its pairs stay as they are."""
     found = version(connection)
     if found < SCHEMA_VERSION:
         with transaction(connection):
             for schema in range(found + 1, SCHEMA_VERSION + 1):
                 for statement in _MIGRATIONS[schema].split(";"):
                     connection.execute(statement)
+            if found < WITH_CHECKSUMS:
+                _seal(connection)
             connection.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
 
 
-def check_health(connection: sqlite3.Connection, file: Path) -> None:
-    """StoreError when the file is damaged, or a pair is missing between its oldest and its newest."""
-    found = connection.execute("PRAGMA quick_check(1)").fetchone()[0]
-    count, oldest, newest = connection.execute(
-        "SELECT count(*), coalesce(min(seq), 1), coalesce(max(seq), 0) FROM pairs"
-    ).fetchone()
-    missing = newest - oldest + 1 - count + (oldest - 1 if version(connection) < MAY_BE_TRIMMED else 0)
-    if found != "ok" or missing:
-        what = found if found != "ok" else f"{missing} pairs are missing"
-        raise StoreError(damaged(file, what))
+def trouble(connection: sqlite3.Connection) -> str | None:
+    """Return what is wrong with the pages of the file or with its identity; None when nothing is."""
+    try:
+        found = connection.execute("PRAGMA quick_check(1)").fetchone()[0].decode(errors="replace")
+        if found == "ok":
+            meta(connection)
+    except sqlite3.DatabaseError as error:
+        if not is_damage(error):
+            raise
+        return str(error)
+    except ValueError as error:
+        return str(error)
+    return None if found == "ok" else found.splitlines()[-1]
 
 
 def meta(connection: sqlite3.Connection) -> dict[str, str]:
-    """What is said of the store as a whole."""
-    return dict(connection.execute("SELECT key, value FROM meta").fetchall())
+    """Return what is said of the store as a whole: `store`, its identity, `joints` and more.
+
+    Raises:
+        ValueError: the disk changed it, or a part is missing.
+    """
+    rows = connection.execute("SELECT key, value FROM meta LIMIT 100").fetchall()
+    try:
+        found = {key.decode(): value.decode() for key, value in rows}
+        sealed = version(connection) < WITH_CHECKSUMS or found.pop(CHECKSUM) == str(_checksum_of(found))
+        if not (sealed and found["store"].isprintable() and 0 < len(found["store"]) <= LONGEST_IDENTITY):
+            raise ValueError
+        joints_of(found)
+        given_up_to(found)
+    except (AttributeError, KeyError, ValueError) as error:
+        raise ValueError("its identity or its joints cannot be read") from error
+    return found
+
+
+def new_meta(joints: Sequence[str], utc: str) -> dict[str, str]:
+    """Return what is said of a new store."""
+    return {"store": str(uuid.uuid4()), "created_utc": utc, "joints": msgspec.json.encode(joints).decode()}
+
+
+def joints_of(meta: dict[str, str]) -> tuple[str, ...]:
+    """Return the names in the order of q; ValueError when they are not names."""
+    try:
+        joints = msgspec.json.decode(meta["joints"], type=tuple[str, ...])
+    except msgspec.DecodeError as error:
+        raise ValueError from error
+    if not joints or len(set(joints)) != len(joints) or not all(name.isprintable() and name for name in joints):
+        raise ValueError
+    return joints
+
+
+def given_up_to(meta: dict[str, str]) -> int:
+    """Return the largest number that a lost pair may have; 0 where none is lost. ValueError when it is not a number."""
+    number = int(meta.get(GIVEN_UP_TO, "0"))
+    if not 0 <= number < 2**62:
+        raise ValueError
+    return number
+
+
+def write_meta(connection: sqlite3.Connection, contents: dict[str, str]) -> None:
+    """Say this of the store as a whole, inside a transaction."""
+    rows = {**contents, CHECKSUM: str(_checksum_of(contents))} if version(connection) >= WITH_CHECKSUMS else contents
+    connection.executemany("INSERT OR REPLACE INTO meta VALUES (?, ?)", rows.items())
+
+
+def create(connection: sqlite3.Connection, contents: dict[str, str]) -> None:
+    """Make the tables of an empty store."""
+    with transaction(connection):
+        for statement in TABLES:
+            connection.execute(statement)
+        connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
+        connection.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
+        write_meta(connection, contents)
+
+
+def _pair_columns(schema: int) -> list[str]:
+    names = COLUMNS["pairs"].split(", ")
+    turned = names if schema >= WITH_ORIENTATION else names[: names.index("R")]
+    return [*turned, CHECKSUM] if schema >= WITH_CHECKSUMS else turned
+
+
+def _unlike(connection: sqlite3.Connection, schema: int) -> str | None:
+    """Return what a file has that a pair store of this schema cannot have, or lacks."""
+    sealed = [CHECKSUM] if schema >= WITH_CHECKSUMS else []
+    expected = {"meta": ["key", "value"], "pairs": _pair_columns(schema)}
+    others = ("sessions", "devices") if schema >= WITH_DEVICES else ("sessions",)
+    expected |= {name: [*COLUMNS[name].split(", "), *sealed] for name in others}
+    if connection.execute("PRAGMA encoding").fetchone()[0] != b"UTF-8":
+        return "its texts are not UTF-8"
+    trigger = connection.execute("SELECT name FROM sqlite_schema WHERE type = 'trigger'").fetchone()
+    if trigger is not None:
+        return "it has a trigger, which a pair store has not"
+    plain = {row[1] for row in connection.execute("PRAGMA table_list") if row[2] == b"table"}
+    for table, names in expected.items():
+        there = connection.execute(f"PRAGMA table_xinfo({table})").fetchall()
+        if table.encode() not in plain or {row[1] for row in there if not row[-1]} != {name.encode() for name in names}:
+            return f"its table {table} is not that of schema {schema}"
+        if len(there) != len(names):
+            return f"its table {table} has computed columns"
+    return None
+
+
+def _seal(connection: sqlite3.Connection) -> None:
+    """Give each row its checksum. A pair that cannot be read gets none."""
+    contents = meta(connection)
+    joints = len(joints_of(contents))
+
+    def sealed_pairs(*row: object) -> int | None:
+        try:
+            pair_of("", row, joints)
+        except DamagedRow:
+            return None
+        return checksum(row)
+
+    functions = {"pairs": sealed_pairs, "devices": lambda *row: checksum(row), "sessions": lambda *row: checksum(row)}
+    for table, function in functions.items():
+        names = COLUMNS[table].split(", ")
+        connection.create_function(f"sealed_{table}", len(names), function, deterministic=True)
+        # As bytes: a text that is not UTF-8 would end the statement.
+        texts = [name if name in NUMBERS else f"CAST({name} AS BLOB)" for name in names]
+        connection.execute(_SEAL.format(table=table, columns=", ".join(texts)))
+    connection.execute("INSERT INTO meta VALUES (?, ?)", (CHECKSUM, str(_checksum_of(contents))))
+
+
+def _checksum_of(contents: dict[str, str]) -> int:
+    return checksum(tuple(part.encode() for item in sorted(contents.items()) for part in item))

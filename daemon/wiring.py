@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator
 from colorsys import hsv_to_rgb
 from contextlib import contextmanager
@@ -17,10 +18,10 @@ from drivers.serial_lines.config import SerialLinesConfig
 from drivers.serial_lines.joints import SerialLineJoints
 from interfaces.camera import StereoCalibration
 from interfaces.clock import SystemClock
-from interfaces.errors import ConfigError
+from interfaces.errors import ConfigError, StoreError
 from interfaces.plugins import PluginConfig, load
 from interfaces.protocols import Clock, JointSource
-from interfaces.records import MarkerMiss, StereoFrame
+from interfaces.records import MarkerFix, StereoFrame
 from interfaces.rejections import WORDS
 from kbmaps import RigidChain
 
@@ -37,10 +38,13 @@ if TYPE_CHECKING:
     from sim_backend.config import CameraConfig, SimConfig, SimTag
     from vision.config import VisionConfig
 
+log = logging.getLogger(__name__)
+
 # A painted ball. Hues that the room does not have reach beyond its band by so much [deg], and are at least so many.
 _SATURATION, _VALUE, _ROOM_DEG, _GAP_DEG = 0.93, 0.86, 6.0, 36.0
 # A ball that is told by its brightness glows; all else is darker than half of what is looked for.
 _LAMP, _DIMMED = 0.9, 0.45
+_APART_S = 60.0  # a tracker has forgotten what it saw then
 
 Hardware = DynamixelConfig | FeetechConfig | SerialLinesConfig | Ros2Config | PluginConfig
 
@@ -77,7 +81,6 @@ def open_joints(config: Config, clock: Clock) -> EncoderJoints:
 
     Raises:
         ConfigError: no servos and no ROS 2 robot are configured, or zero-force or gaze do not fit the robot.
-        StoreError: the store, which tells where they were last, cannot be read.
     """
     hardware = config.tables.drivers.hardware
     if hardware is None:
@@ -139,8 +142,12 @@ def _last_pose(config: Config) -> list[float] | None:
     """Where the joints were at the newest pair [rad]."""
     if not config.store_file.exists():
         return None
-    with PairReader(config.store_file) as pairs:
-        last = pairs.last()
+    try:
+        with PairReader(config.store_file) as pairs:
+            last = pairs.last()
+    except StoreError as error:  # the sampler says so, too, and mends what can be mended
+        log.warning("where the joints were last is not known: %s", error)
+        return None
     return None if last is None or len(last.q) != len(config.robot.joints) else last.q.tolist()
 
 
@@ -268,19 +275,22 @@ def _marker(vision: VisionConfig) -> dict[str, Any]:
 
 def _require_found(config: Config, calibration: StereoCalibration, camera: CameraConfig) -> None:
     """ConfigError where the tracker does not even find the marker by itself before a plain wall."""
-    from sim_backend.eye import portrait
+    from sim_backend.eye import portraits
     from vision.trackers import tracker_of
 
-    tracker = tracker_of(calibration, config.tables.vision)
-    seen = tracker.track(StereoFrame(0.0, *portrait(calibration, camera)))
-    if isinstance(seen, MarkerMiss):
-        keys = {"ball": "[vision.colour] or [vision] radius_m", "bright_ball": "[vision] min_brightness"}
-        raise ConfigError(
-            "the tracker would not find the marker that [vision] describes in the simulation's images, not even alone "
-            f"before a plain wall: {WORDS[seen.reason]}",
-            file=config.file,
-            remedy=f"Change {keys.get(config.tables.vision.marker, '[vision.tag]')}, or what [sim.camera] shows",
-        )
+    tracker, reasons = tracker_of(calibration, config.tables.vision), []
+    for t, images in enumerate(portraits(calibration, camera)):
+        seen = tracker.track(StereoFrame(_APART_S * t, *images))
+        if isinstance(seen, MarkerFix):
+            return
+        reasons.append(seen.reason)
+    keys = {"ball": "[vision.colour] or [vision] radius_m", "bright_ball": "[vision] min_brightness"}
+    raise ConfigError(
+        "the tracker would not find the marker of [vision] in the simulation's images, not even alone before a plain "
+        f"wall: {WORDS[reasons[0]]}",
+        file=config.file,
+        remedy=f"Change {keys.get(config.tables.vision.marker, '[vision.tag]')}, or what [sim.camera] shows",
+    )
 
 
 def _tags(vision: VisionConfig) -> tuple[SimTag, ...]:

@@ -39,8 +39,15 @@ def backup(
         config = config.with_state_dir(state_dir)
     made = write_backup(config, file, utc=SystemClock().utc(), version=version("bodyschema"), replace=force)
     learnt = "" if any(name.endswith(".ckpt") for name in made.files) else ", no checkpoint yet"
-    Console(highlight=False, soft_wrap=True).print(
+    console = Console(highlight=False, soft_wrap=True)
+    console.print(
         f"{file}: {made.robot}, {made.pairs} pairs to number {made.last_seq}{learnt}, "
         f"{file.stat().st_size / 1e6:.1f} MB",
         markup=False,
     )
+    if made.unreadable:
+        console.print(
+            f"{made.unreadable} pairs cannot be read and are not in it: the disk changed what was written. Check the "
+            "disk; `bodyschema doctor` tells their numbers",
+            markup=False,
+        )

@@ -15,7 +15,9 @@ def restore(
     /,
     *,
     robot: Annotated[Path, Parameter(help="Where robot.toml goes, and beside it what it names.")] = HERE,
-    state_dir: Annotated[Path | None, Parameter(help="Where state goes; else as that robot.toml says.")] = None,
+    state_dir: Annotated[
+        Path | None, Parameter(help="Where state goes; else as robot.toml says, in its folder.")
+    ] = None,
     force: Annotated[bool, flag("Move what is in the way aside.")] = False,
 ) -> None:
     """Put a backup back: robot.toml, the files that it names, pairs and checkpoint. Verified before anything changes.
@@ -35,7 +37,10 @@ def restore(
     with Backup(file) as opened:
         made = opened.manifest
         done = put_back(opened, robot, state_dir, force=force)
-    console.print(f"{made.robot} as it was at {made.written_utc}: {made.pairs} pairs to number {made.last_seq}")
+    text = f"{made.robot} as it was at {made.written_utc}: {made.pairs} pairs to number {made.last_seq}"
+    console.print(text, markup=False)
+    if done.unreadable:
+        console.print(f"  {done.unreadable} pairs between could not be read when it was written", markup=False)
     for written in done.written:
         console.print(f"  {written}", markup=False)
     for aside in done.aside:

@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
+import errno
+import hashlib
 import json
+import os
 import shutil
+import sqlite3
 import threading
 import zipfile
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import numpy as np
@@ -143,10 +149,9 @@ def test_a_restored_store_is_another_one_so_that_no_learner_mixes_it_with_the_fi
         assert one.identity != other.identity
 
 
-def contents(folder: Path) -> dict[str, bytes]:
-    """Of all files but locks, which are always empty."""
-    files = [path for path in folder.rglob("*") if path.is_file() and path.suffix != ".lock"]
-    return {str(path.relative_to(folder)): path.read_bytes() for path in files}
+def contents(folder: Path) -> dict[str, bytes | None]:
+    """Everything in a folder; None for what is not a file."""
+    return {str(path.relative_to(folder)): path.read_bytes() if path.is_file() else None for path in folder.rglob("*")}
 
 
 def refused(file: Path, robot: Path) -> str:
@@ -236,7 +241,8 @@ def test_a_name_that_leads_elsewhere_is_refused(backed_up, elsewhere, name) -> N
         manifest["files"][name] = manifest["files"][ROBOT_TOML]
         members[MANIFEST], members[name] = json.dumps(manifest).encode(), members[ROBOT_TOML]
 
-    assert "it would be written elsewhere" in refused(altered(backed_up, lead_astray), elsewhere)
+    said = refused(altered(backed_up, lead_astray), elsewhere)
+    assert f"has {name!r}, which its robot.toml does not name so. Nothing was changed" in said
 
 
 def test_a_robot_s_name_that_leads_elsewhere_is_refused(backed_up, elsewhere) -> None:
@@ -269,6 +275,234 @@ def test_a_file_that_is_no_archive_is_refused(file, elsewhere, data) -> None:
 def test_a_torn_backup_is_refused(backed_up, elsewhere) -> None:
     backed_up.write_bytes(backed_up.read_bytes()[:-100])
     assert "is no backup, or is damaged" in refused(backed_up, elsewhere)
+
+
+# --- archives that were made to do harm
+
+
+def described(change: Callable[[str], str], **files: bytes) -> Callable[[dict[str, bytes]], None]:
+    """An archive whose checksums are right, with another robot.toml and with files in the robot's folder."""
+
+    def altered_members(members: dict[str, bytes]) -> None:
+        members[ROBOT_TOML] = change(members[ROBOT_TOML].decode()).encode()
+        members |= files
+        seal(members)
+
+    return altered_members
+
+
+def seal(members: dict[str, bytes]) -> None:
+    manifest = json.loads(members.pop(MANIFEST))
+    manifest["files"] = {
+        name: {"size": len(data), "blake2b": hashlib.blake2b(data, digest_size=32).hexdigest(), "origin": "/there"}
+        for name, data in members.items()
+    }
+    members[MANIFEST] = json.dumps(manifest).encode()
+
+
+HARMFUL = [
+    ".git/hooks/post-checkout", ".bashrc", "venv/lib/python3.11/site-packages/evil.pth", "Makefile", "conftest.py",
+    "a/../.ssh/authorized_keys", "a\nb.urdf", "robot.toml", "state/../../arm.urdf", "/etc/cron.d/evil.urdf",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("name", HARMFUL)
+@pytest.mark.parametrize("named", [False, True], ids=["not named by robot.toml", "named as the URDF"])
+def test_a_file_that_could_be_run_is_not_written(backed_up, elsewhere, name, named) -> None:
+    def change(text: str) -> str:
+        return text.replace('"arm.urdf"', json.dumps(name)) if named else text
+
+    archive = altered(backed_up, described(change, **{f"robot/{name}": b"import os"}))
+    assert "Nothing was changed" in refused(archive, elsewhere)
+
+
+@pytest.mark.parametrize("folder", ["/srv/state", "../state", "a/../../state"])
+def test_a_state_dir_elsewhere_is_asked_for(backed_up, elsewhere, folder, tmp_path) -> None:
+    archive = altered(backed_up, described(lambda text: text.replace('"state"', json.dumps(folder))))
+    assert "keeps pairs and checkpoint outside of its folder. Nothing was changed. Give --state-dir" in refused(
+        archive, elsewhere
+    )
+    with Backup(archive) as backup:
+        restore(backup, elsewhere, tmp_path / "given")
+    assert len(stored(tmp_path / "given" / "pairs.sqlite")) == PAIRS
+
+
+def test_a_state_dir_that_this_robot_has_already_is_not_asked_for(config, file, tmp_path) -> None:
+    config.file.write_text(config.file.read_text().replace('"state"', json.dumps(str(tmp_path / "far"))))
+    far = Config.load(config.file, {})
+    config.state_dir.rename(far.state_dir)
+    write_backup(far, file, utc=UTC, version="0")
+    assert len(stored(put_back(file, far.file, force=True).store_file)) == PAIRS
+
+
+@pytest.mark.parametrize("name", ["ROBOT/robot.toml", "state/PAIRS.sqlite"])
+def test_names_that_differ_in_case_alone_are_refused(backed_up, elsewhere, name) -> None:
+    assert "has two files of the same name" in refused(altered(backed_up, lambda m: m.update({name: b""})), elsewhere)
+
+
+def test_a_name_that_comes_twice_is_refused(backed_up, elsewhere) -> None:
+    with zipfile.ZipFile(backed_up, "a") as archive, pytest.warns(UserWarning, match="Duplicate"):
+        archive.writestr(ROBOT_TOML, "other")
+    assert "has two files of the same name" in refused(backed_up, elsewhere)
+
+
+def test_a_link_in_an_archive_is_not_made(backed_up, elsewhere) -> None:
+    with zipfile.ZipFile(backed_up) as archive:
+        members = {info: archive.read(info) for info in archive.infolist()}
+    with zipfile.ZipFile(backed_up, "w") as archive:
+        for info, data in members.items():
+            info.external_attr = 0o120777 << 16
+            archive.writestr(info, data)
+    again = put_back(backed_up, elsewhere)
+    assert not any(path.is_symlink() for path in again.file.parent.rglob("*"))
+
+
+@pytest.mark.parametrize("packing", [zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
+def test_a_packing_that_swells_without_limit_is_refused(backed_up, elsewhere, packing) -> None:
+    with zipfile.ZipFile(backed_up) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    with zipfile.ZipFile(backed_up, "w", packing) as archive:
+        for name, data in members.items():
+            archive.writestr(name, data)
+    assert "is packed in another way than a backup" in refused(backed_up, elsewhere)
+
+
+@pytest.mark.parametrize(
+    "text", ["robot = 3", "[robot", "robot = { urdf = 4 }\nzenoh = 5", "x" * 10, "\x00", "a." * 500]
+)
+def test_a_robot_toml_that_is_none_is_refused(backed_up, elsewhere, text) -> None:
+    assert str(backed_up.with_name("altered.zip")) in refused(altered(backed_up, described(lambda _: text)), elsewhere)
+
+
+def test_endpoints_that_are_none_are_refused(backed_up, elsewhere) -> None:
+    archive = altered(backed_up, described(lambda text: text.replace("[zenoh]", "[zenoh]\nlearner = 5\n[other]")))
+    assert "zenoh" in refused(archive, elsewhere)
+
+
+def test_a_store_with_a_program_in_it_is_refused(backed_up, elsewhere, tmp_path) -> None:
+    def plant(members: dict[str, bytes]) -> None:
+        (tmp_path / "planted").write_bytes(members[STORE])
+        with contextlib.closing(sqlite3.connect(tmp_path / "planted")) as connection:
+            connection.execute("CREATE TRIGGER t AFTER INSERT ON pairs BEGIN DELETE FROM pairs; END")
+        members[STORE] = (tmp_path / "planted").read_bytes()
+        seal(members)
+
+    assert "it has a trigger" in refused(altered(backed_up, plant), elsewhere)
+
+
+def test_what_a_disk_changed_is_left_out_of_a_backup_and_told(config, file, elsewhere, capsys) -> None:
+    with contextlib.closing(sqlite3.connect(config.store_file)) as connection:
+        connection.execute("UPDATE pairs SET q = '[0.5,0.5]' WHERE seq IN (3, 4)")
+        connection.commit()
+    before = config.store_file.read_bytes()
+    for words in (["backup", file, "--robot", config.file], ["restore", file, "--robot", elsewhere]):
+        command_line(words[0])(list(map(str, words)), exit_on_error=False, result_action="return_value")
+    shown = capsys.readouterr().out
+    assert f"{file}: arm, 18 pairs to number 20" in shown
+    assert "2 pairs cannot be read and are not in it" in shown
+    assert "2 pairs between could not be read when it was written" in shown
+    assert config.store_file.read_bytes() == before
+    with PairReader(elsewhere.parent / "state" / "pairs.sqlite") as pairs:
+        audit = pairs.audit()
+    assert (audit.pairs, audit.newest, audit.lost_rows) == (18, 20, 0)
+
+
+def test_a_damaged_pair_in_an_older_backup_is_left_out(backed_up, elsewhere, tmp_path) -> None:
+    def damage(members: dict[str, bytes]) -> None:
+        members[STORE] = members[STORE].replace(b"[0.1,0.2,1.0]", b"[0.1,0.3,1.0]")
+        seal(members)
+
+    again = put_back(altered(backed_up, damage), elsewhere)
+    assert [seq for seq, _ in stored(again.store_file)] == [1, *range(3, PAIRS + 1)]
+
+
+# --- "Nothing was changed" is true
+
+
+@pytest.mark.parametrize("nth", range(1, 6))
+def test_a_restore_that_fails_midway_is_undone(config, backed_up, monkeypatch, nth) -> None:
+    with PairStore(config.store_file, session_of(config, SystemClock())) as store:
+        fill(store, 5)
+    config.file.with_name("arm.urdf").write_text("<other/>")
+    config.file.write_text(config.file.read_text() + "# changed\n")
+    before, left = contents(config.file.parent), [nth]
+
+    def failing(do: Callable[..., object]) -> Callable[..., object]:
+        def once(*paths: object) -> object:
+            left[0] -= 1
+            if left[0] == 0:
+                raise OSError(errno.EIO, "Input/output error", str(paths[0]))
+            return do(*paths)
+
+        return once
+
+    monkeypatch.setattr("os.replace", failing(os.replace))
+    monkeypatch.setattr("daemon.restoring.sync_folder", failing(lambda folder: None))
+    with pytest.raises(BackupError, match=r"Input/output error\. Nothing was changed"):
+        put_back(backed_up, config.file, force=True)
+    assert contents(config.file.parent) == before
+
+
+def test_a_restore_without_room_changes_nothing(mount_small_disk, backed_up) -> None:
+    folder = mount_small_disk("size=64k")
+    (folder / "ballast").write_bytes(bytes(2**15))
+    said = refused(backed_up, folder / "robot.toml")
+    assert "Nothing was changed" in said
+    assert "is full" in said or "MB are needed" in said
+
+
+def test_files_of_others_beside_the_robot_stay(backed_up, elsewhere) -> None:
+    elsewhere.parent.mkdir()
+    for name in ("robot.toml.restored", "arm.urdf.restored", ".restore-1"):
+        (elsewhere.parent / name).write_text("mine")
+    put_back(backed_up, elsewhere)
+    assert (elsewhere.parent / "arm.urdf.restored").read_text() == "mine"
+
+
+def flip_each(bits: Iterable[int], archive: Path, robot: Path) -> Counter[str]:
+    """Restore from the archive with one bit changed: what was backed up, or a message and no change."""
+    outcomes: Counter[str] = Counter()
+    data, flipped = archive.read_bytes(), archive.with_name("flipped.zip")
+    for bit in bits:
+        changed = bytearray(data)
+        changed[bit // 8] ^= 1 << bit % 8
+        flipped.write_bytes(changed)
+        shutil.rmtree(robot.parent, ignore_errors=True)
+        robot.parent.mkdir()
+        try:
+            with Backup(flipped) as backup:
+                restore(backup, robot)
+        except (BackupError, StoreError):
+            outcomes["refused"] += 1
+            assert contents(robot.parent) == {}
+        else:
+            outcomes["restored"] += 1
+            assert robot.with_name("arm.urdf").read_text() == URDF
+            assert len(stored(robot.parent / "state" / "pairs.sqlite")) == PAIRS
+    return outcomes
+
+
+@pytest.fixture
+def at_rest(monkeypatch) -> None:
+    """No process is asked for: there is none."""
+    monkeypatch.setattr("daemon.restoring.is_alive", lambda *_: False)
+
+
+@pytest.mark.usefixtures("at_rest")
+def test_a_flipped_bit_in_an_archive_is_found(backed_up, elsewhere) -> None:
+    size = 8 * backed_up.stat().st_size
+    rng = np.random.default_rng(0)
+    bits = [*rng.choice(size, 40, replace=False).tolist(), *range(size - 8 * 600, size, 97)]  # its directory is last
+    outcomes = flip_each(bits, backed_up, elsewhere)
+    assert outcomes["refused"] > 40
+
+
+@pytest.mark.soak
+@pytest.mark.timeout(7200)
+@pytest.mark.usefixtures("at_rest")
+def test_every_flipped_bit_in_an_archive_is_found(backed_up, elsewhere) -> None:
+    size = 8 * backed_up.stat().st_size
+    assert flip_each(range(size), backed_up, elsewhere)["refused"] > 0.8 * size
 
 
 # --- writing one

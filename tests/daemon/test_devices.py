@@ -126,6 +126,8 @@ def as_schema_1(file: Path) -> None:
     connection = sqlite3.connect(file)
     connection.executescript(
         "DROP TABLE devices; ALTER TABLE pairs DROP COLUMN R; ALTER TABLE pairs DROP COLUMN cov_R;"
+        "ALTER TABLE pairs DROP COLUMN checksum; ALTER TABLE sessions DROP COLUMN checksum;"
+        "DELETE FROM meta WHERE key = 'checksum';"
         "PRAGMA user_version = 1;"
     )
     connection.close()

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import socket
+import sqlite3
 import time
 from io import StringIO
 from pathlib import Path
 
+import numpy as np
 import pytest
 from rich.console import Console
 
@@ -21,9 +24,11 @@ from daemon.identity import Route
 from daemon.keys import Keys
 from daemon.servo_wiring import Check
 from daemon.status import SamplerStatus
+from daemon.store import PairStore, Session
 from daemon.wire import encode
 from drivers import checks
 from drivers.checks import Holder
+from interfaces.records import MarkerFix
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "desk_arm" / "servos.toml"
 LONGEST_S = 5.0
@@ -185,3 +190,48 @@ def test_all_well_is_one_sentence() -> None:
     show(console, [Check("disk", "ok", "fine")])
     assert isinstance(console.file, StringIO)
     assert console.file.getvalue().endswith("All is well.\n")
+
+
+# --- the store
+
+
+@pytest.fixture
+def stored(tmp_path: Path) -> Path:
+    session = Session(("waist",), "", "", "", "{}", "0", "here")
+    with PairStore(tmp_path / "pairs.sqlite", session) as store:
+        for k in range(5):
+            store.append(1, "utc", np.array([0.1 * k]), MarkerFix(float(k), np.zeros(3), np.eye(3)))
+    return store.file
+
+
+def changed(file: Path, statement: str) -> Check:
+    with contextlib.closing(sqlite3.connect(file)) as connection:
+        connection.execute(statement)
+        connection.commit()
+    (check,) = doctor.store_checks(file)
+    return check
+
+
+def test_a_sound_store_is_told_to_be_sound(stored) -> None:
+    (check,) = doctor.store_checks(stored)
+    assert (check.state, check.said) == ("ok", f"all 5 pairs in {stored} are as they were written")
+
+
+def test_a_pair_that_the_disk_changed_is_told_by_number(stored) -> None:
+    check = changed(stored, "UPDATE pairs SET q = '[0.3]' WHERE seq = 3")
+    assert check.state == "warning"
+    assert "1 pair of" in check.said
+    assert "without number 3." in check.said
+
+
+def test_a_note_that_the_disk_changed_is_told(stored) -> None:
+    assert "1 notes on runs or servos" in changed(stored, "UPDATE sessions SET host = 'there'").said
+
+
+def test_damaged_pages_are_told_with_what_mends_them(stored) -> None:
+    data = stored.read_bytes()
+    page = data.index(b"here") // 4096
+    stored.write_bytes(data[: page * 4096] + bytes(4096) + data[(page + 1) * 4096 :])
+    (check,) = doctor.store_checks(stored)
+    assert check.state == "wrong"
+    assert "The sampler puts what can be read into a new file" in check.said

@@ -43,6 +43,7 @@ class Store:
         self.pairs, self.store, self.asked, self.answers = pairs, STORE, 0, True
         self.gone = self.goes = 0  # of the oldest pairs: so many are not kept, and with each answer so many more
         self.refusal: str | None = None
+        self.last_seq: int | None = None  # where it is not how many pairs there are
 
     def __call__(self, begin: int) -> Page:
         self.asked += 1
@@ -52,7 +53,7 @@ class Store:
             raise RequestError(self.refusal)
         page = [pair_to_wire(pair) for pair in self.pairs if pair.seq >= max(begin, self.gone + 1)][:PAGE]
         self.gone = min(self.gone + self.goes, len(self.pairs) - 1)
-        return read_page(encode(PairsReply(self.store, len(self.pairs), page)))
+        return read_page(encode(PairsReply(self.store, self.last_seq or len(self.pairs), page)))
 
 
 def payload(pair: Pair) -> bytes:
@@ -179,7 +180,7 @@ def test_a_new_learner_begins_with_the_oldest_pair_that_is_left(caplog) -> None:
     fed.settle()
     assert fed.learnt == (8, 20)
     assert fed.learning.counters.missed == 12
-    assert "no longer keeps the pairs 1 to 12" in caplog.text
+    assert "has no pairs 1 to 12 any more" in caplog.text
 
 
 def test_a_learner_that_was_away_too_long_goes_on_and_counts_what_it_missed() -> None:
@@ -199,6 +200,21 @@ def test_pairs_that_go_while_a_learner_catches_up_are_skipped_too() -> None:
     assert fed.learnt[1] == 30
     assert fed.learnt[0] + fed.learning.counters.missed == 30
     assert fed.learning.counters.missed > 0
+
+
+@pytest.mark.parametrize("lost", [[7], [1], [6, 7, 8], [7, 8, 14], [2, 19, 20]])
+def test_pairs_that_a_disk_changed_are_passed_over(lost) -> None:
+    fed = Fed(stored=20)
+    fed.history.pairs = [pair for pair in PAIRS[:20] if pair.seq not in lost]
+    fed.history.last_seq = 20
+    fed.settle()
+    fed.history.pairs += PAIRS[20:22]
+    fed.history.last_seq = 22
+    fed.publish(PAIRS[21])
+    fed.settle()
+    assert fed.learnt == (22 - len(lost), 22)
+    assert (fed.learning.counters.missed, fed.learning.counters.gaps_recovered) == (len(lost), 22 - len(lost))
+    assert fed.feed.problem is None
 
 
 # --- what cannot be taken

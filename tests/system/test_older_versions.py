@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import shutil
+import signal
 import sqlite3
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -19,9 +22,12 @@ from daemon.restoring import restore
 from daemon.session import session_of
 from daemon.status import LearnerStatus
 from daemon.store import PairReader, PairStore
+from daemon.store_damage import Damage
 from daemon.store_schema import SCHEMA_VERSION
+from daemon.wire import PairMessage, pair_to_wire
 from interfaces.clock import SystemClock
 from interfaces.errors import StoreError
+from interfaces.records import Pair
 
 OLDER = Path(__file__).parents[1] / "daemon" / "older_versions"
 PAIRS = 40  # in each of the files
@@ -42,16 +48,89 @@ def schema(file: Path) -> int:
         return connection.execute("PRAGMA user_version").fetchone()[0]
 
 
-def test_the_first_version_s_pairs_are_brought_to_the_present_schema_as_they_were(config: Config) -> None:
-    with PairReader(config.store_file) as before:
-        pairs, identity = before.read(), before.identity
-    assert schema(config.store_file) == 1  # a reader changes nothing
-    with PairStore(config.store_file, session_of(config, SystemClock())) as store:
-        assert store.identity == identity
-        assert [(p.seq, p.utc, p.q.tolist(), p.x.tolist()) for p in store.read()] == [
-            (p.seq, p.utc, p.q.tolist(), p.x.tolist()) for p in pairs
-        ]
-    assert (schema(config.store_file), len(pairs)) == (SCHEMA_VERSION, PAIRS)
+@pytest.fixture(params=[1, 4])
+def older(config: Config, request: pytest.FixtureRequest) -> Config:
+    """The robot with the pairs of an older schema."""
+    shutil.copy(OLDER / f"pairs_{request.param}.sqlite", config.store_file)
+    return config
+
+
+def told(pairs: list[Pair]) -> list[PairMessage]:
+    return [pair_to_wire(pair) for pair in pairs]
+
+
+def test_an_older_schema_is_brought_to_the_present_one_with_its_pairs_as_they_were(older: Config) -> None:
+    before = schema(older.store_file)
+    with PairReader(older.store_file) as reader:
+        pairs, identity = told(reader.read()), reader.identity
+    assert schema(older.store_file) == before  # a reader changes nothing
+    with PairStore(older.store_file, session_of(older, SystemClock())) as store:
+        assert (store.identity, told(store.read())) == (identity, pairs)
+        assert (store.audit.pairs, store.audit.lost_rows, store.complaints) == (PAIRS, 0, [])
+    assert (schema(older.store_file), len(pairs)) == (SCHEMA_VERSION, PAIRS)
+
+
+def test_after_an_upgrade_a_changed_digit_is_found(older: Config) -> None:
+    with PairStore(older.store_file, session_of(older, SystemClock())):
+        pass
+    with contextlib.closing(sqlite3.connect(older.store_file)) as connection:
+        connection.execute("UPDATE pairs SET x = replace(x, '1', '2') WHERE seq = 7")
+        connection.commit()
+    with PairReader(older.store_file) as reader:
+        assert reader.audit().damage == Damage(((7, 7),))
+
+
+def test_an_older_row_that_is_no_pair_is_left_out(older: Config) -> None:
+    with contextlib.closing(sqlite3.connect(older.store_file)) as connection:
+        connection.execute("UPDATE pairs SET q = CAST(x'5b80' AS TEXT) WHERE seq = 7")
+        connection.commit()
+    with PairStore(older.store_file, session_of(older, SystemClock())) as store:
+        assert store.audit.damage == Damage(((7, 7),))
+        assert store.audit.pairs == PAIRS - 1
+
+
+KILLED_WHILE_MIGRATING = """
+import os, signal, sys
+from pathlib import Path
+from daemon import store_schema
+from daemon.config import Config
+from daemon.session import session_of
+from daemon.store import PairStore
+from interfaces.clock import SystemClock
+left = int(sys.argv[2])
+seal = store_schema.pair_of
+def doomed(*row):
+    global left
+    left -= 1
+    if left == 0:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return seal(*row)
+store_schema.pair_of = doomed
+config = Config.load(Path(sys.argv[1]))
+with PairStore(config.store_file, session_of(config, SystemClock())):
+    pass
+"""
+
+
+def test_an_upgrade_that_is_killed_leaves_the_older_pairs(older: Config) -> None:
+    before = schema(older.store_file)
+    with PairReader(older.store_file) as reader:
+        pairs = told(reader.read())
+    command = [sys.executable, "-P", "-c", KILLED_WHILE_MIGRATING, str(older.file), "30"]
+    done = subprocess.run(command, timeout=120, check=False)
+    assert done.returncode == -signal.SIGKILL
+    with PairStore(older.store_file, session_of(older, SystemClock())) as store:
+        assert told(store.read()) == pairs
+    assert before < schema(older.store_file) == SCHEMA_VERSION
+
+
+def test_a_version_from_before_says_that_the_store_is_newer(config: Config, monkeypatch) -> None:
+    with PairStore(config.store_file, session_of(config, SystemClock())):
+        pass
+    monkeypatch.setattr("daemon.store_schema.SCHEMA_VERSION", SCHEMA_VERSION - 1)
+    said = rf"written by a newer bodyschema \(schema {SCHEMA_VERSION}, this one knows {SCHEMA_VERSION - 1}\). Install"
+    with pytest.raises(StoreError, match=said), PairReader(config.store_file):
+        pass
 
 
 def test_a_migration_that_cannot_be_finished_leaves_the_first_version(config: Config) -> None:

@@ -1,0 +1,247 @@
+"""The pairs of a file that may be damaged: what is sound, which numbers are lost, and a new file of the rest."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+import sqlite3
+import uuid
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import closing
+from dataclasses import dataclass
+from itertools import islice, pairwise
+from pathlib import Path
+from typing import Any, TypeVar
+
+from . import store_schema
+from .kept_files import sync_folder, unused_name
+from .store_file import is_damage
+from .store_rows import COLUMNS, DamagedRow, pair_of, require_sound, sealed
+
+# After so many numbers in a row that cannot be read, larger and larger steps look for the next that can: a damaged
+# page holds some ten pairs, one above it some thousand. A larger value takes longer, a smaller one passes more over.
+PATIENCE = 64
+# A row of `pairs` takes more bytes. Pages that lead in a circle give more rows than fit into the file.
+SMALLEST_ROW_BYTES = 20
+# So many numbers are left free after the newest readable pair where SQLite lost the end of the store: those behind it
+# were given already. A page holds fewer pairs.
+LEFT_FREE = 100
+SHOWN = 8  # places of damage in a sentence
+
+Made = TypeVar("Made")
+Make = Callable[[tuple[Any, ...]], Made]
+
+
+@dataclass(frozen=True, slots=True)
+class Damage:
+    """Numbers of pairs that a store had and that cannot be read: ranges, ascending, both ends inclusive."""
+
+    ranges: tuple[tuple[int, int], ...] = ()
+
+    @classmethod
+    def between(cls, numbers: Iterable[int]) -> Damage:
+        """Return the numbers that are missing between ascending ones."""
+        return cls(tuple((one + 1, next_one - 1) for one, next_one in pairwise(numbers) if next_one > one + 1))
+
+    @property
+    def count(self) -> int:
+        """How many numbers there are."""
+        return sum(last - first + 1 for first, last in self.ranges)
+
+    def told(self, file: Path) -> str:
+        """Return a sentence that names the numbers and the remedy."""
+        many = "1 pair" if self.count == 1 else f"{self.count} pairs"
+        return (
+            f"{many} of {file} cannot be read: the disk changed what was written. Learning goes on without number "
+            f"{self}. Check the disk and write a backup"
+        )
+
+    def __or__(self, other: Damage) -> Damage:
+        joined: list[tuple[int, int]] = []
+        for first, last in sorted(self.ranges + other.ranges):
+            if joined and first <= joined[-1][1] + 1:
+                joined[-1] = joined[-1][0], max(last, joined[-1][1])
+            else:
+                joined.append((first, last))
+        return Damage(tuple(joined))
+
+    def since(self, oldest: int) -> Damage:
+        """Return those from the number `oldest` on."""
+        return Damage(tuple((max(first, oldest), last) for first, last in self.ranges if last >= oldest))
+
+    def __str__(self) -> str:
+        shown = [str(a) if a == b else f"{a} to {b}" for a, b in self.ranges[:SHOWN]]
+        more = len(self.ranges) - SHOWN
+        return ", ".join(shown) + (f" and at {more} other places" if more > 0 else "")
+
+
+def scan(connection: sqlite3.Connection, columns: str, make: Make[Made], first: int = 1) -> Iterator[Made]:
+    """Yield what `make` gives of each sound row of `pairs` from number `first` on, each once and in order.
+
+    Args:
+        make: raises DamagedRow where a row is not sound; such a row, and what SQLite cannot read, is passed over.
+    """
+    statement = f"SELECT {columns} FROM pairs WHERE seq >= ? ORDER BY seq LIMIT ?"
+    position, failed_at = first, None
+    while position < 2**62:
+        try:
+            for row in _rows(connection, statement, position):
+                try:
+                    made = make(row)
+                except DamagedRow:
+                    continue
+                if row[0] >= position:
+                    yield made
+                    position, failed_at = row[0] + 1, None
+            return
+        except sqlite3.DatabaseError as error:
+            if not is_damage(error):
+                raise
+        failed_at = position if failed_at is None else failed_at
+        position += 1 + (position - failed_at) // PATIENCE
+
+
+def scan_back(connection: sqlite3.Connection, columns: str, make: Make[Made]) -> Iterator[Made | None]:
+    """Yield the same from the newest row on, and None for a row that is not sound.
+
+    Raises:
+        sqlite3.DatabaseError: SQLite cannot read further.
+    """
+    statement = f"SELECT {columns} FROM pairs WHERE seq <= ? ORDER BY seq DESC LIMIT ?"
+    for row in _rows(connection, statement, 2**62):
+        try:
+            made = make(row)
+        except DamagedRow:
+            made = None
+        yield made
+
+
+def rebuild(file: Path, fresh: dict[str, str]) -> Path:
+    """Put a sound store of the present schema in the place of a damaged one, with all that can be read.
+
+    Args:
+        fresh: `meta` of a new store, for one whose own is lost.
+
+    Returns:
+        Where the damaged one was kept.
+
+    Raises:
+        sqlite3.Error, OSError: the disk is full or failing; the damaged one is where it was.
+    """
+    new = file.with_name(f".{file.name}.rebuilt-{uuid.uuid4().hex[:8]}")
+    try:
+        with closing(store_schema.connect(file)) as source:
+            source.execute("PRAGMA journal_mode = DELETE")  # a log of the old file is not for the new one
+            with closing(store_schema.connect(new)) as target:
+                target.execute("PRAGMA synchronous = FULL")
+                _copy(source, target, fresh)
+        kept = unused_name(file, "damaged")
+        try:
+            os.link(file, kept)
+        except OSError:  # a file system without hard links
+            shutil.copyfile(file, kept)
+        os.replace(new, file)
+        sync_folder(file.parent)
+    finally:
+        for suffix in ("", "-journal"):
+            new.with_name(new.name + suffix).unlink(missing_ok=True)
+    return kept
+
+
+def records(connection: sqlite3.Connection, table: str) -> Iterator[tuple[Any, ...] | None]:
+    """Yield the rows of `devices` or `sessions` without their checksums, as far as SQLite can read them.
+
+    None is for a row that is not sound. Stores of the first schema have no devices.
+    """
+    schema = store_schema.version(connection)
+    with_checksums = schema >= store_schema.WITH_CHECKSUMS
+    if table == "devices" and schema < store_schema.WITH_DEVICES:
+        return
+    try:
+        last = store_schema.CHECKSUM if with_checksums else "NULL"
+        statement = f"SELECT {COLUMNS[table]}, {last} FROM {table} ORDER BY id LIMIT ?"
+        for row in connection.execute(statement, (_most_rows(connection),)):
+            try:
+                if with_checksums:
+                    require_sound(row)
+            except DamagedRow:
+                yield None
+            else:
+                yield row[:-1]
+    except sqlite3.DatabaseError as error:
+        if not is_damage(error):
+            raise
+
+
+def oldest(connection: sqlite3.Connection) -> int:
+    """Return the number of the oldest row of `pairs`; 1 when there is none."""
+    return connection.execute("SELECT coalesce(min(seq), 1) FROM pairs").fetchone()[0]
+
+
+def _copy(source: sqlite3.Connection, target: sqlite3.Connection, fresh: dict[str, str]) -> None:
+    try:
+        contents = store_schema.meta(source)
+    except (ValueError, sqlite3.DatabaseError):
+        contents = fresh
+    joints, schema = len(store_schema.joints_of(contents)), store_schema.version(source)
+
+    def make(row: tuple[Any, ...]) -> tuple[Any, ...]:
+        if schema >= store_schema.WITH_CHECKSUMS:
+            require_sound(row)
+        pair_of("", row[:-1], joints)
+        return row[:-1]
+
+    columns = store_schema.columns(schema)
+    store_schema.create(target, contents)
+    with store_schema.transaction(target):
+        target.executemany(store_schema.INSERT["pairs"], map(_written, scan(source, columns, make)))
+        bad, behind = 0, None
+        try:
+            for row in scan_back(source, columns, make):
+                if row is None:
+                    bad += 1
+                    continue
+                behind = bad if behind is None else behind
+                target.execute(store_schema.INSERT["pairs"], _written(row))
+            behind = bad if behind is None else behind
+        except sqlite3.DatabaseError as error:
+            if not is_damage(error):
+                raise
+        for table in ("sessions", "devices"):
+            sound = (row for row in records(source, table) if row is not None)
+            target.executemany(store_schema.INSERT[table], map(_written, sound))
+        newest = target.execute("SELECT coalesce(max(seq), 0) FROM pairs").fetchone()[0]
+        given = max(store_schema.given_up_to(contents), newest + (LEFT_FREE if behind is None else behind))
+        store_schema.write_meta(target, {**contents, store_schema.GIVEN_UP_TO: str(given)})
+
+
+def _written(row: tuple[Any, ...]) -> tuple[Any, ...]:
+    """The sealed row, its bytes as texts again."""
+    return sealed(tuple(value.decode(errors="replace") if isinstance(value, bytes) else value for value in row))
+
+
+def _rows(connection: sqlite3.Connection, statement: str, start: int) -> Iterator[tuple[Any, ...]]:
+    """Yield rows as far as SQLite can read them, then raise its error.
+
+    Python's sqlite3 does not give the row before one that cannot be read. It is asked for again as the last one.
+    """
+    came = 0
+    try:
+        with closing(connection.execute(statement, (start, _most_rows(connection)))) as rows:
+            for row in rows:
+                came += 1
+                yield row
+        return
+    except sqlite3.DatabaseError as error:
+        if not is_damage(error):
+            raise
+        met = error
+    with contextlib.suppress(sqlite3.DatabaseError), closing(connection.execute(statement, (start, came + 1))) as rows:
+        yield from islice(rows, came, None)
+    raise met
+
+
+def _most_rows(connection: sqlite3.Connection) -> int:
+    pages, size = (connection.execute(f"PRAGMA {name}").fetchone()[0] for name in ("page_count", "page_size"))
+    return pages * size // SMALLEST_ROW_BYTES

@@ -1,0 +1,325 @@
+"""A disk that gives back something else than was written: each true pair is kept, and no other is believed."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+import sqlite3
+from collections import Counter
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from msgspec.structs import replace
+
+from daemon.bus import Request
+from daemon.history import answer_pairs
+from daemon.recordings import from_store
+from daemon.retention import Keep
+from daemon.store import PairReader, PairStore, Session, leave_out_damage
+from daemon.store_damage import LEFT_FREE, Damage
+from daemon.wire import JSON, PairsReply, decode, pair_to_wire
+from interfaces.errors import RecordingError, StoreError
+from interfaces.records import MarkerFix, frozen_array
+
+JOINTS = ("waist", "shoulder")
+SESSION = Session(JOINTS, "2026-01-01T00:00:00+00:00", "[robot]", "<robot/>", "{}", "0", "host")
+COV = frozen_array(np.diag([1e-6, 2e-6, 9e-6]) + 1e-7)
+TURN, COV_TURN = frozen_array([0.0, 0.6, 0.0, 0.8]), frozen_array(1e-4 * np.eye(3))
+PAIRS, LONG, PAGE_BYTES = 20, 150, 4096
+
+
+def add(store: PairStore, count: int) -> None:
+    for k in range(count):
+        fix = MarkerFix(float(k), frozen_array([0.1 * k, 0.2, 1.0]), COV, (1.0, 2.0, 3.0, 4.5), 0.0, TURN, COV_TURN)
+        store.append(1, f"2026-01-01T00:00:{k % 60:02}", frozen_array([0.1 * k, -0.1]), fix)
+
+
+def written(folder: Path, pairs: int) -> Path:
+    folder.mkdir(exist_ok=True)
+    with PairStore(folder / "pairs.sqlite", SESSION) as store:
+        store.note_devices("utc", [{"joint": "waist", "zero_ticks": 7}])
+        add(store, pairs)
+    return store.file
+
+
+@pytest.fixture(scope="module")
+def short_and_long(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """A store of a few pages, and one of many."""
+    return written(tmp_path_factory.mktemp("short"), PAIRS), written(tmp_path_factory.mktemp("long"), LONG)
+
+
+@pytest.fixture
+def file(short_and_long: tuple[Path, Path], tmp_path: Path) -> Path:
+    (tmp_path / "state").mkdir()
+    return Path(shutil.copy(short_and_long[0], tmp_path / "state"))
+
+
+@pytest.fixture
+def long(short_and_long: tuple[Path, Path], tmp_path: Path) -> Path:
+    return Path(shutil.copy(short_and_long[1], tmp_path))
+
+
+def alter(file: Path, statement: str, *values: object) -> None:
+    with contextlib.closing(sqlite3.connect(file)) as connection:
+        connection.execute(statement, values)
+        connection.commit()
+
+
+def numbers(reader: PairReader | PairStore) -> list[int]:
+    return [pair.seq for pair in reader.read()]
+
+
+CHANGED = {
+    "seq": "100",
+    "session": "session + 1",
+    "segment": "segment + 8",
+    "t": "t + 0.5",
+    "utc": "replace(utc, '2026', '2027')",
+    "q": "replace(q, '1', '9')",
+    "x": "replace(x, '2', '3')",
+    "cov": "replace(cov, '1', '7')",
+    "centres_px": "replace(centres_px, '4', '5')",
+    "R": "replace(R, '6', '5')",
+    "cov_R": "NULL",
+    "checksum": "checksum + 1",
+}
+
+
+@pytest.mark.parametrize(
+    ("column", "seq"),
+    [("seq", PAIRS), *((column, seq) for column in CHANGED for seq in (1, 7, PAIRS) if column != "seq")],
+)
+def test_one_changed_value_costs_one_pair(file, column, seq) -> None:
+    alter(file, f"UPDATE pairs SET {column} = {CHANGED[column]} WHERE seq = ?", seq)
+    with PairReader(file) as reader:
+        assert numbers(reader) == [k for k in range(1, PAIRS + 1) if k != seq]
+        assert reader.audit().damage == Damage(((seq, seq),))
+    with PairStore(file, SESSION) as store:
+        assert f"1 pair of {file} cannot be read" in store.complaints[0]
+        assert f"goes on without number {seq}." in store.complaints[0]
+        add(store, 1)
+        assert numbers(store)[-1] == PAIRS + 1
+
+
+@pytest.mark.parametrize("damage", ["x'ff'", "'[1,2'", "'[null,0.1]'", "'[1e999,0.1]'", "5", "''"])
+def test_a_row_that_is_no_pair_is_left_out(file, damage) -> None:
+    alter(file, f"UPDATE pairs SET q = {damage} WHERE seq = 7")
+    with PairStore(file, SESSION) as store:
+        assert 7 not in numbers(store)
+        assert len(numbers(store)) == PAIRS - 1
+
+
+def test_a_missing_number_is_told_and_passed_over(file) -> None:
+    alter(file, "DELETE FROM pairs WHERE seq BETWEEN 5 AND 6")
+    with PairStore(file, SESSION) as store:
+        assert "2 pairs of" in store.complaints[0]
+        assert "number 5 to 6" in store.complaints[0]
+
+
+def test_damage_that_comes_while_the_store_is_open_is_told(file) -> None:
+    with PairStore(file, SESSION) as store:
+        assert store.complaints == []
+        alter(file, "UPDATE pairs SET x = replace(x, '2', '3') WHERE seq = 7")
+        assert 7 not in numbers(store)
+        assert "without number 7." in store.complaints[0]
+
+
+def test_damage_that_was_deleted_with_old_pairs_is_no_longer_told(file) -> None:
+    alter(file, "UPDATE pairs SET x = replace(x, '2', '3') WHERE seq = 7")
+    with PairStore(file, SESSION) as store:
+        while store.trim(Keep(None, 0.0, 10), "2026-01-02T00:00:00"):
+            pass
+        assert store.complaints == []
+
+
+def test_a_damaged_newest_number_deletes_nothing(file) -> None:
+    alter(file, "UPDATE pairs SET seq = 1000000 WHERE seq = ?", PAIRS)
+    with PairStore(file, SESSION) as store:
+        assert store.trim(Keep(None, 0.0, PAIRS), "2026-01-02T00:00:00") == 0
+        add(store, 1)
+        assert numbers(store) == [*range(1, PAIRS), PAIRS + 1]
+
+
+def test_history_answers_with_the_other_pairs(file) -> None:
+    alter(file, "UPDATE pairs SET q = 'x' WHERE seq IN (7, 20)")
+    with PairReader(file) as reader:
+        reply = decode(answer_pairs(reader, Request({}, b"", JSON)), PairsReply)
+    assert [pair.seq for pair in reply.pairs] == [k for k in range(1, PAIRS) if k != 7]
+    assert reply.last_seq == PAIRS
+
+
+def test_a_changed_record_of_devices_is_left_out(file) -> None:
+    alter(file, "UPDATE devices SET record = replace(record, '7', '8')")
+    with PairStore(file, SESSION) as store:
+        assert store.reader.devices() == []
+        assert store.audit.lost_rows == 1
+
+
+# --- pages that SQLite cannot read
+
+
+def zero(file: Path, page: int, pages: int = 1) -> None:
+    with file.open("r+b") as stream:
+        stream.seek((page - 1) * PAGE_BYTES)
+        stream.write(bytes(pages * PAGE_BYTES))
+
+
+def leaves(file: Path) -> list[int]:
+    """The pages that hold pairs, in their order."""
+    data = file.read_bytes()
+    pages = [data[k : k + PAGE_BYTES] for k in range(0, len(data), PAGE_BYTES)]
+    return [k for k, page in enumerate(pages, 1) if page[0] == 0x0D and page.count(b"2026-01-01T00:00:") > 2]
+
+
+def test_a_lost_page_costs_its_own_pairs_and_the_file_is_kept(long) -> None:
+    page = leaves(long)[4]
+    zero(long, page)
+    damaged = long.read_bytes()
+    with PairReader(long) as reader:
+        readable = numbers(reader)
+    assert len(readable) > LONG - 30
+    with PairStore(long, SESSION) as store:
+        assert numbers(store) == readable
+        rebuilt, left_out = store.complaints
+        add(store, 1)
+        assert numbers(store)[-1] == LONG + 1
+    kept = long.with_name("pairs.sqlite.damaged-1")
+    assert f"{long} was damaged" in rebuilt
+    assert f"kept as {kept}" in rebuilt
+    assert f"{LONG - len(readable)} pairs of {long} cannot be read" in left_out
+    assert kept.read_bytes()[100:] == damaged[100:]  # its header has another journal mode
+    with PairStore(long, SESSION) as store:
+        assert store.complaints == [left_out]
+
+
+def test_numbers_of_a_lost_end_are_not_given_again(long) -> None:
+    zero(long, leaves(long)[-1])
+    with PairStore(long, SESSION) as store:
+        newest = numbers(store)[-1]
+        add(store, 1)
+        assert numbers(store)[-1] == newest + LEFT_FREE + 1 > LONG + 1
+
+
+def test_several_lost_pages_cost_their_own_pairs(long) -> None:
+    pages = leaves(long)
+    for page in (pages[2], pages[5], pages[6]):
+        zero(long, page)
+    with PairStore(long, SESSION) as store:
+        assert LONG - 3 * 30 < len(numbers(store)) < LONG
+
+
+def test_a_lost_identity_is_replaced_and_every_pair_kept(file) -> None:
+    alter(file, "UPDATE meta SET value = replace(value, '-', '+') WHERE key = 'store'")
+    with (
+        pytest.raises(StoreError, match="Start the sampler: it puts the pairs"),
+        PairReader(file),
+    ):
+        pass
+    with PairStore(file, SESSION) as store:
+        assert numbers(store) == list(range(1, PAIRS + 1))
+        assert store.reader.joints == JOINTS
+        assert "+" not in store.identity
+
+
+def test_a_rebuild_without_room_leaves_the_damaged_file(mount_small_disk, long) -> None:
+    folder = mount_small_disk("size=1M")
+    (folder / "state").mkdir()
+    file = Path(shutil.copy(long, folder / "state"))
+    zero(file, leaves(file)[4])
+    with PairReader(file) as reader:
+        before = numbers(reader)
+    (folder / "ballast").write_bytes(bytes(os.statvfs(folder).f_bavail * os.statvfs(folder).f_bsize - 2**15))
+    with pytest.raises(StoreError, match="is full"), PairStore(file, SESSION):
+        pass
+    assert {path.name for path in file.parent.iterdir()} <= {"pairs.sqlite", "pairs.sqlite.lock"}
+    (folder / "ballast").unlink()
+    with PairStore(file, SESSION) as store:
+        assert numbers(store) == before
+
+
+# --- each single bit
+
+
+class Flips:
+    """A store of which one bit after the other is flipped, and what came of it."""
+
+    def __init__(self, file: Path, folder: Path) -> None:
+        with PairReader(file) as reader:
+            self._true = [replace(pair_to_wire(pair), store="") for pair in reader.read()]
+        self._bytes, self._folder = file.read_bytes(), folder
+        self.outcomes: Counter[str] = Counter()
+        self.bits = 8 * len(self._bytes)
+
+    def flip(self, bit: int) -> None:
+        data = bytearray(self._bytes)
+        data[bit // 8] ^= 1 << bit % 8
+        shutil.rmtree(self._folder, ignore_errors=True)
+        self._folder.mkdir()
+        file = self._folder / "pairs.sqlite"
+        file.write_bytes(data)
+        for use in (self._read, self._export, self._copy, self._open):
+            self.outcomes[f"{use.__name__} {self._outcome(use, file, bit)}"] += 1
+
+    def _outcome(self, use: Callable[[Path], int], file: Path, bit: int) -> str:
+        # Without the first page SQLite knows no table, and the second has the identity.
+        if bit >= 2 * 8 * PAGE_BYTES:
+            return "lost" if use(file) else "well"
+        try:
+            return "lost" if use(file) else "well"
+        except (StoreError, RecordingError):
+            return "refused"
+
+    def _lost(self, reader: PairReader | PairStore) -> int:
+        there = [replace(pair_to_wire(pair), store="") for pair in reader.read()]
+        lost = [pair for pair in self._true if pair not in there]
+        assert [pair for pair in self._true if pair in there] == there  # no pair that was not written
+        assert len(lost) <= 1
+        return len(lost)
+
+    def _read(self, file: Path) -> int:
+        with PairReader(file) as reader:
+            assert reader.last_seq() >= PAIRS - 1
+            reader.last()
+            reader.devices()
+            return self._lost(reader)
+
+    def _export(self, file: Path) -> int:
+        return len(self._true) - len(from_store(file))
+
+    def _copy(self, file: Path) -> int:
+        copy = Path(shutil.copy(file, file.with_name("copy.sqlite")))
+        leave_out_damage(copy, JOINTS)
+        with PairReader(copy) as reader:
+            return self._lost(reader)
+
+    def _open(self, file: Path) -> int:
+        with PairStore(file, SESSION) as store:
+            lost = self._lost(store)
+            assert bool(lost) <= bool(store.complaints)
+            add(store, 1)
+            assert numbers(store)[-1] == PAIRS + 1
+        return lost
+
+
+@pytest.fixture
+def flips(file: Path, tmp_path: Path) -> Iterator[Flips]:
+    done = Flips(file, tmp_path / "flipped")
+    yield done
+    print(dict(sorted(done.outcomes.items())))
+
+
+def test_a_flipped_bit_costs_at_most_its_own_pair(flips) -> None:
+    for bit in np.random.default_rng(0).choice(flips.bits, 25, replace=False).tolist():
+        flips.flip(bit)
+    assert flips.outcomes["_open lost"] > 1
+
+
+@pytest.mark.soak
+@pytest.mark.timeout(7200)
+def test_every_flipped_bit_costs_at_most_its_own_pair(flips) -> None:
+    for bit in range(0, flips.bits, 7):  # each byte, and each place in a byte
+        flips.flip(bit)
+    assert flips.outcomes["_open lost"] > 1000
