@@ -10,7 +10,7 @@ export function tiles({ sampler, learner, series }) {
   text("tile-claimed", mm(status?.claimed_error_m));
   text("tile-pairs", whole(status?.pairs ?? sampler?.status?.pairs));
   text("tile-error-of", status?.prequential_pairs ? `${lastPairs(status)}, each predicted before it was learnt. Measurement noise${noise(status)} is in it` : "");
-  text("tile-claimed-of", status?.claimed_error_m ? "the learner's estimate of its distance to the truth, without noise" : "");
+  text("tile-claimed-of", status?.claimed_error_m ? "the learner's estimate of its distance to the truth where data is, without noise" : "");
   const since = status && status.pairs_since_change < status.pairs ? [`${whole(status.pairs_since_change)} since the last change`] : [];
   const behind = status?.behind ? [`${whole(status.behind)} stored and not learnt yet`] : [];
   text("tile-pairs-of", [...since, ...behind].join(", "));
@@ -36,7 +36,7 @@ export function pills({ sampler, learner }) {
 
 export function outlook({ learner, outlook: sentence }) {
   const found = learner?.status?.outlook;
-  text("outlook", found && sentence ? sentence : "Not known yet: the learner says so after its first solution.");
+  text("outlook", found && sentence ? sentence : "Not known yet: the learner finds it some time after its first solution with the present tool.");
   const table = byId("forecast");
   table.hidden = !found;
   if (!found) return;
