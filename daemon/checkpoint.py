@@ -65,7 +65,9 @@ def write_checkpoint(file: Path, state: LearningState, *, robot: str, utc: str) 
     """
     poisoned = state.poisoned()
     if poisoned is not None:
-        raise CheckpointError(f"the checkpoint {file} was not written: {poisoned} of the state is not finite")
+        raise CheckpointError(
+            f"the checkpoint {file} was not written: {poisoned} of the state is not finite or too large"
+        )
     data = _encode(state, robot, utc)
     temporary = file.with_name(file.name + ".tmp")
     try:

@@ -7,12 +7,8 @@ import numpy as np
 from interfaces.errors import RequestError
 from interfaces.records import Pair
 
-from .state import Counters
+from .state import FARTHEST_M, LARGEST_Q, Counters
 
-# A measurement farther away than this is not one in metres [m].
-FARTHEST_M = 1000.0
-# Nobody turns a joint so often: such a number is not an angle [rad or m].
-LARGEST_Q = 1e6
 # Of a covariance's largest eigenvalue: so far below zero the smallest may be rounded.
 ROUNDING = 1e-6
 

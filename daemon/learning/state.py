@@ -21,6 +21,10 @@ from .orientation import OrientationState
 BEFORE = "before/"
 # Names of stored nets begin with this.
 NET = "net_"
+# A measurement farther away than this is not one in metres [m].
+FARTHEST_M = 1000.0
+# Nobody turns a joint so often: such a number is not an angle [rad or m].
+LARGEST_Q = 1e6
 
 
 class StateError(BodyschemaError):
@@ -116,6 +120,10 @@ class LearningState:
         return LearningState(header, {**self.arrays, **{BEFORE + name: each for name, each in before.arrays.items()}})
 
     def poisoned(self) -> str | None:
-        """The name of a net, or of what the pairs were, that is not finite; None when all is well."""
-        nets = (name for name in self.arrays if name.startswith(NET))
-        return next((name for name in (*nets, "q", "x") if not np.isfinite(self.arrays[name]).all()), None)
+        """Return the name of a net, or of what the pairs were, that cannot be; None when all is well."""
+        nets = dict.fromkeys((name for name in self.arrays if name.startswith(NET)), np.inf)
+        limits = {**nets, "q": LARGEST_Q, "x": FARTHEST_M}
+        for name, limit in limits.items():
+            if not (np.isfinite(self.arrays[name]).all() and (np.abs(self.arrays[name]) <= limit).all()):
+                return name
+        return None

@@ -14,12 +14,15 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
+from daemon import store_schema
 from daemon.bus import Request
+from daemon.doctor import store_checks
 from daemon.history import answer_pairs
 from daemon.recordings import from_store
 from daemon.retention import Keep
 from daemon.store import PairReader, PairStore, Session, leave_out_damage
 from daemon.store_damage import LEFT_FREE, Damage
+from daemon.store_rows import COLUMNS, checksum
 from daemon.wire import JSON, PairsReply, decode, pair_to_wire
 from interfaces.errors import RecordingError, StoreError
 from interfaces.records import MarkerFix, frozen_array
@@ -323,3 +326,104 @@ def test_every_flipped_bit_costs_at_most_its_own_pair(flips) -> None:
     for bit in range(0, flips.bits, 7):  # each byte, and each place in a byte
         flips.flip(bit)
     assert flips.outcomes["_open lost"] > 1000
+
+
+# --- stores that somebody else made
+
+
+def remade(file: Path, *statements: str) -> Path:
+    with contextlib.closing(sqlite3.connect(file)) as connection:
+        for statement in statements:
+            connection.execute(statement)
+        connection.commit()
+    return file
+
+
+LOOP = "WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n) SELECT"
+HOSTILE = {
+    "a view that never ends": (
+        "ALTER TABLE pairs RENAME TO old",
+        f"CREATE VIEW pairs AS {LOOP} i AS seq, 1 AS session, 1 AS segment, 0.5 AS t, '' AS utc, '[0,0]' AS q, "
+        "'[0,0,0]' AS x, '[0,0,0,0,0,0]' AS cov, NULL AS centres_px, NULL AS R, NULL AS cov_R, 0 AS checksum FROM n",
+    ),
+    "a trigger": ("CREATE TRIGGER t AFTER INSERT ON pairs BEGIN DELETE FROM pairs; END",),
+    "a computed column": ("ALTER TABLE pairs ADD COLUMN y AS (randomblob(1000000000))",),
+    "a further column": ("ALTER TABLE pairs ADD COLUMN y TEXT",),
+    "a virtual table": ("DROP TABLE pairs", "CREATE VIRTUAL TABLE pairs USING fts4(seq, q, x)"),
+    "no pairs": ("DROP TABLE pairs",),
+    "no meta": ("DROP TABLE meta",),
+    "no joints": ("DELETE FROM meta WHERE key = 'joints'",),
+    "joints that are numbers": ("UPDATE meta SET value = '[1,2]' WHERE key = 'joints'",),
+    "joints of many lines": ("UPDATE meta SET value = '[\"a\\nb\",\"c\"]' WHERE key = 'joints'",),
+    "an older schema than its tables": ("PRAGMA user_version = 4",),
+    "a schema below zero": ("PRAGMA user_version = -1",),
+}
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_a_store_of_other_tables_is_refused(file, name) -> None:
+    remade(file, *HOSTILE[name])
+    with pytest.raises(StoreError, match=str(file)):
+        from_store(file)
+
+
+def test_every_reader_refuses_a_store_with_a_program(file) -> None:
+    remade(file, *HOSTILE["a trigger"])
+    for use in (from_store, lambda file: leave_out_damage(file, JOINTS), lambda file: list(store_checks(file))):
+        with pytest.raises(StoreError, match="it has a trigger"):
+            use(file)
+    with pytest.raises(StoreError, match="it has a trigger"), PairStore(file, SESSION):
+        pass
+
+
+VALUES = (
+    "x'00'",
+    "1",
+    "'x'",
+    "NULL",
+    "9e999",
+    "-1",
+    "zeroblob(60000000)",
+    "'[1e999,0]'",
+    "'[' || hex(zeroblob(99)) || ']'",
+)
+
+
+@pytest.mark.parametrize("column", COLUMNS["pairs"].split(", "))
+@pytest.mark.parametrize("value", VALUES)
+def test_a_value_of_another_kind_costs_its_own_pair(file, column, value) -> None:
+    with contextlib.suppress(sqlite3.IntegrityError):
+        remade(file, f"UPDATE pairs SET {column} = {value} WHERE seq = 7")
+    assert len(from_store(file)) >= PAIRS - 1
+
+
+def test_sealed_rows_of_other_kinds_cost_their_own_pairs(file) -> None:
+    """Their checksums are right: whoever made them knew how."""
+    rng = np.random.default_rng(0)
+    with contextlib.closing(store_schema.connect(file)) as connection:
+        for seq in range(1, PAIRS):
+            column = COLUMNS["pairs"].split(", ")[rng.integers(1, 11)]
+            with contextlib.suppress(sqlite3.IntegrityError):
+                connection.execute(f"UPDATE pairs SET {column} = {rng.choice(VALUES)} WHERE seq = ?", (seq,))
+            row = connection.execute(f"SELECT {COLUMNS['pairs']} FROM pairs WHERE seq = ?", (seq,)).fetchone()
+            connection.execute("UPDATE pairs SET checksum = ? WHERE seq = ?", (checksum(row), seq))
+    recording = from_store(file)
+    assert np.isfinite(recording.q).all()
+    assert np.isfinite(recording.x).all()
+    with PairStore(file, SESSION) as store:
+        add(store, 1)
+        assert numbers(store)[-1] == PAIRS + 1
+
+
+def test_pages_that_lead_in_a_circle_come_to_an_end(long) -> None:
+    data = bytearray(long.read_bytes())
+    root = next(k for k in range(PAGE_BYTES, len(data), PAGE_BYTES) if data[k] == 0x05)
+    cells = int.from_bytes(data[root + 3 : root + 5], "big")
+    for cell in range(cells):  # each leads to the first leaf
+        at = root + int.from_bytes(data[root + 12 + 2 * cell : root + 14 + 2 * cell], "big")
+        data[at : at + 4] = leaves(long)[0].to_bytes(4, "big")
+    long.write_bytes(data)
+    with PairReader(long) as reader:
+        assert 0 < len(numbers(reader)) < LONG
+    with PairStore(long, SESSION) as store:
+        assert 0 < len(numbers(store)) < LONG
