@@ -17,7 +17,7 @@ from typing import Any, TypeVar
 from . import store_schema
 from .kept_files import sync_folder, unused_name
 from .store_file import is_damage
-from .store_rows import COLUMNS, DamagedRow, pair_of, require_sound, sealed
+from .store_rows import COLUMNS, DamagedRow, decoded, require_sound, sealed
 
 # After so many numbers in a row that cannot be read, larger and larger steps look for the next that can: a damaged
 # page holds some ten pairs, one above it some thousand. A larger value takes longer, a smaller one passes more over.
@@ -189,7 +189,7 @@ def _copy(source: sqlite3.Connection, target: sqlite3.Connection, fresh: dict[st
     def make(row: tuple[Any, ...]) -> tuple[Any, ...]:
         if schema >= store_schema.WITH_CHECKSUMS:
             require_sound(row)
-        pair_of("", row[:-1], joints)
+        decoded(row[:-1], joints)
         return row[:-1]
 
     columns = store_schema.columns(schema)

@@ -98,14 +98,14 @@ from daemon.session import session_of
 from daemon.store import PairStore
 from interfaces.clock import SystemClock
 left = int(sys.argv[2])
-seal = store_schema.pair_of
+seal = store_schema.decoded
 def doomed(*row):
     global left
     left -= 1
     if left == 0:
         os.kill(os.getpid(), signal.SIGKILL)
     return seal(*row)
-store_schema.pair_of = doomed
+store_schema.decoded = doomed
 config = Config.load(Path(sys.argv[1]))
 with PairStore(config.store_file, session_of(config, SystemClock())):
     pass
