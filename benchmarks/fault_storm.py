@@ -1,6 +1,7 @@
 """How many wrong readings the drivers believe when answers are lost, late, corrupt, cut, swapped, in garbage.
 
 Virtual time, so millions of transactions in minutes. Type: python -m benchmarks.fault_storm --transactions 10_000_000
+How many readings of six servos come in a second when answers are lost: python -m benchmarks.fault_storm --rates
 """
 
 from __future__ import annotations
@@ -9,12 +10,14 @@ import argparse
 import math
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from random import Random
 from typing import Any
 
 from drivers.bench.device import Device
-from drivers.bench.faults import Storm
+from drivers.bench.faults import Storm, mute
 from drivers.bench.faults import storm as storm_of_lines
 from drivers.bench.virtual_port import VirtualClock, VirtualPort
 from drivers.dynamixel.bench.chain import Chain
@@ -35,9 +38,11 @@ from drivers.serial_lines.config import EncoderConfig, SerialLinesConfig
 from drivers.serial_lines.joints import SerialLineJoints
 from interfaces.errors import SourceLost
 
-JOINTS = 3
-NAMES = [f"joint{k}" for k in range(1, JOINTS + 1)]
-LIMITS = [(-2.0, 2.0)] * JOINTS
+JOINTS = 3  # in a storm
+JOINTS_OF_AN_ARM = 6
+LOSSES = (0.0, 0.005, 0.02, 0.05)
+LATENCY_S = 2e-4  # of the adapter
+LIMITS = (-2.0, 2.0)
 FASTEST = 1.2 * 0.7  # [rad/s], of the paths below
 TIMING_S = 2e-3  # all joints count as read at one time
 LINE_BAUD = 460_800
@@ -72,66 +77,70 @@ def _port(device: Device, clock: VirtualClock, rng: Random, baud: int = 1_000_00
     return VirtualPort(device, clock, baud, outwards=lambda: rng.uniform(0, 1e-4), inwards=lambda: rng.uniform(0, 3e-4))
 
 
-def dynamixel(clock: VirtualClock, rng: Random, model: str, *, is_fast: bool) -> Rig:
+def names(count: int) -> list[str]:
+    """The joints' names."""
+    return [f"joint{k}" for k in range(1, count + 1)]
+
+
+def dynamixel(clock: VirtualClock, rng: Random, count: int, model: str, *, is_fast: bool) -> Rig:
     """Dynamixel servos."""
-    chain = Chain(
-        Servo(BY_NAME[model], k, swing(k), return_delay_s=0.0, booted_s=0.1 * k) for k in range(1, JOINTS + 1)
-    )
+    ids = range(1, count + 1)
+    chain = Chain(Servo(BY_NAME[model], k, swing(k), return_delay_s=0.0, booted_s=0.1 * k) for k in ids)
     port = _port(chain, clock, rng)
     bus = BusConfig("bench", fast_sync_read="auto" if is_fast else "never")
-    config = DynamixelConfig({"arm": bus}, tuple(ServoConfig(name, k, model) for k, name in enumerate(NAMES, 1)))
-    joints = DynamixelJoints(config, NAMES, clock, limits=LIMITS, open_port=lambda *_: (port, 2e-4))
-    step, parts = BY_NAME[model].rad_per_tick, 1 if is_fast else JOINTS
+    config = DynamixelConfig({"arm": bus}, tuple(ServoConfig(name, k, model) for k, name in enumerate(names(count), 1)))
+    limits = [LIMITS] * count
+    joints = DynamixelJoints(config, names(count), clock, limits=limits, open_port=lambda *_: (port, LATENCY_S))
+    step, parts = BY_NAME[model].rad_per_tick, 1 if is_fast else count
     return Rig(chain, joints, lambda: chain.instructions, storm_of_dynamixel, step, parts)
 
 
-def feetech(clock: VirtualClock, rng: Random, model: str) -> Rig:
+def feetech(clock: VirtualClock, rng: Random, count: int, model: str) -> Rig:
     """Feetech servos."""
-    servos = (FeetechServo(FEETECH_MODELS[model], k, swing(k), return_delay_s=0.0) for k in range(1, JOINTS + 1))
+    servos = (FeetechServo(FEETECH_MODELS[model], k, swing(k), return_delay_s=0.0) for k in range(1, count + 1))
     chain = FeetechChain(servos)
     port = _port(chain, clock, rng)
-    entries = tuple(ServoConfig(name, k, model) for k, name in enumerate(NAMES, 1))
+    entries = tuple(ServoConfig(name, k, model) for k, name in enumerate(names(count), 1))
     config = FeetechConfig({"arm": FeetechBus("bench")}, entries)
-    joints = FeetechJoints(config, NAMES, clock, limits=LIMITS, open_port=lambda *_: (port, 2e-4))
+    limits = [LIMITS] * count
+    joints = FeetechJoints(config, names(count), clock, limits=limits, open_port=lambda *_: (port, LATENCY_S))
     step = FEETECH_MODELS[model].rad_per_tick
-    return Rig(chain, joints, lambda: chain.instructions, storm_of_feetech, step, JOINTS)
+    return Rig(chain, joints, lambda: chain.instructions, storm_of_feetech, step, count)
 
 
-def lines(clock: VirtualClock, rng: Random) -> Rig:
+def lines(clock: VirtualClock, rng: Random, count: int) -> Rig:
     """Own encoders."""
-    encoders = {name: (4096, swing(k)) for k, name in enumerate(NAMES, 1)}
+    encoders = {name: (4096, swing(k)) for k, name in enumerate(names(count), 1)}
     board = EncoderBoard(encoders, begun_s=clock.now(), drift=1e-4)
     port = _port(board, clock, rng, LINE_BAUD)
-    config = SerialLinesConfig("bench", tuple(EncoderConfig(name) for name in NAMES), LINE_BAUD)
-    joints = SerialLineJoints(config, NAMES, clock, limits=LIMITS, open_port=lambda *_: port)
+    config = SerialLinesConfig("bench", tuple(EncoderConfig(name) for name in names(count)), LINE_BAUD)
+    joints = SerialLineJoints(config, names(count), clock, limits=[LIMITS] * count, open_port=lambda *_: port)
     return Rig(board, joints, lambda: board.lines, storm_of_lines, 2 * math.pi / 4096, 1)
 
 
-KINDS: dict[str, Callable[[VirtualClock, Random], Rig]] = {
-    "Dynamixel Protocol 2.0, Sync Read": lambda clock, rng: dynamixel(clock, rng, "XM430-W350", is_fast=False),
-    "Dynamixel Protocol 2.0, Fast Sync Read": lambda clock, rng: dynamixel(clock, rng, "XM430-W350", is_fast=True),
-    "Dynamixel Protocol 1.0": lambda clock, rng: dynamixel(clock, rng, "MX-28", is_fast=False),
-    "Feetech STS, Sync Read": lambda clock, rng: feetech(clock, rng, "STS3215"),
-    "Feetech SCS": lambda clock, rng: feetech(clock, rng, "SCS0009"),
+Make = Callable[[VirtualClock, Random, int], Rig]
+KINDS: dict[str, Make] = {
+    "Dynamixel Protocol 2.0, Sync Read": partial(dynamixel, model="XM430-W350", is_fast=False),
+    "Dynamixel Protocol 2.0, Fast Sync Read": partial(dynamixel, model="XM430-W350", is_fast=True),
+    "Dynamixel Protocol 1.0": partial(dynamixel, model="MX-28", is_fast=False),
+    "Feetech STS, Sync Read": partial(feetech, model="STS3215"),
+    "Feetech SCS": partial(feetech, model="SCS0009"),
     "serial lines": lines,
 }
 
 
-def run(make: Callable[[VirtualClock, Random], Rig], transactions: int, intensity: float, seed: int) -> str:
+def run(make: Make, transactions: int, intensity: float, seed: int) -> str:
     """So many transactions with so many answers struck; a line about them."""
     clock, rng = VirtualClock(), Random(seed)
-    rig = make(clock, rng)
+    rig = make(clock, rng, JOINTS)
     tolerance = rig.rad_per_tick + FASTEST * TIMING_S
-    faults: Storm | None = None
+    rig.device.faults = faults = rig.storm(intensity, rng)
     believed = wrong = losses = 0
     worst = 0.0
     told = time.monotonic()
-    calm = rig.device.faults
     while rig.transactions() < transactions:
-        rig.device.faults = calm
-        with rig.joints:
-            rig.device.faults = faults = rig.storm(intensity, rng) if faults is None else faults
-            try:
+        try:
+            with rig.joints:
                 while rig.transactions() < transactions:
                     reading = rig.joints.read(1.0)
                     if reading is None:
@@ -141,9 +150,9 @@ def run(make: Callable[[VirtualClock, Random], Rig], transactions: int, intensit
                     if time.monotonic() - told > TELL_EVERY_S:
                         told = time.monotonic()
                         print(f"  {rig.transactions():,} transactions, {wrong} wrong", flush=True)
-            except SourceLost:
-                losses += 1
-    struck = 0 if faults is None else sum(faults.struck.values())
+        except SourceLost:
+            losses += 1
+    struck = sum(faults.struck.values())
     asked = rig.transactions() if rig.joints.__class__ is SerialLineJoints else believed + rig.joints.dropped
     possible = (1 - intensity) ** rig.parts
     return (
@@ -154,16 +163,41 @@ def run(make: Callable[[VirtualClock, Random], Rig], transactions: int, intensit
     )
 
 
+def rate(make: Make, loss: float, seconds: float, seed: int) -> float:
+    """Return how many readings come in a second of virtual time, openings included, when so many answers are lost."""
+    clock, rng = VirtualClock(), Random(seed)
+    rig, readings, begin = make(clock, rng, JOINTS_OF_AN_ARM), 0, clock.now()
+    rig.device.faults = Storm({"mute": (loss, mute)}, rng)
+    while clock.now() < begin + seconds:
+        with suppress(SourceLost), rig.joints:
+            while clock.now() < begin + seconds:
+                readings += rig.joints.read(1.0) is not None
+    return readings / (clock.now() - begin)
+
+
+def rates(make: Make, seconds: float, seed: int) -> str:
+    """Return a line about the rates, and their ratios to that without losses."""
+    found = [rate(make, loss, seconds, seed) for loss in LOSSES]
+    return ", ".join(
+        f"{100 * loss:g} % lost: {each:.0f}/s ({each / found[0]:.2f})" for loss, each in zip(LOSSES, found, strict=True)
+    )
+
+
 def main() -> None:
     """Print a line for each kind of bus."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--transactions", type=int, default=100_000, help="shared among the kinds of bus")
     parser.add_argument("--intensity", type=float, default=0.02, help="probability that an answer is struck")
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--rates", action="store_true", help="readings per second by the share of answers lost")
+    parser.add_argument("--seconds", type=float, default=20.0, help="of each rate, in virtual time")
     parser.add_argument("--only", choices=tuple(KINDS), help="this kind alone")
     given = parser.parse_args()
     kinds = KINDS if given.only is None else {given.only: KINDS[given.only]}
     for name, make in kinds.items():
+        if given.rates:
+            print(f"{name}: {rates(make, given.seconds, given.seed)}", flush=True)
+            continue
         begin = time.monotonic()
         line = run(make, given.transactions // len(kinds), given.intensity, given.seed)
         print(f"{name}: {line}, {time.monotonic() - begin:.0f} s", flush=True)

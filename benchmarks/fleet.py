@@ -23,7 +23,6 @@ import itertools
 import os
 import socket
 import subprocess
-import sys
 import tempfile
 import threading
 import time
@@ -38,6 +37,7 @@ from daemon.config import Config
 from daemon.keys import Keys
 from daemon.wire import JointsRequest, PairMessage, PairsReply, PredictReply, decode, encode
 from interfaces.errors import BodyschemaError
+from interfaces.interpreter import module_command
 
 JOINTS = 6
 SIGMA_M = 2e-3
@@ -180,7 +180,7 @@ def measure(robots: int, course: Course, processes: int) -> str:
             write_robot(Path(folder) / f"arm_{k}", f"arm_{k}", sampler, ends[k % processes]) for k in range(robots)
         ]
         walks = [Walk(Config.load(file), k) for k, file in enumerate(files)]
-        command = [sys.executable, "-m", "daemon", "learner", "--robot", folder, "--processes", str(processes)]
+        command = module_command("daemon", "learner", "--robot", str(folder), "--processes", str(processes))
         with Bus(listen=sampler) as bus:
             publish = [bus.publisher(Keys(f"arm_{k}").pair, cache=256) for k in range(robots)]
             for k, walk in enumerate(walks):

@@ -26,6 +26,7 @@ from daemon.keys import Keys
 from daemon.status import LearnerStatus
 from daemon.wire import JointsRequest, PairMessage, PairsReply, decode, encode
 from interfaces.errors import BusError
+from interfaces.interpreter import module_command
 from interfaces.records import FloatArray
 from sim_backend import model_file
 
@@ -106,7 +107,7 @@ def asked(robot_file: Path) -> FloatArray:
 @contextmanager
 def running_learner(robot_file: Path, endpoint: str) -> Iterator[None]:
     """`bodyschema learner`, from when it answers to the end of the with statement."""
-    command = [sys.executable, "-m", "daemon", "learner", "--robot", str(robot_file)]
+    command = module_command("daemon", "learner", "--robot", str(robot_file))
     process = subprocess.Popen(command, stdin=subprocess.DEVNULL)
     try:
         while process.poll() is None:

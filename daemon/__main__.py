@@ -2,6 +2,12 @@
 
 from __future__ import annotations
 
+import os
+import sys
+
+if not sys.flags.safe_path:  # `-m` puts the current folder first, whose `vision` or `numpy` is a user's own
+    sys.path[0] = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
+
 from daemon.cli import main
 
 main()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import math
+from collections.abc import Callable
 
 from daemon.bus import Request
 from daemon.learning import Learning, LearntModel
@@ -14,11 +14,10 @@ from daemon.wire import (
     PredictReply,
     decode,
     encode,
-    finite_vector,
     joint_angles,
+    joint_vector,
+    position,
 )
-from interfaces.errors import RequestError
-from interfaces.protocols import Clock
 from interfaces.robot import RobotDescription
 from kbmaps import InverseKinematics
 
@@ -26,8 +25,15 @@ from kbmaps import InverseKinematics
 class Answers:
     """Handlers for the learner's queries. They take no lock, so that learning never delays them."""
 
-    def __init__(self, learning: Learning, robot: RobotDescription, clock: Clock) -> None:
-        self._learning, self._robot, self._clock = learning, robot, clock
+    def __init__(
+        self, learning: Learning, robot: RobotDescription, age_s: Callable[[str | None], float | None]
+    ) -> None:
+        """Answer from what `learning` has learnt.
+
+        Args:
+            age_s: how old what was learnt is [s], given when the newest pair of it was stored (`PairFeed.age_s`).
+        """
+        self._learning, self._robot, self._age_s = learning, robot, age_s
         self._joints = robot.joints
         self._inverse: tuple[LearntModel, InverseKinematics] | None = None
 
@@ -36,14 +42,13 @@ class Answers:
         q = joint_angles(decode(request.payload, JointsRequest, request.encoding), self._joints)
         snapshot = self._learning.snapshot
         prediction = snapshot.predict(q)
-        age = None if snapshot.learnt_at is None else self._clock.now() - snapshot.learnt_at
         reply = PredictReply(
             x=prediction.x.tolist(),
             sigma=prediction.sigma.tolist(),
             in_support=prediction.in_support.tolist(),
             model=snapshot.digest,
             pairs=snapshot.pairs,
-            age_s=age,
+            age_s=self._age_s(snapshot.newest_utc),
             R=None if prediction.R is None else prediction.R.tolist(),
             sigma_R=None if prediction.sigma_R is None else prediction.sigma_R.tolist(),
         )
@@ -59,9 +64,8 @@ class Answers:
     def ik(self, request: Request) -> bytes:
         """Joint angles that put the marker where it is wanted; RequestError as for `predict`."""
         wanted = decode(request.payload, IkRequest, request.encoding)
-        if not all(map(math.isfinite, wanted.x)):
-            raise RequestError("x is not finite")
-        start = None if wanted.start is None else finite_vector("start", wanted.start, self._joints)
+        x = position("x", wanted.x)
+        start = None if wanted.start is None else joint_vector("start", wanted.start, self._joints)
         snapshot = self._learning.snapshot
         inverse = self._inverse_of(snapshot.require_model())
         if wanted.posture is None:
@@ -69,8 +73,8 @@ class Answers:
         elif wanted.posture == "middle":
             posture = inverse.middle
         else:
-            posture = finite_vector("posture", wanted.posture, self._joints)
-        found = inverse.solve(wanted.x, start=start, posture=posture)
+            posture = joint_vector("posture", wanted.posture, self._joints)
+        found = inverse.solve(x, start=start, posture=posture)
         there = snapshot.predict(found.q[None])
         reply = IkReply(
             q=found.q.tolist(),

@@ -25,6 +25,7 @@ from drivers.ros2.config import Ros2Config
 from drivers.serial_lines.config import SerialLinesConfig
 from interfaces.clock import SystemClock
 from interfaces.errors import ConfigError
+from interfaces.limited import read_at_most
 from interfaces.protocols import JointSource
 from interfaces.records import JointReading
 from interfaces.toml_file import read_toml
@@ -80,8 +81,11 @@ def bench_motion(config: Config, tell: Callable[[float], None]) -> Motion:
         return Motion(dict(zip(joints, angles, strict=True)), f"each joint swings slowly by itself ({why})")
     from sim_backend.guided_path import guided_path
 
-    path = guided_path(config.robot, config.tables.sim, PATH_S, config.simulation, lambda done_s: tell(done_s / PATH_S))
-    angles = played(path, config.tables.sim.encoders.rate_hz, monotonic())
+    from .wiring import simulation_settings
+
+    sim = simulation_settings(config)
+    path = guided_path(config.robot, sim, PATH_S, config.simulation, lambda done_s: tell(done_s / PATH_S))
+    angles = played(path, sim.encoders.rate_hz, monotonic())
     words = f"guided by the simulated hand, {PATH_S:.0f} s of path to and fro"
     return Motion(dict(zip(joints, angles, strict=True)), words)
 
@@ -193,7 +197,7 @@ def bench_robot_file(config: Config, bench: DryRun, port: Path) -> Path:
     if "unexplained" in tables:
         tables["unexplained"]["model"] = str((config.file.parent / tables["unexplained"]["model"]).resolve())
     try:
-        if file.exists() and not file.read_text(encoding="utf-8").startswith(MARK):
+        if file.exists() and not read_at_most(file).startswith(MARK.encode()):
             raise ConfigError("is there already, and no bench wrote it", file=file, remedy="Give another --port")
         file.write_text(f"{MARK}\n{toml_text(tables)}", encoding="utf-8")
     except OSError as error:

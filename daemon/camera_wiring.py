@@ -241,8 +241,3 @@ def _calibrated_by(name: str, file: Path) -> str:
 
 def _speed(speed: float) -> str:
     return f"at {speed:g} times their speed" if speed else "as fast as they are read"
-
-
-def connected_cameras() -> list[str]:
-    """The cameras of this machine, by the names that stay."""
-    return connected()

@@ -6,11 +6,10 @@ import logging
 from collections.abc import Sequence
 
 from .learning.change import JOINT, ChangeRecord, KindOfChange
-from .status import Change
+from .status import UNDECIDED, Change
 
 log = logging.getLogger(__name__)
 
-UNDECIDED = "undecided"
 # What is less probable need not be told.
 _TOLD = 0.01
 

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import os
 import sys
-from importlib.metadata import version
+from typing import NoReturn
 
 import cyclopts
 
+from daemon.extras import missing_module
 from daemon.remedies import as_typed
 from daemon.signals import end_with_parent
 from interfaces.errors import BodyschemaError
@@ -48,6 +49,15 @@ COMMANDS = {
 }
 
 
+# Each paragraph is one line: the terminal's width breaks it.
+_HELP = """Calibrate a robot arm by moving it by hand in front of a camera.
+
+Joint encoders and a stereo camera give samples. A learner turns them into the forward kinematics that the camera \
+sees, hand-eye and tool included.
+
+New here? Type: bodyschema demo. Each command's --help says what it needs and what comes next."""
+
+
 def command_line(called: str | None = None) -> cyclopts.App:
     """The command line.
 
@@ -57,14 +67,9 @@ def command_line(called: str | None = None) -> cyclopts.App:
     """
     line = cyclopts.App(
         name="bodyschema",
-        help="""Robot kinematics that calibrates itself.
-
-        Guide the arm by hand: encoders and a stereo camera give pairs, a learner turns them into the forward
-        kinematics that the cameras see. New here? `bodyschema demo`. Then each command's --help says what it needs
-        and what comes next.
-        """,
-        version=lambda: version("bodyschema"),
-        help_format="markdown",
+        help=_HELP,
+        version=_version,
+        help_format="markdown" if called in COMMANDS else "plaintext",  # rendering markdown takes 0.1 s of CPU
     )
     for place, (name, summary) in enumerate(COMMANDS.items()):
         own = None if name == called else summary
@@ -72,20 +77,37 @@ def command_line(called: str | None = None) -> cyclopts.App:
     return line
 
 
+def _version() -> str:
+    from importlib.metadata import version
+
+    return version("bodyschema")
+
+
 app = command_line()
+
+
+def _fail(error: BodyschemaError) -> NoReturn:
+    print(f"bodyschema: {as_typed(str(error))}", file=sys.stderr)  # noqa: T201
+    sys.exit(1)
 
 
 def main() -> None:
     """Run the command line; errors of ours become one line and exit code 1."""
     # Threads of BLAS spin on the small matrices of tracker and learner, and take twice the time.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    # OpenCV would take 3 GiB for what a few kilobytes of PNG call an image; the largest cameras have 100 megapixels.
+    os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(2**27))
     end_with_parent()
     arguments = sys.argv[1:]
     try:
         command_line(arguments[0] if arguments else None)(arguments)
     except BodyschemaError as error:
-        print(f"bodyschema: {as_typed(str(error))}", file=sys.stderr)  # noqa: T201
-        sys.exit(1)
+        _fail(error)
+    except ModuleNotFoundError as error:
+        missing = missing_module(error)
+        if missing is None:
+            raise
+        _fail(missing)
     except KeyboardInterrupt:
         sys.exit(130)
     except BrokenPipeError:  # whoever read our output has had enough, as `head` has

@@ -23,7 +23,7 @@ from interfaces.calibrated_files import EXTENSIONS
 from interfaces.errors import ConfigError
 from interfaces.robot import CameraSection, RobotDescription, RobotSection
 from interfaces.suggest import did_you_mean, hint_at, with_choices
-from interfaces.toml_file import convert, line_of, read_toml
+from interfaces.toml_file import convert, line_of, line_of_endless_key, read_toml
 from sim_backend.config import SimConfig
 from vision.config import VisionConfig
 
@@ -272,6 +272,6 @@ def _checked(variable: str, table: str, key: str, value: Any) -> Any:
 
 def _toml_value(text: str) -> Any:
     try:
-        return tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
+        return text if line_of_endless_key(text) else tomllib.loads(f"value = {text}")["value"]
+    except (ValueError, RecursionError):
         return text

@@ -16,8 +16,8 @@ import msgspec
 from interfaces.errors import BodyschemaError, BusError
 
 from .bus import Bus, is_alive
-from .camera_wiring import camera_checks, cameras_of
 from .config import Config
+from .extras import require_extra
 from .identity import Route
 from .keys import Keys
 from .servo_wiring import (
@@ -57,7 +57,7 @@ def steps(config: Config) -> Iterator[Step]:
         yield "servos", lambda: _on_the_ports(config, servo_checks)
     elif configured_ports(config):
         yield "encoders", lambda: _on_the_ports(config, encoder_checks)
-    if cameras_of(config) is not None:
+    if config.tables.vision.cameras is not None:
         yield "cameras", lambda: _cameras(config)
     if config.tables.drivers.ros2 is not None:
         yield "router", lambda: joint_state_checks(config)
@@ -81,7 +81,7 @@ def _description(config: Config) -> Iterator[Check]:
     if config.tables.drivers.hardware is None:
         said = "no servos are configured, so none were looked at"
         yield Check("robot.toml", "warning", said, "bodyschema robot new --from scan")
-    cameras = cameras_of(config)
+    cameras = config.tables.vision.cameras
     if cameras is not None and cameras.calibration is not None:
         return
     if config.robot.calibration is None:
@@ -96,6 +96,9 @@ def _description(config: Config) -> Iterator[Check]:
 def _cameras(config: Config) -> Iterator[Check]:
     """What the cameras send; while the sampler runs it has them, and tells."""
     if not is_alive(config.route("sampler"), Keys(config.robot.name).alive("sampler"), open_timeout_s=OPEN_S):
+        require_extra("cameras", "looking at the cameras")
+        from .camera_wiring import camera_checks
+
         yield from camera_checks(config)
         return
     with Bus(connect=config.route("sampler"), client=True) as bus:

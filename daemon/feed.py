@@ -6,6 +6,10 @@ import logging
 import queue
 import threading
 from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import datetime
+
+import msgspec
 
 from daemon.history import Page, Unreadable
 from daemon.learning import Learning
@@ -17,8 +21,27 @@ log = logging.getLogger(__name__)
 
 WAITING = 1024
 RETRY_S = 1.0
+# Health tells of a learner that is so many pairs behind: more than come in two or three seconds.
+BEHIND = 100
 
 History = Callable[[int], Page]
+
+
+class _Stamp(msgspec.Struct, frozen=True):
+    """What is read of a published pair to know how far the store goes."""
+
+    store: str
+    seq: int
+    utc: str
+
+
+@dataclass(frozen=True)
+class _Stored:
+    """The newest pair that is known to be stored, and when the learner heard of it [s]."""
+
+    seq: int
+    utc: str
+    heard_at: float
 
 
 class PairFeed:
@@ -49,6 +72,8 @@ class PairFeed:
         self._behind, self._paused = False, False
         self._retry_at = 0.0
         self._refused: str | None = None
+        self._published: tuple[bytes, float] | None = None
+        self._newest: _Stored | None = None
         self.restart()
 
     @property
@@ -62,12 +87,30 @@ class PairFeed:
         return self._refused
 
     @property
+    def behind(self) -> int:
+        """How many pairs are known to be stored and are not learnt yet."""
+        newest = self._look_ahead()
+        return 0 if newest is None else max(newest.seq - self._cursor, 0)
+
+    def age_s(self, utc: str | None) -> float | None:
+        """Return how old what was learnt up to a pair stored at `utc` is [s], counted from the newest stored pair.
+
+        That is the time from this pair to the newest that is known to be stored, by the sampler's clock, and the time
+        since the learner heard of that one, by its own. None before any pair.
+        """
+        newest = self._look_ahead()
+        if utc is None or newest is None:
+            return None
+        return self._clock.now() - newest.heard_at + _seconds(utc, newest.utc)
+
+    @property
     def paused(self) -> bool:
         """Whether pairs are left to history for now."""
         return self._paused
 
     def offer(self, payload: bytes) -> None:
         """A published pair."""
+        self._published = payload, self._clock.now()
         if self._waiting.qsize() < WAITING:
             self._waiting.put(payload)
         else:
@@ -91,6 +134,7 @@ class PairFeed:
         """Go on after the pairs that the learner has; call it when they have changed, holding `lock`."""
         counters = self._learning.counters
         self._store, self._cursor = counters.store, counters.last_seq
+        self._published = self._newest = None
         self._problem: str | None = None
         self._foreign: str | None = None
 
@@ -145,6 +189,7 @@ class PairFeed:
                     self._problem = f"the sampler does not give the pairs from {begin} on: {error}"
                 self._retry_at = self._clock.now() + RETRY_S
                 return
+            self._note_stored(reply)
             with self.lock:
                 if begin == self._cursor + 1 and self._end_of(reply):
                     return
@@ -172,6 +217,34 @@ class PairFeed:
         self._learning.recovered(len(new))
         self._behind = self._cursor < reply.last_seq and bool(new)
         return not self._behind
+
+    def _look_ahead(self) -> _Stored | None:
+        """The newest stored pair that is known of; the last publication is looked at when it is asked for."""
+        published, newest = self._published, self._newest
+        if published is None:
+            return newest
+        payload, heard_at = published
+        try:
+            stamp = decode(payload, _Stamp)
+        except RequestError:
+            return newest
+        if self._store not in (None, stamp.store) or (newest is not None and stamp.seq < newest.seq):
+            return newest
+        return _Stored(stamp.seq, stamp.utc, heard_at)
+
+    def _note_stored(self, reply: Page) -> None:
+        """Note the newest stored pair of a page of history; where the store goes on after the page, ask for it."""
+        known = self._look_ahead()
+        if self._store not in (None, reply.store) or (known is not None and known.seq >= reply.last_seq):
+            return
+        pairs = reply.pairs
+        if not pairs or pairs[-1].seq < reply.last_seq:
+            try:
+                pairs = self._history(reply.last_seq).pairs
+            except (BusError, RequestError) as error:
+                log.debug("the newest pair could not be asked for: %s", error)
+        utc = pairs[-1].utc if pairs and isinstance(pairs[-1], PairMessage) else ""
+        self._newest = _Stored(reply.last_seq, utc, self._clock.now())
 
     def _pass_over(self, missing: int) -> None:
         """Go on where the sampler has no such pairs: it numbers without gaps, so it had them once."""
@@ -205,3 +278,11 @@ class PairFeed:
             f"pairs now come from the store {store}, but this learner learnt from {self._store}; they are not mixed. "
             "Send the command reset_to_prior to begin anew with the new store, or put the old store back"
         )
+
+
+def _seconds(begin: str, end: str) -> float:
+    """Return the time from one moment in ISO 8601 to another [s]; 0 where it is before, or one of them is none."""
+    try:
+        return max((datetime.fromisoformat(end) - datetime.fromisoformat(begin)).total_seconds(), 0.0)
+    except (ValueError, TypeError):
+        return 0.0

@@ -11,6 +11,7 @@ from typing import Any
 import msgspec
 
 from interfaces.errors import ConfigError
+from interfaces.limited import read_at_most
 
 SECURE = ("tls", "quic")
 READ_BY_OTHERS = stat.S_IROTH
@@ -153,8 +154,7 @@ def is_local(endpoint: str) -> bool:
 def _check_file(file: Path, *, secret: bool) -> None:
     try:
         mode = file.stat().st_mode
-        with file.open("rb"):
-            pass
+        read_at_most(file)
     except OSError as error:
         remedy = "docs/security.md shows how certificates are made"
         raise ConfigError(f"{file} cannot be read: {error.strerror}", remedy=remedy) from error
@@ -164,7 +164,7 @@ def _check_file(file: Path, *, secret: bool) -> None:
 
 def _first_line(file: Path) -> str:
     try:
-        lines = file.read_text(encoding="utf-8").splitlines()
+        lines = read_at_most(file).decode().splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError("the password cannot be read", file=file, remedy="Write it in the first line") from error
     if not lines or not lines[0]:

@@ -13,7 +13,7 @@ from .joints_watch import JointState, Seen
 from .remedies import as_typed
 from .screen import bar
 
-HINT = "Move one joint at a time. It went the other way? Then set direction = -1 for it."
+HINT = "Move one joint at a time. It went the other way? Correct "
 
 
 def screen(seen: Seen) -> RenderableType:
@@ -26,8 +26,8 @@ def screen(seen: Seen) -> RenderableType:
     for joint in seen.joints:
         table.add_row(*_row(joint))
     lines = [Text(seen.moved, "cyan")] if seen.moved else []
-    lines += [Text(HINT, "dim")]
-    lines += [Text(_beyond(joint), "yellow") for joint in seen.joints if not joint.within_limits]
+    lines += [Text(f"{HINT}{seen.signs_in}.", "dim")]
+    lines += [Text(_beyond(joint, seen.signs_in), "yellow") for joint in seen.joints if not joint.within_limits]
     lines += [Text(as_typed(complaint), "yellow") for complaint in seen.health]
     lines += [Text(as_typed(seen.trouble), "red")] if seen.trouble else []
     return Group(table, *lines)
@@ -50,9 +50,9 @@ def _row(joint: JointState) -> tuple[str | Text, ...]:
     )
 
 
-def _beyond(joint: JointState) -> str:
+def _beyond(joint: JointState, signs_in: str) -> str:
     low, high, lower, upper = (f"{math.degrees(x):+.0f}°" for x in (joint.low, joint.high, joint.lower, joint.upper))
     return (
         f"{joint.joint} was from {low} to {high}, its limits are {lower} to {upper}: "
-        "look at direction, zero_ticks and the URDF"
+        f"look at the URDF's limits, and {signs_in}"
     )

@@ -12,6 +12,7 @@ from typing import Protocol, Self, runtime_checkable
 import msgspec
 import numpy as np
 
+from drivers.config import DriversConfig
 from interfaces.protocols import Clock, JointSource
 from interfaces.records import FloatArray
 from interfaces.robot import RobotDescription
@@ -109,12 +110,14 @@ class Seen(msgspec.Struct, frozen=True):
         moved: which joint was moved last, and where the URDF says the marker went by it; empty before that.
         health: what is wrong with servos.
         trouble: why nothing is read at present, or None.
+        signs_in: where signs and zeros of the joints are set.
     """
 
     joints: tuple[JointState, ...]
     moved: str
     health: tuple[str, ...]
     trouble: str | None
+    signs_in: str
 
 
 class JointsWatch:
@@ -124,6 +127,7 @@ class JointsWatch:
         """Nothing is opened yet."""
         self._robot, self._source, self._clock = config.robot, source, clock
         self._servos = source if isinstance(source, ServoJoints) else None
+        self._signs_in = signs_in(config.tables.drivers)
         self._reading = Reopening(source, "the encoders", clock)
         self._opened = ExitStack()
         self._temperatures: dict[str, float | None] = dict.fromkeys(config.robot.joints)
@@ -175,7 +179,7 @@ class JointsWatch:
 
     def _seen(self, q: FloatArray) -> Seen:
         joints = tuple(self._joint(place, float(angle)) for place, angle in enumerate(q))
-        return Seen(joints, self._signs.said, self._source.health, self._reading.trouble)
+        return Seen(joints, self._signs.said, self._source.health, self._reading.trouble, self._signs_in)
 
     def _joint(self, place: int, angle: float) -> JointState:
         name = self._robot.joints[place]
@@ -197,6 +201,15 @@ class JointsWatch:
             upper=upper,
             within_limits=lower - BEYOND <= low and high <= upper + BEYOND,
         )
+
+
+def signs_in(drivers: DriversConfig) -> str:
+    """Return where signs and zeros of the joints are set, for people."""
+    if drivers.ros2 is not None:
+        return "[drivers.ros2.names] or the URDF: ROS 2 gives the angles with their signs and zeros"
+    if drivers.plugin is not None:
+        return "the settings of its driver, or the URDF"
+    return "direction and zero_ticks in robot.toml: direction = -1 turns it round"
 
 
 class Speeds:

@@ -19,7 +19,7 @@ from daemon.changes import Changes
 from daemon.checkpoint import CheckpointError, write_checkpoint
 from daemon.config import Config
 from daemon.expected import ExpectedMarker
-from daemon.feed import PairFeed
+from daemon.feed import BEHIND, PairFeed
 from daemon.findings import Findings, FindingTurns
 from daemon.going_on import go_on
 from daemon.history import Page, read_page
@@ -86,7 +86,7 @@ class Learner:
         )
         self._feed = PairFeed(self._learning, self._history, clock, lambda: self._service.beat(loop))
         self._findings = Findings(self._learning, config.robot, clock, robots, turns)
-        self._answers = Answers(self._learning, config.robot, clock)
+        self._answers = Answers(self._learning, config.robot, self._feed.age_s)
         self._more_rarely = more_rarely(robots)
         self._sampler_alive = False
         self._started_at = clock.now()
@@ -183,6 +183,8 @@ class Learner:
             health=list(self._health()),
             orientation=self._learning.orientation_status(),
             missed=counters.missed,
+            behind=self._feed.behind,
+            age_s=self._feed.age_s(snapshot.newest_utc),
             version=version("bodyschema"),
         )
 
@@ -202,6 +204,15 @@ class Learner:
         for problem in (self._feed.problem, self._checkpoint_problem, self._set_aside):
             if problem is not None:
                 yield problem
+        behind = self._feed.behind
+        if behind >= BEHIND and not self._feed.paused:
+            age_s = self._feed.age_s(self._learning.snapshot.newest_utc)
+            newest = "" if age_s is None else f", and the newest that was learnt is {age_s:.0f} s old"
+            yield (
+                f"{behind} stored pairs are not learnt yet{newest}: predictions are of that time. It catches up by "
+                "itself while pairs come more slowly than they are learnt; if the number grows, lower [learner] "
+                "replays_per_pair or run the learner on a faster machine"
+            )
         if self._feed.refused is not None:
             yield f"pairs were refused, {self._learning.counters.refused} so far; the last: {self._feed.refused}"
         if self._nominal.size > LARGEST_NET:

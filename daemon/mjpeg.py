@@ -2,16 +2,31 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
 from interfaces.errors import ConfigError
 
-LOOPBACK = "127.0.0.1"
+from .local_web import HEADERS, LOOPBACK, host_refusal
+
+log = logging.getLogger(__name__)
+
 BOUNDARY = "picture"
+# A browser that shows the pictures has a thread of its own here.
+MOST_VIEWERS = 32
 PAGE = b"<!doctype html><title>bodyschema</title><body style='margin:0;background:#111'><img src=/stream width=100%>"
+POLICY = "default-src 'none'; img-src 'self'; style-src 'unsafe-inline'; frame-ancestors 'none'"
+
+
+class _Server(ThreadingHTTPServer):
+    daemon_threads = True
+
+    def handle_error(self, request: Any, client_address: Any) -> None:  # noqa: ARG002
+        """Log why a request failed; a browser that has gone leaves no traceback on the terminal."""
+        log.debug("a request for pictures failed", exc_info=True)
 
 
 class MjpegServer:
@@ -24,15 +39,15 @@ class MjpegServer:
         self._number = 0
         self._changed = threading.Condition()
         self._is_closing = False
-        self._server: ThreadingHTTPServer | None = None
+        self._viewers = threading.BoundedSemaphore(MOST_VIEWERS)
+        self._server: _Server | None = None
 
     def __enter__(self) -> Self:
         try:
-            self._server = ThreadingHTTPServer((LOOPBACK, self._port), self._handler())
+            self._server = _Server((LOOPBACK, self._port), self._handler())
         except OSError as error:
             remedy = "Give another --port, or --port 0 for one that is free"
             raise ConfigError(f"port {self._port} cannot be used: {error.strerror}", remedy=remedy) from error
-        self._server.daemon_threads = True
         threading.Thread(target=self._server.serve_forever, name="pictures", daemon=True).start()
         return self
 
@@ -72,18 +87,34 @@ class MjpegServer:
 
         class Handler(BaseHTTPRequestHandler):
             def do_GET(self) -> None:
-                if self.path == "/":
-                    self._send("text/html; charset=utf-8", PAGE)
-                elif self.path == "/stream":
-                    self._stream()
+                said = host_refusal(self.headers.get_all("Host", []))
+                if said is not None:
+                    self._say(403, said)
+                elif self.path == "/":
+                    self._send(200, "text/html; charset=utf-8", PAGE)
+                elif self.path != "/stream":
+                    self._say(404, "there is nothing here. The pictures are at /")
+                elif not server._viewers.acquire(blocking=False):
+                    self._say(503, f"{MOST_VIEWERS} browsers look on already. Close one")
                 else:
-                    self.send_error(404)
+                    try:
+                        self._stream()
+                    finally:
+                        server._viewers.release()
 
             def log_message(self, format: str, *args: object) -> None:
-                """Nobody wants a line for each picture."""
+                """Log nothing: there is a request for each browser."""
 
-            def _send(self, kind: str, body: bytes) -> None:
-                self.send_response(200)
+            def end_headers(self) -> None:
+                for name, value in (HEADERS | {"Content-Security-Policy": POLICY}).items():
+                    self.send_header(name, value)
+                super().end_headers()
+
+            def _say(self, status: int, text: str) -> None:
+                self._send(status, "text/plain; charset=utf-8", f"{text}\n".encode())
+
+            def _send(self, status: int, kind: str, body: bytes) -> None:
+                self.send_response(status)
                 self.send_header("Content-Type", kind)
                 self.send_header("Content-Length", str(len(body)))
                 self.end_headers()
@@ -92,7 +123,6 @@ class MjpegServer:
             def _stream(self) -> None:
                 self.send_response(200)
                 self.send_header("Content-Type", f"multipart/x-mixed-replace; boundary={BOUNDARY}")
-                self.send_header("Cache-Control", "no-store")
                 self.end_headers()
                 number = 0
                 try:
@@ -101,6 +131,6 @@ class MjpegServer:
                         head = f"--{BOUNDARY}\r\nContent-Type: image/jpeg\r\nContent-Length: {len(jpeg)}\r\n\r\n"
                         self.wfile.write(head.encode() + jpeg + b"\r\n")
                 except OSError:
-                    return  # who looked has gone
+                    return  # the browser has gone
 
         return Handler

@@ -372,7 +372,7 @@ class Sampler:
         if self._failure is not None:
             said.append(str(self._failure))
         elif not self._ended:
-            said += self._silences()
+            said += self._silences() + self._tally.complaints
         said += [text for drive in self._powered.values() for text in drive.complaints]
         if self._cameras is not None and self._marker.trouble is None:
             said += self._cameras.health

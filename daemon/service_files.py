@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
 from interfaces.errors import ConfigError
+from interfaces.robot import NAME
 
 from .config import Config
 from .udev import ROOT, run_quietly
@@ -70,7 +71,7 @@ class UnitFolder:
         for file in files:
             try:
                 file.unlink()
-                if file.name == OWN:
+                if file.name == OWN and not any(file.parent.iterdir()):  # `systemctl edit` puts files of its own there
                     file.parent.rmdir()
             except OSError as error:
                 raise _refused(file, error, f"{command} --uninstall") from error
@@ -116,6 +117,11 @@ class ServiceFiles:
     processes: Sequence[str] = PROCESSES
     folder: UnitFolder = UnitFolder()
 
+    def __post_init__(self) -> None:
+        if not re.match(NAME, self.name):
+            remedy = "Take letters, digits, _ . and -, and begin with a letter, a digit or _"
+            raise ConfigError(f"{self.name!r} is no name for a service", remedy=remedy)
+
     @property
     def units(self) -> list[str]:
         return [f"bodyschema-{process}@{self.name}.service" for process in self.processes]
@@ -156,7 +162,11 @@ class ServiceFiles:
         found: list[Path] = []
         for process in self.processes:
             own, shared = self._own(process, self.name), self._template(process)
-            others = [file for file in self.folder.path.glob(f"bodyschema-{process}@*.service.d/*") if file != own]
+            others = [
+                file
+                for file in self.folder.path.glob(f"bodyschema-{process}@*.service.d/*")
+                if file.parent != own.parent
+            ]
             found += [file for file in (own, *([] if others else [shared])) if file.exists()]
         return found
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +11,7 @@ from pathlib import Path
 import msgspec
 
 from interfaces.errors import ConfigError
+from interfaces.limited import read_at_most
 
 from .servo_wiring import KnownModel, known_models
 
@@ -106,7 +108,7 @@ def servo_tables(fitting: Fitting) -> str:
     """
     servos, known = list(fitting.servos.values()), known_models()
     make = _make(servos)
-    names = _bus_names(servos, make.software)
+    names = _bus_names(servos)
     lines = ["", "# The servos, as `bodyschema scan` found them. docs/hardware.md has all keys."]
     for (port, baud), name in names.items():
         lines += [f"[{make.table}.buses.{name}]", f"port = {_quoted(port)}", f"baud = {baud:_}", ""]
@@ -137,16 +139,28 @@ def _make(servos: Sequence[Candidate]) -> KnownModel:
     return next(iter(makes.values()))
 
 
-def _bus_names(servos: Sequence[Candidate], software: str) -> dict[tuple[str, int], str]:
+def _bus_names(servos: Sequence[Candidate]) -> dict[tuple[str, int], str]:
     buses = dict.fromkeys((servo.port, servo.baud) for servo in servos)
     taken: dict[str, int] = {}
     for port, baud in buses:
         if taken.setdefault(os.path.realpath(port), baud) != baud:
             raise ConfigError(
                 f"the servos on {port} have different rates",
-                remedy=f"Set all to one, with {software} for instance",
+                remedy=_other_rates(servos, port),
             )
     return {bus: "arm" if len(buses) == 1 else f"bus{place}" for place, bus in enumerate(buses, 1)}
+
+
+def _other_rates(servos: Sequence[Candidate], port: str) -> str:
+    """How all servos of a port get the rate that most of them have."""
+    here = [servo for servo in servos if os.path.realpath(servo.port) == os.path.realpath(port)]
+    most, _ = Counter(servo.baud for servo in here).most_common(1)[0]
+    commands = [
+        f"bodyschema servos set baud={most} --port {port} --id {servo.id} --baud {servo.baud}"
+        for servo in here
+        if servo.baud != most
+    ]
+    return f"Give all the same: {'; '.join(commands)}; then scan again"
 
 
 def _quoted(text: str) -> str:
@@ -161,7 +175,7 @@ def read_scan(file: Path) -> list[Candidate]:
         ConfigError: it cannot be read, or is none.
     """
     try:
-        return candidates_in(file.read_bytes(), file)
+        return candidates_in(read_at_most(file), file)
     except OSError as error:
         remedy = "Write one: bodyschema scan --json > FILE.json"
         raise ConfigError(f"cannot be read: {error.strerror}", file=file, remedy=remedy) from error

@@ -11,6 +11,7 @@ from typing import Literal
 import msgspec
 
 from interfaces.errors import BodyschemaError, ConfigError
+from interfaces.limited import read_at_most
 
 FILE = "servo_writes.jsonl"
 State = Literal["begun", "written", "not written", "something else stands there", "not known"]
@@ -77,7 +78,7 @@ class ServoLog:
         if not self.file.exists():
             return {}
         last: dict[tuple[int, str, int, int], LoggedWrite] = {}
-        lines = self.file.read_bytes().split(b"\n")
+        lines = read_at_most(self.file).split(b"\n")
         for number, line in enumerate(lines, 1):
             try:
                 entry = msgspec.json.decode(line, type=LoggedWrite) if line else None

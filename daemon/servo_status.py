@@ -48,6 +48,8 @@ class BusHealth(Protocol):
     def exchanges(self) -> int: ...
     @property
     def troubles(self) -> Mapping[str, int]: ...
+    @property
+    def way(self) -> str: ...
 
 
 @runtime_checkable
@@ -118,7 +120,7 @@ def _status(servo: ServoHealth) -> ServoStatus:
 def _bus(bus: BusHealth) -> BusStatus:
     failed = sum(bus.troubles.values())
     answered = 1.0 - failed / bus.exchanges if bus.exchanges else 0.0
-    return BusStatus(bus.exchanges, round(answered, 5), dict(bus.troubles))
+    return BusStatus(bus.exchanges, round(answered, 5), dict(bus.troubles), bus.way)
 
 
 def accept_turns(encoders: object) -> str:

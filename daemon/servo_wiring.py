@@ -41,13 +41,11 @@ class KnownModel:
         table: of its make in robot.toml.
         bauds: the rates that it can be given there [bit/s].
         zero_ticks: the middle of its range.
-        software: with which it is set up.
     """
 
     table: str
     bauds: tuple[int, ...]
     zero_ticks: int
-    software: str
 
 
 def servos_of(config: Config) -> Servos | None:
@@ -71,7 +69,7 @@ def require_servos(config: Config) -> Servos:
 def known_models() -> dict[str, KnownModel]:
     """The servos that there are drivers for, by name."""
     return {
-        name: KnownModel(make.table, get_args(baud), model.zero_ticks, make.software)
+        name: KnownModel(make.table, get_args(baud), model.zero_ticks)
         for make, models, baud in ((DYNAMIXEL, DYNAMIXEL_MODELS, DynamixelBaud), (FEETECH, FEETECH_MODELS, FeetechBaud))
         for name, model in models.items()
     }

@@ -7,7 +7,9 @@ from importlib.metadata import version
 
 import msgspec
 
+from interfaces.limited import read_at_most
 from interfaces.protocols import Clock
+from interfaces.toml_file import read_toml
 
 from .config import Config
 from .store import Session
@@ -18,8 +20,8 @@ def session_of(config: Config, wall: Clock) -> Session:
     return Session(
         joints=config.robot.joints,
         started_utc=wall.utc(),
-        robot_toml=config.file.read_text(encoding="utf-8"),
-        urdf=config.robot.tree.file.read_text(encoding="utf-8", errors="replace"),
+        robot_toml=read_toml(config.file)[1],
+        urdf=read_at_most(config.robot.tree.file).decode("utf-8", errors="replace"),
         config=msgspec.json.encode(config.tables).decode(),
         version=version("bodyschema"),
         host=socket.gethostname(),

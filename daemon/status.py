@@ -46,11 +46,13 @@ class BusStatus(msgspec.Struct, frozen=True):
         exchanges: questions that were asked.
         answered: the share of them that was answered as it should be.
         troubles: the others, by what was wrong.
+        way: with which questions its servos are read, such as Sync Read.
     """
 
     exchanges: int
     answered: float
     troubles: dict[str, int]
+    way: str = ""
 
 
 class SamplerStatus(msgspec.Struct, frozen=True, kw_only=True):
@@ -183,6 +185,9 @@ class OrientationStatus(msgspec.Struct, frozen=True):
     claimed_rad: float | None
 
 
+UNDECIDED = "undecided"  # a change whose kind is not known yet
+
+
 class Change(msgspec.Struct, frozen=True, kw_only=True):
     """The last change of the tool, of the camera or of a joint's zero.
 
@@ -237,6 +242,8 @@ class LearnerStatus(msgspec.Struct, frozen=True, kw_only=True):
         health: sentences about what is wrong; empty when all is well.
         orientation: null where no pair with the present tool said how the marker is turned.
         missed: pairs that the sampler no longer kept when this learner asked for them.
+        behind: pairs that are known to be stored and are not learnt yet.
+        age_s: how old the newest learnt pair is, counted from the newest stored one; null before any since the start.
     """
 
     robot: str
@@ -266,4 +273,6 @@ class LearnerStatus(msgspec.Struct, frozen=True, kw_only=True):
     version: str
     orientation: OrientationStatus | None = None
     missed: int = 0
+    behind: int = 0
+    age_s: float | None = None
     schema: int = SCHEMA

@@ -16,7 +16,6 @@ from rich.text import Text
 from interfaces.errors import BusError, RequestError
 
 from .bus import Bus
-from .changes import UNDECIDED
 from .config import Config
 from .findings_view import calibration_table, outlook_lines
 from .identity import Route
@@ -24,7 +23,7 @@ from .keys import Keys
 from .remedies import as_typed
 from .screen import coverage_table, degrees, mm, rejected
 from .servos_view import servos_table
-from .status import BusStatus, LearnerStatus, OrientationStatus, SamplerStatus
+from .status import UNDECIDED, BusStatus, LearnerStatus, OrientationStatus, SamplerStatus
 from .wire import decode
 from .zenoh_config import PROCESSES
 
@@ -131,7 +130,8 @@ def _sampler(status: SamplerStatus) -> list[RenderableType]:
 
 def _bus(bus: BusStatus) -> str:
     wrong = ", ".join(f"{count} × {name}" for name, count in sorted(bus.troubles.items(), key=lambda item: -item[1]))
-    return f"{bus.answered:.2%} of {bus.exchanges} questions answered{f': {wrong}' if wrong else ''}"
+    way = f"{bus.way}; " if bus.way else ""
+    return f"{way}{bus.answered:.2%} of {bus.exchanges} questions answered{f': {wrong}' if wrong else ''}"
 
 
 def _learner(status: LearnerStatus) -> list[RenderableType]:

@@ -10,6 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from interfaces.errors import ConfigError
+from interfaces.interpreter import module_command
 from interfaces.plugins import PluginConfig
 
 from .config import Config
@@ -104,6 +106,8 @@ ExecReload=/bin/kill -HUP $MAINPID
 # Fed by the loops that work, so that one which hangs starves it; the abort leaves every thread's place in the journal.
 WatchdogSec={watchdog_s}
 {kept_running}
+# Five times what the learner takes after 60,000 pairs, ten times the sampler: what grows beyond it is started again.
+MemoryMax={memory_mib}M
 # The store and the checkpoint.
 StateDirectory=bodyschema/%i
 StateDirectoryMode=0750
@@ -119,6 +123,8 @@ WantedBy=multi-user.target
 """
 # Longer than any loop's slowest round: the learner's background work took 6 s with twelve joints on a busy machine.
 _WATCHDOG_S = {"sampler": 30, "learner": 60}
+# A learner of 50 robots takes 16 MB for each.
+_MEMORY_MIB, _MORE_MIB = 2048, 64
 _READY = {
     "sampler": "encoders and cameras are read, the store is open and zenoh answers",
     "learner": "the checkpoint is read and zenoh answers",
@@ -152,7 +158,7 @@ class Installed:
     def here(cls, systemd: int) -> Installed:
         """The one that runs."""
         folders = (Path(sys.prefix), Path(sys.base_prefix), Path(__file__).parents[1])
-        return cls((os.path.abspath(sys.executable), "-P", "-m", "daemon"), folders, systemd)
+        return cls(module_command("daemon"), folders, systemd)
 
 
 def template(process: str, installed: Installed) -> str:
@@ -161,8 +167,9 @@ def template(process: str, installed: Installed) -> str:
         process=process,
         own=OWN,
         ready=_READY[process],
-        command=" ".join(map(_quoted, installed.command)),
+        command=_command(installed.command),
         watchdog_s=_WATCHDOG_S[process],
+        memory_mib=_MEMORY_MIB,
         kept_running=_kept_running(installed),
         devices=_DEVICES[process],
         sandbox=_SANDBOX,
@@ -183,8 +190,7 @@ def of_robot(process: str, config: Config, user: str, installed: Installed) -> s
 
 def of_host(configs: Sequence[Config], user: str, installed: Installed) -> str:
     """What `bodyschema-learner@<name>.service.d/robot.conf` says where one learner serves several robots."""
-    command = " ".join(map(_quoted, [*installed.command, "learner"]))
-    robots = "".join(f" --robot {_quoted(config.file.absolute())}" for config in configs)
+    named = [word for config in configs for word in ("--robot", config.file.absolute())]
     names = " ".join(config.robot.name for config in configs)
     kept = " ".join(f"bodyschema/{config.robot.name}" for config in configs if config.tables.daemon.state_dir is None)
     lines = [
@@ -193,8 +199,9 @@ def of_host(configs: Sequence[Config], user: str, installed: Installed) -> str:
         f"Description=bodyschema: the learner of {len(configs)} robots (%i)",
         "[Service]",
         f"User={user}",
+        f"MemoryMax={_MEMORY_MIB + _MORE_MIB * len(configs)}M",
         "ExecStart=",
-        f"ExecStart={command}{robots}",
+        f"ExecStart={_command([*installed.command, 'learner', *named])}",
         "StateDirectory=",
         *([f"StateDirectory={kept}"] if kept else []),
         *_seen(configs, installed),
@@ -205,10 +212,9 @@ def of_host(configs: Sequence[Config], user: str, installed: Installed) -> str:
 def of_router(config: RouterConfig, user: str, installed: Installed) -> str:
     """The unit `bodyschema-router.service`."""
     file = config.file.absolute()
-    command = " ".join(map(_quoted, [*installed.command, "router", file]))
     seen = hidden([*installed.folders, file.parent, *(path.parent for path in config.identity.files)])
     return _ROUTER.format(
-        command=command,
+        command=_command([*installed.command, "router", file]),
         user=user,
         kept_running=_kept_running(installed),
         seen="".join(f"BindReadOnlyPaths={_quoted(path)}\n" for path in seen),
@@ -278,10 +284,21 @@ def _kept_running(installed: Installed) -> str:
     return "\n".join(["WatchdogSignal=SIGABRT", *times, "KillMode=mixed", "Restart=on-failure", *steps])
 
 
+def _command(words: Iterable[object]) -> str:
+    """A command line as systemd.service(5) wants it: a dollar sign begins a variable."""
+    return " ".join(_quoted(str(word).replace("$", "$$")) for word in words)
+
+
 def _quoted(word: object) -> str:
-    """A word of a unit file, as systemd.syntax(7) wants it: a percent sign begins a specifier."""
+    """A word of a unit file, as systemd.syntax(7) wants it: a percent sign begins a specifier, a colon another path.
+
+    Raises:
+        ConfigError: it has a character that ends a line, or that no text has.
+    """
     text = str(word).replace("%", "%%")
-    if not re.search(r"[\s\"'\\]", text):
+    if not text.isprintable():
+        raise ConfigError(f"{str(word)!r} cannot stand in a unit of systemd", remedy="Rename the file or folder")
+    if not re.search(r"[\s\"'\\:;#]", text):
         return text
     escaped = text.replace("\\", "\\\\").replace('"', '\\"')
     return f'"{escaped}"'

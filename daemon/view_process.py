@@ -5,26 +5,17 @@ from __future__ import annotations
 import logging
 import os
 import subprocess
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from importlib.util import find_spec
 from pathlib import Path
 
 from daemon.signals import with_parent
-from interfaces.errors import ConfigError
+from interfaces.interpreter import module_command
 
 log = logging.getLogger(__name__)
 
 END_LIMIT_S = 5.0
 PORT = 8420
-NEEDED = ("starlette", "uvicorn")
-
-
-def require_extra() -> None:
-    """ConfigError unless the extra `view` is installed."""
-    if any(find_spec(name) is None for name in NEEDED):
-        raise ConfigError("the page needs the extra `view`", remedy="Install it: `pip install 'bodyschema[view]'`")
 
 
 @contextmanager
@@ -33,7 +24,7 @@ def shown(robot_file: Path, port: int = PORT) -> Iterator[subprocess.Popen[bytes
 
     What becomes of the page is no matter of life for whoever is shown: a port that is taken is a line in the log.
     """
-    command = [sys.executable, "-m", "daemon", "view", "--robot", str(robot_file), "--port", str(port)]
+    command = module_command("daemon", "view", "--robot", str(robot_file), "--port", str(port))
     process = subprocess.Popen(command, stdin=subprocess.DEVNULL, env=os.environ | with_parent(), process_group=0)
     try:
         yield process

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import threading
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -13,6 +14,7 @@ import numpy as np
 
 from interfaces.clock import SystemClock
 from interfaces.errors import RecordingError, SourceEnded
+from interfaces.limited import read_at_most
 from interfaces.records import JointReading, MarkerFix, MarkerMiss
 
 from .latency import LATEST_S, LatencyError, Wiggle
@@ -155,7 +157,7 @@ def read_wiggle(file: Path, joints: Sequence[str]) -> Wiggle:
     readings: list[list[float]] = []
     fixes: list[list[float]] = []
     try:
-        with file.open(newline="", encoding="utf-8") as stream:
+        with io.StringIO(read_at_most(file).decode(), newline="") as stream:
             rows = csv.reader(stream)
             if next(rows, []) != columns:
                 remedy = "Record one with `bodyschema calibrate latency --save`"
@@ -169,7 +171,7 @@ def read_wiggle(file: Path, joints: Sequence[str]) -> Wiggle:
                     (readings if any(angles) else fixes).append([float(cell) for cell in cells])
                 except ValueError as error:
                     raise RecordingError(f"{error}", file=file, line=number) from error
-    except (OSError, UnicodeDecodeError) as error:
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise RecordingError(f"cannot be read: {error}", file=file) from error
     if not readings or not fixes:
         raise RecordingError("has to have rows with joint angles and rows with a position", file=file)

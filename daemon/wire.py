@@ -6,7 +6,7 @@ Requests are checked for unknown keys; replies and publications may grow keys, s
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Annotated, Any, Literal, TypeVar
 
 import msgspec
@@ -16,7 +16,7 @@ from msgspec import Meta
 from interfaces.covariance import from_upper, upper_triangle
 from interfaces.errors import RequestError
 from interfaces.recording_columns import QUATERNION_TOLERANCE
-from interfaces.records import FloatArray, Pair, frozen_array
+from interfaces.records import FARTHEST_M, LARGEST_Q, FloatArray, Pair, frozen_array
 from interfaces.suggest import with_choices
 
 from .command_names import CommandName
@@ -76,7 +76,8 @@ class PredictReply(msgspec.Struct, frozen=True):
         in_support: whether the joint angles lie where data was.
         model: hash of the model that answered.
         pairs: how many pairs it had learnt.
-        age_s: time since the last of them, or null before any since the learner started.
+        age_s: how old the last of them is: the time from it to the newest pair that is known to be stored, and since the
+            learner heard of that one; null before any since the learner started.
         R: orientations of the marker in the measurement frame, unit quaternions x, y, z, w; null where none is learnt.
         sigma_R: their 1-sigma, of a small turn about each axis of the measurement frame [rad]; null with R.
     """
@@ -231,27 +232,43 @@ def _four(turn: FloatArray) -> tuple[float, float, float, float]:
     return x, y, z, w
 
 
-def finite_vector(name: str, values: Sequence[float], joints: tuple[str, ...]) -> np.ndarray:
-    """One number for each joint, shape (d,).
+def position(name: str, values: Sequence[float]) -> FloatArray:
+    """Return a position asked for, shape (3,) [m].
 
     Raises:
-        RequestError: too many or too few, or one that is not finite.
+        RequestError: a number is not finite, or so large that it is not in metres.
+    """
+    x = np.array(values, dtype=np.float64)
+    if not np.isfinite(x).all():
+        raise RequestError(f"{name} is not finite")
+    farthest = float(np.abs(x).max())
+    if farthest > FARTHEST_M:
+        raise RequestError(
+            f"{name} lies {farthest:.3g} m away; positions are in metres, at most {FARTHEST_M:.0f} on each axis"
+        )
+    return x
+
+
+def joint_vector(name: str, values: Sequence[float], joints: tuple[str, ...]) -> FloatArray:
+    """Return one number for each joint, shape (d,) [rad].
+
+    Raises:
+        RequestError: too many or too few, or one that no joint has.
     """
     if len(values) != len(joints):
         raise RequestError(
             f"{name} has {len(values)} numbers; this robot has {len(joints)} joints: {', '.join(joints)}"
         )
     vector = np.array(values, dtype=np.float64)
-    if not np.isfinite(vector).all():
-        raise RequestError(f"{name} is not finite at joint {joints[int(np.isfinite(vector).argmin())]!r}")
+    _require_angles(vector[None], joints, lambda _: name)
     return vector
 
 
-def joint_angles(request: JointsRequest, joints: tuple[str, ...]) -> np.ndarray:
-    """The request's joint angles, shape (n, d) [rad].
+def joint_angles(request: JointsRequest, joints: tuple[str, ...]) -> FloatArray:
+    """Return the request's joint angles, shape (n, d) [rad].
 
     Raises:
-        RequestError: a row of the wrong length, a number that is not finite, an empty or too large batch.
+        RequestError: a row of the wrong length, a number that no joint has, an empty or too large batch.
     """
     if not request.q:
         raise RequestError("q is empty; send one vector of joint angles or a list of them")
@@ -266,7 +283,16 @@ def joint_angles(request: JointsRequest, joints: tuple[str, ...]) -> np.ndarray:
                 f"row {number} of q has {length} numbers; this robot has {len(joints)} joints: {', '.join(joints)}"
             )
     q = np.array(rows, dtype=np.float64)
-    if not np.isfinite(q).all():
-        row, column = np.argwhere(~np.isfinite(q))[0]
-        raise RequestError(f"row {row} of q is not finite at joint {joints[column]!r}")
+    _require_angles(q, joints, lambda row: f"row {row} of q")
     return q
+
+
+def _require_angles(q: FloatArray, joints: tuple[str, ...], named: Callable[[int], str]) -> None:
+    wrong = np.argwhere(~(np.abs(q) <= LARGEST_Q))
+    if len(wrong) == 0:
+        return
+    row, column = wrong[0].tolist()
+    value = float(q[row, column])
+    if math.isfinite(value):
+        raise RequestError(f"{named(row)} is {value:.3g} at joint {joints[column]!r}; angles are in radians")
+    raise RequestError(f"{named(row)} is not finite at joint {joints[column]!r}")

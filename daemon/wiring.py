@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator
+from colorsys import hsv_to_rgb
 from contextlib import contextmanager
-from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 
@@ -16,14 +16,18 @@ from drivers.feetech.config import FeetechConfig
 from drivers.ros2.config import Ros2Config
 from drivers.serial_lines.config import SerialLinesConfig
 from drivers.serial_lines.joints import SerialLineJoints
+from interfaces.camera import StereoCalibration
 from interfaces.clock import SystemClock
 from interfaces.errors import ConfigError, StoreError
 from interfaces.plugins import PluginConfig, load
 from interfaces.protocols import Clock, JointSource
+from interfaces.records import MarkerMiss, StereoFrame
+from interfaces.rejections import WORDS
 from kbmaps import RigidChain
 
 from .bench_wiring import require_bench, through_bench
 from .config import Config
+from .extras import require_extra
 from .joints_watch import EncoderJoints, ServoJoints
 from .powered_wiring import open_drives
 from .sources import Head, MarkerTopic, Powered, Sources, StampedJoints
@@ -31,10 +35,15 @@ from .store import PairReader
 
 if TYPE_CHECKING:
     from drivers.ros2.joints import Ros2Joints
-    from sim_backend.config import SimConfig, SimTag
+    from sim_backend.config import CameraConfig, SimConfig, SimTag
     from vision.config import VisionConfig
 
 log = logging.getLogger(__name__)
+
+# A painted ball. Hues that the room does not have reach beyond its band by so much [deg], and are at least so many.
+_SATURATION, _VALUE, _ROOM_DEG, _GAP_DEG = 0.93, 0.86, 6.0, 36.0
+# A ball that is told by its brightness glows; all else is darker than half of what is looked for.
+_LAMP, _DIMMED = 0.9, 0.45
 
 Hardware = DynamixelConfig | FeetechConfig | SerialLinesConfig | Ros2Config | PluginConfig
 
@@ -63,6 +72,7 @@ def check_sources(config: Config, *, sim: bool) -> None:
     _require_source(config, sim=sim)
     if sim:
         require_simulation()
+        simulation_settings(config)
 
 
 def open_joints(config: Config, clock: Clock) -> EncoderJoints:
@@ -163,17 +173,21 @@ def _require_source(config: Config, *, sim: bool) -> None:
     require_usable(config)
 
 
+def connected_cameras() -> list[str]:
+    """Return the cameras of this machine, by the names that stay."""
+    from vision.cameras.serials import connected
+
+    return connected()
+
+
 def _recording(config: Config) -> Path | None:
     recording = config.tables.drivers.recording
     return None if recording is None else config.file.parent / recording
 
 
 def require_simulation() -> None:
-    """ConfigError with the command to type when the simulation's packages are not installed."""
-    if find_spec("pybullet") is None:
-        raise ConfigError(
-            "the simulation needs pybullet, which is not installed", remedy="Type: pip install 'bodyschema[sim]'"
-        )
+    """Raise ConfigError with the command to type when the simulation's packages are not installed."""
+    require_extra("sim", "the simulation")
 
 
 def demonstration_model() -> Path:
@@ -215,7 +229,7 @@ def _simulated(config: Config) -> Iterator[Sources]:
     from vision.trackers import tracker_of
 
     on_bench = config.tables.sim.servo_bench
-    settings = _simulation_settings(config)
+    settings = simulation_settings(config)
     settings = exact_encoders(settings) if on_bench else settings
     with SimWorld(config.robot, settings, config.simulation) as world:
         marker = TrackedCamera(world.camera, tracker_of(world.camera.calibration, config.tables.vision))
@@ -223,16 +237,56 @@ def _simulated(config: Config) -> Iterator[Sources]:
         yield Sources(joints, marker, world.clock, world)
 
 
-def _simulation_settings(config: Config) -> SimConfig:
-    """The table [sim], with the tags that [vision] looks for in the hand unless [sim.camera] names others."""
-    sim, vision = config.tables.sim, config.tables.vision
-    if vision.marker not in ("tag", "cluster") or sim.camera.tags:
-        return sim
-    from vision.tag_dictionary import DICTIONARIES
+def simulation_settings(config: Config) -> SimConfig:
+    """Return the table [sim], with the marker that [vision] looks for in the hand unless [sim.camera] has another.
 
-    number = DICTIONARIES[vision.tag.dictionary]
-    camera = msgspec.structs.replace(sim.camera, tags=_tags(vision), tag_dictionary=number)
+    Raises:
+        ConfigError: the tracker does not find what the simulation would show.
+    """
+    from sim_backend.config import CameraConfig
+
+    sim, vision = config.tables.sim, config.tables.vision
+    usual, marker = CameraConfig(), {} if sim.camera.tags else _marker(vision)
+    unsaid = {name: value for name, value in marker.items() if getattr(sim.camera, name) == getattr(usual, name)}
+    camera = msgspec.structs.replace(sim.camera, **unsaid)
+    if vision.marker != "plugin" and config.robot.calibration is not None:
+        _require_found(config, config.robot.calibration, camera)
     return msgspec.structs.replace(sim, camera=camera)
+
+
+def _marker(vision: VisionConfig) -> dict[str, Any]:
+    """Return the keys of [sim.camera] that show the marker of [vision]."""
+    if vision.marker in ("tag", "cluster"):
+        from vision.tag_dictionary import DICTIONARIES
+
+        return {"tags": _tags(vision), "tag_dictionary": DICTIONARIES[vision.tag.dictionary]}
+    ball = {"ball_radius_m": vision.radius_m}
+    if vision.marker == "bright_ball":
+        level = max(_LAMP, (1.0 + vision.min_brightness) / 2)
+        return {**ball, "ball_rgb": (level, level, level), "light": _DIMMED * vision.min_brightness}
+    band = vision.band
+    # A lit ball is darker on one side, and its highlight is paler.
+    saturation = max(_SATURATION, (1.0 + band.min_saturation) / 2)
+    value = _VALUE if band.min_value < _VALUE / 2 else 1.0
+    rgb = hsv_to_rgb(band.hue_deg / 360.0, saturation, value)
+    return {**ball, "ball_rgb": rgb, "clutter_gap_deg": max(_GAP_DEG, band.half_width_deg + _ROOM_DEG)}
+
+
+def _require_found(config: Config, calibration: StereoCalibration, camera: CameraConfig) -> None:
+    """ConfigError where the tracker does not even find the marker by itself before a plain wall."""
+    from sim_backend.eye import portrait
+    from vision.trackers import tracker_of
+
+    tracker = tracker_of(calibration, config.tables.vision)
+    seen = tracker.track(StereoFrame(0.0, *portrait(calibration, camera)))
+    if isinstance(seen, MarkerMiss):
+        keys = {"ball": "[vision.colour] or [vision] radius_m", "bright_ball": "[vision] min_brightness"}
+        raise ConfigError(
+            "the tracker would not find the marker that [vision] describes in the simulation's images, not even alone "
+            f"before a plain wall: {WORDS[seen.reason]}",
+            file=config.file,
+            remedy=f"Change {keys.get(config.tables.vision.marker, '[vision.tag]')}, or what [sim.camera] shows",
+        )
 
 
 def _tags(vision: VisionConfig) -> tuple[SimTag, ...]:
@@ -261,7 +315,7 @@ def open_postures(config: Config, count: int) -> Iterator[Sources]:
     from vision.tracked_camera import TrackedCamera
     from vision.trackers import tracker_of
 
-    settings = _simulation_settings(config)
+    settings = simulation_settings(config)
     postures = visible_postures(config.robot, settings, count, config.simulation)
     with PosedWorld(config.robot, settings, postures, config.simulation) as world:
         marker = TrackedCamera(world.camera, tracker_of(world.camera.calibration, config.tables.vision))

@@ -23,6 +23,7 @@ import numpy as np
 
 from interfaces.calibrated_files import tables_elsewhere
 from interfaces.errors import ConfigError, RobotError
+from interfaces.limited import read_at_most
 from interfaces.robot import FARTHEST_CAMERA_M, LONGEST_TOOL_M, RobotDescription, Vector3
 from interfaces.suggest import did_you_mean
 from interfaces.toml_file import convert, line_in_entry, line_of, read_toml
@@ -38,6 +39,8 @@ from .unexplained import Unexplained, stored_model
 EXTENDED_FILE = "extended.toml"
 MODEL_FILE = "unexplained.kbmap"
 EFFECTS, UNEXPLAINED = "effects", "unexplained"
+# A map of ten joints takes 1.4 MB, one of the largest nets that are learnt 100 MB.
+MOST_MODEL_BYTES = 2**28
 _HEAD = ("effect", "where", "source")
 # By the end of a number's name: what no sane one exceeds, the unit that it then looks like, and what to do.
 _UNITS: tuple[tuple[str, float, str, str], ...] = (
@@ -125,7 +128,7 @@ def read_unexplained(robot: RobotDescription, tables: Mapping[str, Any], text: s
     table = convert(tables[UNEXPLAINED], _UnexplainedTable, file=file, text=text, prefix=(UNEXPLAINED,))
     model_file, line = file.parent / table.model, line_of(text, (UNEXPLAINED, "model"))
     try:
-        model = stored_model(model_file.read_bytes())
+        model = stored_model(read_at_most(model_file, MOST_MODEL_BYTES))
     except OSError as error:
         raise RobotError(
             f"unexplained.model: {table.model} cannot be read: {error.strerror}",

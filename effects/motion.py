@@ -7,7 +7,6 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import PchipInterpolator
 
 from interfaces.recording import Recording
 from interfaces.records import FloatArray, frozen_array
@@ -92,6 +91,8 @@ class Motion:
     @cached_property
     def cubics(self) -> FloatArray:
         """The path from each row to the next of its run (4, n, d), by powers of the time since, the highest first."""
+        from scipy.interpolate import PchipInterpolator
+
         cubics = np.zeros((4, *self.q.shape))
         cubics[3] = self.q
         for first, end in self.runs:

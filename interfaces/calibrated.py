@@ -14,9 +14,9 @@ from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from kbmaps import RigidChain
+from kbmaps.rotations import exponentials
 
 from .records import FloatArray
 from .robot import RobotDescription
@@ -117,5 +117,5 @@ def _joint_motion(chain: RigidChain, k: int, value: float) -> FloatArray:
     if chain.prismatic[k]:
         motion[:3, 3] = value * chain.axes[k]
     else:
-        motion[:3, :3] = Rotation.from_rotvec(value * chain.axes[k]).as_matrix()
+        motion[:3, :3] = exponentials((value * chain.axes[k])[None])[0][0]
     return motion

@@ -15,6 +15,7 @@ import numpy as np
 
 from .calibrated import CalibratedGeometry
 from .errors import ConfigError
+from .limited import read_at_most
 from .records import FloatArray
 from .robot import RobotDescription
 from .rpy import rpy_of
@@ -72,7 +73,7 @@ def calibrated_urdf(robot: RobotDescription, geometry: CalibratedGeometry, folde
     from lxml import etree  # pyright: ignore[reportAttributeAccessIssue]
 
     parser = etree.XMLParser(resolve_entities=False, no_network=True, load_dtd=False, huge_tree=False)
-    root = etree.fromstring(robot.tree.file.read_bytes(), parser)
+    root = etree.fromstring(read_at_most(robot.tree.file), parser)
     comment = etree.Comment(f" {heading.replace('--', '- -')} ")
     comment.tail = "\n  "
     root.insert(0, comment)

@@ -8,6 +8,9 @@ import numpy as np
 
 from .records import FloatArray
 
+# The largest sensors have 15,000 pixels a side; what is worked on grows with the square of it.
+LARGEST_SIDE_PX = 16384
+
 
 @dataclass(frozen=True, slots=True)
 class StereoCalibration:

@@ -1,18 +1,79 @@
-"""Files of which no more is read than a file of their kind can have: a device, or a file without end, says no size."""
+"""Files from outside: regular ones, and of each no more than a file of its kind can have."""
 
 from __future__ import annotations
 
+import errno
+import os
+import stat
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import BinaryIO
 
 _PIECE = 2**20
+# Of a text that a person or one of our commands writes: no URDF, log or table of ours has a tenth of it.
+MOST_TEXT_BYTES = 2**24
+_KINDS = (
+    (stat.S_ISCHR, "a device, not a file"),
+    (stat.S_ISBLK, "a device, not a file"),
+    (stat.S_ISFIFO, "a pipe, not a file"),
+    (stat.S_ISSOCK, "a socket, not a file"),
+)
 
 
-def read_at_most(file: Path, most: int) -> bytes | None:
-    """The bytes of `file`; None when they are more than `most`. Raises OSError when it cannot be read."""
+class UnfitFile(OSError):
+    """A file that is not read: a device or a pipe, or larger than a file of its kind can be."""
+
+
+def check_regular(file: Path) -> None:
+    """Check that `file` can be given to a library that reads it to its end.
+
+    Raises:
+        UnfitFile: it is a device, a pipe or a socket, which may have no end.
+        OSError: it is a folder, or cannot be looked at.
+    """
+    _require_regular(os.stat(file).st_mode)
+
+
+@contextmanager
+def opened(file: Path, most: int) -> Iterator[BinaryIO]:
+    """Open a regular file for reading.
+
+    Args:
+        most: bytes that a file of its kind can have.
+
+    Raises:
+        UnfitFile: it is larger, or a device, a pipe or a socket.
+        OSError: it cannot be read.
+    """
+    check_regular(file)  # before it is opened: to open a port or a watchdog does something
+    with open(file, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK)) as stream:
+        state = os.fstat(stream.fileno())
+        _require_regular(state.st_mode)
+        if state.st_size > most:
+            raise _too_large(most)
+        yield stream
+
+
+def read_at_most(file: Path, most: int = MOST_TEXT_BYTES) -> bytes:
+    """Return the bytes of a regular file; raises as `opened`."""
     data = bytearray()
-    with file.open("rb") as stream:
-        while piece := stream.read(_PIECE):  # to ask for `most` at once would take the room for it
+    with opened(file, most) as stream:
+        while piece := stream.read(_PIECE):  # files of /proc tell no size
             data += piece
             if len(data) > most:
-                return None
+                raise _too_large(most)
     return bytes(data)
+
+
+def _require_regular(mode: int) -> None:
+    if stat.S_ISDIR(mode):
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
+    for is_kind, what in _KINDS:
+        if is_kind(mode):
+            raise UnfitFile(errno.EINVAL, what)
+
+
+def _too_large(most: int) -> UnfitFile:
+    size = f"{most // 2**30} GiB" if most >= 2**30 else f"{most // 2**20} MiB"
+    return UnfitFile(errno.EFBIG, f"larger than {size}")

@@ -6,15 +6,17 @@ A robot.toml names one; it can name nothing that somebody with the right to inst
 from __future__ import annotations
 
 from collections.abc import Sequence
-from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import msgspec
 
 from .errors import ConfigError
 from .suggest import did_you_mean
 from .toml_file import line_of
+
+if TYPE_CHECKING:
+    from importlib.metadata import EntryPoint
 
 Group = Literal["bodyschema.drivers", "bodyschema.trackers", "bodyschema.effects"]
 
@@ -31,7 +33,7 @@ class PluginConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     name: str
     settings: dict[str, Any] = {}
-    devices: tuple[Annotated[str, msgspec.Meta(pattern="^/dev/.")], ...] = ()
+    devices: tuple[Annotated[str, msgspec.Meta(pattern=r"^/dev/.+\Z")], ...] = ()
     network: bool = False
 
     def check(self, _: Sequence[str], file: Path, text: str) -> None:
@@ -58,7 +60,9 @@ def load(group: Group, name: str) -> Any:
 
 
 def installed(group: Group) -> tuple[EntryPoint, ...]:
-    """What the packages that are installed here offer."""
+    """Return what the packages that are installed here offer."""
+    from importlib.metadata import entry_points
+
     return tuple(entry_points(group=group))
 
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from .covariance import from_upper, upper_triangles
 from .errors import RecordingError
+from .limited import UnfitFile
 from .recording_columns import (
     CENTRES,
     COVARIANCE,
@@ -267,6 +268,8 @@ def joints_in(file: Path) -> tuple[str, ...]:
 
 
 def _unreadable(file: Path, error: OSError) -> RecordingError:
+    if isinstance(error, UnfitFile):
+        return RecordingError(str(error.strerror), file=file, remedy="Cut it, or name a recording")
     if isinstance(error, FileNotFoundError):
         return RecordingError("there is no such file", file=file, remedy="Name a recording that is there")
     if isinstance(error, IsADirectoryError):

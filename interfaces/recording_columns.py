@@ -42,6 +42,7 @@ SMALLEST_SIGMA_M, LARGEST_SIGMA_M = 1e-100, 1e100  # their squares are still num
 _MEND_ROW = "Mend or delete the row"
 # More than any arm has; and of numbers ten hours at 100 pairs/s with 27 columns.
 MOST_COLUMNS, MOST_NUMBERS = 1000, 100_000_000
+LONGEST_NAME = 200
 
 
 class Fault(Exception):
@@ -55,6 +56,10 @@ class Fault(Exception):
     def __init__(self, what: str, *, row: int | None = None, column: str | None = None, remedy: str = "") -> None:
         self.what, self.row, self.column, self.remedy = what, row, column, remedy
         super().__init__(what)
+
+    def moved(self, rows: int) -> Fault:
+        """The same fault of a part that begins with row `rows`."""
+        return Fault(self.what, row=(self.row or 0) + rows, column=self.column, remedy=self.remedy)
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,6 +102,9 @@ def check_width(names: Sequence[str]) -> None:
     if len(names) > MOST_COLUMNS:
         what = f"there are {len(names):,} columns; a recording has at most {MOST_COLUMNS:,}"
         raise Fault(what, remedy="Delete those that are none of a recording's")
+    for name in names:
+        if len(name) > LONGEST_NAME:
+            raise Fault(f"a column's name has {len(name):,} characters", remedy=f"Give it at most {LONGEST_NAME}")
 
 
 def check_header(names: tuple[str, ...], joints: tuple[str, ...]) -> None:
@@ -188,8 +196,13 @@ def _first(bad: BoolArray, what: Callable[[int], str], column: str, remedy: str 
 
 
 def _missing(name: str, unknown: list[str]) -> str:
-    named = f"The columns are named after the joints of robot.toml and x, y, z; not understood: {_list(unknown)}"
+    named = f"The columns are named after the joints of robot.toml and x, y, z; not understood: {_list(unknown[:10])}"
     return named if unknown else f"Add the column {name!r}"
+
+
+def shortened(text: str) -> str:
+    """A text of others in quotes, as much of it as fits into a message."""
+    return repr(text if len(text) <= 40 else text[:37] + "...")
 
 
 def _list(names: Iterable[str]) -> str:

@@ -5,17 +5,19 @@ from __future__ import annotations
 from collections.abc import Iterable
 from itertools import chain
 from pathlib import Path
-from typing import TextIO
+from typing import BinaryIO, TextIO
 
 import numpy as np
 
-from .limited import read_at_most
-from .recording_columns import Fault, Table, check_finite, check_header, check_width
+from .limited import opened
+from .recording_columns import MOST_NUMBERS, Fault, Table, check_finite, check_header, check_width, shortened
 from .records import FloatArray
 
 FIRST_ROW_LINE = 2
-# Of a file, which is read as a whole, and of its first line.
-MOST_BYTES, MOST_HEADER_BYTES = 2**30, 2**20
+# Of a file and of a line: a thousand columns of 25 digits take 25 KiB.
+MOST_BYTES, MOST_LINE_BYTES = 2**30, 2**20
+# What is taken apart at once: enough that Python's own time does not count, little beside the numbers of a recording.
+BLOCK_BYTES = 2**22
 
 
 def read_csv_table(file: Path, joints: tuple[str, ...]) -> Table:
@@ -25,26 +27,29 @@ def read_csv_table(file: Path, joints: tuple[str, ...]) -> Table:
         Fault: something is wrong with the text; rows count from 0 below the header.
         OSError: the file cannot be read.
     """
-    data = read_at_most(file, MOST_BYTES)
-    if data is None:
-        raise Fault("the file is larger than 1 GiB", remedy="Cut it, or write it as Parquet")
-    text = _decoded(data)
-    if not text.strip():
-        raise Fault("the file is empty", remedy="A recording has a header line and at least one row")
-    header, *lines = (line.removesuffix("\r") for line in text.split("\n"))
-    names = tuple(name.strip() for name in header.split(","))
-    _check_header_line(names, joints)
-    whole = lines[-1:] == [""]
-    if whole:
-        lines.pop()
-    if not lines:
+    blocks: list[FloatArray] = []
+    rows, whole = 0, True
+    with opened(file, MOST_BYTES) as stream:
+        names = _header(stream)
+        _check_header_line(names, joints)
+        while data := _block(stream, rows):
+            whole = data.endswith(b"\n")
+            try:
+                blocks.append(_numbers(_lines(_decoded(data)), names, whole))
+            except Fault as fault:
+                raise fault.moved(rows) from None
+            rows += len(blocks[-1])
+            if rows * len(names) > MOST_NUMBERS:
+                most = MOST_NUMBERS // len(names)
+                raise Fault(f"there are more than {most:,} rows of these columns", remedy="Cut the recording")
+    if not rows:
         raise Fault("there are no rows below the header", remedy="Record at least one pair")
-    table = Table(names, _numbers(lines, names, whole))
+    table = Table(names, np.concatenate(blocks))
     check_finite(table)
     if not whole:
         raise Fault(
             "the last line has no line end, so its last number may be cut off",
-            row=len(lines) - 1,
+            row=rows - 1,
             column=names[-1],
             remedy="Add a line end if the number is whole, otherwise delete the line",
         )
@@ -58,11 +63,8 @@ def csv_columns(file: Path) -> tuple[str, ...]:
         Fault: it is no text, or empty.
         OSError: it cannot be read.
     """
-    with file.open("rb") as stream:
-        header = _decoded(stream.readline(MOST_HEADER_BYTES)).rstrip("\r\n")
-    if not header.strip():
-        raise Fault("the file is empty", remedy="A recording has a header line and at least one row")
-    names = tuple(name.strip() for name in header.split(","))
+    with opened(file, MOST_BYTES) as stream:
+        names = _header(stream)
     check_width(names)
     return names
 
@@ -75,14 +77,49 @@ def write_csv_rows(out: TextIO, rows: Iterable[Iterable[float]], integers: froze
     )
 
 
+def _header(stream: BinaryIO) -> tuple[str, ...]:
+    """The names in the first line; a Fault where there is none, or none of text."""
+    line = _line(stream, -1)
+    try:
+        header = _lines(_decoded(line))[0] if line else ""
+    except Fault as fault:
+        raise fault.moved(-1) from None
+    if not header.strip() and not stream.read(MOST_LINE_BYTES).strip():
+        raise Fault("the file is empty", remedy="A recording has a header line and at least one row")
+    for letter in header:
+        if not letter.isprintable() and letter != "\t":
+            what = f"the first line has the character {letter!r}, which is none of a text"
+            raise Fault(what, row=-1, remedy="Name a recording as CSV")
+    return tuple(name.strip() for name in header.split(","))
+
+
+def _block(stream: BinaryIO, row: int) -> bytes:
+    """The next lines; nothing at the end."""
+    data = bytearray()
+    while len(data) < BLOCK_BYTES and (line := _line(stream, row)):
+        data += line
+        row += 1
+    return bytes(data)
+
+
+def _line(stream: BinaryIO, row: int) -> bytes:
+    line = stream.readline(MOST_LINE_BYTES + 1)
+    if len(line) > MOST_LINE_BYTES:
+        raise Fault("the line is longer than 1 MiB", row=row, remedy="Name a recording as CSV")
+    return line
+
+
+def _lines(text: str) -> list[str]:
+    return [line.removesuffix("\r") for line in text.removesuffix("\n").split("\n")]
+
+
 def _decoded(data: bytes) -> str:
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        line = data.count(b"\n", 0, error.start)
         raise Fault(
             f"the byte 0x{data[error.start]:02x} is not UTF-8 text",
-            row=line - 1,
+            row=data.count(b"\n", 0, error.start),
             remedy="Save the recording as CSV in UTF-8, without quotes",
         ) from error
 
@@ -121,7 +158,7 @@ def _first_wrong_field(lines: list[str], names: tuple[str, ...], whole: bool) ->
             return _wrong_width(lines, index, names, whole)
         for name, text in zip(names, line.split(","), strict=True):
             if _number(text) is None:
-                what = "the field is empty" if not text.strip() else f"{_shortened(text)} is not a number"
+                what = "the field is empty" if not text.strip() else f"{shortened(text)} is not a number"
                 return Fault(what, row=index, column=name, remedy="Write it like -0.5 or 1e-3, without quotes")
     raise AssertionError("every field is a number")
 
@@ -144,7 +181,3 @@ def _number(text: str) -> float | None:
         return float(text)
     except ValueError:
         return None
-
-
-def _shortened(text: str) -> str:
-    return repr(text if len(text) <= 40 else text[:37] + "...")

@@ -10,8 +10,10 @@ from typing import Any
 import numpy as np
 
 from .errors import RecordingError
+from .limited import opened
 from .recording_columns import MOST_NUMBERS, Fault, Table, check_finite, check_header, check_width
 
+MOST_BYTES = 2**30  # as many numbers as are read take 0.8 GB
 INTEGER_COLUMNS = frozenset({"segment"})
 
 
@@ -70,7 +72,7 @@ def _check_rows(rows: int, most: int) -> None:
 def _opened(file: Path) -> Iterator[Any]:
     """The Parquet file; a Fault where what is read of it inside is not whole."""
     arrow, parquet = _modules(file)
-    with file.open("rb") as stream:
+    with opened(file, MOST_BYTES) as stream:
         try:
             yield parquet.ParquetFile(stream)
         except (arrow.ArrowException, OSError, ValueError) as error:

@@ -14,23 +14,24 @@ from typing import Annotated, Any, Literal
 import msgspec
 import numpy as np
 from msgspec import Meta
-from scipy.spatial.transform import Rotation
 
 from kbmaps import RigidChain
 
-from .camera import StereoCalibration
+from .camera import LARGEST_SIDE_PX, StereoCalibration
 from .errors import ConfigError, RobotError
 from .records import FloatArray, frozen_array
-from .rpy import rpy_of
+from .rpy import rotation_of, rpy_of
 from .toml_file import convert, line_of, read_toml
 from .urdf import MOVING, UrdfJoint, UrdfTree, chain_between
 
 Vector3 = tuple[float, float, float]
 Positive = Annotated[float, Meta(gt=0)]
+Side = Annotated[int, Meta(ge=1, le=LARGEST_SIDE_PX)]
+ImageSize = tuple[Side, Side]
 # Beyond these a number is of another unit: degrees, millimetres.
 LARGEST_TURN_RAD, LONGEST_TOOL_M, FARTHEST_CAMERA_M = 2.0 * math.pi, 2.0, 50.0
 # One chunk of a zenoh key: no separators, no wild cards, and not the @ that hides a chunk from wild cards.
-NAME = r"^[A-Za-z0-9_][A-Za-z0-9_.-]*$"
+NAME = r"^[A-Za-z0-9_][A-Za-z0-9_.-]*\Z"  # `$` would let a line break follow
 Name = Annotated[str, Meta(pattern=NAME)]
 
 
@@ -76,14 +77,14 @@ class CameraSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     focal_px: Positive | None = None
     principal_point_px: tuple[float, float] | None = None
     baseline_m: Positive | None = None
-    image_size_px: tuple[int, int] | None = None
+    image_size_px: ImageSize | None = None
     pixel_sigma: Positive = 0.2
 
     @property
     def pose(self) -> FloatArray:
         """Pose of the left optical frame in the parent link, shape (4, 4)."""
         T = np.eye(4)
-        T[:3, :3] = Rotation.from_euler("xyz", self.rpy).as_matrix()
+        T[:3, :3] = rotation_of(np.array(self.rpy))
         T[:3, 3] = self.xyz
         return T
 

@@ -17,3 +17,15 @@ def rpy_of(rotation: FloatArray) -> FloatArray:
     sine, cosine = np.sin(roll), np.cos(roll)
     yaw = np.arctan2(sine * r[0, 2] - cosine * r[0, 1], cosine * r[1, 1] - sine * r[1, 2])
     return np.array([roll, pitch, yaw])
+
+
+def rotation_of(rpy: FloatArray) -> FloatArray:
+    """Return the rotation matrix (3, 3) of roll, pitch and yaw (3,) [rad]."""
+    (cr, cp, cy), (sr, sp, sy) = np.cos(rpy), np.sin(rpy)
+    return np.array(
+        [
+            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+            [-sp, cp * sr, cp * cr],
+        ]
+    )

@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 import msgspec
 
 from .errors import ConfigError
-from .limited import read_at_most
+from .limited import UnfitFile, read_at_most
 from .suggest import did_you_mean, hint_at, key_path, struct_in, with_choices
 
 T = TypeVar("T")
@@ -20,8 +20,15 @@ T = TypeVar("T")
 _UNKNOWN = re.compile(r"Object contains unknown field `(?P<field>[^`]*)`(?: - at `\$(?P<path>[^`]*)`)?")
 _HEADER = re.compile(r"\s*\[\[?([^\]]+)\]\]?")
 _KEY = re.compile(r"\s*([A-Za-z0-9_.\"'-]+)\s*=")
-_BETWEEN = re.compile("[,=]")
-MOST_BYTES, MOST_PARTS = 2**22, 100
+# Strings and comments, as far as the text goes where one is not closed. Possessive: no text takes long.
+_QUOTED = re.compile(
+    r'''"""(?:[^"\\]++|\\.|"(?!""))*+(?:"{3,5}|\Z)|"(?:[^"\\\n]++|\\.)*+"?'''
+    r"|'''(?:[^']++|'(?!''))*+(?:'{3,5}|\Z)|'[^'\n]*+'?|#[^\n]*+",
+    re.DOTALL,
+)
+_BETWEEN = re.compile(r"[,=\[\]{}]")
+# The largest robot.toml of ours has 8 KiB. One MiB of keys takes 0.5 GB of memory at most.
+MOST_BYTES, MOST_PARTS = 2**20, 100
 _PLACE = re.compile(r"(?P<what>.*?) - at `\$(?P<path>[^`]*)`$", re.DOTALL)
 
 
@@ -40,12 +47,13 @@ def read_toml(
         raise ConfigError("there is no such file", file=file, remedy=written_by) from error
     except IsADirectoryError as error:
         raise ConfigError("a folder, not a file", file=file, remedy=damaged or "Name the robot.toml in it") from error
+    except UnfitFile as error:
+        raise ConfigError(str(error.strerror), file=file, remedy=damaged or "Name a robot.toml") from error
     except OSError as error:
         raise ConfigError(f"cannot be read: {error.strerror}", file=file, remedy="Mend its permissions") from error
-    if data is None:
-        raise ConfigError("larger than 4 MiB", file=file, remedy=damaged or "Name a robot.toml")
     text = _decoded(data, file, damaged or "Name a robot.toml, or save it as UTF-8")
-    _check_keys(text, file)
+    if (line := line_of_endless_key(text)) is not None:
+        raise ConfigError(f"a key has more than {MOST_PARTS} parts", file=file, line=line, remedy="Delete it")
     try:
         return tomllib.loads(text), text
     except tomllib.TOMLDecodeError as error:
@@ -59,25 +67,27 @@ def read_toml(
         raise ConfigError(f"not TOML: {error}", file=file, remedy="Shorten the number") from error
 
 
-def _check_keys(text: str, file: Path) -> None:
-    """ConfigError where a key has so many parts that reading it would take hours."""
-    for number, line in enumerate(text.split("\n"), 1):
-        if line.count(".") <= MOST_PARTS or line.lstrip().startswith("#"):
-            continue
-        if any(piece.count(".") > MOST_PARTS for piece in _BETWEEN.split(line)):
-            raise ConfigError(f"a key has more than {MOST_PARTS} parts", file=file, line=number, remedy="Delete it")
+def line_of_endless_key(text: str) -> int | None:
+    """Return the first line (from 1) with a key of so many parts that reading it would take hours; else None."""
+    bare = _QUOTED.sub(lambda found: "q" + "\n" * found[0].count("\n"), text)
+    for number, line in enumerate(bare.split("\n"), 1):
+        if line.count(".") > MOST_PARTS and any(piece.count(".") > MOST_PARTS for piece in _BETWEEN.split(line)):
+            return number
+    return None
 
 
-def _not_finite(value: object, keys: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
-    """The keys under which a float is infinite or no number at all."""
+def _unusable(value: object, keys: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], str]]:
+    """Keys with what no key of ours can be, and what it is."""
     if isinstance(value, float) and not math.isfinite(value):
-        yield keys
+        yield keys, "not a finite number"
+    elif isinstance(value, str) and "\0" in value:
+        yield keys, "has the character U+0000, which no name or path has"
     elif isinstance(value, dict):
         for key, inner in value.items():
-            yield from _not_finite(inner, (*keys, key))
+            yield from _unusable(inner, (*keys, key))
     elif isinstance(value, list):
         for inner in value:
-            yield from _not_finite(inner, keys)
+            yield from _unusable(inner, keys)
 
 
 def _decoded(data: bytes, file: Path, remedy: str) -> str:
@@ -98,8 +108,8 @@ def convert(tables: object, kind: type[T], *, file: Path, text: str, prefix: tup
     Args:
         prefix: the keys under which `tables` stands in the file.
     """
-    for keys in _not_finite(tables, prefix):
-        raise ConfigError(f"{'.'.join(keys)}: not a finite number", file=file, line=line_of(text, keys))
+    for keys, what in _unusable(tables, prefix):
+        raise ConfigError(f"{'.'.join(keys)}: {what}", file=file, line=line_of(text, keys))
     try:
         return msgspec.convert(tables, kind)
     except msgspec.ValidationError as error:

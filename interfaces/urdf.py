@@ -1,12 +1,11 @@
-"""A URDF file as a tree of joints, read by yourdfpy behind a parser that fetches and expands nothing.
+"""A URDF file as a tree of joints, read by a parser that fetches and expands nothing.
 
-Meshes are never loaded: kinematics and limits are all that is asked of the file here.
+Only kinematics, limits and masses are read. Meshes are never opened.
 """
 
 from __future__ import annotations
 
-import io
-import re
+import math
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,16 +13,20 @@ from typing import Any
 import numpy as np
 
 from kbmaps import RigidChain
+from kbmaps.rotations import exponentials
 
 from .errors import RobotError
-from .limited import read_at_most
+from .limited import UnfitFile, read_at_most
 from .records import FloatArray, frozen_array
+from .rpy import rotation_of
 from .suggest import did_you_mean
 
 REVOLUTE = frozenset({"revolute", "continuous"})
 MOVING = REVOLUTE | {"prismatic"}
-LARGEST_FILE_BYTES = 16 * 2**20
 MOST_LINKS = 2000  # a humanoid with hands has some hundred
+# Sane ones are 1 long and some metres away; squares of these are far from where floats end.
+SHORTEST_AXIS, LARGEST_PLACE_M = 1e-9, 1e6
+MOST_QUOTED = 60  # characters of a wrong attribute in a message: one line of a terminal
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,6 +38,7 @@ class UrdfJoint:
         T_parent_joint: pose of the joint's frame in its parent link at zero, shape (4, 4).
         axis: unit axis in the joint's frame, shape (3,).
         lower, upper: limits [rad or m]; ±π where a revolute joint has none.
+        mimics: it moves with another joint, as the second finger of a gripper does.
     """
 
     name: str
@@ -45,6 +49,7 @@ class UrdfJoint:
     axis: FloatArray
     lower: float
     upper: float
+    mimics: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,12 +86,13 @@ class UrdfTree:
         Raises:
             RobotError: the file is missing, not XML, not a URDF, or its links do not form a tree.
         """
-        robot = _parse(file)
-        joints = {joint.name: _joint(joint, file) for joint in robot.joints}
-        if len(joints) != len(robot.joints):
-            raise RobotError("two joints have the same name", file=file, remedy="Rename one of them")
-        masses = {link.name: _point_mass(link, file) for link in robot.links if link.inertial is not None}
-        tree = cls(file, str(robot.name), tuple(link.name for link in robot.links), joints, masses)
+        root = _parse(file)
+        links = _by_name(root, "link", file)
+        joints = {name: _joint(element, file) for name, element in _by_name(root, "joint", file).items()}
+        masses = {
+            name: _point_mass(name, link, file) for name, link in links.items() if link.find("inertial") is not None
+        }
+        tree = cls(file, root.get("name", ""), tuple(links), joints, masses)
         tree._check()
         return tree
 
@@ -181,6 +187,11 @@ def chain_between(
         RobotError: a joint does not lie between the links, or the order along the way is another one.
     """
     way = tree.path(start, end)
+    mimicking = next((joint for joint, _ in way if joint.mimics), None)
+    if mimicking is not None:
+        raise RobotError(
+            f"joint {mimicking.name!r} mimics another joint", file=tree.file, remedy="Replace it by a fixed joint"
+        )
     on_way = [joint.name for joint, _ in way if joint.name in joints]
     for name in joints:
         tree.joint(name)
@@ -230,11 +241,9 @@ def standing(joint: UrdfJoint, upward: bool, position: float) -> FloatArray:
 
 
 def _motion(joint: UrdfJoint, position: float) -> FloatArray:
-    from scipy.spatial.transform import Rotation
-
     T = np.eye(4)
     if joint.kind in REVOLUTE:
-        T[:3, :3] = Rotation.from_rotvec(joint.axis * position).as_matrix()
+        T[:3, :3] = exponentials((joint.axis * position)[None])[0][0]
     elif joint.kind == "prismatic":
         T[:3, 3] = joint.axis * position
     return T
@@ -249,67 +258,151 @@ def _movable(way: list[tuple[UrdfJoint, bool]]) -> str:
     return ", ".join(joint.name for joint, _ in way if joint.kind in MOVING) or "none"
 
 
-def _joint(joint: Any, file: Path) -> UrdfJoint:
-    if joint.type not in MOVING | {"fixed"}:
+def _joint(element: Any, file: Path) -> UrdfJoint:
+    name, kind, line = element.get("name"), element.get("type", ""), element.sourceline
+    if kind not in MOVING | {"fixed"}:
         raise RobotError(
-            f"joint {joint.name!r} is of the type {joint.type!r}",
+            f"joint {name!r} is of the type {kind!r}",
             file=file,
+            line=line,
             remedy="Use revolute, continuous, prismatic or fixed joints",
         )
-    if joint.mimic is not None:
-        raise RobotError(f"joint {joint.name!r} mimics another joint", file=file, remedy="Replace it by a fixed joint")
-    axis = np.array([1.0, 0.0, 0.0] if joint.axis is None else joint.axis, dtype=np.float64)
-    length = float(np.linalg.norm(axis))
-    if joint.type != "fixed" and not length > 0:
+    axis = _numbers(element.find("axis"), "xyz", (1.0, 0.0, 0.0), file)
+    length = math.hypot(*axis)  # which does not overflow on the way
+    if kind != "fixed" and not SHORTEST_AXIS < length < 1.0 / SHORTEST_AXIS:
+        what = "no length" if length == 0 else f"the length {length:.3g}"
         raise RobotError(
-            f"the axis of joint {joint.name!r} has no length", file=file, remedy='Write <axis xyz="0 0 1"/>'
+            f"the axis of joint {name!r} has {what}", file=file, line=line, remedy='Write <axis xyz="0 0 1"/>'
         )
-    lower, upper = _limits(joint)
+    lower, upper = _limits(element, kind, file)
     if lower > upper:
-        raise RobotError(f"joint {joint.name!r} has its lower limit above its upper one", file=file, remedy="Swap them")
-    origin = np.eye(4) if joint.origin is None else np.asarray(joint.origin, dtype=np.float64)
-    if not all(np.isfinite(part).all() for part in (origin, axis, lower, upper)):
-        raise RobotError(f"joint {joint.name!r} has a number that is not finite", file=file)
+        raise RobotError(
+            f"joint {name!r} has its lower limit above its upper one", file=file, line=line, remedy="Swap them"
+        )
     return UrdfJoint(
-        name=joint.name,
-        kind=joint.type,
-        parent=joint.parent,
-        child=joint.child,
-        T_parent_joint=frozen_array(origin),
+        name=name,
+        kind=kind,
+        parent=_link_named(element, "parent", file),
+        child=_link_named(element, "child", file),
+        T_parent_joint=frozen_array(_origin(element, file)),
         axis=frozen_array(axis / (length or 1.0)),
         lower=lower,
         upper=upper,
+        mimics=element.find("mimic") is not None,
     )
 
 
-def _point_mass(link: Any, file: Path) -> PointMass:
-    mass = 0.0 if link.inertial.mass is None else float(link.inertial.mass)
-    origin = np.eye(4) if link.inertial.origin is None else np.asarray(link.inertial.origin, dtype=np.float64)
-    if not (np.isfinite(mass) and np.isfinite(origin).all() and mass >= 0.0):
+def _point_mass(name: str, link: Any, file: Path) -> PointMass:
+    inertial = link.find("inertial")
+    [mass] = _numbers(inertial.find("mass"), "value", (0.0,), file)
+    if mass < 0.0:
         raise RobotError(
-            f"link {link.name!r} has a mass of {mass:g} kg, or a centre of mass that is not finite", file=file
+            f"link {name!r} has a mass of {mass:g} kg",
+            file=file,
+            line=inertial.sourceline,
+            remedy="Give a mass of 0 or more",
         )
-    return PointMass(mass, frozen_array(origin[:3, 3]))
+    return PointMass(float(mass), frozen_array(_origin(inertial, file)[:3, 3]))
 
 
-def _limits(joint: Any) -> tuple[float, float]:
-    limit = joint.limit
-    if joint.type == "continuous" or limit is None or limit.lower is None or limit.upper is None:
+def _limits(joint: Any, kind: str, file: Path) -> tuple[float, float]:
+    limit = joint.find("limit")
+    if kind == "continuous" or limit is None or limit.get("lower") is None or limit.get("upper") is None:
         return -np.pi, np.pi
-    return float(limit.lower), float(limit.upper)
+    [lower], [upper] = (_numbers(limit, side, (0.0,), file) for side in ("lower", "upper"))
+    return float(lower), float(upper)
+
+
+def _origin(element: Any, file: Path) -> FloatArray:
+    """The pose (4, 4) of the <origin> in `element`, the identity where there is none."""
+    origin = element.find("origin")
+    T = np.eye(4)
+    T[:3, :3] = rotation_of(_numbers(origin, "rpy", (0.0, 0.0, 0.0), file))
+    T[:3, 3] = _numbers(origin, "xyz", (0.0, 0.0, 0.0), file)
+    if np.abs(T[:3, 3]).max() > LARGEST_PLACE_M:
+        raise RobotError(
+            f"the <origin> of {_owner(origin)} is {np.abs(T[:3, 3]).max():.3g} m away",
+            file=file,
+            line=origin.sourceline,
+            remedy="Give metres",
+        )
+    return T
+
+
+def _numbers(element: Any, attribute: str, default: tuple[float, ...], file: Path) -> FloatArray:
+    """The finite numbers in an attribute, as many as `default` has, which stands for one that is not there."""
+    if element is None or element.get(attribute) is None:
+        return np.array(default)
+    text = element.get(attribute)
+    try:
+        numbers = np.array([float(word) for word in text.split()])
+    except ValueError:
+        numbers = np.empty(0)
+    if len(numbers) != len(default) or not np.isfinite(numbers).all():
+        wanted = "a finite number" if len(default) == 1 else f"{len(default)} finite numbers"
+        raise RobotError(
+            f"<{element.tag} {attribute}={_short(text)}> of {_owner(element)} is not {wanted}",
+            file=file,
+            line=element.sourceline,
+        )
+    return numbers
+
+
+def _short(text: str) -> str:
+    return repr(text if len(text) <= MOST_QUOTED else text[:MOST_QUOTED] + "...")
+
+
+def _owner(element: Any) -> str:
+    """The joint or link around `element`, as an error names it."""
+    for above in element.iterancestors("joint", "link"):
+        return f"{above.tag} {_short(above.get('name', ''))}"
+    return "the robot"
+
+
+def _by_name(root: Any, tag: str, file: Path) -> dict[str, Any]:
+    """The elements of one kind under the root, by their names."""
+    found: dict[str, Any] = {}
+    for element in root.iterfind(tag):
+        name = element.get("name")
+        if not name:
+            raise RobotError(f"a <{tag}> has no name", file=file, line=element.sourceline)
+        if name in found:
+            raise RobotError(
+                f"two {tag}s have the same name, {name!r}",
+                file=file,
+                line=element.sourceline,
+                remedy="Rename one of them",
+            )
+        found[name] = element
+    return found
+
+
+def _link_named(joint: Any, end: str, file: Path) -> str:
+    found = joint.find(end)
+    link = None if found is None else found.get("link")
+    if not link:
+        raise RobotError(
+            f"joint {joint.get('name')!r} names no {end} link",
+            file=file,
+            line=joint.sourceline,
+            remedy=f'Write <{end} link="..."/> in it',
+        )
+    return link
 
 
 def _parse(file: Path) -> Any:
     from lxml import etree  # pyright: ignore[reportAttributeAccessIssue]
 
     try:
-        data = read_at_most(file, LARGEST_FILE_BYTES)
+        data = read_at_most(file)
+    except UnfitFile as error:
+        raise RobotError(
+            f"the URDF is {error.strerror}", file=file, remedy="Keep meshes in files of their own"
+        ) from error
     except OSError as error:
         raise RobotError(
             f"cannot read the URDF: {error.strerror}", file=file, remedy="Mend [robot] urdf, or --urdf"
         ) from error
-    if data is None:
-        raise RobotError("the URDF is larger than 16 MiB", file=file, remedy="Keep meshes in files of their own")
     parser = etree.XMLParser(resolve_entities=False, no_network=True, load_dtd=False, huge_tree=False)
     try:
         root = etree.fromstring(data, parser)
@@ -322,22 +415,4 @@ def _parse(file: Path) -> Any:
         raise RobotError(f"the root element is <{root.tag}>, not <robot>", file=file, line=root.sourceline)
     if sum(1 for _ in root.iter("link", "joint")) > 2 * MOST_LINKS:
         raise RobotError(f"the URDF has more than {MOST_LINKS:,} links", file=file, remedy="Keep the arm's alone")
-    return _read_robot(data, file)
-
-
-def _read_robot(data: bytes, file: Path) -> Any:
-    from yourdfpy import URDF
-
-    try:
-        return URDF.load(io.BytesIO(data), build_scene_graph=False, load_meshes=False).robot
-    except Exception as error:  # yourdfpy raises whatever its conversions raise
-        raise RobotError(
-            f"not a URDF that can be understood: {error}", file=file, line=_line_of(error, data)
-        ) from error
-
-
-def _line_of(error: Exception, data: bytes) -> int | None:
-    """The first line (from 1) that holds the text which the error quotes; None when it quotes none that is there."""
-    quoted = re.search(r"'([^']+)'", str(error))
-    place = -1 if quoted is None else data.find(quoted[1].encode())
-    return None if place < 0 else data.count(b"\n", 0, place) + 1
+    return root

@@ -4,65 +4,69 @@ Numpy and scipy only; no I/O, no clock, no logging. Angles [rad], lengths [m], f
 where a C compiler was there on installation: `kernels_in_use()` tells; BODYSCHEMA_PURE=1 goes without them.
 """
 
-from kbmaps.autocorrelation import shared_by
-from kbmaps.chains.align import Alignment, align
-from kbmaps.chains.belief import ChainBelief
-from kbmaps.chains.chain import RigidChain
-from kbmaps.chains.oriented import OrientedChain, fitted_orientation
-from kbmaps.chains.parameters import ChainParameters, ChainTolerances
-from kbmaps.chains.refitted_tool import with_refitted_tool
-from kbmaps.chains.report import ChainReport, Interval
-from kbmaps.chains.rigid_learner import RigidLearner
-from kbmaps.chains.rigid_recursive import RecursiveRigidLearner
-from kbmaps.chains.search import find_chain
-from kbmaps.chains.tool_layer import ToolLayer
-from kbmaps.changes.detector import ChangeDetector, Suspicion
-from kbmaps.changes.kinds import ChangeKind, any_change, change_kinds
-from kbmaps.changes.naming import Explanation, explanations
-from kbmaps.changes.shared_noise import SharedNoise
-from kbmaps.changes.white_noise import WhiteNoise
-from kbmaps.contest import Contest
-from kbmaps.errors import (
-    BasisError,
-    ChainError,
-    DegenerateDataError,
-    KBMapsError,
-    ModelFormatError,
-    NetSizeError,
-    NonFiniteError,
-    NotNumbersError,
-    RotationError,
-    SettingError,
-    ShapeError,
-    SingularAlphaError,
-)
-from kbmaps.inverse.kinematics import InverseKinematics, InverseSolution
-from kbmaps.inverse.resolved_rates import resolved_rates
-from kbmaps.kernel.kernel_learner import KernelLearner
-from kbmaps.kernel.structured_learner import StructuredLearner
-from kbmaps.ladder import Ladder, Rung
-from kbmaps.maps.basis import JointBasis, learning_bases
-from kbmaps.maps.block_choice import blockwise_precision, follow_a_path
-from kbmaps.maps.exact import ExactLearner, ExactSolution
-from kbmaps.maps.kbmap import KBMap, prediction_errors
-from kbmaps.maps.kernels import in_use as kernels_in_use
-from kbmaps.maps.nlms import NLMS
-from kbmaps.maps.step_size import StepSize
-from kbmaps.maps.support import SUPPORT_LIMIT, SupportSet
-from kbmaps.memory import Memory
-from kbmaps.model import Estimate, Model, PoseModel, PositionModel
-from kbmaps.planning.design import ExperimentDesign, next_pose, next_poses, next_stretch
-from kbmaps.planning.expected_gain import ExpectedError, Forecast, candidate_motions, expected_gain
-from kbmaps.planning.lack_of_fit import systematic_error
-from kbmaps.planning.posterior import ChainPosterior, Posterior
-from kbmaps.residual.learner import ResidualLearner
-from kbmaps.residual.model import ResidualModel
-from kbmaps.rotations import nearest_rotation, quaternions, rotation_matrices, rotation_vectors
-from kbmaps.trains.core_prior import CoreFamily, CorePrior
-from kbmaps.trains.learner import TensorLearner
-from kbmaps.trains.posterior import TensorPosterior
-from kbmaps.trains.settings import TensorSettings
-from kbmaps.trains.train import TensorTrain
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from kbmaps.autocorrelation import shared_by
+    from kbmaps.chains.align import Alignment, align
+    from kbmaps.chains.belief import ChainBelief
+    from kbmaps.chains.chain import RigidChain
+    from kbmaps.chains.oriented import OrientedChain, fitted_orientation
+    from kbmaps.chains.parameters import ChainParameters, ChainTolerances
+    from kbmaps.chains.refitted_tool import with_refitted_tool
+    from kbmaps.chains.report import ChainReport, Interval
+    from kbmaps.chains.rigid_learner import RigidLearner
+    from kbmaps.chains.rigid_recursive import RecursiveRigidLearner
+    from kbmaps.chains.search import find_chain
+    from kbmaps.chains.tool_layer import ToolLayer
+    from kbmaps.changes.detector import ChangeDetector, Suspicion
+    from kbmaps.changes.kinds import ChangeKind, any_change, change_kinds
+    from kbmaps.changes.naming import Explanation, explanations
+    from kbmaps.changes.shared_noise import SharedNoise
+    from kbmaps.changes.white_noise import WhiteNoise
+    from kbmaps.contest import Contest
+    from kbmaps.errors import (
+        BasisError,
+        ChainError,
+        DegenerateDataError,
+        KBMapsError,
+        ModelFormatError,
+        NetSizeError,
+        NonFiniteError,
+        NotNumbersError,
+        RotationError,
+        SettingError,
+        ShapeError,
+        SingularAlphaError,
+    )
+    from kbmaps.inverse.kinematics import InverseKinematics, InverseSolution
+    from kbmaps.inverse.resolved_rates import resolved_rates
+    from kbmaps.kernel.kernel_learner import KernelLearner
+    from kbmaps.kernel.structured_learner import StructuredLearner
+    from kbmaps.ladder import Ladder, Rung
+    from kbmaps.maps.basis import JointBasis, learning_bases
+    from kbmaps.maps.block_choice import blockwise_precision, follow_a_path
+    from kbmaps.maps.exact import ExactLearner, ExactSolution
+    from kbmaps.maps.kbmap import KBMap, prediction_errors
+    from kbmaps.maps.kernels import kernels_in_use
+    from kbmaps.maps.nlms import NLMS
+    from kbmaps.maps.step_size import StepSize
+    from kbmaps.maps.support import SUPPORT_LIMIT, SupportSet
+    from kbmaps.memory import Memory
+    from kbmaps.model import Estimate, Model, PoseModel, PositionModel
+    from kbmaps.planning.design import ExperimentDesign, next_pose, next_poses, next_stretch
+    from kbmaps.planning.expected_gain import ExpectedError, Forecast, candidate_motions, expected_gain
+    from kbmaps.planning.lack_of_fit import systematic_error
+    from kbmaps.planning.posterior import ChainPosterior, Posterior
+    from kbmaps.residual.learner import ResidualLearner
+    from kbmaps.residual.model import ResidualModel
+    from kbmaps.rotations import nearest_rotation, quaternions, rotation_matrices, rotation_vectors
+    from kbmaps.trains.core_prior import CoreFamily, CorePrior
+    from kbmaps.trains.learner import TensorLearner
+    from kbmaps.trains.posterior import TensorPosterior
+    from kbmaps.trains.settings import TensorSettings
+    from kbmaps.trains.train import TensorTrain
 
 __all__ = [
     "NLMS",
@@ -152,3 +156,79 @@ __all__ = [
     "systematic_error",
     "with_refitted_tool",
 ]
+
+# Each public name is imported with its module when it is first asked for: all of them take 0.7 s of CPU.
+_MODULES = {
+    "autocorrelation": ["shared_by"],
+    "chains.align": ["Alignment", "align"],
+    "chains.belief": ["ChainBelief"],
+    "chains.chain": ["RigidChain"],
+    "chains.oriented": ["OrientedChain", "fitted_orientation"],
+    "chains.parameters": ["ChainParameters", "ChainTolerances"],
+    "chains.refitted_tool": ["with_refitted_tool"],
+    "chains.report": ["ChainReport", "Interval"],
+    "chains.rigid_learner": ["RigidLearner"],
+    "chains.rigid_recursive": ["RecursiveRigidLearner"],
+    "chains.search": ["find_chain"],
+    "chains.tool_layer": ["ToolLayer"],
+    "changes.detector": ["ChangeDetector", "Suspicion"],
+    "changes.kinds": ["ChangeKind", "any_change", "change_kinds"],
+    "changes.naming": ["Explanation", "explanations"],
+    "changes.shared_noise": ["SharedNoise"],
+    "changes.white_noise": ["WhiteNoise"],
+    "contest": ["Contest"],
+    "errors": [
+        "BasisError",
+        "ChainError",
+        "DegenerateDataError",
+        "KBMapsError",
+        "ModelFormatError",
+        "NetSizeError",
+        "NonFiniteError",
+        "NotNumbersError",
+        "RotationError",
+        "SettingError",
+        "ShapeError",
+        "SingularAlphaError",
+    ],
+    "inverse.kinematics": ["InverseKinematics", "InverseSolution"],
+    "inverse.resolved_rates": ["resolved_rates"],
+    "kernel.kernel_learner": ["KernelLearner"],
+    "kernel.structured_learner": ["StructuredLearner"],
+    "ladder": ["Ladder", "Rung"],
+    "maps.basis": ["JointBasis", "learning_bases"],
+    "maps.block_choice": ["blockwise_precision", "follow_a_path"],
+    "maps.exact": ["ExactLearner", "ExactSolution"],
+    "maps.kbmap": ["KBMap", "prediction_errors"],
+    "maps.kernels": ["kernels_in_use"],
+    "maps.nlms": ["NLMS"],
+    "maps.step_size": ["StepSize"],
+    "maps.support": ["SUPPORT_LIMIT", "SupportSet"],
+    "memory": ["Memory"],
+    "model": ["Estimate", "Model", "PoseModel", "PositionModel"],
+    "planning.design": ["ExperimentDesign", "next_pose", "next_poses", "next_stretch"],
+    "planning.expected_gain": ["ExpectedError", "Forecast", "candidate_motions", "expected_gain"],
+    "planning.lack_of_fit": ["systematic_error"],
+    "planning.posterior": ["ChainPosterior", "Posterior"],
+    "residual.learner": ["ResidualLearner"],
+    "residual.model": ["ResidualModel"],
+    "rotations": ["nearest_rotation", "quaternions", "rotation_matrices", "rotation_vectors"],
+    "trains.core_prior": ["CoreFamily", "CorePrior"],
+    "trains.learner": ["TensorLearner"],
+    "trains.posterior": ["TensorPosterior"],
+    "trains.settings": ["TensorSettings"],
+    "trains.train": ["TensorTrain"],
+}
+_HOMES = {name: f"kbmaps.{module}" for module, names in _MODULES.items() for name in names}
+
+
+def __getattr__(name: str) -> object:
+    if name not in _HOMES:
+        raise AttributeError(f"module 'kbmaps' has no attribute {name!r}")
+    found = getattr(import_module(_HOMES[name]), name)
+    globals()[name] = found
+    return found
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -18,6 +18,9 @@ FEWEST = 3
 SHORTEST, SHARE, LONGEST = 100, 0.5, 1000
 # A model is worse than another when the difference of their squared errors is so many standard errors.
 CLEARLY = 2.0
+# A model whose mean error on the last so many pairs is so many times another one's does not answer.
+LATELY, WORSE = 50, 1.2
+_LEAST_M = 1e-6
 # A squared error counts up to so many times the median of the better model: an outlier tells of neither.
 _CAP = 9.0
 # No median is taken for smaller [m²]: where a model is exact, another one that errs still loses.
@@ -110,14 +113,24 @@ class Contest:
         """
         errors = ((name, self._errors.get(name)) for name in trusted)
         tried = {name: values for name, values in errors if values is not None and _count(values) >= FEWEST}
-        for name, values in tried.items():
-            if not any(_clearly_worse(values, other) for rival, other in tried.items() if rival != name):
+        rivals = {name: [other for rival, other in tried.items() if rival != name] for name in tried}
+        lately = [name for name in tried if not any(_worse_lately(tried[name], other) for other in rivals[name])]
+        for name in lately:
+            if not any(_clearly_worse(tried[name], other) for other in rivals[name]):
                 return name
-        return present
+        return lately[0] if lately else present
 
 
 def _count(errors: FloatArray) -> int:
     return int(np.isfinite(errors).sum())
+
+
+def _worse_lately(errors: FloatArray, others: FloatArray) -> bool:
+    errors, others = errors[-LATELY:], others[-LATELY:]
+    both = np.isfinite(errors) & np.isfinite(others)
+    if both.sum() < FEWEST:
+        return False
+    return float(np.sqrt(errors[both]).mean()) > WORSE * float(np.sqrt(others[both]).mean()) + _LEAST_M
 
 
 def _clearly_worse(errors: FloatArray, others: FloatArray) -> bool:

@@ -3,38 +3,33 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
+from importlib import import_module
 from typing import Any, cast
 
 import numpy as np
-from scipy.linalg import blas, lapack  # pyright: ignore[reportMissingTypeStubs]
 
 from kbmaps.arrays import FloatArray
 
 _PANEL_COLUMNS = 32
 
 
-def _routine(name: str, library: object = lapack) -> Callable[..., Any]:
-    return cast(Callable[..., Any], getattr(library, name))
-
-
-_dger = _routine("dger", blas)
-_dgeqrf, _dormqr = _routine("dgeqrf"), _routine("dormqr")
-_dtpqrt, _dtpmqrt = _routine("dtpqrt"), _routine("dtpmqrt")
-_dpocon, _dpotrf = _routine("dpocon"), _routine("dpotrf")
-_dpotri, _dpotrs = _routine("dpotri"), _routine("dpotrs")
-_dtrcon, _dtrtri, _dtrtrs = _routine("dtrcon"), _routine("dtrtri"), _routine("dtrtrs")
+@cache
+def _routine(name: str, library: str = "lapack") -> Callable[..., Any]:
+    """Import scipy.linalg with the first call: it takes 0.2 s of CPU, and a robot's description needs none of it."""
+    return cast(Callable[..., Any], getattr(import_module(f"scipy.linalg.{library}"), name))
 
 
 def add_outer_in_place(matrix: FloatArray, column: FloatArray, row: FloatArray) -> None:
     """matrix (n, m), in C order, += column (n,) ⊗ row (m,), without a temporary of its size."""
-    _dger(1.0, row, column, a=matrix.T, overwrite_a=1)
+    _routine("dger", "blas")(1.0, row, column, a=matrix.T, overwrite_a=1)
 
 
 def qr_in_place(square: FloatArray, targets: FloatArray) -> tuple[FloatArray, FloatArray]:
     """R (m, m) and Qᵀ·targets for a square matrix, overwriting both."""
     size = len(square)
-    factor, tau, _, _ = _dgeqrf(square, lwork=64 * size, overwrite_a=1)
-    rotated, _, _ = _dormqr("L", "T", factor, tau, targets, lwork=64 * size, overwrite_c=1)
+    factor, tau, _, _ = _routine("dgeqrf")(square, lwork=64 * size, overwrite_a=1)
+    rotated, _, _ = _routine("dormqr")("L", "T", factor, tau, targets, lwork=64 * size, overwrite_c=1)
     for column in range(size):
         factor[column + 1 :, column] = 0.0
     return factor, rotated
@@ -48,8 +43,8 @@ def qr_append(
     Overwrites all four.
     """
     panel = min(_PANEL_COLUMNS, len(factor))
-    updated, reflectors, blocks, _ = _dtpqrt(0, panel, factor, rows, overwrite_a=1, overwrite_b=1)
-    rotated, _, _ = _dtpmqrt(
+    updated, reflectors, blocks, _ = _routine("dtpqrt")(0, panel, factor, rows, overwrite_a=1, overwrite_b=1)
+    rotated, _, _ = _routine("dtpmqrt")(
         0, reflectors, blocks, targets, row_targets, side="L", trans="T", overwrite_a=1, overwrite_b=1
     )
     return updated, rotated
@@ -60,40 +55,40 @@ def cholesky_lower(symmetric: FloatArray) -> tuple[FloatArray, bool]:
 
     Overwrites the matrix; the part above the diagonal is neither read nor written.
     """
-    factored, info = _dpotrf(symmetric, lower=1, clean=0, overwrite_a=1)
+    factored, info = _routine("dpotrf")(symmetric, lower=1, clean=0, overwrite_a=1)
     return cast(FloatArray, factored), info == 0
 
 
 def cholesky_solve(lower: FloatArray, rhs: FloatArray) -> FloatArray:
     """Solution of L Lᵀ y = rhs."""
-    solution, _ = _dpotrs(lower, rhs, lower=1)
+    solution, _ = _routine("dpotrs")(lower, rhs, lower=1)
     return cast(FloatArray, solution)
 
 
 def lower_solve(lower: FloatArray, rhs: FloatArray) -> FloatArray:
     """Solution of L y = rhs, of a lower triangular matrix without zeros on its diagonal."""
-    return cast(FloatArray, _dtrtrs(lower, rhs, lower=1)[0])
+    return cast(FloatArray, _routine("dtrtrs")(lower, rhs, lower=1)[0])
 
 
 def lower_inverse(lower: FloatArray) -> FloatArray:
     """The inverse of a lower triangular matrix without zeros on its diagonal."""
     # In C order it is the transpose of an upper one in Fortran order, which LAPACK takes as it is.
-    inverse, _ = _dtrtri(lower.T, lower=0)
+    inverse, _ = _routine("dtrtri")(lower.T, lower=0)
     return cast(FloatArray, inverse).T
 
 
 def cholesky_rcond(lower: FloatArray, norm: float) -> float:
     """Estimated reciprocal condition number of L Lᵀ, whose norm is given."""
-    rcond, _ = _dpocon(lower, norm, uplo="L")
+    rcond, _ = _routine("dpocon")(lower, norm, uplo="L")
     return float(rcond)
 
 
 def triangular_solve(upper: FloatArray, rhs: FloatArray, smallest_rcond: float) -> FloatArray | None:
     """Solution of U y = rhs; None if U is nearer to singular than smallest_rcond."""
-    rcond, _ = _dtrcon(upper, norm="1", uplo="U", diag="N")
+    rcond, _ = _routine("dtrcon")(upper, norm="1", uplo="U", diag="N")
     if not rcond > smallest_rcond:
         return None
-    return cast(FloatArray, _dtrtrs(upper, rhs, lower=0)[0])
+    return cast(FloatArray, _routine("dtrtrs")(upper, rhs, lower=0)[0])
 
 
 def smallest_solution(rows: FloatArray, rhs: FloatArray, smallest_rcond: float) -> FloatArray | None:
@@ -102,13 +97,13 @@ def smallest_solution(rows: FloatArray, rhs: FloatArray, smallest_rcond: float) 
     None if the rows are nearer to linearly dependent than smallest_rcond.
     """
     count, unknowns = rows.shape
-    factor, tau, _, _ = _dgeqrf(rows.T.copy(order="F"), lwork=64 * count, overwrite_a=1)
+    factor, tau, _, _ = _routine("dgeqrf")(rows.T.copy(order="F"), lwork=64 * count, overwrite_a=1)
     # The reflectors below the diagonal are not read by the triangular routines.
     upper = np.asfortranarray(factor[:count])
-    rcond, _ = _dtrcon(upper, norm="1", uplo="U", diag="N")
+    rcond, _ = _routine("dtrcon")(upper, norm="1", uplo="U", diag="N")
     if not rcond > smallest_rcond:
         return None
     solution = np.zeros((unknowns, rhs.shape[1]), order="F")
-    solution[:count] = _dtrtrs(upper, rhs, lower=0, trans=1)[0]
-    rotated, _, _ = _dormqr("L", "N", factor, tau, solution, lwork=64 * count, overwrite_c=1)
+    solution[:count] = _routine("dtrtrs")(upper, rhs, lower=0, trans=1)[0]
+    rotated, _, _ = _routine("dormqr")("L", "N", factor, tau, solution, lwork=64 * count, overwrite_c=1)
     return cast(FloatArray, rotated)

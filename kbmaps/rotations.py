@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from typing import cast
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.spatial.transform import Rotation  # pyright: ignore[reportMissingTypeStubs]
 
 from kbmaps.arrays import BoolArray, FloatArray, numbers
 from kbmaps.errors import NonFiniteError, RotationError, ShapeError
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation  # pyright: ignore[reportMissingTypeStubs]
 
 # What a measured rotation may be off by: quaternions and matrices are often written with six digits.
 _TOLERANCE = 1e-4
@@ -67,23 +69,30 @@ def nearest_rotation_rates(matrices: FloatArray, derivatives: FloatArray) -> Flo
     return rotations @ cast(FloatArray, np.linalg.solve(trace * np.eye(3) - stretch, twice))
 
 
+def _rotation_type() -> type[Rotation]:
+    """Import scipy's rotations when they are first needed: it takes 0.4 s of CPU, and most commands need none."""
+    from scipy.spatial.transform import Rotation  # pyright: ignore[reportMissingTypeStubs]
+
+    return Rotation
+
+
 def rotation_vector(rotation: FloatArray) -> FloatArray:
     """Axis times angle (3,) [rad], angle at most π, of a rotation matrix (3, 3)."""
-    return np.asarray(Rotation.from_matrix(rotation).as_rotvec(), dtype=np.float64)
+    return np.asarray(_rotation_type().from_matrix(rotation).as_rotvec(), dtype=np.float64)
 
 
 def rotation_vectors(rotations: FloatArray) -> FloatArray:
     """Axis times angle (n, 3) [rad], angles at most π, of rotation matrices (n, 3, 3)."""
     if not len(rotations):  # scipy refuses an empty batch
         return np.empty((0, 3))
-    return np.asarray(Rotation.from_matrix(rotations).as_rotvec(), dtype=np.float64)
+    return np.asarray(_rotation_type().from_matrix(rotations).as_rotvec(), dtype=np.float64)
 
 
 def quaternions(rotations: FloatArray) -> FloatArray:
     """Unit quaternions x, y, z, w (n, 4), with w not negative, of rotation matrices (n, 3, 3)."""
     if not len(rotations):
         return np.empty((0, 4))
-    return np.asarray(Rotation.from_matrix(rotations).as_quat(canonical=True), dtype=np.float64)
+    return np.asarray(_rotation_type().from_matrix(rotations).as_quat(canonical=True), dtype=np.float64)
 
 
 def exponentials(turns: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -132,7 +141,9 @@ def rotation_matrices(name: str, values: ArrayLike) -> FloatArray:
             raise RotationError(name, "a quaternion is not of length 1")
         # The empty batch is one that scipy refuses.
         return (
-            np.asarray(Rotation.from_quat(given).as_matrix(), dtype=np.float64) if given.size else np.empty((0, 3, 3))
+            np.asarray(_rotation_type().from_quat(given).as_matrix(), dtype=np.float64)
+            if given.size
+            else np.empty((0, 3, 3))
         )
     mended = nearest_rotation(given)
     if given.size and np.abs(mended - given).max() > _TOLERANCE:

@@ -11,7 +11,12 @@ _SHININESS = 20
 
 
 def cast_ball(
-    directions: FloatArray, centre: FloatArray, radius: float, depth: FloatArray, bgr: FloatArray, to_light: FloatArray
+    directions: FloatArray,
+    centre: FloatArray,
+    radius: float,
+    depth: FloatArray,
+    bgr: FloatArray,
+    to_light: FloatArray | None,
 ) -> tuple[np.ndarray, FloatArray]:
     """Which rays hit the ball before anything else, and its colour there.
 
@@ -20,7 +25,7 @@ def cast_ball(
         centre: of the ball in that frame (3,) [m].
         depth: distance along z of what else is there (n, m) [m].
         bgr: the ball's colour (3,), 0 to 1.
-        to_light: unit vector to the light (3,) in that frame.
+        to_light: unit vector to the light (3,) in that frame; None: the ball glows by itself.
 
     Returns:
         The mask (n, m) and the colours (k, 3), 0 to 255, of the rays in the mask.
@@ -30,6 +35,8 @@ def cast_ball(
     discriminant = along**2 - length2 * (centre @ centre - radius**2)
     near = (along - np.sqrt(np.maximum(discriminant, 0.0))) / length2
     mask = (discriminant > 0) & (near > 0) & (near < depth)
+    if to_light is None:
+        return mask, np.tile(255.0 * bgr, (int(mask.sum()), 1))
     rays = directions[mask]
     normals = (near[mask][:, None] * rays - centre) / radius
     facing = np.maximum(normals @ to_light, 0.0)

@@ -17,6 +17,7 @@ from interfaces.errors import ConfigError
 from interfaces.records import FloatArray
 
 from .geometry import cross_matrix
+from .physics_urdf import PhysicsUrdf
 
 
 def load_pybullet() -> Any:
@@ -38,13 +39,15 @@ class Body:
     """One robot in a pybullet world of its own. Angles are true ones, over the named joints.
 
     Args:
-        urdf: URDF text with absolute mesh paths.
+        urdf: the robot, with its meshes.
         joints: names of the joints that `set_angles` and `angles` are about.
         gravity: downward acceleration [m/s²].
         dt: length of one step [s].
     """
 
-    def __init__(self, urdf: str, joints: tuple[str, ...], *, gravity: float = 9.81, dt: float = 1 / 240) -> None:
+    def __init__(
+        self, urdf: PhysicsUrdf, joints: tuple[str, ...], *, gravity: float = 9.81, dt: float = 1 / 240
+    ) -> None:
         self._urdf, self._names = urdf, joints
         self._gravity, self.dt = gravity, dt
         self.bullet: Any = None
@@ -59,7 +62,9 @@ class Body:
         self.client = self.bullet.connect(self.bullet.DIRECT)
         with tempfile.TemporaryDirectory(prefix="bodyschema_") as folder:
             file = Path(folder, "robot.urdf")
-            file.write_text(self._urdf, encoding="utf-8")
+            file.write_text(self._urdf.text, encoding="utf-8")
+            for name, data in self._urdf.meshes.items():
+                Path(folder, name).write_bytes(data)
             self.id = self._load(file)
         count = self.bullet.getNumJoints(self.id, physicsClientId=self.client)
         info = [self.bullet.getJointInfo(self.id, k, physicsClientId=self.client) for k in range(count)]
@@ -138,10 +143,7 @@ class Body:
         try:
             return self.bullet.loadURDF(str(file), useFixedBase=True, physicsClientId=self.client)
         except self.bullet.error as error:
-            raise ConfigError(
-                f"pybullet cannot load the robot's URDF: {error}",
-                remedy="Check its meshes (STL, OBJ or DAE) and its inertias",
-            ) from error
+            raise ConfigError(f"pybullet cannot load the robot's URDF: {error}") from error
 
 
 @contextmanager

@@ -10,7 +10,10 @@ from msgspec import Meta
 
 NonNegative = Annotated[float, Meta(ge=0)]
 Positive = Annotated[float, Meta(gt=0)]
+Fraction = Annotated[float, Meta(ge=0, le=1)]
 Rate = Annotated[int, Meta(ge=1, le=1000)]
+# The ball where neither [sim.camera] nor [vision] describes one.
+BALL_RADIUS_M, BALL_RGB = 0.02, (0.86, 0.07, 0.06)
 
 
 class EncoderConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -59,8 +62,10 @@ class CameraConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
         clutter: number of coloured objects in the background; 0 is a plain wall.
         scene_step: the arm is rendered at every so manieth pixel and scaled up; the marker's surroundings never are.
         supersampling: samples across one pixel around the marker.
-        ball_radius_m: radius of the marker ball [m].
-        ball_rgb: its colour.
+        light: how brightly all but the marker is lit; with less than 1 a ball glows, as a lamp does.
+        ball_radius_m: radius of the marker ball [m]; without this key, as [vision] has it.
+        ball_rgb: its colour; without this key, as [vision] has it.
+        clutter_gap_deg: nothing in the background has a hue nearer to the ball's [deg].
         tags: what is in the hand instead of the ball; without this table, what [vision] looks for.
         tag_dictionary: OpenCV's number of the tags' dictionary.
     """
@@ -70,16 +75,23 @@ class CameraConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     clutter: Annotated[int, Meta(ge=0, le=1000)] = 60
     scene_step: Annotated[int, Meta(ge=1, le=4)] = 2
     supersampling: Annotated[int, Meta(ge=1, le=8)] = 3
-    ball_radius_m: Positive = 0.02
-    ball_rgb: tuple[float, float, float] = (0.86, 0.07, 0.06)
+    light: Annotated[float, Meta(gt=0, le=1)] = 1.0
+    ball_radius_m: Positive | None = None
+    ball_rgb: tuple[Fraction, Fraction, Fraction] | None = None
+    clutter_gap_deg: Annotated[float, Meta(ge=0, le=100)] = 36.0
     tags: tuple[SimTag, ...] = ()
     tag_dictionary: Annotated[int, Meta(ge=0)] = 20
+
+    @property
+    def rgb(self) -> tuple[float, float, float]:
+        """The ball's colour, a red one where nothing is said of it."""
+        return self.ball_rgb or BALL_RGB
 
     @property
     def marker_radius_m(self) -> float:
         """Radius of the smallest ball around the marker's origin that holds it [m]."""
         if not self.tags:
-            return self.ball_radius_m
+            return self.ball_radius_m or BALL_RADIUS_M
         return max(math.hypot(*tag.xyz, math.sqrt(2.0) * tag.half_sheet_m) for tag in self.tags)
 
 

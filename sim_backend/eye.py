@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from colorsys import rgb_to_hsv
+
 import cv2
+import msgspec
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from interfaces.camera import StereoCalibration
 from interfaces.records import FloatArray, ImageArray
@@ -12,13 +16,15 @@ from .ball import cast_ball
 from .config import CameraConfig
 from .panorama import background, cluttered_room
 from .randomness import Stream, generator
-from .raster import Grid, Raster
+from .raster import EmptyWorld, Grid, Raster
 from .tags import TagSheets
 
 TO_LIGHT = np.array([0.35, 0.45, 0.82]) / np.linalg.norm([0.35, 0.45, 0.82])
 # Free pixels around the marker in its finely sampled rectangle, and the most samples across it.
 _MARGIN_PX = 4
 _MOST_SAMPLES = 480
+# A portrait: radius of the marker [px], and how far a tag is turned away [deg]: seen straight on, two poses look alike.
+_PORTRAIT_PX, _PORTRAIT_TURN_DEG = 40.0, 20.0
 _NOISE_FIELDS = 8
 _NOISE_SHIFT_PX = 64
 
@@ -30,15 +36,22 @@ class StereoEyes:
         seed: background and image noise are drawn from it; a frame's noise from its number too.
     """
 
-    def __init__(self, raster: Raster, calibration: StereoCalibration, config: CameraConfig, seed: int) -> None:
+    def __init__(
+        self, raster: Raster | EmptyWorld, calibration: StereoCalibration, config: CameraConfig, seed: int
+    ) -> None:
         self._raster, self._calibration, self._config, self._seed = raster, calibration, config, seed
         width, height = calibration.image_size_px
         step = config.scene_step
         self._scene = Grid(0, 0, -(-width // step), -(-height // step), 1 / step)
         self._directions = self._scene.directions(calibration)
-        self._room = cluttered_room(config.clutter, generator(seed, Stream.BACKGROUND))
+        self._room = cluttered_room(
+            config.clutter,
+            generator(seed, Stream.BACKGROUND),
+            ball_hue_deg=360.0 * rgb_to_hsv(*config.rgb)[0],
+            gap_deg=config.clutter_gap_deg,
+        )
         self._noise = self._noise_fields(width, height)
-        self._bgr = np.array(config.ball_rgb[::-1])
+        self._bgr = np.array(config.rgb[::-1])
         self._sheets = TagSheets(config.tags, config.tag_dictionary) if config.tags else None
 
     def paint(
@@ -67,7 +80,7 @@ class StereoEyes:
 
     def _paint_scene(self, image: ImageArray, T_world_eye: FloatArray, far: ImageArray) -> None:
         bgr, depth = self._raster.render(T_world_eye, self._scene)
-        scene = np.where(np.isinf(depth)[..., None], far, bgr)
+        scene = self._lit(np.where(np.isinf(depth)[..., None], far, bgr))
         height, width = image.shape[:2]
         step = self._config.scene_step
         if step > 1:
@@ -90,16 +103,23 @@ class StereoEyes:
         grid = Grid(left, top, width * fine, height * fine, fine)
         bgr, depth = self._raster.render(T_world_eye, grid)
         patch = image[top : top + height, left : left + width]
-        samples = np.where(np.isinf(depth)[..., None], patch.repeat(fine, 0).repeat(fine, 1), bgr).astype(np.float32)
+        samples = np.where(np.isinf(depth)[..., None], patch.repeat(fine, 0).repeat(fine, 1), self._lit(bgr))
+        samples = samples.astype(np.float32)
         directions, to_light = grid.directions(self._calibration), T_world_eye[:3, :3].T @ TO_LIGHT
         if self._sheets is None:
-            mask, colours = cast_ball(directions, x_eye, self._config.ball_radius_m, depth, self._bgr, to_light)
+            light = to_light if self._config.light == 1.0 else None
+            mask, colours = cast_ball(directions, x_eye, self._config.marker_radius_m, depth, self._bgr, light)
         else:
             # Rays in rows would all miss a straight edge along the row at once.
             directions[..., :2] += (rng.random((*depth.shape, 2)) - 0.5) / (fine * self._calibration.focal_px)
             mask, colours = self._sheets.cast(directions, x_eye, R_eye_marker, depth, to_light)
         samples[mask] = colours
         patch[:] = np.round(samples.reshape(height, fine, width, fine, 3).mean(axis=(1, 3)))
+
+    def _lit(self, image: ImageArray) -> ImageArray:
+        """Return what is not the marker as brightly as it is lit."""
+        light = self._config.light
+        return image if light == 1.0 else (light * image).astype(np.uint8)
 
     def _window(self, x_eye: FloatArray) -> tuple[int, int, int, int] | None:
         """The rectangle (left, top, width, height) around the marker, as far as in the image; None when it is not."""
@@ -131,3 +151,24 @@ class StereoEyes:
         field, dy, dx = int(rng.integers(_NOISE_FIELDS)), *(int(d) for d in rng.integers(_NOISE_SHIFT_PX, size=2))
         height, width = image.shape[:2]
         cv2.add(image, self._noise[field, dy : dy + height, dx : dx + width], dst=image, dtype=cv2.CV_8U)
+
+
+def portrait(calibration: StereoCalibration, config: CameraConfig) -> tuple[ImageArray, ImageArray]:
+    """Return the marker alone before a plain wall in the left and the right image (height, width, 3), BGR, unnoisy.
+
+    It is in the middle between the images, near enough to be measured well, and a tag shows its face.
+    """
+    plain = msgspec.structs.replace(config, clutter=0, noise=0.0)
+    width, height = calibration.image_size_px
+    # As large as that, unless it would leave the images.
+    z = calibration.focal_px * max(config.marker_radius_m / _PORTRAIT_PX, 4.0 * calibration.baseline_m / width)
+    x, y = (np.array([width - 1, height - 1]) / 2 - calibration.principal_point_px) * z / calibration.focal_px
+    left = np.array([x + calibration.baseline_m / 2, y, z])
+    turn = np.eye(3)
+    if config.tags:
+        to_eyes = Rotation.from_euler("x", 180.0 - _PORTRAIT_TURN_DEG, degrees=True)
+        turn = (to_eyes * Rotation.from_euler("xyz", config.tags[0].rpy).inv()).as_matrix()
+    images = np.zeros((height, width, 3), np.uint8), np.zeros((height, width, 3), np.uint8)
+    x_eyes = np.stack([left, left - [calibration.baseline_m, 0.0, 0.0]])
+    StereoEyes(EmptyWorld(), calibration, plain, seed=0).paint(0, np.eye(4), x_eyes, turn, images)
+    return images

@@ -10,12 +10,19 @@ from interfaces.records import FloatArray, ImageArray
 _WIDTH, _HEIGHT = 2048, 1024
 
 
-def cluttered_room(objects: int, rng: np.random.Generator) -> ImageArray:
-    """A picture (1024, 2048, 3), BGR, of a wall with coloured objects: rectangles, discs and bars, none ball-red."""
+def cluttered_room(
+    objects: int, rng: np.random.Generator, *, ball_hue_deg: float = 0.0, gap_deg: float = 36.0
+) -> ImageArray:
+    """Return a picture (1024, 2048, 3), BGR, of a wall with coloured objects: rectangles, discs and bars.
+
+    Args:
+        ball_hue_deg: hue of the ball [deg].
+        gap_deg: nothing has a hue nearer to it [deg].
+    """
     rows = np.linspace(205, 120, _HEIGHT)[:, None, None]
     picture = np.ascontiguousarray(np.broadcast_to(rows * [0.93, 0.97, 1.0], (_HEIGHT, _WIDTH, 3)).astype(np.uint8))
     for _ in range(objects):
-        colour = _colour(rng)
+        colour = _colour(rng, round(ball_hue_deg / 2), round(gap_deg / 2))
         x, y = int(rng.integers(_WIDTH)), int(rng.integers(_HEIGHT))
         w, h = (int(size) for size in rng.integers(15, 160, 2))
         shape = rng.integers(3)
@@ -42,8 +49,10 @@ def background(room: ImageArray, directions: FloatArray, R_world_camera: FloatAr
     return seen.astype(np.uint8, copy=False)
 
 
-def _colour(rng: np.random.Generator) -> tuple[int, int, int]:
-    """Any hue but red at any strength; OpenCV's hue circle has 180 steps and red at 0."""
-    hsv = np.array([[[rng.integers(18, 150), rng.integers(20, 230), rng.integers(40, 240)]]], dtype=np.uint8)
+def _colour(rng: np.random.Generator, ball: int, gap: int) -> tuple[int, int, int]:
+    """Return any hue but the ball's, at any strength; OpenCV's hue circle has 180 steps and red at 0."""
+    # A mixture of two hues at an edge lies between them: more room on the side of the shorter wavelengths.
+    hue = (ball + rng.integers(gap, 168 - gap)) % 180
+    hsv = np.array([[[hue, rng.integers(20, 230), rng.integers(40, 240)]]], dtype=np.uint8)
     blue, green, red = cv2.cvtColor(hsv, cv2.COLOR_HSV2BGR)[0, 0]
     return int(blue), int(green), int(red)

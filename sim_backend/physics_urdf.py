@@ -1,92 +1,316 @@
-"""The true robot as URDF text that pybullet can load from anywhere."""
+"""The true robot as a URDF that pybullet can load from anywhere.
+
+pybullet is given what was understood here, and nothing else of the file: malformed numbers and meshes end its process.
+"""
 
 from __future__ import annotations
 
-from pathlib import Path
+from collections.abc import Iterator, Sequence
+from itertools import chain
+from typing import NamedTuple
 from xml.etree import ElementTree
 
+import msgspec
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from interfaces.errors import RobotError
+from interfaces.limited import read_at_most
+from interfaces.records import FloatArray
+from interfaces.rpy import rpy_of
 from interfaces.urdf import UrdfJoint
 
+from .meshes import LARGEST_M, Meshes
 from .roles import root_link
 from .truth import TrueRobot
 
 # The link above the robot's root. It has no inertia, so that the world frame is the root's frame for pybullet too.
 WORLD_LINK = "bodyschema_world"
-MESHES = (".stl", ".obj", ".dae")
+MOST_LINKS = 120  # pybullet's messages hold 128 joints
+_LONGEST_NAME = 1000  # pybullet's messages hold 1024 bytes
+FARTHEST_M = 100.0
+HEAVIEST_KG = 1e4
+# A rod in the place of a mesh: its radius as a share of its length, and within what [m].
+_ROD_SHARE, _ROD_RADII_M, _SHORTEST_ROD_M = 0.1, (0.005, 0.04), 0.01
+_ROD_RGBA = "0.55 0.57 0.6 1"
+_SIZES = {"box": ("size",), "sphere": ("radius",), "cylinder": ("radius", "length"), "capsule": ("radius", "length")}
+_NAMED = 3
 
 
-def physics_urdf(truth: TrueRobot) -> str:
-    """The URDF of `truth`: joint frames replaced by the true ones, joints that are not learnt locked.
+class PhysicsUrdf(msgspec.Struct, frozen=True):
+    """A URDF and its meshes, which lie beside it.
 
-    Mesh files get absolute paths, links that state no inertia a small one. Textures are left out: no other file of the
+    Attributes:
+        text: the URDF.
+        meshes: files by name.
+        said: what is not as the robot's own URDF has it, in sentences.
+    """
+
+    text: str
+    meshes: dict[str, bytes] = {}
+    said: tuple[str, ...] = ()
+
+
+def physics_urdf(truth: TrueRobot) -> PhysicsUrdf:
+    """Return the URDF of `truth`: joint frames replaced by the true ones, joints that are not learnt locked.
+
+    Meshes have few triangles. What cannot be drawn is left out, and links whose meshes are missing or malformed are
+    rods between their joints. Links that state no inertia get a small one. Textures are left out: no other file of the
     machine's is read because a URDF names it.
 
     Raises:
-        RobotError: a mesh file is missing, or is none.
+        RobotError: the robot has more links than pybullet takes, or joints too far apart.
     """
-    file = truth.tree.file
-    root = ElementTree.fromstring(file.read_bytes())  # `UrdfTree.load` has refused entities and the like
-    for element in root.iterfind("joint"):
-        _set_joint(element, truth.tree.joints[element.attrib["name"]])
-    for mesh in root.iter("mesh"):
-        mesh.set("filename", str(_mesh_file(mesh.get("filename", ""), file)))
-    for material in root.iter("material"):
-        for texture in material.findall("texture"):
-            material.remove(texture)
-    for link in root.iterfind("link"):
-        if link.find("inertial") is None:
-            link.append(_small_inertia())
-    _add_world(root, root_link(truth.tree))
-    return ElementTree.tostring(root, encoding="unicode")
+    return _Writer(truth).written()
 
 
-def _set_joint(element: ElementTree.Element, joint: UrdfJoint) -> None:
-    origin = element.find("origin")
-    if origin is None:
-        origin = ElementTree.SubElement(element, "origin")
-    rotation = Rotation.from_matrix(joint.T_parent_joint[:3, :3])
-    origin.set("xyz", _numbers(joint.T_parent_joint[:3, 3]))
-    origin.set("rpy", _numbers(rotation.as_euler("xyz")))
-    element.set("type", joint.kind)
-    for name in ("mimic", "safety_controller", "dynamics"):
-        for child in element.findall(name):
-            element.remove(child)
-    axis = element.find("axis")
-    if axis is not None:
-        axis.set("xyz", _numbers(joint.axis))
+class _Inertia(NamedTuple):
+    """What an <inertial> says: mass [kg], ixx to izz [kg·m²], and its frame [m], [rad]."""
+
+    mass_kg: float
+    moments: tuple[float, ...]
+    xyz: tuple[float, ...]
+    rpy: tuple[float, ...]
 
 
-def _numbers(values: np.ndarray) -> str:
+_ZERO = (0.0, 0.0, 0.0)
+_MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+# Of a link that states none.
+_SMALL = _Inertia(0.1, (0.0003, 0.0, 0.0, 0.0003, 0.0, 0.0003), _ZERO, _ZERO)
+
+
+class _Writer:
+    def __init__(self, truth: TrueRobot) -> None:
+        self._truth, self._file = truth, truth.tree.file
+        self._source = ElementTree.fromstring(
+            read_at_most(self._file)
+        )  # `UrdfTree.load` has refused entities and the like
+        self._meshes = Meshes(self._file)
+        self._left_out: dict[str, None] = {}  # in order, each once
+        self._rods: set[str] = set()
+        self._colours = {
+            str(material.get("name")): rgba
+            for material in self._source.iter("material")
+            if (rgba := _rgba(material)) is not None
+        }
+
+    def written(self) -> PhysicsUrdf:
+        tree = self._truth.tree
+        if len(tree.links) > MOST_LINKS:
+            raise RobotError(
+                f"the simulation takes robots of up to {MOST_LINKS} links, this one has {len(tree.links)}",
+                file=self._file,
+                remedy="Delete the links that neither carry the cameras nor the marker nor anything that is in the way",
+            )
+        longest = max((*tree.links, *tree.joints), key=len)
+        if len(longest.encode()) > _LONGEST_NAME:
+            raise RobotError(
+                f"the name {longest[:40]!r}... is longer than {_LONGEST_NAME} bytes",
+                file=self._file,
+                remedy="Shorten it",
+            )
+        robot = ElementTree.Element("robot", name="robot")
+        for link in self._source.iterfind("link"):
+            self._add_link(robot, link)
+        for joint in tree.joints.values():
+            self._add_joint(robot, joint)
+        _add_world(robot, root_link(tree))
+        files, coarser = self._meshes.files()
+        self._drop_vanished(robot, files)
+        said = tuple(sentence for sentence in (*self._said(), coarser) if sentence)
+        ElementTree.indent(robot)  # pybullet breaks lines of more than 8 KiB, wherever that is
+        return PhysicsUrdf(ElementTree.tostring(robot, encoding="unicode"), files, said)
+
+    def _add_link(self, robot: ElementTree.Element, source: ElementTree.Element) -> None:
+        name = source.attrib["name"]
+        link = ElementTree.SubElement(robot, "link", name=name)
+        link.append(self._inertial(source))
+        for kind in ("visual", "collision"):
+            shapes = list(source.iterfind(kind))
+            added = [shape for shape in (self._shape(name, shape) for shape in shapes) if shape is not None]
+            lost_mesh = any(shape.find("geometry/mesh") is not None for shape in shapes)
+            if shapes and not added and lost_mesh:
+                added = list(self._rods_of(name, kind))
+            link.extend(added)
+
+    def _leave_out(self, what: str) -> None:
+        self._left_out[what] = None
+
+    def _inertial(self, source: ElementTree.Element) -> ElementTree.Element:
+        inertial = source.find("inertial")
+        inertia = _SMALL if inertial is None else _inertia(inertial)
+        if inertia is None:
+            self._leave_out(f"the inertia of the link {source.attrib['name']!r}, which no body can have")
+            inertia = _SMALL
+        element = ElementTree.Element("inertial")
+        _add_origin(element, inertia.xyz, inertia.rpy)
+        ElementTree.SubElement(element, "mass", value=repr(inertia.mass_kg))
+        ElementTree.SubElement(element, "inertia", dict(zip(_MOMENTS, map(repr, inertia.moments), strict=True)))
+        return element
+
+    def _shape(self, link: str, source: ElementTree.Element) -> ElementTree.Element | None:
+        """Return a <visual> or <collision> as pybullet is given it; None where it cannot be drawn."""
+        geometry = source.find("geometry/*")
+        pose = _origin(source)
+        if geometry is None or pose is None:
+            self._leave_out(f"a {source.tag} of the link {link!r} without geometry or place")
+            return None
+        element = _shape_at(source.tag, *pose)
+        into = ElementTree.SubElement(element, "geometry")
+        if geometry.tag == "mesh":
+            scale = _floats(geometry.get("scale", "1 1 1"), 3)
+            if scale is None or not all(scale):
+                self._leave_out(f"a mesh of the link {link!r} with the scale {geometry.get('scale')!r}")
+                return None
+            name = self._meshes.add(geometry.get("filename", ""), scale, drawn=source.tag == "visual")
+            if name is None:
+                return None
+            ElementTree.SubElement(into, "mesh", filename=name)
+        else:
+            sizes = {key: _sizes(geometry.get(key), 3 if key == "size" else 1) for key in _SIZES.get(geometry.tag, ())}
+            if not sizes or not all(sizes.values()):
+                self._leave_out(f"a {geometry.tag} of the link {link!r} with a size that cannot be drawn")
+                return None
+            ElementTree.SubElement(into, geometry.tag, {key: _numbers(size or ()) for key, size in sizes.items()})
+        if source.tag == "visual":
+            _add_colour(element, self._colour(source))
+        return element
+
+    def _colour(self, visual: ElementTree.Element) -> str | None:
+        material = visual.find("material")
+        if material is None:
+            return None
+        return _rgba(material) or self._colours.get(str(material.get("name")))
+
+    def _rods_of(self, link: str, kind: str) -> Iterator[ElementTree.Element]:
+        """Yield rods from a link's frame to the joints that hang on it."""
+        self._rods.add(link)
+        for joint in self._truth.tree.joints.values():
+            end = joint.T_parent_joint[:3, 3]
+            length = float(np.linalg.norm(end))
+            if joint.parent != link or length < _SHORTEST_ROD_M:
+                continue
+            turn = Rotation.align_vectors(end[None] / length, [[0.0, 0.0, 1.0]])[0]
+            rod = _shape_at(kind, (end / 2).tolist(), rpy_of(turn.as_matrix()).tolist())
+            radius = float(np.clip(_ROD_SHARE * length, *_ROD_RADII_M))
+            ElementTree.SubElement(
+                ElementTree.SubElement(rod, "geometry"), "cylinder", radius=repr(radius), length=repr(length)
+            )
+            if kind == "visual":
+                _add_colour(rod, _ROD_RGBA)
+            yield rod
+
+    def _add_joint(self, robot: ElementTree.Element, joint: UrdfJoint) -> None:
+        place = joint.T_parent_joint[:3, 3]
+        if np.abs(place).max() > FARTHEST_M:
+            raise RobotError(
+                f"joint {joint.name!r} is {np.linalg.norm(place):.3g} m from the joint before it",
+                file=self._file,
+                remedy="Give metres",
+            )
+        element = ElementTree.SubElement(robot, "joint", name=joint.name, type=joint.kind)
+        ElementTree.SubElement(element, "parent", link=joint.parent)
+        ElementTree.SubElement(element, "child", link=joint.child)
+        _add_origin(element, place.tolist(), rpy_of(joint.T_parent_joint[:3, :3]).tolist())
+        ElementTree.SubElement(element, "axis", xyz=_numbers(joint.axis))
+        if joint.kind in ("revolute", "prismatic"):
+            limits = {"lower": repr(joint.lower), "upper": repr(joint.upper), "effort": "1000", "velocity": "10"}
+            ElementTree.SubElement(element, "limit", limits)
+
+    def _drop_vanished(self, robot: ElementTree.Element, files: dict[str, bytes]) -> None:
+        """Drop what shows meshes of which nothing is left with few triangles: screws."""
+        for link in robot.iterfind("link"):
+            for shape in link.findall("visual"):
+                mesh = shape.find("geometry/mesh")
+                if mesh is not None and mesh.get("filename") not in files:
+                    link.remove(shape)
+
+    def _said(self) -> Iterator[str]:
+        drawn = f", and draws rods for {_some(sorted(self._rods))}" if self._rods else ""
+        meshes = self._meshes
+        if meshes.missing:
+            yield (
+                f"missing meshes: {_some(meshes.missing)}. The simulation goes on without{drawn}. It only looks "
+                f"different. To see the robot's shape, put its meshes beside {self._file}"
+            )
+            drawn = ""
+        if meshes.unusable:
+            faults = [f"{name}: {why}" for name, why in meshes.unusable.items()]
+            yield f"meshes that cannot be used: {_some(faults, '; ')}. The simulation goes on without{drawn}"
+        if self._left_out:
+            yield f"the simulation leaves out what it cannot take of {self._file}: {_some(list(self._left_out), '; ')}"
+
+
+def _some(names: Sequence[str], between: str = ", ") -> str:
+    more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
+    return between.join(names[:_NAMED]) + more
+
+
+def _shape_at(kind: str, xyz: Sequence[float], rpy: Sequence[float]) -> ElementTree.Element:
+    element = ElementTree.Element(kind)
+    _add_origin(element, xyz, rpy)
+    return element
+
+
+def _add_origin(element: ElementTree.Element, xyz: Sequence[float], rpy: Sequence[float]) -> None:
+    ElementTree.SubElement(element, "origin", xyz=_numbers(xyz), rpy=_numbers(rpy))
+
+
+def _add_colour(visual: ElementTree.Element, rgba: str | None) -> None:
+    if rgba is not None:
+        # A material of one name has one colour.
+        material = ElementTree.SubElement(visual, "material", name=f"rgba {rgba}")
+        ElementTree.SubElement(material, "color", rgba=rgba)
+
+
+def _numbers(values: Sequence[float] | FloatArray) -> str:
     return " ".join(repr(float(value)) for value in values)
 
 
-def _small_inertia() -> ElementTree.Element:
-    return ElementTree.fromstring(
-        '<inertial><mass value="0.1"/>'
-        '<inertia ixx="0.0003" ixy="0" ixz="0" iyy="0.0003" iyz="0" izz="0.0003"/></inertial>'
-    )
+def _floats(text: str | None, count: int) -> tuple[float, ...] | None:
+    """Return so many finite numbers; None where the text is none."""
+    try:
+        values = tuple(float(word) for word in (text or "").split())
+    except ValueError:
+        return None
+    return values if len(values) == count and all(np.isfinite(values)) else None
 
 
-def _mesh_file(name: str, urdf: Path) -> Path:
-    if name.startswith("package://"):
-        inside = Path(name.removeprefix("package://"))
-        candidates = [parent / part for parent in urdf.resolve().parents for part in (inside, Path(*inside.parts[1:]))]
-    else:
-        candidates = [urdf.resolve().parent / name.removeprefix("file://")]
-    for candidate in candidates:
-        if candidate.is_file():
-            if candidate.resolve().suffix.lower() not in MESHES:
-                raise RobotError(f"the mesh {name!r} is none", file=urdf, remedy=f"Meshes end in {', '.join(MESHES)}")
-            return candidate
-    raise RobotError(
-        f"the mesh {name!r} is missing",
-        file=urdf,
-        remedy="Put it beside the URDF, or replace it by a box, cylinder or sphere for the simulation",
-    )
+def _sizes(text: str | None, count: int) -> tuple[float, ...] | None:
+    """Return so many lengths [m] that a link may have; None where the text is none."""
+    values = _floats(text, count)
+    return values if values is not None and all(0.0 < value <= LARGEST_M for value in values) else None
+
+
+def _origin(element: ElementTree.Element) -> tuple[tuple[float, ...], tuple[float, ...]] | None:
+    """Return the xyz and rpy of an element's <origin>; None where they are no place near the link."""
+    origin = element.find("origin")
+    if origin is None:
+        return _ZERO, _ZERO
+    xyz, rpy = (_floats(origin.get(key, "0 0 0"), 3) for key in ("xyz", "rpy"))
+    if xyz is None or rpy is None or max(map(abs, chain(xyz, rpy))) > FARTHEST_M:
+        return None
+    return xyz, rpy
+
+
+def _rgba(material: ElementTree.Element) -> str | None:
+    colour = material.find("color")
+    values = None if colour is None else _floats(colour.get("rgba"), 4)
+    return None if values is None else _numbers(np.clip(values, 0.0, 1.0))
+
+
+def _inertia(inertial: ElementTree.Element) -> _Inertia | None:
+    """Return what an <inertial> says, a small one where it is all zero; None where no body has such."""
+    mass, tensor, pose = inertial.find("mass"), inertial.find("inertia"), _origin(inertial)
+    kilograms = (0.0,) if mass is None else _floats(mass.get("value"), 1)
+    moments = _floats(" ".join("0" if tensor is None else tensor.get(key, "0") for key in _MOMENTS), 6)
+    if kilograms is None or moments is None or pose is None or not 0.0 <= kilograms[0] <= HEAVIEST_KG:
+        return None
+    if not (kilograms[0] and any(moments)):
+        return _SMALL._replace(mass_kg=kilograms[0] or _SMALL.mass_kg, xyz=pose[0])
+    xx, xy, xz, yy, yz, zz = moments
+    least, _, most = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    return _Inertia(kilograms[0], moments, *pose) if 0.0 < least <= most <= HEAVIEST_KG * LARGEST_M**2 else None
 
 
 def _add_world(root: ElementTree.Element, robot_root: str) -> None:

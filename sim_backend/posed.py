@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 from contextlib import ExitStack
 from types import TracebackType
@@ -26,6 +27,8 @@ from .scene import Scene, scene_of
 from .sources import SimClock, SimJoints, SimStereoCamera
 from .truth import TrueRobot
 from .world import stereo_calibration, stereo_frame
+
+log = logging.getLogger(__name__)
 
 # From one posture to the next [s].
 PERIOD_S = 1.0
@@ -70,6 +73,8 @@ class PosedWorld:
         )
         self._angles = self._true_angles()
         urdf = physics_urdf(self._truth)
+        for sentence in urdf.said:
+            log.warning("%s", sentence)
         with ExitStack() as stack:
             self._body = stack.enter_context(Body(urdf, self.robot.joints))
             link = self.robot.robot.marker_link

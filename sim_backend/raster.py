@@ -95,3 +95,11 @@ class Raster:
         depth = 2 * _NEAR_M * _FAR_M / (_FAR_M + _NEAR_M - (2.0 * buffer - 1.0) * (_FAR_M - _NEAR_M))
         depth[empty] = np.inf
         return rgba[..., 2::-1], depth
+
+
+class EmptyWorld:
+    """What a `Raster` would render of a world without anything in it; needs no pybullet."""
+
+    def render(self, T_world_eye: FloatArray, grid: Grid) -> tuple[ImageArray, FloatArray]:  # noqa: ARG002
+        """Return black colours (rows, columns, 3), and depths (rows, columns) of inf."""
+        return np.zeros((grid.rows, grid.columns, 3), np.uint8), np.full((grid.rows, grid.columns), np.inf)

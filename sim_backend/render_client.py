@@ -6,9 +6,7 @@ import mmap
 import os
 import select
 import subprocess
-import sys
 from contextlib import ExitStack
-from pathlib import Path
 from types import TracebackType
 from typing import Self
 
@@ -16,9 +14,11 @@ import numpy as np
 
 from interfaces.camera import StereoCalibration
 from interfaces.errors import SourceLost
+from interfaces.interpreter import module_command
 from interfaces.records import ImageArray
 
 from .config import SimConfig
+from .physics_urdf import PhysicsUrdf
 from .render_messages import SLOTS, Frame, Setup, Tool, frame_bytes, send, slot_images
 from .scene import Scene
 
@@ -33,7 +33,12 @@ class RenderProcess:
     """
 
     def __init__(
-        self, urdf: str, joints: tuple[str, ...], marker_link: str, calibration: StereoCalibration, config: SimConfig
+        self,
+        urdf: PhysicsUrdf,
+        joints: tuple[str, ...],
+        marker_link: str,
+        calibration: StereoCalibration,
+        config: SimConfig,
     ) -> None:
         self._setup = Setup(
             urdf=urdf,
@@ -126,14 +131,11 @@ class RenderProcess:
 
 
 def _start(memory: int, requests: int, answers: int) -> subprocess.Popen[bytes]:
-    """Start the renderer with this very copy of the package, whatever the working directory."""
-    here = str(Path(__file__).resolve().parents[1])
-    path = os.pathsep.join(part for part in (here, os.environ.get("PYTHONPATH", "")) if part)
     return subprocess.Popen(
-        [sys.executable, "-m", "sim_backend.renderer", str(memory), str(requests), str(answers)],
+        module_command("sim_backend.renderer", str(memory), str(requests), str(answers)),
         pass_fds=(memory, requests, answers),
         stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,
-        env={**os.environ, "PYTHONPATH": path, "OPENBLAS_NUM_THREADS": "1"},
+        env=os.environ | {"OPENBLAS_NUM_THREADS": "1"},
         process_group=0,  # a signal to the group is the parent's to handle
     )

@@ -12,6 +12,7 @@ import numpy as np
 from interfaces.records import ImageArray
 
 from .config import CameraConfig
+from .physics_urdf import PhysicsUrdf
 
 _LENGTH = struct.Struct("<I")
 # Frames in the shared memory; more than can be under way at once.
@@ -21,7 +22,7 @@ SLOTS = 4
 class Setup(msgspec.Struct, frozen=True, tag=True):
     """The robot and the cameras. Comes first, once."""
 
-    urdf: str
+    urdf: PhysicsUrdf
     joints: tuple[str, ...]
     marker_link: str
     focal_px: float

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import subprocess
 import threading
 import time
@@ -26,6 +27,8 @@ from .physics import Physics
 from .render_client import RenderProcess
 from .sources import SimClock, SimJoints, SimStereoCamera
 from .truth import TrueRobot
+
+log = logging.getLogger(__name__)
 
 # How far the world runs ahead of its readers: frames that were taken but not read, and seconds of joint readings.
 FRAMES_AHEAD = 2
@@ -76,6 +79,8 @@ class SimWorld:
         self._truth = TrueRobot.draw(self.robot, self.config, self._extension)
         with ExitStack() as stack:
             self._physics = stack.enter_context(Physics(self._truth, calibration, self.config))
+            for sentence in self._physics.urdf.said:
+                log.warning("%s", sentence)
             self._renderer = stack.enter_context(
                 RenderProcess(
                     self._physics.urdf,

@@ -4,11 +4,32 @@ from __future__ import annotations
 
 import os
 import subprocess
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # read when numpy is imported; more threads only spin
 
 import free_ports
 import pytest
+from hypothesis import HealthCheck, settings
+from skip_remedies import Report, with_remedy
+
+# No time limits: a busy machine is no failure. The same examples in every run, so that a red test is red again;
+# `make soak` draws others (its profile) and keeps what failed in .hypothesis.
+TIMELESS = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.register_profile("suite", TIMELESS, derandomize=True)
+settings.register_profile("soak", TIMELESS, print_blob=True)
+settings.load_profile("suite")
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) -> Generator[None, Report, Report]:
+    return with_remedy((yield))
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_make_collect_report(collector: pytest.Collector) -> Generator[None, Report, Report]:
+    return with_remedy((yield))
 
 
 @pytest.fixture(scope="session")
@@ -27,7 +48,7 @@ def endpoint(free_endpoint: Callable[[], str]) -> str:
 def mount_small_disk(tmp_path: Path) -> Iterator[Callable[[str], Path]]:
     """A function that mounts an empty tmpfs with the options given; needs root."""
     if os.geteuid() != 0:
-        pytest.skip("mounting a small disk needs root")
+        pytest.skip("no small disk can be mounted; to run it: be root")
     folder = tmp_path / "disk"
     folder.mkdir()
 
@@ -35,7 +56,7 @@ def mount_small_disk(tmp_path: Path) -> Iterator[Callable[[str], Path]]:
         command = ["mount", "-t", "tmpfs", "-o", options, "tmpfs", str(folder)]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         if done.returncode:
-            pytest.skip(f"this machine mounts no tmpfs: {done.stderr.strip()}")
+            pytest.skip(f"no tmpfs ({done.stderr.strip()}); to run it: leave the container")
         return folder
 
     yield mount

@@ -13,6 +13,7 @@ from interfaces.errors import BodyschemaError
 from interfaces.records import FloatArray, ImageArray
 
 from .config import HueBand
+from .image_file import read_image
 
 # Around a click the colour is taken from this radius first; the ball is all that joins it with nearly the same [px].
 _SEED_PX = 3
@@ -90,10 +91,10 @@ def read_images(files: Sequence[Path]) -> list[ImageArray]:
     """BGR images of `files`; ColourUnlearnt for one that is no image or has another size than the first."""
     images: list[ImageArray] = []
     for file in files:
-        image = cv2.imread(str(file), cv2.IMREAD_COLOR)
+        image = read_image(file)
         if image is None:
             raise ColourUnlearnt(f"{file} is no image that can be read")
-        images.append(np.asarray(image, dtype=np.uint8))
+        images.append(image)
         if image.shape != images[0].shape:
             raise ColourUnlearnt(f"{file} has another size than {files[0]}", remedy="Give images of one camera")
     return images

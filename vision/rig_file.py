@@ -10,6 +10,7 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
+from interfaces.camera import LARGEST_SIDE_PX
 from interfaces.errors import ConfigError
 from interfaces.records import FloatArray
 from interfaces.toml_file import convert, line_of, read_toml
@@ -24,7 +25,7 @@ _SYMMETRY = 1e-6
 
 Positive = Annotated[float, Meta(gt=0)]
 NotNegative = Annotated[float, Meta(ge=0)]
-Pixels = Annotated[int, Meta(ge=16, le=20000)]
+Pixels = Annotated[int, Meta(ge=16, le=LARGEST_SIDE_PX)]
 Turn = Annotated[float, Meta(ge=-3.2, le=3.2)]
 Place = Annotated[float, Meta(ge=-10, le=10)]
 

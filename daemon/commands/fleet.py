@@ -154,14 +154,15 @@ def diagnose(
     from rich.console import Console
 
     from daemon.diagnosis_run import Asked
-    from daemon.fleet.diagnosing import diagnose_all, require_extra
+    from daemon.extras import require_extra
+    from daemon.fleet.diagnosing import diagnose_all
     from daemon.fleet.diagnosing import workers as cluster
     from daemon.fleet.recordings import jobs
     from daemon.fleet.summary import summary
     from daemon.fleet.summary_view import progress, view
     from daemon.wire import encode
 
-    require_extra()
+    require_extra("fleet", "diagnosing many recordings")
     wanted, asked = jobs(recordings, folder, robot), Asked.of(effects, exclude, seed)
     with (
         progress(Console(stderr=True, highlight=False), len(wanted)) as (told, done),

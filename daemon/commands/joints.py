@@ -34,7 +34,7 @@ def joints(
 
     Needs: robot.toml with servos (`bodyschema robot new`), encoders or a ROS 2 robot, and no sampler that runs.
 
-    Next: mend direction and zero_ticks in robot.toml; then `bodyschema run`.
+    Next: correct what the line below the table names; then `bodyschema run`.
     """
     from rich.console import Console
     from rich.live import Live

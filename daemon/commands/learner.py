@@ -40,16 +40,17 @@ def learner(
     from contextlib import nullcontext
 
     from daemon import logs
+    from daemon.extras import require_extra
     from daemon.fleet.hosting import configs_of, descriptions, spread
     from daemon.learner_host import run_learners
     from daemon.notify import Notifier
     from daemon.signals import Wishes, on_termination
-    from daemon.view_process import require_extra, shown
+    from daemon.view_process import shown
     from interfaces.clock import SystemClock
 
     files = descriptions(robot or (Path(os.environ.get(VARIABLE, HERE)),))
     if view:
-        require_extra()
+        require_extra("view", "the page")
     logs.set_up(verbose=verbose)
     configs = configs_of(files, state_dir)
     if min(processes, len(files)) > 1:

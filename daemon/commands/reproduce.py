@@ -37,11 +37,10 @@ def reproduce(
     Time on two idle cores: fig4 half a minute, fig5 and fig7 about a minute and a half each, fig6 one minute, exactness
     a few seconds. With --no-real fig5 takes half a minute and fig7 one minute.
 
-    Needs: no hardware; pybullet and matplotlib (pip install 'bodyschema[sim]').
+    Needs: no hardware; pybullet and matplotlib (pip install 'bodyschema[sim,plots]').
 
     Next: docs/reproduced.md tells what the paper leaves open, how it was read here, and what --json prints.
     """
-    import importlib.util
     import sys
     import time
     from importlib.metadata import version
@@ -50,19 +49,18 @@ def reproduce(
     import numpy as np
     from rich.console import Console
 
+    from daemon.extras import require_extra
     from daemon.progress import shown_on
     from daemon.reproduce import EXPERIMENTS, Run
     from daemon.reproduce.plot import plot
     from daemon.reproduce.show import show
     from interfaces.errors import ConfigError
 
-    if importlib.util.find_spec("matplotlib") is None:
-        raise ConfigError("the plots need matplotlib", remedy="Type: pip install 'bodyschema[sim]'")
+    require_extra("plots", "a figure")
     if seed < 0:
         raise ConfigError(f"--seed is {seed}", remedy="Give 0 or more")
-    if real and name in ("fig5", "fig7", "all") and importlib.util.find_spec("pybullet") is None:
-        remedy = "Type: pip install 'bodyschema[sim]', or leave them out with --no-real"
-        raise ConfigError("the measured curves need pybullet, which is not installed", remedy=remedy)
+    if real and name in ("fig5", "fig7", "all"):
+        require_extra("sim", "a measured curve (--no-real leaves it out)")
     progress, console = Console(stderr=True), Console()
     try:
         out.mkdir(parents=True, exist_ok=True)

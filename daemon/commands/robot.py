@@ -48,11 +48,11 @@ def new(
 
     Next: mend what is marked CHECK; `bodyschema joints` for signs and zeros; `bodyschema config check`.
     """
-    from daemon.camera_wiring import connected_cameras
     from daemon.commands.config import say, write_new
     from daemon.config import Config
     from daemon.robot_template import guess_from, robot_toml
     from daemon.servo_fitting import first_of, fit, servo_tables
+    from daemon.wiring import connected_cameras
     from interfaces.errors import BodyschemaError, ConfigError
 
     guess = guess_from(urdf, out)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -29,22 +28,23 @@ def run(
 
     from daemon import logs
     from daemon.config import Config
+    from daemon.extras import require_extra
     from daemon.signals import on_termination
     from daemon.supervise import Child, Supervisor
-    from daemon.view_process import require_extra, shown
+    from daemon.view_process import shown
     from daemon.wiring import check_sources
+    from interfaces.interpreter import module_command
 
     if view:
-        require_extra()
+        require_extra("view", "the page")
     logs.set_up(verbose=verbose)
     config = Config.load(robot)
     config.require_learnable()
     check_sources(config, sim=sim)
     options = ["--robot", str(robot), *(["--state-dir", str(state_dir)] if state_dir else [])]
     options += ["--verbose"] if verbose else []
-    python = [sys.executable, "-m", "daemon"]
-    sampler = Child("sampler", [*python, "sampler", *options, *(["--sim"] if sim else [])])
-    learner = Child("learner", [*python, "learner", *options])
+    sampler = Child("sampler", module_command("daemon", "sampler", *options, *(["--sim"] if sim else [])))
+    learner = Child("learner", module_command("daemon", "learner", *options))
     supervisor = Supervisor([sampler, learner])
     with shown(robot) if view else nullcontext(), on_termination(supervisor.stop):
         supervisor.run()

@@ -34,7 +34,7 @@ def scan(
     """
     from rich.console import Console
 
-    from daemon import camera_wiring, servo_wiring
+    from daemon import servo_wiring, wiring
     from daemon.progress import shown_on
     from daemon.scan_report import as_json, report_of
     from daemon.scan_view import show
@@ -53,7 +53,7 @@ def scan(
     ports = servo_wiring.ports_to_scan(port, config)
     with shown_on(Console(stderr=True, highlight=False), "scan") as tell:
         report = replace(
-            report_of(servo_wiring.scan(ports, baud, tell), config), cameras=tuple(camera_wiring.connected_cameras())
+            report_of(servo_wiring.scan(ports, baud, tell), config), cameras=tuple(wiring.connected_cameras())
         )
     if json:
         sys.stdout.write(as_json(report) + "\n")

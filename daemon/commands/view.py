@@ -33,9 +33,9 @@ def view(
 
     from daemon import logs
     from daemon.config import Config
-    from daemon.view_process import require_extra
+    from daemon.extras import require_extra
 
-    require_extra()
+    require_extra("view", "the page")
     from daemon.view.server import serve
 
     logs.set_up(verbose=verbose)

@@ -8,6 +8,19 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
+from diagnosis.report.plot import HEIGHT, WIDTH, Plot
+
+_HEADING = "Forward kinematics learnt while the arm is guided (simulation)"
+_TITLE, _LEGEND_LINE = 22, 14  # heights in the units of the plot, whose text is 10 to 11 high
+_STYLE = (
+    ".page{fill:#fff}text{font:10.5px system-ui,'DejaVu Sans',sans-serif;fill:#4d5662}"
+    ".title{font-size:11px;fill:#1d2127}text.label{fill:#1d2127}text.named{fill:#b3261e}.grid{stroke:#e5e3de}.line{fill:none;stroke-width:1.6}"
+    ".moment{stroke:#b3261e;stroke-dasharray:4 3}.nominal{stroke:#98a2af}.next{stroke:#e39a55;stroke-width:1}"
+    ".expected{stroke:#14804a;stroke-dasharray:5 3}.truth{stroke:#1f78c8;stroke-width:2.2}"
+)
+
 
 @dataclass(frozen=True, slots=True)
 class CurveRow:
@@ -39,50 +52,41 @@ def write_curve(rows: Sequence[CurveRow], file: Path) -> None:
 
 
 def plot_curve(rows: Sequence[CurveRow], change_at: int | None, file: Path) -> None:
-    """The curve as a PNG."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-    from matplotlib.ticker import LogLocator, NullFormatter
-
-    figure = Figure(figsize=(9, 5), layout="constrained")
-    FigureCanvasAgg(figure)
-    axes = figure.add_subplot()
-    pairs = [row.pairs for row in rows]
-    nan = float("nan")
-    axes.plot(pairs, [1e3 * row.nominal_m for row in rows], color="0.6", label="nominal model")
-    axes.plot(
-        pairs,
-        [1e3 * (nan if row.prequential_m is None else row.prequential_m) for row in rows],
-        color="tab:orange",
-        alpha=0.7,
-        label="error on each new pair before it is learnt",
+    """Write the curve as an SVG file, with the moment of the tool change."""
+    curves = {
+        "nominal model": ("nominal", [row.nominal_m for row in rows]),
+        "error on each new sample before it is learnt": ("next", [row.prequential_m for row in rows]),
+        "error that the learner expects": ("expected", [row.claimed_m for row in rows]),
+        "ground truth: error on held-out poses": ("truth", [row.truth_m for row in rows]),
+    }
+    known = [1e3 * error for _, errors in curves.values() for error in errors if error]
+    pairs = np.array([row.pairs for row in rows], dtype=np.float64)
+    plot = Plot(
+        "accepted samples",
+        "mean error [mm]",
+        (float(pairs.min()), float(pairs.max()) + 1.0),
+        (0.8 * min(known), 1.25 * max(known)),
+        log_y=True,
     )
-    axes.plot(
-        pairs,
-        [1e3 * (nan if row.claimed_m is None else row.claimed_m) for row in rows],
-        color="tab:green",
-        linestyle="--",
-        label="error that the learner claims",
-    )
-    axes.plot(pairs, [1e3 * row.truth_m for row in rows], color="tab:blue", linewidth=2, label="held-out poses, truth")
+    marks = []
+    for look, errors in curves.values():
+        there = np.array([bool(error) for error in errors])
+        marks.append(plot.line(pairs[there], 1e3 * np.array([error for error in errors if error]), look))
     if change_at is not None:
-        axes.axvline(change_at, color="tab:red", linewidth=1)
-        axes.annotate(
-            "tool change",
-            (change_at, 0.7),
-            xycoords=("data", "axes fraction"),
-            xytext=(-4, 0),
-            textcoords="offset points",
-            ha="right",
-            color="tab:red",
-        )
-    axes.set_yscale("log")
-    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 3.0)))
-    axes.yaxis.set_major_formatter("{x:g}")
-    axes.yaxis.set_minor_formatter(NullFormatter())
-    axes.grid(alpha=0.3)
-    axes.set_xlabel("accepted pairs")
-    axes.set_ylabel("mean error [mm]")
-    axes.set_title("Learning the arm's forward kinematics while it is guided by hand (simulation)")
-    figure.legend(loc="outside lower center", ncols=4, fontsize=9)
-    figure.savefig(file, dpi=120)
+        marks.append(plot.moment(float(change_at), "tool change"))
+    file.write_text(_page(plot.svg(*marks), {text: look for text, (look, _) in curves.items()}), encoding="utf-8")
+
+
+def _page(plot: str, legend: dict[str, str]) -> str:
+    """Return a standalone SVG: a title, the plot, and a legend below it."""
+    width, height = WIDTH, HEIGHT + _TITLE + _LEGEND_LINE * (len(legend) + 1)
+    title = f'<text class="title" x="{width / 2}" y="16" text-anchor="middle">{_HEADING}</text>'
+    entries = []
+    for number, (text, look) in enumerate(legend.items(), 1):
+        y = HEIGHT + _TITLE + _LEGEND_LINE * number
+        entries.append(f'<path class="line {look}" d="M60 {y - 4}h24"/><text x="92" y="{y}">{text}</text>')
+    return (
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" width="{2 * width}" '
+        f'height="{2 * height}"><style>{_STYLE}</style><rect class="page" width="{width}" height="{height}"/>{title}'
+        f'<svg y="{_TITLE}" width="{WIDTH}" height="{HEIGHT}">{plot}</svg>{"".join(entries)}</svg>\n'
+    )

@@ -74,7 +74,7 @@ class Scene:
     @property
     def plot_file(self) -> Path:
         """The learning curve as a picture."""
-        return self.folder / "learning_curve.png"
+        return self.folder / "learning_curve.svg"
 
 
 def prepare(folder: Path, seed: int, *, bus: Bus | None = None, marker: Marker = "ball") -> Scene:

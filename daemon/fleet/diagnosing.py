@@ -11,7 +11,6 @@ import signal
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,6 +20,7 @@ from daemon.config import Config
 from daemon.diagnosis_run import Asked, Found, Source, measured, require_folder, run, written
 from diagnosis.result import DiagnosisFile
 from interfaces.errors import BodyschemaError, ConfigError
+from interfaces.interpreter import safe_children
 
 from .recordings import Job
 
@@ -63,14 +63,6 @@ class _Read:
 
 Told = Callable[[str, str], None]
 Done = Callable[[Diagnosed], None]
-
-
-def require_extra() -> None:
-    """ConfigError unless the extra `fleet` is installed."""
-    if find_spec("distributed") is None:
-        raise ConfigError(
-            "many diagnoses at once need the extra `fleet`", remedy="Install it: `pip install 'bodyschema[fleet]'`"
-        )
 
 
 def diagnose_all(
@@ -139,7 +131,7 @@ def workers(scheduler: str | None, jobs: int, count: int | None = None) -> Itera
     from distributed import Client, LocalCluster
 
     logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what matters comes as errors of the diagnoses
-    with config.set({"distributed.scheduler.allowed-failures": WORKERS_LOST}):
+    with safe_children(), config.set({"distributed.scheduler.allowed-failures": WORKERS_LOST}):
         if scheduler is not None:
             with _client_of(scheduler) as client:
                 yield client

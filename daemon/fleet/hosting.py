@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -12,6 +11,8 @@ from daemon.learner_host import session_settings
 from daemon.signals import on_termination
 from daemon.supervise import Child, Supervisor
 from interfaces.errors import ConfigError
+from interfaces.interpreter import module_command
+from interfaces.limited import read_at_most
 
 
 def descriptions(named: Sequence[Path]) -> list[Path]:
@@ -35,7 +36,7 @@ def descriptions(named: Sequence[Path]) -> list[Path]:
 
 def _describes_a_robot(file: Path) -> bool:
     try:
-        return re.search(r"^\s*\[robot\]", file.read_text("utf-8"), re.MULTILINE) is not None
+        return re.search(r"^\s*\[robot\]", read_at_most(file).decode("utf-8"), re.MULTILINE) is not None
     except (OSError, UnicodeDecodeError):
         return True  # reading it as a description tells what is wrong
 
@@ -86,7 +87,7 @@ def spread(configs: Sequence[Config], processes: int, options: Sequence[str]) ->
     children: list[Child] = []
     for number, share in enumerate(shares(configs, processes), 1):
         session_settings(share)  # refuses here what would end the process
-        command = [sys.executable, "-m", "daemon", "learner", *options]
+        command = module_command("daemon", "learner", *options)
         for config in share:
             command += ["--robot", str(config.file)]
         if share[0].given_state_dir is not None:

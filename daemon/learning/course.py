@@ -35,7 +35,7 @@ class Course:
         eras: what is learnt.
         counters: all that is counted; who reads it at other times than the course's own takes a copy.
         curve: mean prequential error [m] of the answering model over the pairs.
-        learnt_at: when the last pair was learnt [s]; None: none was.
+        newest_utc: when the last pair that was learnt was stored, ISO 8601; None: none was.
     """
 
     def __init__(self, nominal: NominalModel, settings: LearnerConfig, together_s: float) -> None:
@@ -44,7 +44,7 @@ class Course:
         self._before: LearningState | None = None
         self._met_at = 0.0
         self.counters, self.curve = Counters(), Curve()
-        self.learnt_at: float | None = None
+        self.newest_utc: str | None = None
         self.eras = self._at_nominal()
 
     @property
@@ -67,7 +67,7 @@ class Course:
         self.counters.store, self.counters.last_seq = pair.store, pair.seq
         self.counters.pairs += 1
         self.counters.since_change += 1
-        self.learnt_at = now
+        self.newest_utc = pair.utc
         era = self.eras.present
         if era is None:
             self.eras.waiting.append(pair.q[None], pair.x[None], None if pair.R is None else pair.R[None])
@@ -120,7 +120,7 @@ class Course:
         """Forget what was learnt. With `forget_store`, pairs may come from another store, from its first one on."""
         if forget_store:
             self.counters = Counters(refused=self.counters.refused)
-            self.curve, self.learnt_at = Curve(), None
+            self.curve, self.newest_utc = Curve(), None
         self.counters.since_change = 0
         self.eras, self._before = self._at_nominal(), None
 

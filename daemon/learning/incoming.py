@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from interfaces.errors import RequestError
-from interfaces.records import Pair
+from interfaces.records import FARTHEST_M, LARGEST_Q, Pair
 
 from .state import FARTHEST_M, LARGEST_Q, Counters
 

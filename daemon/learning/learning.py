@@ -340,7 +340,7 @@ class Learning:
             claim=claims.of(answering, None if era is None else era.model.predict),
             support=claims.support,
             pairs=self._course.counters.pairs,
-            learnt_at=self._course.learnt_at,
+            newest_utc=self._course.newest_utc,
             waiting_for=self._waiting_for() if era is None else "",
             orientation=None if era is None else era.orientation,
         )

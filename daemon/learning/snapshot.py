@@ -58,7 +58,7 @@ class Snapshot:
         claim: what is claimed of its error.
         support: where data with the present tool was; None before any.
         pairs: how many pairs it had learnt.
-        learnt_at: time of the last of them [s], or None.
+        newest_utc: when the last of them was stored, ISO 8601; None before any since the learner started.
         waiting_for: what is missing while there is no model.
         orientation: the model of how the marker is turned; None where nothing was learnt of it.
     """
@@ -69,7 +69,7 @@ class Snapshot:
     claim: Claim
     support: SupportSet | None
     pairs: int
-    learnt_at: float | None
+    newest_utc: str | None
     waiting_for: str
     orientation: OrientationModel | None = None
 

@@ -7,7 +7,6 @@ import os
 import signal
 import socket
 import subprocess
-import sys
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -17,6 +16,7 @@ from pathlib import Path
 from daemon.bus import is_alive
 from daemon.signals import with_parent
 from interfaces.errors import BusError
+from interfaces.interpreter import module_command
 
 START_LIMIT_S = 60.0
 END_LIMIT_S = 15.0
@@ -64,11 +64,10 @@ class Process:
 @contextmanager
 def started(name: str, arguments: list[str], environment: Mapping[str, str], log: Path) -> Iterator[Process]:
     """`bodyschema NAME ARGUMENTS` from here to the end of the with statement."""
-    command = [sys.executable, "-m", "daemon", name, *arguments]
     with log.open("wb") as stream:
         # In a process group of its own: Ctrl-C in a terminal is the parent's to handle.
         popen = subprocess.Popen(
-            command,
+            module_command("daemon", name, *arguments),
             stdin=subprocess.DEVNULL,
             stdout=stream,
             stderr=stream,

@@ -14,6 +14,7 @@ from starlette.requests import Request
 from starlette.responses import FileResponse, JSONResponse, Response, StreamingResponse
 from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
+from starlette.types import Receive, Scope, Send
 
 from daemon.command_names import CommandName
 from daemon.wire import CommandReply, decode, encode
@@ -21,7 +22,7 @@ from interfaces.errors import BusError, RequestError
 
 from .documents import Process
 from .guard import Guard
-from .hub import Hub, HubFullError
+from .hub import Follower, Hub, HubFullError
 
 STATIC = Path(__file__).parent / "static"
 LARGEST_BODY = 4096
@@ -29,7 +30,7 @@ LARGEST_BODY = 4096
 HEARTBEAT_S = 10.0
 # How soon a browser asks again.
 RETRY_MS = 1000
-_JSON = "application/json"
+_JSON, _EVENTS = "application/json", "text/event-stream"
 # The report is one file with its own style, and no script.
 _REPORT_POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; frame-ancestors 'none'; sandbox"
 
@@ -76,10 +77,13 @@ def application(hub: Hub, commands: Commands, diagnoses: Diagnosing) -> Starlett
     async def state(_: Request) -> Response:
         return Response(hub.all(), media_type=_JSON)
 
-    async def events(_: Request) -> Response:
-        if hub.full:
-            return JSONResponse({"error": str(HubFullError())}, status_code=503)
-        return StreamingResponse(_events(hub), media_type="text/event-stream")
+    async def events(request: Request) -> Response:
+        if request.method == "HEAD":  # an answer that would never end
+            return Response(media_type=_EVENTS)
+        try:
+            return _EventStream(hub, hub.follow())
+        except HubFullError as error:
+            return JSONResponse({"error": str(error)}, status_code=503)
 
     async def command(request: Request) -> Response:
         asked = decode(await _body(request), PageCommand)
@@ -137,15 +141,27 @@ async def _body(request: Request) -> bytes:
     return body
 
 
-async def _events(hub: Hub) -> AsyncIterator[bytes]:
-    """Server-sent events: each new document under its topic, until the hub is closed."""
-    with hub.following() as follower:
-        yield f"retry: {RETRY_MS}\n\n".encode()
-        while True:
-            news = await follower.take(HEARTBEAT_S)
-            if not news:
-                yield b": still here\n\n"
-            for topic, document in news.items():
-                yield b"event: %s\ndata: %s\n\n" % (topic.encode(), document)
-            if hub.closed:
-                return
+class _EventStream(StreamingResponse):
+    """Server-sent events: each new document under its topic, until the hub is closed or the browser has gone."""
+
+    def __init__(self, hub: Hub, follower: Follower) -> None:
+        super().__init__(_events(hub, follower), media_type=_EVENTS)
+        self._hub, self._follower = hub, follower
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        try:
+            await super().__call__(scope, receive, send)
+        finally:
+            self._hub.leave(self._follower)
+
+
+async def _events(hub: Hub, follower: Follower) -> AsyncIterator[bytes]:
+    yield f"retry: {RETRY_MS}\n\n".encode()
+    while True:
+        news = await follower.take(HEARTBEAT_S)
+        if not news:
+            yield b": still here\n\n"
+        for topic, document in news.items():
+            yield b"event: %s\ndata: %s\n\n" % (topic.encode(), document)
+        if hub.closed:
+            return

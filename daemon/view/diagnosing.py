@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import os
 import subprocess
-import sys
 import tempfile
 import threading
 import time
@@ -22,6 +21,7 @@ from daemon.recorder import History
 from daemon.signals import with_parent
 from diagnosis.result import DiagnosisFile
 from interfaces.errors import BodyschemaError, RecordingError, RequestError
+from interfaces.interpreter import module_command
 from interfaces.records import Pair
 
 from .documents import DiagnosisDocument
@@ -134,8 +134,9 @@ class Diagnoses:
         return len(pairs)
 
     def _diagnose(self, out: Path, number: int) -> None:
-        command = [sys.executable, "-m", "daemon", "diagnose", str(out / RECORDING)]
-        command += ["--robot", str(self._robot_file), "--out", str(out)]
+        command = module_command(
+            "daemon", "diagnose", str(out / RECORDING), "--robot", str(self._robot_file), "--out", str(out)
+        )
         with self._lock:
             if self._stopping:
                 raise RequestError("stopped")

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
 
 import msgspec
 
@@ -67,11 +65,6 @@ class Hub:
         """Whether nothing comes any more."""
         return self._closed
 
-    @property
-    def full(self) -> bool:
-        """Whether no more may follow."""
-        return len(self._followers) >= MOST_FOLLOWERS
-
     def put(self, topic: str, document: object) -> None:
         """Replace a document; followers hear of it when it differs."""
         encoded = msgspec.json.encode(document)
@@ -87,23 +80,23 @@ class Hub:
         with self._lock:
             return msgspec.json.encode({topic: msgspec.Raw(document) for topic, document in self._documents.items()})
 
-    @contextmanager
-    def following(self) -> Iterator[Follower]:
-        """A follower for the time of the with statement, which begins with all documents.
+    def follow(self) -> Follower:
+        """Return a follower, to be given to `leave` in the end; it begins with all documents.
 
         Raises:
             HubFullError: too many follow.
         """
         with self._lock:
-            if self.full:
+            if len(self._followers) >= MOST_FOLLOWERS:
                 raise HubFullError
             follower = Follower(self._documents)
             self._followers.add(follower)
-        try:
-            yield follower
-        finally:
-            with self._lock:
-                self._followers.discard(follower)
+        return follower
+
+    def leave(self, follower: Follower) -> None:
+        """End what `follow` began."""
+        with self._lock:
+            self._followers.discard(follower)
 
     def close(self) -> None:
         """Nothing comes any more: let every follower end."""

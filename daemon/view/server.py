@@ -10,6 +10,7 @@ from collections.abc import Callable
 import uvicorn
 
 from daemon.config import Config
+from daemon.local_web import LOOPBACK
 from daemon.signals import on_termination
 from interfaces.errors import ConfigError
 
@@ -18,7 +19,6 @@ from .diagnosing import Diagnoses
 from .hub import Hub
 from .watch import Watch
 
-LOOPBACK = "127.0.0.1"
 MOST_CONNECTIONS = 100
 END_LIMIT_S = 3
 

@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
+from typing import Any
 
 import numpy as np
 
@@ -20,12 +21,13 @@ ASPECT = (WIDTH - _LEFT - _RIGHT) / (HEIGHT - _TOP - _BOTTOM)
 
 @dataclass(frozen=True)
 class Plot:
-    """Linear axes.
+    """Axes: x is linear, y is linear or logarithmic.
 
     Attributes:
         x_label, y_label: with units.
         x, y: their ranges; from high to low where the axis runs the other way.
         names: of whole numbers on the x axis, in the place of figures.
+        log_y: the y axis is logarithmic; its range is positive.
     """
 
     x_label: str
@@ -33,6 +35,7 @@ class Plot:
     x: tuple[float, float]
     y: tuple[float, float]
     names: Sequence[str] = ()
+    log_y: bool = False
 
     def svg(self, *marks: str) -> str:
         """The plot with marks, the first at the back."""
@@ -81,7 +84,7 @@ class Plot:
 
     def moment(self, x: float, text: str) -> str:
         """An upright line with a name."""
-        left, _ = self._at(np.array([x]), np.array([0.0]))
+        left, _ = self._at(np.array([x]), np.array([self.y[0]]))
         side = "end" if x > 0.5 * sum(self.x) else "start"
         shift = -4 if side == "end" else 4
         return (
@@ -100,13 +103,17 @@ class Plot:
 
     def _at(self, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
         across = (x - self.x[0]) / (self.x[1] - self.x[0])
-        up = (y - self.y[0]) / (self.y[1] - self.y[0])
+        low, high = self._height(self.y[0]), self._height(self.y[1])
+        up = (self._height(y) - low) / (high - low)
         return _LEFT + across * (WIDTH - _LEFT - _RIGHT), HEIGHT - _BOTTOM - up * (HEIGHT - _TOP - _BOTTOM)
+
+    def _height(self, y: Any) -> Any:
+        return np.log10(y) if self.log_y else y
 
     def _grid(self) -> str:
         bottom, right = HEIGHT - _BOTTOM, WIDTH - _RIGHT
         parts = []
-        for value in ticks(*sorted(self.y)):
+        for value in (log_ticks if self.log_y else ticks)(*sorted(self.y)):
             y = self._at(np.array([self.x[0]]), np.array([value]))[1][0]
             zero = " zero" if value == 0.0 else ""
             parts.append(f'<line class="grid{zero}" x1="{_LEFT}" x2="{right}" y1="{y:.1f}" y2="{y:.1f}"/>')
@@ -129,6 +136,17 @@ def ticks(low: float, high: float) -> list[float]:
     step = round_up((high - low) / _TICKS)
     first, last = math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9)
     return [k * step for k in range(first, last + 1)]
+
+
+def log_ticks(low: float, high: float) -> list[float]:
+    """Return the figures 1, 2 and 5 times a power of ten in a positive range."""
+    powers = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
+    return [
+        value
+        for power in powers
+        for value in (10.0**power, 2.0 * 10.0**power, 5.0 * 10.0**power)
+        if low <= value <= high
+    ]
 
 
 def round_up(value: float) -> float:

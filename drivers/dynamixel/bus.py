@@ -4,26 +4,26 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from drivers.servos.bus import Answer, Exchange, Request, Trouble
+from drivers.servos.bus import Answer, Exchange, Request, Trouble, spare_after
 from drivers.servos.bus import Bus as ServoBus
-from drivers.servos.model import Register
+from drivers.servos.model import Layout, Register
 from drivers.servos.packets import Packets
 
-from .packets import PACKETS2, Garbled, packets_of
+from .packets import PACKETS2, packets_of
 
-__all__ = ["Answer", "Bus", "Exchange", "Request", "Trouble", "read_request", "sync_request"]
+__all__ = ["Answer", "Bus", "Exchange", "Request", "Trouble", "sync_request"]
 
 FAST_HEADER = 8  # bytes before the first servo's part
 
 
-def read_request(protocol: int, id: int, address: int, size: int) -> Request:
-    """Ask one servo for part of its control table."""
-    return Request(packets_of(protocol).read(id, address, size), (id,), size, protocol)
+def sync_request(layout: Layout, ids: Sequence[int], *, fast: bool) -> Request:
+    """Ask several servos of Protocol 2.0 for the block that tells their positions."""
+    block = layout.block
 
+    def packet(size: int) -> bytes:
+        return PACKETS2.sync_read(ids, block.address, size, fast=fast)
 
-def sync_request(ids: Sequence[int], address: int, size: int, *, fast: bool) -> Request:
-    """Ask several servos of Protocol 2.0 for the same part."""
-    return Request(PACKETS2.sync_read(ids, address, size, fast=fast), tuple(ids), size, 2, fast)
+    return Request(packet, tuple(ids), block.size, layout.protocol, spare_after(layout, block), fast)
 
 
 class Bus(ServoBus):
@@ -43,20 +43,19 @@ class Bus(ServoBus):
         return self._collect_fast(request) if request.is_fast else super()._collect(request)
 
     def _collect_fast(self, request: Request) -> Exchange:
-        inbox, count = self._inbox(request), len(request.ids)
-        try:
-            while (statuses := PACKETS2.take_fast(inbox.received, 0, count, request.size)) is None:
-                if not inbox.fill():
-                    return Exchange((), inbox.silence(0))
-        except Garbled:
-            return Exchange((), Trouble.GARBLED)
+        inbox, count, size = self._inbox(request), len(request.ids), self._asked_size
+        statuses, trouble = self._next(inbox, lambda received, at: PACKETS2.take_fast(received, at, count, size))
+        if statuses is None:
+            self._note_owed(request, request.ids)
+            return Exchange((), trouble)
         answers: list[Answer] = []
-        start_s = self._sent + len(request.packet) * self._byte_s + self.return_delay_s.get(request.ids[0], 0.0)
-        at = FAST_HEADER
+        start_s = self._sent + self._question_size * self._byte_s + self.return_delay_s.get(request.ids[0], 0.0)
+        part = FAST_HEADER
         for id, status in zip(request.ids, statuses, strict=True):
             trouble = self._doubt(request, id, status, FAST_HEADER + count * status.size)
             if trouble is not None:
                 return Exchange(tuple(answers), trouble, id)
-            answers.append(self._timed(status, start_s + at * self._byte_s, inbox, at))
-            at += status.size
-        return Exchange(tuple(answers), Trouble.GARBLED if len(inbox.received) > at else None)
+            answers.append(self._timed(request, status, start_s + part * self._byte_s, inbox, inbox.at + part))
+            part += status.size
+        is_garbled = len(inbox.received) > inbox.at + part
+        return Exchange(tuple(answers), Trouble.GARBLED if is_garbled else None)

@@ -5,10 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from drivers.serial_line import adapter_latency_s
-from drivers.servos.bus import Bus as ServoBus
-from drivers.servos.bus import Request
 from drivers.servos.drive import Drive
-from drivers.servos.handshake import FittedServo
 from drivers.servos.joints import OpenPort, ServoJoints
 from drivers.servos.make import Make
 from drivers.servos.port import Port
@@ -18,7 +15,7 @@ from .bus import Bus
 from .channel import Channel
 from .config import BusConfig, DynamixelConfig
 from .models import BY_NUMBER, HARDWARE_ERRORS, TICK_S
-from .plan import block_requests
+from .plan import ways_of
 from .port import SafePort
 from .settings import settings_of
 
@@ -31,18 +28,13 @@ def open_serial(config: BusConfig, clock: Clock) -> tuple[Port, float]:
     return port, latency_s
 
 
-def _block_requests(bus: ServoBus, servos: Sequence[FittedServo], config: BusConfig) -> list[Request]:
-    return block_requests(bus, servos, try_fast=config.fast_sync_read == "auto")
-
-
 DYNAMIXEL = Make(
     DynamixelConfig.table,
     BY_NUMBER,
     HARDWARE_ERRORS,
     Bus,
     Channel,
-    "DYNAMIXEL Wizard",
-    _block_requests,
+    ways_of,
     settings_of,
     1,
     TICK_S,

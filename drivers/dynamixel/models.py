@@ -74,8 +74,8 @@ def _layout1(size: int) -> Layout:
     return Layout(1, MappingProxyType(places), Register(36, 11), Register(24, 1), ram=24, size=size)
 
 
-LAYOUT_X = _layout2(64, 661)
-LAYOUT_P = _layout2(512, 661)
+LAYOUT_X = _layout2(64, 662)
+LAYOUT_P = _layout2(512, 762)
 LAYOUT_MX1 = _layout1(74)
 LAYOUT_AX = _layout1(50)
 

@@ -47,6 +47,10 @@ class Packets2:
 
     overhead, ping_size = 11, 3
     refusals, is_weak = 0x7F, False  # e-Manual, status packets
+    pinged_only = (  # the register is in the RAM area, where 2 stands after power-up
+        "answers PING but no READ: its Status Return Level (68; P series 516) is 0 until its supply is switched off "
+        "and on; else the cable is bad"
+    )
     _sdk: Any = sdk.PacketHandler(2.0)
 
     def ping(self, id: int) -> bytes:
@@ -131,6 +135,10 @@ class Packets1:
 
     overhead, ping_size = 6, 0
     refusals, is_weak = 0x58, True
+    pinged_only = (
+        "answers PING but no READ: its Status Return Level (16) may be 0, which only DYNAMIXEL Wizard sets to 2 while "
+        "it cannot be read; else the cable is bad"
+    )
     _sdk: Any = sdk.PacketHandler(1.0)
 
     def ping(self, id: int) -> bytes:

@@ -1,39 +1,37 @@
-"""With which questions all positions of a bus are read."""
+"""The ways in which Dynamixel servos are read."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
-from drivers.servos.bus import Bus, Request
+from drivers.servos.bus import Bus
 from drivers.servos.handshake import FittedServo
 from drivers.servos.model import Layout
+from drivers.servos.plan import Way
 
-from .bus import read_request, sync_request
+from .bus import sync_request
+from .config import BusConfig
 
 
-def block_requests(bus: Bus, servos: Sequence[FittedServo], *, try_fast: bool) -> list[Request]:
-    """The questions of one reading: one for all servos of a series of Protocol 2.0, one for each of Protocol 1.0.
-
-    Args:
-        try_fast: ask once with FAST_SYNC_READ, and keep to it where all answer.
-    """
-    requests: list[Request] = []
-    groups: dict[int, list[FittedServo]] = {}
+def ways_of(bus: Bus, servos: Sequence[FittedServo], config: BusConfig) -> list[list[Way]]:
+    """The ways of each group: one for all servos of Protocol 1.0, and one for each series of Protocol 2.0."""
+    alone = [servo for servo in servos if servo.model.protocol == 1]
+    series: dict[int, list[FittedServo]] = {}
     for servo in servos:
-        block = servo.model.layout.block
-        if servo.model.protocol == 1:
-            requests.append(read_request(1, servo.id, block.address, block.size))
-        else:
-            groups.setdefault(block.address, []).append(servo)
-    for group in groups.values():
-        requests.append(_group_request(bus, group[0].model.layout, [servo.id for servo in group], try_fast))
-    return requests
+        if servo.model.protocol == 2:
+            series.setdefault(servo.model.layout.block.address, []).append(servo)
+    groups = [
+        _ways_of_series(group[0].model.layout, [servo.id for servo in group], try_fast=config.fast_sync_read == "auto")
+        for group in series.values()
+    ]
+    if alone:
+        requests = (bus.read_request(servo.model, servo.id, servo.model.layout.block) for servo in alone)
+        groups.insert(0, [Way("one by one", tuple(requests))])
+    return groups
 
 
-def _group_request(bus: Bus, layout: Layout, ids: list[int], try_fast: bool) -> Request:
-    block = layout.block
-    if len(ids) > 1 and try_fast:
-        fast = sync_request(ids, block.address, block.size, fast=True)
-        if bus.ask(fast).trouble is None:
-            return fast
-    return sync_request(ids, block.address, block.size, fast=False)
+def _ways_of_series(layout: Layout, ids: Sequence[int], *, try_fast: bool) -> list[Way]:
+    sync = Way("Sync Read", (sync_request(layout, ids, fast=False),))
+    if len(ids) < 2 or not try_fast:
+        return [sync]
+    return [Way("Fast Sync Read", (sync_request(layout, ids, fast=True),)), sync]

@@ -18,7 +18,6 @@ PING2 = 10  # bytes
 
 
 def _kind(version: Version) -> Kind:
-    register = 68 if version == 2 else 16
     return Kind(
         name=f"Dynamixel {version}.0",
         bauds=tuple(baud for baud in LIKELY_FIRST if version == 2 or baud <= FASTEST1),
@@ -27,7 +26,6 @@ def _kind(version: Version) -> Kind:
         errors=HARDWARE_ERRORS,
         bus=Bus,
         unsupported=UNSUPPORTED if version == 2 else {},
-        mute=f"answers PING but no READ: set its Status Return Level ({register}) to 2; if it is 2, mend the cable",
     )
 
 

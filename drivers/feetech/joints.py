@@ -6,11 +6,12 @@ from collections.abc import Sequence
 
 from drivers.serial_line import SerialLine, adapter_latency_s
 from drivers.servos.bus import Bus as ServoBus
-from drivers.servos.bus import Request
+from drivers.servos.bus import Request, spare_after
 from drivers.servos.handshake import FittedServo
 from drivers.servos.joints import OpenPort, ServoJoints
 from drivers.servos.make import Make
 from drivers.servos.packets import Packets
+from drivers.servos.plan import Way
 from drivers.servos.port import Port
 from interfaces.protocols import Clock
 
@@ -21,6 +22,10 @@ from .packets import FeetechPackets
 from .settings import settings_of
 
 PACKETS = FeetechPackets()
+SYNC_READ_FAILED = (
+    "Sync Read was not answered by all its servos: they are read one by one, which is slower. "
+    "Look at cable and connectors; it is tried again every 10 s"
+)
 
 
 class Bus(ServoBus):
@@ -39,25 +44,33 @@ def open_serial(config: BusConfig, clock: Clock) -> tuple[Port, float]:
     return SerialLine.open(config.port, config.baud, clock.now), latency_s
 
 
-def block_requests(bus: ServoBus, servos: Sequence[FittedServo], config: BusConfig) -> list[Request]:
-    """The questions of one reading: one for all of the STS and SMS series, one for each of the others."""
+def ways_of(bus: ServoBus, servos: Sequence[FittedServo], config: BusConfig) -> list[list[Way]]:
+    """The ways of each group: one for the STS and SMS series, which know Sync Read, and one for the others."""
     together = [servo for servo in servos if servo.model.protocol == STS]
-    if len(together) > 1 and config.sync_read == "auto":
-        block, ids = together[0].model.layout.block, tuple(servo.id for servo in together)
-        sync = Request(PACKETS.sync_read(ids, block.address, block.size), ids, block.size, STS)
-        if bus.ask(sync).trouble is None:
-            alone = [servo for servo in servos if servo.model.protocol != STS]
-            return [sync, *(_block_request(bus, servo) for servo in alone)]
-    return [_block_request(bus, servo) for servo in servos]
+    if len(together) < 2 or config.sync_read != "auto":
+        return [[_one_by_one(bus, servos)]]
+    alone = [servo for servo in servos if servo.model.protocol != STS]
+    groups = [[_sync_read(together), _one_by_one(bus, together)]]
+    return [*groups, [_one_by_one(bus, alone)]] if alone else groups
 
 
-def _block_request(bus: ServoBus, servo: FittedServo) -> Request:
-    return bus.read_request(servo.model, servo.id, servo.model.layout.block)
+def _sync_read(servos: Sequence[FittedServo]) -> Way:
+    layout, ids = servos[0].model.layout, tuple(servo.id for servo in servos)
+    block = layout.block
+
+    def packet(size: int) -> bytes:
+        return PACKETS.sync_read(ids, block.address, size)
+
+    request = Request(packet, ids, block.size, STS, spare_after(layout, block))
+    return Way("Sync Read", (request,), SYNC_READ_FAILED)
 
 
-FEETECH = Make(
-    FeetechConfig.table, BY_NUMBER, HARDWARE_ERRORS, Bus, Channel, "Feetech's FD", block_requests, settings_of, -1
-)
+def _one_by_one(bus: ServoBus, servos: Sequence[FittedServo]) -> Way:
+    requests = (bus.read_request(servo.model, servo.id, servo.model.layout.block) for servo in servos)
+    return Way("one by one", tuple(requests))
+
+
+FEETECH = Make(FeetechConfig.table, BY_NUMBER, HARDWARE_ERRORS, Bus, Channel, ways_of, settings_of, -1)
 
 
 class FeetechJoints(ServoJoints):

@@ -18,6 +18,8 @@ class FeetechPackets:
 
     overhead, ping_size = 6, 0
     refusals, is_weak = 0xC0, True  # no servo sets these two bits
+    # At any Response Status Level they answer READ.
+    pinged_only = "answers PING but no READ: look at its cable and supply"
 
     def ping(self, id: int) -> bytes:
         """PING."""

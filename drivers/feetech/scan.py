@@ -14,5 +14,4 @@ FEETECH_SERVOS = Kind(
     models=BY_NUMBER,
     errors=HARDWARE_ERRORS,
     bus=Bus,
-    mute="answers PING but no READ: look at its cable and supply",
 )

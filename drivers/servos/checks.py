@@ -14,9 +14,10 @@ from interfaces.protocols import Clock
 
 from .bus import Bus, Request
 from .config import ServosConfig
-from .handshake import Finding, FittedServo, identify
+from .handshake import Finding, FittedServo, ask_again, identify
 from .joints import OpenPort
 from .make import Make
+from .plan import Plan
 
 READ_S = 1.0
 IDENTIFY_S = 1.0  # then who was not asked yet is not asked any more
@@ -24,6 +25,7 @@ FEW_PER_S = 100.0
 MANY_TROUBLES = 0.01
 LONGEST_DELAY_S = 50e-6
 TYPE = "servos"
+FAST_BAUD = 1_000_000
 
 
 def servo_checks(
@@ -42,7 +44,7 @@ def servo_checks(
             servos = [finding.servo for finding in found if finding.servo is not None]
             for servo in servos:
                 yield from _health(make, buses[servo.bus], servo)
-            yield from _delays(make, servos)
+            yield from _delays(servos)
             if servos:
                 yield from _pace(make, config, buses, servos, clock, read_s)
         except SourceError as error:
@@ -72,8 +74,10 @@ def _presence(found: Sequence[Finding]) -> Iterator[Check]:
 
 def _health(make: Make, bus: Bus, servo: FittedServo) -> Iterator[Check]:
     layout = servo.model.layout
-    exchange = bus.ask(bus.read_request(servo.model, servo.id, layout.state))
+    exchange = ask_again(bus, bus.read_request(servo.model, servo.id, layout.state))
     if exchange.trouble is not None:
+        said = f"joint {servo.joint} (ID {servo.id}) does not tell how it is: {exchange.trouble}"
+        yield Check(TYPE, "wrong", said, "look at cable and connectors, then bodyschema doctor once more")
         return
     status = exchange.answers[0].status
     has_torque = layout.value("torque", status.data, layout.state.address)
@@ -87,16 +91,14 @@ def _health(make: Make, bus: Bus, servo: FittedServo) -> Iterator[Check]:
         yield Check(TYPE, "ok", f"joint {servo.joint} holds its place: `bodyschema run` switches its torque off")
 
 
-def _delays(make: Make, servos: Sequence[FittedServo]) -> Iterator[Check]:
-    slow = [servo for servo in servos if servo.return_delay_s > LONGEST_DELAY_S]
-    if not slow:
-        return
-    worst_us = 1e6 * max(servo.return_delay_s for servo in slow)
-    addresses = sorted({servo.model.layout["return_delay"].address for servo in slow})
-    register = " or ".join(map(str, addresses))
-    names = ", ".join(servo.joint for servo in slow)
-    said = f"{names}: each answer comes {worst_us:.0f} µs late by Return Delay Time"
-    yield Check(TYPE, "warning", said, f"{make.software}: set Return Delay Time ({register}) to 0")
+def _delays(servos: Sequence[FittedServo]) -> Iterator[Check]:
+    for name in dict.fromkeys(servo.bus for servo in servos):
+        slow = [s for s in servos if s.bus == name and s.return_delay_s > LONGEST_DELAY_S]
+        if slow:
+            worst_us = 1e6 * max(servo.return_delay_s for servo in slow)
+            names = ", ".join(servo.joint for servo in slow)
+            said = f"{names}: each answer comes {worst_us:.0f} µs late by Return Delay Time"
+            yield Check(TYPE, "warning", said, f"bodyschema servos set return_delay=0 --bus {name}")
 
 
 def _pace(
@@ -109,24 +111,27 @@ def _pace(
 ) -> Iterator[Check]:
     """Read for a while, as fast as it goes."""
     plans = {
-        name: make.block_requests(bus, [s for s in servos if s.bus == name], config.buses[name])
+        name: Plan(bus, make.ways(bus, [s for s in servos if s.bus == name], config.buses[name]))
         for name, bus in buses.items()
     }
+    requests = {name: plan.requests for name, plan in plans.items()}
     before = {name: (bus.counts.exchanges, dict(bus.counts.troubles)) for name, bus in buses.items()}
     end, times = clock.now() + read_s, [clock.now()]
     while clock.now() < end:
-        if _read_all(buses, plans):
+        if _read_all(buses, requests):
             times.append(clock.now())
-    yield _rate(times, read_s, config.rate_hz)
+    yield _rate(times, read_s, config)
+    for name, plan in plans.items():
+        yield from (Check(TYPE, "warning", f"{name}: {complaint}") for complaint in plan.complaints)
     for name, bus in buses.items():
         exchanges, troubles = before[name]
         new = {t.value: n - troubles.get(t, 0) for t, n in bus.counts.troubles.items() if n > troubles.get(t, 0)}
         yield _troubles(name, bus.counts.exchanges - exchanges, new)
 
 
-def _read_all(buses: dict[str, Bus], plans: dict[str, list[Request]]) -> bool:
+def _read_all(buses: dict[str, Bus], requests: dict[str, list[Request]]) -> bool:
     is_whole = True
-    for questions in zip_longest(*plans.values()):
+    for questions in zip_longest(*requests.values()):
         asked = [(bus, question) for bus, question in zip(buses.values(), questions, strict=True) if question]
         for bus, question in asked:
             bus.send(question)
@@ -135,15 +140,19 @@ def _read_all(buses: dict[str, Bus], plans: dict[str, list[Request]]) -> bool:
     return is_whole
 
 
-def _rate(times: Sequence[float], read_s: float, wanted_hz: float) -> Check:
-    rate = (len(times) - 1) / read_s
+def _rate(times: Sequence[float], read_s: float, config: ServosConfig[Any]) -> Check:
+    rate, wanted_hz = (len(times) - 1) / read_s, config.rate_hz
     if len(times) < 4:
         return Check("rate", "wrong", "no reading of all servos came through", "look at cable, supply and baud rates")
     intervals = [b - a for a, b in pairwise(times)]
     jitter_ms = 1e3 * (quantiles(intervals, n=20)[-1] - median(intervals))
     said = f"{rate:.0f} readings/s are possible ({wanted_hz:.0f} wanted), jitter {jitter_ms:.1f} ms (95 %)"
     if rate < min(FEW_PER_S, wanted_hz):
-        return Check("rate", "warning", said, "a higher baud rate, Return Delay Time 0, latency timer 1 ms")
+        slow = next((name for name, bus in config.buses.items() if bus.baud < FAST_BAUD), None)
+        faster = "bodyschema install udev    # an adapter's latency timer; then plug it in again"
+        return Check(
+            "rate", "warning", said, faster if slow is None else f"bodyschema servos set baud={FAST_BAUD} --bus {slow}"
+        )
     return Check("rate", "ok", said)
 
 

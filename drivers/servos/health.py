@@ -46,10 +46,12 @@ class BusHealth:
     Attributes:
         exchanges: questions that were asked.
         troubles: those that were not answered as they should be, by what was wrong.
+        way: with which questions its servos are read; empty before the first opening.
     """
 
     exchanges: int
     troubles: Mapping[str, int]
+    way: str
 
 
 class Health:

@@ -24,6 +24,7 @@ from .handshake import RETRY_S, Finding, FittedServo, identify, require_all, res
 from .health import BusHealth, Health, ServoHealth
 from .inspection import Inspection
 from .make import Make
+from .plan import Plan
 from .port import Port
 
 log = logging.getLogger(__name__)
@@ -33,6 +34,7 @@ FEW_POLLS = 3  # so many have to fail besides: the program itself may have been 
 DOUBTS = 5  # so many answers in a row that cannot be: the servo was restarted
 ANCHOR_POLLS = 50
 SLACK_TICKS = 3
+IMPROVE_EVERY_S = 10.0  # an attempt in vain costs a reading or two
 GOLDEN = 0.618034  # multiples of it, modulo 1, are spread most evenly
 
 OpenPort = Callable[[Any, Clock], tuple[Port, float]]
@@ -82,7 +84,7 @@ class ServoJoints:
         unlimited = [(-math.inf, math.inf)] * len(joints)
         self._turns = TurnCount(limits or unlimited, last_pose, config.max_move_deg, config.table)
         self._buses: dict[str, Bus] = {}
-        self._requests: dict[str, list[Request]] = {}
+        self._plans: dict[str, Plan] = {}
         self._opened = ExitStack()
         self._is_open = self._is_lost = False
         self._had_torque: set[str] = set()
@@ -107,7 +109,8 @@ class ServoJoints:
     @property
     def health(self) -> tuple[str, ...]:
         """What is wrong with servos, and what to do."""
-        return (*self._health.complaints, *(text for drive in self._drives for text in drive.complaints))
+        of_drives = (text for drive in self._drives for text in drive.complaints)
+        return (*self._health.complaints, *self._slow, *of_drives)
 
     @property
     def servo_health(self) -> tuple[ServoHealth, ...]:
@@ -120,7 +123,7 @@ class ServoJoints:
     def bus_health(self) -> Mapping[str, BusHealth]:
         """By name how each bus went since the start. From any thread."""
         return {
-            name: BusHealth(counts.exchanges, {str(name): n for name, n in list(counts.troubles.items())})
+            name: BusHealth(counts.exchanges, {str(t): n for t, n in list(counts.troubles.items())}, self._way(name))
             for name, counts in self._counts.items()
         }
 
@@ -221,10 +224,11 @@ class ServoJoints:
         return identify(self._buses[self._config.bus_of(servo)], servo, self._config.model_of(servo), self._make.models)
 
     def _prepare(self) -> None:
-        self._requests = {}
+        plans: dict[str, Plan] = {}
         for name, bus in self._buses.items():
             servos = [servo for servo in self.servos if servo.bus == name]
-            self._requests[name] = self._make.block_requests(bus, servos, self._config.buses[name])
+            plans[name] = Plan(bus, self._make.ways(bus, servos, self._config.buses[name]))
+        self._plans = plans
         self._channels = [self._make.channel(servo) for servo in self.servos]
         self._at = {(servo.bus, servo.id): place for place, servo in enumerate(self.servos)}
         speed = math.radians(self._config.max_speed_deg_s)
@@ -232,6 +236,7 @@ class ServoJoints:
         self._punctuality = Punctuality()
         now = self._clock.now()
         self._believed_s, self._failures, self._next_poll, self._polls = now, 0, now, 0
+        self._improve_s = now + IMPROVE_EVERY_S
         self._inspection = Inspection(self._buses, self.servos, self._health, self._drives, self._clock)
         self._why = "no answer"
 
@@ -256,9 +261,10 @@ class ServoJoints:
 
     def _say_opened(self) -> None:
         switched = [servo.joint for servo in self.servos if servo.had_torque]
-        fast = any(request.is_fast for requests in self._requests.values() for request in requests)
-        how = "with Fast Sync Read" if fast else ""
-        log.info("%d servos, torque verified off, are read %s", len(self.servos), how)
+        how = "; ".join(f"{name}: {plan.name}" for name, plan in self._plans.items())
+        log.info("%d servos, torque verified off, are read (%s)", len(self.servos), how)
+        for complaint in self._slow:
+            log.warning("%s", complaint)
         if switched:
             log.warning("the torque of %s was on and was switched off", ", ".join(switched))
 
@@ -281,6 +287,7 @@ class ServoJoints:
         samples = self._ask_all()
         reading = None if samples is None else self._judge(samples)
         self._inspection.go_on()
+        self._improve()
         for why in [drive.step(reading, self.samples) for drive in self._drives]:
             if why is not None:
                 self._release(why)
@@ -289,6 +296,22 @@ class ServoJoints:
         else:
             self._believed_s, self._failures = self._clock.now(), 0
         return reading
+
+    def _improve(self) -> None:
+        """Come back to a quicker way of reading, now and then, while nothing is held that would have to wait."""
+        if self._clock.now() < self._improve_s or any(drive.holding for drive in self._drives):
+            return
+        self._improve_s = self._clock.now() + IMPROVE_EVERY_S
+        for name, plan in self._plans.items():
+            if plan.improve():
+                log.info("%s is read with %s from now on", name, plan.name)
+
+    def _way(self, name: str) -> str:
+        return self._plans[name].name if name in self._plans else ""
+
+    @property
+    def _slow(self) -> list[str]:
+        return [f"bus {name}: {complaint}" for name, plan in self._plans.items() for complaint in plan.complaints]
 
     def _following_poll(self) -> float:
         """When to ask next: not always at the same phase of the servos' ticks, which would tell nothing new of them."""
@@ -299,7 +322,7 @@ class ServoJoints:
     def _ask_all(self) -> list[Sample] | None:
         """A sample of each joint; None when one is missing or doubtful. All buses are asked at the same time."""
         samples: dict[int, Sample] = {}
-        for questions in zip_longest(*self._requests.values()):
+        for questions in zip_longest(*(plan.requests for plan in self._plans.values())):
             asked = [(bus, q) for bus, q in zip(self._buses.values(), questions, strict=True) if q is not None]
             for bus, question in asked:
                 bus.send(question)

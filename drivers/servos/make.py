@@ -6,10 +6,11 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from .bus import Bus, Request
+from .bus import Bus
 from .channel import Channel
 from .handshake import FittedServo
 from .model import Model
+from .plan import Way
 from .settings import Setting
 
 
@@ -23,8 +24,7 @@ class Make:
         errors: what each bit of the hardware error means, and what to do.
         bus: a bus of its protocols.
         channel: one servo's answers.
-        software: its maker's program with which its servos are set up.
-        block_requests: the questions of one reading of the servos of a bus.
+        ways: of each group of servos of a bus, how it can be read, the quickest first.
         settings: what a command may change in a model's EEPROM.
         homing_sign: 1 where the homing offset is added to what the sensor tells, −1 where it is taken off.
         tick_s: of the clock with which its servos stamp what they measure [s]; 0 without one.
@@ -35,8 +35,7 @@ class Make:
     errors: Mapping[int, str]
     bus: type[Bus]
     channel: Callable[[FittedServo], Channel]
-    software: str
-    block_requests: Callable[[Bus, Sequence[FittedServo], Any], list[Request]]
+    ways: Callable[[Bus, Sequence[FittedServo], Any], Sequence[Sequence[Way]]]
     settings: Callable[[Model], Sequence[Setting]]
     homing_sign: Literal[1, -1]
     tick_s: float = 0.0

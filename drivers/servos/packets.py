@@ -35,12 +35,14 @@ class Packets(Protocol):
         ping_size: bytes of data in the answer to PING.
         refusals: bits of the error byte with which a servo refuses the question; the others tell of its health.
         is_weak: the checksum lets one in 256 wrong answers through, and no servo's clock tells of late ones.
+        pinged_only: what is to be said of a servo that answers PING but no READ.
     """
 
     overhead: int
     ping_size: int
     refusals: int
     is_weak: bool
+    pinged_only: str
 
     def ping(self, id: int) -> bytes:
         """PING."""

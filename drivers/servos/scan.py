@@ -31,7 +31,6 @@ class Kind:
         models: by number.
         errors: what each bit of the hardware error means, and what to do.
         bus: a bus of its protocols.
-        mute: what is wrong with a servo that answers PING but no READ.
         unsupported: names by number of models that no driver reads, since their control table is another one.
     """
 
@@ -41,7 +40,6 @@ class Kind:
     models: Mapping[int, Model] = field(repr=False)
     errors: Mapping[int, str] = field(repr=False)
     bus: type[Bus]
-    mute: str
     unsupported: Mapping[int, str] = field(default_factory=dict[int, str], repr=False)
 
     @property
@@ -155,7 +153,7 @@ class PingScanner:
         servo, bus = FoundServo(name, port.baud, self.protocol, id), kind.bus(name, port, clock, latency_s)
         head = _asked(bus, kind, id, self._head)
         if head.trouble is Trouble.TIMEOUT:
-            return replace(servo, troubles=tuple(dict.fromkeys(kind.mute for kind in self._kinds)))
+            return replace(servo, troubles=tuple(dict.fromkeys(kind.packets.pinged_only for kind in self._kinds)))
         if head.trouble is not None:
             return replace(servo, is_double=True, troubles=(DOUBLE,))
         identity = self._identity(head.answers[0].status.data, id)
@@ -206,10 +204,10 @@ def _with_state(bus: Bus, servo: FoundServo, kind: Kind, model: Model) -> FoundS
 
 
 def _asked(bus: Bus, kind: Kind, id: int, register: Register) -> Exchange:
-    packet = kind.packets.read(id, register.address, register.size)
+    request = Request(lambda n: kind.packets.read(id, register.address, n), (id,), register.size, kind.version)
     exchange = Exchange(())
     for _ in range(ATTEMPTS):
-        exchange = bus.ask(Request(packet, (id,), register.size, kind.version))
+        exchange = bus.ask(request)
         if exchange.trouble is None:
             break
     return exchange

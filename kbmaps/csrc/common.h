@@ -32,7 +32,7 @@ static inline int plain(PyObject *object, Py_buffer *view)
         PyErr_Clear();
         return 0;
     }
-    if (strcmp(view->format, "d") == 0)
+    if (view->format != NULL && strcmp(view->format, "d") == 0)
         return 1;
     PyBuffer_Release(view);
     return 0;
@@ -52,6 +52,12 @@ static inline int fits(const Py_buffer *view, index_t width, int rows_too)
     int shaped = (view->ndim == 1 && view->shape[0] == width) ||
                  (rows_too && view->ndim == 2 && view->shape[1] == width);
     return shaped && all_finite(view->buf, view->len / (index_t)sizeof(double));
+}
+
+/* 1 for rows (n, width). */
+static inline int has_rows(const Py_buffer *view, index_t n, index_t width)
+{
+    return view->ndim == 2 && view->shape[0] == n && view->shape[1] == width;
 }
 
 /* The object as such a view: itself where it already is one, else what `check` makes of it, which may raise. */

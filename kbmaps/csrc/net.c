@@ -16,11 +16,16 @@ typedef struct {
 
 #define ARRAY(self, which) ((double *)(self)->arrays[which].buf)
 
-static index_t half_size(const Net *net, index_t begin, index_t end)
+/* Control points of the joints begin..end, at most `most`; 0 where they are more. */
+static index_t half_size(const Net *net, index_t begin, index_t end, index_t most)
 {
     index_t size = 1;
-    for (index_t k = begin; k < end; k++)
-        size *= ARRAY(net, SLIDES)[k] != 0.0 ? 2 : 3;
+    for (index_t k = begin; k < end; k++) {
+        index_t functions = ARRAY(net, SLIDES)[k] != 0.0 ? 2 : 3;
+        if (size > most / functions)
+            return 0;
+        size *= functions;
+    }
     return size;
 }
 
@@ -196,9 +201,16 @@ static PyObject *net_new(PyTypeObject *type, PyObject *args, PyObject *Py_UNUSED
         Py_DECREF(net);
         return NULL;
     }
+    index_t points = net->arrays[PLANES].len / (index_t)sizeof(double);
     net->joints = d, net->split = d / 2;
-    net->left = half_size(net, 0, net->split), net->right = half_size(net, net->split, d);
-    net->outputs = net->arrays[PLANES].len / (index_t)sizeof(double) / (net->left * net->right);
+    net->left = half_size(net, 0, net->split, points);
+    net->right = net->left == 0 ? 0 : half_size(net, net->split, d, points / net->left);
+    if (net->right == 0 || points % (net->left * net->right) != 0) {
+        PyErr_Format(PyExc_TypeError, "a net of %zd joints cannot have %zd control points", d, points);
+        Py_DECREF(net);
+        return NULL;
+    }
+    net->outputs = points / (net->left * net->right);
     return (PyObject *)net;
 }
 
@@ -233,8 +245,14 @@ static PyObject *evaluated(Net *net, PyObject *const *args, index_t count, evalu
     double few[ON_STACK], *scratch = working_memory(net, n, few);
     if (out != NULL && scratch == NULL)
         PyErr_NoMemory();
+    index_t bytes = n * outputs * (columns > 0 ? columns : 1) * (index_t)sizeof(double);
     if (out == NULL || scratch == NULL || PyObject_GetBuffer(out, &result, PyBUF_WRITABLE) != 0) {
         Py_XDECREF(out);
+        out = NULL;
+    } else if (result.len != bytes) {
+        PyErr_SetString(PyExc_TypeError, "what is to hold the results has another size");
+        PyBuffer_Release(&result);
+        Py_DECREF(out);
         out = NULL;
     } else {
         PyThreadState *thread = n > 1 ? PyEval_SaveThread() : NULL;
@@ -292,7 +310,20 @@ static PyObject *net_step(Net *net, PyObject *const *args, index_t count)
     return done;
 }
 
-/* replay(q, x, order, mu0): checked rows, and for each step its index (Py_ssize_t) and mu0. */
+/* 1 for a vector of whole numbers of the size of index_t, each from 0 to n - 1. */
+static int is_order(const Py_buffer *view, index_t n)
+{
+    if (view->ndim != 1 || view->itemsize != (index_t)sizeof(index_t) || view->format == NULL ||
+        strlen(view->format) != 1 || strchr("lqn", view->format[0]) == NULL)
+        return 0;
+    const index_t *order = view->buf;
+    for (index_t i = 0; i < view->shape[0]; i++)
+        if (order[i] < 0 || order[i] >= n)
+            return 0;
+    return 1;
+}
+
+/* replay(q, x, order, mu0): rows (n, joints) and (n, outputs), and for each step its index (Py_ssize_t) and mu0. */
 static PyObject *net_replay(Net *net, PyObject *const *args, index_t count)
 {
     if (count != 4 || net->arrays[PLANES].readonly)
@@ -303,12 +334,15 @@ static PyObject *net_replay(Net *net, PyObject *const *args, index_t count)
     if (!take_all(taken, views, elements, 3))
         return NULL;
     PyObject *done = NULL;
-    if (PyObject_GetBuffer(args[2], &order, PyBUF_C_CONTIGUOUS) == 0) {
-        index_t steps = order.len / (index_t)sizeof(index_t);
-        if (views[2].len == steps * (index_t)sizeof(double))
-            done = learned(net, &views[0], &views[1], order.buf, steps, views[2].buf);
+    if (PyObject_GetBuffer(args[2], &order, PyBUF_C_CONTIGUOUS | PyBUF_FORMAT) == 0) {
+        index_t n = views[0].ndim == 2 ? views[0].shape[0] : 0;
+        if (!has_rows(&views[0], n, net->joints) || !has_rows(&views[1], n, net->outputs) || !is_order(&order, n))
+            PyErr_Format(PyExc_TypeError, "a replay needs rows of %zd and %zd numbers, and indices of them",
+                         net->joints, net->outputs);
+        else if (views[2].len != order.shape[0] * (index_t)sizeof(double))
+            PyErr_SetString(PyExc_TypeError, "a replay needs one mu0 for each index");
         else
-            PyErr_Format(PyExc_TypeError, "a replay needs one mu0 for each index");
+            done = learned(net, &views[0], &views[1], order.buf, order.shape[0], views[2].buf);
         PyBuffer_Release(&order);
     }
     release_all(views, 3);

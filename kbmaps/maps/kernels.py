@@ -100,7 +100,7 @@ _available = _load()
 _chosen = ContextVar("_chosen", default=_available)
 
 
-def in_use() -> KernelPath:
+def kernels_in_use() -> KernelPath:
     """The path of maps and learners that are made now."""
     return "numpy" if _chosen.get() is None else "compiled"
 

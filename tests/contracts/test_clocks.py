@@ -26,7 +26,7 @@ def simulated_clock() -> Iterator[Clock]:
         yield world.clock
 
 
-SIMULATED = pytest.mark.skipif(find_spec("pybullet") is None, reason="pybullet is not installed")
+SIMULATED = pytest.mark.skipif(find_spec("pybullet") is None, reason="no pybullet; to run it: pip install -e '.[sim]'")
 
 
 @pytest.fixture(params=[system_clock, pytest.param(simulated_clock, marks=SIMULATED)])

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from daemon.align import JointBuffer, joint_difference
 from interfaces.records import JointReading, Reason, frozen_array
 
-LIMIT_S = 60.0
+LIMIT_S = 500.0
 REVOLUTE = np.array([False, False])
 
 

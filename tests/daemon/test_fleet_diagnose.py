@@ -21,7 +21,7 @@ from diagnosis.result import Cause, DiagnosisFile, Errors, Gain, Interval, Pairs
 from interfaces.errors import RecordingError, RequestError
 from interfaces.robot import RobotDescription
 
-pytest.importorskip("distributed", reason="the extra fleet is not installed")
+pytest.importorskip("distributed")
 
 
 def fleet(*words: object) -> tuple[object, str, str]:

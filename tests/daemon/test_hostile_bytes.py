@@ -22,14 +22,16 @@ from hypothesis import strategies as st
 from small_arm import JOINTS, URDF, write_small_arm
 
 from daemon import checkpoint, wire
+from daemon.answers import Answers
 from daemon.bus import Request
 from daemon.checkpoint import CheckpointError
-from daemon.config import Config
+from daemon.config import Config, LearnerConfig
 from daemon.going_on import DOES_NOT_FIT
 from daemon.history import answer_pairs
-from daemon.learning import StateError
+from daemon.learning import DirectSolver, Learning, NominalModel, StateError
 from daemon.router import RouterConfig
 from daemon.status import LearnerStatus, SamplerStatus
+from effects import Simulation
 from interfaces.errors import BodyschemaError, ConfigError, RecordingError, RequestError
 from interfaces.recording import Recording, joints_in
 from interfaces.robot import RobotDescription
@@ -128,6 +130,40 @@ def test_any_values_in_a_messages_fields_are_a_message_or_an_error(
 def test_depth_and_declared_lengths_are_no_bombs(encoding: str, bomb: bytes) -> None:
     for kind in KINDS:
         assert taken(lambda kind=kind: wire.decode(bomb, kind, encoding)) is None
+
+
+WILD = st.sampled_from([0.0, -0.0, 5e-324, 1e-308, 1e6, 1e155, -1e308, math.inf, math.nan, 2**63]) | st.floats()
+
+
+@pytest.fixture(scope="module")
+def answers(tmp_path_factory) -> Answers:
+    robot = RobotDescription.load(write_small_arm(tmp_path_factory.mktemp("answers")))
+    nominal = NominalModel.extended_by(Simulation(robot, ()))
+    return Answers(Learning(nominal, LearnerConfig(), DirectSolver()), robot, lambda _: None)
+
+
+@settings(quick, max_examples=12)
+@given(st.lists(WILD, min_size=3, max_size=3), st.lists(WILD, min_size=2, max_size=2), st.booleans())
+def test_wild_numbers_get_finite_answers_or_errors(answers: Answers, x: list, q: list, start: bool) -> None:
+    where = {"start": q} if start else {"posture": q}
+    for ask, question in (
+        (answers.predict, {"q": q}),
+        (answers.jacobian, {"q": [q, q]}),
+        (answers.ik, {"x": x} | where),
+    ):
+        request = Request({}, wire.encode(question, wire.MSGPACK), wire.MSGPACK)
+        reply = taken(lambda ask=ask, request=request: ask(request))
+        assert isinstance(reply, bytes | None)
+        numbers = [] if reply is None else msgspec.msgpack.decode(reply).values()
+        flat = [np.ravel(value) for value in numbers if isinstance(value, float | list)]
+        assert all(np.isfinite(value).all() for value in flat)
+
+
+@pytest.mark.parametrize("x", [[1e308, 0.0, 0.0], [0.0, -1e155, 0.0], [2000.0, 0.0, 0.0]])
+def test_a_position_that_is_not_in_metres_is_refused(answers: Answers, x: list[float]) -> None:
+    request = Request({}, wire.encode({"x": x}), wire.JSON)
+    with pytest.raises(RequestError, match="positions are in metres, at most 1000 on each axis"):
+        answers.ik(request)
 
 
 @quick

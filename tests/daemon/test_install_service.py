@@ -45,7 +45,7 @@ model = "XM430-W350"
 STEREO = "focal_px = 600.0\nprincipal_point_px = [319.5, 239.5]\nbaseline_m = 0.2\nimage_size_px = [640, 480]\n"
 HERE = Installed(("/bin/true",), (Path("/home/pi/arm/.venv"), Path("/usr")), 252)
 analyze = pytest.mark.skipif(
-    shutil.which("systemd-analyze") is None, reason="systemd-analyze (Debian: systemd) is not installed"
+    shutil.which("systemd-analyze") is None, reason="no systemd-analyze; to run it: apt-get install systemd"
 )
 
 
@@ -84,13 +84,13 @@ def unit_path(folder: Path) -> dict[str, str]:
 def test_systemd_finds_nothing_to_complain_of(tmp_path, config, process) -> None:
     written(tmp_path, config)
     command = ["systemd-analyze", "verify", "--man=no", f"bodyschema-{process}@arm.service"]
-    done = subprocess.run(command, env=unit_path(tmp_path), capture_output=True, text=True, timeout=60, check=False)
+    done = subprocess.run(command, env=unit_path(tmp_path), capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (0, "")
 
 
 def exposure(folder: Path, process: str) -> float:
     command = ["systemd-analyze", "security", "--offline=true", "--no-pager", f"bodyschema-{process}@arm.service"]
-    done = subprocess.run(command, env=unit_path(folder), capture_output=True, text=True, timeout=60, check=False)
+    done = subprocess.run(command, env=unit_path(folder), capture_output=True, text=True, check=False)
     return float(re.search(r"exposure level for \S+: ([0-9.]+)", done.stdout)[1])
 
 

@@ -14,10 +14,12 @@ from daemon.bench_run import BenchRun
 from daemon.cli import app
 from daemon.config import Config
 from daemon.joints_view import screen
-from daemon.joints_watch import JointState, JointsWatch, Seen, SignCheck, Speeds
+from daemon.joints_watch import JointState, JointsWatch, Seen, SignCheck, Speeds, signs_in
 from daemon.wiring import open_joints
 from drivers.bench.dry_run import DryRun
+from drivers.config import DriversConfig
 from drivers.dynamixel.bench.arm import DynamixelArm
+from drivers.ros2.config import Ros2Config
 from interfaces.clock import SystemClock
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "desk_arm" / "servos.toml"
@@ -143,11 +145,13 @@ def test_the_speed_of_encoders_that_do_not_tell_it_is_that_of_their_angles() -> 
 # --- the screen
 
 
-def shown(**changes) -> str:
+def shown(signs_in: str = "direction = -1", **changes) -> str:
     state = {"joint": "elbow", "id": 3, "angle": 0.5, "velocity": -0.5, "current": 0.12, "temperature_c": 40.0}
     state |= {"low": 0.0, "high": 0.6, "lower": -1.0, "upper": 1.0, "within_limits": True} | changes
     console = Console(file=StringIO(), width=80)
-    console.print(screen(Seen((JointState(**state),), "elbow +20°: by the URDF the marker went up", (), None)))
+    console.print(
+        screen(Seen((JointState(**state),), "elbow +20°: by the URDF the marker went up", (), None, signs_in))
+    )
     assert isinstance(console.file, StringIO)
     return console.file.getvalue()
 
@@ -161,6 +165,14 @@ def test_the_screen_shows_a_joint_in_degrees() -> None:
 def test_the_screen_says_what_moved_and_what_to_do() -> None:
     assert "the marker went up" in shown()
     assert "direction = -1" in shown()
+
+
+def test_signs_of_a_ros_2_robot_are_not_in_our_keys() -> None:
+    robot = DriversConfig(ros2=Ros2Config(router="tcp/127.0.0.1:7447"))
+    text = " ".join(shown(signs_in(robot), high=1.4, within_limits=False).split())
+    assert "[drivers.ros2.names] or the URDF" in text
+    assert "direction" not in text
+    assert "zero_ticks" not in text
 
 
 def test_what_is_not_measured_is_a_dash() -> None:

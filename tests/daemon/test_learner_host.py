@@ -34,7 +34,7 @@ from interfaces.errors import BusError, ConfigError
 from kbmaps import ChainTolerances
 
 NOMINAL = nominal_model()
-LIMIT_S = 30.0
+LIMIT_S = 500.0
 TASK = Task(1, NOMINAL.prior(), NOMINAL.belief(NOMINAL.chain, ChainTolerances()))
 
 

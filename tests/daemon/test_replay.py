@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import json
-import os
 import subprocess
 import sys
 from dataclasses import replace
@@ -10,6 +9,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
+import warm
 from small_arm import JOINTS, write_small_arm
 
 from daemon.cli import app
@@ -24,7 +24,7 @@ from interfaces.robot import RobotDescription
 
 # The limit only ends a replay that would never end; on a busy machine it takes longer, and passes.
 LIMIT_S = 300
-pytestmark = pytest.mark.timeout(LIMIT_S + 60)
+NO_REAL_DATA = "no measured recordings; to run it: put them into ../shared/data"
 REAL_DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 
 
@@ -53,9 +53,7 @@ def replay(*arguments: object) -> None:
 
 
 def command_line(*arguments: object) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "daemon", "replay", *map(str, arguments)]
-    environment = os.environ | {"OPENBLAS_NUM_THREADS": "1"}
-    return subprocess.run(command, capture_output=True, text=True, timeout=LIMIT_S, check=False, env=environment)
+    return warm.run("-m", "daemon", "replay", *arguments)
 
 
 def test_a_guided_path_is_one() -> None:
@@ -221,8 +219,7 @@ def test_ending_the_replay_ends_its_two_processes(tmp_path: Path, robot: Path) -
     guided(robot).write_csv(tmp_path / "a.csv")
     kept = str(tmp_path / "kept")
     command = [sys.executable, "-m", "daemon", "replay", str(tmp_path / "a.csv"), "--keep", kept]
-    environment = os.environ | {"OPENBLAS_NUM_THREADS": "1"}
-    with subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, env=environment) as process:
+    with subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL) as process:
         assert process.stderr is not None
         process.stderr.readline()
         assert len(processes_naming(f"--state-dir {kept}")) >= 2
@@ -231,7 +228,7 @@ def test_ending_the_replay_ends_its_two_processes(tmp_path: Path, robot: Path) -
     assert processes_naming(f"--state-dir {kept}") == []
 
 
-@pytest.mark.skipif(not REAL_DATA.is_dir(), reason="the measured recordings are not here")
+@pytest.mark.skipif(not REAL_DATA.is_dir(), reason=NO_REAL_DATA)
 def test_a_real_eye_in_hand_recording_is_learnt_in_a_frame_that_nobody_knew() -> None:
     folder = REAL_DATA / "panda_eyeinhand"
     ended = command_line(folder / "measured.csv", "--any-step", "--json", "--sigma-mm", 1, "--speed", 1)
@@ -244,12 +241,11 @@ def test_a_real_eye_in_hand_recording_is_learnt_in_a_frame_that_nobody_knew() ->
 
 
 @pytest.mark.soak
-@pytest.mark.skipif(not REAL_DATA.is_dir(), reason="the measured recordings are not here")
+@pytest.mark.skipif(not REAL_DATA.is_dir(), reason=NO_REAL_DATA)
 @pytest.mark.parametrize("name", ["panda_eyeinhand", "ur5_laser", "wam_laser", "ur10_laser_a", "ur10_laser_b"])
 @pytest.mark.timeout(900)
 def test_real_recordings_are_predicted_better_than_by_the_aligned_model(name: str) -> None:
-    command = [sys.executable, "-m", "daemon", "replay", str(REAL_DATA / name / "measured.csv"), "--any-step", "--json"]
-    ended = subprocess.run(command, capture_output=True, text=True, timeout=800, check=False)
+    ended = command_line(REAL_DATA / name / "measured.csv", "--any-step", "--json")
     assert ended.returncode == 0, ended.stderr
     report = json.loads(ended.stdout)
     assert report["after"]["mean_mm"] < report["before"]["mean_mm"]

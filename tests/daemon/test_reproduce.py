@@ -223,7 +223,7 @@ def test_a_folder_that_cannot_be_made_is_told(tmp_path) -> None:
 
 
 def test_measured_curves_without_pybullet_name_what_to_install(tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr("importlib.util.find_spec", lambda name: None if name == "pybullet" else object())
+    monkeypatch.setattr("daemon.extras.find_spec", lambda name: None if name == "pybullet" else object())
     with pytest.raises(ConfigError, match="no-real"):
         app(["reproduce", "fig7", "--out", str(tmp_path)], result_action="return_value")
 

@@ -27,7 +27,7 @@ from interfaces.clock import SystemClock
 from interfaces.errors import BusError, ConfigError, RequestError, SourceError, SourceLost, StoreError
 from interfaces.records import JointReading, MarkerFix, MarkerMiss, Pair, Reason, frozen_array
 
-LIMIT_S = 60.0
+LIMIT_S = 500.0
 KEYS = Keys("arm")
 
 

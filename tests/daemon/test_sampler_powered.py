@@ -23,7 +23,7 @@ from interfaces.clock import SystemClock
 from interfaces.errors import ConfigError, RequestError
 from interfaces.records import frozen_array
 
-LIMIT_S = 30.0
+LIMIT_S = 500.0
 
 
 class Powered:

@@ -26,7 +26,7 @@ from daemon.reception import LIMITS
 from daemon.router import RouterConfig
 from interfaces.errors import BusError, ConfigError, RequestError
 
-LIMIT_S = 30.0
+LIMIT_S = 500.0
 SILENCE_S = 0.3  # in which what was dropped would have arrived
 KEYS = Keys("arm")
 QUESTIONS = {name: getattr(KEYS, name) for name in ("predict", "jacobian", "ik", "model", "pairs")}

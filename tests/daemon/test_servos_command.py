@@ -156,6 +156,6 @@ def test_a_log_whose_last_line_a_crash_cut_off_is_read(bench) -> None:
 
 def test_the_page_names_the_commands() -> None:
     told = subprocess.run(
-        [sys.executable, "-m", "daemon", "servos", "--help"], check=True, capture_output=True, text=True, timeout=60
+        [sys.executable, "-m", "daemon", "servos", "--help"], check=True, capture_output=True, text=True
     ).stdout
     assert all(name in told for name in ("show", "set", "zero", "undo"))

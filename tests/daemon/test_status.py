@@ -24,7 +24,7 @@ from daemon.status_view import Seen, Watcher, as_json, screen
 from daemon.store import PairStore
 from interfaces.clock import SystemClock
 
-LIMIT_S = 60.0
+LIMIT_S = 500.0
 
 
 @pytest.fixture

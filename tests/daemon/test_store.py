@@ -208,7 +208,7 @@ def test_a_second_sampler_on_the_store_is_refused(file, store) -> None:
         "import sys; from pathlib import Path; from daemon.store import PairStore, Session\n"
         "with PairStore(Path(sys.argv[1]), Session(('waist', 'shoulder'), '', '', '', '', '', '')): pass"
     )
-    done = subprocess.run([sys.executable, "-c", code, file], capture_output=True, text=True, timeout=60, check=False)
+    done = subprocess.run([sys.executable, "-c", code, file], capture_output=True, text=True, check=False)
     assert f"another sampler is writing {file}" in done.stderr
 
 

@@ -4,7 +4,6 @@ import os
 import select
 import signal
 import socket
-import subprocess
 import sys
 import threading
 import time
@@ -13,11 +12,12 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+import warm
 
 from daemon.supervise import Child, Supervisor
 from interfaces.errors import BodyschemaError
 
-LIMIT_S = 60.0
+LIMIT_S = 500.0
 # Writes its process id, then waits for SIGTERM to end it.
 WAITING = "import os, signal, sys; print(os.getpid(), file=open(sys.argv[1], 'a'), flush=True); signal.pause()"
 STUBBORN = "import signal; signal.signal(signal.SIGTERM, signal.SIG_IGN); " + WAITING
@@ -125,17 +125,16 @@ def test_a_killed_run_takes_both_processes_with_it(tmp_path, free_endpoint) -> N
 def test_the_command_run_with_a_port_in_use_ends_with_its_message(tmp_path, free_endpoint) -> None:
     taken = free_endpoint()
     with socket.create_server(("127.0.0.1", int(taken.rpartition(":")[2]))):
-        command = [sys.executable, "-m", "daemon", "run", "--robot", _robot(tmp_path, taken, free_endpoint())]
-        done = subprocess.run(command, capture_output=True, text=True, timeout=LIMIT_S, check=False)
+        done = warm.run("-m", "daemon", "run", "--robot", _robot(tmp_path, taken, free_endpoint()))
     assert done.returncode == 1
     assert "is in use. Stop the other bodyschema" in done.stderr
 
 
 @contextmanager
-def running(robot: Path, log: Path) -> Iterator[subprocess.Popen[bytes]]:
+def running(robot: Path, log: Path) -> Iterator[warm.Child]:
     """`bodyschema run`, with both processes at work."""
     with log.open("wb") as stream:
-        run = subprocess.Popen([sys.executable, "-m", "daemon", "run", "--robot", robot], stderr=stream)
+        run = warm.Child("-m", "daemon", "run", "--robot", robot, stderr=stream)
     try:
         wait_until(lambda: log.read_bytes().count(b" answers on ") == 2)
         yield run

@@ -17,7 +17,7 @@ from interfaces.errors import BusError, RequestError
 from interfaces.records import Pair, frozen_array
 
 # The limit only ends what would never end.
-LIMIT_S = 100.0
+LIMIT_S = 500.0
 OVER = ("done", "failed", "stopped")
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import re
-from contextlib import ExitStack
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -204,34 +203,57 @@ def test_all_documents_are_one_object_for_programs(ask, hub) -> None:
     assert ask("GET", "/api/state").json() == {"robot": {"robot": "arm"}, "outlook": None}
 
 
-def test_too_many_pages_are_told_so(ask, hub) -> None:
-    async def fill() -> int:
-        with ExitStack() as stack:
-            for _ in range(MOST_FOLLOWERS):
-                stack.enter_context(hub.following())
-            transport = httpx.ASGITransport(app=application(hub, Processes(), Processes()))
-            async with httpx.AsyncClient(transport=transport, base_url=HERE) as client:
-                return (await client.get("/api/events")).status_code
+async def opened_streams(hub: Hub, count: int) -> list[int]:
+    """The status codes of so many event streams that are asked for at the same time and stay open for a while."""
+    app, codes, enough = application(hub, Processes(), Processes()), [], asyncio.Event()
 
-    assert asyncio.run(fill()) == 503
+    async def send(message: dict[str, Any]) -> None:
+        if message["type"] == "http.response.start":
+            codes.append(message["status"])
+            if len(codes) == count:
+                enough.set()
+
+    async def receive() -> dict[str, str]:
+        await enough.wait()
+        return {"type": "http.disconnect"}
+
+    scope = {"type": "http", "method": "GET", "path": "/api/events", "headers": [(b"host", b"localhost")]}
+    async with asyncio.timeout(60.0), asyncio.TaskGroup() as tasks:
+        for _ in range(count):
+            tasks.create_task(app(scope | {"query_string": b""}, receive, send))  # pyright: ignore[reportArgumentType]
+    return sorted(codes)
+
+
+def test_too_many_pages_at_once_are_refused(hub) -> None:
+    assert asyncio.run(opened_streams(hub, MOST_FOLLOWERS + 3)) == [200] * MOST_FOLLOWERS + [503] * 3
+
+
+def test_pages_that_closed_make_room_again(hub) -> None:
+    for _ in range(2):
+        assert asyncio.run(opened_streams(hub, MOST_FOLLOWERS)) == [200] * MOST_FOLLOWERS
+
+
+def test_a_head_request_takes_no_page_s_place(ask, hub) -> None:
+    for _ in range(MOST_FOLLOWERS + 1):
+        assert ask("HEAD", "/api/events").status_code == 200
 
 
 def test_a_slow_browser_gets_the_newest_of_each_document_alone(hub) -> None:
     async def follow() -> dict[str, bytes]:
-        with hub.following() as follower:
-            for number in range(100):
-                hub.put("series", number)
-            return await follower.take(10.0)
+        follower = hub.follow()
+        for number in range(100):
+            hub.put("series", number)
+        return await follower.take(10.0)
 
     assert asyncio.run(follow()) == {"robot": b'{"robot":"arm"}', "series": b"99"}
 
 
 def test_what_did_not_change_is_not_sent_again(hub) -> None:
     async def follow() -> dict[str, bytes]:
-        with hub.following() as follower:
-            await follower.take(10.0)
-            hub.put("robot", {"robot": "arm"})
-            return await follower.take(0.01)
+        follower = hub.follow()
+        await follower.take(10.0)
+        hub.put("robot", {"robot": "arm"})
+        return await follower.take(0.01)
 
     assert asyncio.run(follow()) == {}
 

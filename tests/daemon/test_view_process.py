@@ -10,13 +10,13 @@ from pathlib import Path
 import pytest
 from small_arm import write_small_arm
 
-from daemon import view_process
+from daemon import extras
 from daemon.cli import app
 from daemon.view_process import shown
 from interfaces.errors import ConfigError
 
 pytest.importorskip("uvicorn")
-LIMIT_S = 100.0
+LIMIT_S = 500.0
 
 
 @pytest.fixture
@@ -27,7 +27,7 @@ def robot(tmp_path: Path, free_endpoint) -> Path:
 
 def page(port: int) -> str | None:
     """The page; None while nobody answers."""
-    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=60)
+    connection = http.client.HTTPConnection("127.0.0.1", port)
     try:
         connection.request("GET", "/")
         return connection.getresponse().read().decode()
@@ -55,6 +55,6 @@ def test_a_port_that_is_taken_is_no_matter_for_whoever_is_shown(robot: Path, cap
 
 @pytest.mark.parametrize("command", [["view"], ["learner", "--view"], ["run", "--view"]])
 def test_without_the_extra_the_error_names_it(robot: Path, command: list[str], monkeypatch) -> None:
-    monkeypatch.setattr(view_process, "NEEDED", ("no_such_library",))
+    monkeypatch.setitem(extras.MODULES, "view", ("no_such_library",))
     with pytest.raises(ConfigError, match=r"bodyschema\[view\]"):
         app([*command, "--robot", str(robot)], result_action="return_value")

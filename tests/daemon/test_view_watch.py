@@ -23,7 +23,7 @@ from daemon.view.watch import Watch
 from daemon.wire import CommandReply, CommandRequest, PairMessage, PairsReply, PredictReply, decode, encode
 from interfaces.errors import BusError, RequestError
 
-LIMIT_S = 60.0
+LIMIT_S = 500.0
 KEYS = Keys("arm")
 
 

@@ -16,7 +16,7 @@ from small_arm import write_small_arm
 from daemon.camera_wiring import camera_checks
 from daemon.cli import app
 from daemon.config import Config
-from daemon.mjpeg import MjpegServer
+from daemon.mjpeg import MOST_VIEWERS, MjpegServer
 from daemon.robot_template import EXAMPLE, robot_toml
 from daemon.wiring import check_sources
 from interfaces.errors import ConfigError
@@ -86,7 +86,7 @@ def test_a_browser_gets_the_newest_picture() -> None:
     with MjpegServer(0) as server:
         server.show(b"old")
         server.show(b"newest")
-        connection = http.client.HTTPConnection(server.address.split("/")[2], timeout=30)
+        connection = http.client.HTTPConnection(server.address.split("/")[2])
         connection.request("GET", "/stream")
         answer = connection.getresponse()
         assert answer.headers["Content-Type"].startswith("multipart/x-mixed-replace")
@@ -94,6 +94,45 @@ def test_a_browser_gets_the_newest_picture() -> None:
         assert b"Content-Length: 6\r\n" in lines
         assert answer.read(6) == b"newest"
         connection.close()
+
+
+@pytest.mark.parametrize("path", ["/", "/stream", "/else"])
+@pytest.mark.parametrize("hosts", [["evil.example:8080"], [""], [], ["127.0.0.1", "evil.example"], ["127.0.0.1.evil"]])
+def test_pictures_are_refused_under_another_host(path: str, hosts: list[str]) -> None:
+    """As after DNS rebinding, when the name of another site leads here."""
+    with MjpegServer(0) as server:
+        server.show(b"secret")
+        answer = asked(server, path, hosts)
+    assert answer.status == 403
+    assert b"use 127.0.0.1 or localhost" in answer.read()
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1:8080", "localhost", "LOCALHOST:9000", "[::1]:8080"])
+def test_pictures_are_served_to_this_machine(host: str) -> None:
+    with MjpegServer(0) as server:
+        answer = asked(server, "/", [host])
+    assert answer.status == 200
+    assert answer.headers["Cross-Origin-Resource-Policy"] == "same-origin"
+
+
+def test_too_many_viewers_of_pictures_are_refused() -> None:
+    with MjpegServer(0) as server:
+        server.show(b"picture")
+        streams = [asked(server, "/stream", ["localhost"]) for _ in range(MOST_VIEWERS)]
+        assert {answer.status for answer in streams} == {200}
+        assert asked(server, "/stream", ["localhost"]).status == 503
+        assert asked(server, "/", ["localhost"]).status == 200
+        for answer in streams:
+            answer.close()
+
+
+def asked(server: MjpegServer, path: str, hosts: list[str]) -> http.client.HTTPResponse:
+    connection = http.client.HTTPConnection(server.address.split("/")[2], timeout=30)
+    connection.putrequest("GET", path, skip_host=True)
+    for host in hosts:
+        connection.putheader("Host", host)
+    connection.endheaders()
+    return connection.getresponse()
 
 
 def test_a_port_that_is_taken_is_named() -> None:

@@ -58,7 +58,7 @@ def test_the_simulation_asks_for_a_stereo_camera(tmp_path) -> None:
 
 
 def test_without_pybullet_the_simulation_names_the_extra(monkeypatch) -> None:
-    monkeypatch.setattr("daemon.wiring.find_spec", lambda _name: None)
+    monkeypatch.setattr("daemon.extras.find_spec", lambda _name: None)
     with pytest.raises(ConfigError, match=r"Type: pip install 'bodyschema\[sim\]'"):
         require_simulation()
 

@@ -1,18 +1,16 @@
-"""The bench on a pseudo-terminal, spoken to by dynamixel-sdk as it is."""
+"""The bench, spoken to by dynamixel-sdk as it is, in virtual time; unplugging on a pseudo-terminal."""
 
 from __future__ import annotations
 
 import math
 import termios
-import time
-from collections.abc import Iterator
-from pathlib import Path
 
 import dynamixel_sdk as sdk
 import pytest
 
 from drivers.bench.faults import Planned, half, mute, wrong_checksum
 from drivers.bench.pty_shell import PtyShell
+from drivers.bench.virtual_port import VirtualClock, VirtualPort
 from drivers.dynamixel.bench.chain import Chain
 from drivers.dynamixel.bench.servo import Servo
 from drivers.dynamixel.models import BY_NAME
@@ -34,20 +32,45 @@ def chain() -> Chain:
     return Chain([*turning, *old, Servo(PH, 21, lambda t: 1.0, return_delay_s=0)], Planned())
 
 
-@pytest.fixture
-def shell(chain: Chain, tmp_path: Path) -> Iterator[PtyShell]:
-    with PtyShell(chain, tmp_path / "bus") as shell:
-        yield shell
+class VirtualHandler(sdk.PortHandler):
+    """The SDK's port with the bench behind it. Time passes while the SDK looks for bytes, which it does in a loop."""
+
+    def __init__(self, chain: Chain) -> None:
+        super().__init__("virtual")
+        self._chain, self._clock, self._waiting = chain, VirtualClock(), bytearray()
+        self.setBaudRate(self.baudrate)
+
+    def setBaudRate(self, baudrate: int) -> bool:
+        self.tx_time_per_byte = 10_000.0 / baudrate
+        self._line = VirtualPort(self._chain, self._clock, baudrate)
+        return True
+
+    def clearPort(self) -> None:
+        self._line.flush()
+        self._waiting.clear()
+
+    def writePort(self, packet: list[int]) -> int:
+        self._line.write(bytes(packet))
+        return len(packet)
+
+    def readPort(self, length: int) -> bytes:
+        if len(self._waiting) < length:
+            self._waiting += self._line.receive(self._clock.now() + 1e-3)
+        data = bytes(self._waiting[:length])
+        del self._waiting[:length]
+        return data
+
+    def getBytesAvailable(self) -> int:
+        self._waiting += self._line.receive(self._clock.now() + 1e-3)
+        return len(self._waiting)
+
+    def getCurrentTime(self) -> float:
+        return 1e3 * self._clock.now()
 
 
 @pytest.fixture
-def port(shell: PtyShell, monkeypatch: pytest.MonkeyPatch) -> Iterator[sdk.PortHandler]:
-    # The SDK spins while it waits, in this process: the bench may get its turn late.
-    monkeypatch.setattr(sdk.port_handler, "LATENCY_TIMER", 100)
-    port = sdk.PortHandler(str(shell.link))
-    assert port.openPort()
-    yield port
-    port.closePort()
+def port(chain: Chain) -> sdk.PortHandler:
+    return VirtualHandler(chain)
 
 
 def signed(number: int) -> int:
@@ -102,6 +125,37 @@ def test_bulk_read_reads_other_registers_of_each(port) -> None:
     group.addParam(2, 146, 1)
     assert group.txRxPacket() == sdk.COMM_SUCCESS
     assert (group.getData(1, 132, 4), group.getData(2, 146, 1)) == (ticks(1), 31)
+
+
+def test_fast_bulk_read_reads_other_registers_of_each(port) -> None:
+    group = sdk.GroupBulkRead(port, P2)
+    group.addParam(1, 132, 4)
+    group.addParam(2, 146, 1)
+    group.addParam(3, 120, 16)
+    assert group.fastBulkRead() == sdk.COMM_SUCCESS
+    assert (group.getData(1, 132, 4), group.getData(2, 146, 1)) == (ticks(1), 31)
+    assert signed(group.getData(3, 132, 4)) == ticks(3)
+
+
+@pytest.mark.parametrize(
+    ("id", "pointer", "data", "goal"), [(1, 168, 224, 116), (1, 632, 661, 116), (21, 168, 634, 564)]
+)
+def test_indirect_data_is_what_its_address_points_at(port, chain, id, pointer, data, goal) -> None:
+    assert P2.read2ByteTxRx(port, id, pointer)[0] == data
+    assert P2.write2ByteTxRx(port, id, pointer, goal) == (sdk.COMM_SUCCESS, 0)
+    assert P2.write1ByteTxRx(port, id, data, 7) == (sdk.COMM_SUCCESS, 0)
+    assert chain.servo(id)["goal"] == 7
+    assert P2.read1ByteTxRx(port, id, data) == (7, sdk.COMM_SUCCESS, 0)
+    chain.servo(id).reboot(1.0)
+    assert P2.read2ByteTxRx(port, id, pointer)[0] == data
+
+
+def test_a_position_is_read_through_indirect_data(port) -> None:
+    for k in range(4):
+        P2.write2ByteTxRx(port, 3, 168 + 2 * k, 132 + k)
+    assert signed(P2.read4ByteTxRx(port, 3, 224)[0]) == ticks(3)
+    assert P2.write4ByteTxRx(port, 3, 224, 5) == (sdk.COMM_SUCCESS, 7)
+    assert P2.write2ByteTxRx(port, 3, 168, 7)[1] != 0
 
 
 def test_sync_write_writes_all(port, chain) -> None:
@@ -169,7 +223,7 @@ def test_overload_switches_torque_off(port, chain) -> None:
 
 def test_a_power_cycle_loses_turns_and_torque(port, chain) -> None:
     chain.servo(3)["torque"] = 1
-    chain.power_cycle(time.monotonic())
+    chain.power_cycle(101.0)
     assert P2.read4ByteTxRx(port, 3, 132)[0] == ticks(3) % 4096
     assert P2.read1ByteTxRx(port, 3, 64)[0] == 0
 
@@ -214,13 +268,19 @@ def test_a_fault_shows_at_the_sdk_and_passes(port, chain, fault, result) -> None
     assert P2.read4ByteTxRx(port, 1, 132) == (ticks(1), sdk.COMM_SUCCESS, 0)
 
 
-def test_a_program_that_has_it_open_notices_the_unplugging(port, shell) -> None:
-    shell.unplug()
-    assert not shell.link.exists()
-    with pytest.raises((termios.error, OSError)):
-        P2.ping(port, 1)
-    shell.plug_in()
-    again = sdk.PortHandler(str(shell.link))
-    assert again.openPort()
-    assert P2.ping(again, 1)[1] == sdk.COMM_SUCCESS
-    again.closePort()
+def test_a_program_that_has_it_open_notices_the_unplugging(chain, tmp_path, monkeypatch) -> None:
+    # The SDK spins while it waits, in this process: the bench may get its turn late.
+    monkeypatch.setattr(sdk.port_handler, "LATENCY_TIMER", 1000)
+    with PtyShell(chain, tmp_path / "bus") as shell:
+        port = sdk.PortHandler(str(shell.link))
+        assert port.openPort()
+        shell.unplug()
+        assert not shell.link.exists()
+        with pytest.raises((termios.error, OSError)):
+            P2.ping(port, 1)
+        port.closePort()
+        shell.plug_in()
+        again = sdk.PortHandler(str(shell.link))
+        assert again.openPort()
+        assert P2.ping(again, 1)[1] == sdk.COMM_SUCCESS
+        again.closePort()

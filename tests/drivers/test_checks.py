@@ -32,16 +32,16 @@ FEETECH_CONFIG = FeetechConfig(
     {"arm": FeetechBus("elsewhere", latency_ms=20.0)},
     (ServoConfig("waist", 1, "STS3215"), ServoConfig("elbow", 2, "SCS0009")),
 )
-# Of each make: how to build its bench, how to open it, the model at the elbow, how a return delay is set to 0, and how
-# an overloaded servo is mended.
+# Of each make: how to build its bench, how to open it, the model at the elbow, and how an
+# overloaded servo is mended.
 MAKES = {
     "Dynamixel": (
         DynamixelArm, CONFIG, DYNAMIXEL, open_dynamixel, "MX-28",
-        "DYNAMIXEL Wizard: set Return Delay Time (5 or 9) to 0", "free the joint, then switch its supply off and on",
+        "free the joint, then switch its supply off and on",
     ),
     "Feetech": (
         FeetechArm, FEETECH_CONFIG, FEETECH, open_feetech, "SCS0009",
-        "Feetech's FD: set Return Delay Time (7) to 0", "free the joint, then switch its supply off and on",
+        "free the joint, then switch its supply off and on",
     ),
 }  # fmt: skip
 EACH = pytest.mark.parametrize("make", MAKES)
@@ -174,13 +174,13 @@ def test_a_missing_servo_is_wrong(make, tmp_path) -> None:
 def test_an_alert_is_wrong_and_says_what_to_do(make, tmp_path, joint) -> None:
     check = Told(make, tmp_path, f"overload@{joint}").of("servos")[1]
     assert (check.state, check.said) == ("wrong", f"joint {joint} (ID {JOINTS.index(joint) + 1}): it is overloaded")
-    assert check.mend == MAKES[make][6]
+    assert check.mend == MAKES[make][5]
 
 
 @EACH
 def test_slow_answers_are_told_with_the_register(make, tmp_path) -> None:
     check = Told(make, tmp_path, delay_s=500e-6).of("servos")[1]
-    assert (check.state, check.mend) == ("warning", MAKES[make][5])
+    assert (check.state, check.mend) == ("warning", "bodyschema servos set return_delay=0 --bus arm")
 
 
 @EACH

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from drivers.bench.virtual_port import VirtualClock
 from drivers.dynamixel.bench.frames import status_packet
-from drivers.dynamixel.bus import Answer, Bus, Trouble, read_request, sync_request
+from drivers.dynamixel.bus import Answer, Bus, Trouble, sync_request
 from drivers.dynamixel.channel import Channel
 from drivers.dynamixel.models import BY_NAME
 from drivers.dynamixel.packets import Status
@@ -55,7 +55,7 @@ def fitted(model: str) -> FittedServo:
 def test_only_intact_answers_of_who_was_asked_are_believed_whatever_comes(pieces) -> None:
     clock = VirtualClock()
     bus = Bus("arm", TalkingPort(clock, list(pieces)), clock, 0.0)
-    exchange = bus.ask(sync_request((1, 2), 120, 16, fast=False))
+    exchange = bus.ask(sync_request(BY_NAME["XM430-W350"].layout, (1, 2), fast=False))
     said = b"".join(pieces)
     for answer, id in zip(exchange.answers, (1, 2), strict=False):
         assert answer.status.id == id
@@ -72,7 +72,7 @@ def whole(answers: tuple[Answer, ...]) -> bytes:
 def test_protocol_1_believes_no_more(pieces) -> None:
     clock = VirtualClock()
     bus = Bus("arm", TalkingPort(clock, list(pieces)), clock, 0.0)
-    exchange = bus.ask(read_request(1, 2, 36, 11))
+    exchange = bus.ask(bus.read_request(BY_NAME["AX-12A"], 2, BY_NAME["AX-12A"].layout.block))
     assert exchange.trouble is not None or exchange.answers[0].status.id == 2
     assert clock.now() < 101.0
 
@@ -99,4 +99,5 @@ def test_an_answer_before_the_wire_can_have_brought_it_is_refused() -> None:
             return self._pieces.pop(0) if self._pieces else super().receive(until)
 
     bus = Bus("arm", Hasty(clock, [status_packet(2, 1, 0, DATA)]), clock, 0.0)
-    assert bus.ask(read_request(2, 1, 120, 16)).trouble is Trouble.EARLY
+    model = BY_NAME["XM430-W350"]
+    assert bus.ask(bus.read_request(model, 1, model.layout.block)).trouble is Trouble.EARLY

@@ -62,7 +62,7 @@ def test_any_bytes_are_a_packet_or_incomplete_or_refused(packets, data, at) -> N
 
 @given(st.lists(st.binary(min_size=16, max_size=16), min_size=1, max_size=6), st.data())
 def test_a_common_answer_is_taken_apart_or_refused_when_a_byte_is_wrong(blocks, draw) -> None:
-    packet = fast_header(len(blocks), 16)
+    packet = fast_header([16] * len(blocks))
     for id, data in enumerate(blocks, 1):
         packet += fast_block(packet, id, 0, data)
     statuses = PACKETS2.take_fast(packet, 0, len(blocks), 16)

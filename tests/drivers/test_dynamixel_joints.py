@@ -183,7 +183,12 @@ def test_two_servos_of_one_id_and_model_are_refused_by_their_positions() -> None
 def test_a_servo_that_answers_ping_only_is_told_apart() -> None:
     arm = Arm()
     arm.chain.servo(1)["status_return"] = 0
-    with pytest.raises(SourceError, match="answers PING but no READ: its Status Return Level is 0"), arm.joints:
+    with (
+        pytest.raises(
+            SourceError, match=r"answers PING but no READ: its Status Return Level .* supply is switched off"
+        ),
+        arm.joints,
+    ):
         pass
 
 

@@ -11,7 +11,7 @@ from test_dynamixel_bus import TalkingPort
 
 from drivers.bench.virtual_port import VirtualClock
 from drivers.feetech.bench.chain import Chain
-from drivers.feetech.bench.frames import instructions_in, status_packet
+from drivers.feetech.bench.frames import Code, instructions_in, status_packet
 from drivers.feetech.bench.servo import CALIBRATE, Servo
 from drivers.feetech.channel import Channel
 from drivers.feetech.joints import PACKETS, Bus
@@ -58,7 +58,7 @@ def test_any_bytes_are_a_packet_or_incomplete_or_refused(data, at) -> None:
 def test_only_intact_answers_of_who_was_asked_are_believed_whatever_comes(pieces) -> None:
     clock = VirtualClock()
     bus = Bus("arm", TalkingPort(clock, list(pieces)), clock, 0.0)
-    exchange = bus.ask(Request(PACKETS.sync_read((1, 2), 56, 15), (1, 2), 15, 0))
+    exchange = bus.ask(Request(lambda n: PACKETS.sync_read((1, 2), 56, n), (1, 2), 15, 0))
     said = b"".join(pieces)
     for answer, id in zip(exchange.answers, (1, 2), strict=False):
         assert answer.status.id == id
@@ -154,6 +154,37 @@ def test_servos_answer_a_sync_read_one_after_the_other() -> None:
     assert [reply.data[2] for reply in replies] == [3, 1]
     assert replies[1].start == pytest.approx(replies[0].start + 8 * 10 / BAUD)
     assert int.from_bytes(replies[0].data[5:7], "little") == 2048 + round(0.5 * 4096 / (2 * math.pi))
+
+
+def test_a_broadcast_ping_is_answered_by_each() -> None:
+    chain = Chain([Servo(BY_NAME["STS3215"], id, lambda t: 0.0) for id in (6, 2, 1, 252)])
+    replies = chain.send(PACKETS.ping(0xFE), 0.0, BAUD)
+    assert [reply.data for reply in replies] == [status_packet(id, 0, b"") for id in (1, 2, 6, 252)]
+    ends = [reply.start + 6 * 10 / BAUD for reply in replies]
+    assert all(end < after.start for end, after in zip(ends[:-1], replies[1:], strict=True))
+
+
+@pytest.mark.parametrize(
+    ("model", "address", "size", "number"),
+    [
+        ("STS3215", 9, 2, 0),
+        ("STS3215", 11, 2, 4095),
+        ("STS3215", 13, 1, 70),
+        ("STS3215", 14, 1, 80),
+        ("STS3215", 16, 2, 1000),
+        ("STS3215", 21, 1, 32),
+        ("STS3215", 48, 2, 1000),
+        ("SCS0009", 11, 2, 1023),
+    ],
+)
+def test_limits_are_those_of_a_new_servo(model, address, size, number) -> None:
+    chain = Chain([Servo(BY_NAME[model], 1, lambda t: 0.0)])
+    order = "big" if model == "SCS0009" else "little"
+    assert int.from_bytes(told(chain, address, size), order) == number
+    chain.send(PACKETS.write(1, address, bytes(size)), 2.0, BAUD)
+    body = bytes((1, 2, Code.RESET))
+    chain.send(b"\xff\xff" + body + bytes((~sum(body) & 0xFF,)), 3.0, BAUD)
+    assert int.from_bytes(told(chain, address, size, 4.0), order) == number
 
 
 def test_a_registered_write_waits_for_action() -> None:

@@ -14,7 +14,7 @@ from interfaces.errors import RequestError
 from interfaces.robot import RobotDescription
 
 TORQUE = 64
-PATH_S = 12.0
+PATH_S = 8.0
 
 
 def torque(robot: GazingRobot) -> list[int]:
@@ -22,7 +22,10 @@ def torque(robot: GazingRobot) -> list[int]:
 
 
 def dropped(robot: GazingRobot, seconds: float = 3.0) -> str:
-    robot.run(seconds)
+    """Read until gaze has ended; return why."""
+    end = robot.clock.now() + seconds
+    while robot.gaze.state == "on" and robot.clock.now() < end:
+        robot.run(0.1)
     assert (robot.gaze.state, torque(robot)) == ("dropped", [0] * 7)
     return robot.gaze.complaints[0]
 
@@ -57,7 +60,7 @@ def test_the_head_turns_no_faster_than_allowed() -> None:
     with (robot := GazingRobot(max_speed_deg_s=5.0)).joints:
         robot.switch_on()
         angles = []
-        for _ in range(100):
+        for _ in range(60):
             robot.run(0.05)
             angles.append(robot.q()[:2])
         speeds = np.abs(np.diff(angles, axis=0)).max() / 0.05
@@ -68,7 +71,7 @@ def test_the_head_stays_within_its_limits() -> None:
     with (robot := GazingRobot(limits_deg={"neck_pitch": (15.0, 22.0), "neck_yaw": (-5.0, 5.0)})).joints:
         robot.switch_on()
         robot.run(2.0)
-        for _ in range(100):
+        for _ in range(60):
             robot.run(0.1)
             yaw, pitch = np.degrees(robot.q()[:2])
             assert -5.2 <= yaw <= 5.2
@@ -78,10 +81,10 @@ def test_the_head_stays_within_its_limits() -> None:
 def test_a_head_without_a_fresh_aim_stands_still() -> None:
     with (robot := GazingRobot()).joints:
         robot.switch_on()
-        robot.run(3.0)
+        robot.run(1.5)
         robot.run(1.0, looking=False)
         before = robot.q()[:2]
-        robot.run(2.0, looking=False)
+        robot.run(1.0, looking=False)
         assert robot.gaze.state == "on"
         assert np.abs(robot.q()[:2] - before).max() < 1e-6
 
@@ -112,8 +115,8 @@ def learner(robot: RobotDescription, truth, sigma: float, support: bool = True):
 def off_middle(robot: GazingRobot) -> float:
     with robot.joints:
         robot.switch_on()
-        robot.run(2.0)
-        return float(np.abs(robot.run(8.0) - [340.0, 239.5]).mean())
+        robot.run(1.0)
+        return float(np.abs(robot.run(4.0) - [340.0, 239.5]).mean())
 
 
 @pytest.fixture(scope="module")

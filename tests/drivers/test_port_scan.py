@@ -21,6 +21,7 @@ from drivers.feetech.bench.chain import Chain as FeetechChain
 from drivers.feetech.bench.servo import Servo as FeetechServo
 from drivers.feetech.models import BAUDS as FEETECH_BAUDS
 from drivers.feetech.models import BY_NAME as FEETECH
+from drivers.feetech.packets import FeetechPackets
 from drivers.scan import FoundServo, ScannedBus, scan_port, serial_ports
 from drivers.scanners import SCANNERS
 from interfaces.clock import SystemClock
@@ -177,7 +178,14 @@ def test_two_servos_of_two_models_with_one_id_are_told(one, other) -> None:
 def test_a_servo_that_answers_no_read_is_told_with_its_register() -> None:
     silent = servo("XM430-W350", 3)
     silent["status_return"] = 0
-    assert "Status Return Level (68)" in found(silent)[0].troubles[0]
+    assert "Status Return Level (68" in found(silent)[0].troubles[0]
+
+
+def test_a_feetech_servo_without_read_is_not_told_of_its_level() -> None:
+    assert "Status Return" not in FeetechPackets.pinged_only
+    level_0 = feetech("STS3215", 3)
+    level_0["status_return"] = 0
+    assert found(level_0)[0].troubles == ()
 
 
 class XL320(Servo):
@@ -228,10 +236,17 @@ def test_a_port_that_is_lost_keeps_what_was_found() -> None:
 
 
 def test_a_scan_of_a_real_port_finds_its_servos(tmp_path: Path) -> None:
+    there = [(1, "XM430-W350"), (2, "MX-28")]
     servos = [servo("XM430-W350", 1, booted_s=0.0), servo("MX-28", 2)]
+    port = str(tmp_path / "bus")
     with PtyShell(Chain(servos), tmp_path / "bus"):
-        told = scan_port(str(tmp_path / "bus"), SCANNERS, SystemClock(), lambda _: None, bauds=[1_000_000])
-    assert [(s.id, s.model) for s in told.servos] == [(1, "XM430-W350"), (2, "MX-28")]
+        for _ in range(20):  # a scan does not wait for a bench that gets its turn late on a busy machine
+            told = scan_port(port, SCANNERS, SystemClock(), lambda _: None, bauds=[1_000_000])
+            found = [(s.id, s.model) for s in told.servos]
+            assert set(found) <= set(there)
+            if found == there:
+                return
+    raise AssertionError(f"never found all: {found}")
 
 
 def test_ports_are_named_by_what_stays_the_same(tmp_path: Path) -> None:

@@ -32,11 +32,11 @@ from kbmaps import ExactLearner, JointBasis, KBMap
 from sim_backend import SimConfig, SimWorld
 from sim_backend.guided_path import guided_path
 
-pytestmark = pytest.mark.skipif(find_spec("pybullet") is None, reason="pybullet is not installed")
+pytestmark = pytest.mark.skipif(find_spec("pybullet") is None, reason="no pybullet; to run it: pip install -e '.[sim]'")
 
 ROBOT = Path(__file__).parents[2] / "examples" / "desk_arm" / "robot.toml"
 CONFIG = SimConfig()
-SECONDS, RATE_HZ = 60.0, 60.0
+SECONDS, RATE_HZ = 30.0, 60.0
 BEGIN_S = 100.0  # of the path on the benches' clocks, which stand there at first
 LATENCY_S = 1e-3
 

@@ -401,7 +401,7 @@ int main() { setup(); for (int k = 0; k < 5000; k++) loop(); }
 """
 
 
-@pytest.mark.skipif(shutil.which("g++") is None, reason="no C++ compiler")
+@pytest.mark.skipif(shutil.which("g++") is None, reason="no C++ compiler; to run it: apt-get install g++")
 def test_the_sketch_says_what_the_driver_reads(tmp_path) -> None:
     text = re.sub(r"#include <(Arduino|Wire)\.h>", "", SKETCH.read_text())
     (tmp_path / "sketch.inc").write_text(text)

@@ -28,7 +28,7 @@ from vision.trackers import tracker_of
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "extending.md").read_text(encoding="utf-8")
-LIMIT_S = 100.0
+LIMIT_S = 500.0
 CAMERAS = StereoCalibration(
     focal_px=700.0, principal_point_px=(320.0, 240.0), baseline_m=0.12, image_size_px=(640, 480), pixel_sigma=0.2
 )

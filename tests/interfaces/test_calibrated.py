@@ -66,7 +66,7 @@ def test_our_own_loader_reads_the_learnt_positions(seed, head, arm) -> None:
 @settings(deadline=None, max_examples=20)
 @given(st.integers(0, 10**6), HEADS, ARMS)
 def test_pybullet_reads_the_learnt_positions(seed, head, arm) -> None:
-    pybullet = pytest.importorskip("pybullet", reason="pybullet has wheels for Python 3.11 only")
+    pybullet = pytest.importorskip("pybullet")
     with tempfile.TemporaryDirectory() as folder:
         robot, chain, file = written(Path(folder), seed, head, arm)
         urdf = without_visuals(file.parent / "robot.urdf")
@@ -112,7 +112,7 @@ def bullet_position(pybullet, client: int, body: int, robot: RobotDescription, q
 @settings(deadline=None, max_examples=30)
 @given(st.integers(0, 10**6), HEADS, ARMS)
 def test_pinocchio_reads_the_learnt_positions(seed, head, arm) -> None:
-    pinocchio = pytest.importorskip("pinocchio", reason="the extra `pinocchio` is not installed")
+    pinocchio = pytest.importorskip("pinocchio")
     with tempfile.TemporaryDirectory() as folder:
         robot, chain, file = written(Path(folder), seed, head, arm)
         model = pinocchio.buildModelFromUrdf(str(file.parent / "robot.urdf"))

@@ -11,6 +11,6 @@ from kbmaps.maps import kernels
 def kernel_path(request: pytest.FixtureRequest) -> Iterator[str]:
     """Everything made in the module takes this path: once the compiled one, once NumPy's."""
     if request.param not in kernels.available():
-        pytest.skip("kbmaps was installed without a C compiler, or BODYSCHEMA_PURE is set")
+        pytest.skip("no compiled kernels; to run it: unset BODYSCHEMA_PURE, apt-get install gcc, make clean setup")
     with kernels.using(request.param):
         yield request.param

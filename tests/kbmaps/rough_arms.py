@@ -13,7 +13,7 @@ ROUGH = ChainTolerances(axes=np.radians(3.0), points=0.015, tool=0.03)
 REACH_DEG = 80.0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Arm:
     nominal: RigidChain
     real: RigidChain

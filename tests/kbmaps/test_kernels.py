@@ -8,6 +8,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable
+from importlib import import_module
 
 import numpy as np
 import pytest
@@ -21,7 +22,10 @@ from kbmaps.maps import kernels
 
 seeds = st.integers(0, 2**32 - 1)
 kinds = st.text("RP", min_size=1, max_size=6)
-needs_both = pytest.mark.skipif(len(kernels.available()) < 2, reason="kbmaps was installed without a C compiler")
+needs_both = pytest.mark.skipif(
+    len(kernels.available()) < 2,
+    reason="no compiled kernels; to run it: apt-get install gcc",
+)
 
 
 def on_both_paths(make: Callable[[], object]) -> list[object]:
@@ -219,3 +223,67 @@ def test_the_path_is_chosen_for_a_block_only():
     with kernels.using("numpy"):
         assert kernels_in_use() == "numpy"
     assert kernels_in_use() == before
+
+
+# --- buffers that Python's own checks would not have let through
+
+
+def net_of(joints: int, points: int, empty: Callable[[object], object] = np.empty):
+    arrays = np.zeros(2 * joints), np.zeros(9 * joints), np.zeros(joints), np.zeros(points)
+    return import_module("kbmaps._kernels").Net(*arrays, np.asarray, np.asarray, empty)
+
+
+REPLAYED = {"q": np.zeros((4, 2)), "x": np.zeros((4, 3)), "order": np.array([0, 3]), "mu0": np.ones(2)}
+
+
+@needs_both
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"q": np.zeros((4, 1))},
+        {"q": np.zeros((4, 3))},
+        {"q": np.zeros(8)},
+        {"q": np.zeros((8, 2))[::2]},
+        {"q": np.zeros((4, 2), np.float32)},
+        {"q": b"12345678" * 8},
+        {"q": np.zeros(())},
+        {"x": np.zeros((4, 2))},
+        {"x": np.zeros((3, 3))},
+        {"x": np.zeros((4, 3, 1))},
+        {"x": np.zeros(12)},
+        {"order": np.array([0, 4])},
+        {"order": np.array([0, -1])},
+        {"order": np.array([0, 2**62])},
+        {"order": np.array([0, 3], np.int32)},
+        {"order": np.array([0, 3], np.uint64)},
+        {"order": np.array([0, 3], float)},
+        {"order": np.array([[0, 3]])},
+        {"order": [0, 3]},
+        {"mu0": np.ones(1)},
+        {"mu0": np.ones(3)},
+    ],
+    ids=str,
+)
+def test_a_replay_refuses_buffers_that_do_not_fit(wrong: dict[str, object]) -> None:
+    net = net_of(2, 27)
+    net.replay(*REPLAYED.values())
+    with pytest.raises((TypeError, BufferError)):
+        net.replay(*(REPLAYED | wrong).values())
+
+
+@needs_both
+@pytest.mark.parametrize(
+    ("joints", "points"),
+    [(2, 0), (2, 8), (2, 26), (3, 9), (50, 2**10), (64, 2**10), (41, 3**6)],
+)
+def test_a_net_refuses_planes_that_do_not_fit(joints: int, points: int) -> None:
+    with pytest.raises(TypeError, match=f"{joints} joints cannot have {points} control points"):
+        net_of(joints, points)
+
+
+@needs_both
+def test_results_are_not_written_into_a_smaller_array() -> None:
+    net = net_of(2, 27, lambda _: np.zeros(2))
+    for ask in (net.outputs, net.derivatives):
+        with pytest.raises(TypeError, match="another size"):
+            ask(np.zeros((30, 2)), 0, 3)

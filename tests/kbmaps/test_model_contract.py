@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import math
 from collections.abc import Callable
 
@@ -72,15 +73,29 @@ def bent_pairs(arm: Arm, rng: np.random.Generator, n: int) -> tuple[np.ndarray, 
     return q, x + 0.001 * rng.normal(size=(n, 3))
 
 
+@functools.cache
 def bent_learner(arm: Arm) -> ResidualLearner:
     learner = ResidualLearner(arm.nominal, ROUGH)
     learner.learn(*bent_pairs(arm, np.random.default_rng(6), 150))
     return learner
 
 
+ARM = rough_arm(np.random.default_rng(1), KINDS)
+
+
+def freshly_taught(name: str) -> Model:
+    rng = np.random.default_rng(2)
+    model = MODELS[name](ARM)
+    model.learn(*(bent_pairs(ARM, rng, LONG[name]) if name in LONG else ARM.pairs(rng, 12, 0.01)))
+    return model
+
+
+taught_once = functools.cache(freshly_taught)
+
+
 @pytest.fixture
 def arm() -> Arm:
-    return rough_arm(np.random.default_rng(1), KINDS)
+    return ARM
 
 
 @pytest.fixture(params=MODELS)
@@ -94,10 +109,9 @@ def model(name: str, arm: Arm) -> Model:
 
 
 @pytest.fixture
-def taught(name: str, model: Model, arm: Arm) -> Model:
-    rng = np.random.default_rng(2)
-    model.learn(*(bent_pairs(arm, rng, LONG[name]) if name in LONG else arm.pairs(rng, 12, 0.01)))
-    return model
+def taught(name: str) -> Model:
+    """A model that all tests share: none of them changes it."""
+    return taught_once(name)
 
 
 @pytest.fixture
@@ -182,7 +196,8 @@ def test_an_estimate_is_of_what_is_predicted_and_says_how_sure_it_is(taught, q):
     assert estimate.in_support.dtype == np.bool_
 
 
-def test_predicting_changes_nothing(taught, q):
+def test_predicting_changes_nothing(name, q):
+    taught = freshly_taught(name)
     before = taught.to_bytes()
     first = taught.predict(q)
     taught.estimate(q)
@@ -228,7 +243,8 @@ def test_the_lesson_of_a_short_window_folds_it(arm):
     assert learner.kept < learner.pairs
 
 
-def test_bytes_give_the_same_estimate_to_the_last_bit_and_learn_on(taught, arm, q):
+def test_bytes_give_the_same_estimate_to_the_last_bit_and_learn_on(name, arm, q):
+    taught = freshly_taught(name)
     again = type(taught).from_bytes(taught.to_bytes())
     more = arm.pairs(np.random.default_rng(5), 3, 0.01)
     for _ in range(2):

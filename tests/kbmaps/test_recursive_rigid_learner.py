@@ -20,7 +20,8 @@ from kbmaps import (
     ShapeError,
 )
 
-pytestmark = pytest.mark.usefixtures("kernel_path")
+# What depends on the kernels; that both agree on everything else is shown in test_kernels.py.
+on_both_paths = pytest.mark.usefixtures("kernel_path")
 
 seeds = st.integers(0, 2**32 - 1)
 # Everything may be off, so that a third of the directions show in no position, and some others hardly.
@@ -29,7 +30,7 @@ SLIGHT = ChainTolerances(axes=1e-4, points=1e-4, zeros=1e-4, slide_zeros=1e-4, t
 
 
 @given(seed=seeds, kinds=st.sampled_from(["RRRR", "RPR", "RRRRRRR"]))
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=8, deadline=None)
 def test_pair_by_pair_is_all_at_once_where_the_problem_is_linear(seed, kinds):
     rng = np.random.default_rng(seed)
     arm = rough_arm(rng, kinds, SLIGHT)
@@ -95,6 +96,7 @@ def test_it_goes_on_from_a_batch_as_the_batch_would():
     np.testing.assert_allclose(other.sigma, one.sigma, rtol=0.1)
 
 
+@on_both_paths
 def test_a_new_tool_is_learnt_from_few_pairs_without_losing_the_arm():
     rng = np.random.default_rng(4)
     arm = rough_arm(rng, "RRRRRRR")
@@ -121,6 +123,7 @@ def test_a_tool_that_was_held_is_set_free_by_its_change():
     np.testing.assert_allclose(learner.predict(q), moved.positions(q), atol=0.003)
 
 
+@on_both_paths
 def test_an_outlier_moves_the_chain_no_further_than_a_pair_at_the_gate():
     rng = np.random.default_rng(7)
     arm = rough_arm(rng)
@@ -131,8 +134,7 @@ def test_an_outlier_moves_the_chain_no_further_than_a_pair_at_the_gate():
     assert arm.error(learner, rng) < 0.006
 
 
-@pytest.mark.parametrize("told", [True, False])
-@pytest.mark.parametrize("pairs", [30, 100])
+@pytest.mark.parametrize(("told", "pairs"), [(True, 30), (False, 100)])
 def test_outliers_from_the_first_pair_on_cost_no_more_than_their_share_of_the_pairs(told, pairs):
     spoilt, clean = [], []
     for seed in range(6):
@@ -192,7 +194,7 @@ def most_apart_from_a_batch(seed: int) -> float:
 
 
 def test_between_refits_it_stays_where_a_batch_is():
-    assert max(most_apart_from_a_batch(seed) for seed in range(4)) < 0.3
+    assert max(most_apart_from_a_batch(seed) for seed in range(2)) < 0.3
 
 
 @pytest.mark.soak
@@ -213,6 +215,7 @@ def test_claims_between_refits_are_those_of_a_batch():
     np.testing.assert_allclose(learner.estimate(test).sigma, batch.estimate(test).sigma, rtol=0.1)
 
 
+@on_both_paths
 @pytest.mark.parametrize("sigma", [None, 0.004])
 def test_vectors_and_rows_tell_the_same_to_the_last_bit(sigma):
     rng = np.random.default_rng(19)
@@ -226,7 +229,7 @@ def test_vectors_and_rows_tell_the_same_to_the_last_bit(sigma):
 
 
 @given(seed=seeds, cuts=st.lists(st.integers(1, 59), max_size=4))
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=5, deadline=None)
 def test_pairs_tell_the_same_in_whatever_portions_they_come(seed, cuts):
     rng = np.random.default_rng(seed)
     arm = rough_arm(rng, "RRR")
@@ -239,6 +242,7 @@ def test_pairs_tell_the_same_in_whatever_portions_they_come(seed, cuts):
     np.testing.assert_allclose(in_portions.predict(test), at_once.predict(test), rtol=0, atol=1e-9)
 
 
+@on_both_paths
 def test_its_memory_is_bounded_by_the_window():
     rng = np.random.default_rng(13)
     arm = rough_arm(rng, "RRR")
@@ -285,6 +289,7 @@ def test_an_arm_that_is_not_rigid_widens_sigma_when_the_noise_was_told():
     assert learner.estimate(q).sigma.mean() == pytest.approx(np.sqrt(np.square(rest).mean()), rel=0.2)
 
 
+@on_both_paths
 def test_a_wild_pair_leaves_finite_numbers():
     rng = np.random.default_rng(8)
     arm = rough_arm(rng)
@@ -294,6 +299,7 @@ def test_a_wild_pair_leaves_finite_numbers():
     assert arm.error(learner, rng) < 0.02
 
 
+@on_both_paths
 @pytest.mark.parametrize("sigma", [0.004, None])
 @pytest.mark.parametrize("tool_changed", [False, True])
 def test_bytes_give_a_learner_that_goes_on_to_the_last_bit(tool_changed, sigma):
@@ -317,6 +323,7 @@ def test_bytes_of_the_other_learner_are_refused():
         RecursiveRigidLearner.from_bytes(RigidLearner(arm.nominal, ROUGH).to_bytes())
 
 
+@on_both_paths
 @pytest.mark.parametrize(
     ("q", "x", "sigma", "error"),
     [

@@ -50,7 +50,7 @@ def built(folder: Path, **environment: str) -> Built:
 def test_without_a_compiler_the_wheel_is_pure_and_the_build_says_why(tmp_path):
     failing = shutil.which("false")
     if failing is None:
-        pytest.skip("there is no command `false` to stand for a compiler")
+        pytest.skip("no command `false`; to run it: apt-get install coreutils")
     result = built(tmp_path, CC=failing)
     assert result.wheel.endswith("-py3-none-any.whl")
     assert result.says[1:] == ["numpy", "3"]
@@ -70,7 +70,7 @@ def test_a_pure_wheel_can_be_asked_for(tmp_path):
     assert "kernels" not in result.log
 
 
-@pytest.mark.skipif(shutil.which("cc") is None, reason="there is no C compiler on this machine")
+@pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler; to run it: apt-get install gcc")
 def test_with_a_compiler_the_wheel_holds_kernels_for_every_python_from_3_11(tmp_path):
     result = built(tmp_path, CC="cc", CFLAGS="-O0 -Wall -Wextra -Werror -Wno-cast-function-type")
     assert "-cp311-abi3-" in result.wheel

@@ -25,7 +25,7 @@ def python(version: str) -> Path:
     """The interpreter of this version; the test is skipped where there is none."""
     found = shutil.which(f"python{version}")
     if found is None or subprocess.run([found, "-c", ""], capture_output=True, check=False).returncode:
-        pytest.skip(f"there is no Python {version} here")
+        pytest.skip(f"no Python {version}; to run it: pyenv install {version}")
     return Path(found)
 
 

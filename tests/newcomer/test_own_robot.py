@@ -7,11 +7,11 @@ import re
 import shlex
 import shutil
 import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+import warm
 from scipy.spatial.transform import Rotation
 
 from daemon.cli import command_line
@@ -24,7 +24,6 @@ from kbmaps import RigidChain
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "own_robot.md").read_text(encoding="utf-8")
 EXAMPLE = ROOT / "examples" / "desk_arm"
-LIMIT_S = 60.0
 STEP_RAD = np.radians(2.0)
 COMMANDS = re.findall(r"^\$ (bodyschema .*)$", PAGE, re.MULTILINE)
 
@@ -51,11 +50,8 @@ def desk(tmp_path: Path) -> Path:
 
 
 def typed(command: str, folder: Path) -> subprocess.CompletedProcess[str]:
-    line = [sys.executable, "-m", "daemon", *shlex.split(command)[1:]]
     environment = {"XDG_STATE_HOME": "/home/you/.local/state", "PATH": "/usr/bin:/bin", "OPENBLAS_NUM_THREADS": "1"}
-    return subprocess.run(
-        line, capture_output=True, text=True, timeout=LIMIT_S, check=False, cwd=folder, env=environment
-    )
+    return warm.run("-m", "daemon", *shlex.split(command)[1:], cwd=folder, env=environment)
 
 
 def test_the_page_shows_the_example_s_robot_toml() -> None:

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import ast
 import re
 import subprocess
 import sys
 import tomllib
+from importlib import import_module
 from importlib.metadata import packages_distributions
 from pathlib import Path
 
 import pytest
+
+import kbmaps
 
 ROOT = Path(__file__).parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
@@ -26,8 +30,9 @@ def test_no_package_has_the_name_of_a_standard_module(package: str) -> None:
     assert package not in sys.stdlib_module_names
 
 
-def test_the_lock_file_names_no_download_host() -> None:
-    assert not re.search(r"https?://|--(extra-)?index-url", (ROOT / "requirements.lock").read_text(encoding="utf-8"))
+@pytest.mark.parametrize("file", ["requirements.lock", "requirements-demo.lock"])
+def test_the_lock_file_names_no_download_host(file: str) -> None:
+    assert not re.search(r"https?://|--(extra-)?index-url", (ROOT / file).read_text(encoding="utf-8"))
 
 
 def test_every_dependency_is_justified() -> None:
@@ -39,7 +44,7 @@ def test_every_dependency_is_justified() -> None:
 
 
 FOREIGN = ("msgspec", "cv2", "zenoh", "interfaces", "logging.handlers")
-HEAVY = ("pybullet", "matplotlib", "cv2", "scipy", "numpy", "zenoh", "yourdfpy")
+HEAVY = ("pybullet", "matplotlib", "cv2", "scipy", "numpy", "zenoh")
 
 
 def test_help_imports_nothing_heavy() -> None:
@@ -54,6 +59,41 @@ print("heavy:", [name for name in {HEAVY} if name in sys.modules])
 """
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
     assert "heavy: []" in result.stdout
+
+
+def test_a_client_imports_neither_scipy_nor_opencv() -> None:
+    """`status` and `predict` take a fraction of a second of CPU; scipy alone takes one."""
+    robot = ROOT / "examples/desk_arm/robot.toml"
+    code = f"""
+import sys
+from pathlib import Path
+import daemon.bus, daemon.commands.predict, daemon.commands.status, daemon.status_view
+from daemon.config import Config
+assert Config.load(Path({str(robot)!r})).robot.chain.joints == 4
+print("heavy:", [name for name in ("scipy", "cv2", "pybullet", "matplotlib") if f"{{name}}.version" in sys.modules])
+"""
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
+    assert result.stdout == "heavy: []\n"
+
+
+def test_type_checkers_see_what_kbmaps_imports_lazily() -> None:
+    tree = ast.parse(Path(kbmaps.__file__).read_text(encoding="utf-8"))
+    checked = {
+        alias.name: getattr(import_module(node.module), alias.name)
+        for node in ast.walk(tree)
+        if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("kbmaps.")
+        for alias in node.names
+    }
+    assert checked == {name: getattr(kbmaps, name) for name in kbmaps.__all__}
+
+
+def test_the_demo_s_lock_file_is_part_of_the_other() -> None:
+    whole, demo = (
+        set(re.findall(r"^[a-z][^ ]*==[^ ]*", (ROOT / file).read_text(encoding="utf-8"), re.MULTILINE))
+        for file in ("requirements.lock", "requirements-demo.lock")
+    )
+    assert demo
+    assert demo <= whole
 
 
 def test_the_maths_imports_numpy_and_scipy_alone() -> None:

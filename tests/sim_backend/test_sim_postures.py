@@ -13,7 +13,7 @@ from sim_backend import SimConfig, true_chain
 from sim_backend.posed import PosedWorld
 from sim_backend.postures import visible_postures
 
-LIMIT_S = 60.0
+LIMIT_S = 500.0
 POSTURES = 3
 
 

@@ -16,7 +16,7 @@ from sim_backend.raster import Grid, Raster
 PLAIN = CameraConfig(noise=0, clutter=0)
 UNTURNED = np.eye(3)
 CALIBRATION = StereoCalibration(600.0, (319.5, 239.5), 0.09, (640, 480))
-RADIUS = CameraConfig().ball_radius_m
+RADIUS = CameraConfig().marker_radius_m
 
 
 @pytest.fixture

@@ -9,14 +9,12 @@ from pathlib import Path
 
 import msgspec
 import pytest
-from guided_run import described, shipped
+from guided_run import shipped
 
-from interfaces.errors import ConfigError, RobotError
+from interfaces.errors import ConfigError
 from interfaces.robot import RobotDescription
 from interfaces.toml_file import read_toml
 from sim_backend import SimConfig, SimWorld, model_file
-from sim_backend.physics_urdf import physics_urdf
-from sim_backend.truth import TrueRobot
 
 ROOT = Path(__file__).resolve().parents[2]
 HOLD_OPEN = """
@@ -82,51 +80,6 @@ def test_a_robot_without_stereo_calibration_is_told_which_keys_are_missing():
     robot = RobotDescription.from_tables(tables, text, file)
     with pytest.raises(ConfigError, match="focal_px, principal_point_px, baseline_m"), SimWorld(robot, SimConfig()):
         pass
-
-
-def with_mesh(tmp_path, name):
-    urdf = f"""<robot name="r"><link name="base"/><link name="tip"><visual><geometry>
-        <mesh filename="{name}"/></geometry>
-        <material name="m"><texture filename="/etc/passwd"/></material></visual></link>
-        <joint name="turn" type="continuous"><parent link="base"/><child link="tip"/><axis xyz="0 0 1"/></joint>
-        </robot>"""
-    toml = """
-        [robot]
-        name = "r"
-        urdf = "robot.urdf"
-        joints = ["turn"]
-        marker_link = "tip"
-        [camera]
-        parent_link = "base"
-        focal_px = 600.0
-        principal_point_px = [319.5, 239.5]
-        baseline_m = 0.1
-        image_size_px = [640, 480]
-        """
-    return described(tmp_path, urdf, toml)
-
-
-def test_a_missing_mesh_is_named(tmp_path):
-    robot = with_mesh(tmp_path, "package://robot/tip.stl")
-    with pytest.raises(RobotError, match=r"robot\.urdf.*package://robot/tip\.stl"), SimWorld(robot, SimConfig()):
-        pass
-
-
-@pytest.mark.parametrize(
-    "name", ["/etc/passwd", "../../../../../../../../etc/passwd", "package://a/../../etc/passwd", "linked.stl"]
-)
-def test_a_file_that_is_no_mesh_is_not_read_as_one(tmp_path, name):
-    (tmp_path / "linked.stl").symlink_to("/etc/passwd")
-    robot = with_mesh(tmp_path, name)
-    with pytest.raises(RobotError, match=r"is none. Meshes end in|is missing"):
-        physics_urdf(TrueRobot.draw(robot, SimConfig()))
-
-
-def test_textures_are_not_looked_for(tmp_path):
-    (tmp_path / "tip.stl").write_bytes(b"")
-    text = physics_urdf(TrueRobot.draw(with_mesh(tmp_path, "tip.stl"), SimConfig()))
-    assert str(tmp_path / "tip.stl") in text
-    assert "passwd" not in text
 
 
 def test_an_unknown_model_is_answered_with_the_known_ones():

@@ -13,7 +13,7 @@ import v4l2_cameras
 def library(tmp_path_factory: pytest.TempPathFactory) -> Path:
     found = v4l2_cameras.compiled(tmp_path_factory.mktemp("shim"))
     if found is None:
-        pytest.skip("no C compiler with V4L2's headers, so cameras cannot be emulated below OpenCV")
+        pytest.skip("cameras are emulated in C; to run it: apt-get install gcc linux-libc-dev")
     return found
 
 
@@ -22,5 +22,5 @@ def disk_shim(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The library that makes disks fail and clocks jump."""
     found = failing_disk.compiled(tmp_path_factory.mktemp("disk_shim"))
     if found is None:
-        pytest.skip("no C compiler, so nothing can be put between a process and its disk")
+        pytest.skip("a shim in C stands between a process and its disk; to run it: apt-get install gcc")
     return found

@@ -20,7 +20,7 @@ from daemon.view.hub import Hub
 from daemon.view.watch import Watch
 from interfaces.errors import BodyschemaError, BusError
 
-LIMIT_S = 60.0
+LIMIT_S = 400.0
 KEYS = Keys("arm")
 
 

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import warm
 
 from daemon.bench_wiring import Motion, bench_robot_file, open_bench
 from daemon.bus import Bus
@@ -26,7 +27,7 @@ from drivers.bench.dry_run import DryRun
 from interfaces.errors import BodyschemaError
 from interfaces.records import FloatArray, Pair
 
-LIMIT_S = 90.0
+LIMIT_S = 500.0
 
 
 def limb(x: FloatArray, radius_m: float) -> FloatArray:
@@ -71,7 +72,7 @@ def on_the_bench(config: Config, folder: Path, angle: Callable[[float], FloatArr
 class SamplerProcess:
     """`bodyschema sampler`, begun."""
 
-    def __init__(self, config: Config, bus: Bus, process: subprocess.Popen[bytes], log: Path) -> None:
+    def __init__(self, config: Config, bus: Bus, process: subprocess.Popen[bytes] | warm.Child, log: Path) -> None:
         self.process, self._bus, self._log = process, bus, log
         self._keys = Keys(config.robot.name)
 
@@ -101,10 +102,13 @@ class SamplerProcess:
 @contextlib.contextmanager
 def sampling(config: Config, environment: dict[str, str] | None = None) -> Iterator[SamplerProcess]:
     """A sampler process."""
-    command = [sys.executable, "-m", "daemon", "sampler", "--robot", str(config.file)]
+    words = ["-m", "daemon", "sampler", "--robot", config.file]
     log = config.file.with_suffix(".log")
     with log.open("w") as errors:
-        process = subprocess.Popen(command, env=environment, stderr=errors)
+        if environment:  # it works on what starts
+            process = subprocess.Popen([sys.executable, *words], env=environment, stderr=errors)
+        else:
+            process = warm.Child(*words, stderr=errors)
     try:
         with Bus(connect=config.tables.zenoh.sampler) as bus:
             yield SamplerProcess(config, bus, process, log)

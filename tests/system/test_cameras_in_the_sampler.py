@@ -19,7 +19,6 @@ from v4l2_cameras import ShimCamera, preloaded
 from daemon.config import Config
 from interfaces.records import FloatArray
 
-pytestmark = pytest.mark.timeout(240)
 ARM = Path(__file__).parents[2] / "examples" / "desk_arm"
 FPS, FRAMES = 30.0, 240
 TRIES = 4

@@ -11,7 +11,6 @@ from two_processes import expect_each_pair_learnt_once, learner_with, running, s
 
 from daemon.store import PairReader
 
-pytestmark = pytest.mark.timeout(600)
 HOUR_S, YEAR_S = 3600, 31_557_600
 # Ahead, back before the start, years ahead as from a dead battery to the time of the network, and right again.
 JUMPS_S = (HOUR_S, -HOUR_S, 20 * YEAR_S, -40 * YEAR_S, 0)

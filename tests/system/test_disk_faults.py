@@ -34,7 +34,6 @@ from daemon.store import PairReader
 from daemon.wire import CommandRequest, encode
 from interfaces.errors import BodyschemaError
 
-pytestmark = pytest.mark.timeout(600)
 SOME, MORE = 20, 20
 
 
@@ -196,7 +195,7 @@ def test_a_process_that_may_not_write_a_file_so_large_tells_it(tmp_path, free_en
     config = write_robot(tmp_path, free_endpoint)
     limited = ("prlimit", f"--fsize={256 * 1024}")
     if not any(os.access(f"{folder}/prlimit", os.X_OK) for folder in os.environ["PATH"].split(":")):
-        pytest.skip("no prlimit")
+        pytest.skip("no prlimit; to run it: apt-get install util-linux")
     with running(config, "sampler", prefix=limited):
         text = health(config, "sampler", SamplerStatus, "No pairs are taken until the disk does")
         stopped = sampler_with(config, 0).pairs

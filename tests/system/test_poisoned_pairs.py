@@ -24,7 +24,6 @@ from interfaces.clock import SystemClock
 from interfaces.records import MarkerFix, frozen_array
 from kbmaps import RigidChain
 
-pytestmark = pytest.mark.timeout(600)
 PAIRS, SPOILT = 60, 30
 
 

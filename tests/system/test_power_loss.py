@@ -22,7 +22,6 @@ from daemon.wire import CommandRequest, encode, pair_to_wire
 from interfaces.clock import SystemClock
 from interfaces.errors import StoreError
 
-pytestmark = pytest.mark.timeout(600)
 CHECKPOINT = "learner.ckpt"
 
 

@@ -6,14 +6,13 @@ import contextlib
 import os
 import signal
 import socket
-import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator
 from itertools import pairwise
 from pathlib import Path
 
 import pytest
+import warm
 from security_recipe import SEVERAL, carried_out
 from stalled_at import WORK
 from two_processes import KEYS, write_robot
@@ -25,8 +24,7 @@ from daemon.status import LearnerStatus, SamplerStatus
 from daemon.store import PairReader
 from daemon.wire import PairsReply, decode
 
-pytestmark = pytest.mark.timeout(120)
-LIMIT_S = 60.0
+LIMIT_S = 500.0
 WATCHDOG_S = 0.8
 STARVED_S = 2 * WATCHDOG_S
 LOOPS = {"sampler": sampler.LOOPS, "learner": learner.LOOPS}
@@ -82,23 +80,22 @@ def systemd(tmp_path: Path) -> Iterator[Systemd]:
 
 @pytest.fixture
 def config(tmp_path: Path, free_endpoint: Callable[[], str]) -> Config:
-    return write_robot(tmp_path, free_endpoint, rows=6000)
+    return write_robot(tmp_path, free_endpoint, rows=12_000)
 
 
 def started(
     config: Config, systemd: Systemd, process: str, *wrapper: object
-) -> contextlib.AbstractContextManager[subprocess.Popen[bytes]]:
+) -> contextlib.AbstractContextManager[warm.Child]:
     """A process of ours under `systemd`, its log beside robot.toml."""
     return running(systemd, log_of(config), *(wrapper or ("-m", "daemon")), process, "--robot", config.file)
 
 
 @contextlib.contextmanager
-def running(systemd: Systemd, log_file: Path, *arguments: object) -> Iterator[subprocess.Popen[bytes]]:
+def running(systemd: Systemd, log_file: Path, *arguments: object) -> Iterator[warm.Child]:
     """Python with these arguments under `systemd`."""
     environment = os.environ | {"NOTIFY_SOCKET": str(systemd.file), "WATCHDOG_USEC": str(round(1e6 * WATCHDOG_S))}
-    command = [sys.executable, *arguments]
     with log_file.open("ab") as log:
-        child = subprocess.Popen(command, stdin=subprocess.DEVNULL, stderr=log, env=environment)
+        child = warm.Child(*arguments, stderr=log, env=environment)
     try:
         yield child
     finally:

@@ -1,4 +1,4 @@
-"""A robot's PC has no simulator: everything but `--sim` works where pybullet and matplotlib cannot be imported."""
+"""The base installation has no extras: all that needs neither simulator nor cameras works without them."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Without:
         return getattr(self.finder, name)
 
     def find_spec(self, name, path=None, target=None):
-        if name.split(".")[0] in ("pybullet", "pybullet_data", "matplotlib"):
+        if name.split(".")[0] in ("pybullet", "pybullet_data", "matplotlib", "cv2"):
             return None
         return self.finder.find_spec(name, path, target)
 
@@ -47,11 +47,20 @@ def guarded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def run(code: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=100, check=False)
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
 
 
 def test_the_guard_refuses_the_simulator(guarded: Path) -> None:
     assert "ModuleNotFoundError: No module named 'pybullet'" in run("import pybullet").stderr
+
+
+def test_a_camera_command_names_the_extra(guarded: Path, tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "daemon", "calibrate", "cameras", str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=600, check=False)
+    assert (done.returncode, done.stderr) == (
+        1,
+        "bodyschema: this needs OpenCV, which is not installed. Type: pip install 'bodyschema[cameras]'\n",
+    )
 
 
 def test_every_command_but_the_simulator_s_can_be_loaded(guarded: Path) -> None:
@@ -71,7 +80,6 @@ def test_the_simulation_says_what_to_install(guarded: Path, tmp_path: Path) -> N
         [sys.executable, "-m", "daemon", "run", "--sim", "--robot", ROOT / "examples" / "desk_arm" / "robot.toml"],
         capture_output=True,
         text=True,
-        timeout=100,
         check=False,
     )
     assert (done.returncode, "pip install 'bodyschema[sim]'" in done.stderr) == (1, True)

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
+import warm
 from killed_at import NOWHERE
 from small_arm import URDF
 
@@ -24,11 +25,13 @@ from interfaces.errors import BodyschemaError
 from interfaces.recording import Recording
 
 # It only ends a test that would never end; on a busy machine everything here takes longer, and passes.
-LIFE_LIMIT_S = 100.0
+LIFE_LIMIT_S = 500.0
 KEYS = Keys("arm")
 PAIRS_PER_S = 60.0
 CHECKPOINT_EVERY_S = 0.2
+_walks: dict[tuple[int, float], bytes] = {}  # text of recordings: it takes half a second to write
 S = TypeVar("S", SamplerStatus, LearnerStatus)
+Process = subprocess.Popen[bytes] | warm.Child
 ROBOT = """[robot]
 name = "arm"
 urdf = "arm.urdf"
@@ -53,7 +56,7 @@ checkpoint_every_s = {checkpoint_every_s}
 def write_robot(
     folder: Path,
     endpoint: Callable[[], str],
-    rows: int = 60_000,
+    rows: int = 30_000,
     pairs_per_s: float = PAIRS_PER_S,
     state_dir: Path = Path("state"),
 ) -> Config:
@@ -63,10 +66,14 @@ def write_robot(
     values = {"state_dir": state_dir, "checkpoint_every_s": CHECKPOINT_EVERY_S}
     robot_file.write_text(ROBOT.format(sampler=endpoint(), learner=endpoint(), **values))
     config = Config.load(robot_file, {})
-    t = np.arange(rows) / pairs_per_s
-    q = np.stack([1.5 * np.sin(0.3 * t), 1.2 * np.sin(0.17 * t + 1.0)], axis=1)
-    x = config.robot.chain.with_tool([0.03, 0.01, -0.02]).positions(q)
-    Recording(config.robot.joints, q, x, t).write_csv(folder / "walk.csv")
+    file = folder / "walk.csv"
+    if (rows, pairs_per_s) not in _walks:
+        t = np.arange(rows) / pairs_per_s
+        q = np.stack([1.5 * np.sin(0.3 * t), 1.2 * np.sin(0.17 * t + 1.0)], axis=1)
+        x = config.robot.chain.with_tool([0.03, 0.01, -0.02]).positions(q)
+        Recording(config.robot.joints, q, x, t).write_csv(file)
+        _walks[rows, pairs_per_s] = file.read_bytes()
+    file.write_bytes(_walks[rows, pairs_per_s])
     return config
 
 
@@ -79,7 +86,7 @@ def running(
     journal: Path | None = None,
     environment: Mapping[str, str] | None = None,
     prefix: tuple[str, ...] = (),
-) -> Iterator[subprocess.Popen[bytes]]:
+) -> Iterator[Process]:
     """A process of ours; it is gone after the with statement, if it has not ended before.
 
     Args:
@@ -89,10 +96,13 @@ def running(
         prefix: what the command begins with.
     """
     wrapper, notes = Path(__file__).with_name("killed_at.py"), journal or config.file.with_name("journal")
-    command = [*prefix, sys.executable, wrapper, *fate, notes, process, "--robot", config.file]
+    words = [wrapper, *fate, notes, process, "--robot", config.file]
     with (config.file.parent / f"{process}.log").open("ab") as log:
-        variables = {**os.environ, **(environment or {})}
-        child = subprocess.Popen(command, stdin=subprocess.DEVNULL, stderr=log, env=variables)
+        if environment or prefix:  # they work on what starts
+            command, variables = [*prefix, sys.executable, *words], {**os.environ, **(environment or {})}
+            child = subprocess.Popen(command, stdin=subprocess.DEVNULL, stderr=log, env=variables)
+        else:
+            child = warm.Child(*words, stderr=log)
     try:
         yield child
     finally:
@@ -100,7 +110,7 @@ def running(
         child.wait()
 
 
-def ended_well(child: subprocess.Popen[bytes]) -> bool:
+def ended_well(child: Process) -> bool:
     """Let it come to its end, and whether that was a good one."""
     child.terminate()
     return child.wait(LIFE_LIMIT_S) == 0

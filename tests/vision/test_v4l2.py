@@ -31,7 +31,7 @@ Make = Callable[..., ShimCamera]
 def library(tmp_path_factory: pytest.TempPathFactory) -> Path:
     found = compiled(tmp_path_factory.mktemp("shim"))
     if found is None:
-        pytest.skip("no C compiler with V4L2's headers, so cameras cannot be emulated below OpenCV")
+        pytest.skip("cameras are emulated in C; to run it: apt-get install gcc linux-libc-dev")
     return found
 
 

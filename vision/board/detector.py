@@ -24,6 +24,7 @@ Why = Literal["dark", "over_exposed", "blurred", "other_dictionary", "other_patt
 OTHER_BOARD: tuple[Why, ...] = ("other_dictionary", "other_pattern", "other_squares")
 
 _LEAST_CORNERS = 6
+_LEAST_MARKERS = 3
 # A corner's place is known to a small part of its edges' width; from here on it gets too large a part.
 _MOST_BLUR_PX = 2.5
 _FAMILIES = ("4X4_1000", "5X5_1000", "6X6_1000", "7X7_1000", "APRILTAG_36h11", "ARUCO_ORIGINAL")
@@ -67,6 +68,7 @@ class BoardDetector:
         """Prepare OpenCV's detector of this board."""
         self.board = board
         self._charuco = None if board.pattern == "chessboard" else cv2.aruco.CharucoDetector(board.opencv())
+        self._other_family: str | None = None
 
     def find(self, image: ImageArray) -> Corners | NotFound:
         """The board's corners in `image`, shape (height, width, 3) BGR or (height, width)."""
@@ -84,7 +86,7 @@ class BoardDetector:
     def _marked(self, grey: ImageArray) -> Corners | NotFound:
         px, numbers, marker_px, marker_numbers = self._charuco.detectBoard(grey)  # pyright: ignore
         markers = [] if marker_numbers is None else [int(number) for number in np.ravel(marker_numbers)]
-        if len(markers) >= 3:
+        if len(markers) >= _LEAST_MARKERS:
             seen = squares_seen(
                 markers, [np.reshape(each, (4, 2)).astype(np.float64) for each in marker_px], self.board
             )
@@ -104,7 +106,7 @@ class BoardDetector:
     def _nothing(self, grey: ImageArray, markers: int) -> NotFound:
         if markers:
             return NotFound("not_found", f"too little of the board: {markers} of its markers. Bring it into view")
-        other = _other_dictionary(grey, self.board.dictionary_name)
+        other = self._other_dictionary(grey, self.board.dictionary_name)
         if other is not None:
             wanted = self.board.dictionary_name
             text = f"the markers are {other}, not {wanted}. Give --dictionary {other}, or take the right board"
@@ -115,7 +117,7 @@ class BoardDetector:
         size = (self.board.columns - 1, self.board.rows - 1)
         found, px = cv2.findChessboardCornersSB(grey, size, flags=cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY)
         if not found:
-            markers = _other_dictionary(grey, None)
+            markers = self._other_dictionary(grey, None)
             if markers is not None:
                 remedy = f"Leave out --pattern, and give --dictionary {markers}"
                 return NotFound("other_pattern", f"the board has {markers} markers in its squares. {remedy}")
@@ -124,17 +126,21 @@ class BoardDetector:
         corners = _in_order(grey, np.reshape(px, (size[1], size[0], 2)).astype(np.float64), self.board)
         return Corners(np.arange(len(self.board.corners_m)), corners.reshape(-1, 2))
 
+    def _other_dictionary(self, grey: ImageArray, wanted: str | None) -> str | None:
+        """The family of markers that are in the image in the place of those wanted, if any are.
 
-def _other_dictionary(grey: ImageArray, wanted: str | None) -> str | None:
-    """The family of markers that are in the image in the place of those wanted, if any are."""
-    bits = "" if wanted is None else wanted.split("_")[0]
-    families = [name for name in _FAMILIES if name.split("_")[0] != bits or "APRILTAG" in name]
-    seen = {name: _markers(grey, name) for name in families if name != wanted}
-    best = max(seen, key=lambda name: len(seen[name]))
-    if len(seen[best]) < 3:
+        That of an earlier image is looked for first: a search for all families takes five times as long.
+        """
+        bits = "" if wanted is None else wanted.split("_")[0]
+        families = [name for name in _FAMILIES if name.split("_")[0] != bits or "APRILTAG" in name]
+        for names in ([self._other_family] if self._other_family else [], families):
+            seen = {name: _markers(grey, name) for name in names if name != wanted}
+            best = max(seen, key=lambda name: len(seen[name]), default="")
+            if best and len(seen[best]) >= _LEAST_MARKERS:
+                self._other_family = best
+                bits, _, size = best.partition("_")
+                return f"{bits}_{smallest_size(max(seen[best]) + 1)}" if size == str(SIZES[-1]) else best
         return None
-    bits, _, size = best.partition("_")
-    return f"{bits}_{smallest_size(max(seen[best]) + 1)}" if size == str(SIZES[-1]) else best
 
 
 def _markers(grey: ImageArray, family: str) -> list[int]:

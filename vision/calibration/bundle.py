@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -144,8 +145,9 @@ def eye_of(
         return left, pose[:3], pose[3:], (np.zeros((6, 6)), np.eye(6))
     composed = cv2.composeRT(pose[:3], pose[3:], rotation, translation)
     r, t, r_r1, r_t1, r_r2, r_t2, t_r1, t_t1, t_r2, t_t2 = (np.asarray(each, dtype=np.float64) for each in composed)
-    by_rig = np.block([[r_r2, r_t2], [t_r2, t_t2]])
-    by_pose = np.block([[r_r1, r_t1], [t_r1, t_t1]])
+    by_rig, by_pose = np.empty((2, _POSE, _POSE))
+    by_rig[:3, :3], by_rig[:3, 3:], by_rig[3:, :3], by_rig[3:, 3:] = r_r2, r_t2, t_r2, t_t2
+    by_pose[:3, :3], by_pose[:3, 3:], by_pose[3:, :3], by_pose[3:, 3:] = r_r1, r_t1, t_r1, t_t1
     return right, r.ravel(), t.ravel(), (by_rig, by_pose)
 
 
@@ -186,7 +188,7 @@ class _Linear:
     pose_gradients: FloatArray
     mixed: FloatArray
 
-    @property
+    @cached_property
     def squares(self) -> float:
         return _weighted(self.residuals, self.weights)
 

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
-import numpy as np
 
 from interfaces.records import ImageArray
+from vision.image_file import read_image
 from vision.rig import CalibrationError
 
 _ENDINGS = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".webp"}
@@ -147,10 +147,10 @@ def _in_order(file: Path) -> tuple[list[tuple[float, str]], str]:
 
 
 def _read(file: Path) -> ImageArray:
-    image = cv2.imdecode(np.frombuffer(file.read_bytes(), np.uint8), cv2.IMREAD_COLOR) if file.stat().st_size else None
+    image = read_image(file)
     if image is None:
         raise CalibrationError(f"{file}: no image that can be read. Remove the file, or take it anew")
-    return np.asarray(image, dtype=np.uint8)
+    return image
 
 
 def write_pair(pair: ImagePair, folder: Path, number: int) -> None:

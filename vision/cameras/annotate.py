@@ -9,6 +9,7 @@ import numpy as np
 
 from interfaces.camera import StereoCalibration
 from interfaces.records import FloatArray, ImageArray, MarkerFix, MarkerMiss, Reason, StereoFrame
+from interfaces.rejections import WORDS
 from vision.blob import Region, find_patches, measure
 from vision.colour import gate_of
 from vision.config import VisionConfig
@@ -20,19 +21,6 @@ GREEN, YELLOW, RED, BLACK = (80, 220, 80), (0, 220, 255), (110, 110, 255), (0, 0
 FONT, LETTERS, LINE_PX = cv2.FONT_HERSHEY_SIMPLEX, 0.5, 18
 SUBPIXEL_BITS = 4
 MAGNIFIED = 10  # the difference of the rows, which is a fraction of a pixel
-
-WORDS = {
-    Reason.NO_MARKER: "no marker",
-    Reason.AT_BORDER: "at the border",
-    Reason.OCCLUDED: "not all to be seen",
-    Reason.SATURATED: "over-exposed",
-    Reason.REFLECTION: "a reflection",
-    Reason.REPROJECTION: "not the marker's shape",
-    Reason.IMPLAUSIBLE_SPEED: "too far from the last place",
-    Reason.EPIPOLAR: "rows differ",
-    Reason.SIZE_MISMATCH: "sizes differ",
-    Reason.AMBIGUOUS: "more than one fits",
-}
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,7 +90,7 @@ class Annotator:
         _circle(image, sight.centre_px, sight.radius_px, colour)
         if sight.reason is not None:
             at = round(sight.centre_px[0] - sight.radius_px), round(sight.centre_px[1] - sight.radius_px) - 6
-            _write(image, WORDS.get(sight.reason, sight.reason.replace("_", " ")), at, RED)
+            _write(image, WORDS[sight.reason], at, RED)
 
     def _draw_fix(self, eyes: list[ImageArray], fix: MarkerFix) -> None:
         """The marker as it would be seen at the fix, and its row in the other eye."""
@@ -122,7 +110,7 @@ class Annotator:
 
     def _headline(self, frame: StereoFrame, seen: MarkerFix | MarkerMiss) -> str:
         if isinstance(seen, MarkerMiss):
-            return f"{frame.t:.3f} s  refused: {WORDS.get(seen.reason, seen.reason.replace('_', ' '))}"
+            return f"{frame.t:.3f} s  refused: {WORDS[seen.reason]}"
         x, y, z = 1e3 * seen.x
         sigma = 1e3 * float(np.sqrt(np.linalg.eigvalsh(seen.cov)[-1]))
         rows = "" if seen.centres_px is None else f"  rows differ {seen.centres_px[3] - seen.centres_px[1]:+.2f} px"
@@ -131,7 +119,7 @@ class Annotator:
 
 def _draw_tag(image: ImageArray, tag: TagSight) -> None:
     """A tag's outline and number: yellow where it is measured, red where it is not, with the reason."""
-    why = WORDS.get(tag.reason, "") if tag.reason is not None else ""
+    why = WORDS[tag.reason] if tag.reason is not None else ""
     why = why if tag.is_wanted else "not the marker's"
     colour = RED if why else YELLOW
     outline(image, tag.corners_px, colour)

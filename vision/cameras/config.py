@@ -9,12 +9,13 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
+from interfaces.camera import LARGEST_SIDE_PX
 from interfaces.errors import ConfigError
 from interfaces.toml_file import line_of
 
 Positive = Annotated[float, Meta(gt=0)]
 NonNegative = Annotated[float, Meta(ge=0)]
-Side = Annotated[int, Meta(ge=16, le=16384)]
+Side = Annotated[int, Meta(ge=16, le=LARGEST_SIDE_PX)]
 
 LAYOUTS = ("two", "side_by_side", "images", "videos")
 # Of a camera whose latency nobody has measured [s]: exposure, readout and transfer of a webcam.

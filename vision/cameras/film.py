@@ -11,6 +11,7 @@ from typing import Protocol, Self
 import numpy as np
 
 from interfaces.errors import ConfigError, SourceEnded, SourceError
+from interfaces.limited import read_at_most
 from interfaces.protocols import Clock
 from interfaces.records import FloatArray, ImageArray, StereoFrame, frozen_array
 
@@ -164,7 +165,7 @@ def read_times(file: Path, count: int) -> FloatArray:
         ConfigError: it cannot be read, has not `count` times, or they do not increase.
     """
     try:
-        lines = [line.split("#")[0].replace(",", " ").split() for line in file.read_text(encoding="utf-8").splitlines()]
+        lines = [line.split("#")[0].replace(",", " ").split() for line in read_at_most(file).decode().splitlines()]
         times = np.array([float(words[0]) for words in lines if words])
     except (OSError, ValueError) as error:
         remedy = "Write one time in seconds a line"

@@ -10,6 +10,7 @@ import numpy as np
 
 from interfaces.errors import ConfigError, SourceError
 from interfaces.records import FloatArray, ImageArray, frozen_array
+from vision.image_file import read_image
 
 from .config import ImagesConfig
 from .film import checked_times, read_times
@@ -107,10 +108,10 @@ def _ticks(file: Path, since: int) -> float:
 
 
 def _image(file: Path) -> ImageArray:
-    image = cv2.imread(str(file), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    image = read_image(file, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     if image is None:
         raise SourceError(f"{file} is no image that can be read")
-    return np.asarray(image, np.uint8)
+    return image
 
 
 def _size(image: ImageArray) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from types import TracebackType
 from typing import Self
 
@@ -10,24 +9,13 @@ import numpy as np
 
 from interfaces.protocols import StereoCamera, StereoEyes
 from interfaces.records import ImageArray, MarkerFix, Reason, StereoFrame
+from interfaces.rejections import REMEDIES, WORDS
 from vision.config import VisionConfig
 from vision.trackers import tracker_of
 
-from .annotate import WORDS, Annotator
+from .annotate import Annotator
 
 MOSTLY = 0.5  # of the frames: what is the matter in so many is advised on
-REMEDIES: Mapping[Reason, str] = {
-    Reason.NO_MARKER: "Is it in sight of both eyes, and are [vision] marker, colour, number and light right?",
-    Reason.AT_BORDER: "Bring it nearer to the middle of both images.",
-    Reason.OCCLUDED: "Is a hand, a cable or the tool before it, or does it move too fast for the exposure?",
-    Reason.SATURATED: "Shorten exposure_s, less light.",
-    Reason.REFLECTION: "Turn the lamp or what mirrors it away, or mask it.",
-    Reason.REPROJECTION: "Is the paper flat, the light not too bright, and is each tag where robot.toml has it?",
-    Reason.EPIPOLAR: "Are the cameras exchanged, one upside down, or moved? `bodyschema calibrate check` tells.",
-    Reason.SIZE_MISMATCH: "Is its size in [vision] right? Else it is the calibration of other cameras, or they were "
-    "moved: `bodyschema calibrate check`.",
-    Reason.AMBIGUOUS: "Take other things of its colour, or the second tag of its number, out of sight.",
-}
 
 
 class WatchedCamera:
@@ -76,8 +64,8 @@ class WatchedCamera:
         text = f"{self.frames} frames"
         if self.frames:
             text += f", the marker in {self.fixes}"
-        text += "".join(f"; {WORDS.get(reason, reason.replace('_', ' '))}: {count}" for reason, count in counts)
-        if counts and counts[0][1] > MOSTLY * self.frames and counts[0][0] in REMEDIES:
+        text += "".join(f"; {WORDS[reason]}: {count}" for reason, count in counts)
+        if counts and counts[0][1] > MOSTLY * self.frames:
             text += f". {REMEDIES[counts[0][0]]}"
         return text
 

@@ -52,6 +52,7 @@ class Chain(ServoChain[Servo]):
                 Code.SYNC_READ: self._sync_read,
                 Code.FAST_SYNC_READ: self._fast_sync_read,
                 Code.BULK_READ: self._bulk_read,
+                Code.FAST_BULK_READ: self._fast_bulk_read,
                 Code.SYNC_WRITE: self._sync_write,
                 Code.BULK_WRITE: self._bulk_write,
             }.get(Code(instruction.code))
@@ -90,8 +91,8 @@ class Chain(ServoChain[Servo]):
                 return Error.INSTRUCTION, b""
 
     def _read(self, servo: Servo, address: int, size: int, t: float) -> tuple[Error, bytes]:
-        position = servo.model.layout["position"]
-        if address <= position.address and position.end <= address + size:
+        position, places = servo.model.layout["position"], servo.places(address, size)
+        if all(place in places for place in range(position.address, position.end)):
             self.samplings[servo.id] = Sampling(t, servo.angle(t))
         return servo.read(address, size, t)
 
@@ -116,24 +117,29 @@ class Chain(ServoChain[Servo]):
         if instruction.protocol == 1:  # a zero, then length, ID, address of each
             parts = [params[k : k + 3] for k in range(1, len(params) - 2, 3)]
             return self._in_turn(servos, [(id, address, size) for size, id, address in parts], t, Code.READ)
-        parts = [params[k : k + 5] for k in range(0, len(params) - 4, 5)]
-        return self._in_turn(servos, [(p[0], _number(p[1:3]), _number(p[3:5])) for p in parts], t, Code.READ)
+        return self._in_turn(servos, _bulk_parts(params), t, Code.READ)
+
+    def _fast_bulk_read(self, servos: list[Servo], instruction: Instruction, t: float) -> list[Reply]:
+        return self._in_one(servos, _bulk_parts(instruction.params), t)
 
     def _fast_sync_read(self, servos: list[Servo], instruction: Instruction, t: float) -> list[Reply]:
         address, size = _number(instruction.params[:2]), _number(instruction.params[2:4])
-        ids = instruction.params[4:]
-        packet = fast_header(len(ids), size)
+        return self._in_one(servos, [(id, address, size) for id in instruction.params[4:]], t)
+
+    def _in_one(self, servos: list[Servo], parts: list[tuple[int, int, int]], t: float) -> list[Reply]:
+        """The common answer of servos, of ID, address and size each."""
+        packet = fast_header([size for _, _, size in parts])
         start = now = t
-        for place, id in enumerate(ids):
+        for place, (id, address, size) in enumerate(parts):
             there = [s for s in servos if s.id == id and s.fast and s["status_return"] > 0]
             if not there:  # whoever comes after a missing one does not know that it is its turn
-                return [Reply(ids[0], start, packet)] if place else []
+                return [Reply(parts[0][0], start, packet)] if place else []
             if place == 0:
                 start = t + there[0].return_delay_s
             now = start + len(packet) * self._byte_s
             told = [(servo, *self._read(servo, address, size, now)) for servo in there]
             packet += mixed([fast_block(packet, id, _error_byte(servo, error), data) for servo, error, data in told])
-        return [Reply(ids[0], start, packet)] if ids else []
+        return [Reply(parts[0][0], start, packet)] if parts else []
 
     def _sync_write(self, servos: list[Servo], instruction: Instruction, t: float) -> list[Reply]:
         wide, params = instruction.protocol, instruction.params
@@ -158,7 +164,13 @@ class Chain(ServoChain[Servo]):
 
 _CODES = frozenset(Code)
 _LISTS = (Code.SYNC_READ, Code.FAST_SYNC_READ, Code.SYNC_WRITE)
-_ONLY2 = (Code.SYNC_READ, Code.FAST_SYNC_READ, Code.BULK_WRITE)
+_ONLY2 = (Code.SYNC_READ, Code.FAST_SYNC_READ, Code.FAST_BULK_READ, Code.BULK_WRITE)
+
+
+def _bulk_parts(params: bytes) -> list[tuple[int, int, int]]:
+    """ID, address and size of each servo that a BULK_READ of Protocol 2.0 asks."""
+    parts = (params[k : k + 5] for k in range(0, len(params) - 4, 5))
+    return [(part[0], _number(part[1:3]), _number(part[3:5])) for part in parts]
 
 
 def _is_for(instruction: Instruction, id: int) -> bool:

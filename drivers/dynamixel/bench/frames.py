@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Literal
@@ -31,6 +32,7 @@ class Code(IntEnum):
     FAST_SYNC_READ = 0x8A
     BULK_READ = 0x92
     BULK_WRITE = 0x93
+    FAST_BULK_READ = 0x9A
 
 
 class Error(IntEnum):
@@ -124,9 +126,10 @@ def status_packet(protocol: int, id: int, error: int, params: bytes) -> bytes:
     return packet + crc16(packet).to_bytes(2, "little")
 
 
-def fast_header(blocks: int, length: int) -> bytes:
-    """How the common answer of so many servos to FAST_SYNC_READ begins, each with `length` bytes."""
-    return HEADER2 + bytes((BROADCAST,)) + (1 + blocks * (length + 4)).to_bytes(2, "little") + bytes((STATUS,))
+def fast_header(sizes: Sequence[int]) -> bytes:
+    """How the common answer to FAST_SYNC_READ and FAST_BULK_READ begins, of servos that give so many bytes each."""
+    length = 1 + sum(size + 4 for size in sizes)
+    return HEADER2 + bytes((BROADCAST,)) + length.to_bytes(2, "little") + bytes((STATUS,))
 
 
 def fast_block(before: bytes, id: int, error: int, params: bytes) -> bytes:

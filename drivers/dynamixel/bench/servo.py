@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 
-from drivers.dynamixel.models import TICK_S, TICKS, Model, baud_of, baud_value
+from drivers.dynamixel.models import LAYOUT_P, LAYOUT_X, TICK_S, TICKS, Model, baud_of, baud_value
 
 from .frames import Error
 
@@ -44,6 +44,9 @@ FACTORY1 = {
     "voltage": 120,
     "temperature": 31,
 }
+# Blocks of Indirect Addresses and Indirect Data: where they begin, and how many there are (e-Manual, XL430-W250 and
+# PH54-200-S500; the beginnings are those of dynamixel-sdk's control tables).
+INDIRECT = {LAYOUT_X.ram: ((168, 224, 28), (578, 634, 28)), LAYOUT_P.ram: ((168, 634, 128),)}
 READ_ONLY = (
     "model",
     "firmware",
@@ -94,6 +97,12 @@ class Servo:
         self.glitch_ticks, self.excess_a = 0, 0.0
         self._angle = angle
         self._memory = bytearray(model.layout.size)
+        self._indirect = {
+            data + k: pointer + 2 * k
+            for pointer, data, count in INDIRECT.get(model.layout.ram, ())
+            for k in range(count)
+        }
+        self._first_indirect = min(self._indirect, default=len(self._memory))
         self._reset_memory()
         self["id"], self["baud"] = id, baud_value(model.layout, baud)
         self["return_delay"] = round(return_delay_s * 1e6 / TICKS_PER_REPLY_DELAY_US)
@@ -203,13 +212,36 @@ class Servo:
         """Bytes of the control table at `t`."""
         if address + size > len(self._memory) or size == 0:
             return Error.ACCESS, b""
-        block = self.model.layout.block
-        if address < block.end and address + size > block.address:
+        block, places = self.model.layout.block, self.places(address, size)
+        if any(block.address <= place < block.end for place in places):
             self._sense(t)
-        return Error.NONE, bytes(self._memory[address : address + size])
+        return Error.NONE, bytes(self._memory[place] for place in places)
+
+    def places(self, address: int, size: int) -> list[int]:
+        """Return the addresses that are meant: those of Indirect Data are where their Indirect Address points."""
+        places = list(range(address, address + size))
+        if address + size <= self._first_indirect:
+            return places
+        for data, pointer in self._indirect.items():
+            if address <= data < address + size:
+                places[data - address] = int.from_bytes(self._memory[pointer : pointer + 2], "little")
+        return places
 
     def write(self, address: int, data: bytes, t: float) -> Error:
         """Change bytes of the control table, where that is allowed."""
+        for begin, part in self._runs(address, data):
+            error = self._write(begin, part, t)
+            if error is not Error.NONE:
+                return error
+        return Error.NONE if data else Error.ACCESS
+
+    def _runs(self, address: int, data: bytes) -> list[tuple[int, bytes]]:
+        """Return the bytes in pieces that are meant for addresses one after the other."""
+        places = self.places(address, len(data))
+        begins = [k for k in range(len(places)) if k == 0 or places[k] != places[k - 1] + 1]
+        return [(places[k], data[k:end]) for k, end in zip(begins, [*begins[1:], len(data)], strict=True)]
+
+    def _write(self, address: int, data: bytes, t: float) -> Error:
         error = self._refusal(address, data)
         if error is not Error.NONE:
             return error
@@ -242,6 +274,7 @@ class Servo:
         fresh = bytearray(len(self._memory))
         fresh[: self.model.layout.ram] = self._memory[: self.model.layout.ram]
         self._memory = fresh
+        self._point_indirect()
         for name in RAM_OF_FACTORY:
             if self.model.layout[name].address >= self.model.layout.ram:
                 self[name] = self._factory[name]
@@ -289,6 +322,7 @@ class Servo:
     def _reset_memory(self) -> None:
         self._memory[:] = bytes(len(self._memory))
         self._error1 = 0
+        self._point_indirect()
         self["model"] = self.model.number
         for name, value in self._factory.items():
             self[name] = value
@@ -296,6 +330,11 @@ class Servo:
             turn = self.model.ticks_per_turn or 0
             self["min_position"] = self.model.zero_ticks - turn // 2
             self["max_position"] = self["min_position"] + turn - 1
+
+    def _point_indirect(self) -> None:
+        """Each Indirect Address points at its own Indirect Data."""
+        for data, pointer in self._indirect.items():
+            self._memory[pointer : pointer + 2] = data.to_bytes(2, "little")
 
     def _fold(self, t: float) -> None:
         turn = self.model.ticks_per_turn
@@ -332,6 +371,11 @@ class Servo:
             return Error.ACCESS
         if address < layout.ram and self["torque"] and self.model.protocol == 2:
             return Error.ACCESS
+        for pointer in self._indirect.values():
+            if address <= pointer and pointer + 2 <= end:
+                target = int.from_bytes(data[pointer - address : pointer - address + 2], "little")
+                if not layout.ram <= target < len(self._memory):
+                    return Error.RANGE
         for name in READ_ONLY:
             if name in layout and layout[name].address < end and layout[name].end > address:
                 return Error.ACCESS

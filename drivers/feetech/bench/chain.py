@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
-from drivers.bench.chain import ServoChain
+from drivers.bench.chain import ServoChain, mixed
 from drivers.bench.device import Reply, Sampling
 
 from .frames import BROADCAST, Code, Instruction, instructions_in, status_packet
 from .servo import Servo
+
+# Less than the 3 ms for which scan_port of huggingface/lerobot waits for each ID besides the bytes, more than the
+# longest return delay.
+PING_GAP_S = 1e-3
 
 
 class Chain(ServoChain[Servo]):
@@ -40,7 +44,26 @@ class Chain(ServoChain[Servo]):
             for servo in there:
                 self._obey(servo, instruction, t)
             return []
+        if is_for_all:
+            return self._pinged(there, t)
         return self._together(there, t, lambda servo, now: self._obey(servo, instruction, now), instruction.code)
+
+    def _pinged(self, servos: list[Servo], t: float) -> list[Reply]:
+        """Answers to a PING for all: those of the SCS series talk at once, of the others each ID has its time."""
+        at_once = [servo for servo in servos if not servo.knows_sync_read]
+        groups = [[servo for servo in servos if servo.knows_sync_read and servo.id == id] for id in range(BROADCAST)]
+        slot_s = self.overhead * self._byte_s + PING_GAP_S
+        replies = [
+            Reply(group[0].id, t + id * slot_s + group[0].return_delay_s, mixed(self._pongs(group)))
+            for id, group in enumerate(groups)
+            if group
+        ]
+        if at_once:
+            replies.append(Reply(at_once[0].id, t + at_once[0].return_delay_s, mixed(self._pongs(at_once))))
+        return replies
+
+    def _pongs(self, servos: list[Servo]) -> list[bytes]:
+        return [status_packet(servo.id, servo["status"], b"") for servo in servos]
 
     def _is_understood(self, servo: Servo, instruction: Instruction) -> bool:
         params = instruction.params

@@ -13,8 +13,49 @@ Angle = Callable[[float], float]
 VELOCITY_STEP_S = 0.01
 RETURN_DELAY_UNIT_US = 2
 CALIBRATE = 128  # written to the torque register: where it is, is the middle of its range from now on
-FACTORY = {"firmware": 0x030A, "baud": 0, "id": 1, "return_delay": 250, "status_return": 1, "unloading": 44}
+FACTORY = {"firmware": 0x030A, "baud": 0, "id": 1, "return_delay": 250, "status_return": 1}
 RAM_OF_FACTORY = {"lock": 1, "voltage": 74, "temperature": 31}
+# What else stands in the EEPROM of a new servo: address, bytes, number.
+# Sources: Feetech, "SMS/STS memory table"; gains and protection current as huggingface/lerobot calls the defaults
+# (robots/so_follower); limits of voltage as Mickael-Roger/python-st3215 tells of the 7.4 V variant.
+FACTORY_STS = (
+    (9, 2, 0),  # position limits [ticks]
+    (11, 2, 4095),
+    (13, 1, 70),  # temperature [°C]
+    (14, 1, 80),  # voltages [0.1 V]
+    (15, 1, 40),
+    (16, 2, 1000),  # torque [0.1 %]
+    (18, 1, 12),  # Phase
+    (19, 1, 44),  # troubles that switch torque off: overload, current, temperature
+    (20, 1, 47),  # ... and the LED on
+    (21, 1, 32),  # P, D, I
+    (22, 1, 32),
+    (23, 1, 0),
+    (24, 2, 16),  # least torque at the start [0.1 %]
+    (26, 1, 1),  # dead zones [ticks]
+    (27, 1, 1),
+    (28, 2, 500),  # current [6.5 mA]
+    (30, 1, 1),  # resolution
+    (34, 1, 20),  # overload: torque then [%], after [10 ms], above [%]
+    (35, 1, 200),
+    (36, 1, 80),
+    (38, 1, 200),  # too much current: after [10 ms]
+)
+# Source: Feetech, "SCS15 manual" v1.02, memory control table.
+FACTORY_SCS = (
+    (9, 2, 0),
+    (11, 2, 1023),
+    (13, 1, 80),
+    (14, 1, 250),
+    (15, 1, 50),
+    (16, 2, 1023),
+    (19, 1, 37),
+    (20, 1, 37),
+    (21, 1, 15),
+    (26, 1, 2),
+    (27, 1, 2),
+)
+MAX_TORQUE, TORQUE_LIMIT = 16, 48  # the second takes over the first one's two bytes with the power
 READ_ONLY = ("firmware", "model", "position", "velocity", "load", "voltage", "temperature", "status", "moving")
 LARGEST_SPEED = 3400  # [ticks/s]
 
@@ -52,11 +93,13 @@ class Servo:
         self._memory = bytearray(model.layout.size)
         self._registered: tuple[int, bytes] | None = None
         self["model"] = model.number
-        for name, value in (FACTORY | RAM_OF_FACTORY).items():
+        self._set_factory_values()
+        for name, value in RAM_OF_FACTORY.items():
             self[name] = value
         self["id"], self["baud"] = id, BAUDS.index(baud)
         self["return_delay"] = round(return_delay_s * 1e6 / RETURN_DELAY_UNIT_US)
         self._saved = bytes(self._memory[: model.layout.ram])
+        self._power_up()
 
     def __getitem__(self, name: str) -> int:
         """The number in a register."""
@@ -99,6 +142,7 @@ class Servo:
         self._memory[:] = self._saved + bytes(len(self._memory) - ram)
         for name, value in RAM_OF_FACTORY.items():
             self[name] = value
+        self._power_up()
         self._registered = None
         self._base = math.floor(self._count(t) / (self.model.ticks_per_turn or 1))
 
@@ -140,10 +184,21 @@ class Servo:
 
     def factory_reset(self, t: float) -> None:
         """All but the ID as it left the factory."""
-        for name, value in FACTORY.items():
-            if name != "id":
-                self[name] = value
+        id = self.id
+        self._set_factory_values()
+        self["id"] = id
         self.reboot(t)
+
+    def _set_factory_values(self) -> None:
+        model = self.model
+        for address, size, value in FACTORY_STS if model.protocol != SCS else FACTORY_SCS:
+            self._memory[address : address + size] = value.to_bytes(size, model.layout["model"].order)
+        for name, value in FACTORY.items():
+            self[name] = value
+
+    def _power_up(self) -> None:
+        if self.model.protocol != SCS:
+            self._memory[TORQUE_LIMIT : TORQUE_LIMIT + 2] = self._memory[MAX_TORQUE : MAX_TORQUE + 2]
 
     def _calibrate(self, t: float) -> None:
         self["torque"] = 0

@@ -1,0 +1,52 @@
+"""Why frames become no pairs, in words, and what to do about each reason."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from .records import Reason
+
+WORDS: Mapping[Reason, str] = {
+    Reason.NO_MARKER: "no marker",
+    Reason.AT_BORDER: "at the border",
+    Reason.OCCLUDED: "not all to be seen",
+    Reason.SATURATED: "over-exposed",
+    Reason.REFLECTION: "a reflection",
+    Reason.REPROJECTION: "not the marker's shape",
+    Reason.IMPLAUSIBLE_SPEED: "too far from the last place",
+    Reason.EPIPOLAR: "rows differ",
+    Reason.SIZE_MISMATCH: "sizes differ",
+    Reason.AMBIGUOUS: "more than one fits",
+    Reason.NO_JOINTS: "no encoder readings at its time",
+    Reason.STALE: "encoder readings too far apart",
+    Reason.MOVING: "joints too fast for the time stamps",
+    Reason.TOO_NEAR: "hardly any motion since the last pair",
+    Reason.PAUSED: "paused",
+    Reason.NOT_FINITE: "a position that is no number",
+    Reason.NOT_STORED: "the disk took no pair",
+    Reason.NOT_BORNE: "zero-force is off",
+}
+REMEDIES: Mapping[Reason, str] = {
+    Reason.NO_MARKER: "Is it in sight of both eyes, large enough in both images, and are [vision] marker, colour, "
+    "number and light right?",
+    Reason.AT_BORDER: "Bring it nearer to the middle of both images.",
+    Reason.OCCLUDED: "Is a hand, a cable or the tool before it, or does it move too fast for the exposure?",
+    Reason.SATURATED: "Shorten exposure_s, less light.",
+    Reason.REFLECTION: "Turn the lamp or what mirrors it away, or mask it.",
+    Reason.REPROJECTION: "Is the paper flat, the light not too bright, and is each tag where robot.toml has it?",
+    Reason.IMPLAUSIBLE_SPEED: "Is another thing of its colour in sight? If it really is so fast, raise [vision] "
+    "max_speed_m_s and [daemon] max_marker_speed_m_s.",
+    Reason.EPIPOLAR: "Are the cameras exchanged, one upside down, or moved? `bodyschema calibrate check` tells.",
+    Reason.SIZE_MISMATCH: "Is its size in [vision] right? Else it is the calibration of other cameras, or they were "
+    "moved: `bodyschema calibrate check`.",
+    Reason.AMBIGUOUS: "Take other things of its colour, or the second tag of its number, out of sight.",
+    Reason.NO_JOINTS: "Do the encoders answer, and is [vision.cameras] latency_s right? `bodyschema calibrate latency` "
+    "measures it.",
+    Reason.STALE: "Read the encoders more often, or raise [daemon] max_reading_gap_s.",
+    Reason.MOVING: "Guide the arm more slowly, or measure the cameras' latency: `bodyschema calibrate latency`.",
+    Reason.TOO_NEAR: "Move the arm.",
+    Reason.PAUSED: "Resume with `bodyschema command resume`.",
+    Reason.NOT_FINITE: "That is a fault of the tracker in [vision.plugin].",
+    Reason.NOT_STORED: "Make room on the disk of the store, and see that it can be written.",
+    Reason.NOT_BORNE: "Switch it on: `bodyschema command zero_force_on`.",
+}

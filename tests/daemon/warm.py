@@ -1,0 +1,193 @@
+"""Processes of `bodyschema` as forks of one that has imported everything: a start costs 0.05 s of CPU, not 1 s.
+
+All that makes a process is as ever: its own memory, files, signals, exit code. Tests of the start itself (imports, what
+libraries read from the environment, LD_PRELOAD) need `subprocess`.
+"""
+
+from __future__ import annotations
+
+import atexit
+import ctypes
+import functools
+import gc
+import importlib
+import json
+import os
+import pkgutil
+import runpy
+import select
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+import traceback
+from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import IO
+
+RARELY_NEEDED = ("daemon.view", "daemon.fleet", "daemon.reproduce", "daemon.rerun", "daemon.__main__")
+PR_SET_PDEATHSIG = 1
+LONGEST_REQUEST = 1 << 17
+_ASKING = threading.Lock()
+
+
+class Child:
+    """A process with the methods of `subprocess.Popen`.
+
+    Args:
+        arguments: as for the interpreter: `-m MODULE ...`, or a script and its arguments.
+        stdout, stderr: open files; without them, the output is dropped.
+    """
+
+    def __init__(
+        self,
+        *arguments: object,
+        cwd: Path | None = None,
+        env: Mapping[str, str] | None = None,
+        stdout: IO | None = None,
+        stderr: IO | None = None,
+    ) -> None:
+        self.args, self.returncode, self._lock = [str(word) for word in arguments], None, threading.Lock()
+        request = json.dumps([self.args, str(cwd or Path.cwd()), dict(os.environ if env is None else env)])
+        self._fate, fate = os.pipe()
+        with open(os.devnull, "wb") as nowhere:
+            files = [fate, (stdout or nowhere).fileno(), (stderr or nowhere).fileno()]
+            with _ASKING:  # two threads must not start two servers
+                socket.send_fds(_server(), [request.encode()], files)
+        os.close(fate)
+        self.pid = int(os.read(self._fate, 64))
+
+    def __del__(self) -> None:
+        os.close(self._fate)
+
+    def wait(self, timeout: float | None = None) -> int:
+        if not select.select([self._fate], [], [], timeout)[0]:
+            raise subprocess.TimeoutExpired(self.args, timeout or 0.0)
+        with self._lock:  # two threads may wait
+            if self.returncode is None:
+                self.returncode = int(os.read(self._fate, 64))
+            return self.returncode
+
+    def poll(self) -> int | None:
+        with suppress(subprocess.TimeoutExpired):
+            return self.wait(0.0)
+        return None
+
+    def send_signal(self, number: int) -> None:
+        if self.poll() is None:
+            with suppress(ProcessLookupError):
+                os.kill(self.pid, number)
+
+    def terminate(self) -> None:
+        self.send_signal(signal.SIGTERM)
+
+    def kill(self) -> None:
+        self.send_signal(signal.SIGKILL)
+
+
+def run(
+    *arguments: object, cwd: Path | None = None, env: Mapping[str, str] | None = None
+) -> subprocess.CompletedProcess[str]:
+    """Run it to its end, as `subprocess.run` does with the output captured as text."""
+    with tempfile.TemporaryFile("w+") as out, tempfile.TemporaryFile("w+") as err:
+        child = Child(*arguments, cwd=cwd, env=env, stdout=out, stderr=err)
+        try:
+            code = child.wait()
+        finally:
+            child.kill()
+        for file in (out, err):
+            file.seek(0)
+        return subprocess.CompletedProcess(child.args, code, out.read(), err.read())
+
+
+@functools.cache
+def _server() -> socket.socket:
+    """The way to the process that forks; it ends with this one."""
+    ours, its = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    environment = {"OPENBLAS_NUM_THREADS": "1"} | os.environ
+    with its:
+        subprocess.Popen(
+            [sys.executable, __file__, str(its.fileno())],
+            stdin=subprocess.DEVNULL,
+            env=environment,
+            pass_fds=[its.fileno()],
+        ).returncode = 0  # nobody waits for it
+    return ours
+
+
+def _import_all() -> None:
+    import daemon
+
+    for module in pkgutil.walk_packages(daemon.__path__, "daemon."):
+        if not module.name.startswith(RARELY_NEEDED):
+            with suppress(ImportError):  # of an extra that is not installed
+                importlib.import_module(module.name)
+
+
+def _serve(wire: socket.socket) -> list[str]:
+    """Fork for each request, until the other end closes; return in the fork what it is to run."""
+    alive: dict[int, tuple[int, int]] = {}  # pidfd: pid, where its exit code goes
+    while True:
+        for ready in select.select([wire.fileno(), *alive], [], [])[0]:
+            if ready != wire.fileno():
+                pid, fate = alive.pop(ready)
+                os.write(fate, b"%d" % os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]))
+                os.close(fate)
+                os.close(ready)
+                continue
+            message, files, *_ = socket.recv_fds(wire, LONGEST_REQUEST, 3)
+            if not message:
+                os._exit(0)
+            if (pid := os.fork()) == 0:
+                return _settle(json.loads(message), files)
+            os.write(files[0], b"%d" % pid)
+            alive[os.pidfd_open(pid)] = pid, files[0]
+            for file in files[1:]:
+                os.close(file)
+
+
+def _settle(request: tuple[list[str], str, dict[str, str]], files: list[int]) -> list[str]:
+    """Be as a process that has just begun; return its arguments."""
+    arguments, folder, environment = request
+    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+    os.dup2(files[1], 1)
+    os.dup2(files[2], 2)
+    os.closerange(3, max(map(int, os.listdir("/proc/self/fd"))) + 1)
+    os.chdir(folder)
+    os.environ.clear()
+    os.environ.update(environment)
+    return arguments
+
+
+def _run(arguments: list[str]) -> int:
+    """Run them; return the exit code that Python would end with."""
+    sys.argv[:] = arguments[1:] if arguments[0] == "-m" else arguments
+    try:
+        if arguments[0] == "-m":
+            sys.path.insert(0, os.getcwd())
+            runpy.run_module(arguments[1], run_name="__main__", alter_sys=True)
+        else:
+            sys.path.insert(0, os.path.dirname(arguments[0]))
+            runpy.run_path(arguments[0], run_name="__main__")
+    except SystemExit as end:
+        if isinstance(end.code, str):
+            print(end.code, file=sys.stderr)
+        return end.code if isinstance(end.code, int) else int(end.code is not None)
+    except BaseException:
+        traceback.print_exc()
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.path.pop(0)
+    _import_all()
+    gc.freeze()  # a collection would copy every page
+    code = _run(_serve(socket.socket(fileno=int(sys.argv[1]))))
+    threading._shutdown()
+    atexit._run_exitfuncs()
+    sys.stdout.flush()
+    os._exit(code)  # taking all modules apart costs more than all the rest

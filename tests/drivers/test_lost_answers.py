@@ -1,0 +1,150 @@
+"""What lost and late answers cost, and that a late one never passes for the answer to a later question."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from itertools import pairwise
+from random import Random
+from statistics import median
+
+import pytest
+from bench_arm import Arm
+from feetech_arm import FeetechArm
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from drivers.bench.device import Reply
+from drivers.bench.faults import Planned, Storm, mute
+from drivers.bench.virtual_port import VirtualClock, VirtualPort
+from drivers.dynamixel.bench.chain import Chain
+from drivers.dynamixel.bench.servo import Servo
+from drivers.dynamixel.bus import Bus
+from drivers.dynamixel.models import BY_NAME
+from drivers.feetech.bench.chain import Chain as FeetechChain
+from drivers.feetech.bench.servo import Servo as FeetechServo
+from drivers.feetech.joints import Bus as FeetechBus
+from drivers.feetech.models import BY_NAME as FEETECH_MODELS
+
+SYNC_READ, FAST_SYNC_READ = 0x82, 0x8A
+MAKES = {
+    "feetech": lambda **given: FeetechArm(("STS3215",) * 6, **given),
+    "feetech one by one": lambda **given: FeetechArm(("STS3215",) * 6, sync="never", **given),
+    "SCS": lambda **given: FeetechArm(("SCS0009",) * 6, **given),
+    "sync read": lambda **given: Arm(fast="never", **given),
+    "fast sync read": Arm,
+    "protocol 1": lambda **given: Arm(("MX-28", "AX-12A", "MX-28"), **given),
+}
+BUSES = {
+    "STS3215": (FeetechBus, FeetechChain, FeetechServo, FEETECH_MODELS),
+    "SCS0009": (FeetechBus, FeetechChain, FeetechServo, FEETECH_MODELS),
+    "XM430-W350": (Bus, Chain, Servo, BY_NAME),
+    "AX-12A": (Bus, Chain, Servo, BY_NAME),
+}
+
+
+class LosesAnswersTo:
+    """The wire of a chain whose answers to one instruction are lost so many times."""
+
+    def __init__(self, arm, code: int, times: float) -> None:
+        self._arm, self._code, self.left = arm, code, times
+
+    def __call__(self, reply: Reply) -> Reply:
+        if self._arm.port.heard[-1].code != self._code or self.left <= 0:
+            return reply
+        self.left -= 1
+        return replace(reply, data=b"")
+
+
+@pytest.mark.parametrize(
+    ("make", "code"), [(FeetechArm, SYNC_READ), (Arm, FAST_SYNC_READ)], ids=["feetech", "dynamixel"]
+)
+def test_one_lost_answer_at_opening_keeps_sync_read(make, code) -> None:
+    arm = make()
+    arm.chain.faults = LosesAnswersTo(arm, code, 1)
+    with arm.joints:
+        arm.port.heard.clear()
+        arm.joints.read(0.1)
+        assert code in {instruction.code for instruction in arm.port.heard}
+    assert arm.joints.health == ()
+
+
+def test_reading_one_by_one_is_told_and_left_again() -> None:
+    arm = FeetechArm()
+    arm.chain.faults = lost = LosesAnswersTo(arm, SYNC_READ, math.inf)
+    with arm.joints:
+        arm.joints.read(0.1)
+        assert arm.joints.bus_health["arm"].way == "one by one"
+        assert arm.joints.health[0].startswith("bus arm: Sync Read was not answered by all its servos")
+        lost.left = 0
+        arm.clock.wait_until(arm.clock.now() + 10.0)
+        arm.joints.read(0.1)
+        assert arm.joints.bus_health["arm"].way == "Sync Read"
+        assert arm.joints.health == ()
+
+
+@pytest.mark.parametrize("make", MAKES.values(), ids=MAKES)
+@pytest.mark.parametrize("missing", ["first", "last"])
+def test_a_lost_answer_costs_one_reading(make, missing) -> None:
+    arm = make(latency_s=2e-3)
+    with arm.joints:
+        for _ in range(20):
+            arm.joints.read(0.1)
+        readings = [arm.joints.read(0.1)]
+        arm.faults.add(1 if missing == "first" else len(arm.names), mute, 1)
+        readings += [arm.joints.read(0.1) for _ in range(3)]
+        gaps = [after.t - before.t for before, after in pairwise(readings)]
+    assert max(gaps) < 2 * median(gaps) + 8e-3
+
+
+def rig(model: str, angles: list[float]):
+    """A bus with one servo, whose shaft is at the next angle whenever it is asked."""
+    bus_of, chain_of, servo_of, models = BUSES[model]
+    clock, faults = VirtualClock(), Planned()
+    chain = chain_of([servo_of(models[model], 1, lambda t: angles[0], return_delay_s=0.0)], faults)
+    return bus_of("arm", VirtualPort(chain, clock), clock, 0.0), clock, faults, models[model]
+
+
+def late_by(seconds: float):
+    return lambda reply, rng: replace(reply, start=reply.start + seconds)
+
+
+@pytest.mark.parametrize("model", BUSES)
+@given(late_s=st.floats(3e-3, 0.05), pause_s=st.sampled_from([0.0, 1e-3]))
+@settings(max_examples=20, deadline=None)
+def test_a_late_answer_is_never_that_to_the_next_question(model, late_s, pause_s) -> None:
+    angles = [0.5]
+    bus, clock, faults, servo = rig(model, angles)
+    ask = bus.read_request(servo, 1, servo.layout["position"])
+    old = bus.ask(ask).answers[0].status.data
+    faults.add(1, late_by(late_s), 1)
+    if bus.ask(ask).trouble is None:
+        return  # it was not late enough
+    angles[0] = -0.5
+    faults.add(1, mute, 8)
+    bus.listen(clock.now() + pause_s)
+    for _ in range(20):
+        assert all(answer.status.data != old for answer in bus.ask(ask).answers)
+    assert bus.ask(ask).trouble is None
+
+
+@pytest.mark.parametrize("model", BUSES)
+def test_a_late_answer_does_not_hold_the_next_question_up(model) -> None:
+    bus, clock, faults, servo = rig(model, [0.5])
+    ask = bus.read_request(servo, 1, servo.layout["position"])
+    faults.add(1, late_by(6e-3), 1)
+    assert bus.ask(ask).trouble is not None
+    begin = clock.now()
+    assert bus.ask(ask).trouble is None
+    assert clock.now() - begin < 4e-3
+
+
+@pytest.mark.parametrize("loss", [0.02, 0.05])
+def test_lost_answers_leave_the_readings_that_they_did_not_strike(loss) -> None:
+    arm = FeetechArm(("STS3215",) * 6)
+    arm.chain.faults = Storm({"mute": (loss, mute)}, Random(3))
+    with arm.joints:
+        begin, count = arm.clock.now(), 0
+        while arm.clock.now() < begin + 1.5:
+            count += arm.joints.read(0.1) is not None
+    assert count / 1.5 > 0.93 * (1 - loss) ** 6 * 249

@@ -1,0 +1,46 @@
+"""Our child processes import nothing from the folder that the user stands in."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+from hostile_folder import FIRST_PARTY, HostileFolder
+
+from interfaces.interpreter import module_command, safe_children
+
+ROOT = Path(__file__).parents[2]
+LIMIT_S = 60.0
+
+
+def test_a_child_imports_nothing_from_the_current_folder(tmp_path: Path) -> None:
+    hostile = HostileFolder(tmp_path)
+    command = module_command("daemon", "--version")
+    done = subprocess.run(command, capture_output=True, text=True, timeout=LIMIT_S, cwd=tmp_path, check=True)
+    assert (hostile.executed, done.stderr) == ([], "")
+
+
+def test_a_users_own_vision_folder_is_not_ours(tmp_path: Path) -> None:
+    for package in FIRST_PARTY - {"daemon"}:
+        (tmp_path / package).mkdir()
+        (tmp_path / package / "__init__.py").write_text("raise ImportError(__file__)")
+    command = [sys.executable, "-m", "daemon", "predict", "--robot", "no.toml", "0"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=LIMIT_S, cwd=tmp_path, check=False)
+    assert done.stderr.startswith("bodyschema: no.toml: there is no such file")
+
+
+def test_every_python_child_is_started_by_module_command() -> None:
+    named = [file for package in FIRST_PARTY for file in (ROOT / package).rglob("*.py")]
+    starting = {str(file.relative_to(ROOT)) for file in named if re.search(r"sys\.executable", file.read_text("utf-8"))}
+    assert starting == {"interfaces/interpreter.py"}
+
+
+def test_safe_children_hold_for_interpreters_of_others(tmp_path: Path) -> None:
+    hostile, command = HostileFolder(tmp_path), [sys.executable, "-c", "import json"]
+    with safe_children():
+        subprocess.run(command, cwd=tmp_path, timeout=LIMIT_S, check=True)
+    assert hostile.executed == []
+    subprocess.run(command, cwd=tmp_path, capture_output=True, timeout=LIMIT_S, check=False)
+    assert hostile.executed == ["json.py.executed"]

@@ -1,0 +1,28 @@
+"""Image files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from interfaces.limited import read_at_most
+from interfaces.records import ImageArray
+
+# The largest camera images, uncompressed, have half of it.
+MOST_BYTES = 2**28
+
+
+def read_image(file: Path, flags: int = cv2.IMREAD_COLOR) -> ImageArray | None:
+    """Return the image (height, width, 3) in `file`; None where there is none that can be read.
+
+    Args:
+        flags: of `cv2.imdecode`; those of a colour image.
+    """
+    try:
+        data = np.frombuffer(read_at_most(file, MOST_BYTES), np.uint8)
+    except OSError:
+        return None
+    image = cv2.imdecode(data, flags) if len(data) else None
+    return None if image is None else np.asarray(image, np.uint8)
