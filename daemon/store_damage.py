@@ -51,10 +51,11 @@ class Damage:
 
     def told(self, file: Path) -> str:
         """Return a sentence that names the numbers and the remedy."""
-        many = "1 pair" if self.count == 1 else f"{self.count} pairs"
+        one = self.count == 1
+        many, they = ("1 pair", "It is") if one else (f"{self.count} pairs", "They are")
         return (
-            f"{many} of {file} cannot be read: the disk changed what was written. Learning goes on without number "
-            f"{self}. Check the disk and write a backup"
+            f"{many} of {file} cannot be read: the disk changed what was written. {they} left out "
+            f"(number{'' if one else 's'} {self}). Check the disk and write a backup"
         )
 
     def __or__(self, other: Damage) -> Damage:

@@ -7,7 +7,7 @@ import numpy as np
 from interfaces.errors import RequestError
 from interfaces.records import FARTHEST_M, LARGEST_Q, Pair
 
-from .state import FARTHEST_M, LARGEST_Q, Counters
+from .state import Counters
 
 # Of a covariance's largest eigenvalue: so far below zero the smallest may be rounded.
 ROUNDING = 1e-6

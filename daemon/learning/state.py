@@ -10,7 +10,7 @@ import numpy as np
 
 from daemon.status import CurvePoint
 from interfaces.errors import BodyschemaError
-from interfaces.records import FloatArray
+from interfaces.records import FARTHEST_M, LARGEST_Q, FloatArray
 
 from .change import ChangeRecord
 from .claims import ClaimsState
@@ -21,10 +21,6 @@ from .orientation import OrientationState
 BEFORE = "before/"
 # Names of stored nets begin with this.
 NET = "net_"
-# A measurement farther away than this is not one in metres [m].
-FARTHEST_M = 1000.0
-# Nobody turns a joint so often: such a number is not an angle [rad or m].
-LARGEST_Q = 1e6
 
 
 class StateError(BodyschemaError):

@@ -102,7 +102,7 @@ def test_one_changed_value_costs_one_pair(file, column, seq) -> None:
         assert reader.audit().damage == Damage(((seq, seq),))
     with PairStore(file, SESSION) as store:
         assert f"1 pair of {file} cannot be read" in store.complaints[0]
-        assert f"goes on without number {seq}." in store.complaints[0]
+        assert f"It is left out (number {seq})." in store.complaints[0]
         add(store, 1)
         assert numbers(store)[-1] == PAIRS + 1
 
@@ -119,7 +119,7 @@ def test_a_missing_number_is_told_and_passed_over(file) -> None:
     alter(file, "DELETE FROM pairs WHERE seq BETWEEN 5 AND 6")
     with PairStore(file, SESSION) as store:
         assert "2 pairs of" in store.complaints[0]
-        assert "number 5 to 6" in store.complaints[0]
+        assert "(numbers 5 to 6)" in store.complaints[0]
 
 
 def test_damage_that_comes_while_the_store_is_open_is_told(file) -> None:
@@ -127,7 +127,7 @@ def test_damage_that_comes_while_the_store_is_open_is_told(file) -> None:
         assert store.complaints == []
         alter(file, "UPDATE pairs SET x = replace(x, '2', '3') WHERE seq = 7")
         assert 7 not in numbers(store)
-        assert "without number 7." in store.complaints[0]
+        assert "(number 7)" in store.complaints[0]
 
 
 def test_damage_that_was_deleted_with_old_pairs_is_no_longer_told(file) -> None:

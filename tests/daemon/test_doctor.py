@@ -221,7 +221,7 @@ def test_a_pair_that_the_disk_changed_is_told_by_number(stored) -> None:
     check = changed(stored, "UPDATE pairs SET q = '[0.3]' WHERE seq = 3")
     assert check.state == "warning"
     assert "1 pair of" in check.said
-    assert "without number 3." in check.said
+    assert "(number 3)" in check.said
 
 
 def test_a_note_that_the_disk_changed_is_told(stored) -> None:

@@ -139,7 +139,7 @@ def test_pairs_that_cannot_be_read_are_left_out_and_told(tmp_path: Path, store: 
     export(store.file, tmp_path / "a.csv")
     assert len(Recording.read(tmp_path / "a.csv", JOINTS)) == 2
     assert f"2 pairs of {store.file} cannot be read" in caplog.text
-    assert "without number 2, 4." in caplog.text
+    assert "(numbers 2, 4)" in caplog.text
 
 
 def test_an_empty_store_is_said_to_be_empty(tmp_path: Path, store: PairStore) -> None:
