@@ -176,8 +176,22 @@ def records(connection: sqlite3.Connection, table: str) -> Iterator[tuple[Any, .
 
 
 def oldest(connection: sqlite3.Connection) -> int:
-    """Return the number of the oldest row of `pairs`; 1 when there is none."""
-    return connection.execute("SELECT coalesce(min(seq), 1) FROM pairs").fetchone()[0]
+    """Return the number of the oldest row of `pairs`; 1 when there is none that SQLite can read."""
+    return _one(connection, "SELECT coalesce(min(seq), 1) FROM pairs", 1)
+
+
+def count_pairs(connection: sqlite3.Connection, otherwise: int) -> int:
+    """Return how many rows `pairs` has, sound or not; `otherwise` when SQLite cannot count them."""
+    return _one(connection, "SELECT count(*) FROM pairs", otherwise)
+
+
+def _one(connection: sqlite3.Connection, statement: str, otherwise: int) -> int:
+    try:
+        return connection.execute(statement).fetchone()[0]
+    except sqlite3.DatabaseError as error:
+        if not is_damage(error):
+            raise
+        return otherwise
 
 
 def _copy(source: sqlite3.Connection, target: sqlite3.Connection, fresh: dict[str, str]) -> None:

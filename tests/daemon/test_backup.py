@@ -280,12 +280,11 @@ def test_a_torn_backup_is_refused(backed_up, elsewhere) -> None:
 # --- archives that were made to do harm
 
 
-def described(change: Callable[[str], str], **files: bytes) -> Callable[[dict[str, bytes]], None]:
-    """An archive whose checksums are right, with another robot.toml and with files in the robot's folder."""
+def described(change: Callable[[str], str]) -> Callable[[dict[str, bytes]], None]:
+    """An archive whose checksums are right, with another robot.toml."""
 
     def altered_members(members: dict[str, bytes]) -> None:
         members[ROBOT_TOML] = change(members[ROBOT_TOML].decode()).encode()
-        members |= files
         seal(members)
 
     return altered_members
@@ -302,18 +301,29 @@ def seal(members: dict[str, bytes]) -> None:
 
 HARMFUL = [
     ".git/hooks/post-checkout", ".bashrc", "venv/lib/python3.11/site-packages/evil.pth", "Makefile", "conftest.py",
-    "a/../.ssh/authorized_keys", "a\nb.urdf", "robot.toml", "state/../../arm.urdf", "/etc/cron.d/evil.urdf",
+    "a/../.ssh/authorized_keys", "a\nb.urdf", "state/../../arm.urdf", "/etc/cron.d/evil.urdf",
 ]  # fmt: skip
 
 
 @pytest.mark.parametrize("name", HARMFUL)
 @pytest.mark.parametrize("named", [False, True], ids=["not named by robot.toml", "named as the URDF"])
 def test_a_file_that_could_be_run_is_not_written(backed_up, elsewhere, name, named) -> None:
-    def change(text: str) -> str:
-        return text.replace('"arm.urdf"', json.dumps(name)) if named else text
+    def plant(members: dict[str, bytes]) -> None:
+        text = members[ROBOT_TOML].decode()
+        if named:
+            members[ROBOT_TOML] = text.replace('"arm.urdf"', json.dumps(name)).encode()
+            del members["robot/arm.urdf"]
+        members[f"robot/{name}"] = members[ROBOT_TOML] if name == "robot.toml" else b"import os"
+        seal(members)
 
-    archive = altered(backed_up, described(change, **{f"robot/{name}": b"import os"}))
-    assert "Nothing was changed" in refused(archive, elsewhere)
+    assert "Nothing was changed" in refused(altered(backed_up, plant), elsewhere)
+
+
+def test_an_archive_that_says_it_is_encrypted_is_refused(backed_up, elsewhere) -> None:
+    data = bytearray(backed_up.read_bytes())
+    data[data.rindex(b"PK\x01\x02") + 8] |= 1
+    backed_up.write_bytes(data)
+    assert "is no backup, or is damaged" in refused(backed_up, elsewhere)
 
 
 @pytest.mark.parametrize("folder", ["/srv/state", "../state", "a/../../state"])

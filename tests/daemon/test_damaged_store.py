@@ -183,6 +183,9 @@ def test_a_lost_page_costs_its_own_pairs_and_the_file_is_kept(long) -> None:
     damaged = long.read_bytes()
     with PairReader(long) as reader:
         readable = numbers(reader)
+        assert reader.audit().damage.count == LONG - len(readable)
+    assert len(from_store(long)) == len(readable)
+    assert [check.state for check in store_checks(long)] == ["wrong"]
     assert len(readable) > LONG - 30
     with PairStore(long, SESSION) as store:
         assert numbers(store) == readable
@@ -204,6 +207,18 @@ def test_numbers_of_a_lost_end_are_not_given_again(long) -> None:
         newest = numbers(store)[-1]
         add(store, 1)
         assert numbers(store)[-1] == newest + LEFT_FREE + 1 > LONG + 1
+
+
+@pytest.mark.parametrize("place", [0, -1])
+def test_a_lost_end_keeps_no_other_pair_from_readers(long, place) -> None:
+    zero(long, leaves(long)[place])
+    with PairReader(long) as reader:
+        readable = numbers(reader)
+        assert len(readable) > LONG - 30
+        assert reader.last_seq() == readable[-1]
+        assert reader.last().seq == readable[-1]
+        page = decode(answer_pairs(reader, Request({}, b"", JSON)), PairsReply)
+    assert [pair.seq for pair in page.pairs] == readable == list(from_store(long).t.astype(int) + 1)
 
 
 def test_several_lost_pages_cost_their_own_pairs(long) -> None:
