@@ -115,6 +115,16 @@ class JointBuffer:
         fraction = (t - before.t) / (after.t - before.t)
         return frozen_array(before.q + fraction * joint_difference(after.q, before.q, self._prismatic))
 
+    def slack(self, t: float) -> FloatArray:
+        """How far the joints move while the times of the readings around `t` are uncertain, shape (d,) [rad or m].
+
+        For a `t` at which `at` gave angles.
+        """
+        with self._changed:
+            before, after = self._around(t)
+        sigma_s, apart_s = max(before.t_sigma, after.t_sigma), max(after.t - before.t, ROUNDING_S)
+        return frozen_array(sigma_s / apart_s * joint_difference(after.q, before.q, self._prismatic))
+
     def moved(self, t: float, during_s: float, timeout_s: float) -> FloatArray | Reason:
         """How far the joints move within `during_s` of time `t`, shape (d,) [rad or m]; a reason as of `at`.
 

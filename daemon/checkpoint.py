@@ -111,12 +111,9 @@ def checkpoint_bytes(file: Path) -> bytes:
         CheckpointError: it cannot be read, or is larger than a checkpoint can be.
     """
     try:
-        data = read_at_most(file, LARGEST_BYTES)
+        return read_at_most(file, LARGEST_BYTES)
     except OSError as error:
         raise CheckpointError(f"cannot read the checkpoint {file}: {error.strerror}") from error
-    if data is None:
-        raise CheckpointError(f"{file} is not a checkpoint: it is larger than {LARGEST_BYTES // 2**20} MiB")
-    return data
 
 
 def generations(file: Path) -> tuple[Path, Path]:

@@ -14,7 +14,6 @@ from kbmaps import ChainBelief, KBMapsError
 
 from .chain_figures import ChainFigures, is_told, no_surer_than_possible
 from .learning import Learning
-from .learning.learning import REGION_RAD
 from .learning.members import SOLVED
 from .learning.outlook import Known, Scatter, foreseen
 from .learning.workmanship import WORKMANSHIP, probable
@@ -116,7 +115,7 @@ class Findings:
 
 def _found(robot: RobotDescription, known: Known) -> tuple[ChainCalibration, Outlook | None]:
     scatter = Scatter.of(known)
-    outlook = foreseen(known, scatter, robot.joints, REGION_RAD) if known.solved else None
+    outlook = foreseen(known, scatter, robot.joints) if known.solved else None
     return calibrated(robot, known, scatter), outlook
 
 

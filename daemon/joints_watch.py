@@ -12,7 +12,6 @@ from typing import Protocol, Self, runtime_checkable
 import msgspec
 import numpy as np
 
-from drivers.config import DriversConfig
 from interfaces.protocols import Clock, JointSource
 from interfaces.records import FloatArray
 from interfaces.robot import RobotDescription
@@ -127,7 +126,8 @@ class JointsWatch:
         """Nothing is opened yet."""
         self._robot, self._source, self._clock = config.robot, source, clock
         self._servos = source if isinstance(source, ServoJoints) else None
-        self._signs_in = signs_in(config.tables.drivers)
+        drivers = config.tables.drivers
+        self._signs_in = signs_in(is_ros2=drivers.ros2 is not None, is_plugin=drivers.plugin is not None)
         self._reading = Reopening(source, "the encoders", clock)
         self._opened = ExitStack()
         self._temperatures: dict[str, float | None] = dict.fromkeys(config.robot.joints)
@@ -203,11 +203,11 @@ class JointsWatch:
         )
 
 
-def signs_in(drivers: DriversConfig) -> str:
+def signs_in(*, is_ros2: bool, is_plugin: bool) -> str:
     """Return where signs and zeros of the joints are set, for people."""
-    if drivers.ros2 is not None:
+    if is_ros2:
         return "[drivers.ros2.names] or the URDF: ROS 2 gives the angles with their signs and zeros"
-    if drivers.plugin is not None:
+    if is_plugin:
         return "the settings of its driver, or the URDF"
     return "direction and zero_ticks in robot.toml: direction = -1 turns it round"
 

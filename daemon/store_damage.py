@@ -25,8 +25,8 @@ PATIENCE = 64
 # A row of `pairs` takes more bytes. Pages that lead in a circle give more rows than fit into the file.
 SMALLEST_ROW_BYTES = 20
 # So many numbers are left free after the newest readable pair where SQLite lost the end of the store: those behind it
-# were given already. A page holds fewer pairs.
-LEFT_FREE = 100
+# were given already. A page of 4096 bytes holds at most 37.
+LEFT_FREE = 50
 SHOWN = 8  # places of damage in a sentence
 
 Made = TypeVar("Made")

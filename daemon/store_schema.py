@@ -70,6 +70,8 @@ def connect(file: Path, *, readonly: bool = False) -> sqlite3.Connection:
 
     What the file itself defines (triggers, generated columns) may not call functions with side effects.
     """
+    if file.exists() and not file.is_file():  # SQLite would wait for what a pipe never says
+        raise StoreError(f"{file} is not a file. Move it away, or give another --state-dir. {NOTHING_CHANGED}")
     uri = f"{file.absolute().as_uri()}?mode={'ro' if readonly else 'rwc'}"
     connection = sqlite3.connect(uri, uri=True, isolation_level=None, check_same_thread=False)
     connection.text_factory = bytes  # a text that is not UTF-8 spoils its own row alone

@@ -76,8 +76,8 @@ class PredictReply(msgspec.Struct, frozen=True):
         in_support: whether the joint angles lie where data was.
         model: hash of the model that answered.
         pairs: how many pairs it had learnt.
-        age_s: how old the last of them is: the time from it to the newest pair that is known to be stored, and since the
-            learner heard of that one; null before any since the learner started.
+        age_s: how old the last of them is: the time from it to the newest pair that is known to be stored, plus the
+            time since the learner heard of that one; null before any since the learner started.
         R: orientations of the marker in the measurement frame, unit quaternions x, y, z, w; null where none is learnt.
         sigma_R: their 1-sigma, of a small turn about each axis of the measurement frame [rad]; null with R.
     """

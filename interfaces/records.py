@@ -39,7 +39,8 @@ class Reason(StrEnum):
     IMPLAUSIBLE_SPEED = "implausible_speed"  # farther from the last fix than a hand can move it
     NO_JOINTS = "no_joints"  # no encoder readings around the frame's time
     STALE = "stale"  # encoder readings around the frame's time too far apart
-    MOVING = "moving"  # joints too fast for the uncertainty of the time stamps
+    MOVING = "moving"  # joints too fast for the uncertainty of the frame's time
+    LATE_JOINTS = "late_joints"  # joints too fast for the uncertainty of the times of their readings
     TOO_NEAR = "too_near"  # nearer than the smallest step to the predecessor: wait
     PAUSED = "paused"  # an operator paused the sampler
     NOT_FINITE = "not_finite"  # the tracker gave a position that is no number
@@ -54,10 +55,12 @@ class JointReading:
     Attributes:
         t: time of the reading on the source's monotonic clock [s].
         q: joint angles [rad] (m for a prismatic joint), shape (d,), in the robot description's order.
+        t_sigma: 1-sigma of `t` [s].
     """
 
     t: float
     q: FloatArray
+    t_sigma: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,6 +20,7 @@ WORDS: Mapping[Reason, str] = {
     Reason.NO_JOINTS: "no encoder readings at its time",
     Reason.STALE: "encoder readings too far apart",
     Reason.MOVING: "joints too fast for the time stamps",
+    Reason.LATE_JOINTS: "joints too fast for the times of their readings",
     Reason.TOO_NEAR: "hardly any motion since the last pair",
     Reason.PAUSED: "paused",
     Reason.NOT_FINITE: "a position that is no number",
@@ -44,6 +45,8 @@ REMEDIES: Mapping[Reason, str] = {
     "measures it.",
     Reason.STALE: "Read the encoders more often, or raise [daemon] max_reading_gap_s.",
     Reason.MOVING: "Guide the arm more slowly, or measure the cameras' latency: `bodyschema calibrate latency`.",
+    Reason.LATE_JOINTS: "Guide the arm more slowly, end other programs that keep the machine busy, or see what "
+    "`bodyschema doctor` says of latency timer and return delay.",
     Reason.TOO_NEAR: "Move the arm.",
     Reason.PAUSED: "Resume with `bodyschema command resume`.",
     Reason.NOT_FINITE: "That is a fault of the tracker in [vision.plugin].",

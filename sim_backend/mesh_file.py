@@ -42,8 +42,6 @@ def read_mesh(file: Path) -> FloatArray:
         data = read_at_most(file, LARGEST_MESH_BYTES)
     except OSError as error:
         raise MeshError(f"it cannot be read: {error.strerror}") from error
-    if data is None:
-        raise MeshError(f"it is larger than {LARGEST_MESH_BYTES >> 20} MiB")
     read = {".stl": _stl, ".obj": _obj, ".dae": _collada}[file.suffix.lower()]
     try:
         with np.errstate(all="ignore"):

@@ -132,5 +132,5 @@ def _line(sampler: SamplerStatus, learner: LearnerStatus) -> str:
     return (
         f"{sampler.frames} rows fed, {sampler.pairs} pairs accepted, {learner.pairs} learnt, "
         f"{learner.replayed} replayed, {learner.state} ({learner.answering}), "
-        f"error before learning each {mm(error)}"
+        f"error on new pairs {mm(error)}"
     )

@@ -376,7 +376,7 @@ class ServoJoints:
         if t <= self._last_t:
             return None
         self._last_t = t
-        return JointReading(t, frozen_array(self._turns.keep(counts)))
+        return JointReading(t, frozen_array(self._turns.keep(counts)), unsure / math.sqrt(3))  # of a uniform error
 
     def _dropped_one(self) -> None:
         self.dropped += 1

@@ -52,6 +52,13 @@ def test_readings_too_far_apart_are_stale(buffer) -> None:
     assert buffer.at(0.05, 0.0) is Reason.STALE
 
 
+@pytest.mark.parametrize(("t_sigma", "slack"), [(0.0, 0.0), (0.002, 0.02)])
+def test_slack_is_speed_times_time_sigma(buffer, t_sigma, slack) -> None:
+    buffer.put(JointReading(0.0, frozen_array([0.0, 1.0]), t_sigma))
+    buffer.put(JointReading(0.01, frozen_array([0.1, 1.0])))
+    assert buffer.slack(0.005).tolist() == pytest.approx([slack, 0.0])
+
+
 def test_a_frame_before_all_readings_has_no_joints(buffer) -> None:
     buffer.put(reading(1.0, 1.0, 1.0))
     buffer.put(reading(1.01, 1.0, 1.0))

@@ -17,9 +17,7 @@ from daemon.joints_view import screen
 from daemon.joints_watch import JointState, JointsWatch, Seen, SignCheck, Speeds, signs_in
 from daemon.wiring import open_joints
 from drivers.bench.dry_run import DryRun
-from drivers.config import DriversConfig
 from drivers.dynamixel.bench.arm import DynamixelArm
-from drivers.ros2.config import Ros2Config
 from interfaces.clock import SystemClock
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "desk_arm" / "servos.toml"
@@ -168,8 +166,8 @@ def test_the_screen_says_what_moved_and_what_to_do() -> None:
 
 
 def test_signs_of_a_ros_2_robot_are_not_in_our_keys() -> None:
-    robot = DriversConfig(ros2=Ros2Config(router="tcp/127.0.0.1:7447"))
-    text = " ".join(shown(signs_in(robot), high=1.4, within_limits=False).split())
+    said = signs_in(is_ros2=True, is_plugin=False)
+    text = " ".join(shown(said, high=1.4, within_limits=False).split())
     assert "[drivers.ros2.names] or the URDF" in text
     assert "direction" not in text
     assert "zero_ticks" not in text

@@ -28,6 +28,7 @@ from daemon.wire import MSGPACK, CommandRequest, PairMessage, PairsReply, decode
 from interfaces.clock import SystemClock
 from interfaces.errors import BusError, ConfigError, RequestError, SourceError, SourceLost, StoreError
 from interfaces.records import JointReading, MarkerFix, MarkerMiss, Pair, Reason, frozen_array
+from interfaces.rejections import REMEDIES
 
 LIMIT_S = 500.0
 KEYS = Keys("arm")
@@ -423,6 +424,24 @@ def test_silent_sources_are_reported(config, monkeypatch) -> None:
 
 
 # --- how sure the time is
+
+
+def test_frames_refused_for_one_reason_are_a_complaint(config) -> None:
+    walk, held = Walk(config.robot, 40), threading.Event()
+    misses = [MarkerMiss(fix.t, Reason.SIZE_MISMATCH) for fix in walk.fixes]
+    with running(config, walk.sources(fixes=[*misses, held])) as bus:
+        status = status_when(bus, lambda status: bool(status.health))
+        held.set()
+    assert status.health == [f"40 of the last 40 frames were rejected: size mismatch. {REMEDIES[Reason.SIZE_MISMATCH]}"]
+
+
+def test_joints_too_fast_for_their_readings_make_no_pairs(config) -> None:
+    walk = Walk(config.robot, 20)
+    late = [replace(reading, t_sigma=0.01) for reading in walk.readings]
+    pairs, status = sample(config, walk.sources(readings=late, fixes=walk.fixes[2:-2]))
+    assert (pairs, status.rejected) == ([], {"late_joints": 16})
+    sure = [replace(reading, t_sigma=1e-4) for reading in walk.readings]
+    assert len(sample(config, walk.sources(readings=sure, fixes=walk.fixes[2:-2]))[0]) == 16
 
 
 def uncertain(walk: Walk, t_sigma: float) -> list[MarkerFix]:

@@ -247,6 +247,15 @@ def test_times_are_those_of_the_sampling_to_half_a_millisecond() -> None:
     assert np.percentile(off, 99) < 0.5e-3
 
 
+def test_a_reading_tells_how_sure_its_time_is() -> None:
+    with (arm := FeetechArm(("STS3215",) * 6, latency_s=4e-3)).joints:
+        for _ in range(50):
+            reading = read(arm)[0]
+            assert abs(reading.t - arm.sampled()) <= math.sqrt(3) * reading.t_sigma + 1e-6
+            assert 0 <= reading.t_sigma < 4e-3
+        assert reading.t_sigma > 1e-5
+
+
 def test_a_reading_that_was_held_up_is_dropped_where_no_clock_tells_its_time() -> None:
     with (arm := FeetechArm(("STS3215",) * 6)).joints:
         read(arm, 60)
