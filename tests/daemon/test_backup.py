@@ -272,6 +272,10 @@ def test_a_file_that_is_no_archive_is_refused(file, elsewhere, data) -> None:
     assert f"{file} is no backup, or is damaged" in refused(file, elsewhere)
 
 
+def test_a_device_in_the_place_of_a_backup_is_refused(elsewhere) -> None:
+    assert "a device, not a file" in refused(Path("/dev/zero"), elsewhere)
+
+
 def test_a_torn_backup_is_refused(backed_up, elsewhere) -> None:
     backed_up.write_bytes(backed_up.read_bytes()[:-100])
     assert "is no backup, or is damaged" in refused(backed_up, elsewhere)

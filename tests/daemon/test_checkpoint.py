@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from guided_arm import Scene, new_learning, teach
 
-from daemon.checkpoint import CheckpointError, generations, read_checkpoint, set_aside, write_checkpoint
+from daemon.checkpoint import LARGEST_BYTES, CheckpointError, generations, read_checkpoint, set_aside, write_checkpoint
 from daemon.going_on import go_on
 from daemon.learning import LearningState
 
@@ -210,11 +210,18 @@ def test_pairs_that_no_arm_has_are_not_gone_on_from(written, old, name, number) 
 
 
 @pytest.mark.parametrize("endless", ["/dev/zero", "/dev/urandom"])
-def test_a_checkpoint_without_end_is_refused_in_little_memory(file, endless, monkeypatch) -> None:
-    monkeypatch.setattr("daemon.checkpoint.LARGEST_BYTES", 2**22)
+def test_a_device_in_the_place_of_a_checkpoint_is_refused(file, endless) -> None:
     file.parent.mkdir()
     file.symlink_to(endless)
-    with pytest.raises(CheckpointError, match="is not a checkpoint: it is larger than 4 MiB"):
+    with pytest.raises(CheckpointError, match="a device, not a file"):
+        read_checkpoint(file, robot="arm")
+
+
+def test_a_file_that_is_larger_than_a_checkpoint_is_refused_unread(file) -> None:
+    file.parent.mkdir()
+    with file.open("wb") as stream:
+        stream.truncate(LARGEST_BYTES + 1)
+    with pytest.raises(CheckpointError, match="cannot read the checkpoint"):
         read_checkpoint(file, robot="arm")
 
 
