@@ -272,7 +272,7 @@ def test_a_file_that_is_no_archive_is_refused(file, elsewhere, data) -> None:
     assert f"{file} is no backup, or is damaged" in refused(file, elsewhere)
 
 
-def test_a_device_in_the_place_of_a_backup_is_refused(elsewhere) -> None:
+def test_a_device_as_backup_is_refused(elsewhere) -> None:
     assert "a device, not a file" in refused(Path("/dev/zero"), elsewhere)
 
 
@@ -311,7 +311,7 @@ HARMFUL = [
 
 @pytest.mark.parametrize("name", HARMFUL)
 @pytest.mark.parametrize("named", [False, True], ids=["not named by robot.toml", "named as the URDF"])
-def test_a_file_that_could_be_run_is_not_written(backed_up, elsewhere, name, named) -> None:
+def test_an_executable_file_is_not_written(backed_up, elsewhere, name, named) -> None:
     def plant(members: dict[str, bytes]) -> None:
         text = members[ROBOT_TOML].decode()
         if named:
@@ -323,7 +323,7 @@ def test_a_file_that_could_be_run_is_not_written(backed_up, elsewhere, name, nam
     assert "Nothing was changed" in refused(altered(backed_up, plant), elsewhere)
 
 
-def test_an_archive_that_says_it_is_encrypted_is_refused(backed_up, elsewhere) -> None:
+def test_an_encrypted_archive_is_refused(backed_up, elsewhere) -> None:
     data = bytearray(backed_up.read_bytes())
     data[data.rindex(b"PK\x01\x02") + 8] |= 1
     backed_up.write_bytes(data)
@@ -341,7 +341,7 @@ def test_a_state_dir_elsewhere_is_asked_for(backed_up, elsewhere, folder, tmp_pa
     assert len(stored(tmp_path / "given" / "pairs.sqlite")) == PAIRS
 
 
-def test_a_state_dir_that_this_robot_has_already_is_not_asked_for(config, file, tmp_path) -> None:
+def test_a_known_state_dir_is_not_asked_for(config, file, tmp_path) -> None:
     config.file.write_text(config.file.read_text().replace('"state"', json.dumps(str(tmp_path / "far"))))
     far = Config.load(config.file, {})
     config.state_dir.rename(far.state_dir)
@@ -393,7 +393,7 @@ def test_endpoints_that_are_none_are_refused(backed_up, elsewhere) -> None:
     assert "zenoh" in refused(archive, elsewhere)
 
 
-def test_a_store_with_a_program_in_it_is_refused(backed_up, elsewhere, tmp_path) -> None:
+def test_a_store_with_a_trigger_is_refused(backed_up, elsewhere, tmp_path) -> None:
     def plant(members: dict[str, bytes]) -> None:
         (tmp_path / "planted").write_bytes(members[STORE])
         with contextlib.closing(sqlite3.connect(tmp_path / "planted")) as connection:
@@ -404,7 +404,7 @@ def test_a_store_with_a_program_in_it_is_refused(backed_up, elsewhere, tmp_path)
     assert "it has a trigger" in refused(altered(backed_up, plant), elsewhere)
 
 
-def test_what_a_disk_changed_is_left_out_of_a_backup_and_told(config, file, elsewhere, capsys) -> None:
+def test_a_backup_leaves_out_changed_pairs(config, file, elsewhere, capsys) -> None:
     with contextlib.closing(sqlite3.connect(config.store_file)) as connection:
         connection.execute("UPDATE pairs SET q = '[0.5,0.5]' WHERE seq IN (3, 4)")
         connection.commit()
@@ -421,7 +421,7 @@ def test_what_a_disk_changed_is_left_out_of_a_backup_and_told(config, file, else
     assert (audit.pairs, audit.newest, audit.lost_rows) == (18, 20, 0)
 
 
-def test_a_damaged_pair_in_an_older_backup_is_left_out(backed_up, elsewhere, tmp_path) -> None:
+def test_restore_leaves_out_changed_pairs(backed_up, elsewhere, tmp_path) -> None:
     def damage(members: dict[str, bytes]) -> None:
         members[STORE] = members[STORE].replace(b"[0.1,0.2,1.0]", b"[0.1,0.3,1.0]")
         seal(members)

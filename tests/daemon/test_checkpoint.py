@@ -180,7 +180,7 @@ def test_an_array_that_cannot_be_is_refused(written, shape) -> None:
         read_checkpoint(sealed(written, change), robot="arm")
 
 
-def test_shapes_that_make_up_for_each_other_are_refused(written) -> None:
+def test_shapes_that_cancel_are_refused(written) -> None:
     def change(header: dict[str, Any]) -> None:
         first, second, *_ = header["arrays"]
         first["shape"], second["shape"] = [-1], [math.prod(first["shape"]) + math.prod(second["shape"]) + 1]
@@ -199,7 +199,7 @@ def test_a_header_of_many_layers_is_refused(written) -> None:
 
 
 @pytest.mark.parametrize(("name", "number"), [("q", 1e7), ("q", 1e308), ("x", 2000.0), ("x", -1e308)])
-def test_pairs_that_no_arm_has_are_not_gone_on_from(written, old, name, number) -> None:
+def test_impossible_kept_pairs_are_refused(written, old, name, number) -> None:
     arrays = {**old.arrays, name: np.full_like(old.arrays[name], number)}
     data = b"".join(np.ascontiguousarray(array, dtype="<f8").tobytes() for array in arrays.values())
     sealed(written, lambda header: None, lambda _: data)
@@ -210,14 +210,14 @@ def test_pairs_that_no_arm_has_are_not_gone_on_from(written, old, name, number) 
 
 
 @pytest.mark.parametrize("endless", ["/dev/zero", "/dev/urandom"])
-def test_a_device_in_the_place_of_a_checkpoint_is_refused(file, endless) -> None:
+def test_a_device_as_checkpoint_is_refused(file, endless) -> None:
     file.parent.mkdir()
     file.symlink_to(endless)
     with pytest.raises(CheckpointError, match="a device, not a file"):
         read_checkpoint(file, robot="arm")
 
 
-def test_a_file_that_is_larger_than_a_checkpoint_is_refused_unread(file) -> None:
+def test_a_huge_checkpoint_is_refused_unread(file) -> None:
     file.parent.mkdir()
     with file.open("wb") as stream:
         stream.truncate(LARGEST_BYTES + 1)
@@ -225,7 +225,7 @@ def test_a_file_that_is_larger_than_a_checkpoint_is_refused_unread(file) -> None
         read_checkpoint(file, robot="arm")
 
 
-def test_a_folder_in_the_place_of_a_checkpoint_is_refused(file) -> None:
+def test_a_folder_as_checkpoint_is_refused(file) -> None:
     file.mkdir(parents=True)
     with pytest.raises(CheckpointError, match="cannot read the checkpoint"):
         read_checkpoint(file, robot="arm")
@@ -256,7 +256,7 @@ def go_on_from_nasty_headers(written: Path, count: int) -> None:
         learning.state()
 
 
-def test_a_header_that_was_made_to_do_harm_ends_no_learner(written) -> None:
+def test_a_harmful_header_ends_no_learner(written) -> None:
     go_on_from_nasty_headers(written, 40)
 
 

@@ -108,7 +108,7 @@ def test_one_changed_value_costs_one_pair(file, column, seq) -> None:
 
 
 @pytest.mark.parametrize("damage", ["x'ff'", "'[1,2'", "'[null,0.1]'", "'[1e999,0.1]'", "5", "''"])
-def test_a_row_that_is_no_pair_is_left_out(file, damage) -> None:
+def test_an_unreadable_row_is_left_out(file, damage) -> None:
     alter(file, f"UPDATE pairs SET q = {damage} WHERE seq = 7")
     with PairStore(file, SESSION) as store:
         assert 7 not in numbers(store)
@@ -122,7 +122,7 @@ def test_a_missing_number_is_told_and_passed_over(file) -> None:
         assert "(numbers 5 to 6)" in store.complaints[0]
 
 
-def test_damage_that_comes_while_the_store_is_open_is_told(file) -> None:
+def test_damage_to_an_open_store_is_told(file) -> None:
     with PairStore(file, SESSION) as store:
         assert store.complaints == []
         alter(file, "UPDATE pairs SET x = replace(x, '2', '3') WHERE seq = 7")
@@ -130,7 +130,7 @@ def test_damage_that_comes_while_the_store_is_open_is_told(file) -> None:
         assert "(number 7)" in store.complaints[0]
 
 
-def test_damage_that_was_deleted_with_old_pairs_is_no_longer_told(file) -> None:
+def test_deleted_damage_is_no_longer_told(file) -> None:
     alter(file, "UPDATE pairs SET x = replace(x, '2', '3') WHERE seq = 7")
     with PairStore(file, SESSION) as store:
         while store.trim(Keep(None, 0.0, 10), "2026-01-02T00:00:00"):
@@ -177,7 +177,7 @@ def leaves(file: Path) -> list[int]:
     return [k for k, page in enumerate(pages, 1) if page[0] == 0x0D and page.count(b"2026-01-01T00:00:") > 2]
 
 
-def test_a_lost_page_costs_its_own_pairs_and_the_file_is_kept(long) -> None:
+def test_a_lost_page_costs_its_own_pairs(long) -> None:
     page = leaves(long)[4]
     zero(long, page)
     damaged = long.read_bytes()
@@ -201,7 +201,7 @@ def test_a_lost_page_costs_its_own_pairs_and_the_file_is_kept(long) -> None:
         assert store.complaints == [left_out]
 
 
-def test_numbers_of_a_lost_end_are_not_given_again(long) -> None:
+def test_lost_numbers_are_not_given_again(long) -> None:
     zero(long, leaves(long)[-1])
     with PairStore(long, SESSION) as store:
         newest = numbers(store)[-1]
@@ -210,7 +210,7 @@ def test_numbers_of_a_lost_end_are_not_given_again(long) -> None:
 
 
 @pytest.mark.parametrize("place", [0, -1])
-def test_a_lost_end_keeps_no_other_pair_from_readers(long, place) -> None:
+def test_readers_get_pairs_beside_a_lost_end(long, place) -> None:
     zero(long, leaves(long)[place])
     with PairReader(long) as reader:
         readable = numbers(reader)
@@ -229,7 +229,7 @@ def test_several_lost_pages_cost_their_own_pairs(long) -> None:
         assert LONG - 3 * 30 < len(numbers(store)) < LONG
 
 
-def test_a_lost_identity_is_replaced_and_every_pair_kept(file) -> None:
+def test_a_lost_identity_costs_no_pair(file) -> None:
     alter(file, "UPDATE meta SET value = replace(value, '-', '+') WHERE key = 'store'")
     with (
         pytest.raises(StoreError, match="Start the sampler: it puts the pairs"),
@@ -329,7 +329,7 @@ def flips(file: Path, tmp_path: Path) -> Iterator[Flips]:
     print(dict(sorted(done.outcomes.items())))
 
 
-def test_a_flipped_bit_costs_at_most_its_own_pair(flips) -> None:
+def test_a_flipped_bit_costs_one_pair_at_most(flips) -> None:
     for bit in np.random.default_rng(0).choice(flips.bits, 25, replace=False).tolist():
         flips.flip(bit)
     assert flips.outcomes["_open lost"] > 1
@@ -337,7 +337,7 @@ def test_a_flipped_bit_costs_at_most_its_own_pair(flips) -> None:
 
 @pytest.mark.soak
 @pytest.mark.timeout(7200)
-def test_every_flipped_bit_costs_at_most_its_own_pair(flips) -> None:
+def test_every_flipped_bit_costs_one_pair_at_most(flips) -> None:
     for bit in range(0, flips.bits, 7):  # each byte, and each place in a byte
         flips.flip(bit)
     assert flips.outcomes["_open lost"] > 1000
@@ -406,13 +406,13 @@ VALUES = (
 
 @pytest.mark.parametrize("column", COLUMNS["pairs"].split(", "))
 @pytest.mark.parametrize("value", VALUES)
-def test_a_value_of_another_kind_costs_its_own_pair(file, column, value) -> None:
+def test_a_wrong_type_costs_its_own_pair(file, column, value) -> None:
     with contextlib.suppress(sqlite3.IntegrityError):
         remade(file, f"UPDATE pairs SET {column} = {value} WHERE seq = 7")
     assert len(from_store(file)) >= PAIRS - 1
 
 
-def test_sealed_rows_of_other_kinds_cost_their_own_pairs(file) -> None:
+def test_sealed_nonsense_costs_its_own_pairs(file) -> None:
     """Their checksums are right: whoever made them knew how."""
     rng = np.random.default_rng(0)
     with contextlib.closing(store_schema.connect(file)) as connection:
@@ -430,7 +430,7 @@ def test_sealed_rows_of_other_kinds_cost_their_own_pairs(file) -> None:
         assert numbers(store)[-1] == PAIRS + 1
 
 
-def test_pages_that_lead_in_a_circle_come_to_an_end(long) -> None:
+def test_reading_circular_pages_ends(long) -> None:
     data = bytearray(long.read_bytes())
     root = next(k for k in range(PAGE_BYTES, len(data), PAGE_BYTES) if data[k] == 0x05)
     cells = int.from_bytes(data[root + 3 : root + 5], "big")

@@ -129,7 +129,7 @@ def test_a_store_in_use_is_exported_without_robot_toml(tmp_path: Path, store: Pa
     assert "1 pairs" in capsys.readouterr().out
 
 
-def test_pairs_that_cannot_be_read_are_left_out_and_told(tmp_path: Path, store: PairStore, caplog) -> None:
+def test_an_export_tells_unreadable_pairs(tmp_path: Path, store: PairStore, caplog) -> None:
     for k in range(4):
         fix = MarkerFix(1.5 + k, np.array([1.0, 2, 3]), np.eye(3) * 1e-6)
         store.append(7, "2026-01-01T00:00:00Z", np.array([0.1, 0.2]), fix)

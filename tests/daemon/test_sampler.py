@@ -461,7 +461,7 @@ def test_the_same_joints_make_pairs_where_the_time_is_known_well(config) -> None
 
 
 @pytest.mark.parametrize("column", ["q", "x", "t", "segment"])
-def test_a_pair_that_the_disk_changed_stops_no_sampler(config, column) -> None:
+def test_a_changed_pair_stops_no_sampler(config, column) -> None:
     walk = Walk(config.robot, 20)
     sample(config, walk.sources())
     with contextlib.closing(sqlite3.connect(config.store_file)) as connection:
