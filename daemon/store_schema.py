@@ -14,7 +14,7 @@ import msgspec
 from interfaces.errors import StoreError
 
 from .store_file import NOTHING_CHANGED, damaged, is_damage
-from .store_rows import COLUMNS, DamagedRow, checksum, pair_of
+from .store_rows import COLUMNS, DamagedRow, checksum, decoded
 
 SCHEMA_VERSION = 5
 WITH_DEVICES, WITH_ORIENTATION, WITH_CHECKSUMS = 2, 3, 5
@@ -243,7 +243,7 @@ def _seal(connection: sqlite3.Connection) -> None:
 
     def sealed_pairs(*row: object) -> int | None:
         try:
-            pair_of("", row, joints)
+            decoded(row, joints)
         except DamagedRow:
             return None
         return checksum(row)

@@ -1,6 +1,8 @@
 from __future__ import annotations
 
+import contextlib
 import json
+import sqlite3
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -456,3 +458,18 @@ def test_the_same_joints_make_pairs_where_the_time_is_known_well(config) -> None
     walk = Walk(config.robot, 20)
     pairs, _ = sample(config, walk.sources(fixes=uncertain(walk, 0.001)))
     assert len(pairs) == 16
+
+
+@pytest.mark.parametrize("column", ["q", "x", "t", "segment"])
+def test_a_changed_pair_stops_no_sampler(config, column) -> None:
+    walk = Walk(config.robot, 20)
+    sample(config, walk.sources())
+    with contextlib.closing(sqlite3.connect(config.store_file)) as connection:
+        value = f"'x' || {column}" if column in "qx" else f"{column} + 1"
+        connection.execute(f"UPDATE pairs SET {column} = {value} WHERE seq = 7")
+        connection.commit()
+    pairs, status = sample(config, walk.sources())
+    assert status.unreadable == 1
+    assert any("cannot be read" in text and "(number 7)" in text for text in status.health)
+    assert [pair.seq for pair in pairs] == [number for number in range(1, status.pairs + 1) if number != 7]
+    assert status.pairs > 20
