@@ -206,6 +206,7 @@ class Learner:
         for problem in (self._feed.problem, self._checkpoint_problem, self._set_aside):
             if problem is not None:
                 yield problem
+        yield from self._findings.doubts
         behind = self._feed.behind
         if behind >= BEHIND and not self._feed.paused:
             age_s = self._feed.age_s(self._learning.snapshot.newest_utc)

@@ -170,6 +170,13 @@ class Learning:
                 x=x,
             )
 
+    def kept(self, limit: int) -> tuple[FloatArray, FloatArray]:
+        """At most `limit` of the kept pairs with the present tool, evenly spread: q (n, d) [rad, m], x (n, 3) [m]."""
+        with self._lock:
+            memory = self._course.eras.memory
+            places = np.unique(np.linspace(0, len(memory) - 1, min(limit, len(memory))).astype(np.intp))
+            return memory.at(places)
+
     def learn(self, pair: Pair, now: float) -> None:
         """Learn one pair at once.
 
