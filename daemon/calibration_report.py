@@ -9,7 +9,7 @@ import numpy as np
 
 from daemon.calibration import Calibration
 from daemon.learning.workmanship import WORKMANSHIP
-from daemon.plausibility import Plausibility
+from daemon.plausibility.check import Plausibility
 from daemon.tool_jump import tool_jump
 from interfaces.recording import Recording
 from interfaces.records import FloatArray

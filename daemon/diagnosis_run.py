@@ -32,7 +32,8 @@ from . import recordings
 from .bus import client
 from .config import Config
 from .learning import NominalModel
-from .plausibility import plausibility, require_units, told_sigma
+from .plausibility.check import plausibility, told_sigma
+from .plausibility.limits import require_units
 from .recorder import History
 
 DIAGNOSIS, REPORT = "diagnosis.json", "report.html"

@@ -17,8 +17,7 @@ from .learning import Learning
 from .learning.members import SOLVED
 from .learning.outlook import Known, Scatter, foreseen
 from .learning.workmanship import WORKMANSHIP, probable
-from .plausibility import plausibility
-from .plausibility.check import FEWEST_ROWS, ROWS
+from .plausibility.check import FEWEST_ROWS, ROWS, plausibility
 from .status import ChainCalibration, JointZero, LearntFigure, Outlook
 
 log = logging.getLogger(__name__)

@@ -84,7 +84,8 @@ def arm(
     from daemon.calibration_report import CalibrationReport
     from daemon.calibration_view import two_tools, view
     from daemon.config import Config
-    from daemon.plausibility import plausibility, require_units, told_sigma
+    from daemon.plausibility.check import plausibility, told_sigma
+    from daemon.plausibility.limits import require_units
     from daemon.present_tool import first_pair
     from daemon.wire import encode
     from interfaces.calibrated_files import write_calibrated

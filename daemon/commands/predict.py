@@ -55,7 +55,7 @@ def _notes(config: Config, q: FloatArray, deg: bool) -> Iterator[str]:
     """What is to be said of joint values q (n, d) [rad, m] that the arm cannot have."""
     import numpy as np
 
-    from daemon.plausibility import beyond_limits, limits_text
+    from daemon.plausibility.limits import beyond_limits, limits_text
 
     beyond = beyond_limits(config.robot, q)
     for joint in np.flatnonzero(beyond.any(axis=0)):

@@ -61,7 +61,8 @@ def replay(
     from daemon.config import Config
     from daemon.evaluate import split_blocks
     from daemon.learning import NominalModel
-    from daemon.plausibility import plausibility, require_units, told_sigma
+    from daemon.plausibility.check import plausibility, told_sigma
+    from daemon.plausibility.limits import require_units
     from daemon.replay.report import as_text
     from daemon.replay.run import Job
     from daemon.replay.run import replay as run_replay

@@ -19,7 +19,7 @@ from daemon.checkpoint import write_checkpoint
 from daemon.cli import app
 from daemon.config import Config
 from daemon.learning import DirectSolver, Learning, NominalModel
-from daemon.plausibility import Plausibility
+from daemon.plausibility.check import Plausibility
 from daemon.recordings import of_robot
 from daemon.session import session_of
 from daemon.store import PairStore

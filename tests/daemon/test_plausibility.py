@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from daemon.config import Config
 from daemon.findings import Findings
 from daemon.learning import DirectSolver, Learning, NominalModel
-from daemon.plausibility import Plausibility, plausibility
+from daemon.plausibility.check import Plausibility, plausibility
 from daemon.plausibility.reading import Reading
 from interfaces.clock import SystemClock
 from interfaces.errors import RecordingError
