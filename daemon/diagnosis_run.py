@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cached_property
 from importlib.metadata import version
@@ -190,8 +191,29 @@ def run(config: Config, source: Source, asked: Asked, tell: Tell, *, force: bool
     return Found(diagnosis, source, robot, warnings)
 
 
-def require_folder(folder: Path) -> None:
-    """Make DIR, before minutes of work are lost; RecordingError where nothing can be written to it."""
+@contextmanager
+def results_in(folder: Path | None) -> Iterator[None]:
+    """Make the folder for results before minutes of work are lost, and remove it when they end without a result.
+
+    Raises:
+        RecordingError: nothing can be written to it.
+    """
+    if folder is None:
+        yield
+        return
+    new = [place for place in (folder, *folder.parents) if not place.exists()]
+    require_writable(folder)
+    try:
+        yield
+    except BaseException:
+        for place in new:
+            with suppress(OSError):  # something else was put there meanwhile
+                place.rmdir()
+        raise
+
+
+def require_writable(folder: Path) -> None:
+    """Make the folder; raise RecordingError where nothing can be written to it."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):

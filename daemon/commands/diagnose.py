@@ -52,16 +52,14 @@ def diagnose(
     from rich.console import Console
 
     from daemon.config import Config
-    from daemon.diagnosis_run import Asked, measured, require_folder, run, written
+    from daemon.diagnosis_run import Asked, measured, results_in, run, written
     from daemon.diagnosis_view import view
 
     config = Config.load(robot_file(robot, recording))
     asked = Asked.of(effects, exclude, seed)
     source = measured(config, recording, live=live)
-    if out is not None:
-        require_folder(out)
     told = Console(stderr=True, highlight=False)
-    with _progress(told) as tell:
+    with results_in(out), _progress(told) as tell:
         found = run(config, source, asked, tell, force=force)
         if out is not None:
             tell("writing the report")

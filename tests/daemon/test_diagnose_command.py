@@ -304,6 +304,12 @@ def test_a_recording_of_other_joints_is_refused(file, tmp_path) -> None:
     assert "elbow_pitch" in refused(tmp_path / "other.csv", "--robot", DESK_ARM)
 
 
+def test_a_refused_recording_leaves_no_folder(recording, tmp_path) -> None:
+    file = written(recording, tmp_path, q=-recording.q)
+    refused(file, "--robot", DESK_ARM, "--out", tmp_path / "found" / "here")
+    assert not (tmp_path / "found").exists()
+
+
 def test_degrees_are_seen(recording, tmp_path) -> None:
     file = written(recording, tmp_path, q=np.degrees(recording.q))
     assert "these look like degrees" in refused(file, "--robot", DESK_ARM)
