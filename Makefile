@@ -34,6 +34,8 @@ $(DEMO_STAMP): $(SOURCES) requirements-demo.lock
 $(STAMP): $(DEMO_STAMP) requirements.lock
 	@echo "Adding the tools for tests, lint and docs (about 200 MB are downloaded the first time; one minute)"
 	@$(PIP) --no-compile -r requirements.lock
+	@# To tests every warning is an error, those of compiling other people's modules, too.
+	@$(BIN)/python -W ignore -m compileall -q -j 0 $(VENV)/lib >/dev/null || true
 	@touch $@
 
 demo: $(DEMO_STAMP) ## Watch the whole thing learn in simulation, about a minute

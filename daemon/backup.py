@@ -21,6 +21,7 @@ from typing import IO, Any
 import msgspec
 
 from interfaces.errors import BodyschemaError, StoreError
+from interfaces.limited import check_regular
 from interfaces.robot import Name
 from interfaces.toml_file import read_toml
 
@@ -159,6 +160,7 @@ class Backup:
     def __enter__(self) -> Backup:
         try:
             with self._explained():
+                check_regular(self.file)
                 self._archive = zipfile.ZipFile(self.file)
                 self._manifest = self._checked(self._archive)
         except BaseException:

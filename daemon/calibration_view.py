@@ -47,6 +47,11 @@ def sentences(report: CalibrationReport) -> list[str]:
             "the camera, of the marker, or of a neighbouring joint, and nothing needs to: the positions are the same. "
             "The other figures are given that."
         )
+    if report.undirected:
+        said.append(
+            f"These pairs do not show which way {', '.join(report.undirected)} "
+            f"count{'s' if len(report.undirected) == 1 else ''}: the positions are the same either way."
+        )
     if report.first > 1:
         said.insert(0, f"Learnt from number {report.first} on.")
     if report.other_tool_from is not None:

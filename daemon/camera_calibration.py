@@ -33,7 +33,7 @@ REPORT = "report.html"
 NORMAL_95 = 1.96
 # Where the uncertainty of a position is told: straight ahead, at this distance [m].
 AHEAD_M = 0.6
-_SQUARES = re.compile(r"(\d+)\s*[xX×]\s*(\d+)")
+_SQUARES = re.compile(r"(\d{1,9})\s*[xX×]\s*(\d{1,9})")
 
 Tell = Callable[[str], None]
 

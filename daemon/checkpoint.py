@@ -65,7 +65,7 @@ def write_checkpoint(file: Path, state: LearningState, *, robot: str, utc: str) 
     """
     poisoned = state.poisoned()
     if poisoned is not None:
-        raise CheckpointError(f"the checkpoint {file} was not written: {poisoned} of the state is not finite")
+        raise CheckpointError(f"the checkpoint {file} was not written: {poisoned} is not finite or too large")
     data = _encode(state, robot, utc)
     temporary = file.with_name(file.name + ".tmp")
     try:
@@ -106,15 +106,12 @@ def checkpoint_bytes(file: Path) -> bytes:
     """Return what is in the file.
 
     Raises:
-        CheckpointError: it cannot be read, or is larger than a checkpoint can be.
+        CheckpointError: it cannot be read, is larger than a checkpoint can be, or is a device.
     """
     try:
-        data = read_at_most(file, LARGEST_BYTES)
+        return read_at_most(file, LARGEST_BYTES)
     except OSError as error:
         raise CheckpointError(f"cannot read the checkpoint {file}: {error.strerror}") from error
-    if data is None:
-        raise CheckpointError(f"{file} is not a checkpoint: it is larger than {LARGEST_BYTES // 2**20} MiB")
-    return data
 
 
 def generations(file: Path) -> tuple[Path, Path]:

@@ -27,7 +27,7 @@ from vision.tag_image import TagImage
 from .camera_calibration import Images
 
 _MOST_GROWN, _SIGMAS = 0.01, 4.0
-_SIDE = re.compile(r"(\d+)=(\d+\.?\d*)")
+_SIDE = re.compile(r"(\d{1,9})=(\d{1,9}\.?\d*)")
 
 
 @dataclass(frozen=True)

@@ -97,8 +97,8 @@ class LearnerConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """
 
     step_size: Annotated[float, Meta(gt=0, lt=2)] = 0.5
-    replays_per_pair: NonNegative = 8.0
-    replay_capacity: Count = 20_000
+    replays_per_pair: Annotated[float, Meta(ge=0, le=1000)] = 8.0
+    replay_capacity: Annotated[int, Meta(ge=1, le=1_000_000)] = 20_000  # which take 0.1 GB with seven joints
     solve_every: Count = 25
     angle_tolerance_deg: Positive = 3.0
     length_tolerance_m: Positive = 0.015

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cached_property
 from importlib.metadata import version
@@ -24,15 +25,16 @@ from diagnosis.words import modelled
 from effects import KINDS, write_corrected, write_extended
 from interfaces.errors import BodyschemaError, RecordingError, RequestError
 from interfaces.recording import Recording
-from interfaces.records import FloatArray, Pair
+from interfaces.records import Pair
 from interfaces.robot import RobotDescription
 from interfaces.suggest import did_you_mean
-from kbmaps import KBMapsError, align
 
 from . import recordings
 from .bus import client
 from .config import Config
-from .plausibility import is_far_off, mixed_up, require_units
+from .learning import NominalModel
+from .plausibility.check import plausibility, told_sigma
+from .plausibility.limits import require_units
 from .recorder import History
 
 DIAGNOSIS, REPORT = "diagnosis.json", "report.html"
@@ -40,11 +42,6 @@ DIAGNOSIS, REPORT = "diagnosis.json", "report.html"
 ALWAYS = ("outliers",)
 # So many pairs for each joint are the fewest that say anything.
 FEWEST_PAIRS_A_JOINT = 5
-# Of the arm's reach, so much left by the drawn arm in its best place makes other orders of the columns worth a try.
-SUSPECT = 0.005
-# What may be wrong where nothing is found that is.
-ELSE = "Are the columns in another order, does a joint count the other way, is a zero off by a quarter turn?"
-
 Tell = Callable[[str], None]
 
 
@@ -127,11 +124,16 @@ def _history(history: History, joints: tuple[str, ...]) -> Recording:
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """A diagnosis and what is told of it."""
+    """A diagnosis and what is told of it.
+
+    Attributes:
+        warnings: what may be wrong with the recording itself.
+    """
 
     diagnosis: Diagnosis
     source: Source
     robot: RobotDescription
+    warnings: tuple[str, ...]
 
     @cached_property
     def file(self) -> DiagnosisFile:
@@ -156,11 +158,15 @@ class Found:
         return remedies(self.file, self.robot, ticks(self.source.recording.q), torques)
 
 
-def run(config: Config, source: Source, asked: Asked, tell: Tell) -> Found:
+def run(config: Config, source: Source, asked: Asked, tell: Tell, *, force: bool = False) -> Found:
     """Diagnose.
 
+    Args:
+        force: go on with pairs that do not seem to be of this robot.
+
     Raises:
-        DiagnosisError: there is too little to go by, or the pairs cannot be of this robot.
+        DiagnosisError: there is too little to go by.
+        RecordingError: the pairs cannot be of this robot as they are.
     """
     robot, recording = config.robot, source.recording
     fewest = FEWEST_PAIRS_A_JOINT * len(robot.joints)
@@ -172,7 +178,9 @@ def run(config: Config, source: Source, asked: Asked, tell: Tell) -> Found:
     if np.ptp(recording.q, axis=0).max() < STILL:
         raise DiagnosisError(f"{source.name}: no joint ever moved. Guide each joint through its range")
     tell(f"{len(recording)} pairs of {source.name}")
-    _require_columns(robot, recording, source.name)
+    chain = NominalModel.extended_by(config.simulation).chain
+    seen = plausibility(robot, recording.q, recording.x, chain=chain, sigma_m=told_sigma(recording))
+    warnings = seen.require(source.name, force=force)
     diagnosis = diagnosed(
         recording, config.simulation, only=asked.only, without=asked.without, seed=asked.seed, tell=tell
     )
@@ -180,50 +188,32 @@ def run(config: Config, source: Source, asked: Asked, tell: Tell) -> Found:
         raise DiagnosisError(
             f"{source.name}: nothing to look for. {' '.join(diagnosis.hypotheses.limitations)}".strip()
         )
-    _require_this_robot(robot, recording, diagnosis.extended.run.measured, source.name)
-    return Found(diagnosis, source, robot)
+    return Found(diagnosis, source, robot, warnings)
 
 
-def _require_columns(robot: RobotDescription, recording: Recording, name: str) -> None:
-    """DiagnosisError where the joints' columns are mixed up, or count the other way.
+@contextmanager
+def results_in(folder: Path | None) -> Iterator[None]:
+    """Make the folder for results before minutes of work are lost, and remove it when they end without a result.
 
-    Couplings and scales would fit that as well, as causes that are none.
+    Raises:
+        RecordingError: nothing can be written to it.
     """
-    known = {"pose_known": robot.camera.pose_known, "marker_known": robot.robot.marker_known}
-    try:
-        drawn = align(robot.chain, recording.q, recording.x, **known).chain.positions(recording.q)
-    except KBMapsError as error:
-        raise DiagnosisError(f"{name}: the simulation cannot be laid on the pairs: {error}") from error
-    if not is_far_off(robot, np.linalg.norm(drawn - recording.x, axis=1), _told_sigma(recording), SUSPECT):
+    if folder is None:
+        yield
         return
-    if (changed := mixed_up(robot, recording, _told_sigma(recording))) is not None:
-        raise DiagnosisError(f"{name}: the columns of the joints seem to be mixed up. {changed}. Mend that first")
+    new = [place for place in (folder, *folder.parents) if not place.exists()]
+    require_writable(folder)
+    try:
+        yield
+    except BaseException:
+        for place in new:
+            with suppress(OSError):  # something else was put there meanwhile
+                place.rmdir()
+        raise
 
 
-def _asked(robot: RobotDescription, recording: Recording) -> str:
-    changed = mixed_up(robot, recording, _told_sigma(recording))
-    return ELSE if changed is None else f"{changed}."
-
-
-def _told_sigma(recording: Recording) -> float | None:
-    """1-sigma of a coordinate [m], where the recording tells it."""
-    if recording.cov is None:
-        return None
-    return float(np.sqrt(np.trace(recording.cov, axis1=1, axis2=2).mean() / 3.0))
-
-
-def _require_this_robot(robot: RobotDescription, recording: Recording, predicted: FloatArray, name: str) -> None:
-    """DiagnosisError where the extended simulation is so far off that the pairs are hardly of this robot."""
-    left = np.linalg.norm(predicted - recording.x, axis=1)
-    if is_far_off(robot, left, _told_sigma(recording)):
-        raise DiagnosisError(
-            f"{name}: whatever is tried, half of the pairs are missed by over {1e3 * float(np.median(left)):.3g} mm: "
-            f"they are hardly of this robot. {_asked(robot, recording)}"
-        )
-
-
-def require_folder(folder: Path) -> None:
-    """Make DIR, before minutes of work are lost; RecordingError where nothing can be written to it."""
+def require_writable(folder: Path) -> None:
+    """Make the folder; raise RecordingError where nothing can be written to it."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):

@@ -1,4 +1,4 @@
-"""What people want to know of a learner: where camera and tool are, and whether there is enough data."""
+"""What people want to know of a learner: where camera and tool are, whether there is enough data, and what is wrong."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from kbmaps import ChainBelief, KBMapsError
 
 from .chain_figures import ChainFigures, is_told, no_surer_than_possible
 from .learning import Learning
-from .learning.learning import REGION_RAD
 from .learning.members import SOLVED
 from .learning.outlook import Known, Scatter, foreseen
 from .learning.workmanship import WORKMANSHIP, probable
+from .plausibility.check import FEWEST_ROWS, ROWS, plausibility
 from .status import ChainCalibration, JointZero, LearntFigure, Outlook
 
 log = logging.getLogger(__name__)
@@ -71,6 +71,12 @@ class Findings:
         self._found_of: tuple[ChainBelief | None, str] = None, ""
         self._due_at = clock.now()
         self._found: tuple[ChainCalibration | None, Outlook | None] = None, None
+        self._checked, self._doubts = 0, ()
+
+    @property
+    def doubts(self) -> tuple[str, ...]:
+        """Why the pairs may not be of this robot: columns exchanged, joints that count the other way."""
+        return self._doubts
 
     @property
     def calibration(self) -> ChainCalibration | None:
@@ -93,7 +99,8 @@ class Findings:
         return self._learning.belief, self._learning.snapshot.answering
 
     def renew(self) -> None:
-        """Find both again if what they rest on has changed, and it is time to."""
+        """Find all again if what they rest on has changed, and it is time to."""
+        self._check()
         begin, present = self._clock.now(), self._present
         if present[0] is None:
             self._found_of, self._found = present, (None, None)  # what was found was of another tool
@@ -113,10 +120,22 @@ class Findings:
         self._turns.took(begin, seconds)
         self._due_at = begin + max(self._parts * seconds, EVERY_S)
 
+    def _check(self) -> None:
+        """Look at the pairs with the present tool when there are enough, and whenever they have doubled."""
+        begin, count = self._clock.now(), self._learning.counters.since_change
+        if count < self._checked:
+            self._checked, self._doubts = 0, ()
+        if count < max(FEWEST_ROWS, 2 * self._checked) or begin < self._turns.due_at:
+            return
+        q, x = self._learning.kept(ROWS)
+        self._checked = count
+        self._doubts = plausibility(self._robot, q, x, chain=self._learning.nominal.chain).sentences
+        self._turns.took(begin, self._clock.now() - begin)
+
 
 def _found(robot: RobotDescription, known: Known) -> tuple[ChainCalibration, Outlook | None]:
     scatter = Scatter.of(known)
-    outlook = foreseen(known, scatter, robot.joints, REGION_RAD) if known.solved else None
+    outlook = foreseen(known, scatter, robot.joints) if known.solved else None
     return calibrated(robot, known, scatter), outlook
 
 

@@ -78,6 +78,7 @@ class Learner:
         self._loop = loop
         self._settings, self._robot = config.tables.learner, config.robot
         self._keys = Keys(config.robot.name)
+        self._version = version("bodyschema")  # a file that is read: once, while there are descriptors for it
         self._nominal = NominalModel.extended_by(config.simulation)
         self._learning, self._set_aside = go_on(
             lambda: Learning(self._nominal, self._settings, solver, together_s=together_s(robots)),
@@ -153,7 +154,7 @@ class Learner:
         """The learner's state."""
         counters = self._learning.counters
         at_rest = self._rested_with == counters.pairs  # before what is said below: it is final then
-        snapshot = self._learning.snapshot
+        snapshot, recent = self._learning.snapshot, self._learning.recent()
         now = self._clock.now()
         written = self._checkpointed_at if self._checkpoint_problem is None else None
         return LearnerStatus(
@@ -166,7 +167,8 @@ class Learner:
             sampler_alive=self._sampler_alive,
             replayed=counters.replayed,
             answering=snapshot.answering,
-            prequential_m=self._learning.prequential_m(),
+            prequential_m=dict(recent.means),
+            prequential_pairs=recent.pairs,
             claimed_error_m=self._learning.claimed_error_m(),
             curve=self._learning.curve,
             model=snapshot.digest,
@@ -185,7 +187,7 @@ class Learner:
             missed=counters.missed,
             behind=self._feed.behind,
             age_s=self._feed.age_s(snapshot.newest_utc),
-            version=version("bodyschema"),
+            version=self._version,
         )
 
     def _state(self, pairs: int) -> str:
@@ -204,6 +206,7 @@ class Learner:
         for problem in (self._feed.problem, self._checkpoint_problem, self._set_aside):
             if problem is not None:
                 yield problem
+        yield from self._findings.doubts
         behind = self._feed.behind
         if behind >= BEHIND and not self._feed.paused:
             age_s = self._feed.age_s(self._learning.snapshot.newest_utc)
@@ -282,7 +285,10 @@ class Learner:
             self._learning.tool_changed()
             self._changes.note(self._learning.change)
         self.checkpoint()
-        return "pairs with the old tool no longer count; what they taught is where learning starts again"
+        return (
+            "pairs with the old tool no longer count; what they taught is where learning starts again. "
+            "`bodyschema command rollback` takes it back"
+        )
 
     def _rollback(self) -> str:
         with self._feed.lock:

@@ -9,7 +9,9 @@ from .recordings import StoredPairs
 
 
 def first_pair(pairs: StoredPairs, checkpoint: Path, robot: str) -> int:
-    """Number of the first pair with the present tool; 1 where no learner of these pairs left a checkpoint to tell.
+    """Return the row, from 1, of the first pair with the present tool.
+
+    1 where no learner of these pairs left a checkpoint to tell.
 
     Pairs from before a `reset_to_prior` are not among those with the present tool either.
     """
@@ -20,4 +22,5 @@ def first_pair(pairs: StoredPairs, checkpoint: Path, robot: str) -> int:
     if state is None or state.header.counters.store != pairs.store:
         return 1
     counters = state.header.counters
-    return counters.last_seq - counters.since_change + 1
+    number = counters.last_seq - counters.since_change + 1
+    return sum(each < number for each in pairs.numbers) + 1

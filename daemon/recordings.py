@@ -31,8 +31,12 @@ _WRITERS: dict[str, Callable[[Recording, Path, Sequence[Devices]], None]] = {
 }
 
 
-def from_pairs(pairs: Sequence[Pair], joints: tuple[str, ...]) -> Recording:
-    """The recording of `pairs`, at least one; with pixel centres and orientations where every pair has them."""
+def from_pairs(pairs: Sequence[Pair], joints: tuple[str, ...], file: Path | None = None) -> Recording:
+    """Return the recording of `pairs`, at least one; with pixel centres and orientations where every pair has them.
+
+    Args:
+        file: where they are from, for messages.
+    """
     centres = [pair.centres_px for pair in pairs]
     turns = [pair.R for pair in pairs if pair.R is not None]
     if 0 < len(turns) < len(pairs):
@@ -46,6 +50,7 @@ def from_pairs(pairs: Sequence[Pair], joints: tuple[str, ...]) -> Recording:
         segment=np.array([pair.segment for pair in pairs]),
         centres_px=None if None in centres else np.array(centres),
         orientation=np.array(turns) if len(turns) == len(pairs) else None,
+        file=file,
     )
 
 
@@ -55,11 +60,13 @@ class StoredPairs:
 
     Attributes:
         store: its identity.
-        recording: all pairs in it; the first has the number 1.
+        recording: all pairs in it that can be read; rows are counted from 1.
+        numbers: sequence number of each row, ascending.
     """
 
     store: str
     recording: Recording
+    numbers: Sequence[int]
 
 
 def from_store(file: Path) -> Recording:
@@ -68,17 +75,19 @@ def from_store(file: Path) -> Recording:
 
 
 def stored_pairs(file: Path) -> StoredPairs:
-    """All pairs of a store, which a sampler may be writing meanwhile.
+    """All pairs of a store that can be read, which a sampler may be writing meanwhile. Others are told in the log.
 
     Raises:
         StoreError: it cannot be read.
         RecordingError: it has no pairs.
     """
     with PairReader(file) as reader:
-        pairs = reader.read()
+        pairs, damage = reader.read(), reader.audit().damage
+        if damage.count:
+            log.warning("%s", damage.told(file))
         if not pairs:
-            raise RecordingError("the store has no pairs yet", file=file, remedy="Move the arm in front of the camera")
-        return StoredPairs(pairs[0].store, from_pairs(pairs, reader.joints))
+            raise RecordingError("the store has no pairs", file=file, remedy="Move the arm in front of the camera")
+        return StoredPairs(pairs[0].store, from_pairs(pairs, reader.joints, file), [pair.seq for pair in pairs])
 
 
 def devices_of(store: Path) -> list[Devices]:

@@ -28,6 +28,11 @@ def given_robot(arguments: Sequence[str]) -> str | None:
     return None
 
 
+def printable(text: str) -> str:
+    """Return the text with its control characters spelt out: a name in a file must not steer the terminal."""
+    return "".join(letter if letter.isprintable() or letter == "\n" else repr(letter)[1:-1] for letter in text)
+
+
 def as_typed(text: str, arguments: Sequence[str] | None = None) -> str:
     """`text`, each of our commands in it, in backticks or as a whole line, with the --robot of this command line.
 

@@ -90,6 +90,7 @@ class Sampler:
         self._wall = SystemClock() if wall is None else wall
         self._service = Service.nobodys(self._wall) if service is None else service
         self._keys = Keys(config.robot.name)
+        self._version = version("bodyschema")  # a file that is read: once, while there are descriptors for it
         self._powered = {drive.name: drive for drive in sources.powered}
         held = config.robot.robot.hold == "zero_force"
         self._bears = self._powered.get(ZERO_FORCE) if held else None
@@ -180,7 +181,7 @@ class Sampler:
             health=self._health(),
             servos=servos_of(self._encoders),
             buses=buses_of(self._encoders),
-            version=version("bodyschema"),
+            version=self._version,
             unreadable=self._store.reader.present_damage().count,
         )
 

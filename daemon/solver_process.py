@@ -129,9 +129,12 @@ class SolverProcess:
             command = module_command("daemon.solver_process")
             environment = os.environ | {"OPENBLAS_NUM_THREADS": "1"}
             # In a process group of its own: Ctrl-C in a terminal is the parent's to handle.
-            self._child = subprocess.Popen(
-                command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment, process_group=0
-            )
+            try:
+                self._child = subprocess.Popen(
+                    command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment, process_group=0
+                )
+            except OSError as error:  # no memory, or too many open files
+                raise SolverLostError(f"the solver cannot be started: {error.strerror}; it is tried again") from error
         self._send(
             StartTask(
                 number=task.number,

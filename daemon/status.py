@@ -226,9 +226,11 @@ class LearnerStatus(msgspec.Struct, frozen=True, kw_only=True):
         replayed: replay steps since the start.
         pairs_since_change: pairs since the last change, or since the beginning.
         answering: which model answers queries.
-        prequential_m: recent mean distance between prediction and measurement, before learning [m], by model.
-        claimed_error_m: the error [m] that the learner claims for predictions where data is.
-        curve: the learning curve of the answering model.
+        prequential_m: error on new pairs, by model: mean distance between the measurement, its noise included, and the
+            prediction made before the pair was learnt [m]; over the same pairs for all models.
+        claimed_error_m: the mean distance to the truth [m], without the measurement's noise, that the learner claims
+            for its predictions where data is.
+        curve: the error on new pairs of the model that answered, over the pairs.
         model: hash of the model that answers.
         calibration: camera, tool and joint zeros; null before the first solution with the present tool.
         outlook: whether there is enough data; null while no solution with the present tool answers.
@@ -241,6 +243,7 @@ class LearnerStatus(msgspec.Struct, frozen=True, kw_only=True):
         checkpoint_age_s: time since the last checkpoint, or null before any.
         health: sentences about what is wrong; empty when all is well.
         orientation: null where no pair with the present tool said how the marker is turned.
+        prequential_pairs: on how many of the last pairs `prequential_m` was seen.
         missed: pairs that the sampler no longer kept when this learner asked for them.
         behind: pairs that are known to be stored and are not learnt yet.
         age_s: how old the newest learnt pair is, counted from the newest stored one; null before any since the start.
@@ -272,6 +275,7 @@ class LearnerStatus(msgspec.Struct, frozen=True, kw_only=True):
     health: list[str]
     version: str
     orientation: OrientationStatus | None = None
+    prequential_pairs: int = 0
     missed: int = 0
     behind: int = 0
     age_s: float | None = None

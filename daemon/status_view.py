@@ -141,13 +141,18 @@ def _learner(status: LearnerStatus) -> list[RenderableType]:
     refused = f", {status.refused} refused" if status.refused else ""
     facts = _facts()
     facts.add_row("pairs", f"{status.pairs} learnt, {status.replayed} replay steps{doubted}{refused}")
-    facts.add_row("next pair", f"missed by: {errors}")
-    facts.add_row("claimed", f"{mm(status.claimed_error_m)} mean error where data is{_elsewhere(status)}")
+    if status.behind:
+        age = "" if status.age_s is None else f"; the newest learnt is {_duration(status.age_s)} old"
+        facts.add_row("", f"{status.behind} stored and not learnt yet{age}")
+    facts.add_row("new pairs", f"missed by: {errors}")
+    if status.prequential_pairs:
+        facts.add_row("", f"mean of the last {status.prequential_pairs}, measurement noise included")
+    facts.add_row("claimed", f"{mm(status.claimed_error_m)} from the truth where data is{_elsewhere(status)}")
     if status.orientation is not None:
         facts.add_row("orientation", _orientation(status.orientation))
     if status.changes:
-        for name, line in zip(("change", ""), _change(status), strict=False):
-            facts.add_row(name, line)
+        for number, line in enumerate(_change(status)):
+            facts.add_row("" if number else "change", line)
     for name, line in zip(("enough?", ""), outlook_lines(status.outlook), strict=False):
         facts.add_row(name, line)
     facts.add_row("answering", f"{status.answering}, model {status.model or 'none yet'}")
@@ -174,6 +179,8 @@ def _change(status: LearnerStatus) -> Iterator[str]:
         yield ", ".join(f"{kind} {share:.0%}" for kind, share in change.probabilities.items())
     elif change.alike is not None:
         yield f"or {change.alike}: no motion tells them apart"
+    if change.can_roll_back:
+        yield as_typed("`bodyschema command rollback` goes back to the model before it")
 
 
 def _facts() -> Table:
@@ -202,6 +209,6 @@ def _duration(seconds: float) -> str:
 def _orientation(status: OrientationStatus) -> str:
     errors = ", ".join(f"{name} {degrees(error)}" for name, error in status.prequential_rad.items())
     return (
-        f"{status.answering} answers, of {status.pairs} pairs; next pair: {errors}; "
+        f"{status.answering} answers, of {status.pairs} pairs; new pairs: {errors}; "
         f"claimed {degrees(status.claimed_rad)} where data is"
     )

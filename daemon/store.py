@@ -22,9 +22,9 @@ from interfaces.records import FloatArray, MarkerFix, Pair, frozen_array
 
 from . import store_schema
 from .retention import Keep, delete_until
-from .store_damage import Damage, oldest, rebuild, records, scan, scan_back
+from .store_damage import Damage, count_pairs, oldest, rebuild, records, scan, scan_back
 from .store_file import NOTHING_CHANGED, damaged, explained, is_damage, lock, unwritable
-from .store_rows import Checked, as_json, checked, pair_of, require_sound, row_of, sealed
+from .store_rows import Checked, as_json, checked, decoded, pair_of, require_sound, row_of, sealed
 
 log = logging.getLogger(__name__)
 
@@ -206,7 +206,7 @@ class PairReader:
             first = oldest(connection)
             before = [first - 1] if numbers and first < numbers[0] else []
             self.damage |= Damage.between([*before, *numbers, newest + 1])
-            lost = connection.execute("SELECT count(*) FROM pairs").fetchone()[0] - len(numbers)
+            lost = count_pairs(connection, len(numbers)) - len(numbers)
             lost += sum(row is None for table in ("sessions", "devices") for row in records(connection, table))
         ranges = (frozen_array(ends[0]), frozen_array(ends[1])) if numbers else None
         return Audit(len(numbers), newest, session, self.damage, lost, ranges)
@@ -232,8 +232,7 @@ class PairReader:
         if self._with_checksums:
             require_sound(row)
             return checked(row, len(self.joints))
-        pair = pair_of(self.identity, row[:-1], len(self.joints))
-        return Checked(pair.seq, row[1], pair.q.tolist())
+        return Checked(row[0], row[1], decoded(row[:-1], len(self.joints))[5])
 
     @contextmanager
     def _reading(self) -> Iterator[sqlite3.Connection]:

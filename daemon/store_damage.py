@@ -17,7 +17,7 @@ from typing import Any, TypeVar
 from . import store_schema
 from .kept_files import sync_folder, unused_name
 from .store_file import is_damage
-from .store_rows import COLUMNS, DamagedRow, pair_of, require_sound, sealed
+from .store_rows import COLUMNS, DamagedRow, decoded, require_sound, sealed
 
 # After so many numbers in a row that cannot be read, larger and larger steps look for the next that can: a damaged
 # page holds some ten pairs, one above it some thousand. A larger value takes longer, a smaller one passes more over.
@@ -25,8 +25,8 @@ PATIENCE = 64
 # A row of `pairs` takes more bytes. Pages that lead in a circle give more rows than fit into the file.
 SMALLEST_ROW_BYTES = 20
 # So many numbers are left free after the newest readable pair where SQLite lost the end of the store: those behind it
-# were given already. A page holds fewer pairs.
-LEFT_FREE = 100
+# were given already. A page of 4096 bytes holds at most 37.
+LEFT_FREE = 50
 SHOWN = 8  # places of damage in a sentence
 
 Made = TypeVar("Made")
@@ -51,10 +51,11 @@ class Damage:
 
     def told(self, file: Path) -> str:
         """Return a sentence that names the numbers and the remedy."""
-        many = "1 pair" if self.count == 1 else f"{self.count} pairs"
+        one = self.count == 1
+        many, they = ("1 pair", "It is") if one else (f"{self.count} pairs", "They are")
         return (
-            f"{many} of {file} cannot be read: the disk changed what was written. Learning goes on without number "
-            f"{self}. Check the disk and write a backup"
+            f"{many} of {file} cannot be read: the disk changed what was written. {they} left out "
+            f"(number{'' if one else 's'} {self}). Check the disk and write a backup"
         )
 
     def __or__(self, other: Damage) -> Damage:
@@ -175,8 +176,22 @@ def records(connection: sqlite3.Connection, table: str) -> Iterator[tuple[Any, .
 
 
 def oldest(connection: sqlite3.Connection) -> int:
-    """Return the number of the oldest row of `pairs`; 1 when there is none."""
-    return connection.execute("SELECT coalesce(min(seq), 1) FROM pairs").fetchone()[0]
+    """Return the number of the oldest row of `pairs`; 1 when there is none that SQLite can read."""
+    return _one(connection, "SELECT coalesce(min(seq), 1) FROM pairs", 1)
+
+
+def count_pairs(connection: sqlite3.Connection, otherwise: int) -> int:
+    """Return how many rows `pairs` has, sound or not; `otherwise` when SQLite cannot count them."""
+    return _one(connection, "SELECT count(*) FROM pairs", otherwise)
+
+
+def _one(connection: sqlite3.Connection, statement: str, otherwise: int) -> int:
+    try:
+        return connection.execute(statement).fetchone()[0]
+    except sqlite3.DatabaseError as error:
+        if not is_damage(error):
+            raise
+        return otherwise
 
 
 def _copy(source: sqlite3.Connection, target: sqlite3.Connection, fresh: dict[str, str]) -> None:
@@ -189,7 +204,7 @@ def _copy(source: sqlite3.Connection, target: sqlite3.Connection, fresh: dict[st
     def make(row: tuple[Any, ...]) -> tuple[Any, ...]:
         if schema >= store_schema.WITH_CHECKSUMS:
             require_sound(row)
-        pair_of("", row[:-1], joints)
+        decoded(row[:-1], joints)
         return row[:-1]
 
     columns = store_schema.columns(schema)

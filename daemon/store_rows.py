@@ -68,34 +68,46 @@ def require_sound(row: tuple[Any, ...]) -> None:
         raise DamagedRow
 
 
-def pair_of(store: str, row: tuple[Any, ...], joints: int) -> Pair:
-    """Return the pair of a row of `pairs` without its checksum, texts as bytes.
+def decoded(row: tuple[Any, ...], joints: int) -> tuple[Any, ...]:
+    """Return the values of a row of `pairs` without its checksum, texts as bytes: numbers and lists of numbers.
 
     Raises:
         DamagedRow: it is not a row that a sampler with so many joints writes.
     """
-    seq, _, segment, t, utc, q, x, upper, centres, turn, cov_turn = row
+    seq, session, segment, t, utc, q, x, upper, centres, turn, cov_turn = row
     try:
         if len(q) > LARGEST_ANGLES_BYTES or seq < 1:
             raise DamagedRow
-        pair = Pair(
-            store=store,
-            seq=seq,
-            segment=segment,
-            t=t,
-            utc=utc.decode(),
-            q=frozen_array(_angles.decode(q)),
-            x=frozen_array(_three.decode(x)),
-            cov=_covariance(upper),
-            centres_px=None if centres is None else _four.decode(centres),
-            R=None if turn is None else frozen_array(_four.decode(turn)),
-            cov_R=None if cov_turn is None else _covariance(cov_turn),
+        angles = _angles.decode(q)
+        values = (
+            *(seq, session, segment, t, utc.decode(), angles, _three.decode(x), _six.decode(upper)),
+            None if centres is None else _four.decode(centres),
+            None if turn is None else _four.decode(turn),
+            None if cov_turn is None else _six.decode(cov_turn),
         )
     except (AttributeError, TypeError, UnicodeDecodeError, msgspec.DecodeError, RecursionError) as error:
         raise DamagedRow from error
-    if len(pair.q) != joints or type(segment) is not int or type(t) is not float or not math.isfinite(t):
+    if len(angles) != joints or type(segment) is not int or type(t) is not float or not math.isfinite(t):
         raise DamagedRow
-    return pair
+    return values
+
+
+def pair_of(store: str, row: tuple[Any, ...], joints: int) -> Pair:
+    """Return the pair of a row as for `decoded`, which may raise DamagedRow."""
+    seq, _, segment, t, utc, q, x, upper, centres, turn, cov_turn = decoded(row, joints)
+    return Pair(
+        store=store,
+        seq=seq,
+        segment=segment,
+        t=t,
+        utc=utc,
+        q=frozen_array(q),
+        x=frozen_array(x),
+        cov=_covariance(upper),
+        centres_px=centres,
+        R=None if turn is None else frozen_array(turn),
+        cov_R=None if cov_turn is None else _covariance(cov_turn),
+    )
 
 
 def checked(row: tuple[Any, ...], joints: int) -> Checked:
@@ -118,6 +130,6 @@ def as_json(numbers: object) -> str:
     return msgspec.json.encode(numbers).decode()
 
 
-def _covariance(upper: bytes) -> FloatArray:
-    xx, xy, xz, yy, yz, zz = _six.decode(upper)
+def _covariance(upper: Upper) -> FloatArray:
+    xx, xy, xz, yy, yz, zz = upper
     return frozen_array(((xx, xy, xz), (xy, yy, yz), (xz, yz, zz)))

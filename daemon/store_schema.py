@@ -14,7 +14,7 @@ import msgspec
 from interfaces.errors import StoreError
 
 from .store_file import NOTHING_CHANGED, damaged, is_damage
-from .store_rows import COLUMNS, DamagedRow, checksum, pair_of
+from .store_rows import COLUMNS, DamagedRow, checksum, decoded
 
 SCHEMA_VERSION = 5
 WITH_DEVICES, WITH_ORIENTATION, WITH_CHECKSUMS = 2, 3, 5
@@ -70,6 +70,8 @@ def connect(file: Path, *, readonly: bool = False) -> sqlite3.Connection:
 
     What the file itself defines (triggers, generated columns) may not call functions with side effects.
     """
+    if file.exists() and not file.is_file():  # SQLite would wait for what a pipe never says
+        raise StoreError(f"{file} is not a file. Move it away, or give another --state-dir. {NOTHING_CHANGED}")
     uri = f"{file.absolute().as_uri()}?mode={'ro' if readonly else 'rwc'}"
     connection = sqlite3.connect(uri, uri=True, isolation_level=None, check_same_thread=False)
     connection.text_factory = bytes  # a text that is not UTF-8 spoils its own row alone
@@ -241,7 +243,7 @@ def _seal(connection: sqlite3.Connection) -> None:
 
     def sealed_pairs(*row: object) -> int | None:
         try:
-            pair_of("", row, joints)
+            decoded(row, joints)
         except DamagedRow:
             return None
         return checksum(row)

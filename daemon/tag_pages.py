@@ -16,7 +16,7 @@ from vision.tag_config import Dictionary
 from .pages import write_page
 
 ShapeName = Literal["tags", "plate", "cube"]
-_RUN = re.compile(r"(\d+)(?:-(\d+))?")
+_RUN = re.compile(r"(\d{1,9})(?:-(\d{1,9}))?")
 _MOST_TAGS = 100
 
 

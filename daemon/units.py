@@ -292,7 +292,7 @@ def _kept_running(installed: Installed) -> str:
 
 
 def _command(words: Iterable[object]) -> str:
-    """A command line as systemd.service(5) wants it: a dollar sign begins a variable."""
+    """Return a command line for systemd.service(5), in which a dollar sign begins a variable."""
     return " ".join(_quoted(str(word).replace("$", "$$")) for word in words)
 
 

@@ -21,7 +21,7 @@ from interfaces.clock import SystemClock
 from interfaces.errors import ConfigError, StoreError
 from interfaces.plugins import PluginConfig, load
 from interfaces.protocols import Clock, JointSource
-from interfaces.records import MarkerMiss, StereoFrame
+from interfaces.records import MarkerFix, StereoFrame
 from interfaces.rejections import WORDS
 from kbmaps import RigidChain
 
@@ -44,6 +44,7 @@ log = logging.getLogger(__name__)
 _SATURATION, _VALUE, _ROOM_DEG, _GAP_DEG = 0.93, 0.86, 6.0, 36.0
 # A ball that is told by its brightness glows; all else is darker than half of what is looked for.
 _LAMP, _DIMMED = 0.9, 0.45
+_APART_S = 60.0  # a tracker has forgotten what it saw then
 
 Hardware = DynamixelConfig | FeetechConfig | SerialLinesConfig | Ros2Config | PluginConfig
 
@@ -274,19 +275,22 @@ def _marker(vision: VisionConfig) -> dict[str, Any]:
 
 def _require_found(config: Config, calibration: StereoCalibration, camera: CameraConfig) -> None:
     """ConfigError where the tracker does not even find the marker by itself before a plain wall."""
-    from sim_backend.eye import portrait
+    from sim_backend.eye import portraits
     from vision.trackers import tracker_of
 
-    tracker = tracker_of(calibration, config.tables.vision)
-    seen = tracker.track(StereoFrame(0.0, *portrait(calibration, camera)))
-    if isinstance(seen, MarkerMiss):
-        keys = {"ball": "[vision.colour] or [vision] radius_m", "bright_ball": "[vision] min_brightness"}
-        raise ConfigError(
-            "the tracker would not find the marker that [vision] describes in the simulation's images, not even alone "
-            f"before a plain wall: {WORDS[seen.reason]}",
-            file=config.file,
-            remedy=f"Change {keys.get(config.tables.vision.marker, '[vision.tag]')}, or what [sim.camera] shows",
-        )
+    tracker, reasons = tracker_of(calibration, config.tables.vision), []
+    for t, images in enumerate(portraits(calibration, camera)):
+        seen = tracker.track(StereoFrame(_APART_S * t, *images))
+        if isinstance(seen, MarkerFix):
+            return
+        reasons.append(seen.reason)
+    keys = {"ball": "[vision.colour] or [vision] radius_m", "bright_ball": "[vision] min_brightness"}
+    raise ConfigError(
+        "the tracker would not find the marker of [vision] in the simulation's images, not even alone before a plain "
+        f"wall: {WORDS[reasons[0]]}",
+        file=config.file,
+        remedy=f"Change {keys.get(config.tables.vision.marker, '[vision.tag]')}, or what [sim.camera] shows",
+    )
 
 
 def _tags(vision: VisionConfig) -> tuple[SimTag, ...]:

@@ -269,7 +269,7 @@ def joints_in(file: Path) -> tuple[str, ...]:
 
 def _unreadable(file: Path, error: OSError) -> RecordingError:
     if isinstance(error, UnfitFile):
-        return RecordingError(str(error.strerror), file=file, remedy="Cut it, or name a recording")
+        return RecordingError(str(error.strerror), file=file, remedy="Name a recording of at most 1 GiB")
     if isinstance(error, FileNotFoundError):
         return RecordingError("there is no such file", file=file, remedy="Name a recording that is there")
     if isinstance(error, IsADirectoryError):

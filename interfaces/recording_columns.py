@@ -58,7 +58,7 @@ class Fault(Exception):
         super().__init__(what)
 
     def moved(self, rows: int) -> Fault:
-        """The same fault of a part that begins with row `rows`."""
+        """Return the fault as counted in the whole table, where it was found in the part that begins at row `rows`."""
         return Fault(self.what, row=(self.row or 0) + rows, column=self.column, remedy=self.remedy)
 
 
@@ -201,7 +201,7 @@ def _missing(name: str, unknown: list[str]) -> str:
 
 
 def shortened(text: str) -> str:
-    """A text of others in quotes, as much of it as fits into a message."""
+    """Return a quoted excerpt of a text from a file, short enough for a message."""
     return repr(text if len(text) <= 40 else text[:37] + "...")
 
 

@@ -78,7 +78,7 @@ def write_csv_rows(out: TextIO, rows: Iterable[Iterable[float]], integers: froze
 
 
 def _header(stream: BinaryIO) -> tuple[str, ...]:
-    """The names in the first line; a Fault where there is none, or none of text."""
+    """Return the names in the first line. Raises Fault where it is missing or not text."""
     line = _line(stream, -1)
     try:
         header = _lines(_decoded(line))[0] if line else ""
@@ -88,13 +88,13 @@ def _header(stream: BinaryIO) -> tuple[str, ...]:
         raise Fault("the file is empty", remedy="A recording has a header line and at least one row")
     for letter in header:
         if not letter.isprintable() and letter != "\t":
-            what = f"the first line has the character {letter!r}, which is none of a text"
-            raise Fault(what, row=-1, remedy="Name a recording as CSV")
+            what = f"this is not a text file: its first line has the character {letter!r}"
+            raise Fault(what, row=-1, remedy="Name a CSV file")
     return tuple(name.strip() for name in header.split(","))
 
 
 def _block(stream: BinaryIO, row: int) -> bytes:
-    """The next lines; nothing at the end."""
+    """Return the next lines, empty at the end of the file."""
     data = bytearray()
     while len(data) < BLOCK_BYTES and (line := _line(stream, row)):
         data += line
@@ -105,7 +105,7 @@ def _block(stream: BinaryIO, row: int) -> bytes:
 def _line(stream: BinaryIO, row: int) -> bytes:
     line = stream.readline(MOST_LINE_BYTES + 1)
     if len(line) > MOST_LINE_BYTES:
-        raise Fault("the line is longer than 1 MiB", row=row, remedy="Name a recording as CSV")
+        raise Fault("the line is longer than 1 MiB", row=row, remedy="Name a CSV file")
     return line
 
 

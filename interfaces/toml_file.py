@@ -77,7 +77,7 @@ def line_of_endless_key(text: str) -> int | None:
 
 
 def _unusable(value: object, keys: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], str]]:
-    """Keys with what no key of ours can be, and what it is."""
+    """Yield the keys of values that no table may have, each with the reason."""
     if isinstance(value, float) and not math.isfinite(value):
         yield keys, "not a finite number"
     elif isinstance(value, str) and "\0" in value:

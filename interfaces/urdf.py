@@ -310,6 +310,13 @@ def _limits(joint: Any, kind: str, file: Path) -> tuple[float, float]:
     if kind == "continuous" or limit is None or limit.get("lower") is None or limit.get("upper") is None:
         return -np.pi, np.pi
     [lower], [upper] = (_numbers(limit, side, (0.0,), file) for side in ("lower", "upper"))
+    if kind == "prismatic" and max(abs(lower), abs(upper)) > LARGEST_PLACE_M:
+        raise RobotError(
+            f"<limit> of {_owner(limit)} lets it slide {max(abs(lower), abs(upper)):.3g} m away",
+            file=file,
+            line=limit.sourceline,
+            remedy="Give metres",
+        )
     return float(lower), float(upper)
 
 

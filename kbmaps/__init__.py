@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from kbmaps.changes.naming import Explanation, explanations
     from kbmaps.changes.shared_noise import SharedNoise
     from kbmaps.changes.white_noise import WhiteNoise
-    from kbmaps.contest import Contest
+    from kbmaps.contest import Contest, Recent
     from kbmaps.errors import (
         BasisError,
         ChainError,
@@ -110,6 +110,7 @@ __all__ = [
     "PoseModel",
     "PositionModel",
     "Posterior",
+    "Recent",
     "RecursiveRigidLearner",
     "ResidualLearner",
     "ResidualModel",
@@ -176,7 +177,7 @@ _MODULES = {
     "changes.naming": ["Explanation", "explanations"],
     "changes.shared_noise": ["SharedNoise"],
     "changes.white_noise": ["WhiteNoise"],
-    "contest": ["Contest"],
+    "contest": ["Contest", "Recent"],
     "errors": [
         "BasisError",
         "ChainError",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,13 +19,31 @@ FEWEST = 3
 SHORTEST, SHARE, LONGEST = 100, 0.5, 1000
 # A model is worse than another when the difference of their squared errors is so many standard errors.
 CLEARLY = 2.0
-# A model whose mean error on the last so many pairs is so many times another one's does not answer.
+# A model whose mean error on the last so many pairs is so many times another one's does not answer: what fitted most of
+# the pairs may fail where the arm has just come to, and the cap below hides by how much. A share of 1.2 is what answers
+# are promised to stay within; fewer than 50 pairs scatter by about as much.
 LATELY, WORSE = 50, 1.2
+# A difference that no camera sees [m].
 _LEAST_M = 1e-6
+# Of the last pairs, a model has to have predicted so many to be listed beside the one that answers.
+LISTED = 10
 # A squared error counts up to so many times the median of the better model: an outlier tells of neither.
 _CAP = 9.0
 # No median is taken for smaller [m²]: where a model is exact, another one that errs still loses.
 _LEAST = 1e-30
+
+
+@dataclass(frozen=True)
+class Recent:
+    """Errors on the last pairs that all of these models predicted before they learnt them.
+
+    Attributes:
+        pairs: how many pairs.
+        means: by model, the mean distance between prediction and measurement [m].
+    """
+
+    pairs: int
+    means: Mapping[str, float]
 
 
 class Contest:
@@ -82,19 +101,14 @@ class Contest:
             kept = np.concatenate([values, np.where(np.isfinite(more), more, math.nan)])
             self._errors[name] = kept[-self._length :]
 
-    def add_late(self, name: str, squares: ArrayLike, fresher: Sequence[str] = ()) -> None:
+    def add_late(self, name: str, squares: ArrayLike) -> None:
         """The squared distances (n,) [m²] of a model found only now for the last pairs, none of which it has learnt.
 
-        They take the place of those of an older model by this name. The models `fresher` had learnt the pair just
-        before each of these; what that gained them is no merit, and they are not compared there.
+        They take the place of those of an older model by this name. NaN where the model had learnt the pair.
         """
         late = np.asarray(squares, dtype=np.float64)[-self._length :] if self._length else np.empty(0)
-        begin = self._length - len(late)
-        for other in fresher:
-            if other in self._errors:
-                self._errors[other][begin:] = math.nan
         values = self._errors.setdefault(name, np.full(self._length, math.nan))
-        values[begin:] = np.where(np.isfinite(late), late, math.nan)
+        values[self._length - len(late) :] = np.where(np.isfinite(late), late, math.nan)
 
     def forget(self, name: str) -> None:
         """A model is another one from now on."""
@@ -104,8 +118,30 @@ class Contest:
         """Whether a model has predicted enough of the last pairs to be compared."""
         return name in self._errors and _count(self._errors[name]) >= FEWEST
 
+    def recent(self, answering: str) -> Recent:
+        """Return the models' errors on the last pairs, the same for all of them.
+
+        A model that has predicted few of those that `answering` has is left out.
+        """
+        last = {name: values[-LATELY:] for name, values in self._errors.items()}
+        seen = {name: np.isfinite(values) for name, values in last.items()}
+        if answering not in seen or not seen[answering].any():
+            answering = max(seen, key=lambda name: int(seen[name].sum()), default="")
+        if not answering:
+            return Recent(0, {})
+        common = seen[answering]
+        fewest = min(LISTED, int(common.sum()))
+        listed = [name for name in seen if (seen[name] & seen[answering]).sum() >= fewest]
+        for name in listed:
+            common = common & seen[name]
+        pairs = int(common.sum())
+        return Recent(pairs, {name: float(np.sqrt(last[name][common]).mean()) for name in listed} if pairs else {})
+
     def best(self, trusted: Sequence[str], present: str) -> str:
-        """The model that shall answer: the most trusted one that is not clearly worse than any other.
+        """The model that shall answer: the most trusted one that no other beats.
+
+        One beats another where the other's mean error is a fifth larger on the newest pairs of both, or its squared
+        errors are larger by more than chance on all pairs that are compared.
 
         Args:
             trusted: the models, the most trusted first.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from colorsys import rgb_to_hsv
 
 import cv2
@@ -23,8 +24,8 @@ TO_LIGHT = np.array([0.35, 0.45, 0.82]) / np.linalg.norm([0.35, 0.45, 0.82])
 # Free pixels around the marker in its finely sampled rectangle, and the most samples across it.
 _MARGIN_PX = 4
 _MOST_SAMPLES = 480
-# A portrait: radius of the marker [px], and how far a tag is turned away [deg]: seen straight on, two poses look alike.
-_PORTRAIT_PX, _PORTRAIT_TURN_DEG = 40.0, 20.0
+# Portraits: radius of the marker [px], and how far a tag is turned away [deg]. Several, as chance may spoil one.
+_PORTRAITS = ((40.0, 30.0), (60.0, 40.0), (30.0, 10.0), (60.0, 20.0))
 _NOISE_FIELDS = 8
 _NOISE_SHIFT_PX = 64
 
@@ -153,22 +154,22 @@ class StereoEyes:
         cv2.add(image, self._noise[field, dy : dy + height, dx : dx + width], dst=image, dtype=cv2.CV_8U)
 
 
-def portrait(calibration: StereoCalibration, config: CameraConfig) -> tuple[ImageArray, ImageArray]:
-    """Return the marker alone before a plain wall in the left and the right image (height, width, 3), BGR, unnoisy.
+def portraits(calibration: StereoCalibration, config: CameraConfig) -> Iterator[tuple[ImageArray, ImageArray]]:
+    """Yield the marker alone before a plain wall in left and right images (height, width, 3), BGR, without noise.
 
-    It is in the middle between the images, near enough to be measured well, and a tag shows its face.
+    It is in the middle between the images, near enough to be measured well, and a tag is turned a little away.
     """
-    plain = msgspec.structs.replace(config, clutter=0, noise=0.0)
+    eyes = StereoEyes(EmptyWorld(), calibration, msgspec.structs.replace(config, clutter=0, noise=0.0), seed=0)
     width, height = calibration.image_size_px
-    # As large as that, unless it would leave the images.
-    z = calibration.focal_px * max(config.marker_radius_m / _PORTRAIT_PX, 4.0 * calibration.baseline_m / width)
-    x, y = (np.array([width - 1, height - 1]) / 2 - calibration.principal_point_px) * z / calibration.focal_px
-    left = np.array([x + calibration.baseline_m / 2, y, z])
-    turn = np.eye(3)
-    if config.tags:
-        to_eyes = Rotation.from_euler("x", 180.0 - _PORTRAIT_TURN_DEG, degrees=True)
-        turn = (to_eyes * Rotation.from_euler("xyz", config.tags[0].rpy).inv()).as_matrix()
-    images = np.zeros((height, width, 3), np.uint8), np.zeros((height, width, 3), np.uint8)
-    x_eyes = np.stack([left, left - [calibration.baseline_m, 0.0, 0.0]])
-    StereoEyes(EmptyWorld(), calibration, plain, seed=0).paint(0, np.eye(4), x_eyes, turn, images)
-    return images
+    middle_px = np.array([width - 1, height - 1]) / 2 - calibration.principal_point_px
+    faced = Rotation.from_euler("xyz", config.tags[0].rpy).inv() if config.tags else Rotation.identity()
+    for radius_px, turn_deg in _PORTRAITS:
+        # As large as that, unless it would leave the images.
+        z = calibration.focal_px * max(config.marker_radius_m / radius_px, 2.0 * calibration.baseline_m / width)
+        x, y = middle_px * z / calibration.focal_px
+        left = np.array([x + calibration.baseline_m / 2, y, z])
+        turn = Rotation.from_euler("x", 180.0 - turn_deg, degrees=True) * faced
+        images = np.zeros((height, width, 3), np.uint8), np.zeros((height, width, 3), np.uint8)
+        x_eyes = np.stack([left, left - [calibration.baseline_m, 0.0, 0.0]])
+        eyes.paint(0, np.eye(4), x_eyes, turn.as_matrix(), images)
+        yield images

@@ -18,7 +18,7 @@ from interfaces.errors import RobotError
 from interfaces.limited import read_at_most
 from interfaces.records import FloatArray
 from interfaces.rpy import rpy_of
-from interfaces.urdf import UrdfJoint
+from interfaces.urdf import MOVING, UrdfJoint, UrdfTree
 
 from .meshes import LARGEST_M, Meshes
 from .roles import root_link
@@ -82,12 +82,12 @@ _SMALL = _Inertia(0.1, (0.0003, 0.0, 0.0, 0.0003, 0.0, 0.0003), _ZERO, _ZERO)
 class _Writer:
     def __init__(self, truth: TrueRobot) -> None:
         self._truth, self._file = truth, truth.tree.file
-        self._source = ElementTree.fromstring(
-            read_at_most(self._file)
-        )  # `UrdfTree.load` has refused entities and the like
+        # `UrdfTree.load` has refused entities and the like.
+        self._source = ElementTree.fromstring(read_at_most(self._file))
         self._meshes = Meshes(self._file)
         self._left_out: dict[str, None] = {}  # in order, each once
         self._rods: set[str] = set()
+        self._moving = _moved(truth.robot.tree)
         self._colours = {
             str(material.get("name")): rgba
             for material in self._source.iter("material")
@@ -183,12 +183,12 @@ class _Writer:
         return _rgba(material) or self._colours.get(str(material.get("name")))
 
     def _rods_of(self, link: str, kind: str) -> Iterator[ElementTree.Element]:
-        """Yield rods from a link's frame to the joints that hang on it."""
+        """Yield rods from a link's frame to the joints that lead to others; one to a tool would hide the marker."""
         self._rods.add(link)
         for joint in self._truth.tree.joints.values():
             end = joint.T_parent_joint[:3, 3]
             length = float(np.linalg.norm(end))
-            if joint.parent != link or length < _SHORTEST_ROD_M:
+            if joint.parent != link or length < _SHORTEST_ROD_M or joint.child not in self._moving:
                 continue
             turn = Rotation.align_vectors(end[None] / length, [[0.0, 0.0, 1.0]])[0]
             rod = _shape_at(kind, (end / 2).tolist(), rpy_of(turn.as_matrix()).tolist())
@@ -239,6 +239,16 @@ class _Writer:
             yield f"meshes that cannot be used: {_some(faults, '; ')}. The simulation goes on without{drawn}"
         if self._left_out:
             yield f"the simulation leaves out what it cannot take of {self._file}: {_some(list(self._left_out), '; ')}"
+
+
+def _moved(tree: UrdfTree) -> set[str]:
+    """Return the links that hang on a moving joint, or that one hangs on."""
+    moved = {joint.child for joint in tree.joints.values() if joint.kind in MOVING}
+    above = {joint.child: joint.parent for joint in tree.joints.values()}
+    for link in tuple(moved):
+        while (link := above.get(link, link)) in above and link not in moved:
+            moved.add(link)
+    return moved
 
 
 def _some(names: Sequence[str], between: str = ", ") -> str:

@@ -86,7 +86,7 @@ class VisionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     eye_size_ratio: Ratio = 1.05
     depth_size_ratio: Ratio = 1.3
     max_speed_m_s: Positive = 3.0
-    max_candidates: Annotated[int, Meta(ge=1)] = 12
+    max_candidates: Annotated[int, Meta(ge=1, le=1000)] = 12
     cameras: CamerasConfig | None = None
     tag: TagConfig = TagConfig()
     cluster: ClusterConfig = ClusterConfig()

@@ -22,7 +22,7 @@ def read_image(file: Path, flags: int = cv2.IMREAD_COLOR) -> ImageArray | None:
     """
     try:
         data = np.frombuffer(read_at_most(file, MOST_BYTES), np.uint8)
-    except OSError:
+        image = cv2.imdecode(data, flags) if len(data) else None
+    except (OSError, cv2.error):  # of OpenCV: more pixels than it is allowed to make of a file
         return None
-    image = cv2.imdecode(data, flags) if len(data) else None
     return None if image is None else np.asarray(image, np.uint8)

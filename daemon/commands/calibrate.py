@@ -51,13 +51,19 @@ def arm(
         Path | None, Parameter(help="Write the calibrated robot into this folder: a URDF and a robot.toml.")
     ] = None,
     as_json: Annotated[bool, flag("Print the figures as JSON.", name="--json")] = False,
+    force: Annotated[
+        bool, flag("Go on, and write, although the pairs do not seem to be of this robot, or its zeros are far off.")
+    ] = False,
 ) -> None:
     """Where camera and tool are and what the joint zeros are, with 95 % intervals; writes a calibrated URDF.
 
     Learns a rigid chain from all pairs, around the nominal one. Outliers are left out. All pairs have to be of one
     tool: from a store those are learnt that the learner beside it counts since the tool was last changed. Where
-    residuals jump as with another tool, this is said, with the row, and nothing is written; nor is it where the pairs
-    are far from any arm like the drawn one: columns mixed up, another robot.
+    residuals jump as with another tool, this is said, with the row, and nothing is written.
+
+    Pairs whose columns are exchanged, count the other way, have another zero or unit, or are of another robot, are
+    refused. Zeros off by more than five times --zeros-deg, and links worse than those of any arm, are printed and not
+    written. --force overrules both.
 
     The URDF opens in pybullet, Pinocchio and ROS: it has the camera and the marker as links of their own, and takes
     its positions from them to rounding as the learnt chain does. Meshes, masses and limits stay.
@@ -78,7 +84,8 @@ def arm(
     from daemon.calibration_report import CalibrationReport
     from daemon.calibration_view import two_tools, view
     from daemon.config import Config
-    from daemon.plausibility import require_units
+    from daemon.plausibility.check import plausibility, told_sigma
+    from daemon.plausibility.limits import require_units
     from daemon.present_tool import first_pair
     from daemon.wire import encode
     from interfaces.calibrated_files import write_calibrated
@@ -96,14 +103,19 @@ def arm(
     recording = recordings.between(recording, first, last, source)
     sigma_m = None if sigma_mm is None else 1e-3 * sigma_mm
     require_units(description, recording, source)
+    seen = plausibility(description, recording.q, recording.x, sigma_m=told_sigma(recording) or sigma_m)
+    if seen.misread:
+        seen.require(source, force=force)
     found = Calibration.of(description, recording, sigma_m=sigma_m, zeros_rad=math.radians(zeros_deg))
-    report = CalibrationReport.of(found, source.name, first)
+    report = CalibrationReport.of(found, seen, source.name, first)
+    if report.other_tool_from is None:
+        seen.require(source, force=force)
     written = None
     if out is not None:
         if report.other_tool_from is not None:
             raise CalibrationError(f"nothing was written. {two_tools(report)}")
-        if report.doubt is not None:
-            raise CalibrationError(f"nothing was written. {report.doubt}")
+        if report.beyond is not None and not force:
+            raise CalibrationError(f"nothing was written. {report.doubt} Or write it as it is with --force")
         heading = f"Calibrated by bodyschema from {report.pairs} pairs of {source.name}"
         written = write_calibrated(description, found.figures.geometry, out, heading)
     if as_json:

@@ -32,6 +32,7 @@ def diagnose(
     exclude: Annotated[str | None, Parameter(help="Do not look for these.")] = None,
     seed: Annotated[int, Parameter(help="Of the resampling behind the intervals.", validator=Number(gte=0))] = 0,
     as_json: Annotated[bool, flag("Print diagnosis.json.", name="--json")] = False,
+    force: Annotated[bool, flag("Go on although the pairs do not seem to be of this robot.")] = False,
 ) -> None:
     """What the simulation gets wrong of a recording, why, and by how much it gets better.
 
@@ -39,7 +40,8 @@ def diagnose(
     fitted. What remains are causes with their numbers and how sure they are; or that nothing is wrong; or that this
     recording cannot decide, or that no known effect explains it. The exit code is 0 whatever is found.
 
-    Without --out nothing is written.
+    Without --out nothing is written. Pairs whose columns are exchanged, count the other way, have another zero or unit,
+    or are of another robot, are refused.
 
     Needs: a recording or a store and its robot.toml, no hardware; with --live a running sampler.
 
@@ -50,19 +52,20 @@ def diagnose(
     from rich.console import Console
 
     from daemon.config import Config
-    from daemon.diagnosis_run import Asked, measured, require_folder, run, written
+    from daemon.diagnosis_run import Asked, measured, results_in, run, written
     from daemon.diagnosis_view import view
 
     config = Config.load(robot_file(robot, recording))
     asked = Asked.of(effects, exclude, seed)
     source = measured(config, recording, live=live)
-    if out is not None:
-        require_folder(out)
-    with _progress(Console(stderr=True, highlight=False)) as tell:
-        found = run(config, source, asked, tell)
+    told = Console(stderr=True, highlight=False)
+    with results_in(out), _progress(told) as tell:
+        found = run(config, source, asked, tell, force=force)
         if out is not None:
             tell("writing the report")
             written(found, out)
+    for warning in found.warnings:
+        told.print(f"Warning: {warning}", markup=False, soft_wrap=True)
     if as_json:
         sys.stdout.write(found.json + "\n")
         return

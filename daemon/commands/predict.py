@@ -55,7 +55,7 @@ def _notes(config: Config, q: FloatArray, deg: bool) -> Iterator[str]:
     """What is to be said of joint values q (n, d) [rad, m] that the arm cannot have."""
     import numpy as np
 
-    from daemon.plausibility import beyond_limits, limits_text
+    from daemon.plausibility.limits import beyond_limits, limits_text
 
     beyond = beyond_limits(config.robot, q)
     for joint in np.flatnonzero(beyond.any(axis=0)):
@@ -123,5 +123,5 @@ def _show(reply: PredictReply) -> None:
         table.add_row(*(f"{1e3 * value:.1f}" for value in x), spread, where)
     console = Console(highlight=False)
     console.print(table)
-    age = "none since it started" if reply.age_s is None else f"the last one {reply.age_s:.1f} s ago"
+    age = "none since it started" if reply.age_s is None else f"the newest {reply.age_s:.1f} s old"
     console.print(f"model {reply.model}, {reply.pairs} pairs learnt, {age}", style="dim")

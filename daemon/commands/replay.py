@@ -41,12 +41,14 @@ def replay(
     held_out: Annotated[float, Parameter(help="Share of the rows to leave out and judge by.")] = 0.3,
     as_json: Annotated[bool, flag("Print the figures as JSON.", name="--json")] = False,
     keep: Annotated[Path | None, Parameter(help="Keep store, checkpoint and logs in this new folder.")] = None,
+    force: Annotated[bool, flag("Go on although the rows do not seem to be of this robot.")] = False,
 ) -> None:
     """Feed a recording through sampler and learner; prints the error before and after on rows left out.
 
     The two processes run as they do live, on ports and with a store of their own, so a running daemon is not
     disturbed. Contiguous blocks of rows are held out. "Before" is the nominal model with what robot.toml calls not
-    known fitted to the other rows; "after" is what the learner answers when it has learnt them.
+    known fitted to the other rows; "after" is what the learner answers when it has learnt them. Rows whose columns are
+    exchanged, count the other way, have another zero or unit, or are of another robot, are refused.
 
     Needs: a recording and its robot.toml; neither hardware nor a running daemon.
 
@@ -58,7 +60,9 @@ def replay(
 
     from daemon.config import Config
     from daemon.evaluate import split_blocks
-    from daemon.plausibility import require_units
+    from daemon.learning import NominalModel
+    from daemon.plausibility.check import plausibility, told_sigma
+    from daemon.plausibility.limits import require_units
     from daemon.replay.report import as_text
     from daemon.replay.run import Job
     from daemon.replay.run import replay as run_replay
@@ -74,11 +78,14 @@ def replay(
     any_step |= config.tables.daemon.any_step
     if not any_step:
         require_path(Steps.of(rows, config.robot, config.tables.daemon), rows)
+    sigma_m = None if sigma_mm is None else 1e-3 * sigma_mm
+    chain = NominalModel.extended_by(config.simulation).chain
+    seen = plausibility(config.robot, rows.q, rows.x, chain=chain, sigma_m=told_sigma(rows) or sigma_m)
+    warnings = seen.require(recording, force=force)
     if keep is not None:
         _make_folder(keep)
     with _ending_on_sigterm(), tempfile.TemporaryDirectory(prefix="bodyschema-replay-") as temporary:
-        sigma_m = None if sigma_mm is None else 1e-3 * sigma_mm
-        job = Job(config, rows, split, speed, sigma_m, any_step, keep or Path(temporary))
+        job = Job(config, rows, split, speed, sigma_m, any_step, keep or Path(temporary), warnings)
         with _progress(Console(stderr=True, highlight=False)) as show:
             report = run_replay(job, show)
     sys.stdout.write((encode(report).decode() if as_json else as_text(report, Console().width)) + "\n")
@@ -132,5 +139,5 @@ def _line(sampler: SamplerStatus, learner: LearnerStatus) -> str:
     return (
         f"{sampler.frames} rows fed, {sampler.pairs} pairs accepted, {learner.pairs} learnt, "
         f"{learner.replayed} replayed, {learner.state} ({learner.answering}), "
-        f"error before learning each {mm(error)}"
+        f"error on new pairs {mm(error)}"
     )

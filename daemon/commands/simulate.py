@@ -38,7 +38,7 @@ def simulate(
     from rich.console import Console
 
     from daemon import recordings
-    from daemon.plausibility import require_units
+    from daemon.plausibility.limits import require_units
     from daemon.synthesis import simulated, with_noise, without_consequence
     from effects import load_simulation
 

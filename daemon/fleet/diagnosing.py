@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from daemon.config import Config
-from daemon.diagnosis_run import Asked, Found, Source, measured, require_folder, run, written
+from daemon.diagnosis_run import Asked, Found, Source, measured, require_writable, run, written
 from diagnosis.result import DiagnosisFile
 from interfaces.errors import BodyschemaError, ConfigError
 from interfaces.interpreter import safe_children
@@ -90,7 +90,7 @@ def diagnose_all(
     from distributed import as_completed
 
     if out is not None:
-        require_folder(out)
+        require_writable(out)
     results: dict[str, Diagnosed] = {}
 
     def take(result: Diagnosed) -> None:

@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 
 from interfaces.records import FloatArray
-from kbmaps import ChainBelief, Contest, JointBasis, ResidualModel, SupportSet
+from kbmaps import ChainBelief, Contest, JointBasis, Recent, ResidualModel, SupportSet
 
 from .members import INSTANT, PRIOR, RESIDUAL, RIGID, SOLVED, TRUSTED
 from .misfit import misfit
@@ -110,6 +110,10 @@ class Claims:
     def best_map(self, present: str) -> str:
         """The best of the models that are KB-Maps; `present` while there is nothing to compare."""
         return self._contest.best([name for name in self._trusted if name != RESIDUAL], present)
+
+    def recent(self, answering: str) -> Recent:
+        """How far the models were off on the last pairs, each as old as the newest solution."""
+        return self._contest.recent(answering)
 
     @property
     def support(self) -> SupportSet | None:
@@ -224,19 +228,24 @@ class Claims:
         scatter = 0.0 if belief is None else belief.noise
         self._misfits[name] = misfit(errors, noise, before, neighbours=neighbours, scatter=scatter)
 
-    def predicted_late(self, name: str, predict: Predict, q: FloatArray, errors: FloatArray, *, anew: bool) -> None:
+    def predicted_late(
+        self, name: str, predict: Predict, q: FloatArray, errors: FloatArray, instant: FloatArray, *, anew: bool
+    ) -> None:
         """A solution that was found only now predicts the last pairs, of which it knows none.
 
         Args:
             predict: its positions (n, 3) [m] at q (n, d) [rad].
-            anew: whether it knows so much more than the last one that what that predicted says nothing of it.
             q: where (n, d) [rad], in their order.
             errors: measured minus predicted (n, 3) [m].
+            instant: the same of the instant learner as it was when the solution was asked for, NaN where it had learnt
+                the pair by then: what that gains it is no merit.
+            anew: whether it knows so much more than the last one that what that predicted says nothing of it.
         """
         if anew:
             self._contest.forget(name)
             self.errors[name] = ErrorMemory(self._expected_m)
-        self._contest.add_late(name, np.square(errors).sum(axis=1), fresher=(INSTANT,))
+        for each, missed in ((name, errors), (INSTANT, instant)):
+            self._contest.add_late(each, np.square(missed).sum(axis=1))
         noise = self.errors[PRIOR].noise_variance
         claimed = self.of(name, predict).variance(q) + noise
         self.errors[name].add(errors, noise, np.square(errors).sum(axis=1) / claimed.sum(axis=1))

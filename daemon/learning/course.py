@@ -34,7 +34,7 @@ class Course:
     Attributes:
         eras: what is learnt.
         counters: all that is counted; who reads it at other times than the course's own takes a copy.
-        curve: mean prequential error [m] of the answering model over the pairs.
+        curve: the error [m] of the model that answered, on the last pairs before each of these.
         newest_utc: when the last pair that was learnt was stored, ISO 8601; None: none was.
     """
 
@@ -144,10 +144,11 @@ class Course:
 
     def _judged(self, era: Era, pairs: Sequence[Pair], doubted: BoolArray) -> None:
         """Count what `era` has learnt of these pairs and what it doubts, and follow a change that they show."""
-        error_m = self.eras.claims.errors[era.answering].mean_m or 0.0
+        error_m = era.recent.means.get(era.answering)
         first = self.counters.pairs - len(era.met) - len(pairs) + 1
-        for place in np.flatnonzero(~doubted).tolist():
-            self.curve.add(first + place, error_m)
+        if error_m is not None:
+            for place in np.flatnonzero(~doubted).tolist():
+                self.curve.add(first + place, error_m)
         self.counters.doubted += int(doubted.sum())
         if self._followed(era, pairs[-1], learnt=not doubted[-1]):
             self.counters.changes += 1

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from daemon.config import LearnerConfig
 from interfaces.records import FloatArray, Pair
-from kbmaps import ChainBelief, KBMap, follow_a_path
+from kbmaps import ChainBelief, KBMap, Recent, follow_a_path
 
 from .arm import KnownArm
 from .claims import Claims
@@ -274,7 +274,7 @@ class Era:
         neighbours = follow_a_path(self.members.prior, q)
         errors = x - model.predict(q)
         self._claims.solution_taken(solved.name, errors, solved.belief, solved.wide, neighbours=neighbours)
-        self._judge_late(solved.name, model, solved.pairs)
+        self._judge_late(solved.name, model, solved.pairs, fed)
         self._choose()
         if self.watch.wants_reference and solved.pairs == fed:
             self._offer(fed)
@@ -329,13 +329,17 @@ class Era:
         self._choose_map()
         self.solve_from_what_is_known()
 
-    def _judge_late(self, name: str, model: LearntModel, pairs: int) -> None:
+    def _judge_late(self, name: str, model: LearntModel, pairs: int, fed: int) -> None:
         """What came while the solver worked is new to its solution: a pair that it had not learnt judges it fairly."""
         q, x, _ = self.memory.since(max(pairs, self.memory.count - JUDGED_LATE))
-        if len(q):
-            self._claims.predicted_late(
-                name, model.predict, q, x - model.predict(q), anew=len(q) >= JUDGED_ANEW * pairs
-            )
+        if len(q) == 0:
+            return
+        instant = np.full(x.shape, math.nan)
+        new = min(max(self.memory.count - fed, 0), len(q))
+        if new and self.members.delayed is not None:
+            instant[-new:] = x[-new:] - self.members.delayed.predict(q[-new:])
+        anew = len(q) >= JUDGED_ANEW * pairs
+        self._claims.predicted_late(name, model.predict, q, x - model.predict(q), instant, anew=anew)
 
     def _learn_turn(self, q: FloatArray, turn: FloatArray | None, cov: FloatArray | None = None) -> None:
         if turn is not None and np.isfinite(turn).all():
@@ -344,6 +348,11 @@ class Era:
     def _keep(self, q: FloatArray, x: FloatArray, turns: FloatArray | None = None) -> None:
         self.memory.append(q, x, turns)
         self._claims.learnt(q)
+
+    @property
+    def recent(self) -> Recent:
+        """How far the models were off on the last pairs, before they learnt them."""
+        return self._claims.recent(self.answering)
 
     def _choose(self) -> None:
         self.answering = self._claims.best(self.answering)

@@ -75,7 +75,8 @@ class Eras:
         """As they were when `state` was taken.
 
         Raises:
-            StateError: it belongs to another nominal model, or to other tolerances, or is not finite.
+            StateError: it belongs to another nominal model, or to other tolerances, or has numbers that
+                cannot be.
         """
         header, arrays = state.header, state.arrays
         eras = cls(nominal, settings, task_numbers)
@@ -84,7 +85,7 @@ class Eras:
                 "it belongs to another nominal model or to other tolerances: robot.toml or the URDF has changed since"
             )
         if (poisoned := state.poisoned()) is not None:
-            raise StateError(f"it is of no use: {poisoned} is not finite")
+            raise StateError(f"it is of no use: {poisoned} is not finite or too large")
         eras.fitting.restore(header.next_fit, header.first_fit, arrays)
         eras.claims.restore(header.claims, arrays)
         eras.change = header.change

@@ -13,12 +13,12 @@ import numpy as np
 
 from daemon.config import LearnerConfig
 from daemon.status import CurvePoint, OrientationStatus
-from interfaces.records import Pair
-from kbmaps import ChainBelief
+from interfaces.records import FloatArray, Pair
+from kbmaps import ChainBelief, Recent
 
 from .change import ChangeRecord
 from .course import Course
-from .era import LOOKED_BACK
+from .era import LOOKED_BACK, Era
 from .members import PRIOR, SOLVED
 from .nominal import NominalModel, chain_tolerances
 from .outlook import Known
@@ -95,7 +95,7 @@ class Learning:
 
     @property
     def curve(self) -> list[CurvePoint]:
-        """Mean prequential error [m] of the answering model over the pairs."""
+        """The error [m] of the model that answered, on the last pairs before each of these."""
         with self._lock:
             return self._course.curve.points
 
@@ -110,11 +110,11 @@ class Learning:
         """Whether the state before the last change is kept."""
         return self._course.can_roll_back
 
-    def prequential_m(self) -> dict[str, float]:
-        """Recent mean distance between prediction and measurement, before learning [m], by model."""
+    def recent(self) -> Recent:
+        """Return the models' errors on the last pairs, which each predicted before it learnt them."""
         with self._lock:
-            means = {name: memory.mean_m for name, memory in self._course.eras.claims.errors.items()}
-        return {name: mean for name, mean in means.items() if mean is not None}
+            era = self._course.eras.present
+            return Recent(0, {}) if era is None else era.recent
 
     def claimed_error_m(self) -> float | None:
         """Mean distance to the truth [m] that is claimed in the data's region; None while there are too few pairs.
@@ -126,9 +126,14 @@ class Learning:
             answering = None if era is None else self._course.eras.claims.errors.get(era.answering)
             if era is None or answering is None or answering.weight < FEWEST_TO_CLAIM:
                 return None
-            rng = np.random.default_rng(0)
-            q, _ = era.memory.at(rng.integers(len(era.memory), size=REGION_SAMPLES))
-        return snapshot.expected_error_m(q + rng.normal(0.0, 1.0, q.shape) * self._nominal.reach(REGION_RAD))
+            region = self._region(era)
+        return snapshot.expected_error_m(region)
+
+    def _region(self, era: Era) -> FloatArray:
+        """Poses (n, d) [rad, m] that stand for where the data is; the same for the same pairs."""
+        rng = np.random.default_rng(0)
+        q, _ = era.memory.at(rng.integers(len(era.memory), size=REGION_SAMPLES))
+        return q + rng.normal(0.0, 1.0, q.shape) * self._nominal.reach(REGION_RAD)
 
     def orientation_status(self) -> OrientationStatus | None:
         """How well it is known how the marker is turned; None where no pair with the present tool said it."""
@@ -136,11 +141,8 @@ class Learning:
             era, model = self._course.eras.present, self._snapshot.orientation
             if era is None or model is None:
                 return None
-            pairs, errors = era.orientations.pairs, era.orientations.prequential_rad()
-            rng = np.random.default_rng(0)
-            q, _ = era.memory.at(rng.integers(len(era.memory), size=REGION_SAMPLES))
-        near = q + rng.normal(0.0, 1.0, q.shape) * self._nominal.reach(REGION_RAD)
-        claimed = model.expected_error(near) if pairs >= FEWEST_TO_CLAIM else None
+            pairs, errors, region = era.orientations.pairs, era.orientations.prequential_rad(), self._region(era)
+        claimed = model.expected_error(region) if pairs >= FEWEST_TO_CLAIM else None
         return OrientationStatus(pairs, model.name, errors, claimed)
 
     def known(self) -> Known | None:
@@ -162,10 +164,18 @@ class Learning:
                 claim=claims.of(era.answering, era.model.predict),
                 solved=era.answering in SOLVED,
                 pairs=self._course.counters.since_change,
+                region=self._region(era),
                 seen=seen,
                 q=q,
                 x=x,
             )
+
+    def kept(self, limit: int) -> tuple[FloatArray, FloatArray]:
+        """At most `limit` of the kept pairs with the present tool, evenly spread: q (n, d) [rad, m], x (n, 3) [m]."""
+        with self._lock:
+            memory = self._course.eras.memory
+            places = np.unique(np.linspace(0, len(memory) - 1, min(limit, len(memory))).astype(np.intp))
+            return memory.at(places)
 
     def learn(self, pair: Pair, now: float) -> None:
         """Learn one pair at once.

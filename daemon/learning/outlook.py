@@ -42,6 +42,7 @@ class Known:
         claim: of the model that answers.
         solved: whether that is a solution, of whose error the belief tells.
         pairs: how many pairs with the present tool were learnt.
+        region: poses (m, d) [rad, m] that stand for where the data is.
         seen: poses (n, d) [rad, m] of some of them, evenly spread.
         q, x: the newest that the solver knows, (m, d) [rad, m] and (m, 3) [m].
     """
@@ -53,6 +54,7 @@ class Known:
     claim: Claim
     solved: bool
     pairs: int
+    region: FloatArray
     seen: FloatArray
     q: FloatArray
     x: FloatArray
@@ -85,12 +87,13 @@ class Scatter:
         return cls(noise, int((~inliers).sum()), shared_by(missed[inliers]))
 
 
-def foreseen(known: Known, scatter: Scatter, joints: tuple[str, ...], reach_rad: float) -> Outlook:
+def foreseen(known: Known, scatter: Scatter, joints: tuple[str, ...]) -> Outlook:
     """What further pairs would gain where the arm has been, of a solution that answers.
+
+    The error now is the one that is claimed for predictions there. The forecast says by which factor it falls.
 
     Args:
         joints: their names.
-        reach_rad: how far each joint may be from a pose of the pairs.
     """
     rng = np.random.default_rng(0)  # the same pairs have the same outlook
     nominal, claim = known.nominal, known.claim
@@ -98,27 +101,31 @@ def foreseen(known: Known, scatter: Scatter, joints: tuple[str, ...], reach_rad:
     floor = float(np.sqrt(np.square(claim.inside).mean()))
     noise = scatter.noise_m * math.sqrt(scatter.shared)
     posterior = ChainPosterior.of_belief(known.belief, noise=max(noise, floor), floor=floor)
-    chosen = known.seen[rng.integers(len(known.seen), size=POSES)]
-    region = chosen + rng.normal(0.0, 1.0, chosen.shape) * nominal.reach(reach_rad)
     motions = candidate_motions(known.seen, lower, upper, rng, names=joints, count=POSES)
-    forecast = expected_gain(posterior, region, motions, FURTHER, rng)
+    forecast = expected_gain(posterior, known.region[:POSES], motions, FURTHER, rng)
     by_motion = {motion.motion: motion.errors for motion in forecast.motions}
     best = forecast.motions[0].motion
     if by_motion[best][-1] > (1.0 - WORTH) * by_motion[SAME][-1]:
         best = SAME
-    gain = forecast.now - forecast.motions[0].errors[-1]
-    anywhere = claim.variance(rng.uniform(lower, upper, (POSES, nominal.joints))).sum(axis=1)
+    claimed = _mean_error_m(claim, known.region)
+    scale = claimed / forecast.now if forecast.now > 0.0 else 1.0
+    gain = scale * (forecast.now - forecast.motions[0].errors[-1])
     return Outlook(
         pairs=known.pairs,
-        error_m=claim.surprise * forecast.now,
-        least_error_m=claim.surprise * forecast.least,
-        anywhere_m=MEAN_OVER_RMS * float(np.sqrt(anywhere).mean()),
+        error_m=claimed,
+        least_error_m=scale * forecast.least,
+        anywhere_m=_mean_error_m(claim, rng.uniform(lower, upper, (POSES, nominal.joints))),
         further_pairs=list(FURTHER),
-        like_so_far_m=[claim.surprise * error for error in by_motion[SAME]],
+        like_so_far_m=[scale * error for error in by_motion[SAME]],
         best_motion=_in_words(best),
-        best_motion_m=[claim.surprise * error for error in by_motion[best]],
+        best_motion_m=[scale * error for error in by_motion[best]],
         enough=forecast.is_enough() or gain < NOTICED * scatter.noise_m,
     )
+
+
+def _mean_error_m(claim: Claim, q: FloatArray) -> float:
+    """Mean distance to the truth [m] that is claimed at q (n, d) [rad]."""
+    return MEAN_OVER_RMS * float(np.sqrt(claim.variance(q).sum(axis=1)).mean())
 
 
 def _in_words(motion: str) -> str:

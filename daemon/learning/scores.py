@@ -21,7 +21,6 @@ class ErrorMemory(msgspec.Struct):
     Attributes:
         expected_m: RMS distance expected before there were errors [m].
         weight: how many errors count.
-        distance: sum of their lengths [m].
         square: sums of their squares per axis [m²].
         noise: sums of the measurements' variances per axis [m²].
         ratio: sum of their squares over what was claimed.
@@ -31,7 +30,6 @@ class ErrorMemory(msgspec.Struct):
     expected_m: float
     discount: float = DISCOUNT
     weight: float = 0.0
-    distance: float = 0.0
     square: tuple[float, float, float] = (0.0, 0.0, 0.0)
     noise: tuple[float, float, float] = (0.0, 0.0, 0.0)
     ratio: float = 0.0
@@ -48,15 +46,9 @@ class ErrorMemory(msgspec.Struct):
         kept, faded = self.discount**count, self.discount ** np.arange(count - 1.0, -1.0, -1.0)
         squares = np.square(errors)
         self.weight = kept * self.weight + float(faded.sum())
-        self.distance = kept * self.distance + float(faded @ np.sqrt(squares.sum(axis=1)))
         self.square = _triple(kept * np.array(self.square) + faded @ squares)
         self.noise = _triple(kept * np.array(self.noise) + faded @ np.broadcast_to(variances, squares.shape))
         self.ratio = kept * self.ratio + float(faded @ np.broadcast_to(ratios, count))
-
-    @property
-    def mean_m(self) -> float | None:
-        """Mean distance between prediction and measurement [m]; None before any."""
-        return self.distance / self.weight if self.weight else None
 
     @property
     def rms_m(self) -> float:

@@ -10,7 +10,7 @@ import numpy as np
 
 from daemon.status import CurvePoint
 from interfaces.errors import BodyschemaError
-from interfaces.records import FloatArray
+from interfaces.records import FARTHEST_M, LARGEST_Q, FloatArray
 
 from .change import ChangeRecord
 from .claims import ClaimsState
@@ -116,6 +116,10 @@ class LearningState:
         return LearningState(header, {**self.arrays, **{BEFORE + name: each for name, each in before.arrays.items()}})
 
     def poisoned(self) -> str | None:
-        """The name of a net, or of what the pairs were, that is not finite; None when all is well."""
-        nets = (name for name in self.arrays if name.startswith(NET))
-        return next((name for name in (*nets, "q", "x") if not np.isfinite(self.arrays[name]).all()), None)
+        """Return the name of a net, or of what the pairs were, that cannot be; None when all is well."""
+        nets = dict.fromkeys((name for name in self.arrays if name.startswith(NET)), np.inf)
+        limits = {**nets, "q": LARGEST_Q, "x": FARTHEST_M}
+        for name, limit in limits.items():
+            if not (np.isfinite(self.arrays[name]).all() and (np.abs(self.arrays[name]) <= limit).all()):
+                return name
+        return None

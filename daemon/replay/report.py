@@ -70,7 +70,7 @@ class ReplayReport(msgspec.Struct, frozen=True, kw_only=True):
         within_sigma_share: share of held-out coordinates within the 1-sigma claimed and the noise that was stated.
         replayed: replay steps of the instant learner.
         outlook: what the learner expects of further pairs, or null.
-        doubt: why no figure is to be trusted, or null: the rows are far from any arm like the drawn one.
+        doubt: what may be wrong with the recording, or null: columns read wrongly, another robot.
         learning_s: time from the first pair to the end of learning [s].
         angle: of the marker's orientation; null where the recording has none.
     """
@@ -128,6 +128,7 @@ def as_text(report: ReplayReport, width: int = 80) -> str:
         f"{report.in_support_share:.0%} of the held-out rows lie where data was",
         *([] if report.outlook is None else [outlook_sentence(report.outlook)]),
         f"{report.replayed} replay steps, {report.doubted} pairs doubted, {report.learning_s:.1f} s",
+        *([] if report.doubt is None else ["", f"Warning: {report.doubt}"]),
     ]
     return "\n".join(_wrapped(line, width) for line in lines)
 
@@ -152,8 +153,6 @@ def _row(figures: Figures) -> str:
 
 
 def _verdict(report: ReplayReport) -> str:
-    if report.doubt is not None:
-        return report.doubt
     ratio = report.after.mean_mm / report.before.mean_mm if report.before.mean_mm else 1.0
     if abs(ratio - 1.0) < 0.01:
         return "Learning left the mean error as it was."

@@ -15,7 +15,6 @@ from daemon.bus import Bus, client
 from daemon.config import Config
 from daemon.evaluate import ErrorFigures, Split, aligned_chain, coverage
 from daemon.keys import Keys
-from daemon.plausibility import FAR_OFF_AS_DRAWN, OTHER_CAUSES, is_far_off, mixed_up
 from daemon.status import LearnerStatus, SamplerStatus
 from daemon.wire import JointsRequest, PredictReply, decode, encode
 from interfaces.errors import BusError, RecordingError
@@ -45,6 +44,7 @@ class Job:
         sigma_m: 1-sigma of the positions where the recording has none [m]; None as robot.toml says.
         any_step: relax the sampler's step and speed rules.
         folder: for store, checkpoint, logs and the rows that are learnt.
+        warnings: what may be wrong with the recording.
     """
 
     config: Config
@@ -54,6 +54,7 @@ class Job:
     sigma_m: float | None
     any_step: bool
     folder: Path
+    warnings: tuple[str, ...] = ()
 
     @property
     def drivers(self) -> dict[str, float]:
@@ -139,7 +140,7 @@ def _report(job: Job, before: FloatArray, learnt: Learnt, prediction: PredictRep
         doubted=learner.doubted,
         replayed=learner.replayed,
         outlook=learner.outlook,
-        doubt=_doubt(job, before),
+        doubt=" ".join(job.warnings) or None,
         learning_s=learnt.seconds,
         angle=_angles(held_out, prediction, learner),
     )
@@ -153,15 +154,6 @@ def _angles(held_out: Recording, prediction: PredictReply, learner: LearnerStatu
     turns = rotation_vectors(rotation_matrices("R", prediction.R) @ measured.swapaxes(1, 2))
     claimed = None if learner.orientation is None else learner.orientation.claimed_rad
     return AngleFigures.of(np.linalg.norm(turns, axis=1), claimed)
-
-
-def _doubt(job: Job, before: FloatArray) -> str | None:
-    """Why the rows are not this arm's, as its drawing in the best place has them; None where they may be."""
-    robot, held_out = job.config.robot, job.held_out_rows
-    left_m = np.linalg.norm(before - held_out.x, axis=1)
-    if not is_far_off(robot, left_m, job.sigma_m, share=FAR_OFF_AS_DRAWN):
-        return None
-    return f"So far apart is no arm from its drawing. {mixed_up(robot, job.learnt_rows, job.sigma_m) or OTHER_CAUSES}."
 
 
 class _Live:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from daemon.status import Change as LastChange
 from daemon.status import LearnerStatus
 
 from .documents import Change, CourseDocument, SeriesDocument, Version
@@ -47,33 +48,38 @@ class Course:
     """Changes and the models that answered, from one state of the learner to the next."""
 
     def __init__(self) -> None:
-        self._changes: list[Change] = []
+        self._changes: dict[tuple[int | None, int | None], Change] = {}
         self._versions: list[Version] = []
         self._store: str | None = None
 
     @property
     def document(self) -> CourseDocument:
         """What is known now."""
-        return CourseDocument(list(self._changes), list(self._versions))
+        return CourseDocument(list(self._changes.values()), list(self._versions))
 
     def note(self, status: LearnerStatus, now: float) -> None:
         """What the learner said at this time, UTC [s since 1970]."""
         begun_anew = self._versions and status.pairs < self._versions[-1].pairs
         if begun_anew or status.store != self._store:
-            self._changes, self._versions, self._store = [], [], status.store
+            self._changes, self._versions, self._store = {}, [], status.store
         changed = self._note_change(status, now)
         if status.model:
             self._note_version(status, now, changed=changed)
 
     def _note_change(self, status: LearnerStatus, now: float) -> bool:
-        at = status.pairs - status.pairs_since_change
-        kind = None if status.last_change is None else status.last_change.kind
-        if at > 0 and self._changes and self._changes[-1].pairs >= at:
-            self._changes[-1] = Change(self._changes[-1].pairs, self._changes[-1].t, kind)
-            return False
+        """Note the change that is in force; those after it were rolled back. Return True when it is new."""
+        at, last = status.pairs - status.pairs_since_change, status.last_change
+        key = (at, None) if last is None else (None, last.noticed_seq)
         if at <= 0:
+            self._changes = {}
             return False
-        self._changes = [*self._changes, Change(at, now, kind)][-LARGEST_COURSE:]
+        if key in self._changes:
+            keys = list(self._changes)
+            self._changes = {each: self._changes[each] for each in keys[: keys.index(key) + 1]}
+            self._changes[key] = _marked(last, self._changes[key].pairs, self._changes[key].t)
+            return False
+        before = [(each, mark) for each, mark in self._changes.items() if mark.pairs < at]
+        self._changes = dict([*before, (key, _marked(last, at, now))][-LARGEST_COURSE:])
         return True
 
     def _note_version(self, status: LearnerStatus, now: float, *, changed: bool) -> None:
@@ -90,3 +96,7 @@ class Course:
         )
         earlier = self._versions[:-1] if goes_on else self._versions
         self._versions = [*earlier, version][-LARGEST_COURSE:]
+
+
+def _marked(last: LastChange | None, pairs: int, t: float) -> Change:
+    return Change(pairs, t, None if last is None else last.kind, last is not None and not last.found)

@@ -41,8 +41,8 @@ class SeriesDocument(msgspec.Struct, frozen=True):
 
     Attributes:
         t: UTC [s since 1970].
-        error_m: recent prequential error of the answering model [m]; null while there is none.
-        claimed_m: what the learner claims where data is [m].
+        error_m: error on new pairs of the answering model [m], measurement noise included; null while there is none.
+        claimed_m: the distance to the truth that the learner claims where data is [m].
         pairs_per_s: accepted pairs.
         predict_s: how long one prediction took, there and back [s]; null where none came.
     """
@@ -60,12 +60,14 @@ class Change(msgspec.Struct, frozen=True):
     Attributes:
         pairs: learnt before it.
         t: when the view heard of it, UTC [s since 1970].
-        kind: as in the learner's status; null where it does not tell.
+        kind: as in the learner's status; null where learning began again from the prior.
+        told: whether it was told; else the learner found it.
     """
 
     pairs: int
     t: float
     kind: str | None
+    told: bool
 
 
 class Version(msgspec.Struct, frozen=True):
@@ -76,7 +78,7 @@ class Version(msgspec.Struct, frozen=True):
         first_pairs, pairs: pairs learnt when it began, and at last.
         answering: which model.
         model: hash of the newest of them.
-        error_m: its recent prequential error [m].
+        error_m: its error on new pairs [m].
         after_change: whether it began with a change of the tool.
     """
 

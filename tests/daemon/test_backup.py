@@ -272,6 +272,10 @@ def test_a_file_that_is_no_archive_is_refused(file, elsewhere, data) -> None:
     assert f"{file} is no backup, or is damaged" in refused(file, elsewhere)
 
 
+def test_a_device_as_backup_is_refused(elsewhere) -> None:
+    assert "a device, not a file" in refused(Path("/dev/zero"), elsewhere)
+
+
 def test_a_torn_backup_is_refused(backed_up, elsewhere) -> None:
     backed_up.write_bytes(backed_up.read_bytes()[:-100])
     assert "is no backup, or is damaged" in refused(backed_up, elsewhere)
@@ -280,12 +284,11 @@ def test_a_torn_backup_is_refused(backed_up, elsewhere) -> None:
 # --- archives that were made to do harm
 
 
-def described(change: Callable[[str], str], **files: bytes) -> Callable[[dict[str, bytes]], None]:
-    """An archive whose checksums are right, with another robot.toml and with files in the robot's folder."""
+def described(change: Callable[[str], str]) -> Callable[[dict[str, bytes]], None]:
+    """An archive whose checksums are right, with another robot.toml."""
 
     def altered_members(members: dict[str, bytes]) -> None:
         members[ROBOT_TOML] = change(members[ROBOT_TOML].decode()).encode()
-        members |= files
         seal(members)
 
     return altered_members
@@ -302,18 +305,29 @@ def seal(members: dict[str, bytes]) -> None:
 
 HARMFUL = [
     ".git/hooks/post-checkout", ".bashrc", "venv/lib/python3.11/site-packages/evil.pth", "Makefile", "conftest.py",
-    "a/../.ssh/authorized_keys", "a\nb.urdf", "robot.toml", "state/../../arm.urdf", "/etc/cron.d/evil.urdf",
+    "a/../.ssh/authorized_keys", "a\nb.urdf", "state/../../arm.urdf", "/etc/cron.d/evil.urdf",
 ]  # fmt: skip
 
 
 @pytest.mark.parametrize("name", HARMFUL)
 @pytest.mark.parametrize("named", [False, True], ids=["not named by robot.toml", "named as the URDF"])
-def test_a_file_that_could_be_run_is_not_written(backed_up, elsewhere, name, named) -> None:
-    def change(text: str) -> str:
-        return text.replace('"arm.urdf"', json.dumps(name)) if named else text
+def test_an_executable_file_is_not_written(backed_up, elsewhere, name, named) -> None:
+    def plant(members: dict[str, bytes]) -> None:
+        text = members[ROBOT_TOML].decode()
+        if named:
+            members[ROBOT_TOML] = text.replace('"arm.urdf"', json.dumps(name)).encode()
+            del members["robot/arm.urdf"]
+        members[f"robot/{name}"] = members[ROBOT_TOML] if name == "robot.toml" else b"import os"
+        seal(members)
 
-    archive = altered(backed_up, described(change, **{f"robot/{name}": b"import os"}))
-    assert "Nothing was changed" in refused(archive, elsewhere)
+    assert "Nothing was changed" in refused(altered(backed_up, plant), elsewhere)
+
+
+def test_an_encrypted_archive_is_refused(backed_up, elsewhere) -> None:
+    data = bytearray(backed_up.read_bytes())
+    data[data.rindex(b"PK\x01\x02") + 8] |= 1
+    backed_up.write_bytes(data)
+    assert "is no backup, or is damaged" in refused(backed_up, elsewhere)
 
 
 @pytest.mark.parametrize("folder", ["/srv/state", "../state", "a/../../state"])
@@ -327,7 +341,7 @@ def test_a_state_dir_elsewhere_is_asked_for(backed_up, elsewhere, folder, tmp_pa
     assert len(stored(tmp_path / "given" / "pairs.sqlite")) == PAIRS
 
 
-def test_a_state_dir_that_this_robot_has_already_is_not_asked_for(config, file, tmp_path) -> None:
+def test_a_known_state_dir_is_not_asked_for(config, file, tmp_path) -> None:
     config.file.write_text(config.file.read_text().replace('"state"', json.dumps(str(tmp_path / "far"))))
     far = Config.load(config.file, {})
     config.state_dir.rename(far.state_dir)
@@ -379,7 +393,7 @@ def test_endpoints_that_are_none_are_refused(backed_up, elsewhere) -> None:
     assert "zenoh" in refused(archive, elsewhere)
 
 
-def test_a_store_with_a_program_in_it_is_refused(backed_up, elsewhere, tmp_path) -> None:
+def test_a_store_with_a_trigger_is_refused(backed_up, elsewhere, tmp_path) -> None:
     def plant(members: dict[str, bytes]) -> None:
         (tmp_path / "planted").write_bytes(members[STORE])
         with contextlib.closing(sqlite3.connect(tmp_path / "planted")) as connection:
@@ -390,7 +404,7 @@ def test_a_store_with_a_program_in_it_is_refused(backed_up, elsewhere, tmp_path)
     assert "it has a trigger" in refused(altered(backed_up, plant), elsewhere)
 
 
-def test_what_a_disk_changed_is_left_out_of_a_backup_and_told(config, file, elsewhere, capsys) -> None:
+def test_a_backup_leaves_out_changed_pairs(config, file, elsewhere, capsys) -> None:
     with contextlib.closing(sqlite3.connect(config.store_file)) as connection:
         connection.execute("UPDATE pairs SET q = '[0.5,0.5]' WHERE seq IN (3, 4)")
         connection.commit()
@@ -407,7 +421,7 @@ def test_what_a_disk_changed_is_left_out_of_a_backup_and_told(config, file, else
     assert (audit.pairs, audit.newest, audit.lost_rows) == (18, 20, 0)
 
 
-def test_a_damaged_pair_in_an_older_backup_is_left_out(backed_up, elsewhere, tmp_path) -> None:
+def test_restore_leaves_out_changed_pairs(backed_up, elsewhere, tmp_path) -> None:
     def damage(members: dict[str, bytes]) -> None:
         members[STORE] = members[STORE].replace(b"[0.1,0.2,1.0]", b"[0.1,0.3,1.0]")
         seal(members)

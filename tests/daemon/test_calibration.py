@@ -19,7 +19,7 @@ from daemon.checkpoint import write_checkpoint
 from daemon.cli import app
 from daemon.config import Config
 from daemon.learning import DirectSolver, Learning, NominalModel
-from daemon.plausibility import mixed_up
+from daemon.plausibility.check import Plausibility
 from daemon.recordings import of_robot
 from daemon.session import session_of
 from daemon.store import PairStore
@@ -76,7 +76,7 @@ def planted(seed: int, *, pairs: int = 100, sigma: float = SIGMA_M, outliers: in
 
 @functools.cache
 def report_on(arm: Planted) -> CalibrationReport:
-    return CalibrationReport.of(arm.calibrated(), "pairs.csv")
+    return CalibrationReport.of(arm.calibrated(), Plausibility(), "pairs.csv")
 
 
 def test_the_zeros_that_a_noise_free_recording_shows_are_found() -> None:
@@ -290,32 +290,46 @@ def test_angles_in_degrees_are_refused(pairs_file) -> None:
         called(pairs_file)
 
 
-def test_columns_in_another_order_are_named_and_nothing_is_written(pairs_file, tmp_path) -> None:
+def test_exchanged_columns_are_refused_and_nothing_written(pairs_file, tmp_path) -> None:
     written_as(pairs_file, order=(1, 0, 2, 3))
-    said_why = r"nothing was written. .*With the columns base_yaw and shoulder_pitch exchanged, the pairs would fit to"
-    with pytest.raises(CalibrationError, match=said_why):
+    with pytest.raises(RecordingError, match=r"it seems that the columns base_yaw and shoulder_pitch are exchanged"):
         called(pairs_file, "--out", tmp_path / "calibrated")
     assert not (tmp_path / "calibrated").exists()
 
 
-def test_a_joint_that_counts_the_other_way_is_named() -> None:
-    arm = planted(2)
-    q = arm.recording.q * [1.0, -1.0, 1.0, 1.0]
-    assert "With shoulder_pitch counting the other way, the pairs" in (
-        mixed_up(arm.robot, Recording(arm.robot.joints, q, arm.recording.x)) or ""
-    )
+def test_force_writes_what_is_refused(pairs_file, tmp_path, capsys) -> None:
+    written_as(pairs_file, order=(1, 0, 2, 3))
+    called(pairs_file, "--out", tmp_path / "calibrated", "--force")
+    assert "the columns base_yaw and shoulder_pitch are exchanged" in capsys.readouterr().out.replace("\n", " ")
+    assert (tmp_path / "calibrated" / "robot.toml").exists()
 
 
-def test_columns_that_are_right_are_not_said_to_be_mixed_up() -> None:
-    arm = planted(3)
-    assert mixed_up(arm.robot, arm.recording) is None
-
-
-def test_positions_of_no_arm_are_doubted_without_a_cause() -> None:
+def test_a_zero_far_beyond_its_tolerance_is_not_written(pairs_file, tmp_path) -> None:
     arm = planted(1)
-    x = 0.2 * np.random.default_rng(0).normal(size=(100, 3))
-    doubt = report_on(dataclasses.replace(arm, recording=Recording(arm.robot.joints, arm.recording.q, x))).doubt
-    assert "Is the recording of another robot" in (doubt or "")
+    change = arm.change.copy()
+    change[arm.parameters.zeros] += [0.0, np.radians(25.0), 0.0, 0.0]
+    q = arm.recording.q
+    Recording(arm.robot.joints, q, arm.parameters.positions(change, q)).write_csv(pairs_file)
+    with pytest.raises(CalibrationError, match=r"nothing was written. .* zero of shoulder_pitch comes out .* --force"):
+        called(pairs_file, "--out", tmp_path / "calibrated")
+    assert not (tmp_path / "calibrated").exists()
+
+
+def test_a_zero_as_far_off_as_was_told_is_written(pairs_file, tmp_path) -> None:
+    called(pairs_file, "--out", tmp_path / "calibrated", "--zeros-deg", 10)
+    assert (tmp_path / "calibrated" / "robot.toml").exists()
+
+
+def test_links_worse_than_any_are_not_written(pairs_file, tmp_path) -> None:
+    arm = planted(1)
+    change, rng = arm.change.copy(), np.random.default_rng(0)
+    change[arm.parameters.shifts] += 0.15 * rng.normal(size=8)
+    change[arm.parameters.tilts] += 0.3 * rng.normal(size=8)
+    q = arm.recording.q
+    Recording(arm.robot.joints, q, arm.parameters.positions(change, q)).write_csv(pairs_file)
+    with pytest.raises((CalibrationError, RecordingError), match=r"of another arm|hardly of this robot"):
+        called(pairs_file, "--out", tmp_path / "calibrated")
+    assert not (tmp_path / "calibrated").exists()
 
 
 # --- pairs of two tools

@@ -1,12 +1,18 @@
 from __future__ import annotations
 
+import hashlib
+import math
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 from guided_arm import Scene, new_learning, teach
 
-from daemon.checkpoint import CheckpointError, generations, read_checkpoint, set_aside, write_checkpoint
+from daemon.checkpoint import LARGEST_BYTES, CheckpointError, generations, read_checkpoint, set_aside, write_checkpoint
+from daemon.going_on import go_on
 from daemon.learning import LearningState
 
 UTC = "2026-11-21T12:00:00.000+00:00"
@@ -87,7 +93,7 @@ def test_a_file_system_without_hard_links_keeps_the_previous_too(written, old, n
 @pytest.mark.parametrize("name", ["net_nlms", "q", "x"])
 def test_a_state_with_a_number_that_is_not_finite_is_not_written(written, old, new, name) -> None:
     poisoned = {**new.arrays, name: np.full_like(new.arrays[name], np.nan)}
-    with pytest.raises(CheckpointError, match=f"was not written: {name} of the state is not finite"):
+    with pytest.raises(CheckpointError, match=f"was not written: {name} is not finite"):
         write(written, LearningState(new.header, poisoned))
     assert same(old, read_checkpoint(written, robot="arm"))
 
@@ -148,3 +154,112 @@ def test_what_is_set_aside_is_kept_beside_what_was_before(written) -> None:
     second = set_aside(written)
     assert (first.read_bytes(), second.read_bytes()) == (content, b"second")
     assert not written.exists()
+
+
+# --- checksums that are right, of headers that are not
+
+
+def sealed(file: Path, change: Callable[[dict[str, Any]], None], arrays: Callable[[bytes], bytes] = bytes) -> Path:
+    """The checkpoint with another header and other arrays, and the checksum that goes with them."""
+    data = file.read_bytes()
+    end = 16 + int.from_bytes(data[12:16], "little")
+    header = msgspec.msgpack.decode(data[16:end])
+    change(header)
+    encoded = msgspec.msgpack.encode(header)
+    body = data[:12] + len(encoded).to_bytes(4, "little") + encoded + arrays(data[end:-16])
+    file.write_bytes(body + hashlib.blake2b(body, digest_size=16).digest())
+    return file
+
+
+@pytest.mark.parametrize("shape", [[-1, -1], [-8], [2**62, 2**62], [0, 2**63 - 1], [1] * 70, [1.5], None, ["1"], [[1]]])
+def test_an_array_that_cannot_be_is_refused(written, shape) -> None:
+    def change(header: dict[str, Any]) -> None:
+        header["arrays"][0]["shape"] = shape
+
+    with pytest.raises(CheckpointError, match=str(written)):
+        read_checkpoint(sealed(written, change), robot="arm")
+
+
+def test_shapes_that_cancel_are_refused(written) -> None:
+    def change(header: dict[str, Any]) -> None:
+        first, second, *_ = header["arrays"]
+        first["shape"], second["shape"] = [-1], [math.prod(first["shape"]) + math.prod(second["shape"]) + 1]
+
+    with pytest.raises(CheckpointError, match="cannot be understood"):
+        read_checkpoint(sealed(written, change), robot="arm")
+
+
+def test_a_header_of_many_layers_is_refused(written) -> None:
+    def change(header: dict[str, Any]) -> None:
+        for _ in range(400):
+            header["learning"] = {**header["learning"], "before": dict(header["learning"])}
+
+    with pytest.raises(CheckpointError):
+        read_checkpoint(sealed(written, change, lambda _: b""), robot="arm")
+
+
+@pytest.mark.parametrize(("name", "number"), [("q", 1e7), ("q", 1e308), ("x", 2000.0), ("x", -1e308)])
+def test_impossible_kept_pairs_are_refused(written, old, name, number) -> None:
+    arrays = {**old.arrays, name: np.full_like(old.arrays[name], number)}
+    data = b"".join(np.ascontiguousarray(array, dtype="<f8").tobytes() for array in arrays.values())
+    sealed(written, lambda header: None, lambda _: data)
+    learning, said = go_on(new_learning, written, "arm")
+    assert learning.counters.pairs == 0
+    assert said is not None
+    assert f"{name} is not finite or too large" in said
+
+
+@pytest.mark.parametrize("endless", ["/dev/zero", "/dev/urandom"])
+def test_a_device_as_checkpoint_is_refused(file, endless) -> None:
+    file.parent.mkdir()
+    file.symlink_to(endless)
+    with pytest.raises(CheckpointError, match="a device, not a file"):
+        read_checkpoint(file, robot="arm")
+
+
+def test_a_huge_checkpoint_is_refused_unread(file) -> None:
+    file.parent.mkdir()
+    with file.open("wb") as stream:
+        stream.truncate(LARGEST_BYTES + 1)
+    with pytest.raises(CheckpointError, match="cannot read the checkpoint"):
+        read_checkpoint(file, robot="arm")
+
+
+def test_a_folder_as_checkpoint_is_refused(file) -> None:
+    file.mkdir(parents=True)
+    with pytest.raises(CheckpointError, match="cannot read the checkpoint"):
+        read_checkpoint(file, robot="arm")
+
+
+NASTY = (0, -1, 2**63 - 1, -(2**63), 1e308, math.nan, None, "", "\0", b"\xff", [], [[]], {}, True, [1e308] * 3)
+
+
+def altered(value: Any, rng: np.random.Generator) -> Any:
+    """The same with something nasty somewhere in it."""
+    if isinstance(value, dict) and value and ("learning" in value or rng.random() < 0.9):
+        key = list(value)[rng.integers(len(value))]
+        return {**value, key: altered(value[key], rng)}
+    if isinstance(value, list) and value and rng.random() < 0.9:
+        place = int(rng.integers(len(value)))
+        return [*value[:place], altered(value[place], rng), *value[place + 1 :]]
+    return NASTY[rng.integers(len(NASTY))]
+
+
+def go_on_from_nasty_headers(written: Path, count: int) -> None:
+    """A learner goes on, or says why it does not."""
+    data, rng = written.read_bytes(), np.random.default_rng(0)
+    for _ in range(count):
+        written.write_bytes(data)
+        sealed(written, lambda header: header.update(altered(header, rng)))
+        learning, _ = go_on(new_learning, written, "arm")
+        assert learning.counters.pairs >= 0
+        learning.state()
+
+
+def test_a_harmful_header_ends_no_learner(written) -> None:
+    go_on_from_nasty_headers(written, 40)
+
+
+@pytest.mark.soak
+def test_ten_thousand_harmful_headers_end_no_learner(written) -> None:
+    go_on_from_nasty_headers(written, 10_000)

@@ -14,12 +14,15 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
+from daemon import store_schema
 from daemon.bus import Request
+from daemon.doctor import store_checks
 from daemon.history import answer_pairs
 from daemon.recordings import from_store
 from daemon.retention import Keep
 from daemon.store import PairReader, PairStore, Session, leave_out_damage
 from daemon.store_damage import LEFT_FREE, Damage
+from daemon.store_rows import COLUMNS, checksum
 from daemon.wire import JSON, PairsReply, decode, pair_to_wire
 from interfaces.errors import RecordingError, StoreError
 from interfaces.records import MarkerFix, frozen_array
@@ -99,13 +102,13 @@ def test_one_changed_value_costs_one_pair(file, column, seq) -> None:
         assert reader.audit().damage == Damage(((seq, seq),))
     with PairStore(file, SESSION) as store:
         assert f"1 pair of {file} cannot be read" in store.complaints[0]
-        assert f"goes on without number {seq}." in store.complaints[0]
+        assert f"It is left out (number {seq})." in store.complaints[0]
         add(store, 1)
         assert numbers(store)[-1] == PAIRS + 1
 
 
 @pytest.mark.parametrize("damage", ["x'ff'", "'[1,2'", "'[null,0.1]'", "'[1e999,0.1]'", "5", "''"])
-def test_a_row_that_is_no_pair_is_left_out(file, damage) -> None:
+def test_an_unreadable_row_is_left_out(file, damage) -> None:
     alter(file, f"UPDATE pairs SET q = {damage} WHERE seq = 7")
     with PairStore(file, SESSION) as store:
         assert 7 not in numbers(store)
@@ -116,18 +119,18 @@ def test_a_missing_number_is_told_and_passed_over(file) -> None:
     alter(file, "DELETE FROM pairs WHERE seq BETWEEN 5 AND 6")
     with PairStore(file, SESSION) as store:
         assert "2 pairs of" in store.complaints[0]
-        assert "number 5 to 6" in store.complaints[0]
+        assert "(numbers 5 to 6)" in store.complaints[0]
 
 
-def test_damage_that_comes_while_the_store_is_open_is_told(file) -> None:
+def test_damage_to_an_open_store_is_told(file) -> None:
     with PairStore(file, SESSION) as store:
         assert store.complaints == []
         alter(file, "UPDATE pairs SET x = replace(x, '2', '3') WHERE seq = 7")
         assert 7 not in numbers(store)
-        assert "without number 7." in store.complaints[0]
+        assert "(number 7)" in store.complaints[0]
 
 
-def test_damage_that_was_deleted_with_old_pairs_is_no_longer_told(file) -> None:
+def test_deleted_damage_is_no_longer_told(file) -> None:
     alter(file, "UPDATE pairs SET x = replace(x, '2', '3') WHERE seq = 7")
     with PairStore(file, SESSION) as store:
         while store.trim(Keep(None, 0.0, 10), "2026-01-02T00:00:00"):
@@ -174,12 +177,15 @@ def leaves(file: Path) -> list[int]:
     return [k for k, page in enumerate(pages, 1) if page[0] == 0x0D and page.count(b"2026-01-01T00:00:") > 2]
 
 
-def test_a_lost_page_costs_its_own_pairs_and_the_file_is_kept(long) -> None:
+def test_a_lost_page_costs_its_own_pairs(long) -> None:
     page = leaves(long)[4]
     zero(long, page)
     damaged = long.read_bytes()
     with PairReader(long) as reader:
         readable = numbers(reader)
+        assert reader.audit().damage.count == LONG - len(readable)
+    assert len(from_store(long)) == len(readable)
+    assert [check.state for check in store_checks(long)] == ["wrong"]
     assert len(readable) > LONG - 30
     with PairStore(long, SESSION) as store:
         assert numbers(store) == readable
@@ -195,12 +201,24 @@ def test_a_lost_page_costs_its_own_pairs_and_the_file_is_kept(long) -> None:
         assert store.complaints == [left_out]
 
 
-def test_numbers_of_a_lost_end_are_not_given_again(long) -> None:
+def test_lost_numbers_are_not_given_again(long) -> None:
     zero(long, leaves(long)[-1])
     with PairStore(long, SESSION) as store:
         newest = numbers(store)[-1]
         add(store, 1)
         assert numbers(store)[-1] == newest + LEFT_FREE + 1 > LONG + 1
+
+
+@pytest.mark.parametrize("place", [0, -1])
+def test_readers_get_pairs_beside_a_lost_end(long, place) -> None:
+    zero(long, leaves(long)[place])
+    with PairReader(long) as reader:
+        readable = numbers(reader)
+        assert len(readable) > LONG - 30
+        assert reader.last_seq() == readable[-1]
+        assert reader.last().seq == readable[-1]
+        page = decode(answer_pairs(reader, Request({}, b"", JSON)), PairsReply)
+    assert [pair.seq for pair in page.pairs] == readable == list(from_store(long).t.astype(int) + 1)
 
 
 def test_several_lost_pages_cost_their_own_pairs(long) -> None:
@@ -211,7 +229,7 @@ def test_several_lost_pages_cost_their_own_pairs(long) -> None:
         assert LONG - 3 * 30 < len(numbers(store)) < LONG
 
 
-def test_a_lost_identity_is_replaced_and_every_pair_kept(file) -> None:
+def test_a_lost_identity_costs_no_pair(file) -> None:
     alter(file, "UPDATE meta SET value = replace(value, '-', '+') WHERE key = 'store'")
     with (
         pytest.raises(StoreError, match="Start the sampler: it puts the pairs"),
@@ -311,7 +329,7 @@ def flips(file: Path, tmp_path: Path) -> Iterator[Flips]:
     print(dict(sorted(done.outcomes.items())))
 
 
-def test_a_flipped_bit_costs_at_most_its_own_pair(flips) -> None:
+def test_a_flipped_bit_costs_one_pair_at_most(flips) -> None:
     for bit in np.random.default_rng(0).choice(flips.bits, 25, replace=False).tolist():
         flips.flip(bit)
     assert flips.outcomes["_open lost"] > 1
@@ -319,7 +337,108 @@ def test_a_flipped_bit_costs_at_most_its_own_pair(flips) -> None:
 
 @pytest.mark.soak
 @pytest.mark.timeout(7200)
-def test_every_flipped_bit_costs_at_most_its_own_pair(flips) -> None:
+def test_every_flipped_bit_costs_one_pair_at_most(flips) -> None:
     for bit in range(0, flips.bits, 7):  # each byte, and each place in a byte
         flips.flip(bit)
     assert flips.outcomes["_open lost"] > 1000
+
+
+# --- stores that somebody else made
+
+
+def remade(file: Path, *statements: str) -> Path:
+    with contextlib.closing(sqlite3.connect(file)) as connection:
+        for statement in statements:
+            connection.execute(statement)
+        connection.commit()
+    return file
+
+
+LOOP = "WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n) SELECT"
+HOSTILE = {
+    "a view that never ends": (
+        "ALTER TABLE pairs RENAME TO old",
+        f"CREATE VIEW pairs AS {LOOP} i AS seq, 1 AS session, 1 AS segment, 0.5 AS t, '' AS utc, '[0,0]' AS q, "
+        "'[0,0,0]' AS x, '[0,0,0,0,0,0]' AS cov, NULL AS centres_px, NULL AS R, NULL AS cov_R, 0 AS checksum FROM n",
+    ),
+    "a trigger": ("CREATE TRIGGER t AFTER INSERT ON pairs BEGIN DELETE FROM pairs; END",),
+    "a computed column": ("ALTER TABLE pairs ADD COLUMN y AS (q || q)",),
+    "a further column": ("ALTER TABLE pairs ADD COLUMN y TEXT",),
+    "a virtual table": ("DROP TABLE pairs", "CREATE VIRTUAL TABLE pairs USING fts4(seq, q, x)"),
+    "no pairs": ("DROP TABLE pairs",),
+    "no meta": ("DROP TABLE meta",),
+    "no joints": ("DELETE FROM meta WHERE key = 'joints'",),
+    "joints that are numbers": ("UPDATE meta SET value = '[1,2]' WHERE key = 'joints'",),
+    "joints of many lines": ("UPDATE meta SET value = '[\"a\\nb\",\"c\"]' WHERE key = 'joints'",),
+    "an older schema than its tables": ("PRAGMA user_version = 4",),
+    "a schema below zero": ("PRAGMA user_version = -1",),
+}
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_a_store_of_other_tables_is_refused(file, name) -> None:
+    remade(file, *HOSTILE[name])
+    with pytest.raises(StoreError, match=str(file)):
+        from_store(file)
+
+
+def test_every_reader_refuses_a_store_with_a_program(file) -> None:
+    remade(file, *HOSTILE["a trigger"])
+    for use in (from_store, lambda file: leave_out_damage(file, JOINTS), lambda file: list(store_checks(file))):
+        with pytest.raises(StoreError, match="it has a trigger"):
+            use(file)
+    with pytest.raises(StoreError, match="it has a trigger"), PairStore(file, SESSION):
+        pass
+
+
+VALUES = (
+    "x'00'",
+    "1",
+    "'x'",
+    "NULL",
+    "9e999",
+    "-1",
+    "zeroblob(1000000)",
+    "'[1e999,0]'",
+    "'[' || hex(zeroblob(99)) || ']'",
+)
+
+
+@pytest.mark.parametrize("column", COLUMNS["pairs"].split(", "))
+@pytest.mark.parametrize("value", VALUES)
+def test_a_wrong_type_costs_its_own_pair(file, column, value) -> None:
+    with contextlib.suppress(sqlite3.IntegrityError):
+        remade(file, f"UPDATE pairs SET {column} = {value} WHERE seq = 7")
+    assert len(from_store(file)) >= PAIRS - 1
+
+
+def test_sealed_nonsense_costs_its_own_pairs(file) -> None:
+    """Their checksums are right: whoever made them knew how."""
+    rng = np.random.default_rng(0)
+    with contextlib.closing(store_schema.connect(file)) as connection:
+        for seq in range(1, PAIRS):
+            column = COLUMNS["pairs"].split(", ")[rng.integers(1, 11)]
+            with contextlib.suppress(sqlite3.IntegrityError):
+                connection.execute(f"UPDATE pairs SET {column} = {rng.choice(VALUES)} WHERE seq = ?", (seq,))
+            row = connection.execute(f"SELECT {COLUMNS['pairs']} FROM pairs WHERE seq = ?", (seq,)).fetchone()
+            connection.execute("UPDATE pairs SET checksum = ? WHERE seq = ?", (checksum(row), seq))
+    recording = from_store(file)
+    assert np.isfinite(recording.q).all()
+    assert np.isfinite(recording.x).all()
+    with PairStore(file, SESSION) as store:
+        add(store, 1)
+        assert numbers(store)[-1] == PAIRS + 1
+
+
+def test_reading_circular_pages_ends(long) -> None:
+    data = bytearray(long.read_bytes())
+    root = next(k for k in range(PAGE_BYTES, len(data), PAGE_BYTES) if data[k] == 0x05)
+    cells = int.from_bytes(data[root + 3 : root + 5], "big")
+    for cell in range(cells):  # each leads to the first leaf
+        at = root + int.from_bytes(data[root + 12 + 2 * cell : root + 14 + 2 * cell], "big")
+        data[at : at + 4] = leaves(long)[0].to_bytes(4, "big")
+    long.write_bytes(data)
+    with PairReader(long) as reader:
+        assert 0 < len(numbers(reader)) < LONG
+    with PairStore(long, SESSION) as store:
+        assert 0 < len(numbers(store)) < LONG

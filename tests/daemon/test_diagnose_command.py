@@ -304,6 +304,12 @@ def test_a_recording_of_other_joints_is_refused(file, tmp_path) -> None:
     assert "elbow_pitch" in refused(tmp_path / "other.csv", "--robot", DESK_ARM)
 
 
+def test_a_refused_recording_leaves_no_folder(recording, tmp_path) -> None:
+    file = written(recording, tmp_path, q=-recording.q)
+    refused(file, "--robot", DESK_ARM, "--out", tmp_path / "found" / "here")
+    assert not (tmp_path / "found").exists()
+
+
 def test_degrees_are_seen(recording, tmp_path) -> None:
     file = written(recording, tmp_path, q=np.degrees(recording.q))
     assert "these look like degrees" in refused(file, "--robot", DESK_ARM)
@@ -323,23 +329,23 @@ def test_times_in_another_unit_are_seen(recording, tmp_path, unit, factor) -> No
 
 def test_all_joints_that_count_the_other_way_are_told_together(recording, tmp_path) -> None:
     line = refused(written(recording, tmp_path, q=-recording.q), "--robot", DESK_ARM)
-    assert "all joints counting the other way" in line
+    assert "all joints count the other way" in line
 
 
 @pytest.mark.parametrize("axis", range(3))
 def test_positions_in_a_left_handed_frame_are_seen(recording, tmp_path, axis) -> None:
     x = recording.x * np.where(np.arange(3) == axis, -1.0, 1.0)
-    assert "the positions mirrored" in refused(written(recording, tmp_path, x=x), "--robot", DESK_ARM)
+    assert "the positions are mirrored" in refused(written(recording, tmp_path, x=x), "--robot", DESK_ARM)
 
 
 def test_a_mirrored_joint_is_seen(recording, tmp_path) -> None:
     file = written(recording, tmp_path, q=recording.q * [1, -1, 1, 1])
-    assert "counting the other way" in refused(file, "--robot", DESK_ARM)
+    assert "shoulder_pitch counts the other way" in refused(file, "--robot", DESK_ARM)
 
 
 def test_exchanged_columns_are_seen(recording, tmp_path) -> None:
     file = written(recording, tmp_path, q=recording.q[:, [0, 2, 1, 3]])
-    assert "the columns shoulder_pitch and elbow_pitch exchanged" in refused(file, "--robot", DESK_ARM)
+    assert "the columns shoulder_pitch and elbow_pitch are exchanged" in refused(file, "--robot", DESK_ARM)
 
 
 def test_positions_that_have_nothing_to_do_with_the_arm_are_refused(recording, tmp_path) -> None:

@@ -217,14 +217,14 @@ def test_a_sound_store_is_told_to_be_sound(stored) -> None:
     assert (check.state, check.said) == ("ok", f"all 5 pairs in {stored} are as they were written")
 
 
-def test_a_pair_that_the_disk_changed_is_told_by_number(stored) -> None:
+def test_a_changed_pair_is_told_by_number(stored) -> None:
     check = changed(stored, "UPDATE pairs SET q = '[0.3]' WHERE seq = 3")
     assert check.state == "warning"
     assert "1 pair of" in check.said
-    assert "without number 3." in check.said
+    assert "(number 3)" in check.said
 
 
-def test_a_note_that_the_disk_changed_is_told(stored) -> None:
+def test_a_changed_note_is_told(stored) -> None:
     assert "1 notes on runs or servos" in changed(stored, "UPDATE sessions SET host = 'there'").said
 
 

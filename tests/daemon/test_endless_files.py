@@ -10,13 +10,16 @@ import numpy as np
 import pytest
 from small_arm import write_small_arm
 
+from daemon import store_schema
+from daemon.backup import Backup
 from daemon.config import Config
 from daemon.identity import Identity, TlsConfig
 from daemon.servo_fitting import read_scan
+from daemon.store import PairReader
 from daemon.wiggling import read_wiggle
 from effects.files import load_simulation
 from interfaces import recording_csv
-from interfaces.errors import BodyschemaError, ConfigError, RecordingError
+from interfaces.errors import BodyschemaError, ConfigError, RecordingError, StoreError
 from interfaces.limited import UnfitFile, read_at_most
 from interfaces.recording import Recording
 from interfaces.toml_file import read_toml
@@ -66,6 +69,8 @@ READERS: dict[str, Callable[[Path], object]] = {
     "scan.json": read_scan,
     "times.txt": lambda file: read_times(file, 3),
     "wiggle.csv": lambda file: read_wiggle(file, JOINTS),
+    "pairs.sqlite": lambda file: PairReader(file).__enter__(),
+    "a.zip": lambda file: Backup(file).__enter__(),
     "ca.pem": lambda file: Identity.of(TlsConfig(ca=file.name), None, None, file.parent),
 }
 
@@ -81,6 +86,18 @@ def test_no_reader_takes_a_file_without_end(tmp_path: Path, name: str, make: Cal
 @pytest.mark.parametrize("make", MADE)
 def test_no_image_is_read_from_a_file_without_end(tmp_path: Path, make: Callable[[Path], None]) -> None:
     make(tmp_path / "a.png")
+    assert read_image(tmp_path / "a.png") is None
+
+
+@pytest.mark.parametrize("make", [a_device, a_pipe, a_folder])
+def test_no_store_is_opened_where_something_else_is(tmp_path: Path, make: Callable[[Path], None]) -> None:
+    make(tmp_path / "pairs.sqlite")
+    with pytest.raises(StoreError, match="is not a file"):
+        store_schema.connect(tmp_path / "pairs.sqlite")
+
+
+def test_an_image_of_more_pixels_than_memory_is_none(tmp_path: Path) -> None:
+    (tmp_path / "a.png").write_bytes(b"P6\n40000 40000\n255\n" + bytes(100))
     assert read_image(tmp_path / "a.png") is None
 
 
@@ -126,7 +143,7 @@ def test_texts_with_many_full_stops_are_no_keys(tmp_path: Path) -> None:
     ("data", "said"),
     [
         (bytes(3 * 2**20), "line 1: the line is longer than 1 MiB"),
-        (bytes(100), r"line 1: the first line has the character '\\x00'"),
+        (bytes(100), r"line 1: this is not a text file: its first line has the character '\\x00'"),
         (HEADER + b"0,0,1,2,3\n" * 3 + bytes(3 * 2**20), "line 5: the line is longer than 1 MiB"),
         (HEADER + b"0,0,1,2,3\n" * 3 + b"\0,0,1,2,3\n", r"line 5, column waist: '\\x00' is not a number"),
         (b"a" * 10_000 + b"," + HEADER, "a column's name has 10,000 characters"),

@@ -1,6 +1,8 @@
 from __future__ import annotations
 
+import contextlib
 import json
+import sqlite3
 import sys
 from pathlib import Path
 
@@ -127,8 +129,21 @@ def test_a_store_in_use_is_exported_without_robot_toml(tmp_path: Path, store: Pa
     assert "1 pairs" in capsys.readouterr().out
 
 
+def test_an_export_tells_unreadable_pairs(tmp_path: Path, store: PairStore, caplog) -> None:
+    for k in range(4):
+        fix = MarkerFix(1.5 + k, np.array([1.0, 2, 3]), np.eye(3) * 1e-6)
+        store.append(7, "2026-01-01T00:00:00Z", np.array([0.1, 0.2]), fix)
+    with contextlib.closing(sqlite3.connect(store.file)) as connection:
+        connection.execute("UPDATE pairs SET t = t + 1 WHERE seq IN (2, 4)")
+        connection.commit()
+    export(store.file, tmp_path / "a.csv")
+    assert len(Recording.read(tmp_path / "a.csv", JOINTS)) == 2
+    assert f"2 pairs of {store.file} cannot be read" in caplog.text
+    assert "(numbers 2, 4)" in caplog.text
+
+
 def test_an_empty_store_is_said_to_be_empty(tmp_path: Path, store: PairStore) -> None:
-    with pytest.raises(RecordingError, match="no pairs yet"):
+    with pytest.raises(RecordingError, match="the store has no pairs"):
         export(tmp_path / "pairs.sqlite", tmp_path / "a.csv")
 
 

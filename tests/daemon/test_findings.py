@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from guided_arm import Scene, make_pair, near, new_learning, teach
+from guided_arm import NOW_AND_THEN, Scene, make_pair, near, new_learning, teach
 from test_calibration import DESK_ARM, figures_of
 
 import daemon.findings
@@ -14,7 +14,6 @@ from daemon.chain_figures import is_told, no_surer_than_possible
 from daemon.config import LearnerConfig
 from daemon.findings import EVERY_S, SHARE, Findings, FindingTurns, figures
 from daemon.learning import DirectSolver, Learning, NominalModel
-from daemon.learning.learning import REGION_RAD
 from daemon.learning.outlook import Known, Scatter, foreseen
 from daemon.status import Outlook
 from interfaces.records import FloatArray
@@ -78,7 +77,7 @@ class Planted:
         x = self.parameters.positions(self.change, q) + SIGMA_M * rng.normal(size=(pairs, 3))
         for k in range(pairs):
             self.learning.learn(make_pair(first + k, q[k], x[k], SIGMA_M), 0.0)
-            if k < 20:
+            if k < 20 and k % 5 == 4:
                 self.solve()
         self.solve()
         self.learning.learn(make_pair(first + pairs, q[0], x[0], SIGMA_M), 0.0)
@@ -128,7 +127,7 @@ def covered_after_another_tool(seed: int) -> list[bool]:
 
 
 def test_the_intervals_cover_what_was_planted_after_a_tool_change_too() -> None:
-    assert np.mean([inside for seed in range(3) for inside in covered_after_another_tool(seed)]) > 0.8
+    assert np.mean([inside for seed in range(2) for inside in covered_after_another_tool(seed)]) > 0.8
 
 
 def test_freeing_what_nothing_shows_leaves_every_position_where_it_is() -> None:
@@ -186,12 +185,12 @@ def test_the_noise_is_the_scatter_of_the_pairs() -> None:
 def outlook_of(learning: Learning) -> Outlook:
     known = learning.known()
     assert known is not None
-    return foreseen(known, Scatter.of(known), NAMES, REGION_RAD)
+    return foreseen(known, Scatter.of(known), NAMES)
 
 
 def guided(seed: int, pairs: int) -> tuple[Learning, Scene]:
     scene, learning = Scene.draw(seed, pairs), new_learning()
-    teach(learning, scene.pairs)
+    teach(learning, scene.pairs, every=NOW_AND_THEN)
     return learning, scene
 
 
@@ -201,7 +200,7 @@ def after_60() -> list[tuple[Learning, Scene, Outlook]]:
     found = []
     for seed in range(5):
         scene, learning = Scene.draw(seed, 160), new_learning()
-        teach(learning, scene.pairs[:60])
+        teach(learning, scene.pairs[:60], every=NOW_AND_THEN)
         found.append((learning, scene, outlook_of(learning)))
     return found
 
@@ -217,10 +216,15 @@ def test_the_expected_error_is_the_true_one(after_60) -> None:
     assert 0.6 < np.exp(np.mean(np.log(ratios))) < 1.7
 
 
+def test_the_expected_error_is_the_claimed_one(after_60) -> None:
+    for learning, _, outlook in after_60:
+        assert outlook.error_m == pytest.approx(learning.claimed_error_m(), rel=1e-12)
+
+
 def test_what_is_foreseen_of_further_pairs_comes(after_60) -> None:
     ratios = []
     for learning, scene, outlook in after_60:
-        teach(learning, scene.pairs[60:])
+        teach(learning, scene.pairs[60:], every=NOW_AND_THEN)
         ratios.append(outlook.like_so_far_m[0] / true_error_m(learning, scene, 60))
     assert 0.5 < np.exp(np.mean(np.log(ratios))) < 2.0
 
@@ -241,7 +245,7 @@ def test_of_an_arm_that_moved_few_joints_other_motions_gain_more() -> None:
     q = scene.q * np.array([1.0, 1.0, 0.05, 1.0])
     rng = np.random.default_rng(0)
     x = scene.chain.positions(q) + 0.002 * rng.normal(size=(80, 3))
-    teach(learning, [make_pair(k + 1, q[k], x[k]) for k in range(80)])
+    teach(learning, [make_pair(k + 1, q[k], x[k]) for k in range(80)], every=NOW_AND_THEN)
     outlook = outlook_of(learning)
     assert outlook.best_motion != "going on as so far"
     assert outlook.best_motion_m[-1] < outlook.like_so_far_m[-1]

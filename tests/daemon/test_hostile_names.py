@@ -69,6 +69,11 @@ def test_an_image_has_a_size_that_a_sensor_can_have(tmp_path: Path, value: str, 
             "line 4: the axis of joint 'shoulder' has the length 1e-200",
         ),
         ('<axis xyz="0 1 0"/>', '<axis xyz="0 1e-12 0"/>', "line 4: the axis of joint 'shoulder' has the length"),
+        (
+            'type="revolute"><parent link="base"/><child link="upper"/><axis xyz="0 0 1"/>\n<limit lower="-3"',
+            'type="prismatic"><parent link="base"/><child link="upper"/><axis xyz="0 0 1"/>\n<limit lower="-1e308"',
+            "line 3: <limit> of joint 'waist' lets it slide 1e.308 m away. Give metres",
+        ),
         ('"0.3 0 0"', '"1e300 0 0"', "line 4: the <origin> of joint 'shoulder' is 1e.300 m away. Give metres"),
     ],
 )

@@ -119,7 +119,7 @@ def test_errors_that_come_together_weigh_as_one_after_the_other() -> None:
     together.add(errors, variances, ratios)
     for row in range(9):
         each.add(errors[row : row + 1], variances[row : row + 1], ratios[row : row + 1])
-    found = [[m.weight, m.distance, *m.square, *m.noise, m.ratio] for m in (together, each)]
+    found = [[m.weight, *m.square, *m.noise, m.ratio] for m in (together, each)]
     np.testing.assert_allclose(*found, rtol=1e-12)
 
 

@@ -186,8 +186,8 @@ def test_the_report_says_how_far_orientations_are_off_where_there_are_any() -> N
     assert max(map(len, as_text(report(angle=angle), 80).splitlines())) <= 80
 
 
-def test_a_doubt_about_the_recording_takes_the_place_of_the_verdict() -> None:
-    assert "So far apart." in as_text(report(doubt="So far apart."))
+def test_a_doubt_about_the_recording_is_a_warning() -> None:
+    assert as_text(report(doubt="So far apart.")).endswith("Warning: So far apart.")
 
 
 def test_a_guided_recording_is_learnt_by_the_two_processes(tmp_path: Path, robot: Path) -> None:

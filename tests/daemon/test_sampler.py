@@ -1,6 +1,8 @@
 from __future__ import annotations
 
+import contextlib
 import json
+import sqlite3
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -26,6 +28,7 @@ from daemon.wire import MSGPACK, CommandRequest, PairMessage, PairsReply, decode
 from interfaces.clock import SystemClock
 from interfaces.errors import BusError, ConfigError, RequestError, SourceError, SourceLost, StoreError
 from interfaces.records import JointReading, MarkerFix, MarkerMiss, Pair, Reason, frozen_array
+from interfaces.rejections import REMEDIES
 
 LIMIT_S = 500.0
 KEYS = Keys("arm")
@@ -423,6 +426,15 @@ def test_silent_sources_are_reported(config, monkeypatch) -> None:
 # --- how sure the time is
 
 
+def test_frames_refused_for_one_reason_are_a_complaint(config) -> None:
+    walk, held = Walk(config.robot, 40), threading.Event()
+    misses = [MarkerMiss(fix.t, Reason.SIZE_MISMATCH) for fix in walk.fixes]
+    with running(config, walk.sources(fixes=[*misses, held])) as bus:
+        status = status_when(bus, lambda status: bool(status.health))
+        held.set()
+    assert status.health == [f"40 of the last 40 frames were rejected: size mismatch. {REMEDIES[Reason.SIZE_MISMATCH]}"]
+
+
 def test_joints_too_fast_for_their_readings_make_no_pairs(config) -> None:
     walk = Walk(config.robot, 20)
     late = [replace(reading, t_sigma=0.01) for reading in walk.readings]
@@ -446,3 +458,18 @@ def test_the_same_joints_make_pairs_where_the_time_is_known_well(config) -> None
     walk = Walk(config.robot, 20)
     pairs, _ = sample(config, walk.sources(fixes=uncertain(walk, 0.001)))
     assert len(pairs) == 16
+
+
+@pytest.mark.parametrize("column", ["q", "x", "t", "segment"])
+def test_a_changed_pair_stops_no_sampler(config, column) -> None:
+    walk = Walk(config.robot, 20)
+    sample(config, walk.sources())
+    with contextlib.closing(sqlite3.connect(config.store_file)) as connection:
+        value = f"'x' || {column}" if column in "qx" else f"{column} + 1"
+        connection.execute(f"UPDATE pairs SET {column} = {value} WHERE seq = 7")
+        connection.commit()
+    pairs, status = sample(config, walk.sources())
+    assert status.unreadable == 1
+    assert any("cannot be read" in text and "(number 7)" in text for text in status.health)
+    assert [pair.seq for pair in pairs] == [number for number in range(1, status.pairs + 1) if number != 7]
+    assert status.pairs > 20

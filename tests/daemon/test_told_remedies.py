@@ -10,7 +10,7 @@ from rich.console import Console
 
 from daemon.doctor_view import show
 from daemon.logs import PlainFormatter
-from daemon.remedies import WITH_ROBOT, as_typed, given_robot
+from daemon.remedies import WITH_ROBOT, as_typed, given_robot, printable
 from daemon.servo_wiring import Check
 
 GIVEN = ["doctor", "--robot", "arm/left.toml"]
@@ -74,3 +74,9 @@ def test_doctor_and_the_log_say_it(monkeypatch, capsys) -> None:
     assert "bodyschema joints --robot arm/left.toml    # live" in capsys.readouterr().out
     record = logging.LogRecord("x", logging.INFO, "", 0, "see `bodyschema status`", None, None)
     assert PlainFormatter("%(message)s").format(record) == "see `bodyschema status --robot arm/left.toml`"
+
+
+def test_no_name_in_a_message_steers_the_terminal() -> None:
+    assert printable("a joint '\x1b[2J\rwaist\x00'\nis not there: Gelenk ä") == (
+        "a joint '\\x1b[2J\\rwaist\\x00'\nis not there: Gelenk ä"
+    )

@@ -21,10 +21,10 @@ def learner(pairs: int, **changed: Any) -> LearnerStatus:
     return msgspec.structs.replace(LEARNER, **told)
 
 
-def change(kind: str) -> Change:
+def change(kind: str, *, noticed_seq: int = 105, found: bool = True) -> Change:
     return Change(
-        first_seq=101, earliest_seq=100, latest_seq=102, noticed_seq=105, found=True, kind=kind, probabilities={},
-        alike=None, moved_m=None, can_roll_back=True,
+        first_seq=101, earliest_seq=100, latest_seq=102, noticed_seq=noticed_seq, found=found, kind=kind,
+        probabilities={}, alike=None, moved_m=None, can_roll_back=True,
     )  # fmt: skip
 
 
@@ -59,6 +59,37 @@ def test_a_change_is_marked_once_where_it_was_and_named_when_it_is_known() -> No
         last = change("undecided" if pairs < 200 else "camera")
         course.note(learner(pairs, pairs_since_change=pairs - 100, last_change=last), 2.0)
     assert [(mark.pairs, mark.kind) for mark in course.document.changes] == [(100, "camera")]
+
+
+def marks(course: Course) -> list[tuple[int, str | None, bool]]:
+    return [(mark.pairs, mark.kind, mark.told) for mark in course.document.changes]
+
+
+def test_a_told_tool_change_is_marked_as_told() -> None:
+    course = Course()
+    told = change("tool", noticed_seq=100, found=False)
+    for pairs in (100, 150):
+        course.note(learner(pairs, pairs_since_change=pairs - 100, last_change=told), 1.0)
+    assert marks(course) == [(100, "tool", True)]
+
+
+def test_a_change_that_was_rolled_back_is_marked_no_more() -> None:
+    course = Course()
+    first, second = change("camera"), change("tool", noticed_seq=200, found=False)
+    course.note(learner(110, pairs_since_change=10, last_change=first), 1.0)
+    course.note(learner(210, pairs_since_change=10, last_change=second), 2.0)
+    assert len(marks(course)) == 2
+    course.note(learner(215, pairs_since_change=100, last_change=first), 3.0)
+    assert marks(course) == [(100, "camera", False)]
+    course.note(learner(216, pairs_since_change=216), 4.0)
+    assert marks(course) == []
+
+
+def test_a_change_that_is_placed_anew_is_marked_once() -> None:
+    course = Course()
+    for since in (10, 12, 9):
+        course.note(learner(110, pairs_since_change=since, last_change=change("camera")), 1.0)
+    assert marks(course) == [(100, "camera", False)]
 
 
 def test_a_span_of_one_model_is_one_line_with_its_newest_version() -> None:

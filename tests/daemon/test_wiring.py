@@ -7,7 +7,15 @@ import pytest
 from small_arm import write_small_arm
 
 from daemon.config import Config
-from daemon.wiring import check_sources, demonstration_model, open_joints, open_sources, require_simulation
+from daemon.wiring import (
+    check_sources,
+    demonstration_model,
+    open_joints,
+    open_postures,
+    open_sources,
+    require_simulation,
+    simulation_settings,
+)
 from interfaces.clock import SystemClock
 from interfaces.errors import ConfigError, RecordingError, SourceLost
 from interfaces.records import MarkerFix
@@ -55,6 +63,75 @@ def test_a_recording_that_is_not_there_is_named(tmp_path) -> None:
 def test_the_simulation_asks_for_a_stereo_camera(tmp_path) -> None:
     with pytest.raises(ConfigError, match=r"describes no stereo pair.*Add focal_px"):
         enter(load(tmp_path), sim=True)
+
+
+STEREO = """xyz = [1.1, 0.0, 0.1]
+rpy = [-1.5707963, 0.0, 1.5707963]
+focal_px = 600.0
+principal_point_px = [319.5, 239.5]
+baseline_m = 0.1
+image_size_px = [640, 480]
+"""
+COLOUR = "[vision]\n[vision.colour]\nhue_deg = 200\nhalf_width_deg = {}\nmin_saturation = {}\nmin_value = {}\n"
+CLUSTER = """[vision]
+marker = "cluster"
+[vision.tag]
+dictionary = "aruco_mip_36h12"
+[[vision.cluster.tags]]
+id = 7
+xyz = [0.0, 0.0, 0.05]
+rpy = [0.0, 1.2, 0.0]
+side_m = 0.06
+[[vision.cluster.tags]]
+id = 8
+"""
+
+
+@pytest.mark.parametrize(
+    ("vision", "shown"),
+    [
+        ("", {"ball_radius_m": 0.02, "light": 1.0, "clutter_gap_deg": 36.0}),
+        ('[vision]\ncolour = "green"\nradius_m = 0.015\n', {"ball_radius_m": 0.015, "rgb": (0.0602, 0.86, 0.0602)}),
+        ('[vision]\ncolour = "yellow"\n', {"clutter_gap_deg": 36.0}),
+        (COLOUR.format(60, 0.8, 0.5), {"clutter_gap_deg": 66.0}),
+        ('[vision]\nmarker = "bright_ball"\n', {"rgb": (0.9, 0.9, 0.9), "light": 0.27}),
+        ('[vision]\nmarker = "tag"\n[vision.tag]\nid = 3\nside_m = 0.05\n', {"tag_dictionary": 20}),
+        (CLUSTER, {"marker_radius_m": pytest.approx(0.0729, abs=1e-4)}),
+    ],
+    ids=["red", "green", "yellow", "band", "bright", "tag", "cluster"],
+)
+def test_the_simulation_shows_the_marker_of_vision(tmp_path, vision, shown) -> None:
+    camera = simulation_settings(load(tmp_path, STEREO + vision)).camera
+    assert {name: getattr(camera, name) for name in shown} == {
+        name: value if isinstance(value, int) else pytest.approx(value) for name, value in shown.items()
+    }
+
+
+def test_sim_camera_may_show_another_marker(tmp_path) -> None:
+    asked = '[vision]\ncolour = "green"\n[sim.camera]\nball_radius_m = 0.021\nball_rgb = [0.1, 0.8, 0.2]\n'
+    camera = simulation_settings(load(tmp_path, STEREO + asked)).camera
+    assert (camera.ball_radius_m, camera.ball_rgb) == (0.021, (0.1, 0.8, 0.2))
+
+
+@pytest.mark.parametrize(
+    ("tables", "keys"),
+    [
+        (COLOUR.format(20, 0.5, 0.97), r"\[vision.colour\] or"),
+        ('[vision]\nmarker = "bright_ball"\nmin_brightness = 1.0\n', r"\[vision\] min_brightness"),
+        ('[vision]\nmarker = "tag"\n[vision.tag]\nside_m = 0.005\n', r"\[vision.tag\]"),
+        ("[sim.camera]\nball_rgb = [0.1, 0.8, 0.2]\n", r"\[vision.colour\] or"),
+    ],
+)
+def test_a_marker_that_cannot_be_shown_is_told(tmp_path, tables, keys) -> None:
+    with pytest.raises(ConfigError, match=rf"robot.toml: the tracker would not find the marker .*Change {keys}"):
+        check_sources(load(tmp_path, STEREO + tables), sim=True)
+
+
+def test_small_green_balls_make_fixes_in_the_simulation(tmp_path) -> None:
+    config = load(tmp_path, STEREO + '[vision]\ncolour = "green"\nradius_m = 0.015\n')
+    with open_postures(config, 2) as sources, sources.marker:
+        seen = [sources.marker.read(60.0) for _ in range(2)]
+    assert [type(fix) for fix in seen] == [MarkerFix, MarkerFix]
 
 
 def test_without_pybullet_the_simulation_names_the_extra(monkeypatch) -> None:

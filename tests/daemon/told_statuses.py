@@ -92,4 +92,7 @@ LEARNER = LearnerStatus(
     uptime_s=4000.0,
     health=[],
     version="0.1.0",
+    prequential_pairs=50,
+    behind=4120,
+    age_s=137.0,
 )

@@ -6,14 +6,14 @@ import json
 import math
 import os
 import signal
-import subprocess
-import sys
+import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+import warm
 
 from daemon.config import Config
 from daemon.wiring import open_joints
@@ -23,8 +23,6 @@ from drivers.dynamixel.bench.servo import CURRENT_MODE, POSITION_MODE
 from interfaces.clock import SystemClock
 from interfaces.errors import ConfigError
 
-REPOSITORY = Path(__file__).parents[2]
-LIMIT_S = 40.0
 HEARTBEAT_S = 0.5  # generous: bench, driver and test share the machine with others
 ANGLES = {"shoulder": 0.3, "elbow": -0.5}
 LINK = '<link name="{name}">{inertial}</link>'
@@ -94,44 +92,46 @@ class Floating:
     """`bodyschema joints --zero-force`, begun."""
 
     def __init__(self, folder: Path) -> None:
-        command = [sys.executable, "-m", "daemon", "joints", "--json", "--zero-force", "--robot", "robot.toml"]
-        self.process = subprocess.Popen(
-            command,
-            cwd=folder,
-            env={**os.environ, "PYTHONPATH": str(REPOSITORY)},
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
+        words = ["joints", "--json", "--zero-force", "--robot", "robot.toml"]
+        ours, its = os.pipe()
+        self._said, self._errors = os.fdopen(ours), tempfile.TemporaryFile("w+")  # noqa: SIM115
+        with os.fdopen(its, "w") as out:
+            self.process = warm.Child("-m", "daemon", *words, cwd=folder, stdout=out, stderr=self._errors)
+
+    def __enter__(self) -> Floating:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.process.kill()
+        self.ended()
+        self._said.close()
+        self._errors.close()
 
     def until(self, true) -> dict:
         """Read what it says until that is true of it."""
-        assert self.process.stdout is not None
-        end = time.monotonic() + LIMIT_S
-        for line in self.process.stdout:
+        for line in self._said:
             said = json.loads(line)
             if true(said):
                 return said
-            if time.monotonic() > end:
-                break
-        self.process.kill()
-        raise AssertionError(self.process.communicate()[1])
+        raise AssertionError(self.errors())
 
     def ended(self) -> int:
         """Its exit code."""
-        self.process.communicate(timeout=LIMIT_S)
-        return self.process.returncode
+        for _ in self._said:
+            pass
+        return self.process.wait()
+
+    def errors(self) -> str:
+        """What it wrote to stderr."""
+        self._errors.seek(0)
+        return self._errors.read()
 
 
 @pytest.fixture
 def floating(bench: DryRun, tmp_path: Path) -> Iterator[Floating]:
-    floating = Floating(tmp_path)
-    try:
+    with Floating(tmp_path) as floating:
         floating.until(lambda _: min(map(abs, currents(bench, 0.0))) > 0.1)
         yield floating
-    finally:
-        floating.process.kill()
-        floating.process.communicate(timeout=LIMIT_S)
 
 
 def torque(bench: DryRun) -> list[int]:
@@ -174,11 +174,9 @@ def test_a_fault_of_a_servo_ends_it(bench, floating) -> None:
 
 
 def test_another_mode_is_refused_with_the_command(tmp_path) -> None:
-    with bench_of(write_robot(tmp_path), POSITION_MODE) as bench:
-        process = Floating(tmp_path).process
-        said = process.communicate(timeout=LIMIT_S)[1]
-        assert process.returncode == 1
-        assert "bodyschema servos set operating_mode=0 --joint shoulder" in " ".join(said.split())
+    with bench_of(write_robot(tmp_path), POSITION_MODE) as bench, Floating(tmp_path) as floating:
+        assert floating.ended() == 1
+        assert "bodyschema servos set operating_mode=0 --joint shoulder" in " ".join(floating.errors().split())
         assert torque(bench) == [0, 0]
 
 

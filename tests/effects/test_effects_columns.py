@@ -35,7 +35,7 @@ def robot(tmp_path_factory):
 
 
 PLACES = st.sampled_from([kind.name for kind in KINDS.values()])
-KNOWN = settings(deadline=None, max_examples=60)
+KNOWN = settings(max_examples=60)
 
 
 def drawn(data, robot):

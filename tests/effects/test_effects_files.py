@@ -55,7 +55,7 @@ def kernel() -> KernelLearner:
     return learner
 
 
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 @given(st.data(), st.floats(0.0, 1.0), st.integers(0, 100))
 def test_effects_come_back_from_the_file_to_the_last_bit(robot, tmp_path_factory, data, share, seed) -> None:
     places = data.draw(st.lists(st.sampled_from(everywhere(robot)), max_size=6))

@@ -30,7 +30,7 @@ def body(robot):
         yield body
 
 
-@settings(deadline=None, max_examples=50)
+@settings(max_examples=50)
 @given(st.lists(st.floats(-2.0, 2.0), min_size=len(ALL), max_size=len(ALL)).map(np.array))
 def test_torques_are_those_that_pybullet_needs_to_hold_the_arm_turned_round(robot, body, q) -> None:
     torques = GravityLoad(robot).torques(q[None])[0]

@@ -30,7 +30,7 @@ SLIGHT = ChainTolerances(axes=1e-4, points=1e-4, zeros=1e-4, slide_zeros=1e-4, t
 
 
 @given(seed=seeds, kinds=st.sampled_from(["RRRR", "RPR", "RRRRRRR"]))
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=8)
 def test_pair_by_pair_is_all_at_once_where_the_problem_is_linear(seed, kinds):
     rng = np.random.default_rng(seed)
     arm = rough_arm(rng, kinds, SLIGHT)
@@ -229,7 +229,7 @@ def test_vectors_and_rows_tell_the_same_to_the_last_bit(sigma):
 
 
 @given(seed=seeds, cuts=st.lists(st.integers(1, 59), max_size=4))
-@settings(max_examples=5, deadline=None)
+@settings(max_examples=5)
 def test_pairs_tell_the_same_in_whatever_portions_they_come(seed, cuts):
     rng = np.random.default_rng(seed)
     arm = rough_arm(rng, "RRR")

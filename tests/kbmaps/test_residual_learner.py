@@ -222,11 +222,11 @@ def test_an_arm_placed_anywhere_is_learnt(arm, rng):
 
 
 def test_errors_shared_by_neighbours_on_a_path_are_not_taken_for_shape(arm, rng):
-    steps = np.cumsum(rng.normal(0.0, np.radians(0.7), (400, 6)), axis=0)
-    drift = np.cumsum(rng.normal(0.0, 0.0007, (400, 3)), axis=0)
+    steps = np.cumsum(rng.normal(0.0, np.radians(0.7), (250, 6)), axis=0)
+    drift = np.cumsum(rng.normal(0.0, 0.0007, (250, 3)), axis=0)
     q = steps - steps.mean(axis=0)
-    learner = taught(arm, q, arm.real.positions(q) + drift + 0.002 * rng.normal(size=(400, 3)))
-    test = q[rng.integers(0, 400, 300)] + rng.normal(0.0, np.radians(5.0), (300, 6))
+    learner = taught(arm, q, arm.real.positions(q) + drift + 0.002 * rng.normal(size=(250, 3)))
+    test = q[rng.integers(0, 250, 300)] + rng.normal(0.0, np.radians(5.0), (300, 6))
     truth = arm.real.positions(test)
     assert mean_distance(learner.predict(test), truth) < 1.5 * mean_distance(learner.rigid.predict(test), truth)
 

@@ -218,7 +218,7 @@ def test_a_belief_alone_is_a_rigid_model(arm):
 
 
 @given(seed=st.integers(0, 1000), correlation=st.floats(0.0, 0.97))
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=15)
 def test_innovations_of_an_autoregression_are_its_fresh_part(seed, correlation):
     fresh = np.random.default_rng(seed).normal(size=(30, 3))
     series = fresh.copy()

@@ -375,7 +375,7 @@ def test_a_restored_learner_claims_the_same_sigma():
 
 
 @given(position=st.floats(0.0, 1.0, exclude_max=True), flip=st.integers(1, 255))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30)
 def test_a_single_changed_byte_is_noticed(position, flip):
     damaged = bytearray(stored_learner())
     damaged[int(position * len(damaged))] ^= flip

@@ -117,8 +117,10 @@ def test_malformed_files_are_told_apart(tmp_path, name) -> None:
 def test_files_beyond_the_limit_are_not_read(tmp_path, monkeypatch) -> None:
     monkeypatch.setattr(mesh_file, "LARGEST_MESH_BYTES", 1 << 20)
     (tmp_path / "endless.stl").symlink_to("/dev/zero")
-    with pytest.raises(MeshError, match="larger than 1 MiB"):
-        read_mesh(tmp_path / "endless.stl")
+    (tmp_path / "large.stl").write_bytes(bytes(2 << 20))
+    for name, why in (("endless.stl", "a device"), ("large.stl", "larger than 1 MiB")):
+        with pytest.raises(MeshError, match=why):
+            read_mesh(tmp_path / name)
 
 
 def test_too_many_triangles_are_refused(tmp_path, monkeypatch) -> None:
@@ -261,6 +263,12 @@ def test_missing_meshes_become_rods_and_are_named(tmp_path, name) -> None:
     shapes, said, bullet = shapes_of(robot_of(tmp_path, mesh(name)))
     assert [kind for kind, _, _ in shapes] == [bullet.GEOM_CYLINDER]
     assert said.startswith(f"missing meshes: {name or 'one without a file name'}. The simulation goes on")
+
+
+def test_no_rod_leads_to_a_tool(tmp_path) -> None:
+    tool = frame("tool").replace("</joint>", '<origin xyz="0.2 0.2 0"/></joint>')
+    shapes, _, _ = shapes_of(robot_of(tmp_path, mesh("base.stl"), tool))
+    assert [shape[1][0] for shape in shapes] == [pytest.approx(np.hypot(0.3, 0.1), abs=0.03)]
 
 
 def test_many_missing_meshes_make_one_sentence(tmp_path) -> None:

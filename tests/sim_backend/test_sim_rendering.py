@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 from guided_run import shipped
@@ -148,6 +149,24 @@ def test_the_background_moves_against_the_heads_turn(bullet):
 @pytest.mark.parametrize("seed", range(5))
 def test_nothing_in_the_background_is_as_red_as_the_ball(seed):
     assert red_pixels(cluttered_room(200, np.random.default_rng(seed))) == 0
+
+
+@pytest.mark.parametrize("hue_deg", [0.0, 120.0, 350.0])
+@pytest.mark.parametrize("gap_deg", [36.0, 96.0])
+def test_the_background_avoids_the_balls_hue(hue_deg, gap_deg):
+    room = cluttered_room(200, np.random.default_rng(0), ball_hue_deg=hue_deg, gap_deg=gap_deg)
+    hue, saturation, _ = np.moveaxis(cv2.cvtColor(room, cv2.COLOR_BGR2HSV).astype(float), -1, 0)
+    apart_deg = np.abs((2.0 * hue - hue_deg + 180.0) % 360.0 - 180.0)[saturation > 100]
+    assert len(apart_deg) > 1000
+    assert (apart_deg < gap_deg - 8.0).mean() < 0.01  # what lies between two things in a blurred edge
+
+
+def test_a_lamp_is_brighter_than_all_else(bullet):
+    lamp = CameraConfig(noise=0, light=0.3, ball_rgb=(0.9, 0.9, 0.9))
+    left, _ = painted(bullet, np.array([0.03, 0.0, 0.6]), lamp)
+    grey = left.mean(axis=2)
+    assert grey.max() == pytest.approx(0.9 * 255, abs=1)
+    assert np.percentile(grey, 90) < 0.3 * 255
 
 
 def test_the_shipped_calibration_has_its_axis_in_the_middle_of_the_image():

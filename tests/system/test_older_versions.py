@@ -59,7 +59,7 @@ def told(pairs: list[Pair]) -> list[PairMessage]:
     return [pair_to_wire(pair) for pair in pairs]
 
 
-def test_an_older_schema_is_brought_to_the_present_one_with_its_pairs_as_they_were(older: Config) -> None:
+def test_an_upgrade_keeps_older_pairs_as_they_were(older: Config) -> None:
     before = schema(older.store_file)
     with PairReader(older.store_file) as reader:
         pairs, identity = told(reader.read()), reader.identity
@@ -80,7 +80,7 @@ def test_after_an_upgrade_a_changed_digit_is_found(older: Config) -> None:
         assert reader.audit().damage == Damage(((7, 7),))
 
 
-def test_an_older_row_that_is_no_pair_is_left_out(older: Config) -> None:
+def test_an_unreadable_older_row_is_left_out(older: Config) -> None:
     with contextlib.closing(sqlite3.connect(older.store_file)) as connection:
         connection.execute("UPDATE pairs SET q = CAST(x'5b80' AS TEXT) WHERE seq = 7")
         connection.commit()
@@ -98,21 +98,21 @@ from daemon.session import session_of
 from daemon.store import PairStore
 from interfaces.clock import SystemClock
 left = int(sys.argv[2])
-seal = store_schema.pair_of
+seal = store_schema.decoded
 def doomed(*row):
     global left
     left -= 1
     if left == 0:
         os.kill(os.getpid(), signal.SIGKILL)
     return seal(*row)
-store_schema.pair_of = doomed
+store_schema.decoded = doomed
 config = Config.load(Path(sys.argv[1]))
 with PairStore(config.store_file, session_of(config, SystemClock())):
     pass
 """
 
 
-def test_an_upgrade_that_is_killed_leaves_the_older_pairs(older: Config) -> None:
+def test_a_killed_upgrade_leaves_older_pairs(older: Config) -> None:
     before = schema(older.store_file)
     with PairReader(older.store_file) as reader:
         pairs = told(reader.read())
@@ -124,7 +124,7 @@ def test_an_upgrade_that_is_killed_leaves_the_older_pairs(older: Config) -> None
     assert before < schema(older.store_file) == SCHEMA_VERSION
 
 
-def test_a_version_from_before_says_that_the_store_is_newer(config: Config, monkeypatch) -> None:
+def test_a_downgrade_is_refused_with_the_remedy(config: Config, monkeypatch) -> None:
     with PairStore(config.store_file, session_of(config, SystemClock())):
         pass
     monkeypatch.setattr("daemon.store_schema.SCHEMA_VERSION", SCHEMA_VERSION - 1)

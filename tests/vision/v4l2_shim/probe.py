@@ -1,6 +1,6 @@
-"""Opens the cameras of a table [vision.cameras] (JSON on standard input) for a while, tells as JSON what came.
+"""Opens the cameras of a table [vision.cameras] (JSON on standard input) for so many frames, tells as JSON what came.
 
-python probe.py SECONDS
+python probe.py FRAMES
 """
 
 from __future__ import annotations
@@ -27,8 +27,7 @@ def main() -> None:
     try:
         with eyes:
             print("open", file=sys.stderr, flush=True)
-            until = time.monotonic() + float(sys.argv[1])
-            while time.monotonic() < until:
+            while len(told["t"]) < int(sys.argv[1]):
                 frame = eyes.read(0.2)
                 if frame is not None:
                     told["t"].append(frame.t)

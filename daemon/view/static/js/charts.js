@@ -125,7 +125,7 @@ export class ErrorChart {
     else this.chart.show([series?.t ?? [], positive(series?.error_m ?? []), positive(series?.claimed_m ?? [])], "time");
     if (!curve.length) return;
     const [[first, begin], [pairs, error]] = [curve[0], curve.at(-1)];
-    const told = this.changes.length ? `; ${this.changes.map((change) => `${changed(change.kind)} after ${whole(change.pairs)}`).join(", ")}` : "";
+    const told = this.changes.length ? `; ${this.changes.map((change) => `${changed(change)} after ${whole(change.pairs)}`).join(", ")}` : "";
     text("error-text", `${mm(error)} after ${whole(pairs)} pairs, ${mm(begin)} after ${whole(first)}${told}.`);
   }
 
@@ -133,15 +133,15 @@ export class ErrorChart {
     const time = key === "time";
     const series = [
       { label: time ? "time" : "pairs", value: (_, shown) => (shown === null ? "–" : time ? clock(shown) : whole(shown)) },
-      line("error on the next pair", "--line", mm),
+      line("error on new pairs", "--line", mm),
     ];
-    if (time) series.push(line("claimed where data is", "--second", mm, { dash: [6, 4] }));
+    if (time) series.push(line("claimed error", "--second", mm, { dash: [6, 4] }));
     return {
       series,
       scales: { x: { time }, y: { distr: 3 } },
       axes: [time ? { ...axis(undefined, times), space: 70 } : axis("pairs learnt"), { ...axis("mm", millimetres), size: 58 }],
       cursor: { drag: { x: true, y: false } },
-      plugins: [marks(() => this.changes.map((change) => ({ at: time ? change.t : change.pairs, said: changed(change.kind) })))],
+      plugins: [marks(() => this.changes.map((change) => ({ at: time ? change.t : change.pairs, said: changed(change) })))],
     };
   }
 }

@@ -32,11 +32,15 @@ export function clock(secondsSince1970) {
 }
 
 // What changed, in words; the learner's kinds are tool, camera, joint NAME, other and undecided.
-export function changed(kind) {
+export function kindOfChange(kind) {
   if (kind === "tool") return "tool changed";
   if (kind === "camera") return "camera moved";
   if (kind?.startsWith("joint ")) return `zero of ${kind.slice(6)} moved`;
-  return "something changed";
+  return kind ? "something changed" : "learning began again";
+}
+
+export function changed({ kind, told }) {
+  return `${kindOfChange(kind)}${told ? " (told)" : kind ? " (found)" : ""}`;
 }
 
 export function words(name) {

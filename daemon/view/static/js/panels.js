@@ -1,6 +1,6 @@
 // Tiles, tables and sentences.
 import { bar, byId, element, row, text } from "./dom.js";
-import { changed, clock, joint, milliseconds, mm, span, whole, words } from "./format.js";
+import { clock, joint, kindOfChange, milliseconds, mm, span, whole, words } from "./format.js";
 
 const last = (values) => values?.findLast((value) => value !== null);
 
@@ -9,13 +9,19 @@ export function tiles({ sampler, learner, series }) {
   text("tile-error", mm(status?.prequential_m[status.answering]));
   text("tile-claimed", mm(status?.claimed_error_m));
   text("tile-pairs", whole(status?.pairs ?? sampler?.status?.pairs));
-  const tool = status && status.pairs_since_change < status.pairs ? `, ${whole(status.pairs_since_change)} with this tool` : "";
-  text("tile-pairs-label", `pairs learnt${tool}`);
+  text("tile-error-of", status?.prequential_pairs ? `${lastPairs(status)}, each predicted before it was learnt. Measurement noise${noise(status)} is in it` : "");
+  text("tile-claimed-of", status?.claimed_error_m ? "the learner's estimate of its distance to the truth where data is, without noise" : "");
+  const since = status && status.pairs_since_change < status.pairs ? [`${whole(status.pairs_since_change)} since the last change`] : [];
+  const behind = status?.behind ? [`${whole(status.behind)} stored and not learnt yet`] : [];
+  text("tile-pairs-of", [...since, ...behind].join(", "));
   text("tile-rate", sampler?.answers ? sampler.status.pairs_per_s.toFixed(1) : "–");
   text("tile-predict", learner?.answers ? milliseconds(last(series?.predict_s)) : "–");
   text("tile-model", status?.answering ?? "–");
   text("tile-model-label", status?.model ? `answers, version ${status.model.slice(0, 8)}` : "answers");
 }
+
+const lastPairs = (status) => `last ${whole(status.prequential_pairs)} pairs`;
+const noise = (status) => (status.calibration ? ` (${mm(status.calibration.noise_m)} a coordinate)` : "");
 
 export function pills({ sampler, learner }) {
   for (const [name, process] of [["sampler", sampler], ["learner", learner]]) {
@@ -30,12 +36,12 @@ export function pills({ sampler, learner }) {
 
 export function outlook({ learner, outlook: sentence }) {
   const found = learner?.status?.outlook;
-  text("outlook", found && sentence ? sentence : "Not known yet: the learner says so after its first solution.");
+  text("outlook", found && sentence ? sentence : "Not known yet: the learner finds it some time after its first solution with the present tool.");
   const table = byId("forecast");
   table.hidden = !found;
   if (!found) return;
   const differs = found.best_motion_m.some((error, k) => error !== found.like_so_far_m[k]);
-  table.tHead.replaceChildren(row(element("th", {}, ""), ...["now", ...found.further_pairs.map((pairs) => `+${pairs} pairs`)].map((name) => element("th", { scope: "col" }, name))));
+  table.tHead.replaceChildren(row(element("th", {}, ""), ...[found.error_m === learner.status.claimed_error_m ? "now" : `after ${whole(found.pairs)} pairs`, ...found.further_pairs.map((pairs) => `+${pairs} pairs`)].map((name) => element("th", { scope: "col" }, name))));
   const rows = [row("as so far", mm(found.error_m), ...found.like_so_far_m.map(mm))];
   if (differs) {
     rows.push(row(found.best_motion, mm(found.error_m), ...found.best_motion_m.map(mm)));
@@ -98,7 +104,7 @@ export function suspicions({ learner }) {
   const probable = Object.entries(learner?.status?.last_change?.probabilities ?? {}).sort((a, b) => b[1] - a[1]);
   const open = probable.length > 1 && probable[0][1] < 0.95;
   byId("suspicions").hidden = !open;
-  byId("suspicions").replaceChildren(...(open ? probable.map(([kind, probability]) => element("li", {}, `${changed(kind)}: ${Math.round(100 * probability)} %`)) : []));
+  byId("suspicions").replaceChildren(...(open ? probable.map(([kind, probability]) => element("li", {}, `${kindOfChange(kind)}: ${Math.round(100 * probability)} %`)) : []));
 }
 
 export function models({ learner, course }) {
@@ -112,6 +118,7 @@ export function models({ learner, course }) {
   }));
   const status = learner?.status;
   const errors = Object.entries(status?.prequential_m ?? {}).sort((a, b) => a[1] - b[1]);
+  text("models-of", errors.length ? `Error of each on the ${lastPairs(status)}, the same for all, predicted before they were learnt; measurement noise${noise(status)} included` : "");
   const worst = Math.max(1e-12, ...errors.map(([, error]) => error));
   byId("models").hidden = !errors.length;
   byId("models").tBodies[0].replaceChildren(...errors.map(([name, error]) => {

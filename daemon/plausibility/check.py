@@ -1,0 +1,317 @@
+"""The one check whether a recording can be of this robot, before anything is fitted that would be believed.
+
+A rigid chain with free links fits a recording with a flipped joint or a zero 90° off as well as the right one: its
+links are then nonsense. So the drawn links are kept, and the pose of the camera, the marker and the joint zeros are
+fitted to many ways to read the columns.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from interfaces.errors import RecordingError
+from interfaces.recording import Recording
+from interfaces.records import FloatArray
+from interfaces.robot import RobotDescription
+from kbmaps import RigidChain, align
+from kbmaps.chains.placement import place
+
+from .limits import reach_m, spread_m
+from .reading import QUARTER, Reading
+
+# Rows that are read in other ways, evenly spread. Twice as many cost twice the time and change no verdict of the tests.
+ROWS = 80
+# With fewer rows nothing is refused: a wrong reading may fit by chance.
+FEWEST_ROWS = 40
+# Share of the rows, the nearest ones, that a fit is measured by: outliers and rows with another tool are left out.
+MEASURED = 0.7
+# How far zeros and marker may be off (1-sigma). Of arms with zeros off by 10° and a marker by 0.3 m all are placed.
+ZEROS_RAD, SLIDES_M, TOOL_M = 0.15, 0.05, 0.3
+# Readings of which the neighbours are tried, and how often: zeros of up to four joints a quarter turn off are found.
+WIDTH, DEPTH = 4, 5
+# Readings whose errors differ by less are one: zeros of the first and of the last joint make no difference.
+SAME = 0.005
+# Shares of the positions' spread that a fit may leave to be the last: of the columns as they are, and read otherwise.
+ENOUGH_AS_IT_IS, ENOUGH = 0.05, 0.01
+# Another reading is named when the pairs fit so many times better, and mentioned from `AS_GOOD` times on. Arms with
+# tolerances of 0.5° and 1 mm, zeros off by 10° and noise of 10 mm stay below 1.15 with all wrong readings.
+MUCH_BETTER, AS_GOOD = 1.5, 1.15
+# ... and so much more probable [nats], each change of the reading costing some.
+CERTAIN, A_CHANGE = 10.0, 3.0
+# A fit that leaves so large a share of the positions' spread, and of the arm's reach, is of no arm like the drawn one.
+UNEXPLAINED, OF_REACH = 0.25, 0.02
+# ... and so many times the noise that is known.
+NOISES = 5.0
+# A zero this far off is mentioned. Of 300 generated arms whose zeros are off by up to 10°, one is.
+FAR_ZERO_RAD = math.radians(20.0)
+# A camera is not turned by so much against a pose that is known.
+TURNED_RAD = math.radians(30.0)
+# Distances below this share of the reach are no longer told apart.
+EXACT = 1e-5
+
+
+@dataclass(frozen=True, slots=True)
+class Plausibility:
+    """What a recording looks like.
+
+    Attributes:
+        refusal: why it cannot be of this robot as it is, or None.
+        remedy: what to do about that.
+        misread: another reading of the columns was found that fits.
+        warnings: sentences about what may be wrong.
+        undirected: joints of which these pairs do not show which way they count.
+    """
+
+    refusal: str | None = None
+    remedy: str = ""
+    misread: bool = False
+    warnings: tuple[str, ...] = ()
+    undirected: tuple[str, ...] = ()
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """All that is wrong or may be."""
+        refused = () if self.refusal is None else (f"{self.refusal}. {self.remedy}",)
+        return tuple(f"{text[0].upper()}{text[1:]}." for text in (*refused, *self.warnings))
+
+    def require(self, file: Path | str, *, force: bool) -> tuple[str, ...]:
+        """What is left to say of a recording that is fitted.
+
+        Args:
+            file: what the recording is of.
+            force: fit what would be refused.
+
+        Raises:
+            RecordingError: it cannot be of this robot as it is.
+        """
+        if self.refusal is not None and not force:
+            raise RecordingError(self.refusal, file=file, remedy=f"{self.remedy}. Or fit it as it is with --force")
+        return self.sentences
+
+
+@dataclass(frozen=True, slots=True)
+class _Fit:
+    """How well a reading fits.
+
+    Attributes:
+        error: RMS distance of the nearest pairs, in the recording's own unit.
+        nats: minus the log-likelihood, what zeros and marker cost included.
+        zeros: added to the joints (d,) beside the quarter turns [rad, m].
+        rotation: of the nominal measurement frame in the real one (3, 3).
+    """
+
+    error: float
+    nats: float
+    zeros: FloatArray
+    rotation: FloatArray
+
+
+def told_sigma(recording: Recording) -> float | None:
+    """1-sigma of a coordinate [m], where the recording has it."""
+    if recording.cov is None:
+        return None
+    return float(np.sqrt(np.trace(recording.cov, axis1=1, axis2=2).mean() / 3.0))
+
+
+def plausibility(
+    robot: RobotDescription,
+    q: FloatArray,
+    x: FloatArray,
+    *,
+    chain: RigidChain | None = None,
+    sigma_m: float | None = None,
+) -> Plausibility:
+    """Check pairs q (n, d) [rad, m] and x (n, 3) [m] before a fit to them is believed.
+
+    Args:
+        chain: the nominal chain where it is another one than the robot's.
+        sigma_m: 1-sigma of a coordinate [m] where it is known.
+    """
+    chain = chain or robot.chain
+    reach, spread = reach_m(robot), spread_m(x)
+    if 3 * len(q) < 2 * (chain.joints + 9) or spread < EXACT * reach:
+        return Plausibility()
+    rows = np.unique(np.linspace(0, len(q) - 1, ROWS).astype(np.intp))
+    search = _Search(chain, q[rows], x[rows], EXACT * reach, robot.camera.pose_known)
+    as_it_is, chosen, others = search.verdict()
+    fit, names = search.fits[chosen], robot.joints
+    before, after = search.fits[as_it_is].error, fit.error / chosen.scale
+    noise = 0.0 if sigma_m is None else NOISES * sigma_m
+    if after > max(UNEXPLAINED * spread / chosen.scale, OF_REACH * reach, noise):
+        found = Plausibility(
+            f"the pairs are hardly of this robot: placed as well as it can be, the drawn arm misses them by "
+            f"{_mm(before)}, and with joints exchanged, counting the other way or a quarter turn off still by "
+            f"{_mm(after)}",
+            "Is the recording of another robot, or the URDF of another one? Where the positions are that noisy, say so "
+            "with --sigma-mm",
+        )
+    elif chosen != as_it_is:
+        frame = _frame(fit.rotation, True) if robot.camera.pose_known and chosen.mirrored else ""
+        text = (
+            f"it seems that {chosen.looks(names, fit.zeros)}{frame}: the pairs then fit to {_mm(after)}, and as they "
+            f"are to {_mm(before)}"
+        )
+        either = "".join(f". As good a fit: {other.looks(names, search.fits[other].zeros)}" for other in others[:1])
+        remedy = chosen.remedy(names, fit.zeros) + either
+        if before > MUCH_BETTER * fit.error:
+            found = Plausibility(text, remedy, misread=True)
+        else:
+            found = Plausibility(warnings=(f"perhaps {text.removeprefix('it seems that ')}{either}",))
+    else:
+        far = [
+            f"with the links as drawn, the zero of {name} comes out {math.degrees(zero):+.0f}°: it is wrong, or the "
+            "URDF is of another arm"
+            for name, zero, slides in zip(names, fit.zeros, chain.prismatic, strict=True)
+            if not slides and abs(zero) > FAR_ZERO_RAD and search.held_error() > MUCH_BETTER * fit.error
+        ]
+        found = Plausibility(warnings=tuple(far), undirected=search.undirected(names))
+        if robot.camera.pose_known:
+            found = _turned(chain, q[rows], x[rows], fit) or found
+    if found.refusal is None or len(q) >= FEWEST_ROWS:
+        return found
+    few = f"{found.refusal}. {found.remedy}. (These are {len(q)} pairs: {FEWEST_ROWS} would tell.)"
+    return Plausibility(warnings=(few,))
+
+
+def _turned(chain: RigidChain, q: FloatArray, x: FloatArray, fit: _Fit) -> Plausibility | None:
+    """The measurement frame is turned against robot.toml, which says that it is known; None where it is not."""
+    angle = float(Rotation.from_matrix(fit.rotation).magnitude())
+    if angle < TURNED_RAD:
+        return None
+    told, free = (align(chain, q, x, pose_known=known, marker_known=False).rms for known in (True, False))
+    if told < MUCH_BETTER * free:
+        return None
+    return Plausibility(
+        f"it seems that the measurement frame is turned by {math.degrees(angle):.0f}° against [camera] of robot.toml"
+        f"{_frame(fit.rotation, False)}: the pairs then fit to {_mm(free)}, and as they are to {_mm(told)}",
+        "Correct the columns x, y, z, the pose of the camera or the zero of the first joint; or set pose_known = false",
+        misread=True,
+    )
+
+
+def _frame(rotation: FloatArray, mirrored: bool) -> str:
+    """The order and signs in which x, y, z are given, where they are those of the frame that robot.toml tells."""
+    given = np.diag([-1.0 if mirrored else 1.0, 1.0, 1.0]) @ rotation
+    which = np.abs(given).argmax(axis=1)
+    along = np.abs(given).max(axis=1)
+    if len(set(which.tolist())) < 3 or along.min() < math.cos(TURNED_RAD):
+        return ""
+    order = ", ".join(f"{'-' if given[k, axis] < 0.0 else ''}{'xyz'[axis]}" for k, axis in enumerate(which))
+    return f" (the columns x, y, z hold {order})"
+
+
+class _Search:
+    """Readings of the same pairs and how well they fit."""
+
+    def __init__(self, chain: RigidChain, q: FloatArray, x: FloatArray, exact_m: float, pose_known: bool) -> None:
+        self._chain, self._q, self._x, self._exact_m, self._pose_known = chain, q, x, exact_m, pose_known
+        self._std = np.where(chain.prismatic, SLIDES_M, ZEROS_RAD)
+        self._tried: set[Reading] = set()
+        self.fits: dict[Reading, _Fit] = {}
+
+    def verdict(self) -> tuple[Reading, Reading, list[Reading]]:
+        """The columns as they are, the simplest reading that fits as well as any, and others that do."""
+        as_it_is = Reading.plain(self._chain.joints)
+        slides: list[bool] = self._chain.prismatic.tolist()
+        self._try([as_it_is, *as_it_is.neighbours(slides)])
+        if self._best()[0] != as_it_is:
+            # With a marker far from its place, a fit of the right reading may have ended in a wrong place.
+            self._fit([as_it_is] * 6, tools=TOOL_M * np.concatenate([np.eye(3), -np.eye(3)]))
+        expanded, spread = [as_it_is], spread_m(self._x)
+        for depth in range(1, DEPTH):
+            best = self._best()[0]
+            left = self.fits[best].error / spread
+            if best in expanded and (left < ENOUGH or (best == as_it_is and (left < ENOUGH_AS_IT_IS or depth > 1))):
+                break
+            new = self._distinct(expanded)
+            expanded += new
+            if depth == 1:
+                self._try(as_it_is.doubles(slides))
+            self._try(other for reading in new for other in reading.neighbours(slides))
+        if as_it_is not in self.fits:
+            self._fit([as_it_is], held=True)
+        best = self.fits[self._best()[0]]
+        good = sorted(
+            (reading for reading in self.fits if self._as_good(self.fits[reading], best)),
+            key=lambda reading: (reading.changes, reading.quarters != as_it_is.quarters, self.fits[reading].nats),
+        )
+        others = [reading for reading in good[1:] if reading.changes == good[0].changes]
+        return as_it_is, good[0], others
+
+    def held_error(self) -> float:
+        """RMS distance [m] of the nearest pairs as they are, with all zeros as drawn."""
+        held = place(self._chain, self._q[None], self._x[None], zeros_std=1e-3 * self._std, tool_std=TOOL_M)
+        return float(held.errors(MEASURED)[0])
+
+    def undirected(self, names: tuple[str, ...]) -> tuple[str, ...]:
+        """Joints whose sign makes no difference."""
+        plain = Reading.plain(len(names))
+        fits = (
+            (name, self.fits.get(reading))
+            for name, reading in zip(names, plain.neighbours(self._chain.prismatic.tolist()), strict=False)
+        )
+        return tuple(name for name, fit in fits if fit is not None and self._as_good(fit, self.fits[plain]))
+
+    def _best(self) -> list[Reading]:
+        """All readings, the best first."""
+        return sorted(self.fits, key=lambda reading: self.fits[reading].nats + A_CHANGE * reading.changes)
+
+    def _distinct(self, expanded: list[Reading]) -> list[Reading]:
+        """The best readings that fit otherwise than those that were expanded, and than each other."""
+        seen, new = [self.fits[reading].error for reading in expanded if reading in self.fits], list[Reading]()
+        for reading in self._best():
+            error = self.fits[reading].error
+            if all(abs(error - other) > SAME * other for other in seen):
+                new.append(reading)
+                seen.append(error)
+            if len(new) == WIDTH:
+                break
+        return new
+
+    @staticmethod
+    def _as_good(fit: _Fit, best: _Fit) -> bool:
+        return fit.nats < best.nats + CERTAIN or fit.error < AS_GOOD * best.error
+
+    def _try(self, readings: Iterable[Reading]) -> None:
+        """Fit readings that were not tried yet."""
+        new = [reading for reading in dict.fromkeys(readings) if reading not in self._tried]
+        self._tried.update(new)
+        if new:
+            self._fit(new)
+
+    def _fit(self, new: list[Reading], *, held: bool = False, tools: FloatArray | None = None) -> None:
+        """Fit readings; a zero that goes to the next quarter turn makes it another reading.
+
+        Args:
+            held: keep the zeros as drawn.
+            tools: moves of the marker (s, 3) [m] to start from.
+        """
+        slides = self._chain.prismatic
+        q = np.stack([reading.angles(self._q, slides) for reading in new])
+        x = np.stack([reading.positions(self._x) for reading in new])
+        placed = place(self._chain, q, x, zeros_std=self._std * (1e-3 if held else 1.0), tool_std=TOOL_M, tools=tools)
+        quarters = np.where(slides | held, 0, np.rint(placed.zeros / QUARTER)).astype(np.intp)
+        zeros = placed.zeros - QUARTER * quarters
+        errors = np.maximum(placed.errors(MEASURED), self._exact_m) * [reading.scale for reading in new]
+        cost = 0.5 * np.square(zeros / self._std).sum(axis=1) + 0.5 * np.square(placed.tools / TOOL_M).sum(axis=1)
+        if self._pose_known:
+            turns = Rotation.from_matrix(placed.rotations).magnitude()
+            cost += [0.0 if r.mirrored else 0.5 * (turn / TURNED_RAD) ** 2 for r, turn in zip(new, turns, strict=True)]
+        nats = 3.0 * MEASURED * len(self._x) * np.log(errors) + cost
+        for k, reading in enumerate(new):
+            found, fit = (
+                reading.turned(quarters[k].tolist()),
+                _Fit(float(errors[k]), float(nats[k]), zeros[k], placed.rotations[k]),
+            )
+            if found not in self.fits or fit.nats < self.fits[found].nats:
+                self.fits[found] = fit
+
+
+def _mm(distance_m: float) -> str:
+    return f"{1e3 * distance_m:.3g} mm" if distance_m < 1.0 else f"{distance_m:.3g} m"

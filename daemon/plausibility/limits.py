@@ -1,0 +1,122 @@
+"""What a robot's limits and reach say of a recording's units."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from interfaces.errors import RecordingError
+from interfaces.recording import Recording
+from interfaces.records import FloatArray
+from interfaces.robot import RobotDescription
+from interfaces.urdf import REVOLUTE
+
+BoolArray = NDArray[np.bool_]
+
+# Positions in the middle lie so far from the middle position, in units of the arm's reach, only in another unit.
+FARTHEST = 2.0
+# A joint of limited range is never so far beyond its limits [rad]: encoders wrap after a turn at the latest.
+BEYOND_LIMITS_RAD = 2.0 * math.pi
+# So large a share of rows makes it a matter of units, not of single wrong readings.
+MANY = 0.1
+# By how much to divide what is given in another unit, for metres.
+UNITS_PER_METRE = {"millimetres": 1000.0, "centimetres": 100.0, "inches": 39.37, "feet": 3.281}
+_UNITS_PER_SECOND = (("milliseconds", 1e3), ("microseconds", 1e6), ("nanoseconds", 1e9))
+# An arm that is guided, or goes from pose to pose, is never so slow in the middle [rad/s]; it is about so fast.
+SLOWEST, USUAL = 0.005, 0.3
+# So far on a slide counts as one radian [m]; so many moves there must be to judge by.
+A_RADIAN_M, FEWEST_MOVES = 0.1, 20
+
+
+def reach_m(robot: RobotDescription) -> float:
+    """How far from the first joint the marker can be at most [m]: all links and ways end to end."""
+    chain = robot.chain
+    ways = np.maximum(np.abs(robot.lower), np.abs(robot.upper))[chain.prismatic]
+    return float(np.linalg.norm(chain.fixed[1:, :3, 3], axis=1).sum() + ways.sum())
+
+
+def beyond_limits(robot: RobotDescription, q: FloatArray, by: float = 0.0) -> BoolArray:
+    """Which joints poses (..., d) [rad, m] put beyond their limits by more than `by`; a continuous joint has none."""
+    limited = np.array([robot.tree.joint(name).kind != "continuous" for name in robot.joints])
+    return limited & (np.maximum(robot.lower - q, q - robot.upper) > by)
+
+
+def limits_text(robot: RobotDescription, joint: int) -> str:
+    """A joint's limits for people, as in `-2.6 to 2.6 rad (-149° to 149°)`."""
+    lower, upper = robot.lower[joint], robot.upper[joint]
+    if robot.tree.joint(robot.joints[joint]).kind not in REVOLUTE:
+        return f"{lower:.4g} to {upper:.4g} m"
+    return f"{lower:.4g} to {upper:.4g} rad ({math.degrees(lower):.4g}° to {math.degrees(upper):.4g}°)"
+
+
+def require_units(robot: RobotDescription, recording: Recording, file: Path) -> None:
+    """Refuse angles and positions that no arm has in radians and metres.
+
+    Args:
+        file: what the recording is of.
+
+    Raises:
+        RecordingError: angles far beyond the limits, positions farther apart than the arm reaches, or times in which
+            an arm hardly moves.
+    """
+    _require_radians(robot, recording, file)
+    _require_metres(robot, recording, file)
+    _require_seconds(robot, recording, file)
+
+
+def _require_radians(robot: RobotDescription, recording: Recording, file: Path) -> None:
+    beyond = beyond_limits(robot, recording.q, BEYOND_LIMITS_RAD).mean(axis=0)
+    beyond[robot.chain.prismatic] = 0.0
+    if beyond.max() > MANY:
+        joint = int(beyond.argmax())
+        extreme = recording.q[np.abs(recording.q[:, joint]).argmax(), joint]
+        raise RecordingError(
+            f"the joint {robot.joints[joint]!r} goes to {extreme:.4g}, with limits from {limits_text(robot, joint)}: "
+            "these look like degrees",
+            file=file,
+            remedy="Give angles in radians: multiply by π/180",
+        )
+
+
+def _require_metres(robot: RobotDescription, recording: Recording, file: Path) -> None:
+    spread, reach = spread_m(recording.x), reach_m(robot)
+    if spread > FARTHEST * reach:
+        drawn = spread_m(robot.chain.positions(recording.q))
+        name, factor = min(
+            UNITS_PER_METRE.items(), key=lambda unit: abs(math.log(spread / (unit[1] * max(drawn, 1e-9))))
+        )
+        raise RecordingError(
+            f"the positions x, y, z lie about {spread:.4g} m from their middle, and the arm reaches {reach:.3g} m: "
+            f"these look like {name}",
+            file=file,
+            remedy=f"Give positions in metres: divide by {factor:g}",
+        )
+
+
+def _require_seconds(robot: RobotDescription, recording: Recording, file: Path) -> None:
+    if recording.t is None:
+        return
+    moves = np.diff(recording.q, axis=0) / np.where(robot.chain.prismatic, A_RADIAN_M, 1.0)
+    gaps, steps = np.diff(recording.t), np.linalg.norm(moves, axis=1)
+    inside = (gaps > 0.0) & (steps > 0.0)
+    if recording.segment is not None and np.diff(recording.segment).any():
+        inside &= np.diff(recording.segment) == 0
+    if inside.sum() < FEWEST_MOVES:
+        return
+    gap, speed = float(np.median(gaps[inside])), float(np.median(steps[inside] / gaps[inside]))
+    if speed < SLOWEST:
+        name, factor = min(_UNITS_PER_SECOND, key=lambda unit: abs(math.log(speed * unit[1] / USUAL)))
+        raise RecordingError(
+            f"the times t are {gap:.4g} apart in the middle, in which the joints move by "
+            f"{math.degrees(speed * gap):.2g}°: these look like {name}",
+            file=file,
+            remedy=f"Give times in seconds: divide by {factor:g}",
+        )
+
+
+def spread_m(x: FloatArray) -> float:
+    """Middle distance (n, 3) [m] from the middle position."""
+    return float(np.median(np.linalg.norm(x - np.median(x, axis=0), axis=1)))

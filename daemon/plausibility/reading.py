@@ -1,0 +1,175 @@
+"""Ways to read a recording's columns: order, directions and zeros of the joints, units, and the frame of x, y, z."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from interfaces.records import FloatArray
+
+from .limits import UNITS_PER_METRE
+
+METRES = "metres"
+QUARTER = math.pi / 2.0
+# A zero this near to a quarter turn counts as one: assembled arms are off by less.
+NEAR_RAD = math.radians(12.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """One way to read the columns; the default of everything but the order is as they are.
+
+    A joint is its column times its sign, plus its quarter turns.
+
+    Attributes:
+        order: place of the column of each joint.
+        signs: 1 or -1 for each joint.
+        quarters: quarter turns to add to each joint, 2 to -1.
+        mirrored: the positions are given in a left-handed frame.
+        unit: of the positions.
+        degrees: the angles are in degrees.
+        millimetres: the readings of sliding joints are in millimetres.
+    """
+
+    order: tuple[int, ...]
+    signs: tuple[int, ...]
+    quarters: tuple[int, ...]
+    mirrored: bool = False
+    unit: str = METRES
+    degrees: bool = False
+    millimetres: bool = False
+
+    @classmethod
+    def plain(cls, joints: int) -> Reading:
+        """The columns as they are."""
+        return cls(tuple(range(joints)), (1,) * joints, (0,) * joints)
+
+    @property
+    def scale(self) -> float:
+        """By what positions are divided to be in metres."""
+        return UNITS_PER_METRE.get(self.unit, 1.0)
+
+    def angles(self, q: FloatArray, slides: NDArray[np.bool_]) -> FloatArray:
+        """Joint angles (n, d) [rad, m] of the columns q (n, d)."""
+        units = np.where(slides, 1e-3 if self.millimetres else 1.0, math.radians(1.0) if self.degrees else 1.0)
+        return (q[:, self.order] * units) * np.array(self.signs) + QUARTER * np.array(self.quarters)
+
+    def positions(self, x: FloatArray) -> FloatArray:
+        """Positions (n, 3) [m] of the columns x (n, 3)."""
+        return x * np.array([-1.0 if self.mirrored else 1.0, 1.0, 1.0]) / self.scale
+
+    def turned(self, quarters: Sequence[int]) -> Reading:
+        """With so many quarter turns more (d,)."""
+        both = zip(self.quarters, quarters, strict=True)
+        return replace(self, quarters=tuple((own + more + 1) % 4 - 1 for own, more in both))
+
+    def neighbours(self, slides: Sequence[bool]) -> Iterator[Reading]:
+        """All readings with one change more.
+
+        Args:
+            slides: which joints (d,) slide: they have no quarter turns.
+        """
+        joints = range(len(self.order))
+        for k in joints:
+            yield replace(self, signs=_replaced(self.signs, {k: -self.signs[k]}))
+        for k in joints[1:-1]:  # those of the ends make no difference: camera and marker are fitted
+            if not slides[k]:
+                yield from (self.turned([turns * (j == k) for j in joints]) for turns in (1, -1, 2))
+        for j, k in itertools.combinations(joints, 2):
+            yield replace(
+                self,
+                order=_replaced(self.order, {j: self.order[k], k: self.order[j]}),
+                signs=_replaced(self.signs, {j: self.signs[k], k: self.signs[j]}),
+            )
+        yield replace(self, signs=tuple(-sign for sign in self.signs))
+        yield replace(self, mirrored=not self.mirrored)
+        if self.unit == METRES:
+            yield from (replace(self, unit=unit) for unit in UNITS_PER_METRE)
+        yield replace(self, degrees=not self.degrees)
+        if any(slides):
+            yield replace(self, millimetres=not self.millimetres)
+
+    def doubles(self, slides: Sequence[bool]) -> Iterator[Reading]:
+        """All readings with two signs more, or two quarter turns: one alone may fit no better than none."""
+        joints = range(len(self.order))
+        for j, k in itertools.combinations(joints, 2):
+            yield replace(self, signs=_replaced(self.signs, {j: -self.signs[j], k: -self.signs[k]}))
+        turning = [k for k in joints[1:-1] if not slides[k]]
+        for j, k in itertools.combinations(turning, 2):
+            for turns, others in itertools.product((1, -1, 2), repeat=2):
+                yield self.turned([turns * (i == j) + others * (i == k) for i in joints])
+
+    @property
+    def changes(self) -> int:
+        """How much is read otherwise than it is; all joints counting the other way are one change."""
+        moved, turned = sum(k != column for k, column in enumerate(self.order)), self.signs.count(-1)
+        return (
+            max(moved - 1, 0)
+            + (turned if turned < len(self.signs) else 1)
+            + sum(map(bool, self.quarters))
+            + sum((self.mirrored, self.unit != METRES, self.degrees, self.millimetres))
+        )
+
+    def looks(self, joints: Sequence[str], zeros: FloatArray) -> str:
+        """What it says of the recording, as in `the columns q1 and q2 are exchanged`.
+
+        Args:
+            zeros: fitted to the joints (d,) beside the quarter turns [rad, m].
+        """
+        return _listed([looks for looks, _ in self._said(joints, zeros)])
+
+    def remedy(self, joints: Sequence[str], zeros: FloatArray) -> str:
+        """What to do; arguments as of `looks`."""
+        remedies = "; ".join(remedy for _, remedy in self._said(joints, zeros))
+        return f"{remedies[0].upper()}{remedies[1:]}"
+
+    def _said(self, joints: Sequence[str], zeros: FloatArray) -> Iterator[tuple[str, str]]:
+        moved = [k for k, column in enumerate(self.order) if column != k]
+        names = _listed([joints[k] for k in moved]) if moved else ""
+        if len(moved) == 2:
+            yield f"the columns {names} are exchanged", f"exchange the names {names} in the recording's header"
+        elif moved:
+            order = ", ".join(joints[k] for k in sorted(moved, key=self.order.__getitem__))
+            yield f"the columns {names} are in the order {order}", "name them in that order"
+        other = [joint for joint, sign in zip(joints, self.signs, strict=True) if sign < 0]
+        if other and len(other) == len(joints):
+            yield "all joints count the other way", "multiply all joint columns by -1"
+        elif other:
+            verb, column = ("counts", "column") if len(other) == 1 else ("count", "columns")
+            yield (
+                f"{_listed(other)} {verb} the other way",
+                f"multiply the {column} {_listed(other)} by -1, or set `direction` in robot.toml",
+            )
+        for joint, quarters, zero in zip(joints, self.quarters, zeros, strict=True):
+            if quarters:
+                # What is near a quarter turn is one, and the rest a tolerance.
+                degrees = 90 * quarters + (0 if abs(zero) < NEAR_RAD else round(math.degrees(zero)))
+                yield (
+                    f"the zero of {joint} is about {abs(degrees)}° off",
+                    f"add {degrees:+d}° to the readings of {joint}, or set its zero",
+                )
+        if self.mirrored:
+            yield (
+                "the positions are mirrored (a left-handed frame: two of x, y, z exchanged, or one counting the other "
+                "way)",
+                "exchange the two columns, or multiply the one by -1",
+            )
+        if self.unit != METRES:
+            yield f"x, y, z are in {self.unit}", f"divide x, y, z by {self.scale:g}"
+        if self.degrees:
+            yield "the angles are in degrees", "multiply the angles by π/180"
+        if self.millimetres:
+            yield "the sliding joints are in millimetres", "divide their columns by 1000"
+
+
+def _replaced(values: tuple[int, ...], changes: dict[int, int]) -> tuple[int, ...]:
+    return tuple(changes.get(k, value) for k, value in enumerate(values))
+
+
+def _listed(names: Sequence[str]) -> str:
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"

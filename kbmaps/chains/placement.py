@@ -1,0 +1,182 @@
+"""Where a chain stands by its pairs, and its joints' zeros: fitted for several readings of the pairs side by side."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import cast
+
+import numpy as np
+
+from kbmaps.arrays import BoolArray, FloatArray, IntArray
+from kbmaps.chains.chain import RigidChain
+from kbmaps.robust import MEDIAN_NORM, ROUNDING_M
+from kbmaps.rotations import cross_matrix, exponentials
+
+_STEPS = 30
+# Weights are nearly those of least squares at first, and halve their reach with each step down to so many sigma.
+_FIRST_REACH, _LEAST_REACH = 32.0, 4.0
+_FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-3, 1e-9, 1e6
+# A step that lowers the cost by less than this share is the last, once the weights have settled.
+_SMALL_GAIN, _SETTLING = 1e-3, 4
+# Holds directions that nothing shows; as a share of the largest diagonal entry.
+_RIDGE = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Placements:
+    """A nominal chain placed to s readings of the same n pairs.
+
+    Attributes:
+        rotations, shifts: the pose of the nominal measurement frame in the real one (s, 3, 3) and (s, 3) [m].
+        zeros: added to the joints' readings (s, d) [rad, m].
+        tools: moves of the marker in the marker frame (s, 3) [m].
+        distances: of the pairs from the chain (s, n) [m].
+    """
+
+    rotations: FloatArray
+    shifts: FloatArray
+    zeros: FloatArray
+    tools: FloatArray
+    distances: FloatArray
+
+    def errors(self, share: float) -> FloatArray:
+        """RMS distance (s,) [m] of this share of the pairs, the nearest ones."""
+        nearest = np.sort(np.square(self.distances), axis=1)[:, : int(np.ceil(share * self.distances.shape[1]))]
+        return np.sqrt(nearest.mean(axis=1))
+
+
+@dataclass(eq=False)
+class _State:
+    """Estimates (s, ...), with residuals (s, 3n) and their Jacobians (s, 3n, 9 + d)."""
+
+    rotations: FloatArray
+    shifts: FloatArray
+    zeros: FloatArray
+    tools: FloatArray
+    residuals: FloatArray
+    jacobian: FloatArray
+
+    def put(self, rows: IntArray, other: _State, chosen: BoolArray) -> None:
+        for name in self.__dataclass_fields__:
+            getattr(self, name)[rows] = getattr(other, name)[chosen]
+
+    @property
+    def distances(self) -> FloatArray:
+        return np.linalg.norm(self.residuals.reshape(len(self.residuals), -1, 3), axis=2)
+
+
+def place(
+    chain: RigidChain,
+    q: FloatArray,
+    x: FloatArray,
+    *,
+    zeros_std: FloatArray,
+    tool_std: float,
+    tools: FloatArray | None = None,
+) -> Placements:
+    """Fit the pose of the measurement frame, the marker and the joint zeros to each reading; the links are as drawn.
+
+    Levenberg-Marquardt from where the drawn chain fits best (Kabsch 1976), with Geman-McClure weights. The inputs are
+    trusted.
+
+    Args:
+        chain: the nominal chain.
+        q: joint angles (s, n, d) [rad, m].
+        x: marker positions (s, n, 3) [m].
+        zeros_std: how far each zero may be off (d,) [rad, m]; 1-sigma.
+        tool_std: how far the marker may be from where it is drawn [m]; 1-sigma of a coordinate.
+        tools: moves of the marker (s, 3) [m] to start from; none by default.
+    """
+    return _Fitter(chain, q, x, np.concatenate([np.zeros(6), zeros_std**-2.0, np.full(3, tool_std**-2.0)])).run(tools)
+
+
+class _Fitter:
+    """What is minimised is the weighted sum of squares over sigma² plus what the prior says of zeros and marker."""
+
+    def __init__(self, chain: RigidChain, q: FloatArray, x: FloatArray, information: FloatArray) -> None:
+        self._chain, self._q, self._x, self._information = chain, q, x, information
+        # The middle lies above the median by the pairs that the parameters can explain whatever they are.
+        self._middle = min(q.shape[1] // 2 + len(information) // 6, q.shape[1] - 1)
+
+    def run(self, tools: FloatArray | None) -> Placements:
+        count = len(self._q)
+        every = np.arange(count)
+        state = self._start(every, np.zeros((count, 3)) if tools is None else tools)
+        damping, active = np.full(count, _FIRST_DAMPING), every
+        for k in range(_STEPS):
+            reach = max(_FIRST_REACH * 0.5**k, _LEAST_REACH)
+            distances = state.distances[active]
+            sigma = np.maximum(np.partition(distances, self._middle)[:, self._middle] / MEDIAN_NORM, ROUNDING_M)
+            scale = np.square(reach * sigma)[:, None]
+            weights = np.repeat(np.square(scale / (scale + np.square(distances))), 3, axis=1) / sigma[:, None] ** 2
+            tried = self._moved(state, active, self._step(state, active, weights, damping[active]))
+            before, after = self._cost(state, active, weights), self._cost(tried, slice(None), weights)
+            better = after <= before
+            state.put(active[better], tried, better)
+            damping[active] = np.where(
+                better, np.maximum(0.1 * damping[active], _LEAST_DAMPING), 10.0 * damping[active]
+            )
+            settled = better & (k >= _SETTLING) & (before - after < _SMALL_GAIN * before)
+            active = active[~(settled | (damping[active] > _MOST_DAMPING))]
+            if not len(active):
+                break
+        return Placements(state.rotations, state.shifts, state.zeros, state.tools, state.distances)
+
+    def _start(self, every: IntArray, tools: FloatArray) -> _State:
+        count, n, d = self._q.shape
+        poses = self._chain.poses(self._q.reshape(-1, d)).reshape(count, n, 4, 4)
+        drawn = poses[..., :3, 3] + (poses[..., :3, :3] @ tools[:, None, :, None])[..., 0]
+        centred = drawn - drawn.mean(axis=1, keepdims=True)
+        covariance = centred.swapaxes(1, 2) @ (self._x - self._x.mean(axis=1, keepdims=True))
+        u, _, vt = np.linalg.svd(covariance)
+        handed = np.ones((count, 1, 3))
+        handed[:, 0, 2] = np.sign(np.linalg.det(u @ vt))
+        rotations = ((u * handed) @ vt).swapaxes(1, 2)
+        shifts = self._x.mean(axis=1) - (rotations @ drawn.mean(axis=1)[..., None])[..., 0]
+        return self._at(every, rotations, shifts, np.zeros((count, d)), tools.copy())
+
+    def _moved(self, state: _State, rows: IntArray, step: FloatArray) -> _State:
+        turns = exponentials(step[:, :3])[0]
+        return self._at(
+            rows,
+            turns @ state.rotations[rows],
+            state.shifts[rows] + step[:, 3:6],
+            state.zeros[rows] + step[:, 6:-3],
+            state.tools[rows] + step[:, -3:],
+        )
+
+    def _at(
+        self, rows: IntArray, rotations: FloatArray, shifts: FloatArray, zeros: FloatArray, tools: FloatArray
+    ) -> _State:
+        chain, (count, n, d) = self._chain, self._q[rows].shape
+        frames = chain.frames((self._q[rows] + zeros[:, None]).reshape(-1, d)).reshape(count, n, d + 1, 4, 4)
+        turned = rotations[:, None] @ frames[:, :, -1, :3, :3]
+        base = (rotations[:, None] @ frames[:, :, -1, :3, 3, None])[..., 0]
+        marker = base + (turned @ tools[:, None, :, None])[..., 0]
+        places = np.einsum("sij,snkj->snki", rotations, frames[:, :, :-1, :3, 3])
+        axes = np.einsum("sil,snklj,kj->snki", rotations, frames[:, :, :-1, :3, :3], chain.axes, optimize=True)
+        moved = np.where(chain.prismatic[:, None], axes, np.cross(axes, marker[:, :, None] - places))
+        jacobian = np.empty((count, n, 3, 9 + d))
+        jacobian[..., :3] = cross_matrix(-marker)
+        jacobian[..., 3:6] = np.eye(3)
+        jacobian[..., 6:-3] = moved.swapaxes(2, 3)
+        jacobian[..., -3:] = turned
+        residuals = self._x[rows] - marker - shifts[:, None]
+        return _State(
+            rotations, shifts, zeros, tools, residuals.reshape(count, 3 * n), jacobian.reshape(count, 3 * n, 9 + d)
+        )
+
+    def _step(self, state: _State, rows: IntArray, weights: FloatArray, damping: FloatArray) -> FloatArray:
+        weighted = state.jacobian[rows] * weights[..., None]
+        gram = weighted.swapaxes(1, 2) @ state.jacobian[rows]
+        slope = (weighted.swapaxes(1, 2) @ state.residuals[rows][..., None])[..., 0]
+        slope[:, 6:] -= self._information[6:] * np.concatenate([state.zeros[rows], state.tools[rows]], axis=1)
+        diagonal = np.einsum("sff->sf", gram)
+        diagonal += self._information
+        diagonal += damping[:, None] * diagonal + _RIDGE * diagonal.max(axis=1, keepdims=True)
+        return cast(FloatArray, np.linalg.solve(gram, slope[..., None])[..., 0])
+
+    def _cost(self, state: _State, rows: IntArray | slice, weights: FloatArray) -> FloatArray:
+        prior = np.square(state.zeros[rows]) @ self._information[6:-3]
+        prior += np.square(state.tools[rows]) @ self._information[-3:]
+        return prior + (weights * np.square(state.residuals[rows])).sum(axis=1)

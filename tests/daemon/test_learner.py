@@ -1,0 +1,112 @@
+"""One robot's learner on a bus that is none: what it says of itself and of how far it is behind."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import pytest
+from guided_arm import make_pair
+from small_arm import write_small_arm
+
+from daemon.bus import Bus, Request
+from daemon.config import Config
+from daemon.keys import Keys
+from daemon.learner import Learner
+from daemon.learning import DirectSolver
+from daemon.status import LearnerStatus
+from daemon.wire import JSON, CommandReply, CommandRequest, PairsReply, PredictReply, decode, encode, pair_to_wire
+from interfaces.errors import BusError
+from interfaces.records import Pair
+
+KEYS = Keys("arm")
+
+
+class Still:
+    """A clock that stands still."""
+
+    def now(self) -> float:
+        return 50.0
+
+    def utc(self) -> str:
+        return "2026-11-21T12:00:00.000+00:00"
+
+
+class Wire:
+    """Stands for a session: keeps the handlers, and the sampler's history until that is gone."""
+
+    def __init__(self, stored: list[Pair]) -> None:
+        self.handlers: dict[str, Callable[..., Any]] = {}
+        self._stored = stored
+
+    def answer(self, key: str, handler: Callable[..., Any], **_: object) -> None:
+        self.handlers[key] = handler
+
+    def subscribe(self, key: str, handler: Callable[..., Any], **_: object) -> None:
+        self.handlers[key] = handler
+
+    def watch(self, key: str, changed: Callable[[bool], None]) -> None:
+        self.handlers[key] = changed
+
+    def token(self, key: str) -> None:
+        """Nothing watches it."""
+
+    def ask_one(self, key: str, **_: object) -> bytes:
+        begin = int(key.partition("from=")[2])
+        page = [pair_to_wire(pair) for pair in self._stored if pair.seq >= begin]
+        if not page:
+            raise BusError("nobody answers")
+        return encode(PairsReply("one", self._stored[-1].seq, page))
+
+    def ask(self, key: str, request: object = None) -> bytes:
+        return self.handlers[key](Request({}, b"" if request is None else encode(request), JSON))
+
+    def status(self) -> LearnerStatus:
+        return decode(self.ask(KEYS.status("learner")), LearnerStatus)
+
+
+def pair(seq: int) -> Pair:
+    return make_pair(seq, np.array([0.01 * seq, 0.1]), np.array([0.3, 0.001 * seq, 0.2]))
+
+
+@pytest.fixture
+def learner(tmp_path: Path) -> tuple[Learner, Wire]:
+    config = Config.load(write_small_arm(tmp_path, '[daemon]\nstate_dir = "state"\n'), {})
+    wire = Wire([pair(seq) for seq in range(1, 6)])
+    learner = Learner(config, DirectSolver(), cast(Bus, wire), Still())
+    learner._declare()
+    learner._feed.step(0.0)
+    wire.handlers[KEYS.alive("sampler")](True)
+    return learner, wire
+
+
+def test_a_learner_with_all_pairs_is_well(learner: tuple[Learner, Wire]) -> None:
+    status = learner[1].status()
+    assert (status.pairs, status.behind, status.age_s, status.health) == (5, 0, 0.0, [])
+
+
+def test_a_learner_far_behind_says_so(learner: tuple[Learner, Wire]) -> None:
+    wire = learner[1]
+    late = pair(4000)
+    wire.handlers[KEYS.pair](encode(pair_to_wire(late)).replace(b"12:00:00.000", b"12:05:00.000"))
+    status = wire.status()
+    assert (status.behind, status.age_s) == (3995, 300.0)
+    assert "3995 stored pairs are not learnt yet, and the newest that was learnt is 300 s old" in status.health[0]
+    assert decode(wire.ask(KEYS.predict, {"q": [0.1, 0.2]}), PredictReply).age_s == 300.0
+
+
+def test_a_told_tool_change_is_told_with_how_to_undo_it(learner: tuple[Learner, Wire]) -> None:
+    wire = learner[1]
+    reply = decode(wire.ask(KEYS.command("learner"), CommandRequest("tool_changed")), CommandReply)
+    assert "`bodyschema command rollback` takes it back" in reply.message
+    change = wire.status().last_change
+    assert change is not None
+    assert (change.kind, change.found, change.can_roll_back) == ("tool", False, True)
+
+
+def test_new_pairs_tell_on_how_many_their_error_rests(learner: tuple[Learner, Wire]) -> None:
+    status = learner[1].status()
+    assert status.prequential_pairs == 5
+    assert set(status.prequential_m) == {"prior", "nlms"}

@@ -1,0 +1,229 @@
+"""What the one plausibility check says of recordings whose columns are read wrongly, and of those that are right."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from daemon.config import Config
+from daemon.findings import Findings
+from daemon.learning import DirectSolver, Learning, NominalModel
+from daemon.plausibility.check import Plausibility, plausibility
+from daemon.plausibility.reading import Reading
+from interfaces.clock import SystemClock
+from interfaces.errors import RecordingError
+from interfaces.recording import Recording
+from interfaces.records import Pair
+from kbmaps import ChainParameters, ChainTolerances, RigidChain
+
+REAL_DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
+JOINTS = tuple(f"q{k}" for k in range(1, 7))
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """Pairs of an arm of six joints, made to 0.2° and 0.5 mm, that may be read otherwise than they were measured."""
+
+    q: np.ndarray
+    x: np.ndarray
+    pose_known: bool = False
+
+    def seen(self, rows: int | None = None) -> Plausibility:
+        chain = arm()
+        limits = np.full(6, 3.0)
+        robot = SimpleNamespace(
+            chain=chain, joints=JOINTS, lower=-limits, upper=limits, camera=SimpleNamespace(pose_known=self.pose_known)
+        )
+        return plausibility(robot, self.q[:rows], self.x[:rows])
+
+    def read(self, reading: Reading) -> Pairs:
+        """As `reading` would have to be undone: applied to this recording's columns."""
+        return replace(self, q=reading.angles(self.q, np.zeros(6, dtype=bool)), x=reading.positions(self.x))
+
+
+def arm() -> RigidChain:
+    """An arm with a shoulder of two axes, an elbow and a wrist of three axes that do not meet."""
+    fixed = np.tile(np.eye(4), (7, 1, 1))
+    fixed[1:4, 0, 3] = 0.0, 0.42, 0.39
+    fixed[[1, 4, 5], [2, 1, 2], 3] = 0.15, 0.11, 0.09
+    fixed[6, :3, 3] = 0.03, 0.08, 0.02
+    axes = np.array([(0, 0, 1), (0, 1, 0), (0, 1, 0), (0, 1, 0), (0, 0, 1), (0, 1, 0)], dtype=float)
+    return RigidChain(fixed, axes, np.zeros(6, dtype=bool))
+
+
+def pairs(
+    seed: int = 0, *, count: int = 120, noise: float = 0.0005, zeros_deg: float = 3.0, tool: float = 0.02
+) -> Pairs:
+    rng = np.random.default_rng(seed)
+    parameters = ChainParameters(arm())
+    made = ChainTolerances(axes=np.radians(0.2), points=0.0005, tool=tool)
+    change = parameters.standard_deviations(made) * rng.normal(size=parameters.size)
+    change[parameters.zeros] = np.radians(zeros_deg) * rng.uniform(-1.0, 1.0, 6)
+    change[parameters.base_turn] = Rotation.from_rotvec(rng.normal(size=3)).as_rotvec()
+    change[parameters.base_shift] = rng.uniform(-2.0, 2.0, 3)
+    q = np.array([0.3, -0.8, 1.2, 0.4, 0.9, 0.0]) + rng.uniform(-1.2, 1.2, (count, 6))
+    return Pairs(q, parameters.positions(change, q) + noise * rng.normal(size=(count, 3)))
+
+
+PLAIN = Reading.plain(6)
+MISREAD = {
+    "q3 counts the other way": replace(PLAIN, signs=(1, 1, -1, 1, 1, 1)),
+    "q2 and q5 count the other way": replace(PLAIN, signs=(1, -1, 1, 1, -1, 1)),
+    "the columns q1 and q2 are exchanged": replace(PLAIN, order=(1, 0, 2, 3, 4, 5)),
+    "the columns q1, q2 and q3 are in the order q2, q3, q1": replace(PLAIN, order=(1, 2, 0, 3, 4, 5)),
+    "the columns q5 and q6 are exchanged": replace(PLAIN, order=(0, 1, 2, 3, 5, 4)),
+    "the positions are mirrored": replace(PLAIN, mirrored=True),
+    "the zero of q2 is about 90° off": PLAIN.turned((0, 1, 0, 0, 0, 0)),
+    "the zero of q2 is about 90° off and the zero of q3 is about 90° off": PLAIN.turned((0, 1, -1, 0, 0, 0)),
+}
+
+
+@pytest.mark.parametrize("said", MISREAD)
+def test_a_wrong_reading_is_refused_and_named(said) -> None:
+    found = pairs().read(MISREAD[said]).seen()
+    assert found.misread
+    assert said in (found.refusal or "")
+
+
+@pytest.mark.parametrize(
+    ("unit", "factor"), [("millimetres", 1000), ("centimetres", 100), ("inches", 39.37), ("feet", 3.281)]
+)
+def test_a_unit_of_length_is_named(unit, factor) -> None:
+    right = pairs()
+    found = replace(right, x=factor * right.x).seen()
+    assert f"x, y, z are in {unit}" in (found.refusal or "")
+    assert found.remedy.startswith(f"Divide x, y, z by {factor:g}")
+
+
+def test_degrees_are_named_however_small() -> None:
+    right = pairs()
+    assert "the angles are in degrees" in (replace(right, q=np.degrees(right.q)).seen().refusal or "")
+
+
+def test_a_refusal_gives_both_errors_and_the_remedy() -> None:
+    found = pairs().read(MISREAD["the zero of q2 is about 90° off"]).seen()
+    assert "the pairs then fit to" in (found.refusal or "")
+    assert "and as they are to" in (found.refusal or "")
+    assert found.remedy.startswith("Add -90° to the readings of q2")
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_right_recording_is_not_doubted(seed) -> None:
+    noise, zeros, tool = ((0.00003, 10.0, 0.02), (0.01, 3.0, 0.02), (0.0005, 10.0, 0.2))[seed % 3]
+    assert pairs(seed, noise=noise, zeros_deg=zeros, tool=tool, count=40 + 100 * seed).seen().sentences == ()
+
+
+def test_outliers_are_no_reason_to_doubt() -> None:
+    right = pairs()
+    x = right.x.copy()
+    x[::8] += 0.7
+    assert replace(right, x=x).seen().sentences == ()
+
+
+def test_few_rows_are_warned_of_not_refused() -> None:
+    found = pairs().read(MISREAD["q3 counts the other way"]).seen(rows=30)
+    assert found.refusal is None
+    assert "q3 counts the other way" in found.warnings[0]
+    assert "These are 30 pairs" in found.warnings[0]
+
+
+def test_a_zero_far_off_is_mentioned() -> None:
+    right = pairs()
+    found = replace(right, q=right.q - np.radians([0.0, 0.0, 30.0, 0.0, 0.0, 0.0])).seen()
+    assert found.refusal is None
+    assert "the zero of q3 comes out +" in found.warnings[0]
+
+
+def test_positions_of_another_robot_are_refused_without_a_name() -> None:
+    right = pairs()
+    found = replace(right, x=np.random.default_rng(1).permutation(right.x)).seen()
+    assert "hardly of this robot" in (found.refusal or "")
+    assert not found.misread
+
+
+def test_the_direction_of_a_joint_through_the_marker_is_not_shown() -> None:
+    right = pairs(tool=0.0, zeros_deg=0.0)
+    still = right.q * [1, 1, 1, 1, 1, 0]
+    parameters = ChainParameters(arm())
+    found = replace(right, q=still, x=parameters.positions(np.zeros(parameters.size), still)).seen()
+    assert found.undirected == ("q6",)
+
+
+def test_a_camera_turned_against_a_known_pose_is_refused() -> None:
+    q = pairs().q
+    x = arm().positions(q)[:, [1, 2, 0]]
+    found = Pairs(q, x, pose_known=True).seen()
+    assert "the columns x, y, z hold y, z, x" in (found.refusal or "")
+
+
+def test_exchanged_positions_are_named_where_the_pose_is_known() -> None:
+    q = pairs().q
+    found = Pairs(q, arm().positions(q)[:, [1, 0, 2]], pose_known=True).seen()
+    assert "the columns x, y, z hold y, x, z" in (found.refusal or "")
+
+
+def test_force_turns_a_refusal_into_a_warning() -> None:
+    found = pairs().read(MISREAD["q3 counts the other way"]).seen()
+    assert "q3 counts the other way" in found.require("pairs.csv", force=True)[0]
+    with pytest.raises(RecordingError, match=r"pairs.csv: it seems that q3 counts the other way.* with --force"):
+        found.require("pairs.csv", force=False)
+
+
+# --- real recordings
+
+UR5 = REAL_DATA / "ur5_laser"
+real = pytest.mark.skipif(not UR5.exists(), reason=f"no {REAL_DATA}")
+CASES = {
+    "the columns q1 and q2 are exchanged": ([1, 0, 2, 3, 4, 5], [1] * 6, 0.0, [0, 1, 2]),
+    "q3 counts the other way": (range(6), [1, 1, -1, 1, 1, 1], 0.0, [0, 1, 2]),
+    "the positions are mirrored": (range(6), [1] * 6, 0.0, [1, 0, 2]),
+    "the columns q5 and q6 are exchanged": ([0, 1, 2, 3, 5, 4], [1] * 6, 0.0, [0, 1, 2]),
+    "the zero of q2 is about 90° off": (range(6), [1] * 6, np.pi / 2, [0, 1, 2]),
+}
+
+
+def misread_ur5(case: str) -> tuple[Config, Recording]:
+    config = Config.load(UR5 / "robot.toml", {})
+    order, signs, zero, axes = CASES[case]
+    recording = Recording.read(UR5 / "measured.csv", config.robot.joints)
+    q = recording.q[:, list(order)] * signs + [0.0, zero, 0.0, 0.0, 0.0, 0.0]
+    return config, dataclasses.replace(recording, q=q, x=recording.x[:, axes])
+
+
+@real
+@pytest.mark.parametrize("case", CASES)
+def test_a_misread_recording_of_a_real_arm_is_named(case) -> None:
+    config, recording = misread_ur5(case)
+    assert case in (plausibility(config.robot, recording.q, recording.x).refusal or "")
+
+
+@real
+@pytest.mark.parametrize(
+    "name", ["ur5_laser", "wam_laser", "ur10_laser_a", "ur10_laser_b", "panda_eyeinhand", "tiago_eyehand"]
+)
+def test_real_recordings_are_not_doubted(name) -> None:
+    robot = Config.load(REAL_DATA / name / "robot.toml", {}).robot
+    recording = Recording.read(REAL_DATA / name / "measured.csv", robot.joints)
+    assert plausibility(robot, recording.q, recording.x).sentences == ()
+
+
+@real
+@pytest.mark.parametrize("case", [*CASES, None])
+def test_the_live_learner_names_a_wrong_reading(case) -> None:
+    config, recording = misread_ur5(case or "q3 counts the other way")
+    if case is None:
+        recording = Recording.read(UR5 / "measured.csv", config.robot.joints)
+    learning = Learning(NominalModel.extended_by(config.simulation), config.tables.learner, DirectSolver())
+    findings = Findings(learning, config.robot, SystemClock())
+    for k in range(45):
+        pair = Pair("s", k + 1, 1, float(k), "", recording.q[k], recording.x[k], 1e-8 * np.eye(3))
+        learning.learn(pair, float(k))
+        findings.renew()
+    assert (case or "") in "".join(findings.doubts)
+    assert bool(findings.doubts) == (case is not None)

@@ -1,0 +1,69 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from small_arm import write_small_arm
+
+from daemon.tally import FEWEST_FRAMES, NEWEST_FRAMES, Tally
+from interfaces.clock import SystemClock
+from interfaces.records import Reason
+from interfaces.rejections import REMEDIES, WORDS
+from interfaces.robot import RobotDescription
+
+Q = np.zeros(2)
+
+
+@pytest.fixture
+def tally(tmp_path: Path) -> Tally:
+    return Tally(RobotDescription.load(write_small_arm(tmp_path)), SystemClock())
+
+
+def refuse(tally: Tally, reason: Reason, count: int) -> None:
+    for _ in range(count):
+        tally.reject(reason)
+
+
+@pytest.mark.parametrize("reason", Reason)
+def test_every_reason_has_words_and_a_remedy(reason) -> None:
+    assert WORDS[reason]
+    assert REMEDIES[reason].endswith((".", "?"))
+
+
+@pytest.mark.parametrize("reason", [Reason.NO_MARKER, Reason.EPIPOLAR, Reason.STALE, Reason.MOVING])
+def test_frames_all_refused_name_reason_and_remedy(tally, reason) -> None:
+    refuse(tally, reason, FEWEST_FRAMES)
+    name = reason.replace("_", " ")
+    assert tally.complaints == [
+        f"{FEWEST_FRAMES} of the last {FEWEST_FRAMES} frames were rejected: {name}. {REMEDIES[reason]}"
+    ]
+
+
+def test_the_most_frequent_of_several_reasons_is_named(tally) -> None:
+    refuse(tally, Reason.OCCLUDED, 40)
+    refuse(tally, Reason.EPIPOLAR, 50)
+    tally.accept(Q)
+    assert [sentence.partition(". ")[0] for sentence in tally.complaints] == [
+        "50 of the last 91 frames were rejected: epipolar"
+    ]
+
+
+def test_few_frames_are_no_reason_to_complain(tally) -> None:
+    refuse(tally, Reason.NO_MARKER, FEWEST_FRAMES - 1)
+    assert tally.complaints == []
+
+
+@pytest.mark.parametrize("reason", [Reason.TOO_NEAR, Reason.PAUSED])
+def test_an_arm_that_stands_still_is_in_order(tally, reason) -> None:
+    refuse(tally, reason, NEWEST_FRAMES)
+    assert tally.complaints == []
+
+
+def test_pairs_end_the_complaint(tally) -> None:
+    refuse(tally, Reason.NO_MARKER, NEWEST_FRAMES)
+    for _ in range(NEWEST_FRAMES // 10):
+        tally.accept(Q)
+    assert tally.complaints
+    tally.accept(Q)
+    assert tally.complaints == []
