@@ -43,7 +43,7 @@ def unified() -> Path | None:
 def missing_here() -> str | None:
     """Return why no systemd can be started on this machine and how to change that; None where it can."""
     if os.geteuid() != 0:
-        return "systemd in namespaces takes root; to run it: sudo .venv/bin/python -m pytest -m soak FILE"
+        return "not root; to run it: sudo .venv/bin/python -m pytest -m soak tests/system/test_systemd.py"
     if not SYSTEMD.exists() or any(shutil.which(tool) is None for tool in ("systemctl", "unshare", "nsenter", "ip")):
         return "no systemd, unshare, nsenter or ip; to run it: apt-get install systemd util-linux iproute2"
     if unified() is None:
