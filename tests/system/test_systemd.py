@@ -280,9 +280,31 @@ def test_one_learner_serves_several_robots(machine, tmp_path) -> None:
         machine.until(partial(machine.has, f"/var/lib/bodyschema/{name}/learner.ckpt"))
 
 
-def test_the_router_waits_for_a_slow_network(machine, tmp_path) -> None:
+def without_network(machine: Machine) -> None:
     machine.run("sh", "-c", "ip address del 192.0.2.10/24 dev lo 2>&- || true")
     machine.systemctl("stop", "slow-network.service", "network-online.target")
+
+
+def test_a_boot_with_a_slow_network_lets_all_meet(machine, robot) -> None:
+    folder = carried_out(robot.parent)
+    shutil.copy(SEVERAL / "router.toml", folder)
+    arm = re.sub(r"\[zenoh\]\n.*\n.*\n", "", robot.read_text())
+    install(machine, "router", folder / "router.toml")
+    for process in ("sampler", "learner"):
+        file, table = folder / f"{process}.toml", "robot.toml" if process == "sampler" else "learner.toml"
+        file.write_text(arm + (SEVERAL / table).read_text())
+        install(machine, "service", "--robot", file, "--only", process)
+    machine.run("chown", "-R", USER, folder)
+    machine.systemctl("enable", ROUTER, SAMPLER, LEARNER)
+    without_network(machine)
+    machine.systemctl("isolate", "quiet.target")
+    machine.systemctl("isolate", "--no-block", "machine.target")
+    machine.until(lambda: all(map(machine.is_active, (ROUTER, SAMPLER, LEARNER))))
+    assert gets_pairs(machine, SAMPLER, LEARNER)
+
+
+def test_the_router_waits_for_a_slow_network(machine, tmp_path) -> None:
+    without_network(machine)
     pki = carried_out(tmp_path)
     shutil.copy(SEVERAL / "router.toml", pki)
     tmp_path.chmod(0o755)
