@@ -224,7 +224,7 @@ class RouterFiles:
 
 
 def make_state_folders(configs: Sequence[Config], user: str, root: Path = ROOT) -> None:
-    """Make the `state_dir` of each robot.toml that has one, for `user`: systemd makes the others alone.
+    """Make the `state_dir` that a robot.toml names, owned by `user`; systemd itself makes the others.
 
     Raises:
         ConfigError: one cannot be made.

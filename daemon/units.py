@@ -278,7 +278,7 @@ def _seen(configs: Sequence[Config], installed: Installed) -> list[str]:
 
 
 def _bound(path: Path) -> str:
-    """A path that may be missing: the process then says so, where systemd would say 226/NAMESPACE."""
+    """Return the path as optional: where it is missing, the process names it; systemd would say 226/NAMESPACE."""
     return _quoted(f"-{path}")
 
 

@@ -35,7 +35,7 @@ LIMIT_S = 300.0  # only ends a test that would never end
 
 
 def unified() -> Path | None:
-    """The folder of the cgroup2 hierarchy."""
+    """Return the folder of the cgroup2 hierarchy."""
     mounts = (line.split() for line in Path("/proc/mounts").read_text().splitlines())
     return next((Path(at) for _, at, kind, *_ in mounts if kind == "cgroup2"), None)
 
@@ -95,7 +95,7 @@ class Machine:
         self._end()
 
     def run(self, *words: object, check: bool = True) -> subprocess.CompletedProcess[str]:
-        """A command as root on the machine."""
+        """Run a command as root on the machine."""
         enter = ["nsenter", f"--target={self._first()}", *NAMESPACES, "--"]
         variables = ["env", f"SYSTEMD_UNIT_PATH={FOLDER}:{self.folder}/units"]
         command = [*enter, *variables, *map(str, words)]
@@ -107,7 +107,7 @@ class Machine:
         return self.run("systemctl", "--no-pager", *words).stdout.strip()
 
     def show(self, unit: str, key: str) -> str:
-        """A property of a unit, as systemd has it."""
+        """Return a property of a unit."""
         return self.systemctl("show", "--value", "--property", key, unit)
 
     def is_active(self, unit: str) -> bool:
@@ -117,7 +117,7 @@ class Machine:
         return self.run("test", "-s", file, check=False).returncode == 0
 
     def drop_in(self, unit: str, text: str) -> None:
-        """As `systemctl edit`."""
+        """Write a drop-in, as `systemctl edit` does."""
         file = FOLDER / f"{unit}.d" / "zz-test.conf"
         self.run("sh", "-c", 'mkdir -p "$(dirname "$0")" && printf %s "$1" > "$0"', file, text)
         self.systemctl("daemon-reload")
@@ -134,7 +134,7 @@ class Machine:
             time.sleep(0.1)
 
     def _first(self) -> str:
-        """The number of its PID 1 outside; empty where it does not run."""
+        """Return the PID of its PID 1 as seen from outside; empty where it does not run."""
         return Path(f"/proc/{self._unshare.pid}/task/{self._unshare.pid}/children").read_text().strip()
 
     def _is_up(self) -> bool:

@@ -77,7 +77,7 @@ def robot(tmp_path: Path) -> Path:
 
 
 def walking(folder: Path, name: str = "arm", first_port: int = 7447) -> Path:
-    """A robot.toml whose encoders and cameras are a recording, its state where the service has it."""
+    """Write a robot.toml that plays a recording and keeps its state where services do."""
     folder.chmod(0o755)  # the service is another user's
     ports = count(first_port)
     file = write_robot(folder, lambda: f"tcp/127.0.0.1:{next(ports)}").file
@@ -97,15 +97,15 @@ def started(machine: Machine, robot: Path) -> None:
 
 
 def pairs(machine: Machine, unit: str) -> int:
-    """How many it says to have."""
+    """Return the number of pairs that a unit reports."""
     found = re.search(r"(\d+) pairs", machine.show(unit, "StatusText"))
     return 0 if found is None else int(found[1])
 
 
-def gets_pairs(machine: Machine, *units: str) -> bool:
+def await_pairs(machine: Machine, *units: str) -> None:
+    """Wait until each unit reports more pairs than now."""
     before = {unit: pairs(machine, unit) for unit in units}
     machine.until(lambda: all(pairs(machine, unit) > before[unit] for unit in units))
-    return True
 
 
 def restarts(machine: Machine, unit: str) -> int:
@@ -116,7 +116,7 @@ def test_installed_services_start_and_learn(machine, robot) -> None:
     started(machine, robot)
     assert machine.is_active(SAMPLER)
     assert machine.is_active(LEARNER)
-    assert gets_pairs(machine, SAMPLER, LEARNER)
+    await_pairs(machine, SAMPLER, LEARNER)
     assert restarts(machine, SAMPLER) == restarts(machine, LEARNER) == 0
     listed = machine.run("stat", "-c", "%U %a %n", "/var/lib/bodyschema/arm").stdout
     assert listed == f"{USER} 750 /var/lib/bodyschema/arm\n"
@@ -128,7 +128,7 @@ def test_a_boot_starts_what_is_enabled(machine, robot) -> None:
     assert not machine.is_active(SAMPLER)
     machine.systemctl("isolate", "machine.target")
     assert machine.is_active(LEARNER)
-    assert gets_pairs(machine, SAMPLER, LEARNER)
+    await_pairs(machine, SAMPLER, LEARNER)
 
 
 def test_reload_follows_robot_toml(machine, robot) -> None:
@@ -139,7 +139,7 @@ def test_reload_follows_robot_toml(machine, robot) -> None:
     machine.until(lambda: "in force now: daemon.segment_gap_s = 7.0" in machine.journal(SAMPLER))
     machine.until(lambda: machine.is_active(SAMPLER))
     assert machine.show(SAMPLER, "MainPID") == before
-    assert gets_pairs(machine, SAMPLER, LEARNER)
+    await_pairs(machine, SAMPLER, LEARNER)
 
 
 @pytest.mark.parametrize("unit", [SAMPLER, LEARNER])
@@ -147,24 +147,24 @@ def test_a_hung_service_is_aborted_and_restarted(machine, robot, unit) -> None:
     started(machine, robot)
     machine.drop_in(unit, "[Service]\nWatchdogSec=10\n")
     machine.systemctl("restart", unit)
-    gets_pairs(machine, unit)
+    await_pairs(machine, unit)
     machine.run("kill", "-STOP", machine.show(unit, "MainPID"))
     machine.until(lambda: restarts(machine, unit) >= 1)
     machine.until(lambda: machine.is_active(unit))
     assert "Fatal Python error: Aborted" in machine.journal(unit)
-    assert gets_pairs(machine, SAMPLER, LEARNER)
+    await_pairs(machine, SAMPLER, LEARNER)
 
 
 @pytest.mark.parametrize("unit", [SAMPLER, LEARNER])
 def test_a_killed_service_is_restarted_alone(machine, robot, unit) -> None:
     started(machine, robot)
-    gets_pairs(machine, SAMPLER, LEARNER)
+    await_pairs(machine, SAMPLER, LEARNER)
     other = LEARNER if unit == SAMPLER else SAMPLER
     running, killed = machine.show(other, "MainPID"), machine.show(unit, "MainPID")
     machine.run("kill", "-KILL", killed)
     machine.until(lambda: restarts(machine, unit) >= 1 and machine.is_active(unit))
     assert machine.show(other, "MainPID") == running
-    assert gets_pairs(machine, SAMPLER, LEARNER)
+    await_pairs(machine, SAMPLER, LEARNER)
 
 
 def test_a_service_over_its_memory_is_restarted(machine, robot) -> None:
@@ -174,10 +174,10 @@ def test_a_service_over_its_memory_is_restarted(machine, robot) -> None:
     machine.drop_in(LEARNER, "[Service]\nMemoryMax=60M\n")
     machine.systemctl("restart", "--no-block", LEARNER)
     machine.until(lambda: restarts(machine, LEARNER) >= 1)
-    assert gets_pairs(machine, SAMPLER)
+    await_pairs(machine, SAMPLER)
 
 
-def test_a_robot_out_of_reach_is_named_and_awaited(machine, robot) -> None:
+def test_a_robot_out_of_reach_is_awaited(machine, robot) -> None:
     started(machine, robot)
     away = robot.parent.rename(robot.parent.with_name("away"))
     for unit in (SAMPLER, LEARNER):
@@ -185,12 +185,12 @@ def test_a_robot_out_of_reach_is_named_and_awaited(machine, robot) -> None:
         assert f"{robot}: " in machine.journal(unit)
     away.rename(robot.parent)
     machine.until(lambda: machine.is_active(SAMPLER) and machine.is_active(LEARNER))
-    assert gets_pairs(machine, SAMPLER, LEARNER)
+    await_pairs(machine, SAMPLER, LEARNER)
 
 
 def test_stop_ends_services_in_order(machine, robot) -> None:
     started(machine, robot)
-    gets_pairs(machine, SAMPLER, LEARNER)
+    await_pairs(machine, SAMPLER, LEARNER)
     machine.systemctl("stop", SAMPLER, LEARNER)
     for unit in (SAMPLER, LEARNER):
         assert machine.show(unit, "ActiveState") == "inactive"
@@ -260,7 +260,7 @@ def test_servos_and_a_camera_give_pairs(machine, tmp_path, library) -> None:
         # The camera is a library below OpenCV: it takes the place of V4L2.
         machine.drop_in(unit, f"[Service]\nEnvironment=LD_PRELOAD={library}\nBindReadOnlyPaths={library.parent}\n")
         machine.systemctl("start", unit)
-        assert gets_pairs(machine, unit)
+        await_pairs(machine, unit)
         machine.systemctl("stop", unit)
         assert machine.show(unit, "Result") == "success"
 
@@ -275,7 +275,7 @@ def test_one_learner_serves_several_robots(machine, tmp_path) -> None:
     install(machine, "service", *(word for robot in robots for word in ("--robot", robot)), "--name", "lab")
     units = ["bodyschema-learner@lab.service", *(f"bodyschema-sampler@{name}.service" for name in ("left", "right"))]
     machine.systemctl("start", *units)
-    assert gets_pairs(machine, *units)
+    await_pairs(machine, *units)
     for name in ("left", "right"):
         machine.until(partial(machine.has, f"/var/lib/bodyschema/{name}/learner.ckpt"))
 
@@ -285,7 +285,7 @@ def without_network(machine: Machine) -> None:
     machine.systemctl("stop", "slow-network.service", "network-online.target")
 
 
-def test_a_boot_with_a_slow_network_lets_all_meet(machine, robot) -> None:
+def test_a_boot_with_slow_network_lets_all_meet(machine, robot) -> None:
     folder = carried_out(robot.parent)
     shutil.copy(SEVERAL / "router.toml", folder)
     arm = re.sub(r"\[zenoh\]\n.*\n.*\n", "", robot.read_text())
@@ -300,7 +300,7 @@ def test_a_boot_with_a_slow_network_lets_all_meet(machine, robot) -> None:
     machine.systemctl("isolate", "quiet.target")
     machine.systemctl("isolate", "--no-block", "machine.target")
     machine.until(lambda: all(map(machine.is_active, (ROUTER, SAMPLER, LEARNER))))
-    assert gets_pairs(machine, SAMPLER, LEARNER)
+    await_pairs(machine, SAMPLER, LEARNER)
 
 
 def test_the_router_waits_for_a_slow_network(machine, tmp_path) -> None:
