@@ -1,6 +1,6 @@
 #!/bin/bash
 # Start systemd as PID 1 of the namespaces that own_systemd.py made: boot_machine.sh FOLDER SYSTEMD
-# It sees the files of this machine. Changes in /etc, /var, /run and /dev stay in the namespaces.
+# It sees the files of this machine. Changes in /etc, /var, /run, /tmp and /dev stay in the namespaces.
 set -eu
 folder=$1
 mount --make-rprivate /
@@ -12,6 +12,12 @@ done
 rm -rf /etc/systemd/system /var/log/journal # the journal stays in /run
 mkdir -p /etc/systemd/system
 mount -t tmpfs -o mode=755 tmpfs /run
+shared=$(dirname "$folder") # the tests' files; the rest of /tmp is the namespace's own
+mkdir /run/shared
+mount --rbind "$shared" /run/shared
+mount -t tmpfs -o mode=1777 tmpfs /tmp
+mkdir -p "$shared"
+mount --move /run/shared "$shared"
 
 mkdir "$folder/own/dev"
 mount -t tmpfs -o mode=755 tmpfs "$folder/own/dev"
