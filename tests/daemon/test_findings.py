@@ -15,6 +15,7 @@ from daemon.config import LearnerConfig
 from daemon.findings import EVERY_S, SHARE, Findings, FindingTurns, figures
 from daemon.learning import DirectSolver, Learning, NominalModel
 from daemon.learning.outlook import Known, Scatter, foreseen
+from daemon.plausibility.check import FEWEST_ROWS
 from daemon.status import Outlook
 from interfaces.records import FloatArray
 from interfaces.robot import RobotDescription
@@ -281,7 +282,8 @@ def test_they_are_found_again_when_a_new_chain_was_found_and_not_too_soon() -> N
 
 def test_of_several_robots_one_finds_at_a_time() -> None:
     clock, turns = Slow(), FindingTurns()
-    arms = [Planted.of(seed, 40) for seed in (1, 2)]
+    # From FEWEST_ROWS pairs on, they are checked in a turn of their own.
+    arms = [Planted.of(seed, FEWEST_ROWS - 2) for seed in (1, 2)]
     found = [Findings(arm.learning, arm.robot, clock, 2, turns) for arm in arms]
     for findings in found:
         findings.renew()

@@ -178,7 +178,7 @@ def test_force_turns_a_refusal_into_a_warning() -> None:
 # --- real recordings
 
 UR5 = REAL_DATA / "ur5_laser"
-real = pytest.mark.skipif(not UR5.exists(), reason=f"no {REAL_DATA}")
+real = pytest.mark.skipif(not UR5.exists(), reason=f"no {REAL_DATA}; to run it: put the recordings there")
 CASES = {
     "the columns q1 and q2 are exchanged": ([1, 0, 2, 3, 4, 5], [1] * 6, 0.0, [0, 1, 2]),
     "q3 counts the other way": (range(6), [1, 1, -1, 1, 1, 1], 0.0, [0, 1, 2]),
