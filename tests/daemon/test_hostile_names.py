@@ -104,7 +104,7 @@ def test_signs_of_systemd_in_a_path_stay_signs(tmp_path: Path) -> None:
     config = in_folder(tmp_path / 'a:b $HOME ${x} %h "c"')
     text = of_host([config], "pi", HERE)
     assert rf'"{tmp_path}/a:b $$HOME $${{x}} %%h \"c\"/robot.toml"' in text
-    assert rf'BindReadOnlyPaths="{tmp_path}/a:b $HOME ${{x}} %%h \"c\""' in text
+    assert rf'BindReadOnlyPaths="-{tmp_path}/a:b $HOME ${{x}} %%h \"c\""' in text
 
 
 @pytest.mark.parametrize("name", ["../../x", "a/b", "a\nb", "a\n", "", "a b", "%i"])
