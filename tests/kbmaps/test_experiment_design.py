@@ -95,9 +95,9 @@ def test_the_rms_errors_fall_by_at_least_the_gain(seed, floor):
 @given(seed=seeds)
 @settings(max_examples=15)
 def test_gains_are_those_of_the_textbook_to_first_order(seed):
-    """With noise so large that a pair changes little the tangent is the curve."""
+    """With noise so large that a pair changes little the tangent is the curve; with more, rounding is what is seen."""
     model, region, q = planted(seed)
-    model.noise = 1e4
+    model.noise = 1e3
     before = np.sqrt(np.trace(model.covariances_after(q[:0], region), axis1=1, axis2=2)).mean()
     gains = ExperimentDesign(model, region).gains(model.roots(q))
     after = [np.trace(model.covariances_after(q[k : k + 1], region), axis1=1, axis2=2) for k in range(len(q))]

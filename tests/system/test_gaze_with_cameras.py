@@ -199,6 +199,7 @@ def episode(library, tmp_path_factory, free_endpoint) -> Episode:
             gazing = stage.watch(sampler, WATCHED_S, PAIRS)
             stage.head[1].fail(OVERLOAD)
             until(sampler, lambda said: any("gaze ended" in text for text in said.health))
+            time.sleep(EVERY_S)  # what is looked at next was after the end
             failed = stage.watch(sampler, 0.5)
             stage.head[1].reboot(time.monotonic())
             sampler.command("gaze_on")
