@@ -46,7 +46,7 @@ AS_OFTEN_AS_ONE = 10
 # What has to come round for the learner to be alive.
 LISTENING = "learning"
 LOOPS = (LISTENING, "background", "status")
-TABLES = ("robot", "camera", "zenoh", "daemon", "drivers", "learner", "effects", "unexplained")
+TABLES = ("robot", "camera", "zenoh", "daemon", "drivers", "learner", "effects", "background", "unexplained")
 CHANGEABLE = {("learner", "checkpoint_every_s")}
 
 

@@ -20,7 +20,7 @@ from .store import PairStore
 
 log = logging.getLogger(__name__)
 
-TABLES = ("robot", "camera", "zenoh", "daemon", "drivers", "vision", "sim", "effects", "unexplained")
+TABLES = ("robot", "camera", "zenoh", "daemon", "drivers", "vision", "sim", "effects", "background", "unexplained")
 CHANGEABLE = {("daemon", key) for key in DaemonConfig.__struct_fields__ if key != "state_dir"}
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 
@@ -26,6 +26,7 @@ from .observations import Observations
 from .rivals import Standing, standings
 from .scan import Candidate, Scan
 from .search import Search
+from .together import together, tolerated
 from .unknown import Unknowns
 
 Told = Callable[[str], None]
@@ -41,6 +42,8 @@ _BY_SO_MUCH = 4.0
 MOST_DOUBTFUL = 0.25
 # Beside what has no name a cause stays named only if it is more probable than not.
 _HALF = 0.5
+# Tolerances of another size than that are taken up (in logarithms), so many times at most.
+_SAME_SCALE, _RESCALED = 0.25, 3
 # Of the instrument's noise, another size than that is taken up (in logarithms).
 _SAME_NOISE = 0.1
 
@@ -96,7 +99,7 @@ class Diagnosis:
         """Measured minus predicted (n, 3) [m] on rows that causes and smooth model have not seen."""
         if self.left.model is None:
             return held_out_errors(fit, self.blocks)
-        return fit.observations.x - fit.run.measured + self.left.model.unseen
+        return fit.observations.x - fit.predicted + self.left.model.unseen
 
     @cached_property
     def held_out(self) -> dict[str, FloatArray]:
@@ -164,7 +167,7 @@ class Diagnosis:
         """Covariances (n, 3, 3) [m²] of the noise, from what is left when all is explained that can be."""
         fit = self.extended
         unstored = 0.0 if self.left.model is None else self.left.model.unstored
-        left = fit.observations.residuals(fit.run.measured + unstored)[self.markers]
+        left = fit.observations.residuals(fit.predicted + unstored)[self.markers]
         roots = np.linalg.inv(fit.observations.whitening)
         return float(np.square(left).mean()) * roots @ np.swapaxes(roots, 1, 2)
 
@@ -208,7 +211,8 @@ def diagnose(
     tell(f"{len(hypotheses.effects)} hypotheses")
     search = Search(hypotheses.effects, tell)
     unknowns = Unknowns(start)
-    extended = search.run(start, partial(needs_no_more_names, unknowns=unknowns, search=search))
+    enough = partial(needs_no_more_names, unknowns=unknowns, search=search)
+    extended = _searched(together(start, hypotheses.effects), search, enough)
     factor, rows = instrument_factor(extended), doubtful(extended)
     left_out = rows if rows.mean() <= MOST_DOUBTFUL else np.zeros_like(rows)
     if abs(np.log(factor)) > _SAME_NOISE or left_out.any():
@@ -216,8 +220,8 @@ def diagnose(
         start = aligned(observations, simulation)
         unknowns = Unknowns(start)
         enough = partial(needs_no_more_names, unknowns=unknowns, search=search)
-        extended = search.run(start.with_causes(extended.causes), enough)
-        search.path.insert(0, start)
+        begun = start.with_causes(extended.causes).tolerating(extended.background.scales)
+        extended = _searched(begun, search, enough)
     tell("asking whether something without a name is at work")
     blocks = blocks or Blocks.cut(len(recording))
     explanation = explain(extended, search.path, unknowns, search, tell)
@@ -236,13 +240,26 @@ def diagnose(
         nominal=fitted(observations, simulation, len(simulation.effects)),
         aligned=start,
         geometry=_geometry(start),
-        extended=explanation.fit if left.model is None else left.model.fit,
+        extended=(explanation.fit if left.model is None else left.model.fit).settled(),
         standings=tuple(stands),
         left=left,
         blocks=blocks,
         seed=seed,
         ended_early=search.ended_early,
     )
+
+
+def _searched(begun: Fit, search: Search, enough: Callable[[Sequence[Fit], float], bool]) -> Fit:
+    """With what a search finds from there, and tolerances as large as they then are."""
+    for _ in range(_RESCALED):
+        extended = search.run(begun, enough)
+        if extended.causes:
+            search.path.insert(0, begun.with_causes([]))
+        scales = tolerated(extended)
+        if np.abs(np.log(scales) - np.log(extended.background.scales)).max() < _SAME_SCALE:
+            break
+        begun = extended.tolerating(scales)
+    return extended
 
 
 def _geometry(start: Fit) -> Fit:

@@ -173,7 +173,7 @@ def _with_unknown(fit: Fit, unknowns: Unknowns, search: Search, least: float = -
     if apart is None:
         return Explanation(fit, None, fit.log_likelihood - names, promise=promise)
     worth = apart.fit.log_likelihood - names - unknowns.cost(apart)
-    return Explanation(fit, apart, worth, _length(fit, apart.predicted - fit.run.measured), promise)
+    return Explanation(fit, apart, worth, _length(fit, apart.predicted - fit.predicted), promise)
 
 
 def cost_of_names(causes: Iterable[Effect], search: Search) -> float:

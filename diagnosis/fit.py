@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -12,6 +12,7 @@ from scipy.ndimage import uniform_filter1d
 from effects import Effect, Simulated, Simulation
 from interfaces.records import FloatArray
 
+from .background import Background, Scales
 from .observations import Observations
 
 # An effect is not expected to be larger than so many times its usual size; what cannot be told stays near nothing.
@@ -59,8 +60,18 @@ class Noise:
     log_likelihood: float
 
     @classmethod
-    def of(cls, residuals: FloatArray, observations: Observations, start: Noise | None = None) -> Noise:
-        """The most probable noise of residuals (n, 3), by expectation maximisation; rows not trusted count nothing."""
+    def of(
+        cls,
+        residuals: FloatArray,
+        observations: Observations,
+        start: Noise | None = None,
+        spent: Callable[[float], float] = lambda _: 0.0,
+    ) -> Noise:
+        """The most probable noise of residuals (n, 3), by expectation maximisation; rows not trusted count nothing.
+
+        Args:
+            spent: how many of the numbers a background of tolerances takes for itself beside noise of a size.
+        """
         trusted, outlier_density = observations.trusted, observations.outlier_density
         squares = np.einsum("ni,ni->n", residuals, residuals)
         # Of three squared normal coordinates the median is 2.366.
@@ -80,7 +91,8 @@ class Noise:
             share = float(np.clip(1.0 - weights[trusted].mean(), _FEWEST_OUTLIERS, 0.5))
             weights[~trusted] = 0.0
             total = float(np.where(bursts, inlier, both)[trusted].sum())
-            sigma = float(np.sqrt(max((weights @ squares) / (3.0 * max(weights.sum(), 1.0)), ROUNDED**2)))
+            counted = max(3.0 * max(float(weights.sum()), 1.0) - spent(sigma), 1.0)
+            sigma = float(np.sqrt(max((weights @ squares) / counted, ROUNDED**2)))
         return cls(sigma, share, weights, total)
 
 
@@ -92,6 +104,8 @@ class Fit:
         observations: what it was fitted to.
         simulation: with all effects, the nuisances first.
         nuisances: how many of its effects are no findings.
+        background: what tolerances may change.
+        tolerated: by how much each of them does (p,).
         run: the simulation over the observed motion.
         residuals: (n, 3) in units of the stated noise.
         noise: what is known of it.
@@ -100,6 +114,8 @@ class Fit:
     observations: Observations
     simulation: Simulation
     nuisances: int
+    background: Background
+    tolerated: FloatArray
     run: Simulated
     residuals: FloatArray
     noise: Noise
@@ -131,8 +147,20 @@ class Fit:
 
     @property
     def log_likelihood(self) -> float:
-        """Of the observations, less what implausibly large effects cost [nats]."""
-        return self.noise.log_likelihood - _cost(self.simulation.effects[self.nuisances :])
+        """Of the observations, less what implausibly large effects and tolerances cost [nats]."""
+        beyond = 0.5 * float(self.background.precision @ np.square(self.tolerated))
+        beyond += self.background.volume(self.noise.sigma)
+        return self.noise.log_likelihood - _cost(self.simulation.effects[self.nuisances :]) - beyond
+
+    @cached_property
+    def predicted(self) -> FloatArray:
+        """What is measured (n, 3) [m] by all effects and tolerances."""
+        return self.run.measured + self.background.shift(self.tolerated)
+
+    @cached_property
+    def precision(self) -> FloatArray:
+        """Of the amounts of all effects, then of the tolerances, beforehand (p,)."""
+        return np.append(prior_precision(self.simulation, self.nuisances), self.background.precision)
 
     @cached_property
     def root_weights(self) -> FloatArray:
@@ -141,8 +169,8 @@ class Fit:
 
     @cached_property
     def run_columns(self) -> FloatArray:
-        """Derivatives (n, 3, p) of what is measured by all amounts [m]."""
-        return amount_columns(self.run, self.simulation.effects)
+        """Derivatives (n, 3, p) of what is measured by all amounts, and then by all tolerances [m]."""
+        return np.concatenate([amount_columns(self.run, self.simulation.effects), self.background.columns], axis=2)
 
     @cached_property
     def columns(self) -> FloatArray:
@@ -154,10 +182,41 @@ class Fit:
         return self.observations.whitened(columns) * self.root_weights[:, :, None]
 
     @cached_property
+    def absorbed(self) -> tuple[FloatArray, FloatArray]:
+        """Orthonormal directions (3 n, r) that tolerances change, and which share of the squares there is theirs (r,).
+
+        To all that is tested the background is noise that is shared among the rows (Rasmussen and Williams 2006, 2.7).
+        """
+        amounts = self.columns.shape[2] - len(self.tolerated)
+        flat = (self.columns[:, :, amounts:] * self.background.tolerances).reshape(self.left.size, len(self.tolerated))
+        values, vectors = np.linalg.eigh(flat.T @ flat)
+        there = values > 1e-9 * self.noise.sigma**2
+        values, vectors = values[there], vectors[:, there]
+        return flat @ (vectors / np.sqrt(values)), values / (values + self.noise.sigma**2)
+
+    def unshared(self, flat: FloatArray) -> FloatArray:
+        """Weighted columns (3 n, k) in units in which the background and the noise together are white."""
+        directions, shares = self.absorbed
+        if not len(shares):
+            return flat
+        return flat - directions @ ((1.0 - np.sqrt(1.0 - shares))[:, None] * (directions.T @ flat))
+
+    @cached_property
+    def evident(self) -> FloatArray:
+        """What the effects leave (n, 3), weighted and `unshared`."""
+        return self.left_by(self.run.measured)
+
+    def left_by(self, predicted: FloatArray) -> FloatArray:
+        """What a prediction (n, 3) [m] by effects leaves (n, 3), weighted and `unshared`."""
+        untolerated = self.background.shift(np.zeros_like(self.tolerated))
+        left = self.observations.residuals(predicted + untolerated) * self.root_weights
+        return self.unshared(left.reshape(-1, 1)).reshape(left.shape)
+
+    @cached_property
     def orthogonal(self) -> FloatArray:
-        """An orthonormal basis (n, 3, r) of what the amounts can change."""
-        n, _, p = self.columns.shape
-        flat = self.columns.reshape(3 * n, p)
+        """An orthonormal basis (n, 3, r) of what the amounts of effects can change, `unshared`."""
+        n, p = len(self.left), self.columns.shape[2] - len(self.tolerated)
+        flat = self.unshared(self.columns[:, :, :p].reshape(3 * n, p))
         scales = np.linalg.norm(flat, axis=0)
         q, r = np.linalg.qr(flat / np.where(scales > 0.0, scales, 1.0))
         left, values, _ = np.linalg.svd(r)
@@ -182,7 +241,7 @@ class Fit:
         """
         columns = np.concatenate([self.columns, self.shape_columns], axis=2)
         flat, variance = columns.reshape(self.left.size, -1), self.noise.sigma**2
-        precision = np.append(prior_precision(self.simulation, self.nuisances), self._shape_precision / _UNTOLD**2)
+        precision = np.append(self.precision, self._shape_precision / _UNTOLD**2)
         information = flat.T @ flat / variance + np.diag(precision)
         # In units in which each number is told alike: seconds and radians are of very different size.
         units = np.outer(scales := np.sqrt(np.diag(information)), scales)
@@ -207,9 +266,9 @@ class Fit:
             (p + s,), and [nats].
         """
         flat = np.concatenate([self.columns, self.shape_columns], axis=2).reshape(self.left.size, -1)
-        prior = prior_precision(self.simulation, self.nuisances)
-        precision = np.append(prior, self._shape_precision) * self.noise.sigma**2
-        values = np.concatenate([effect.values[effect.amounts] for effect in self.simulation.effects])
+        precision = np.append(self.precision, self._shape_precision) * self.noise.sigma**2
+        own = [effect.values[effect.amounts] for effect in self.simulation.effects]
+        values = np.concatenate([*own, self.tolerated])
         normal = flat.T @ flat + np.diag(precision)
         gradient = flat.T @ self.left.ravel()
         gradient[: len(values)] -= precision[: len(values)] * values
@@ -226,8 +285,8 @@ class Fit:
             amounts, shapes = amounts + len(effect.amounts), shapes + len(own)
         raise ValueError(f"{cause.name} is no effect of this fit")
 
-    def moved(self, step: FloatArray) -> Simulation:
-        """The simulation with its numbers moved by a step (p + s,)."""
+    def moved(self, step: FloatArray) -> tuple[Simulation, FloatArray]:
+        """The simulation with its numbers moved by a step (p + s,), and the tolerances."""
         effects, first = [], 0
         shape = self.columns.shape[2]
         for index, effect in enumerate(self.simulation.effects):
@@ -239,11 +298,37 @@ class Fit:
                     values[k] = _bounded(effect, k, values[k] + step[shape], self.observations.motion.clock)
                     shape += 1
             effects.append(effect.with_values(values))
-        return self.simulation.with_effects(effects)
+        return self.simulation.with_effects(effects), self.tolerated + step[first : first + len(self.tolerated)]
+
+    def stepped(self, step: FloatArray) -> Fit:
+        """With its numbers moved by a step (p + s,)."""
+        return self._with(*self.moved(step))
 
     def at(self, simulation: Simulation) -> Fit:
-        """A simulation with the same nuisances, as it is."""
-        return _at(self.observations, simulation, self.nuisances, self.noise)
+        """A simulation with the same nuisances and tolerances, as it is."""
+        return self._with(simulation, self.tolerated)
+
+    def _with(self, simulation: Simulation, tolerated: FloatArray) -> Fit:
+        return _at(self.observations, simulation, self.nuisances, self.noise, self.background, tolerated)
+
+    def to(self, observations: Observations, start: Simulation | None = None) -> Fit:
+        """The same, or another simulation to start from, refitted to other observations of the same motion."""
+        simulation = start or self.simulation
+        fit = _at(observations, simulation, self.nuisances, self.noise, self.background, self.tolerated)
+        return improved(fit)
+
+    def tolerating(self, scales: Scales) -> Fit:
+        """With tolerances of these scales beside it, linear about what they are here; all refitted."""
+        here = self.settled()
+        background = Background(here.run, self.observations.whitening, scales)
+        return improved(_at(self.observations, here.simulation, self.nuisances, self.noise, background))
+
+    def settled(self) -> Fit:
+        """The same with its tolerances in the simulation."""
+        simulation = self.simulation.with_background(self.background.with_amounts(self.tolerated))
+        run = simulation.run(self.observations.motion)
+        background = Background(run, self.observations.whitening, self.background.scales)
+        return _at(self.observations, simulation, self.nuisances, self.noise, background)
 
     def without(self, cause: Effect) -> Fit:
         """All causes but one, refitted."""
@@ -261,9 +346,10 @@ class Fit:
 def fitted(observations: Observations, simulation: Simulation, nuisances: int, start: Noise | None = None) -> Fit:
     """The most probable amounts of all effects of `simulation`, by Gauss-Newton steps that are halved where too far.
 
-    Periods and time constants of the causes move along; moments stay as they are.
+    Periods and time constants of the causes move along; moments stay as they are. Nothing else is tolerated.
     """
-    return improved(_at(observations, simulation, nuisances, start))
+    run = simulation.run(observations.motion)
+    return improved(_at(observations, simulation, nuisances, start, Background(run, observations.whitening, None)))
 
 
 def improved(fit: Fit, least: float = -np.inf) -> Fit:
@@ -281,7 +367,7 @@ def improved(fit: Fit, least: float = -np.inf) -> Fit:
             return fit
         best = None
         for shortened in (1.0, 0.3, 0.05):
-            tried = _at(fit.observations, fit.moved(shortened * step), fit.nuisances, fit.noise)
+            tried = fit.stepped(shortened * step)
             if tried.log_likelihood > fit.log_likelihood:
                 best = tried
                 break
@@ -300,11 +386,19 @@ def _rise(promised: float, fit: Fit) -> float:
     return -half_square * float(np.log1p(-min(promised / max(half_square, 1e-300), 0.999999)))
 
 
-def _at(observations: Observations, simulation: Simulation, nuisances: int, start: Noise | None) -> Fit:
+def _at(
+    observations: Observations,
+    simulation: Simulation,
+    nuisances: int,
+    start: Noise | None,
+    background: Background,
+    tolerated: FloatArray | None = None,
+) -> Fit:
     run = simulation.run(observations.motion)
-    residuals = observations.residuals(run.measured)
-    noise = Noise.of(residuals, observations, start)
-    return Fit(observations, simulation, nuisances, run, residuals, noise)
+    tolerated = background.start if tolerated is None else tolerated
+    residuals = observations.residuals(run.measured + background.shift(tolerated))
+    noise = Noise.of(residuals, observations, start, background.spent)
+    return Fit(observations, simulation, nuisances, background, tolerated, run, residuals, noise)
 
 
 def solved(normal: FloatArray, gradient: FloatArray) -> FloatArray:

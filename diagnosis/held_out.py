@@ -15,7 +15,7 @@ from scipy import stats
 from effects import Effect
 from interfaces.records import FloatArray
 
-from .fit import LARGEST, Fit, prior_precision, solved
+from .fit import LARGEST, Fit, solved
 from .observations import IntArray
 from .scan import Candidate
 from .scatter import instruments
@@ -60,10 +60,10 @@ class Blocks:
 
 def held_out_errors(fit: Fit, blocks: Blocks) -> FloatArray:
     """Measured minus predicted (n, 3) [m], each row predicted without its own fold."""
-    errors = fit.observations.x - fit.run.measured
+    errors = fit.observations.x - fit.predicted
     if not fit.columns.shape[2]:
         return errors
-    precision = np.diag(prior_precision(fit.simulation, fit.nuisances)) * fit.noise.sigma**2
+    precision = np.diag(fit.precision) * fit.noise.sigma**2
     for fold in range(_FOLDS):
         own = blocks.fold == fold
         errors[own] -= fit.run_columns[own] @ _solve(fit.columns[~own], fit.left[~own], precision)
@@ -100,14 +100,14 @@ class Added:
 def added(fit: Fit, candidates: Sequence[Candidate], blocks: Blocks) -> list[Added]:
     """What each of the candidates would bring on top of a fit, to first order."""
     folds = _Folds.of(fit, fit.columns, blocks)
-    before = folds.products.missed(prior_precision(fit.simulation, fit.nuisances))
+    before = folds.products.missed(fit.precision)
     return [_added(fit, candidate.effect, folds, before, blocks) for candidate in candidates]
 
 
 def _added(fit: Fit, effect: Effect, folds: _Folds, before: float, blocks: Blocks) -> Added:
     own = instruments(fit, effect)
     usual = np.array([effect.parameters[j].usual for j in effect.amounts])
-    precision = [prior_precision(fit.simulation, fit.nuisances), 1.0 / np.square(LARGEST * usual)]
+    precision = [fit.precision, 1.0 / np.square(LARGEST * usual)]
     after = folds.beside(own).missed(np.concatenate(precision))
     gain = 1.0 - after / before if before > 0.0 else 0.0
     return Added(100.0 * gain, block_p_value(fit, own, blocks))
@@ -189,6 +189,7 @@ def block_p_value(fit: Fit, columns: FloatArray, blocks: Blocks) -> float:
     1986; Hotelling's T² for so few blocks).
     """
     basis, flat = fit.orthogonal.reshape(fit.left.size, -1), columns.reshape(fit.left.size, -1)
+    flat = fit.unshared(flat)
     flat = flat - basis @ (basis.T @ flat)
     beside, inner = flat.reshape(columns.shape), flat.T @ flat
     scales = np.sqrt(np.maximum(np.diag(inner), 1e-300))
@@ -199,7 +200,7 @@ def block_p_value(fit: Fit, columns: FloatArray, blocks: Blocks) -> float:
         return 1.0
     # Orthonormal columns: the amounts that fit best are the scores themselves.
     beside = beside @ (vectors[:, told] / np.sqrt(values[told]) / scales[:, None])
-    return scores_p_value(beside, fit.left, blocks)
+    return scores_p_value(beside, fit.evident, blocks)
 
 
 def scores_p_value(columns: FloatArray, left: FloatArray, blocks: Blocks) -> float:

@@ -14,7 +14,7 @@ def instrument_factor(fit: Fit) -> float:
     """The most probable factor on the stated standard deviations, given what a fit has left and what rounding does."""
     observations = fit.observations
     rows = fit.noise.weights >= 0.5
-    left = (observations.x - fit.run.measured)[rows]
+    left = (observations.x - fit.predicted)[rows]
     stated, rounding = observations.stated[rows], observations.rounding[rows]
     if not rounding.any():
         return observations.stated_factor

@@ -67,17 +67,21 @@ class Products:
 
     def __init__(self, fit: Fit, besides: Sequence[Effect] = ()) -> None:
         self._fit = fit
-        self._basis = fit.orthogonal
-        flat = self._basis.reshape(fit.left.size, -1)
+        flat = fit.orthogonal.reshape(fit.left.size, -1)
         self.rows = float(fit.noise.weights.sum())
-        self._freed = [np.zeros((flat.shape[1], 0)), *(self._only_of(cause, flat) for cause in besides)]
-        lefts = [fit.left, *(self._left_without(cause) for cause in besides)]
-        for place, free in enumerate(self._freed):
-            seen = flat.T @ lefts[place].ravel()
-            lefts[place] = lefts[place] - (flat @ (seen - free @ (free.T @ seen))).reshape(fit.left.shape)
-        self._lefts = np.stack(lefts, axis=2)
+        freed = [np.zeros((flat.shape[1], 0)), *(self._only_of(cause, flat) for cause in besides)]
+        lefts = np.stack([fit.evident.ravel(), *(self._left_without(cause) for cause in besides)], axis=1)
+        for place, free in enumerate(freed):
+            seen = flat.T @ lefts[:, place]
+            lefts[:, place] -= flat @ (seen - free @ (free.T @ seen))
         # A simulation's own output leaves nothing, or what is rounded.
-        self.squares = np.maximum(np.square(self._lefts).sum(axis=(0, 1)), 3.0 * self.rows * ROUNDED**2)
+        self.squares = np.maximum(np.square(lefts).sum(axis=0), 3.0 * self.rows * ROUNDED**2)
+        # What is tested is not `unshared` itself, as its rows are scaled one by one: all else is, twice.
+        directions, shares = fit.absorbed
+        basis = np.concatenate([directions * np.sqrt(shares), fit.unshared(flat)], axis=1)
+        self._basis = basis.reshape(*fit.left.shape, -1)
+        self._freed = [np.concatenate([np.zeros((len(shares), free.shape[1])), free]) for free in freed]
+        self._lefts = fit.unshared(lefts).reshape(*fit.left.shape, -1)
         self._ports: dict[int, Rows] = {}
         self._kept: dict[tuple[object, ...], System] = {}
 
@@ -106,17 +110,17 @@ class Products:
         return Rows(turned @ columns, turned @ self._basis, turned @ self._lefts, self._freed)
 
     def _left_without(self, cause: Effect) -> FloatArray:
-        """Weighted residuals (n, 3) without a cause, all others as they are."""
+        """What is left (3 n,) without a cause, all others as they are, weighted and `unshared`."""
         fit = self._fit
         others = [effect for effect in fit.simulation.effects if effect is not cause]
-        predicted = fit.simulation.with_effects(others).positions(fit.observations.motion)
-        return fit.observations.residuals(predicted) * fit.root_weights
+        return fit.left_by(fit.simulation.with_effects(others).positions(fit.observations.motion)).ravel()
 
     def _only_of(self, cause: Effect, flat: FloatArray) -> FloatArray:
         """The directions (r, f) of the basis (3 n, r) that no other effect can change."""
         places = set(self._fit.places(cause))
-        others = [k for k in range(self._fit.columns.shape[2]) if k not in places]
-        seen = flat.T @ self._fit.columns.reshape(len(flat), -1)[:, others]
+        amounts = self._fit.columns.shape[2] - len(self._fit.tolerated)
+        others = [k for k in range(amounts) if k not in places]
+        seen = flat.T @ self._fit.unshared(self._fit.columns.reshape(len(flat), -1)[:, others])
         seen = seen / np.maximum(np.linalg.norm(seen, axis=0), 1e-300)
         left, values, _ = np.linalg.svd(seen)
         return left[:, int((values > _ROUNDED_OFF * values.max(initial=0.0)).sum()) :]

@@ -167,8 +167,8 @@ def _as_fitted(fit: Fit, effect: Effect) -> _Other:
 
 def _difference(one: Fit, other: Fit | Nameless) -> float:
     """Twice the log-likelihood by which the predictions of two fits differ over their observations."""
-    predicted = other.run.measured if isinstance(other, Fit) else other.predicted
-    apart = one.observations.whitened((one.run.measured - predicted)[:, :, None])[:, :, 0]
+    predicted = other.predicted
+    apart = one.observations.whitened((one.predicted - predicted)[:, :, None])[:, :, 0]
     return float((one.noise.weights[:, None] * np.square(apart)).sum() / one.noise.sigma**2)
 
 

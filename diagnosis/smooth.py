@@ -13,11 +13,11 @@ from itertools import combinations_with_replacement
 
 import numpy as np
 
-from effects import Motion, Simulated, Simulation, Unexplained, place_map, smooth_map
+from effects import Motion, Simulated, Unexplained, place_map, smooth_map
 from interfaces.records import FloatArray
 
 from .families import Family
-from .fit import Fit, fitted, prior_precision, solved
+from .fit import Fit, solved
 from .held_out import Blocks
 from .unknown import Apart
 
@@ -59,7 +59,7 @@ def smooth_model(alone: Fit, apart: Apart, families: Sequence[Family], blocks: B
     Args:
         apart: the same causes beside the families.
     """
-    said = apart.predicted - alone.run.measured
+    said = apart.predicted - alone.predicted
     lasting = [family for family in families if not family.over_time]
     # Whatever depends on the place in the image is learnt by the same functions: one family stands for all.
     places = [family for family in lasting if family.kind == "place"]
@@ -77,8 +77,7 @@ def smooth_model(alone: Fit, apart: Apart, families: Sequence[Family], blocks: B
     stored, off_m = functions.stored(amounts.of_functions, _LEFT_OUT * noise_m)
     if off_m > _TOO_FAR_OFF * noise_m:
         return none
-    simulation = Simulation(fit.simulation.robot, fit.simulation.effects, stored)
-    beside = fitted(fit.observations, simulation, fit.nuisances, fit.noise)
+    beside = fit.to(fit.observations, replace(fit.simulation, residual=stored))
     later = _Amounts(beside, functions.columns[:, :, :0], _timed(beside, timed), blocks)
     explained = functions.shift(functions.given, amounts.of_functions) + later.in_time
     return SmoothModel(beside, stored, explained, later.in_time, amounts.unseen)
@@ -235,7 +234,7 @@ class _Amounts:
         self, fit: Fit, functions: FloatArray, timed: FloatArray, blocks: Blocks, bent: FloatArray | None = None
     ) -> None:
         self._fit, self._blocks = fit, blocks
-        self._left_m = fit.observations.x - fit.run.measured - (0.0 if bent is None else bent)
+        self._left_m = fit.observations.x - fit.predicted - (0.0 if bent is None else bent)
         self._causes, self._lasting = fit.run_columns.shape[2], functions.shape[2]
         self._columns = np.concatenate([fit.run_columns, functions, timed], axis=2)
         weighted = fit.weighted(self._columns)
@@ -290,7 +289,7 @@ class _Amounts:
 
     def _solved(self, rows: np.ndarray, size: float) -> FloatArray:
         free = self._flat.shape[1] - self._causes
-        precision = [prior_precision(self._fit.simulation, self._fit.nuisances)]
+        precision = [self._fit.precision]
         precision.append(np.full(free, (size * _noise_m(self._fit)) ** -2))
         ridge = np.diag(np.concatenate(precision)) * self._fit.noise.sigma**2
         flat = self._flat[rows]

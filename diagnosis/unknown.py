@@ -16,7 +16,7 @@ from scipy import stats
 from interfaces.records import FloatArray
 
 from .families import Family, families
-from .fit import Fit, fitted, prior_precision, solved
+from .fit import Fit, solved
 from .held_out import FEWEST_ROWS_A_BLOCK, Blocks, held_out_square, scores_p_value
 from .low_rank import low_rank, numbers_of
 from .observations import Observations
@@ -122,7 +122,7 @@ class Apart:
     @property
     def predicted(self) -> FloatArray:
         """What is measured (n, 3) [m] by causes and families together."""
-        return self.fit.run.measured + (self.observations.x - self.fit.observations.x)
+        return self.fit.predicted + (self.observations.x - self.fit.observations.x)
 
     @property
     def choice(self) -> int:
@@ -154,7 +154,7 @@ class Unknowns:
         basis = basis_of(fit)
         for way in others:
             basis = np.concatenate([basis, self._fresh(fit, basis, way)], axis=1)
-        left = fit.left.ravel()
+        left = fit.evident.ravel()
         return basis, left - basis @ (basis.T @ left)
 
     def nearest(self, fit: Fit, others: Sequence[Way] = ()) -> list[tuple[Way, float]]:
@@ -168,7 +168,9 @@ class Unknowns:
         basis, left = self.beside(fit, others)
         weights = np.repeat(fit.root_weights[:, 0], 3)
         rss, rows = float(left @ left), float(fit.noise.weights.sum())
-        seen = np.ascontiguousarray((np.column_stack([basis, left]) * weights[:, None]).T)
+        directions, shares = fit.absorbed
+        twice = np.column_stack([directions * np.sqrt(shares), fit.unshared(np.column_stack([basis, left]))])
+        seen = np.ascontiguousarray((twice * weights[:, None]).T)
         ranked: list[tuple[float, Way, FloatArray | None]] = []
         for way in self._ways:
             if way in others:
@@ -199,7 +201,7 @@ class Unknowns:
         Args:
             least: twice the log-likelihood that they have to bring, to first order.
         """
-        basis, left = basis_of(fit), fit.left.ravel() / fit.noise.sigma
+        basis, left = basis_of(fit), fit.evident.ravel() / fit.noise.sigma
         ranked = [
             (float(np.square(self._fresh(fit, basis, way).T @ left).sum()), k)
             for k, way in enumerate(self._ways)
@@ -227,7 +229,7 @@ class Unknowns:
         for _ in range(_ROUNDS):
             numbers = self._step(here)
             left = self._without(fit.observations, chosen, numbers)
-            tried = fitted(left, here.fit.simulation, fit.nuisances, here.fit.noise)
+            tried = here.fit.to(left)
             rise = tried.log_likelihood - here.fit.log_likelihood
             if rise > 0.0:
                 here = replace(here, numbers=numbers, fit=tried)
@@ -264,7 +266,7 @@ class Unknowns:
 
     def _missed(self, fit: Fit, blocks: Blocks, apart: Apart | None = None) -> float:
         """Mean square of what causes, and ways, leave of rows that they were not fitted to, whitened."""
-        columns, precision = fit.columns, prior_precision(fit.simulation, fit.nuisances)
+        columns, precision = fit.columns, fit.precision
         if apart is not None:
             # Held to what a number of each may be, as they were found: what few rows tell is not followed beyond them.
             more = [way.columns.reshape(*fit.left.shape, -1) * fit.root_weights[:, :, None] for way in apart.chosen]
@@ -279,13 +281,13 @@ class Unknowns:
         fit, counts = here.fit, [len(number) for number in here.numbers]
         basis = basis_of(fit)
         weights = np.repeat(fit.root_weights[:, 0], 3)[:, None]
-        columns = np.concatenate([way.columns for way in here.chosen], axis=1) * weights
+        columns = fit.unshared(np.concatenate([way.columns for way in here.chosen], axis=1) * weights)
         columns = columns - basis @ (basis.T @ columns)
         scales = np.concatenate([way.scales for way in here.chosen])
         before = np.concatenate(here.numbers) * scales
         ridge = here.precision * fit.noise.sigma**2
         normal = columns.T @ columns + ridge * np.eye(len(before))
-        step = solved(normal, columns.T @ fit.left.ravel() - ridge * before)
+        step = solved(normal, columns.T @ fit.evident.ravel() - ridge * before)
         return tuple(np.split((before + step) / scales, np.cumsum(counts)[:-1]))
 
     def _without(
@@ -327,7 +329,7 @@ def basis_of(fit: Fit) -> FloatArray:
 
 def _directions(columns: FloatArray, fit: Fit, basis: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Columns (3 n, p) weighted and beside a basis, and the squared lengths (r,) and mixtures (p, r) that are told."""
-    weighted = columns * np.repeat(fit.root_weights[:, 0], 3)[:, None]
+    weighted = fit.unshared(columns * np.repeat(fit.root_weights[:, 0], 3)[:, None])
     weighted = weighted - basis @ (basis.T @ weighted)
     values, vectors = np.linalg.eigh(weighted.T @ weighted)
     there = values > _LEFT

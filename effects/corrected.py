@@ -32,7 +32,7 @@ def corrected_geometry(simulation: Simulation) -> CalibratedGeometry | None:
     """
     simulation = simulation.placed
     robot = simulation.robot
-    rigid = [effect for effect in simulation.effects if effect.name in RIGID]
+    rigid = [effect for effect in simulation.all_effects if effect.name in RIGID]
     if not rigid:
         return None
     origins: dict[str, FloatArray] = {}

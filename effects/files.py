@@ -5,6 +5,11 @@ effect = "joint_compliance"
 where = "shoulder"
 compliance_rad_per_Nm = 0.0031
 
+[[background]]                  # small errors everywhere, within what its makers tolerate; the same keys
+effect = "link_geometry"
+where = "elbow"
+x_m = 0.0002
+
 [unexplained]
 model = "unexplained.kbmap"     # relative to this file
 joints = ["shoulder", "elbow"]  # whose readings it takes
@@ -38,7 +43,7 @@ from .unexplained import Unexplained, stored_model
 
 EXTENDED_FILE = "extended.toml"
 MODEL_FILE = "unexplained.kbmap"
-EFFECTS, UNEXPLAINED = "effects", "unexplained"
+EFFECTS, BACKGROUND, UNEXPLAINED = "effects", "background", "unexplained"
 # A map of ten joints takes 1.4 MB, one of the largest nets that are learnt 100 MB.
 MOST_MODEL_BYTES = 2**28
 _HEAD = ("effect", "where", "source")
@@ -91,28 +96,30 @@ def load_simulation(file: Path) -> Simulation:
 
 def simulation_of(robot: RobotDescription, tables: Mapping[str, Any], text: str) -> Simulation:
     """As `load_simulation`, from the tables and the text of the robot's file."""
-    effects = read_effects(robot, tables, text, robot.file)
-    return Simulation(robot, effects, read_unexplained(robot, tables, text, robot.file))
+    effects, background = (read_effects(robot, tables, text, robot.file, key) for key in (EFFECTS, BACKGROUND))
+    return Simulation(robot, effects, read_unexplained(robot, tables, text, robot.file), background)
 
 
-def read_effects(robot: RobotDescription, tables: Mapping[str, Any], text: str, file: Path) -> tuple[Effect, ...]:
-    """The effects in `[[effects]]`, in their order; none without it.
+def read_effects(
+    robot: RobotDescription, tables: Mapping[str, Any], text: str, file: Path, key: str = EFFECTS
+) -> tuple[Effect, ...]:
+    """The effects in `[[effects]]`, or another list `key` of the same form, in their order; none without it.
 
     Raises:
         ConfigError: an effect, a joint or a number is unknown, missing, or of another unit; names line and remedy.
     """
-    entries = tables.get(EFFECTS, [])
+    entries = tables.get(key, [])
     if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
-        remedy = "Write each effect under a heading [[effects]]"
-        raise ConfigError("effects is not a list of tables", file=file, line=line_of(text, (EFFECTS,)), remedy=remedy)
+        remedy = f"Write each effect under a heading [[{key}]]"
+        raise ConfigError(f"{key} is not a list of tables", file=file, line=line_of(text, (key,)), remedy=remedy)
     effects: list[Effect] = []
     for place, entry in enumerate(entries):
         try:
             effect = _effect(robot, entry)
             effects.append(effect.one_more(sum(other.key == effect.key for other in effects)))
         except _WrongEntry as wrong:
-            line = line_in_entry(text, EFFECTS, place, wrong.key)
-            what = f"effect {place + 1}: {wrong.what}"
+            line = line_in_entry(text, key, place, wrong.key)
+            what = f"{'effect' if key == EFFECTS else key} {place + 1}: {wrong.what}"
             raise RobotError(what, file=file, line=line, remedy=wrong.remedy) from None
     return tuple(effects)
 
@@ -167,10 +174,11 @@ def write_extended(simulation: Simulation, folder: Path, heading: str, *, replac
     file = folder / EXTENDED_FILE
     simulation = simulation.placed
     tables = tables_elsewhere(simulation.robot, folder)
-    tables.pop(EFFECTS, None)
-    tables.pop(UNEXPLAINED, None)
-    if simulation.effects:
-        tables[EFFECTS] = [effect.table() for effect in simulation.effects]
+    for key in (EFFECTS, BACKGROUND, UNEXPLAINED):
+        tables.pop(key, None)
+    for key, effects in ((EFFECTS, simulation.effects), (BACKGROUND, simulation.background)):
+        if effects:
+            tables[key] = [effect.table() for effect in effects]
     residual = simulation.residual
     if residual is not None:
         if not isinstance(residual, Unexplained):

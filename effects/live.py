@@ -24,7 +24,7 @@ class LiveEncoders:
     """
 
     def __init__(self, simulation: Simulation, row_readings: int = 1) -> None:
-        encoder = [effect for effect in simulation.effects if effect.kind.encoder is not None]
+        encoder = [effect for effect in simulation.all_effects if effect.kind.encoder is not None]
         plays = [effect for effect in encoder if isinstance(effect.kind.encoder, Backlash)]
         settling = [effect for effect in encoder if isinstance(effect.kind.encoder, Settling)]
         self._place = simulation.place

@@ -6,7 +6,7 @@ x_measured = drift(t) + residual(q(t)) + optics(camera(tool(structure(encoder(q(
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Protocol
 
@@ -52,11 +52,18 @@ class Simulation:
         effects: what is added to it.
         residual: what is added to what is measured; None for nothing. It depends on the readings alone, so no effect
             changes it.
+        background: small errors everywhere, within what the arm's makers tolerate: none of them is a finding.
     """
 
     robot: RobotDescription
     effects: tuple[Effect, ...] = ()
     residual: Residual | None = None
+    background: tuple[Effect, ...] = ()
+
+    @cached_property
+    def all_effects(self) -> tuple[Effect, ...]:
+        """The background, then the effects."""
+        return (*self.background, *self.effects)
 
     @cached_property
     def gravity(self) -> GravityLoad:
@@ -65,14 +72,23 @@ class Simulation:
 
     def with_effects(self, effects: Sequence[Effect]) -> Simulation:
         """The same robot and residual with these effects in the place of its own."""
-        changed = Simulation(self.robot, tuple(effects), self.residual)
+        changed = replace(self, effects=tuple(effects))
+        changed.__dict__["gravity"] = self.gravity
+        return changed
+
+    def with_background(self, background: Sequence[Effect]) -> Simulation:
+        """The same with other small errors everywhere."""
+        changed = replace(self, background=tuple(background))
         changed.__dict__["gravity"] = self.gravity
         return changed
 
     @cached_property
     def rigid(self) -> Simulation:
         """With those of its effects alone that a rigid chain can have in it, and without the residual."""
-        rigid = Simulation(self.robot, tuple(effect for effect in self.effects if effect.name in RIGID))
+        own, background = (
+            tuple(effect for effect in effects if effect.name in RIGID) for effects in (self.effects, self.background)
+        )
+        rigid = Simulation(self.robot, own, None, background)
         rigid.__dict__["gravity"] = self.gravity
         return rigid
 
@@ -89,7 +105,7 @@ class Simulation:
                 later.append(Effect.at(self.robot, _STAYS[effect.name], effect.where, values=values.tolist()))
             elif effect.name not in _OF_MOTION:
                 own.append(effect)
-        return Simulation(self.robot, (*own, *later), self.residual)
+        return replace(self, effects=(*own, *later))
 
     @property
     def placed(self) -> Simulation:
@@ -106,7 +122,7 @@ class Simulation:
         if not gone:
             return self
         effects = tuple(effect for effect in self.effects if effect.name not in gone)
-        return Simulation(robot.with_placement(pose, marker), effects, self.residual)
+        return replace(self, robot=robot.with_placement(pose, marker), effects=effects)
 
     def positions(self, motion: Motion) -> FloatArray:
         """What would be measured (n, 3) [m] in the measurement frame."""
@@ -132,7 +148,7 @@ class Simulation:
     def unloaded(self, readings: Motion) -> FloatArray:
         """True joint angles (n, d) [rad, m] where no weight bends the joints."""
         q = readings.q.copy()
-        for effect in self.effects:
+        for effect in self.all_effects:
             if effect.kind.encoder is not None:
                 place = self.place(effect)
                 q[:, place.joint] += effect.kind.encoder.correction(readings, place, effect.values)
@@ -160,7 +176,7 @@ class Simulation:
         return sum(e.value("latency_s") for e in self._of("camera_latency"))
 
     def _of(self, name: str) -> list[Effect]:
-        return [effect for effect in self.effects if effect.name == name]
+        return [effect for effect in self.all_effects if effect.name == name]
 
     @property
     def bears_weight(self) -> bool:
@@ -185,7 +201,7 @@ class Simulation:
         chain = rigid._chain()
         fixed = chain.fixed.copy()
         fixed[0] = inverse(rigid.camera_pose) @ fixed[0]
-        for effect in rigid.effects:
+        for effect in rigid.all_effects:
             if effect.name == "joint_offset":
                 k = rigid.place(effect).joint
                 fixed[k] = fixed[k] @ self._turned(k, effect.values[0])

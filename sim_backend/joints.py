@@ -46,7 +46,7 @@ class JointPaths:
         """Whether the joints are where the drives are: no effect moves them."""
         return not any(
             effect.kind.encoder is not None or effect.name in ("joint_compliance", "camera_latency")
-            for effect in self._truth.beyond.effects
+            for effect in self._truth.beyond.all_effects
         )
 
     def record(self, angles: FloatArray, t: float) -> None:

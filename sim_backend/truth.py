@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -79,7 +80,7 @@ class TrueRobot:
                 joints[name] = _locked(joint, held_at)
         return cls(
             robot=robot,
-            beyond=extension.with_effects([effect for effect in extension.effects if effect.name not in GEOMETRY]),
+            beyond=extension.with_effects(_bent(extension.effects)).with_background(_bent(extension.background)),
             tree=replace(robot.tree, joints=joints),
             offsets=frozen_array([offsets[name] for name in robot.joints]),
             T_parent_camera=frozen_array(robot.camera.pose @ extension.camera_pose @ camera_error),
@@ -120,8 +121,13 @@ def with_offsets(chain: RigidChain, offsets: FloatArray) -> RigidChain:
     return RigidChain(fixed=fixed, axes=chain.axes, prismatic=chain.prismatic)
 
 
+def _bent(effects: Iterable[Effect]) -> list[Effect]:
+    """Those that no tree of rigid links can have in it."""
+    return [effect for effect in effects if effect.name not in GEOMETRY]
+
+
 def _named(simulation: Simulation, name: str) -> list[Effect]:
-    return [effect for effect in simulation.effects if effect.name == name]
+    return [effect for effect in simulation.all_effects if effect.name == name]
 
 
 def _offset(joint: UrdfJoint, errors: ErrorConfig, rng: np.random.Generator) -> float:

@@ -80,7 +80,7 @@ class NominalModel:
         since = simulation.since.placed
         robot = since.robot
         known = robot.camera.pose_known, robot.robot.marker_known
-        bent = len(since.effects) > len(since.rigid.effects) or since.residual is not None
+        bent = len(since.all_effects) > len(since.rigid.all_effects) or since.residual is not None
         return cls(since.rigid_chain, robot.lower, robot.upper, *known, since if bent and all(known) else None)
 
     @property

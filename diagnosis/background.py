@@ -1,0 +1,143 @@
+"""The background: each link, axis and drive of an arm is off by a little, within what its makers tolerate.
+
+A link's place and its axis, the zero with it, are off by N(0, (s τ)²), and so are the small periodic errors of each
+drive. One scale s for lengths, one for angles and one for the drives are what the data tell. The background is part
+of every fit and never a finding; a cause is what is larger.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+from effects import Effect, Simulated, Simulation
+from interfaces.records import FloatArray
+
+# What workshops tolerate: of a link's length, of an axis or a zero, and of a drive over a turn [m, rad].
+LENGTH_M, ANGLE_RAD, DRIVE_RAD = 0.3e-3, float(np.radians(0.06)), float(np.radians(0.01))
+# Of a sliding joint's drive [m].
+_DRIVE_M = 0.03e-3
+# The periodic errors of a drive that every arm has: once and twice a turn of the joint.
+_TWICE = 2.0
+# Of the scales' logarithms before the data.
+SPREAD = 1.0
+
+
+class Scales(NamedTuple):
+    """How many times larger tolerances are than `LENGTH_M`, `ANGLE_RAD` and `DRIVE_RAD`."""
+
+    lengths: float = 1.0
+    angles: float = 1.0
+    drives: float = 1.0
+
+    @property
+    def doubt(self) -> float:
+        """How improbable they are before the data, beside those of a workshop [nats]."""
+        return float(0.5 * np.square(np.log(self) / SPREAD).sum())
+
+
+class Background:
+    """Small errors everywhere beside a run of a simulation, to first order about those that the simulation has.
+
+    Args:
+        run: of a simulation, whose background may be empty.
+        whitening: (n, 3, 3), to units in which the stated noise is one.
+        scales: of what is tolerated; None for no background at all.
+
+    Attributes:
+        effects: those of the background at rest: a link at each joint, eccentricity and ripple of each drive.
+        columns: derivatives (n, 3, p) [m] of what is measured by its amounts.
+        tolerances: how large each may be, 1-sigma (p,).
+        start: the amounts (p,) of the simulation, about which the columns are.
+    """
+
+    def __init__(self, run: Simulated, whitening: FloatArray, scales: Scales | None) -> None:
+        simulation = run.simulation
+        self._whitening, self.scales = whitening, scales
+        self.effects = () if scales is None else background_effects(simulation, run.motion.q)
+        own = simulation.background or self.effects
+        self.start = _amounts(own) if self.effects else np.zeros(0)
+        parts = [run.columns(effect)[:, :, effect.amounts] for effect in own] if self.effects else []
+        self.columns = np.concatenate([np.empty((len(run.motion), 3, 0)), *parts], axis=2)
+        self.group = np.concatenate([np.empty(0, int), *map(_groups, self.effects)])
+        units = np.concatenate([np.empty(0), *map(_units, self.effects)])
+        self.tolerances = units if scales is None else units * np.asarray(scales)[self.group]
+
+    def scaled(self, scales: Scales) -> Background:
+        """The same about the same run with other scales."""
+        other = object.__new__(Background)
+        other._whitening, other.scales, other.effects, other.start = self._whitening, scales, self.effects, self.start
+        other.columns, other.group = self.columns, self.group
+        other.tolerances = np.concatenate([np.empty(0), *map(_units, self.effects)]) * np.asarray(scales)[self.group]
+        return other
+
+    def shift(self, amounts: FloatArray) -> FloatArray:
+        """What amounts (p,) other than those of the simulation add to what is measured (n, 3) [m]."""
+        return self.columns @ (amounts - self.start)
+
+    def with_amounts(self, amounts: FloatArray) -> tuple[Effect, ...]:
+        """The background's effects with amounts (p,)."""
+        ends = np.cumsum([len(effect.amounts) for effect in self.effects])
+        return tuple(
+            _with(effect, amounts[end - len(effect.amounts) : end])
+            for effect, end in zip(self.effects, ends, strict=True)
+        )
+
+    @cached_property
+    def precision(self) -> FloatArray:
+        """Of the amounts beforehand (p,)."""
+        return 1.0 / np.square(self.tolerances)
+
+    @cached_property
+    def spectrum(self) -> FloatArray:
+        """Squared lengths of what the background changes (p,), in units of the stated noise."""
+        flat = (self._whitening @ (self.columns * self.tolerances)).reshape(3 * len(self.columns), len(self.tolerances))
+        return np.maximum(np.linalg.eigvalsh(flat.T @ flat), 0.0)
+
+    def spent(self, sigma: float) -> float:
+        """How many numbers of the data it takes for itself where the noise is `sigma` times the stated one."""
+        return float((self.spectrum / (self.spectrum + sigma**2)).sum())
+
+    def volume(self, sigma: float) -> float:
+        """What having so many possibilities costs [nats]."""
+        return float(0.5 * np.log1p(self.spectrum / sigma**2).sum())
+
+
+def background_effects(simulation: Simulation, q: FloatArray) -> tuple[Effect, ...]:
+    """What is a little off everywhere, at rest: at each joint that moves over q (n, d), and each link between."""
+    robot, found = simulation.robot, []
+    for k, joint in enumerate(robot.joints):
+        found.append(_resting(Effect.at(robot, "link_geometry", joint)))
+        if not robot.chain.prismatic[k] and np.ptp(q[:, k]) > 0.0:
+            found.append(_resting(Effect.at(robot, "joint_eccentricity", joint)))
+            found.append(_resting(Effect.at(robot, "joint_ripple", joint, values=[0.0, 0.0, _TWICE])))
+    return tuple(effect.one_more(-1) for effect in found)
+
+
+def _resting(effect: Effect) -> Effect:
+    return _with(effect, np.zeros(len(effect.amounts)))
+
+
+def _with(effect: Effect, amounts: FloatArray) -> Effect:
+    values = effect.values.copy()
+    values[effect.amounts] = amounts
+    return effect.with_values(values)
+
+
+def _amounts(effects: Sequence[Effect]) -> FloatArray:
+    return np.concatenate([effect.values[effect.amounts] for effect in effects])
+
+
+def _groups(effect: Effect) -> np.ndarray:
+    if effect.name != "link_geometry":
+        return np.full(len(effect.amounts), 2)
+    return np.array([0, 0, 0, 1, 1, 1])
+
+
+def _units(effect: Effect) -> FloatArray:
+    if effect.name != "link_geometry":
+        return np.full(len(effect.amounts), DRIVE_RAD)
+    return np.repeat([LENGTH_M, ANGLE_RAD], 3)

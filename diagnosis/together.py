@@ -1,0 +1,302 @@
+"""Causes that only together explain what is wrong: sets of them, compared by their evidence beside the background.
+
+With one of four wrong zeros in the model, tolerances still have to be ten times a workshop's, and it seems worth nothing;
+with all four they fall, and that is worth much. So sets of causes are begun from nothing, from all zeros, and from all
+effects of one kind, and what is not worth its numbers is taken away, added and exchanged, with the scales of tolerances
+fitted to each set. Everything is linear about one fit: a set costs what its normal equations cost, not what rows do
+(MacKay 1992, "Bayesian interpolation"; Tipping and Faul 2003, "Fast marginal likelihood maximisation").
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve, solve_triangular
+
+from effects import Effect
+from interfaces.records import FloatArray
+
+from .background import SPREAD, Scales
+from .fit import Fit
+from .scan import Candidate, Scan
+from .search import Key
+
+# What naming a cause costs beside what having looked for so many does [nats].
+_NAMED = 3.0
+# Rounds in which scales and noise are found, until their logarithms move by less than this.
+_ROUNDS, _STILL = 25, 0.02
+# No step of a logarithm is larger.
+_FARTHEST = 1.0
+# Scales are sought within these, and the noise from this share of the fit's on.
+_SMALLEST, _LARGEST, _QUIETEST = 1e-3, 1e2, 1e-3
+# So many of the most promising moves are tried with scales of their own.
+_TRIED = 4
+# Sets of causes are changed so many times at most.
+_MOST_MOVES = 60
+# So many sets are refitted at most, while one promises to be no less probable than the best by more than this [nats].
+_MOST_REFITTED, _COMES_NEAR = 8, 15.0
+# What is wrong at one joint often is at others: zeros are set in one session. So much each costs but the first [nats].
+_ANOTHER = 2.0
+
+
+@dataclass(frozen=True, eq=False)
+class Together:
+    """A set of causes as it stands by its evidence.
+
+    Attributes:
+        chosen: which of the candidates.
+        worth: its evidence less what its causes cost to name [nats]; it counts only beside that of other sets.
+        scales: of the tolerances.
+        sigma: of the noise, in units of the stated one.
+        amounts: of all columns that it has (p,).
+    """
+
+    chosen: tuple[int, ...]
+    worth: float
+    scales: Scales
+    sigma: float
+    amounts: FloatArray
+    factor: tuple[FloatArray, bool]
+    columns: FloatArray
+
+
+class Sets:
+    """Sets of causes beside one fit, to first order.
+
+    Args:
+        fit: with a background.
+        candidates: what may be a cause, each with the amounts, periods and moments about which it is linear.
+        doubt: what naming one of them costs at least [nats].
+    """
+
+    def __init__(self, fit: Fit, candidates: Sequence[Candidate], doubt: float) -> None:
+        self._fit = fit
+        amounts = fit.columns.shape[2] - len(fit.tolerated)
+        causes = sum(len(effect.amounts) for effect in fit.causes)
+        own = [effect.values[effect.amounts] for effect in fit.simulation.effects]
+        now = np.concatenate([*own, fit.tolerated])
+        rows = fit.left.size
+        self._target = fit.left.ravel() + fit.columns.reshape(rows, -1) @ now
+        parts = [fit.columns[:, :, : amounts - causes], fit.columns[:, :, amounts:]]
+        self.effects = [candidate.effect for candidate in candidates]
+        parts += [fit.weighted(fit.run.columns(effect)[:, :, effect.amounts]) for effect in self.effects]
+        self._nuisances, self._tolerances = amounts - causes, len(fit.tolerated)
+        flat = np.concatenate(parts, axis=2).reshape(rows, -1)
+        usual = [effect.parameters[k].usual for effect in self.effects for k in effect.amounts]
+        self._units = np.concatenate([np.ones(self._nuisances), fit.background.tolerances / self._scales_now, usual])
+        lengths = np.linalg.norm(flat[:, : self._nuisances], axis=0)
+        self._units[: self._nuisances] = 1e4 / np.where(lengths > 0.0, lengths, 1.0) * fit.noise.sigma * np.sqrt(rows)
+        flat *= self._units
+        self._inner, self._toward = flat.T @ flat, flat.T @ self._target
+        self._square, self._rows = float(self._target @ self._target), 3.0 * float(fit.noise.weights.sum())
+        self._doubts = [doubt + _NAMED + float(np.log(candidate.trials)) for candidate in candidates]
+        ends = np.cumsum([0, *(len(effect.amounts) for effect in self.effects)])
+        first = self._nuisances + self._tolerances
+        self._places = [np.arange(first + a, first + b) for a, b in pairwise(ends)]
+
+    @cached_property
+    def _scales_now(self) -> FloatArray:
+        scales = self._fit.background.scales
+        return np.asarray(scales if scales is not None else Scales())[self._fit.background.group]
+
+    def climbed(self, starts: Iterable[tuple[int, ...]]) -> list[Together]:
+        """The sets that are reached from some starts."""
+        seen: dict[frozenset[int], Together] = {}
+        reached = {one.chosen: one for one in (self._climbed(start, seen) for start in starts)}
+        return list(reached.values())
+
+    def starts(self, own: tuple[int, ...]) -> Iterator[tuple[int, ...]]:
+        """Where to begin: with the fit's causes, with nothing, with all zeros, and with all effects of each kind."""
+        yield own
+        yield ()
+        kinds = dict.fromkeys(effect.name for effect in self.effects if effect.kind.at_joint and not effect.source)
+        zeros = tuple(k for k, effect in enumerate(self.effects) if effect.name == "joint_offset")
+        for kind in kinds:
+            yield tuple(k for k, effect in enumerate(self.effects) if effect.name == kind)
+        yield tuple(dict.fromkeys((*own, *zeros)))
+
+    def _climbed(self, start: tuple[int, ...], seen: dict[frozenset[int], Together]) -> Together:
+        here = self.of(start)
+        for _ in range(_MOST_MOVES):
+            if frozenset(here.chosen) in seen:
+                return seen[frozenset(here.chosen)]
+            seen[frozenset(here.chosen)] = here
+            better = self._without_one(here) or self._with_one_more(here) or self._exchanged(here)
+            if better is None:
+                return here
+            here = better
+        return here
+
+    def _without_one(self, here: Together) -> Together | None:
+        """With one cause fewer, where that is more probable."""
+        ranked = sorted(here.chosen, key=lambda k: self._loss(here, k))
+        tried = [self.of(tuple(j for j in here.chosen if j != k), here) for k in ranked[:_TRIED]]
+        return _better(tried, here)
+
+    def _with_one_more(self, here: Together) -> Together | None:
+        return _better([self.of((*here.chosen, k), here) for k in self._promising(here)[:_TRIED]], here)
+
+    def _exchanged(self, here: Together) -> Together | None:
+        """With another in the place of a cause."""
+        tried = []
+        for k in here.chosen:
+            without = self.of(tuple(j for j in here.chosen if j != k), here)
+            tried += [self.of((*without.chosen, j), without) for j in self._promising(without)[:_TRIED] if j != k]
+        return _better(tried, here)
+
+    def _loss(self, here: Together, k: int) -> float:
+        """What a cause is worth where scales and noise stay as they are [nats]."""
+        places = np.searchsorted(here.columns, self._places[k])
+        unit = np.zeros((len(here.columns), len(places)))
+        unit[places, np.arange(len(places))] = 1.0
+        covariance = cho_solve(here.factor, unit)[places]
+        amounts = here.amounts[places]
+        gained = 0.5 * float(amounts @ np.linalg.solve(covariance, amounts))
+        return gained + 0.5 * float(np.linalg.slogdet(covariance)[1]) - self._doubt_beside(k, here.chosen)
+
+    def _doubt_beside(self, k: int, others: Sequence[int]) -> float:
+        """What naming a cause costs where others are named [nats]."""
+        kinds = {self.effects[j].name for j in others if j != k}
+        return min(self._doubts[k], _ANOTHER) if self.effects[k].name in kinds else self._doubts[k]
+
+    def _promising(self, here: Together) -> list[int]:
+        """The candidates that are worth most where scales and noise stay as they are, the best first."""
+        open_ones = [k for k in range(len(self._places)) if k not in here.chosen]
+        if not open_ones:
+            return []
+        places = np.concatenate([self._places[k] for k in open_ones])
+        across = self._inner[np.ix_(here.columns, places)] / here.sigma**2
+        solved = cho_solve(here.factor, across)
+        inner = self._inner[np.ix_(places, places)] / here.sigma**2 - across.T @ solved
+        gradient = self._toward[places] / here.sigma**2 - solved.T @ (self._toward[here.columns] / here.sigma**2)
+        worths, first = [], 0
+        for k in open_ones:
+            own = slice(first, first + len(self._places[k]))
+            first = own.stop
+            precision = inner[own, own] + np.eye(own.stop - own.start)
+            gained = 0.5 * float(gradient[own] @ np.linalg.solve(precision, gradient[own]))
+            worths.append(gained - 0.5 * float(np.linalg.slogdet(precision)[1]) - self._doubt_beside(k, here.chosen))
+        ranked = np.argsort(worths)[::-1]
+        return [open_ones[k] for k in ranked]
+
+    def of(self, chosen: tuple[int, ...], near: Together | None = None) -> Together:
+        """A set of causes with the scales and the noise that give it the most evidence."""
+        own = [self._places[k] for k in chosen]
+        columns = np.sort(np.concatenate([np.arange(self._nuisances + self._tolerances), *own]).astype(np.intp))
+        group = np.full(len(columns), -1)
+        group[self._nuisances : self._nuisances + self._tolerances] = self._fit.background.group
+        inner, toward = self._inner[np.ix_(columns, columns)], self._toward[columns]
+        logs = np.log(near.scales if near else Scales())
+        sigma = near.sigma if near else self._fit.noise.sigma
+        members = [group == g for g in range(3)]
+        for done in range(_ROUNDS):
+            factor, variances, amounts = self._solved(inner, toward, group, logs, sigma)
+            inverse = cho_solve(factor, np.eye(len(columns)))
+            told = 1.0 - np.diag(inverse) / variances
+            # What a scale's tolerances say of it, and what workshops do (MacKay 1992, equation 4.10).
+            spent = np.array([told[one].sum() for one in members])
+            squares = np.array([(np.square(amounts) / variances)[one].sum() for one in members])
+            steps = (squares - spent - logs / SPREAD**2) / (2.0 * np.maximum(spent, 0.5) + 1.0 / SPREAD**2)
+            steps = np.clip(steps, -_FARTHEST, _FARTHEST)
+            rss = self._square - 2.0 * float(amounts @ toward) + float(amounts @ inner @ amounts)
+            free = max(self._rows - float(told.sum()), 1.0)
+            quieter = float(np.clip(0.5 * np.log(max(rss, 1e-300) / free) - np.log(sigma), -_FARTHEST, _FARTHEST))
+            if done and max(np.abs(steps).max(), abs(quieter)) < _STILL:
+                break
+            logs = np.clip(logs + steps, np.log(_SMALLEST), np.log(_LARGEST))
+            sigma = max(sigma * float(np.exp(quieter)), _QUIETEST * self._fit.noise.sigma)
+        factor, variances, amounts = self._solved(inner, toward, group, logs, sigma)
+        left = self._square - float(amounts @ toward)
+        evidence = -0.5 * left / sigma**2 - self._rows * float(np.log(sigma))
+        evidence -= float(np.log(np.diag(factor[0])).sum()) + 0.5 * float(np.log(variances).sum())
+        scales = Scales(*np.exp(logs))
+        worth = evidence - scales.doubt - sum(self._doubt_beside(k, chosen[:j]) for j, k in enumerate(chosen))
+        return Together(chosen, worth, scales, sigma, amounts, factor, columns)
+
+    def _solved(
+        self, inner: FloatArray, toward: FloatArray, group: np.ndarray, logs: FloatArray, sigma: float
+    ) -> tuple[tuple[FloatArray, bool], FloatArray, FloatArray]:
+        """Factor of the precision, variances beforehand (p,) and amounts (p,), in units of `_units`."""
+        variances = np.where(group >= 0, np.exp(2.0 * logs)[group], 1.0)
+        precision = inner / sigma**2
+        precision[np.diag_indices_from(precision)] += 1.0 / variances
+        factor = cho_factor(precision, lower=True)
+        return factor, variances, cho_solve(factor, toward / sigma**2)
+
+    def effect(self, here: Together, k: int) -> Effect:
+        """One of the causes of a set, with its amounts."""
+        effect, places = self.effects[k], self._places[k]
+        values = effect.values.copy()
+        values[effect.amounts] = here.amounts[np.searchsorted(here.columns, places)] * self._units[places]
+        return effect.with_values(values)
+
+
+def _better(tried: Sequence[Together], here: Together) -> Together | None:
+    best = max(tried, key=lambda one: one.worth, default=None)
+    return best if best is not None and best.worth > here.worth + _STILL else None
+
+
+def together(start: Fit, hypotheses: Sequence[Effect]) -> Fit:
+    """The causes that together have the most evidence beside tolerances everywhere, fitted.
+
+    What is best to first order is refitted, and compared about its own numbers, until nothing else comes near.
+
+    Args:
+        start: without a background.
+    """
+    known = [_Place(start.tolerating(Scales()), hypotheses)]
+    while len(known) < _MOST_REFITTED:
+        looked_at = {place.name for place in known}
+        proposals = [
+            (one.worth, place, one) for place in known for one in place.reached if place.name_of(one) not in looked_at
+        ]
+        worth, place, one = max(proposals, key=lambda proposal: proposal[0], default=(-np.inf, known[0], known[0].here))
+        if worth < max(place.here.worth for place in known) - _COMES_NEAR:
+            break
+        known.append(_Place(place.refitted(one), hypotheses))
+    return max(known, key=lambda place: place.here.worth).fit
+
+
+def tolerated(fit: Fit) -> Scales:
+    """The scales of tolerances that have the most evidence beside the causes of a fit."""
+    causes = [Candidate(cause, 0.0, 1) for cause in fit.causes]
+    return Sets(fit, causes, 0.0).of(tuple(range(len(causes)))).scales
+
+
+class _Place:
+    """A fit with its causes, and the sets of causes that are reached from it."""
+
+    def __init__(self, fit: Fit, hypotheses: Sequence[Effect]) -> None:
+        self.fit = fit
+        present = {cause.key for cause in fit.causes}
+        scanned = Scan(fit).candidates([effect for effect in hypotheses if effect.key not in present])
+        candidates = [Candidate(cause, 0.0, 1) for cause in fit.causes] + [_at_rest(one) for one in scanned]
+        self._sets = Sets(fit, candidates, float(np.log(max(len(hypotheses), 1))))
+        own = tuple(range(len(fit.causes)))
+        self.here = self._sets.of(own)
+        self.reached = self._sets.climbed(self._sets.starts(own))
+        self.name = self.name_of(self.here)
+
+    def name_of(self, one: Together) -> frozenset[Key]:
+        """Which causes a set has, whatever their numbers."""
+        return frozenset(self._sets.effects[k].key for k in one.chosen)
+
+    def refitted(self, one: Together) -> Fit:
+        """One of the sets, about its own numbers."""
+        causes = [self._sets.effect(one, k) for k in one.chosen]
+        possible = [cause for cause in causes if cause.is_possible]
+        return self.fit.with_causes(possible).tolerating(one.scales).tolerating(one.scales)
+
+
+def _at_rest(candidate: Candidate) -> Candidate:
+    """The candidate about no amount at all where it is linear in its amounts."""
+    effect = candidate.effect
+    if effect.name in ("backlash",):
+        return candidate
+    values = effect.values.copy()
+    values[effect.amounts] = 0.0
+    return Candidate(effect.with_values(values), candidate.gain, candidate.dof, candidate.trials)
