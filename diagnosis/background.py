@@ -7,7 +7,6 @@ of every fit and never a finding; a cause is what is larger.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from functools import cached_property
 from typing import NamedTuple
 
@@ -22,6 +21,9 @@ LENGTH_M, ANGLE_RAD, DRIVE_RAD = 0.3e-3, float(np.radians(0.06)), float(np.radia
 _DRIVE_M = 0.03e-3
 # The periodic errors of a drive that every arm has: once and twice a turn of the joint.
 _TWICE = 2.0
+_PERIODIC = ("joint_eccentricity", "joint_ripple")
+# So many times as large as drives' errors usually are an error of a drive is one like others.
+_LIKE_OTHERS = 3.0
 # Of the scales' logarithms before the data.
 SPREAD = 1.0
 
@@ -57,10 +59,11 @@ class Background:
     def __init__(self, run: Simulated, whitening: FloatArray, scales: Scales | None) -> None:
         simulation = run.simulation
         self._whitening, self.scales = whitening, scales
-        self.effects = () if scales is None else background_effects(simulation, run.motion.q)
-        own = simulation.background or self.effects
-        self.start = _amounts(own) if self.effects else np.zeros(0)
-        parts = [run.columns(effect)[:, :, effect.amounts] for effect in own] if self.effects else []
+        own = simulation.background or background_effects(simulation, run.motion.q)
+        own = () if scales is None else own
+        self.effects = tuple(_resting(effect) for effect in own)
+        self.start = np.concatenate([np.empty(0), *(effect.values[effect.amounts] for effect in own)])
+        parts = [run.columns(effect)[:, :, effect.amounts] for effect in own]
         self.columns = np.concatenate([np.empty((len(run.motion), 3, 0)), *parts], axis=2)
         self.group = np.concatenate([np.empty(0, int), *map(_groups, self.effects)])
         units = np.concatenate([np.empty(0), *map(_units, self.effects)])
@@ -85,6 +88,13 @@ class Background:
             _with(effect, amounts[end - len(effect.amounts) : end])
             for effect, end in zip(self.effects, ends, strict=True)
         )
+
+    def tolerates(self, effect: Effect) -> bool:
+        """Whether an effect is a periodic error of a drive that is no larger than that of others."""
+        if self.scales is None or effect.name not in _PERIODIC:
+            return False
+        unit = _DRIVE_M if effect.prismatic else DRIVE_RAD
+        return float(np.linalg.norm(effect.values[effect.amounts])) < _LIKE_OTHERS * self.scales.drives * unit
 
     @cached_property
     def precision(self) -> FloatArray:
@@ -127,10 +137,6 @@ def _with(effect: Effect, amounts: FloatArray) -> Effect:
     return effect.with_values(values)
 
 
-def _amounts(effects: Sequence[Effect]) -> FloatArray:
-    return np.concatenate([effect.values[effect.amounts] for effect in effects])
-
-
 def _groups(effect: Effect) -> np.ndarray:
     if effect.name != "link_geometry":
         return np.full(len(effect.amounts), 2)
@@ -139,5 +145,5 @@ def _groups(effect: Effect) -> np.ndarray:
 
 def _units(effect: Effect) -> FloatArray:
     if effect.name != "link_geometry":
-        return np.full(len(effect.amounts), DRIVE_RAD)
+        return np.full(len(effect.amounts), _DRIVE_M if effect.prismatic else DRIVE_RAD)
     return np.repeat([LENGTH_M, ANGLE_RAD], 3)

@@ -256,9 +256,10 @@ def _searched(begun: Fit, search: Search, enough: Callable[[Sequence[Fit], float
         if extended.causes:
             search.path.insert(0, begun.with_causes([]))
         scales = tolerated(extended)
-        if np.abs(np.log(scales) - np.log(extended.background.scales)).max() < _SAME_SCALE:
+        small = [cause for cause in extended.causes if extended.background.tolerates(cause)]
+        if not small and np.abs(np.log(scales) - np.log(extended.background.scales)).max() < _SAME_SCALE:
             break
-        begun = extended.tolerating(scales)
+        begun = extended.tolerating(scales, small)
     return extended
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -182,6 +182,17 @@ class Fit:
         return self.observations.whitened(columns) * self.root_weights[:, :, None]
 
     @cached_property
+    def independence(self) -> float:
+        """How many independent rows there are for each (0 to 1], as neighbours agree: (1 - ρ) / (1 + ρ)."""
+        follows = ~self.observations.motion.begins[1:]
+        agree = float((self.left[1:][follows] * self.left[:-1][follows]).sum())
+        squares = float(np.square(self.left[1:][follows]).sum())
+        rho = float(np.clip(agree / max(squares, 1e-300), 0.0, 0.99))
+        # Of white rows it is within so much of nothing.
+        unsure = 2.0 / np.sqrt(max(3.0 * float(follows.sum()), 1.0))
+        return (1.0 - rho) / (1.0 + rho) if rho > unsure else 1.0
+
+    @cached_property
     def absorbed(self) -> tuple[FloatArray, FloatArray]:
         """Orthonormal directions (3 n, r) that tolerances change, and which share of the squares there is theirs (r,).
 
@@ -317,11 +328,19 @@ class Fit:
         fit = _at(observations, simulation, self.nuisances, self.noise, self.background, self.tolerated)
         return improved(fit)
 
-    def tolerating(self, scales: Scales) -> Fit:
-        """With tolerances of these scales beside it, linear about what they are here; all refitted."""
-        here = self.settled()
-        background = Background(here.run, self.observations.whitening, scales)
-        return improved(_at(self.observations, here.simulation, self.nuisances, self.noise, background))
+    def tolerating(self, scales: Scales, also: Collection[Effect] = ()) -> Fit:
+        """With tolerances of these scales beside it, linear about what they are here; all refitted.
+
+        Args:
+            also: some of the causes, which are no more findings but tolerated.
+        """
+        simulation = self.settled().simulation
+        if also:
+            stays = [effect for effect in simulation.effects if effect not in also]
+            moved = [effect.one_more(-2 - k) for k, effect in enumerate(also)]
+            simulation = simulation.with_effects(stays).with_background((*simulation.background, *moved))
+        background = Background(simulation.run(self.observations.motion), self.observations.whitening, scales)
+        return improved(_at(self.observations, simulation, self.nuisances, self.noise, background))
 
     def settled(self) -> Fit:
         """The same with its tolerances in the simulation."""

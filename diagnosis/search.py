@@ -39,6 +39,8 @@ _ELSEWHERE = 1.0
 _ASTRAY = 5.0
 # An exchange that loses no more than this may be worth it with one cause more [nats].
 _WITH_ONE_MORE = 100.0
+# Fewer blocks of time than this cannot say how improbable a chance is; what is worth more is beyond doubt [nats].
+_FEW_BLOCKS, _BEYOND_DOUBT = 20, 30.0
 # The camera's pose and the marker's place are simpler than the link next to them.
 _OF_A_LINK = 1
 
@@ -171,7 +173,8 @@ class Search:
             least = fit.log_likelihood + rise_for(most + doubt, candidate.dof)
             start = fit.starting([*fit.causes, candidate.effect])
             tried = joined(start, candidate.effect, least, fit.log_likelihood + 0.5 * candidate.gain)
-            worth = nats(2.0 * (tried.log_likelihood - fit.log_likelihood), candidate.dof) - doubt
+            gain = 2.0 * (tried.log_likelihood - fit.log_likelihood) * self._counted(tried, candidate.effect)
+            worth = nats(gain, candidate.dof) - doubt
             if worth > most and tried.causes[-1].is_possible:
                 best, most = tried, worth
         return best, most
@@ -261,10 +264,20 @@ class Search:
 
     def agreed(self, fit: Fit, candidate: Candidate) -> float:
         """What a candidate is worth by the agreement of blocks of time, which need not be white inside [nats]."""
-        effect = candidate.effect
-        chance = block_p_value(fit, instruments(fit, effect), Blocks.cut(len(fit.observations)))
+        effect, blocks = candidate.effect, Blocks.cut(len(fit.observations))
+        columns = instruments(fit, effect)
+        chance = block_p_value(fit, columns, blocks)
         gain = float(stats.chi2.isf(max(chance, 1e-290), candidate.dof))
-        return nats(gain, candidate.dof) - self.doubt(candidate)
+        worth = nats(gain, candidate.dof) - self.doubt(candidate)
+        if blocks.count < _FEW_BLOCKS and worth < NAMED:
+            # Of so few blocks none is improbable enough; what explains so much needs no such witness.
+            plain = nats(fit.independence * candidate.gain, candidate.dof) - self.doubt(candidate)
+            worth = max(worth, plain) if plain > _BEYOND_DOUBT else worth
+        return worth
+
+    def _counted(self, fit: Fit, effect: Effect) -> float:
+        """Which share of a gain counts: noise that wanders looks like what changes with time."""
+        return fit.independence if effect.kind.begins or effect.name == "thermal_drift" else 1.0
 
     def shortlist(self, scan: Scan, hypotheses: Sequence[Effect]) -> list[Candidate]:
         """The candidates that may be the best when all is refitted, the most probable first."""
@@ -309,7 +322,9 @@ class Search:
                 tried = beside.with_instead(beside.itself.effect, least=fit.log_likelihood + _ELSEWHERE)
                 if tried.log_likelihood > fit.log_likelihood + _ELSEWHERE:
                     return self._second_thoughts(tried)
-            lost = beside.is_lost_for(NAMED + self.doubt(beside.itself))
+            counted = self._counted(fit, cause)
+            least = NAMED + self.doubt(beside.itself)
+            lost = beside.is_lost_for(least if counted == 1.0 else _rise(least, beside.itself.dof, counted))
             if lost or (remembers(cause) and self.agreed(beside.without, beside.itself) < NAMED):
                 self._tell(f"dropped {describe(cause)}")
                 return beside.without, True
@@ -323,6 +338,11 @@ class Search:
                     self._tell(f"exchanged {describe(cause)} for {describe(candidate.effect)}")
                     return tried, True
         return fit, False
+
+
+def _rise(worth: float, dof: int, counted: float) -> float:
+    """What a cause has to be worth in full where only a share of its gain counts [nats]."""
+    return nats(2.0 * rise_for(worth, dof) / counted, dof)
 
 
 def joined(start: Fit, sought: Effect, least: float, expected: float) -> Fit:
