@@ -12,7 +12,7 @@ from rich.text import Text
 
 from diagnosis.numbers import chance, mm, numbers_of, percent, place, rival_named, share, telling
 from diagnosis.result import Cause, DiagnosisFile, Errors, Indistinguishable, Verdict
-from diagnosis.words import beside_geometry, modelled
+from diagnosis.words import beside_geometry, made_to, modelled
 
 # So many hypotheses that were rejected are shown.
 NEAREST = 6
@@ -57,6 +57,8 @@ def view(diagnosis: DiagnosisFile, remedies: Sequence[str], *, timed: bool) -> G
     parts.append(_errors(diagnosis))
     if diagnosis.causes:
         parts.append(_causes(diagnosis.causes, timed))
+    if diagnosis.tolerances is not None:
+        parts.append(Text(made_to(diagnosis.tolerances)))
     if rivals := [line for cause in diagnosis.causes for line in rival_lines(cause)]:
         parts.append(_list("Not told apart", rivals))
     if diagnosis.rejected:

@@ -25,7 +25,7 @@ _PERIODIC = ("joint_eccentricity", "joint_ripple")
 # So many times as large as drives' errors usually are an error of a drive is one like others.
 _LIKE_OTHERS = 3.0
 # Of the scales' logarithms before the data.
-SPREAD = 1.0
+SPREAD = 2.0
 
 
 class Scales(NamedTuple):

@@ -8,6 +8,7 @@ from effects import Effect
 from interfaces.records import FloatArray
 
 from .advice import advice
+from .background import ANGLE_RAD, DRIVE_RAD, LENGTH_M
 from .contact import before_contact
 from .diagnosis import MOST_DOUBTFUL, Diagnosis
 from .result import (
@@ -21,6 +22,7 @@ from .result import (
     Pairs,
     Rejected,
     Stability,
+    Tolerances,
     Unexplained,
     Verdict,
 )
@@ -57,7 +59,18 @@ def conclusion(diagnosis: Diagnosis) -> DiagnosisFile:
         advice=advice(diagnosis),
         limitations=_limitations(diagnosis),
         alike=_alike(diagnosis),
+        tolerances=_tolerances(diagnosis),
     )
+
+
+def _tolerances(diagnosis: Diagnosis) -> Tolerances:
+    found = diagnosis.tolerated
+    units = np.array([1e3 * LENGTH_M, np.degrees(ANGLE_RAD), np.degrees(DRIVE_RAD)])
+    sizes = units * np.asarray(found.scales)
+    wide = np.exp(_HALF_WIDTH_95 * found.unsure)
+    lowest = np.where(found.seen, sizes / wide, 0.0)
+    ends = zip(sizes.tolist(), lowest.tolist(), (sizes * wide).tolist(), strict=True)
+    return Tolerances(*(Interval(size, (low, high)) for size, low, high in ends))
 
 
 def _verdict(diagnosis: Diagnosis, causes: tuple[Cause, ...]) -> Verdict:

@@ -26,7 +26,7 @@ from .observations import Observations
 from .rivals import Standing, standings
 from .scan import Candidate, Scan
 from .search import Search
-from .together import together, tolerated
+from .together import Tolerated, together, tolerated
 from .unknown import Unknowns
 
 Told = Callable[[str], None]
@@ -57,7 +57,8 @@ class Diagnosis:
         nominal: the simulation as it is.
         aligned: with what robot.toml does not know.
         geometry: with all lengths, axes, zeros, the tool and the camera's pose free.
-        extended: with the causes, and the smooth model of what has no name.
+        extended: with the causes, the tolerances, and the smooth model of what has no name.
+        tolerated: how large the tolerances are.
         standings: how each cause stands against its rivals.
         left: what no effect fits.
         blocks: of time, by which rows were held out.
@@ -70,6 +71,7 @@ class Diagnosis:
     aligned: Fit
     geometry: Fit
     extended: Fit
+    tolerated: Tolerated
     standings: tuple[Standing, ...]
     left: Leftover
     blocks: Blocks
@@ -235,12 +237,14 @@ def diagnose(
         explanation = fewer
         stands = standings(explanation.beside, search, blocks, seed)
     left = leftover(explanation, unknowns, blocks)
+    fit = (explanation.fit if left.model is None else left.model.fit).settled()
     return Diagnosis(
         hypotheses=hypotheses,
         nominal=fitted(observations, simulation, len(simulation.effects)),
         aligned=start,
         geometry=_geometry(start),
-        extended=(explanation.fit if left.model is None else left.model.fit).settled(),
+        extended=fit,
+        tolerated=tolerated(fit),
         standings=tuple(stands),
         left=left,
         blocks=blocks,
@@ -255,7 +259,7 @@ def _searched(begun: Fit, search: Search, enough: Callable[[Sequence[Fit], float
         extended = search.run(begun, enough)
         if extended.causes:
             search.path.insert(0, begun.with_causes([]))
-        scales = tolerated(extended)
+        scales = tolerated(extended).scales
         small = [cause for cause in extended.causes if extended.background.tolerates(cause)]
         if not small and np.abs(np.log(scales) - np.log(extended.background.scales)).max() < _SAME_SCALE:
             break

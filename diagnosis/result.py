@@ -116,6 +116,22 @@ class Unexplained(msgspec.Struct, frozen=True):
     not_in_model: tuple[str, ...] = ()
 
 
+class Tolerances(msgspec.Struct, frozen=True):
+    """How exactly the arm is made, what was found left aside: 1-sigma, each with its 95 % interval.
+
+    Where the lower end is 0 the recording does not show them: they are no larger than the upper one.
+
+    Attributes:
+        length_mm: of the places of links.
+        angle_deg: of axes and zeros.
+        drive_deg: of the periodic errors of drives.
+    """
+
+    length_mm: Interval
+    angle_deg: Interval
+    drive_deg: Interval
+
+
 class Pairs(msgspec.Struct, frozen=True):
     """How many pairs there were, were predicted without having been fitted, and were not the marker."""
 
@@ -157,4 +173,5 @@ class DiagnosisFile(msgspec.Struct, frozen=True):
     advice: tuple[str, ...]
     limitations: tuple[str, ...]
     alike: tuple[Alike, ...] = ()
+    tolerances: Tolerances | None = None
     schema: int = 1

@@ -1,10 +1,10 @@
 """Causes that only together explain what is wrong: sets of them, compared by their evidence beside the background.
 
-With one of four wrong zeros in the model, tolerances still have to be ten times a workshop's, and it seems worth nothing;
-with all four they fall, and that is worth much. So sets of causes are begun from nothing, from all zeros, and from all
-effects of one kind, and what is not worth its numbers is taken away, added and exchanged, with the scales of tolerances
-fitted to each set. Everything is linear about one fit: a set costs what its normal equations cost, not what rows do
-(MacKay 1992, "Bayesian interpolation"; Tipping and Faul 2003, "Fast marginal likelihood maximisation").
+With one of four wrong zeros in the model, tolerances still have to be ten times a workshop's, and it seems worth
+nothing; with all four they fall, and that is worth much. So sets of causes are begun from nothing, from all zeros, and
+from all effects of one kind, and what is not worth its numbers is taken away, added and exchanged, with the scales of
+tolerances fitted to each set. Everything is linear about one fit: a set costs what its normal equations cost, not what
+rows do (MacKay 1992, "Bayesian interpolation"; Tipping and Faul 2003, "Fast marginal likelihood maximisation").
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
 from effects import Effect
@@ -35,12 +36,29 @@ _FARTHEST = 1.0
 _SMALLEST, _LARGEST, _QUIETEST = 1e-3, 1e2, 1e-3
 # So many of the most promising moves are tried with scales of their own.
 _TRIED = 4
+# Tolerances that are smaller than this share of what so many would be are not seen.
+_SEEN = 0.5
 # Sets of causes are changed so many times at most.
 _MOST_MOVES = 60
 # So many sets are refitted at most, while one promises to be no less probable than the best by more than this [nats].
 _MOST_REFITTED, _COMES_NEAR = 8, 15.0
 # What is wrong at one joint often is at others: zeros are set in one session. So much each costs but the first [nats].
 _ANOTHER = 2.0
+
+
+@dataclass(frozen=True, eq=False)
+class Tolerated:
+    """How large tolerances are.
+
+    Attributes:
+        scales: the most probable ones.
+        unsure: how far their logarithms may be off, 1-sigma (3,).
+        seen: which of them show in the data (3,); the others are what the data still allow.
+    """
+
+    scales: Scales
+    unsure: FloatArray
+    seen: NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,13 +70,19 @@ class Together:
         worth: its evidence less what its causes cost to name [nats]; it counts only beside that of other sets.
         scales: of the tolerances.
         sigma: of the noise, in units of the stated one.
+        spent: how many numbers of the data say how large each scale is (3,).
+        squares: of what each scale's tolerances are, in units of it (3,).
         amounts: of all columns that it has (p,).
+        factor: of their precision, as `cho_factor` has it.
+        columns: which they are (p,).
     """
 
     chosen: tuple[int, ...]
     worth: float
     scales: Scales
     sigma: float
+    spent: FloatArray
+    squares: FloatArray
     amounts: FloatArray
     factor: tuple[FloatArray, bool]
     columns: FloatArray
@@ -192,7 +216,8 @@ class Sets:
         inner, toward = self._inner[np.ix_(columns, columns)], self._toward[columns]
         logs = np.log(near.scales if near else Scales())
         sigma = near.sigma if near else self._fit.noise.sigma
-        members = [group == g for g in range(3)]
+        members, spent = [group == g for g in range(3)], np.zeros(3)
+        squares = np.zeros(3)
         for done in range(_ROUNDS):
             factor, variances, amounts = self._solved(inner, toward, group, logs, sigma)
             inverse = cho_solve(factor, np.eye(len(columns)))
@@ -215,7 +240,7 @@ class Sets:
         evidence -= float(np.log(np.diag(factor[0])).sum()) + 0.5 * float(np.log(variances).sum())
         scales = Scales(*np.exp(logs))
         worth = evidence - scales.doubt - sum(self._doubt_beside(k, chosen[:j]) for j, k in enumerate(chosen))
-        return Together(chosen, worth, scales, sigma, amounts, factor, columns)
+        return Together(chosen, worth, scales, sigma, spent, squares, amounts, factor, columns)
 
     def _solved(
         self, inner: FloatArray, toward: FloatArray, group: np.ndarray, logs: FloatArray, sigma: float
@@ -261,10 +286,11 @@ def together(start: Fit, hypotheses: Sequence[Effect]) -> Fit:
     return max(known, key=lambda place: place.here.worth).fit
 
 
-def tolerated(fit: Fit) -> Scales:
+def tolerated(fit: Fit) -> Tolerated:
     """The scales of tolerances that have the most evidence beside the causes of a fit."""
     causes = [Candidate(cause, 0.0, 1) for cause in fit.causes]
-    return Sets(fit, causes, 0.0).of(tuple(range(len(causes)))).scales
+    here = Sets(fit, causes, 0.0).of(tuple(range(len(causes))))
+    return Tolerated(here.scales, 1.0 / np.sqrt(2.0 * here.spent + 1.0 / SPREAD**2), here.squares > _SEEN * here.spent)
 
 
 class _Place:

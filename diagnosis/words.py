@@ -11,12 +11,16 @@ from effects import KINDS
 from effects.unexplained import PLACE
 
 from .numbers import told_values
-from .result import Alike, Cause, Errors, Gain, Unexplained, Verdict
+from .result import Alike, Cause, Errors, Gain, Interval, Tolerances, Unexplained, Verdict
 from .rivals import Standing
 
 _DEG = 180.0 / np.pi
 # A scale error beyond which a joint turns the other way.
 _BACKWARDS = -1.0
+# Where tolerances explain so much of the error, they are what is said [%].
+_BY_TOLERANCES = 5.0
+# A size whose ends are farther apart than this factor is told by its larger end.
+_UNTOLD = 10.0
 # A sentence names so many causes; of more, the smallest are counted.
 _TOLD = 4
 
@@ -105,6 +109,8 @@ def sentence(verdict: Verdict, causes: Sequence[Cause], rms: Errors, gain: Gain,
         named_mm: RMS with the causes alone [mm], where there is a smooth model of what has no name beside them.
     """
     figures = f"{rms.aligned:.3g} mm → {rms.extended:.3g} mm on data not used in the fit"
+    if verdict == "nothing_found" and gain.held_out_percent >= _BY_TOLERANCES:
+        return f"No cause stands out: small errors everywhere explain {_share(gain)} ({figures})"
     if verdict == "nothing_found":
         return f"The simulation is right to within the noise: nothing found in {rms.aligned:.3g} mm of error"
     if not causes:
@@ -139,6 +145,20 @@ def sentence(verdict: Verdict, causes: Sequence[Cause], rms: Errors, gain: Gain,
 def _share(gain: Gain) -> str:
     explained = round(gain.held_out_percent)
     return f"{explained} % of the error" if explained > 0 else "less than 1 % of the error"
+
+
+def made_to(tolerances: Tolerances) -> str:
+    """How exactly an arm is made, in one sentence; of what the recording cannot tell, how large it is at most."""
+
+    def told(size: Interval, unit: str, sign: str = "") -> str:
+        low, high = size.ci95
+        if high > _UNTOLD * low:
+            return f"{sign}{high:.1g}{unit} or better"
+        return f"about {sign}{size.value:.1g}{unit}"
+
+    length, angle = told(tolerances.length_mm, " mm"), told(tolerances.angle_deg, "°")
+    drives = told(tolerances.drive_deg, "°", "±")
+    return f"Beside that, the arm is made to {length} and {angle}; its drives run true to {drives}."
 
 
 def beside_geometry(rms: Errors, alike: Sequence[Alike]) -> list[str]:

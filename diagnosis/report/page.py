@@ -13,7 +13,7 @@ import numpy as np
 from diagnosis.diagnosis import Diagnosis
 from diagnosis.numbers import chance, mm, share, told_values
 from diagnosis.result import Cause, DiagnosisFile, Verdict
-from diagnosis.words import beside_geometry, finding, modelled
+from diagnosis.words import beside_geometry, finding, made_to, modelled
 from effects import Effect
 
 from . import tables
@@ -63,6 +63,7 @@ def page(diagnosis: Diagnosis, file: DiagnosisFile, remedies: Sequence[str], abo
         _head(file, about),
         _glance(residuals, file),
         _causes(residuals, file, remedies),
+        _tolerances(file),
         _alike(file),
         _advice(file),
         _where(residuals),
@@ -149,6 +150,12 @@ def _cause(residuals: Residuals, cause: Cause, effect: Effect | None, remedy: st
         f"{_panels(plots)}<div><p>{tables.numbers(cause, timed=residuals.timed)}</p><p>{escape(cause.evidence)}</p>"
         f"{tables.rivals(cause)}<p><b>What to do.</b> {escape(remedy)}</p></div></div></details>"
     )
+
+
+def _tolerances(file: DiagnosisFile) -> str:
+    if file.tolerances is None:
+        return ""
+    return f'<section id="tolerances"><p>{escape(made_to(file.tolerances))}</p></section>'
 
 
 def _alike(file: DiagnosisFile) -> str:
