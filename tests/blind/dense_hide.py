@@ -8,6 +8,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -229,7 +230,7 @@ def written(cause: Cause) -> str:
     return effect + (f"@{where}" if where else "") + (f":{source}" if source else "")
 
 
-def sealed(case: DenseCase) -> dict[str, object]:
+def sealed(case: DenseCase) -> dict[str, Any]:
     """The truth, for a file."""
     return {
         "seed": case.seed,
