@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import os
 import subprocess
 import sys
@@ -132,7 +133,6 @@ def run(
     truth, told = sealed(case), _told(out, ran)
     what, false, missed = outcome(truth, told) if told else ("crashed", [], [])
     extended = _extended_mm(case, out, checkout) if told else None
-    noise = case.measured.x - case.measured.x_true
     floor = told["rms_mm"]["noise_floor"] if told else None
     return DenseJudgement(
         seed=seed,
@@ -153,7 +153,7 @@ def run(
         inside=inside(truth, told) if told else (0, 0),
         placed_mm=_placed_mm(case),
         extended_mm=extended,
-        floor_ratio=None if floor is None else floor / rms_mm(noise[~case.measured.false]),
+        floor_ratio=None if floor is None else floor / _noise_mm(case),
         tolerances=truth["tolerances"],
         stated_tolerances=told.get("tolerances"),
         cpu_seconds=ran.cpu_seconds,
@@ -167,6 +167,12 @@ def _told(out: Path, ran: Ran) -> dict[str, Any]:
     """diagnosis.json; nothing where there is none."""
     file = out / "diagnosis.json"
     return json.loads(file.read_text(encoding="utf-8")) if ran.code == 0 and file.exists() else {}
+
+
+def _noise_mm(case: DenseCase) -> float:
+    """RMS of the noise, that of whole ticks included and false fixes left out."""
+    added = rms_mm((case.measured.x - case.measured.x_true)[~case.measured.false])
+    return math.hypot(added, 1e3 * math.sqrt(3.0) * case.rounding_m)
 
 
 def _placed_mm(case: DenseCase) -> float:

@@ -177,7 +177,7 @@ def _masses(chain: tuple[Joint, ...], kilograms: FloatArray, reach: float, rng: 
 
 def _ticks(joint: Joint, rng: np.random.Generator) -> int:
     """Ticks a turn, or a metre."""
-    return int(rng.choice([100_000, 1_000_000]) if joint.kind == "prismatic" else 2 ** rng.integers(14, 21))
+    return int(rng.choice([100_000, 1_000_000]) if joint.kind == "prismatic" else 2 ** rng.integers(15, 21))
 
 
 def _log_uniform(rng: np.random.Generator, low: float, high: float) -> float:

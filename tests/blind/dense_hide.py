@@ -122,7 +122,7 @@ class DenseCase:
         rivals: keys of what stands in its place in that set.
         same: keys of what can be all that it is, in any motion, with as few numbers.
         spare_nats: by how much the truth beats the best set with one cause more.
-        nuisances: what robot.toml calls not known, as it is.
+        rounding_m: what whole ticks of the encoders do to a position, along each axis.
         nominal: the arm as described, with its instrument and marker as robot.toml puts them.
     """
 
@@ -141,6 +141,7 @@ class DenseCase:
     rivals: tuple[tuple[str, ...], ...]
     same: tuple[tuple[str, ...], ...]
     spare_nats: float
+    rounding_m: float
     nominal: Built
     measured: Taken
     fresh: Taken
@@ -214,6 +215,7 @@ def hide_dense(
         rivals=tuple(tuple(written(candidates[k]) for k in e.rival) for e in evidence),
         same=tuple(tuple(written(candidates[j]) for j in observer.same(k, chosen)) for k in chosen),
         spare_nats=spare,
+        rounding_m=_rounding_m(arm, way.posture.by_joints()),
         nominal=Built(
             told, np.zeros_like(as_made.frames), np.array(told.marker_xyz), _eye_R(told), np.array(told.camera_xyz)
         ),
@@ -244,6 +246,7 @@ def sealed(case: DenseCase) -> dict[str, Any]:
         "marker_known": case.marker_known,
         "pose_known": case.pose_known,
         "noise": asdict(case.noise),
+        "rounding_m": case.rounding_m,
         "false_fixes": int(case.measured.false.sum()),
         "tolerances": {name: getattr(case.made, name) for name in ("length_m", "angle_rad", "drive_rad", "drive_m")},
         "truth": [
@@ -381,9 +384,10 @@ def _observer(
     """Who knows the scales of `as_made` and of the noise."""
     by_joints, by_frames = way.posture.by_joints(), way.posture.by_frames()
     begins = _begins(motion)
+    sigma_m = math.hypot(noise.told_sigma_m, _rounding_m(way.arm, by_joints))
 
     def white(block: FloatArray) -> FloatArray:
-        return whitened(block, noise.told_sigma_m, noise.correlation, begins)
+        return whitened(block, sigma_m, noise.correlation, begins)
 
     flat = [
         *([] if pose_known else [white(way.posture.by_eye())]),
@@ -409,6 +413,12 @@ def _observer(
         [cause.amounts / cause.usual for cause in causes],
         A_CAUSE - np.log(_weights(causes)),
     )
+
+
+def _rounding_m(arm: Arm, by_joints: FloatArray) -> float:
+    """RMS along each axis [m] of what whole ticks of the encoders do to the marker."""
+    rounding = np.array([arm.quantum(name) for name in arm.read]) / math.sqrt(12.0)
+    return float(np.sqrt(np.square(by_joints * rounding).sum(axis=2).mean()))
 
 
 def _weights(causes: Sequence[Cause]) -> FloatArray:

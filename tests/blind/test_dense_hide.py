@@ -133,3 +133,26 @@ def test_a_cause_with_the_same_column_is_the_same() -> None:
     blocks, amounts = [100 * column, 50 * column, 100 * other], [np.ones(1)] * 3
     observer = Observer.of(np.empty((60, 0)), np.empty((60, 0)), np.zeros(0), blocks, amounts, np.full(3, 3.0))
     assert observer.same(0, [0]) == [1]
+
+
+def test_evidence_is_that_of_the_whole_covariance() -> None:
+    rng = np.random.default_rng(4)
+    rows, flat, background = 40, rng.normal(size=(40, 2)), rng.normal(size=(40, 5))
+    blocks, costs = [rng.normal(size=(rows, m)) for m in (1, 2, 3, 1)], np.array([3.0, 2.0, 1.0, 4.0])
+    drawn, amounts = rng.normal(size=5), [rng.normal(size=b.shape[1]) for b in blocks]
+    observer = Observer.of(flat, background, drawn, blocks, amounts, costs)
+    truth = [0, 2]
+    data = background @ drawn + blocks[0] @ amounts[0] + blocks[2] @ amounts[2]
+
+    def mean_log_evidence(chosen: list[int]) -> float:
+        C = np.eye(rows) + 1e8 * flat @ flat.T + background @ background.T
+        C = C + sum(blocks[k] @ blocks[k].T for k in chosen)
+        fit = data @ np.linalg.solve(C, data) + np.trace(np.linalg.inv(C))
+        return float(-0.5 * fit - 0.5 * np.linalg.slogdet(C)[1] - costs[chosen].sum())
+
+    sets = [[2], [1, 2], [2, 3], [], [1], [3], [1, 2, 3], [1, 3]]
+    evidence, spare = observer.evidence(truth)
+    best = max(map(mean_log_evidence, sets))
+    assert evidence[0].nats == pytest.approx(mean_log_evidence(truth) - best, abs=1e-3)
+    more = max(mean_log_evidence([*truth, k]) for k in (1, 3))
+    assert spare == pytest.approx(mean_log_evidence(truth) - more, abs=1e-3)
