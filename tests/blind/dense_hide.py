@@ -42,8 +42,10 @@ WEIGHTS = {
     "tool_slip": 0.5,
     "encoder_jump": 0.7,
     "camera_moved": 0.5,
+    "camera_pose": 0.5,
     "tool_offset": 1.5,
 }
+LOADED = 0.1  # of the largest load: a joint that bears less is not said to give
 STUDENT = 4.0  # degrees of freedom
 
 
@@ -179,22 +181,22 @@ def hide_dense(
     plain = Built(arm, as_made.frames, np.array(arm.marker_xyz), _eye_R(arm), np.array(arm.camera_xyz), _rigid(arm))
 
     way = _way(arm, motion, plain, timed)
-    bears = with_masses and hold != "torque_free"
     candidates = all_causes(
         arm,
         float(way.clock[-1]),
         choosing,
-        bears=bears,
+        loaded=_loaded(way) if with_masses and hold != "torque_free" else (),
         marker_known=marker_known,
+        pose_known=pose_known,
         longest=float(np.linalg.norm(plain.measured(way.shaft[:1])[0])),
     )
     observer = _observer(candidates, way, as_made, noise, motion, marker_known=marker_known, pose_known=pose_known)
     wanted = int(choosing.choice(COUNTS, p=SHARES)) if count is None else count
-    chosen = _chosen(candidates, observer, wanted, choosing)
+    chosen = _chosen(candidates, observer, wanted, arm, choosing)
     evidence, spare = observer.evidence(chosen)
     truth = tuple(candidates[k] for k in chosen)
 
-    robot = _Robot(arm, as_made, plain, truth, bears)
+    robot = _Robot(arm, as_made, plain, truth)
     measured = _taken(robot, motion, timed, noise, noising)
     again = move(freshly, motion.style, arm.ranges, min(fresh_rows, len(motion.stamps)), _always)
     fresh = _taken(robot, again, timed, noise, freshly)
@@ -273,7 +275,6 @@ class _Robot:
     made: Made
     plain: Built
     causes: Sequence[Cause]
-    bears: bool
 
     def readings(self, shaft: FloatArray, clock: FloatArray) -> FloatArray:
         """What the encoders say (n, d), in whole ticks."""
@@ -324,7 +325,7 @@ class _Robot:
         built = replace(built, soft=soft)
         x = built.measured(built.balanced(out))
         for cause in self.causes:
-            if cause.effect == "camera_moved":
+            if cause.effect in ("camera_pose", "camera_moved"):
                 turn = Rotation.from_rotvec(cause.amounts[3:]).as_matrix()
                 x = np.where(_after(cause, clock)[:, None] > 0.0, (x - cause.amounts[:3]) @ turn, x)
         return x
@@ -352,7 +353,7 @@ def _misread(shaft: FloatArray, cause: Cause, clock: FloatArray) -> FloatArray:
 
 
 def _after(cause: Cause, clock: FloatArray) -> FloatArray:
-    return np.asarray(clock >= cause.shape["moment"], dtype=float)
+    return np.asarray(clock >= cause.shape.get("moment", -math.inf), dtype=float)
 
 
 def _rows(rng: np.random.Generator, walks: bool, most: int | None) -> int:
@@ -364,6 +365,15 @@ def _rows(rng: np.random.Generator, walks: bool, most: int | None) -> int:
 def _way(arm: Arm, motion: Motion, built: Built, timed: bool) -> Way:
     rows = np.searchsorted(motion.t, motion.stamps)
     return Way(arm, motion.shaft, rows, _clock(motion, timed), Posture.of(built, motion.shaft[rows]))
+
+
+def _loaded(way: Way) -> list[str]:
+    """Joints whose load is not only what tolerances make of it."""
+    loads = np.abs(way.posture.torques()).max(axis=0)
+    slides = np.array([way.arm.joint(name).kind == "prismatic" for name in way.arm.read])
+    kinds = [slides == kind for kind in (True, False)]  # forces and torques
+    enough = np.any([kind & (loads > LOADED * loads.max(where=kind, initial=1e-6)) for kind in kinds], axis=0)
+    return [name for name, loaded in zip(way.arm.read, enough, strict=True) if loaded]
 
 
 def _clock(motion: Motion, timed: bool) -> FloatArray:
@@ -428,7 +438,7 @@ def _weights(causes: Sequence[Cause]) -> FloatArray:
     return weights / weights.mean()
 
 
-def _chosen(causes: Sequence[Cause], observer: Observer, count: int, rng: np.random.Generator) -> list[int]:
+def _chosen(causes: Sequence[Cause], observer: Observer, count: int, arm: Arm, rng: np.random.Generator) -> list[int]:
     """Causes to hide, each of which stands out beside the others as long as there are such."""
     weights = _weights(causes)
     zeros = np.array([cause.effect == "joint_offset" for cause in causes])
@@ -449,7 +459,7 @@ def _chosen(causes: Sequence[Cause], observer: Observer, count: int, rng: np.ran
         while len(chosen) < count:
             only_zeros = sum(zeros[k] for k in chosen) < of_zeros
             allowed = weights * (zeros if only_zeros else 1.0)
-            allowed = allowed * [not conflicts(cause, [causes[k] for k in chosen]) for cause in causes]
+            allowed = allowed * [not conflicts(cause, [causes[k] for k in chosen], arm) for cause in causes]
             if not allowed.any():
                 of_zeros = 0
                 continue

@@ -115,22 +115,23 @@ class Observer:
         ]
 
     def _one(self, cause: int, truth: Sequence[int], whole: float, data: FloatArray) -> Evidence:
-        """The best set without a true cause: fewer, with one other, with two others, with one in the place of two."""
+        """The best set without a true cause and what is the same: fewer, one or two others, one in the place of two."""
         without = [k for k in truth if k != cause]
-        alone = self._gains(without, data, cause)
+        barred = [cause, *self.same(cause, truth)]
+        alone = self._gains(without, data, barred)
         bases = [without, *([*without, int(k)] for k in np.argsort(-alone)[:NEAR] if np.isfinite(alone[k]))]
         bases += [[k for k in without if k != dropped] for dropped in without]
         best, rival = -math.inf, ()
         for base in bases:
-            gains, value = self._gains(base, data, cause), self._log_evidence(base, data)
+            gains, value = self._gains(base, data, barred), self._log_evidence(base, data)
             added = int(np.argmax(gains))
             for better, found in ((value, base), (value + float(gains[added]), [*base, added])):
                 if better > best:
                     best, rival = better, tuple(k for k in found if k not in truth)
         return Evidence(whole - best, rival)
 
-    def _gains(self, base: Sequence[int], data: FloatArray, cause: int | None = None) -> FloatArray:
-        """By how much each cause (K,) raises the log evidence of a set, -inf for those in it and for `cause`."""
+    def _gains(self, base: Sequence[int], data: FloatArray, barred: Sequence[int] = ()) -> FloatArray:
+        """By how much each cause (K,) raises the log evidence of a set, -inf for those in it and for `barred`."""
         chosen = self._columns(base)
         p = len(self.amounts)
         size = max(self._count(k) for k in range(len(self.spans)))
@@ -148,7 +149,7 @@ class Observer:
         blocks, wanted = np.eye(size) + S[at], noise[at] + h[places][:, :, None] * h[places][:, None, :]
         fits = np.trace(np.linalg.solve(blocks, wanted), axis1=1, axis2=2)
         gains = 0.5 * (fits - np.linalg.slogdet(blocks)[1]) - self.costs
-        gains[[*base, *([] if cause is None else [cause])]] = -np.inf
+        gains[[*base, *barred]] = -np.inf
         return gains
 
     def _data(self, truth: Sequence[int]) -> FloatArray:
