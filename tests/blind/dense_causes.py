@@ -1,4 +1,4 @@
-"""Causes in arms that are nowhere exactly as described: what each does, and how the marker moves with its numbers."""
+"""Causes of error: parameters of each, and the derivative of the marker position by them."""
 
 from __future__ import annotations
 
@@ -38,13 +38,13 @@ class Cause:
 
     @property
     def key(self) -> Key:
-        """What it is, whatever its numbers."""
+        """Effect, joint and source joint."""
         return self.effect, self.where, self.source
 
 
 @dataclass(frozen=True, eq=False)
 class Way:
-    """What an observer knows of a recording: joint positions in it, and the arm's posture there.
+    """The motion of a recording: joint positions, and the arm's posture at each row.
 
     Attributes:
         path: of the shafts at all instants (f, d) [rad or m]; `rows` of them were recorded (n,).
@@ -136,7 +136,7 @@ def _jump(name: str, slides: bool, rng: np.random.Generator, moment: float) -> C
 
 
 def _ripple(name: str, slides: bool, rng: np.random.Generator) -> Cause:
-    """Sensor tracks whose sine and cosine have a bias, of the order of the wanted angle times the poles."""
+    """Draw a bias of the sine and cosine tracks, scaled to an angle error."""
     poles = float(rng.integers(3, 25))
     turn = float(rng.uniform(0.1, 0.3)) if slides else 2.0 * math.pi  # of shaft travel for each turn of the ring
     size = 2.0 * math.pi * (rng.uniform(0.3e-3, 1.5e-3) if slides else rng.uniform(0.06, 0.6) * DEG) / turn
@@ -151,7 +151,7 @@ def _ring(name: str, rng: np.random.Generator) -> Cause:
 
 
 def _spring(name: str, slides: bool, rng: np.random.Generator) -> Cause:
-    """The amount is how far the joint gives under its largest load [rad or m]."""
+    """Draw a spring; the amount is the deflection under the joint's largest load [rad or m]."""
     gives = rng.uniform(0.3e-3, 3e-3) if slides else rng.uniform(0.1, 1.0) * DEG
     usual = 2e-3 if slides else 0.6 * DEG
     return Cause("joint_compliance", name, None, np.array([gives]), np.array([usual]), {})
@@ -181,7 +181,7 @@ def _pose(rng: np.random.Generator) -> Cause:
 
 
 def columns(cause: Cause, way: Way, by_joints: FloatArray, by_frames: FloatArray) -> FloatArray:
-    """Derivative (n, 3, m) of what is seen at the readings by the cause's amounts.
+    """Return the derivative (n, 3, m) of the position at given readings by the cause's amounts.
 
     Args:
         by_joints, by_frames: those of `way.posture`.
@@ -243,7 +243,7 @@ _SIGNALS: dict[str, Callable[[Cause, Way], FloatArray]] = {
 
 
 def conflicts(cause: Cause, chosen: Sequence[Cause], arm: Arm) -> bool:
-    """Whether a cause would be one with another: a link holds the zero of its joint, the first one the pose."""
+    """Return True if a cause overlaps with a chosen one: a link contains its joint's zero, the pose the first link."""
     same_place = {"joint_offset", "link_geometry"}
     first = {("joint_offset", arm.read[0]), ("link_geometry", arm.read[0])}
     return any(

@@ -1,4 +1,4 @@
-"""Recordings of arms that are nowhere exactly as described, with causes that stand out from their tolerances."""
+"""Recordings of arms with tolerances at every link, and causes that stand out from these."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ STUDENT = 4.0  # degrees of freedom
 
 @dataclass(frozen=True)
 class Noise:
-    """What the instrument adds.
+    """Measurement noise of the instrument.
 
     Attributes:
         sigma_m: along each axis, false fixes left out.
@@ -74,7 +74,7 @@ class Noise:
 
     @property
     def told_sigma_m(self) -> float:
-        """The Gaussian noise from which as much could be learnt."""
+        """1 sigma of Gaussian noise with the same Fisher information."""
         if self.kind != "student":
             return self.sigma_m
         return self.sigma_m * math.sqrt((STUDENT - 2.0) / STUDENT * (STUDENT + 3.0) / (STUDENT + 1.0))
@@ -115,7 +115,7 @@ class Taken:
 
 @dataclass(frozen=True, eq=False)
 class DenseCase:
-    """A case: `folder`/case is what is diagnosed; the truth and a second recording stand beside it.
+    """A case: `folder`/case is the input of the diagnosis; truth and a second recording are beside it.
 
     Attributes:
         truth: the hidden causes.
@@ -150,7 +150,7 @@ class DenseCase:
 
     @property
     def is_decidable(self) -> bool:
-        """Whether a perfect observer would name all causes and no other."""
+        """True if a perfect observer would name all causes and no other."""
         return min((*self.nats, math.inf)) >= DECIDABLE and self.spare_nats > 0.0
 
     @property
@@ -277,7 +277,7 @@ class _Robot:
     causes: Sequence[Cause]
 
     def readings(self, shaft: FloatArray, clock: FloatArray) -> FloatArray:
-        """What the encoders say (n, d), in whole ticks."""
+        """Encoder readings (n, d), in whole ticks."""
         read = shaft.copy()
         for index, name in enumerate(self.arm.read):
             column = read[:, index]
@@ -335,7 +335,7 @@ class _Robot:
 
 
 def _misread(shaft: FloatArray, cause: Cause, clock: FloatArray) -> FloatArray:
-    """Readings (n,) of an encoder with that cause."""
+    """Return the readings (n,) of an encoder with this cause."""
     a = cause.amounts
     match cause.effect:
         case "joint_offset":
@@ -368,7 +368,7 @@ def _way(arm: Arm, motion: Motion, built: Built, timed: bool) -> Way:
 
 
 def _loaded(way: Way) -> list[str]:
-    """Joints whose load is not only what tolerances make of it."""
+    """Return the joints that bear a load by design, not only by their tolerances."""
     loads = np.abs(way.posture.torques()).max(axis=0)
     slides = np.array([way.arm.joint(name).kind == "prismatic" for name in way.arm.read])
     kinds = [slides == kind for kind in (True, False)]  # forces and torques
@@ -391,7 +391,7 @@ def _observer(
     marker_known: bool,
     pose_known: bool,
 ) -> Observer:
-    """Who knows the scales of `as_made` and of the noise."""
+    """Return an observer that knows the scales of `as_made` and of the noise."""
     by_joints, by_frames = way.posture.by_joints(), way.posture.by_frames()
     begins = _begins(motion)
     sigma_m = math.hypot(noise.told_sigma_m, _rounding_m(way.arm, by_joints))
@@ -426,20 +426,20 @@ def _observer(
 
 
 def _rounding_m(arm: Arm, by_joints: FloatArray) -> float:
-    """RMS along each axis [m] of what whole ticks of the encoders do to the marker."""
+    """Return the RMS of encoder quantisation at the marker, along each axis [m]."""
     rounding = np.array([arm.quantum(name) for name in arm.read]) / math.sqrt(12.0)
     return float(np.sqrt(np.square(by_joints * rounding).sum(axis=2).mean()))
 
 
 def _weights(causes: Sequence[Cause]) -> FloatArray:
-    """How usual each cause is at its place, 1 for the mean one (K,)."""
+    """Return the relative frequency of each cause at its place (K,), mean 1."""
     kinds = [cause.effect for cause in causes]
     weights = np.array([WEIGHTS[kind] / kinds.count(kind) for kind in kinds])
     return weights / weights.mean()
 
 
 def _chosen(causes: Sequence[Cause], observer: Observer, count: int, arm: Arm, rng: np.random.Generator) -> list[int]:
-    """Causes to hide, each of which stands out beside the others as long as there are such."""
+    """Choose causes to hide, each decidable beside the others if possible."""
     weights = _weights(causes)
     zeros = np.array([cause.effect == "joint_offset" for cause in causes])
     of_zeros = int(rng.integers(2, max(count, 2) + 1)) if count > 1 and rng.random() < ZEROS else 0
@@ -483,7 +483,7 @@ def _begins(motion: Motion) -> BoolArray:
 
 
 def _told(arm: Arm, rng: np.random.Generator, *, marker_known: bool, pose_known: bool) -> Arm:
-    """The arm with what robot.toml says of its instrument and marker."""
+    """Return the arm with instrument and marker as robot.toml describes them."""
     if not pose_known and rng.random() < 0.5:  # the instrument stands anywhere
         arm = replace(arm, camera_xyz=(0.0, 0.0, 0.0), camera_rpy=(0.0, 0.0, 0.0))
     elif not pose_known:

@@ -1,4 +1,4 @@
-"""The hider of realistic arms: its parts fit each other, and its observer is right about them."""
+"""Hidden causes in arms with tolerances: generator and observer agree."""
 
 from __future__ import annotations
 
