@@ -128,7 +128,7 @@ def run(
     case = hide_dense(seed, folder, rows=rows, count=causes)
     out = folder / "out"
     ran, refused = checkout.diagnose(case, out), ""
-    if ran.code > 0:
+    if ran.code > 0 and "Traceback" not in ran.said:
         refused, ran = ran.said.strip(), checkout.diagnose(case, out, "--force")
     truth, told = sealed(case), _told(out, ran)
     what, false, missed = outcome(truth, told) if told else ("crashed", [], [])
