@@ -36,6 +36,11 @@ class Scales(NamedTuple):
     drives: float = 1.0
 
     @property
+    def no_larger(self) -> Scales:
+        """These, but none larger than a workshop's."""
+        return Scales(*np.minimum(self, 1.0).tolist())
+
+    @property
     def doubt(self) -> float:
         """How improbable they are before the data, beside those of a workshop [nats]."""
         return float(0.5 * np.square(np.log(self) / SPREAD).sum())

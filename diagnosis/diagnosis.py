@@ -16,6 +16,7 @@ from interfaces.records import FloatArray
 from .alignment import aligned
 from .alike import Alike, alike
 from .contact import doubtful
+from .drives import with_small_ripples
 from .explanation import changed_by_the_way, explain, needs_no_more_names, without_one
 from .fit import Fit, fitted
 from .held_out import Added, Blocks, added, gain_percent, held_out_errors, is_marker
@@ -256,9 +257,11 @@ def diagnose(
 def _searched(begun: Fit, search: Search, enough: Callable[[Sequence[Fit], float], bool]) -> Fit:
     """With what a search finds from there, and tolerances as large as they then are."""
     for _ in range(_RESCALED):
+        begun = with_small_ripples(begun)
         extended = search.run(begun, enough)
-        if extended.causes:
-            search.path.insert(0, begun.with_causes([]))
+        # What has no name may be all there is, and make tolerances seem larger than they are.
+        bare = extended.with_causes([])
+        search.path = [bare.tolerating(bare.background.scales.no_larger), bare, *search.path[1:]]
         scales = tolerated(extended).scales
         small = [cause for cause in extended.causes if extended.background.tolerates(cause)]
         if not small and np.abs(np.log(scales) - np.log(extended.background.scales)).max() < _SAME_SCALE:

@@ -12,6 +12,7 @@ from interfaces.records import FloatArray
 
 from .fit import Fit
 from .search import NAMED, Search, named
+from .together import tolerated
 from .unknown import Apart, Unknowns, Way
 
 # What has no name is taken for so much more probability than the named causes alone [nats].
@@ -105,10 +106,20 @@ def explain(
         better = better or _is_as_good(other, best)
         if other.apart is not None and better and unknowns.predicts(other.apart, found):
             best = other
-    if best.unknown:
+    if best.apart is not None:
+        best = _rescaled(best, best.apart, unknowns, search)
         tell("something that none of the effects explains")
         best = _pruned(best, unknowns, search, rest=is_rest and best.fit is found)
     return best
+
+
+def _rescaled(best: Explanation, apart: Apart, unknowns: Unknowns, search: Search) -> Explanation:
+    """With tolerances as large as they are beside what has no name, where that is more probable."""
+    scales = tolerated(apart.fit).scales
+    again = _with_unknown(best.fit.tolerating(scales), unknowns, search)
+    before = best.fit.background.scales
+    gained = again.worth - best.worth - scales.doubt + (0.0 if before is None else before.doubt)
+    return again if again.unknown and gained > 0.0 else best
 
 
 def needs_no_more_names(path: Sequence[Fit], worth: float, unknowns: Unknowns, search: Search) -> bool:

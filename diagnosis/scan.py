@@ -73,6 +73,10 @@ class Scan:
         scan._state = 1 + self._besides.index(cause.identity)
         return scan
 
+    def tolerates(self, effect: Effect) -> bool:
+        """Whether the fit's background has such errors as well."""
+        return self._fit.background.tolerates(effect)
+
     def candidates(self, hypotheses: Iterable[Effect], near: float = 0.0) -> list[Candidate]:
         """One for each hypothesis of which this data tell anything.
 

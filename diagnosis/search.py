@@ -281,7 +281,7 @@ class Search:
 
     def shortlist(self, scan: Scan, hypotheses: Sequence[Effect]) -> list[Candidate]:
         """The candidates that may be the best when all is refitted, the most probable first."""
-        scanned = scan.candidates(hypotheses, _NEAR)
+        scanned = [one for one in scan.candidates(hypotheses, _NEAR) if not scan.tolerates(one.effect)]
         ranked = sorted(scanned, key=lambda c: nats(c.gain, c.dof) - self.doubt(c), reverse=True)
         if not ranked:
             return []

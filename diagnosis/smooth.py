@@ -252,9 +252,9 @@ class _Amounts:
 
     @property
     def in_time(self) -> FloatArray:
-        """What those that change with time say of the rows (n, 3) [m]."""
-        first = self._causes + self._lasting
-        return self._columns[:, :, first:] @ self._all[first:]
+        """What those that change with time say of the rows (n, 3) [m], with what the causes' numbers then do."""
+        lasting = slice(self._causes, self._causes + self._lasting)
+        return self._columns @ self._all - self._columns[:, :, lasting] @ self._all[lasting]
 
     @property
     def lasting_missed(self) -> float:

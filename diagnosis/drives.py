@@ -1,0 +1,48 @@
+"""Small periodic errors of drives beyond those that every drive has: part of the background, found one by one."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from effects import Effect
+
+from .fit import Fit
+from .scan import Scan
+from .search import NAMED, nats
+
+# Rounds in which each joint may be given one more.
+_ROUNDS = 8
+# Two whose phases part by less than this over a joint's range are one [turns].
+_APART = 0.75
+
+
+def with_small_ripples(fit: Fit) -> Fit:
+    """With the ripples in its background that show in the data and are no larger than what is tolerated of drives."""
+    scales = fit.background.scales
+    if scales is None:
+        return fit
+    for _ in range(_ROUNDS):
+        robot, scan = fit.simulation.robot, Scan(fit)
+        moving = np.flatnonzero(np.ptp(fit.observations.motion.q, axis=0) > 0.0)
+        found: list[Effect] = []
+        for k in moving:
+            candidate = scan.candidate(Effect.at(robot, "joint_ripple", robot.joints[k]))
+            if candidate is None or not fit.background.tolerates(candidate.effect) or _is_there(fit, candidate.effect):
+                continue
+            if nats(candidate.gain, candidate.dof) - np.log(len(moving) * candidate.trials) > NAMED:
+                found.append(candidate.effect)
+        if not found:
+            break
+        fit = fit.starting([*fit.causes, *found]).tolerating(scales, found)
+    return fit
+
+
+def _is_there(fit: Fit, ripple: Effect) -> bool:
+    """Whether a fit has one of so nearly the same period that the two could cancel."""
+    joint = fit.simulation.robot.joints.index(str(ripple.where))
+    span = float(np.ptp(fit.observations.motion.q[:, joint])) / (1.0 if ripple.prismatic else 2.0 * np.pi)
+    others = [effect for effect in (*fit.causes, *fit.background.effects) if effect.name == ripple.name]
+    return any(
+        effect.where == ripple.where and abs(float(effect.values[-1] - ripple.values[-1])) * span < _APART
+        for effect in others
+    )
