@@ -96,7 +96,7 @@ class Servo:
         self.model, self.fast = model, fast
         self.glitch_ticks, self.excess_a = 0, 0.0
         self._angle = angle
-        self._memory = bytearray(model.layout.size)
+        self._memory, self._registers = bytearray(model.layout.size), model.layout.registers
         self._indirect = {
             data + k: pointer + 2 * k
             for pointer, data, count in INDIRECT.get(model.layout.ram, ())
@@ -115,8 +115,9 @@ class Servo:
 
     def __getitem__(self, name: str) -> int:
         """The number in a register."""
-        register = self.model.layout[name]
-        return register.value(bytes(self._memory[register.address : register.end]))
+        register = self._registers[name]
+        begin = register.address
+        return register.value(bytes(self._memory[begin : begin + register.size]))
 
     def __setitem__(self, name: str, value: int) -> None:
         """Put a number into a register as the servo itself does, past all locks."""
@@ -126,7 +127,7 @@ class Servo:
     @property
     def id(self) -> int:
         """Its number on the bus."""
-        return self["id"]
+        return self._memory[self._registers["id"].address]
 
     @property
     def baud(self) -> int:
