@@ -117,11 +117,15 @@ class Owed:
         """Return True when this answer was owed; then it is owed no more."""
         return self._until.pop((protocol, status.id, len(status.data)), None) is not None
 
-    def size_for(self, request: Request, now: float) -> int | None:
-        """Return the smallest number of bytes to ask for that no owed answer of the same servos has."""
+    def size_for(self, request: Request, now: float, last: int | None) -> int | None:
+        """Return the smallest number of bytes to ask for that no owed answer of the same servos has.
+
+        Another one than `last`, if there is one.
+        """
         self._until = {answer: until for answer, until in self._until.items() if until > now}
         sizes = range(request.size, request.size + request.spare + 1)
-        return next((size for size in sizes if not self._alike(request, size)), None)
+        free = [size for size in sizes if not self._alike(request, size)]
+        return next((size for size in free if size != last), next(iter(free), None))
 
     def until(self, request: Request) -> float:
         """Return when no answer that looks like one to `request` can come any more [s]."""
@@ -136,7 +140,8 @@ class Bus(ABC):
     """Servos behind one port. A late answer is never taken for that to a later question.
 
     A servo that did not answer in time is asked for another number of bytes from then on, until its answer can come no
-    more. After bytes that cannot be understood the line has to fall silent before the next question.
+    more. Where only the number of bytes tells answers apart, no two questions in a row ask for the same: an answer that
+    comes twice is not taken for that to the next question. After bytes that cannot be understood the line has to fall silent before the next question.
 
     Attributes:
         return_delay_s: by ID, how long each waits before it answers; unknown ones may need the longest time.
@@ -155,6 +160,7 @@ class Bus(ABC):
         self._sent = self._free_s = 0.0
         self._owed = Owed()
         self._asked_size = self._question_size = 0
+        self._last_sizes: dict[tuple[int, ...], int] = {}
 
     @staticmethod
     @abstractmethod
@@ -190,10 +196,12 @@ class Bus(ABC):
 
     def send(self, request: Request) -> None:
         """Send it. Where its answers would look like late ones, wait first until those can come no more."""
-        size = self._owed.size_for(request, self._clock.now())
-        if size is None and self.is_weak(request):
+        is_weak = self.is_weak(request)
+        last = self._last_sizes.get(request.ids) if is_weak else None
+        size = self._owed.size_for(request, self._clock.now(), last)
+        if size is None and is_weak:
             self._wait_out(self._owed.until(request))
-        self._asked_size = request.size if size is None else size
+        self._asked_size = self._last_sizes[request.ids] = request.size if size is None else size
         packet = request.packet(self._asked_size)
         self._question_size = len(packet)
         self._port.flush()
