@@ -141,7 +141,8 @@ class Bus(ABC):
 
     A servo that did not answer in time is asked for another number of bytes from then on, until its answer can come no
     more. Where only the number of bytes tells answers apart, no two questions in a row ask for the same: an answer that
-    comes twice is not taken for that to the next question. After bytes that cannot be understood the line has to fall silent before the next question.
+    comes twice is not taken for that to the next question. After bytes that cannot be understood the line has to fall
+    silent before the next question.
 
     Attributes:
         return_delay_s: by ID, how long each waits before it answers; unknown ones may need the longest time.
