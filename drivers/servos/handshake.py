@@ -105,7 +105,7 @@ def identify(bus: Bus, config: ServoConfig, model: Model, known: Mapping[int, Mo
     """Ask the servo of `config` whether it is a `model`; `known` are those that can be told by their number."""
     layout = model.layout
     head = Register(0, max(layout["model"].end, layout["firmware"].end))
-    data, trouble = _read_surely(bus, model, config.id, head)
+    data, trouble = read_register(bus, model, config.id, head)
     if data is None:
         return Finding(config, _absence(bus, model, config.id, trouble), may_come_back=trouble is Trouble.TIMEOUT)
     number = layout.value("model", data)
@@ -113,7 +113,7 @@ def identify(bus: Bus, config: ServoConfig, model: Model, known: Mapping[int, Mo
         other = known.get(number)
         return Finding(config, f"{other.name if other else f'model number {number}'}: wrong model")
     last = max(layout[name].end for name in SETTINGS if name in layout)
-    table, trouble = _read_surely(bus, model, config.id, Register(0, last))
+    table, trouble = read_register(bus, model, config.id, Register(0, last))
     if table is None:
         return Finding(config, _absence(bus, model, config.id, trouble), may_come_back=True)
     if _is_garbled(bus, model, config.id):
@@ -196,7 +196,19 @@ def restore_torque(bus: Bus, servo: FittedServo) -> None:
 
 
 def read_register(bus: Bus, model: Model, id: int, register: Register) -> tuple[bytes | None, Trouble | None]:
-    """Its bytes; without them what was wrong the last time of several."""
+    """Its bytes, twice the same where a wrong answer may pass its checksum; else what was wrong the last time."""
+    data, trouble = _read_once(bus, model, id, register)
+    for _ in range(ATTEMPTS):
+        if data is None or not bus.is_weak(bus.read_request(model, id, register)):
+            break
+        before = data
+        data, trouble = _read_once(bus, model, id, register)
+        if data == before:
+            break
+    return data, trouble
+
+
+def _read_once(bus: Bus, model: Model, id: int, register: Register) -> tuple[bytes | None, Trouble | None]:
     exchange = ask_again(bus, bus.read_request(model, id, register))
     return (exchange.answers[0].status.data if exchange.trouble is None else None), exchange.trouble
 
@@ -209,19 +221,6 @@ def ask_again(bus: Bus, request: Request) -> Exchange:
         if exchange.trouble is None:
             break
     return exchange
-
-
-def _read_surely(bus: Bus, model: Model, id: int, register: Register) -> tuple[bytes | None, Trouble | None]:
-    """As `read_register`, twice the same where a wrong answer may pass its checksum."""
-    data, trouble = read_register(bus, model, id, register)
-    for _ in range(ATTEMPTS):
-        if data is None or not bus.is_weak(bus.read_request(model, id, register)):
-            break
-        before = data
-        data, trouble = read_register(bus, model, id, register)
-        if data == before:
-            break
-    return data, trouble
 
 
 def _absence(bus: Bus, model: Model, id: int, trouble: Trouble | None) -> str:

@@ -100,3 +100,77 @@ def test_an_answer_that_comes_again_is_not_that_to_the_next_question(model) -> N
     angles[0] = -0.5
     clock.wait_until(clock.now() + 4.65e-3)
     assert all(answer.status.data != old for answer in bus.ask(ask).answers)
+
+
+class Babble:
+    """A port at which there is always something to receive."""
+
+    baud = 1_000_000
+
+    def __init__(self, clock: VirtualClock) -> None:
+        self._clock, self.received = clock, 0
+
+    def write(self, data: bytes) -> None:
+        """Nobody listens."""
+
+    def receive(self, until: float) -> bytes:
+        self._clock.wait_until(self._clock.now() + 1e-4)
+        self.received += 1
+        assert self.received < 10_000, "no end"
+        return b"\x55"
+
+    def flush(self) -> None:
+        """More comes."""
+
+    def close(self) -> None:
+        """More comes."""
+
+
+@pytest.mark.parametrize("model", WEAK)
+def test_noise_without_end_does_not_hold_the_driver(model) -> None:
+    clock, (bus_of, _, _, models) = VirtualClock(), WEAK[model]
+    bus = bus_of("arm", Babble(clock), clock, 0.0)
+    assert bus.ask(bus.read_request(models[model], 1, models[model].layout["position"])).trouble is not None
+    assert not bus.listen(clock.now() + 5e-3)
+
+
+def once(arm: Any, place: int, value: int) -> Change:
+    """The first answer to a question for torque has another byte, and a checksum that fits."""
+    state, left = arm.chain.servo(1).model.layout.state, [1]
+
+    def change(data: bytes, replies: list[Reply], _t: float) -> list[Reply]:
+        if not left or data[4:6] != bytes((2, state.address)) or not replies:
+            return replies
+        left.clear()
+        wrong = bytearray(replies[0].data)
+        wrong[place] = value
+        wrong[-1] = ~sum(wrong[2:-1]) & 0xFF
+        return [replace(replies[0], data=bytes(wrong))]
+
+    return change
+
+
+@pytest.mark.parametrize(
+    "make", [MAKES["protocol 1"], MAKES["feetech"], MAKES["SCS"]], ids=["protocol 1", "STS", "SCS"]
+)
+@pytest.mark.parametrize(("place", "value"), [(4, 0x20), (5, 1)], ids=["alert", "torque"])
+def test_an_alert_or_torque_is_not_believed_from_one_answer(make, place, value) -> None:
+    arm = make()
+    with arm.joints:
+        arm.joints.read(0.1)
+        arm.port.device = Wire(arm.chain, once(arm, place, value))
+        for _ in range(100):
+            arm.joints.read(0.1)
+            assert arm.joints.health == ()
+
+
+@pytest.mark.parametrize(
+    "make", [MAKES["protocol 1"], MAKES["feetech"], MAKES["SCS"]], ids=["protocol 1", "STS", "SCS"]
+)
+def test_torque_is_not_believed_to_be_off_from_one_answer(make) -> None:
+    arm = make()
+    arm.chain.servo(1)["torque"] = 1
+    arm.port.device = Wire(arm.chain, once(arm, 5, 0))
+    with arm.joints:
+        assert arm.chain.servo(1)["torque"] == 0
+        assert arm.joints.servos[0].had_torque
