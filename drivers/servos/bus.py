@@ -64,11 +64,12 @@ class Request:
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """One servo's answer, and between which times [s] it began to answer."""
+    """One servo's answer, between which times [s] it began to answer, and when it was asked [s]."""
 
     status: Status
     earliest: float
     latest: float
+    asked: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -331,7 +332,7 @@ class Bus(ABC):
         """When the packet at `at` was begun: all that came with it and after it was on the wire by the arrival."""
         latest = inbox.arrived - (len(inbox.received) - at) * self._byte_s
         wanted = replace(status, data=status.data[: request.size])
-        return Answer(wanted, min(earliest, latest), latest)
+        return Answer(wanted, min(earliest, latest), latest, self._sent)
 
     def _inbox(self, request: Request) -> Inbox:
         return Inbox(self._port, self._clock, self._deadline(request))

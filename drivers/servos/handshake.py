@@ -18,6 +18,8 @@ RETURN_DELAY_UNIT_S = 2e-6
 SETTINGS = ("return_delay", "drive_mode", "operating_mode", "homing_offset")
 
 ATTEMPTS = 5
+# What a busy machine or a loose cable does too; not a wrong ID, rate or setting.
+PASSING = (Trouble.TIMEOUT, Trouble.FOREIGN, Trouble.WRONG_LENGTH, Trouble.EARLY)
 RETRY_S = 0.2
 LOOKS = 5  # at what a servo measures
 GARBLED = "garbled answers: two servos with this ID, or a bad cable"
@@ -107,7 +109,7 @@ def identify(bus: Bus, config: ServoConfig, model: Model, known: Mapping[int, Mo
     head = Register(0, max(layout["model"].end, layout["firmware"].end))
     data, trouble = read_register(bus, model, config.id, head)
     if data is None:
-        return Finding(config, _absence(bus, model, config.id, trouble), may_come_back=trouble is Trouble.TIMEOUT)
+        return Finding(config, _absence(bus, model, config.id, trouble), may_come_back=trouble in PASSING)
     number = layout.value("model", data)
     if number != model.number:
         other = known.get(number)

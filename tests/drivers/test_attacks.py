@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from random import Random
 from typing import Any
 
 import pytest
@@ -13,6 +14,7 @@ from servo_arm import TICK
 
 from drivers.bench.device import Device, OnlyAnswers, Reply
 from drivers.bench.virtual_port import VirtualClock, VirtualPort
+from drivers.dynamixel.bench import faults
 from drivers.dynamixel.bench.chain import Chain
 from drivers.dynamixel.bench.servo import Servo
 from drivers.dynamixel.bus import Bus
@@ -25,6 +27,7 @@ from drivers.feetech.models import BY_NAME as FEETECH_MODELS
 from drivers.scan import scan_port
 from drivers.scanners import SCANNERS
 from drivers.servos.workbench import Workbench
+from interfaces.errors import SourceLost
 
 Change = Callable[[bytes, list[Reply], float], list[Reply]]
 MAKES: dict[str, Callable[[], Any]] = {
@@ -83,6 +86,18 @@ def test_an_echo_is_not_taken_for_a_servo_with_that_id() -> None:
     with Workbench(DYNAMIXEL, clock, lambda _, baud: (VirtualPort(Wire(chain, echo), clock, baud), 0.0)) as bench:
         bus = bench.bus("bench", 1_000_000)
         assert [bench.is_taken(bus, id) for id in (1, 2)] == [True, False]
+
+
+@pytest.mark.parametrize("make", MAKES.values(), ids=MAKES)
+def test_answers_to_others_at_the_opening_are_waited_out(make) -> None:
+    arm = make()
+
+    def of_another(_data: bytes, replies: list[Reply], _t: float) -> list[Reply]:
+        return [faults.swapped(reply, Random(3)) for reply in replies]
+
+    arm.port.device = Wire(arm.chain, of_another)
+    with pytest.raises(SourceLost, match="another servo's answer"):
+        arm.joints.__enter__()
 
 
 @pytest.mark.parametrize("model", WEAK)
