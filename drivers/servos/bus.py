@@ -64,11 +64,12 @@ class Request:
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """One servo's answer, and between which times [s] it began to answer."""
+    """One servo's answer, between which times [s] it began to answer, and when it was asked [s]."""
 
     status: Status
     earliest: float
     latest: float
+    asked: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,11 +118,15 @@ class Owed:
         """Return True when this answer was owed; then it is owed no more."""
         return self._until.pop((protocol, status.id, len(status.data)), None) is not None
 
-    def size_for(self, request: Request, now: float) -> int | None:
-        """Return the smallest number of bytes to ask for that no owed answer of the same servos has."""
+    def size_for(self, request: Request, now: float, last: int | None) -> int | None:
+        """Return the smallest number of bytes to ask for that no owed answer of the same servos has.
+
+        Another one than `last`, if there is one.
+        """
         self._until = {answer: until for answer, until in self._until.items() if until > now}
         sizes = range(request.size, request.size + request.spare + 1)
-        return next((size for size in sizes if not self._alike(request, size)), None)
+        free = [size for size in sizes if not self._alike(request, size)]
+        return next((size for size in free if size != last), next(iter(free), None))
 
     def until(self, request: Request) -> float:
         """Return when no answer that looks like one to `request` can come any more [s]."""
@@ -136,7 +141,9 @@ class Bus(ABC):
     """Servos behind one port. A late answer is never taken for that to a later question.
 
     A servo that did not answer in time is asked for another number of bytes from then on, until its answer can come no
-    more. After bytes that cannot be understood the line has to fall silent before the next question.
+    more. Where only the number of bytes tells answers apart, no two questions in a row ask for the same: an answer that
+    comes twice is not taken for that to the next question. After bytes that cannot be understood the line has to fall
+    silent before the next question.
 
     Attributes:
         return_delay_s: by ID, how long each waits before it answers; unknown ones may need the longest time.
@@ -155,6 +162,7 @@ class Bus(ABC):
         self._sent = self._free_s = 0.0
         self._owed = Owed()
         self._asked_size = self._question_size = 0
+        self._last_sizes: dict[tuple[int, ...], int] = {}
 
     @staticmethod
     @abstractmethod
@@ -190,10 +198,12 @@ class Bus(ABC):
 
     def send(self, request: Request) -> None:
         """Send it. Where its answers would look like late ones, wait first until those can come no more."""
-        size = self._owed.size_for(request, self._clock.now())
-        if size is None and self.is_weak(request):
+        is_weak = self.is_weak(request)
+        last = self._last_sizes.get(request.ids) if is_weak else None
+        size = self._owed.size_for(request, self._clock.now(), last)
+        if size is None and is_weak:
             self._wait_out(self._owed.until(request))
-        self._asked_size = request.size if size is None else size
+        self._asked_size = self._last_sizes[request.ids] = request.size if size is None else size
         packet = request.packet(self._asked_size)
         self._question_size = len(packet)
         self._port.flush()
@@ -223,6 +233,8 @@ class Bus(ABC):
         while data := self._port.receive(until):
             received += data
             at += self._owed_size(received, at)
+            if self._clock.now() >= until:  # where noise comes without end, something is always there
+                break
         if at == len(received):
             return True
         self.counts.add(Trouble.NOISE)
@@ -237,7 +249,7 @@ class Bus(ABC):
             pass
 
     def _wait_out(self, until: float) -> None:
-        while self._port.receive(until):
+        while self._port.receive(until) and self._clock.now() < until:
             pass
 
     def _owed_size(self, received: bytearray, at: int) -> int:
@@ -320,7 +332,7 @@ class Bus(ABC):
         """When the packet at `at` was begun: all that came with it and after it was on the wire by the arrival."""
         latest = inbox.arrived - (len(inbox.received) - at) * self._byte_s
         wanted = replace(status, data=status.data[: request.size])
-        return Answer(wanted, min(earliest, latest), latest)
+        return Answer(wanted, min(earliest, latest), latest, self._sent)
 
     def _inbox(self, request: Request) -> Inbox:
         return Inbox(self._port, self._clock, self._deadline(request))

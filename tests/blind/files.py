@@ -59,15 +59,18 @@ def write_robot(folder: Path, arm: Arm, hold: str, *, marker_known: bool, pose_k
 def write_recording(
     file: Path,
     joints: tuple[str, ...],
-    t: FloatArray,
+    t: FloatArray | None,
     segment: IntArray | None,
     q: FloatArray,
     x: FloatArray,
     covariance: FloatArray | None,
 ) -> None:
     """A recording as CSV with all digits; columns whose values are None are left out."""
-    names = ["t", *joints, "x", "y", "z"]
-    columns: list[list[float] | list[int]] = [t.tolist(), *q.T.tolist(), *x.T.tolist()]
+    names = [*joints, "x", "y", "z"]
+    columns: list[list[float] | list[int]] = [*q.T.tolist(), *x.T.tolist()]
+    if t is not None:
+        names.insert(0, "t")
+        columns.insert(0, t.tolist())
     if covariance is not None:
         names += ["c" + "xyz"[i] + "xyz"[j] for i, j in UPPER]
         columns += [covariance[:, i, j].tolist() for i, j in UPPER]

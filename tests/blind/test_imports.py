@@ -11,7 +11,17 @@ import pytest
 HERE = Path(__file__).parent
 OURS = {"kbmaps", "interfaces", "drivers", "vision", "sim_backend", "effects", "diagnosis", "daemon", "benchmarks"}
 INSTRUMENT = {"rendered.py": {"interfaces.camera", "interfaces.records", "vision.tracker"}}  # it looks at images
-JUDGE = {"judge.py", "judgement.py", "figures.py", "meaning.py", "oracle.py", "sealed.py"}  # they know both sides
+JUDGE = {
+    "judge.py",
+    "judgement.py",
+    "figures.py",
+    "meaning.py",
+    "oracle.py",
+    "sealed.py",
+    "dense.py",
+    "dense_judge.py",
+    "dense_positions.py",
+}  # they know both sides
 GENERATOR = sorted(file for file in HERE.glob("*.py") if not file.name.startswith("test_") and file.name not in JUDGE)
 
 

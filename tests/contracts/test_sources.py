@@ -371,7 +371,7 @@ def feetech_servos_that_fall_silent() -> AbstractContextManager[Rig]:
 
 def encoders_that_fall_silent() -> AbstractContextManager[Rig]:
     said = count()
-    return encoders_on_the_bench(lambda reply: reply if next(said) < 250 else replace(reply, data=b""))
+    return encoders_on_the_bench(lambda reply: reply if next(said) < 300 else replace(reply, data=b""))
 
 
 def swinging(id: int) -> Callable[[float], float]:
