@@ -17,5 +17,5 @@ their own equations of motion and balance. What judges (`judge`, `sealed`, `orac
 | eyes, outliers | the true cameras' pixels, false fixes, and triangulation by the described cameras |
 | rendered | the same from painted images and the product's tracker |
 | cases, files | recordings with noise and ticks, written out |
-| dense_* | arms that are nowhere exactly as described, from drawing them to judging (`python -m tests.blind.dense`) |
+| dense_* | arms with tolerances at every link, from generator to judge (`python -m tests.blind.dense`) |
 """

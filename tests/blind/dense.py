@@ -1,6 +1,6 @@
-"""`python -m tests.blind.dense --cases 20 --first-seed 0`: judge diagnoses of arms that are nowhere as described.
+"""`python -m tests.blind.dense --cases 20 --first-seed 0`: judge diagnoses of arms with tolerances at every link.
 
-Each diagnosis runs as a command of its own, of any checkout. One line a case, and tables at the end.
+Each diagnosis runs as a separate command, of any checkout. Print one line a case, and tables at the end.
 """
 
 from __future__ import annotations
@@ -32,12 +32,12 @@ RUN_FILE = "import runpy, sys; sys.argv = sys.argv[1:]; runpy.run_path(sys.argv[
 
 @dataclass(frozen=True)
 class Ran:
-    """A command that ended.
+    """The result of a finished command.
 
     Attributes:
-        code: of its exit; negative where it was killed.
-        said: all that it wrote.
-        cpu_seconds, rss_mb: of the processor, and its largest memory.
+        code: exit code; negative when killed.
+        said: standard output and standard error.
+        cpu_seconds, rss_mb: CPU time and peak memory.
     """
 
     code: int
@@ -48,14 +48,14 @@ class Ran:
 
 @dataclass(frozen=True)
 class Checkout:
-    """The version of the product that is judged."""
+    """The version of the product under test."""
 
     folder: Path
     limit_s: float
 
     @property
     def python(self) -> str:
-        """Its own interpreter, where it has one."""
+        """The checkout's own interpreter, else this one."""
         own = self.folder / ".venv" / "bin" / "python"
         return str(own) if own.exists() else sys.executable
 
@@ -65,7 +65,7 @@ class Checkout:
         return self._run(DIAGNOSE, "diagnose", str(case.recording), "--robot", robot, "--out", str(out), *options)
 
     def positions(self, extended: Path, recording: Path, out: Path) -> Ran:
-        """Write where the extended simulation says that the marker is."""
+        """Write the marker positions that the extended simulation predicts."""
         return self._run(RUN_FILE, str(HERE / "dense_positions.py"), str(extended), str(recording), str(out))
 
     def _run(self, code: str, *arguments: str) -> Ran:
@@ -128,7 +128,7 @@ def run(
     case = hide_dense(seed, folder, rows=rows, count=causes)
     out = folder / "out"
     ran, refused = checkout.diagnose(case, out), ""
-    if ran.code > 0:
+    if ran.code > 0 and "Traceback" not in ran.said:
         refused, ran = ran.said.strip(), checkout.diagnose(case, out, "--force")
     truth, told = sealed(case), _told(out, ran)
     what, false, missed = outcome(truth, told) if told else ("crashed", [], [])
@@ -164,26 +164,26 @@ def run(
 
 
 def _told(out: Path, ran: Ran) -> dict[str, Any]:
-    """diagnosis.json; nothing where there is none."""
+    """Return the contents of diagnosis.json; {} without one."""
     file = out / "diagnosis.json"
     return json.loads(file.read_text(encoding="utf-8")) if ran.code == 0 and file.exists() else {}
 
 
 def _noise_mm(case: DenseCase) -> float:
-    """RMS of the noise, that of whole ticks included and false fixes left out."""
+    """Return the RMS of the noise, with encoder quantisation and without false fixes."""
     added = rms_mm((case.measured.x - case.measured.x_true)[~case.measured.false])
     return math.hypot(added, 1e3 * math.sqrt(3.0) * case.rounding_m)
 
 
 def _placed_mm(case: DenseCase) -> float:
-    """RMS error on other poses of the nominal model with what is not known fitted."""
+    """Return the RMS error on other poses of the nominal model, unknown instrument and marker fitted."""
     known = {"pose_known": case.pose_known, "marker_known": case.marker_known}
     built = placed(case.nominal, case.measured.q, case.measured.x, **known)
     return rms_mm(built.measured(case.fresh.q) - case.fresh.x_true)
 
 
 def _extended_mm(case: DenseCase, out: Path, checkout: Checkout) -> float | None:
-    """RMS error on other poses of extended.toml; None where it cannot be loaded."""
+    """Return the RMS error on other poses of extended.toml; None if it cannot be loaded."""
     file = out / "fresh.npy"
     ran = checkout.positions(out / "extended.toml", case.folder / "fresh.csv", file)
     return rms_mm(np.load(file) - case.fresh.x_true) if ran.code == 0 else None

@@ -1,4 +1,4 @@
-"""Arms from desk size to industrial size, and how far a built one is from its URDF at every link and drive."""
+"""Arms from desk size to industrial size, with manufacturing tolerances at every link and drive."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ NO_EYES = Eyes(700.0, 0.2, 0.2)  # the instrument reports positions; these numbe
 
 @dataclass(frozen=True, eq=False)
 class Made:
-    """How one arm differs from its URDF, without any cause.
+    """Deviations of one arm from its URDF, without any cause.
 
     Attributes:
         length_m, angle_rad: 1 sigma of the shifts and turns of this arm's links.
@@ -110,7 +110,7 @@ def described(rng: np.random.Generator, *, with_masses: bool) -> Arm:
 
 
 def _with_slide(letters: str, slides: list[bool], rng: np.random.Generator) -> tuple[str, list[bool]]:
-    """A rail or lift put before the arm, or a reach in the place of the elbow."""
+    """Put a rail or lift before the arm, or a sliding joint in place of the elbow."""
     if rng.random() < 0.7:
         return str(rng.choice(["x", "z"])) + letters, [True, *slides]
     return letters[:2] + "x" + letters[3:], [*slides[:2], True, *slides[3:]]
@@ -119,7 +119,7 @@ def _with_slide(letters: str, slides: list[bool], rng: np.random.Generator) -> t
 def _chain(
     start: str, prefix: str, letters: str, slides: list[bool], reach: float, rng: np.random.Generator
 ) -> tuple[Joint, ...]:
-    """Joints one behind the other; frames turned by quarter turns where the maker liked them turned."""
+    """Return joints in series; in some arms the frames are rotated by quarter turns."""
     proportions = np.array([0.15, 0.10, 0.36, 0.28, 0.10, 0.08, 0.07, 0.06])[: len(letters)]
     turned = rng.random() < 0.6
     frame, parent, joints, stretched = np.eye(3), start, [], (0.0, 0.0, 1.0)

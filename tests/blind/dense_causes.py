@@ -1,4 +1,4 @@
-"""Causes in arms that are nowhere exactly as described: what each does, and how the marker moves with its numbers."""
+"""Causes of error: parameters of each, and the derivative of the marker position by them."""
 
 from __future__ import annotations
 
@@ -38,13 +38,13 @@ class Cause:
 
     @property
     def key(self) -> Key:
-        """What it is, whatever its numbers."""
+        """Effect, joint and source joint."""
         return self.effect, self.where, self.source
 
 
 @dataclass(frozen=True, eq=False)
 class Way:
-    """What an observer knows of a recording: joint positions in it, and the arm's posture there.
+    """The motion of a recording: joint positions, and the arm's posture at each row.
 
     Attributes:
         path: of the shafts at all instants (f, d) [rad or m]; `rows` of them were recorded (n,).
@@ -68,13 +68,20 @@ class Way:
 
 
 def all_causes(
-    arm: Arm, duration: float, rng: np.random.Generator, *, bears: bool, marker_known: bool, longest: float
+    arm: Arm,
+    duration: float,
+    rng: np.random.Generator,
+    *,
+    loaded: Sequence[str],
+    marker_known: bool,
+    pose_known: bool,
+    longest: float,
 ) -> list[Cause]:
     """Draw every cause at every place where it can be.
 
     Args:
         duration: of the recording by its clock; all causes with a moment have the same one.
-        bears: whether joints bear the arm's weight, and the masses are known.
+        loaded: joints that bear the weight of an arm whose masses are known.
         longest: reach of the arm [m], with which link and tool errors grow.
     """
     moment = float(duration * rng.uniform(0.25, 0.75))
@@ -82,6 +89,7 @@ def all_causes(
         _slip(rng, moment, longest),
         _moved(rng, moment, longest),
         *([_tool(rng)] if marker_known else []),
+        *([_pose(rng)] if pose_known else []),
     ]
     for index, name in enumerate(arm.read):
         slides = arm.joint(name).kind == "prismatic"
@@ -90,7 +98,7 @@ def all_causes(
         causes.append(_ripple(name, slides, rng))
         if not slides:
             causes.append(_ring(name, rng))
-        if bears:
+        if name in loaded:
             causes.append(_spring(name, slides, rng))
         for near in (index - 1, index + 1):
             if 0 <= near < len(arm.read) and arm.joint(arm.read[near]).kind != "prismatic" and not slides:
@@ -128,7 +136,7 @@ def _jump(name: str, slides: bool, rng: np.random.Generator, moment: float) -> C
 
 
 def _ripple(name: str, slides: bool, rng: np.random.Generator) -> Cause:
-    """Sensor tracks whose sine and cosine have a bias, of the order of the wanted angle times the poles."""
+    """Draw a bias of the sine and cosine tracks, scaled to an angle error."""
     poles = float(rng.integers(3, 25))
     turn = float(rng.uniform(0.1, 0.3)) if slides else 2.0 * math.pi  # of shaft travel for each turn of the ring
     size = 2.0 * math.pi * (rng.uniform(0.3e-3, 1.5e-3) if slides else rng.uniform(0.06, 0.6) * DEG) / turn
@@ -143,7 +151,7 @@ def _ring(name: str, rng: np.random.Generator) -> Cause:
 
 
 def _spring(name: str, slides: bool, rng: np.random.Generator) -> Cause:
-    """The amount is how far the joint gives under its largest load [rad or m]."""
+    """Draw a spring; the amount is the deflection under the joint's largest load [rad or m]."""
     gives = rng.uniform(0.3e-3, 3e-3) if slides else rng.uniform(0.1, 1.0) * DEG
     usual = 2e-3 if slides else 0.6 * DEG
     return Cause("joint_compliance", name, None, np.array([gives]), np.array([usual]), {})
@@ -167,8 +175,13 @@ def _tool(rng: np.random.Generator) -> Cause:
     return Cause("tool_offset", None, None, rng.uniform(0.01, 0.05) * direction(rng), np.repeat(0.02, 3), {})
 
 
+def _pose(rng: np.random.Generator) -> Cause:
+    six = np.concatenate([rng.uniform(3e-3, 30e-3) * direction(rng), rng.uniform(0.3, 2.0) * DEG * direction(rng)])
+    return Cause("camera_pose", None, None, six, np.repeat([12e-3, 0.8 * DEG], 3), {})
+
+
 def columns(cause: Cause, way: Way, by_joints: FloatArray, by_frames: FloatArray) -> FloatArray:
-    """Derivative (n, 3, m) of what is seen at the readings by the cause's amounts.
+    """Return the derivative (n, 3, m) of the position at given readings by the cause's amounts.
 
     Args:
         by_joints, by_frames: those of `way.posture`.
@@ -179,7 +192,7 @@ def columns(cause: Cause, way: Way, by_joints: FloatArray, by_frames: FloatArray
             return step * way.posture.by_marker()
         case "tool_offset":
             return way.posture.by_marker()
-        case "camera_moved":
+        case "camera_pose" | "camera_moved":
             return step * way.posture.by_eye()
         case "link_geometry":
             return by_frames[:, :, way.index(cause.where)]
@@ -229,12 +242,14 @@ _SIGNALS: dict[str, Callable[[Cause, Way], FloatArray]] = {
 }
 
 
-def conflicts(cause: Cause, chosen: Sequence[Cause]) -> bool:
-    """Whether a cause would be one with another: a link holds the zero of its joint."""
-    same_place = {"joint_offset", "link_geometry", "tool_offset"}
+def conflicts(cause: Cause, chosen: Sequence[Cause], arm: Arm) -> bool:
+    """Return True if a cause overlaps with a chosen one: a link contains its joint's zero, the pose the first link."""
+    same_place = {"joint_offset", "link_geometry"}
+    first = {("joint_offset", arm.read[0]), ("link_geometry", arm.read[0])}
     return any(
         cause.key == other.key
         or ({cause.effect, other.effect} <= same_place and cause.where == other.where)
         or (cause.effect == "encoder_jump" == other.effect)
+        or ("camera_pose" in (cause.effect, other.effect) and first & {cause.key[:2], other.key[:2]})
         for other in chosen
     )

@@ -1,4 +1,4 @@
-"""Forward kinematics of a built arm, how its marker moves with each of its parts, and the weight on its joints."""
+"""Forward kinematics of an arm with tolerances, Jacobians by every joint frame, and gravity torques."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Recordings of arms that are nowhere exactly as described, with causes that stand out from their tolerances."""
+"""Recordings of arms with tolerances at every link, and causes that stand out from these."""
 
 from __future__ import annotations
 
@@ -42,14 +42,16 @@ WEIGHTS = {
     "tool_slip": 0.5,
     "encoder_jump": 0.7,
     "camera_moved": 0.5,
+    "camera_pose": 0.5,
     "tool_offset": 1.5,
 }
+LOADED = 0.1  # of the largest load: a joint that bears less is not said to give
 STUDENT = 4.0  # degrees of freedom
 
 
 @dataclass(frozen=True)
 class Noise:
-    """What the instrument adds.
+    """Measurement noise of the instrument.
 
     Attributes:
         sigma_m: along each axis, false fixes left out.
@@ -72,7 +74,7 @@ class Noise:
 
     @property
     def told_sigma_m(self) -> float:
-        """The Gaussian noise from which as much could be learnt."""
+        """1 sigma of Gaussian noise with the same Fisher information."""
         if self.kind != "student":
             return self.sigma_m
         return self.sigma_m * math.sqrt((STUDENT - 2.0) / STUDENT * (STUDENT + 3.0) / (STUDENT + 1.0))
@@ -113,7 +115,7 @@ class Taken:
 
 @dataclass(frozen=True, eq=False)
 class DenseCase:
-    """A case: `folder`/case is what is diagnosed; the truth and a second recording stand beside it.
+    """A case: `folder`/case is the input of the diagnosis; truth and a second recording are beside it.
 
     Attributes:
         truth: the hidden causes.
@@ -148,7 +150,7 @@ class DenseCase:
 
     @property
     def is_decidable(self) -> bool:
-        """Whether a perfect observer would name all causes and no other."""
+        """True if a perfect observer would name all causes and no other."""
         return min((*self.nats, math.inf)) >= DECIDABLE and self.spare_nats > 0.0
 
     @property
@@ -179,22 +181,22 @@ def hide_dense(
     plain = Built(arm, as_made.frames, np.array(arm.marker_xyz), _eye_R(arm), np.array(arm.camera_xyz), _rigid(arm))
 
     way = _way(arm, motion, plain, timed)
-    bears = with_masses and hold != "torque_free"
     candidates = all_causes(
         arm,
         float(way.clock[-1]),
         choosing,
-        bears=bears,
+        loaded=_loaded(way) if with_masses and hold != "torque_free" else (),
         marker_known=marker_known,
+        pose_known=pose_known,
         longest=float(np.linalg.norm(plain.measured(way.shaft[:1])[0])),
     )
     observer = _observer(candidates, way, as_made, noise, motion, marker_known=marker_known, pose_known=pose_known)
     wanted = int(choosing.choice(COUNTS, p=SHARES)) if count is None else count
-    chosen = _chosen(candidates, observer, wanted, choosing)
+    chosen = _chosen(candidates, observer, wanted, arm, choosing)
     evidence, spare = observer.evidence(chosen)
     truth = tuple(candidates[k] for k in chosen)
 
-    robot = _Robot(arm, as_made, plain, truth, bears)
+    robot = _Robot(arm, as_made, plain, truth)
     measured = _taken(robot, motion, timed, noise, noising)
     again = move(freshly, motion.style, arm.ranges, min(fresh_rows, len(motion.stamps)), _always)
     fresh = _taken(robot, again, timed, noise, freshly)
@@ -273,10 +275,9 @@ class _Robot:
     made: Made
     plain: Built
     causes: Sequence[Cause]
-    bears: bool
 
     def readings(self, shaft: FloatArray, clock: FloatArray) -> FloatArray:
-        """What the encoders say (n, d), in whole ticks."""
+        """Encoder readings (n, d), in whole ticks."""
         read = shaft.copy()
         for index, name in enumerate(self.arm.read):
             column = read[:, index]
@@ -324,7 +325,7 @@ class _Robot:
         built = replace(built, soft=soft)
         x = built.measured(built.balanced(out))
         for cause in self.causes:
-            if cause.effect == "camera_moved":
+            if cause.effect in ("camera_pose", "camera_moved"):
                 turn = Rotation.from_rotvec(cause.amounts[3:]).as_matrix()
                 x = np.where(_after(cause, clock)[:, None] > 0.0, (x - cause.amounts[:3]) @ turn, x)
         return x
@@ -334,7 +335,7 @@ class _Robot:
 
 
 def _misread(shaft: FloatArray, cause: Cause, clock: FloatArray) -> FloatArray:
-    """Readings (n,) of an encoder with that cause."""
+    """Return the readings (n,) of an encoder with this cause."""
     a = cause.amounts
     match cause.effect:
         case "joint_offset":
@@ -352,7 +353,7 @@ def _misread(shaft: FloatArray, cause: Cause, clock: FloatArray) -> FloatArray:
 
 
 def _after(cause: Cause, clock: FloatArray) -> FloatArray:
-    return np.asarray(clock >= cause.shape["moment"], dtype=float)
+    return np.asarray(clock >= cause.shape.get("moment", -math.inf), dtype=float)
 
 
 def _rows(rng: np.random.Generator, walks: bool, most: int | None) -> int:
@@ -364,6 +365,15 @@ def _rows(rng: np.random.Generator, walks: bool, most: int | None) -> int:
 def _way(arm: Arm, motion: Motion, built: Built, timed: bool) -> Way:
     rows = np.searchsorted(motion.t, motion.stamps)
     return Way(arm, motion.shaft, rows, _clock(motion, timed), Posture.of(built, motion.shaft[rows]))
+
+
+def _loaded(way: Way) -> list[str]:
+    """Return the joints that bear a load by design, not only by their tolerances."""
+    loads = np.abs(way.posture.torques()).max(axis=0)
+    slides = np.array([way.arm.joint(name).kind == "prismatic" for name in way.arm.read])
+    kinds = [slides == kind for kind in (True, False)]  # forces and torques
+    enough = np.any([kind & (loads > LOADED * loads.max(where=kind, initial=1e-6)) for kind in kinds], axis=0)
+    return [name for name, loaded in zip(way.arm.read, enough, strict=True) if loaded]
 
 
 def _clock(motion: Motion, timed: bool) -> FloatArray:
@@ -381,7 +391,7 @@ def _observer(
     marker_known: bool,
     pose_known: bool,
 ) -> Observer:
-    """Who knows the scales of `as_made` and of the noise."""
+    """Return an observer that knows the scales of `as_made` and of the noise."""
     by_joints, by_frames = way.posture.by_joints(), way.posture.by_frames()
     begins = _begins(motion)
     sigma_m = math.hypot(noise.told_sigma_m, _rounding_m(way.arm, by_joints))
@@ -416,20 +426,20 @@ def _observer(
 
 
 def _rounding_m(arm: Arm, by_joints: FloatArray) -> float:
-    """RMS along each axis [m] of what whole ticks of the encoders do to the marker."""
+    """Return the RMS of encoder quantisation at the marker, along each axis [m]."""
     rounding = np.array([arm.quantum(name) for name in arm.read]) / math.sqrt(12.0)
     return float(np.sqrt(np.square(by_joints * rounding).sum(axis=2).mean()))
 
 
 def _weights(causes: Sequence[Cause]) -> FloatArray:
-    """How usual each cause is at its place, 1 for the mean one (K,)."""
+    """Return the relative frequency of each cause at its place (K,), mean 1."""
     kinds = [cause.effect for cause in causes]
     weights = np.array([WEIGHTS[kind] / kinds.count(kind) for kind in kinds])
     return weights / weights.mean()
 
 
-def _chosen(causes: Sequence[Cause], observer: Observer, count: int, rng: np.random.Generator) -> list[int]:
-    """Causes to hide, each of which stands out beside the others as long as there are such."""
+def _chosen(causes: Sequence[Cause], observer: Observer, count: int, arm: Arm, rng: np.random.Generator) -> list[int]:
+    """Choose causes to hide, each decidable beside the others if possible."""
     weights = _weights(causes)
     zeros = np.array([cause.effect == "joint_offset" for cause in causes])
     of_zeros = int(rng.integers(2, max(count, 2) + 1)) if count > 1 and rng.random() < ZEROS else 0
@@ -449,7 +459,7 @@ def _chosen(causes: Sequence[Cause], observer: Observer, count: int, rng: np.ran
         while len(chosen) < count:
             only_zeros = sum(zeros[k] for k in chosen) < of_zeros
             allowed = weights * (zeros if only_zeros else 1.0)
-            allowed = allowed * [not conflicts(cause, [causes[k] for k in chosen]) for cause in causes]
+            allowed = allowed * [not conflicts(cause, [causes[k] for k in chosen], arm) for cause in causes]
             if not allowed.any():
                 of_zeros = 0
                 continue
@@ -473,7 +483,7 @@ def _begins(motion: Motion) -> BoolArray:
 
 
 def _told(arm: Arm, rng: np.random.Generator, *, marker_known: bool, pose_known: bool) -> Arm:
-    """The arm with what robot.toml says of its instrument and marker."""
+    """Return the arm with instrument and marker as robot.toml describes them."""
     if not pose_known and rng.random() < 0.5:  # the instrument stands anywhere
         arm = replace(arm, camera_xyz=(0.0, 0.0, 0.0), camera_rpy=(0.0, 0.0, 0.0))
     elif not pose_known:

@@ -1,6 +1,6 @@
-"""Judge what a diagnosis says of an arm that is nowhere exactly as described.
+"""Judge a diagnosis of an arm with tolerances at every link.
 
-It reads diagnosis.json alone, so that any version of the diagnosis can be judged.
+Only diagnosis.json is read, so any version of the diagnosis can be judged.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class DenseJudgement(msgspec.Struct, frozen=True):
             extended.toml.
         floor_ratio: stated noise floor over the RMS of the true noise.
         tolerances, stated_tolerances: 1 sigma, as they are and as they are stated.
-        refused: what the command said of a recording that it did without --force not take.
+        refused: message of the command where it needed --force.
     """
 
     seed: int
@@ -68,7 +68,7 @@ class DenseJudgement(msgspec.Struct, frozen=True):
 
     @property
     def no_worse(self) -> bool | None:
-        """Whether extended.toml predicts other poses at least as well as the placed nominal model."""
+        """True if extended.toml predicts other poses at least as well as the placed nominal model."""
         return None if self.extended_mm is None else self.extended_mm <= NO_WORSE * self.placed_mm
 
 
@@ -79,7 +79,7 @@ def name(entry: Json) -> str:
 
 
 def outcome(sealed: Json, told: Json) -> tuple[Outcome, list[str], list[str]]:
-    """What the diagnosis is, the false causes of weight, and the hidden ones that are not named."""
+    """Return the outcome, the false causes with a large share, and the missed causes."""
     truth = {entry["cause"]: entry["same"] for entry in sealed["truth"]}
     causes = [cause for cause in told["causes"] if not _is_false_fixes(sealed, cause)]
     found = _found(truth, [name(cause) for cause in causes])
@@ -99,7 +99,7 @@ def outcome(sealed: Json, told: Json) -> tuple[Outcome, list[str], list[str]]:
 
 
 def _found(truth: Mapping[str, Sequence[str]], named: Sequence[str]) -> dict[str, str]:
-    """By which name each hidden cause was found: its own, or else another one that is the same in any motion."""
+    """Return the name under which each hidden cause was found: its own, or an equivalent one."""
     found = {hidden: hidden for hidden in truth if hidden in named}
     for hidden, same in truth.items():
         free = [other for other in same if other in named and other not in found.values()]
@@ -109,7 +109,7 @@ def _found(truth: Mapping[str, Sequence[str]], named: Sequence[str]) -> dict[str
 
 
 def _alternatives(cause: Json) -> set[str]:
-    """What a cause is said to be perhaps."""
+    """Return the alternatives that are stated for a cause."""
     return {name(other) for key in ("rivals", "indistinguishable_from") for other in cause.get(key, ())}
 
 
@@ -119,12 +119,12 @@ def _place(hidden: str) -> str:
 
 
 def _is_false_fixes(sealed: Json, cause: Json) -> bool:
-    """Whether a cause says that fixes are false, where some are or the noise has heavy tails."""
+    """Return True for `outliers` where some fixes are false or the noise has heavy tails."""
     return cause["effect"] == "outliers" and sealed["noise"]["kind"] in ("outliers", "student")
 
 
 def inside(sealed: Json, told: Json) -> tuple[int, int]:
-    """How many intervals of zeros and plays hold the truth, and how many there are."""
+    """Count the intervals of zeros and plays that contain the truth, and all of them."""
     hits = []
     for entry in sealed["truth"]:
         effect = entry["cause"].partition("@")[0]
@@ -166,7 +166,7 @@ def placed(nominal: Built, q: FloatArray, x: FloatArray, *, pose_known: bool, ma
 
 
 def _turned(built: Built, q: FloatArray, x: FloatArray) -> Built:
-    """With the instrument where a rigid motion of all positions fits best."""
+    """Align the instrument by the best rigid motion of all positions."""
     seen = Posture.of(built, q).seen()
     middle, there = np.median(seen, axis=0), np.median(x, axis=0)
     U, _, Vt = np.linalg.svd((seen - middle).T @ (x - there))

@@ -1,4 +1,4 @@
-"""A linear Gaussian observer of the true generator: how surely the hidden causes could be named at all.
+"""Evidence for the hidden causes, as a linear Gaussian observer of the true generator has it.
 
 It knows the scale of the tolerances, the noise, and how each cause looks; it does not know the tolerances themselves,
 the amounts, or which causes there are. What it says is averaged over the noise, with the tolerances as they are.
@@ -22,7 +22,7 @@ SAME_SHARE = 1e-3  # part of a cause's signal that is left by a rival that can b
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """How sure one cause is.
+    """Evidence for one cause.
 
     Attributes:
         nats: by how much the true set is more probable than the best one without this cause.
@@ -35,7 +35,7 @@ class Evidence:
 
 @dataclass(frozen=True, eq=False)
 class Observer:
-    """What is left of all causes when the background is unknown.
+    """Information about all causes, tolerances and placement marginalised.
 
     Attributes:
         spans: columns of each cause.
@@ -95,14 +95,14 @@ class Observer:
         )
 
     def evidence(self, truth: Sequence[int]) -> tuple[tuple[Evidence, ...], float]:
-        """For each true cause how sure it is; and by how much the true set beats the best one with one cause more."""
+        """Return the evidence for each true cause, and the margin over the best set with one more cause."""
         data = self._data(truth)
         whole = self._log_evidence(truth, data)
         spare = -float(self._gains(truth, data).max())
         return tuple(self._one(cause, truth, whole, data) for cause in truth), spare
 
     def same(self, cause: int, truth: Sequence[int]) -> list[int]:
-        """Causes of as few numbers that can be all that a true one is, if instrument, marker and amounts are free."""
+        """Return equivalent causes with as few numbers: any motion of them explains the true cause's signal."""
         beside = [k for k in truth if k != cause]
         signal = self.amounts[self.spans[cause]]
         whole = self._left(cause, signal, beside)
@@ -115,22 +115,23 @@ class Observer:
         ]
 
     def _one(self, cause: int, truth: Sequence[int], whole: float, data: FloatArray) -> Evidence:
-        """The best set without a true cause: fewer, with one other, with two others, with one in the place of two."""
+        """Find the best set without a true cause: fewer causes, one or two others, one in place of two."""
         without = [k for k in truth if k != cause]
-        alone = self._gains(without, data, cause)
+        barred = [cause, *self.same(cause, truth)]
+        alone = self._gains(without, data, barred)
         bases = [without, *([*without, int(k)] for k in np.argsort(-alone)[:NEAR] if np.isfinite(alone[k]))]
         bases += [[k for k in without if k != dropped] for dropped in without]
         best, rival = -math.inf, ()
         for base in bases:
-            gains, value = self._gains(base, data, cause), self._log_evidence(base, data)
+            gains, value = self._gains(base, data, barred), self._log_evidence(base, data)
             added = int(np.argmax(gains))
             for better, found in ((value, base), (value + float(gains[added]), [*base, added])):
                 if better > best:
                     best, rival = better, tuple(k for k in found if k not in truth)
         return Evidence(whole - best, rival)
 
-    def _gains(self, base: Sequence[int], data: FloatArray, cause: int | None = None) -> FloatArray:
-        """By how much each cause (K,) raises the log evidence of a set, -inf for those in it and for `cause`."""
+    def _gains(self, base: Sequence[int], data: FloatArray, barred: Sequence[int] = ()) -> FloatArray:
+        """Return the gain in log evidence of a set by each cause (K,), -inf for those in it and for `barred`."""
         chosen = self._columns(base)
         p = len(self.amounts)
         size = max(self._count(k) for k in range(len(self.spans)))
@@ -148,7 +149,7 @@ class Observer:
         blocks, wanted = np.eye(size) + S[at], noise[at] + h[places][:, :, None] * h[places][:, None, :]
         fits = np.trace(np.linalg.solve(blocks, wanted), axis1=1, axis2=2)
         gains = 0.5 * (fits - np.linalg.slogdet(blocks)[1]) - self.costs
-        gains[[*base, *([] if cause is None else [cause])]] = -np.inf
+        gains[[*base, *barred]] = -np.inf
         return gains
 
     def _data(self, truth: Sequence[int]) -> FloatArray:

@@ -1,6 +1,6 @@
-"""`dense_positions.py EXTENDED.toml RECORDING.csv OUT.npy`: where an extended simulation says that the marker is.
+"""`dense_positions.py EXTENDED.toml RECORDING.csv OUT.npy`: predict marker positions with an extended simulation.
 
-It runs in whichever checkout it is called from, beside the diagnosis that wrote the file.
+Runs in the checkout whose diagnosis wrote the file.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What the judge of realistic arms calls right, honest, vague and wrong, fed with diagnoses that were made up."""
+"""Outcomes of made-up diagnoses of arms with tolerances."""
 
 from __future__ import annotations
 
