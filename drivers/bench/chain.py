@@ -153,4 +153,6 @@ class ServoChain(OnlyAnswers, ABC, Generic[ServoT]):
 
 def mixed(packets: list[bytes]) -> bytes:
     """What is heard when all talk at the same time."""
+    if len(packets) == 1:
+        return packets[0]
     return bytes(reduce(and_, together) for together in zip(*packets, strict=False))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import TypeVar
 
@@ -123,10 +123,12 @@ class Owed:
 
         Another one than `last`, if there is one.
         """
-        self._until = {answer: until for answer, until in self._until.items() if until > now}
+        if self._until:
+            self._until = {answer: until for answer, until in self._until.items() if until > now}
         sizes = range(request.size, request.size + request.spare + 1)
-        free = [size for size in sizes if not self._alike(request, size)]
-        return next((size for size in free if size != last), next(iter(free), None))
+        free = (size for size in sizes if not self._alike(request, size))
+        first = next(free, None)
+        return next(free, first) if first == last else first
 
     def until(self, request: Request) -> float:
         """Return when no answer that looks like one to `request` can come any more [s]."""
@@ -331,7 +333,7 @@ class Bus(ABC):
     def _timed(self, request: Request, status: Status, earliest: float, inbox: Inbox, at: int) -> Answer:
         """When the packet at `at` was begun: all that came with it and after it was on the wire by the arrival."""
         latest = inbox.arrived - (len(inbox.received) - at) * self._byte_s
-        wanted = replace(status, data=status.data[: request.size])
+        wanted = Status(status.id, status.error, status.data[: request.size], status.size)
         return Answer(wanted, min(earliest, latest), latest, self._sent)
 
     def _inbox(self, request: Request) -> Inbox:
