@@ -88,7 +88,8 @@ class Servo:
         self.model, self.fast = model, fast
         self.glitch_ticks, self.excess_a = 0, 0.0
         self._angle = angle
-        self._memory, self._registers = bytearray(model.layout.size), model.layout.registers
+        self._memory = bytearray(model.layout.size)
+        self._places = {name: (r.address, r.end, r.signed) for name, r in model.layout.registers.items()}
         self._indirect = {
             data + k: pointer + 2 * k for pointer, data, count in indirect_blocks(model) for k in range(count)
         }
@@ -105,19 +106,20 @@ class Servo:
 
     def __getitem__(self, name: str) -> int:
         """The number in a register."""
-        register = self._registers[name]
-        begin = register.address
-        return register.value(bytes(self._memory[begin : begin + register.size]))
+        address, end, signed = self._places[name]
+        if end == address + 1 and not signed:
+            return self._memory[address]
+        return int.from_bytes(self._memory[address:end], "little", signed=signed)
 
     def __setitem__(self, name: str, value: int) -> None:
         """Put a number into a register as the servo itself does, past all locks."""
-        register = self.model.layout[name]
-        self._memory[register.address : register.end] = register.bytes(value)
+        address, end, signed = self._places[name]
+        self._memory[address:end] = value.to_bytes(end - address, "little", signed=signed)
 
     @property
     def id(self) -> int:
         """Its number on the bus."""
-        return self._memory[self._registers["id"].address]
+        return self["id"]
 
     @property
     def baud(self) -> int:
