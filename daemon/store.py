@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import sqlite3
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from itertools import islice, takewhile
@@ -188,14 +188,17 @@ class PairReader:
         with self._reading() as connection:
             return store_schema.trouble(connection)
 
-    def audit(self) -> Audit:
+    def audit(self, working: Callable[[], None] = lambda: None) -> Audit:
         """Look at each row. What cannot be read is among `damage` from then on.
+
+        Args:
+            working: is called again and again meanwhile.
 
         Raises:
             StoreError: the file cannot be read.
         """
         newest = self.last_seq()
-        with self._reading() as connection:
+        with self._reading() as connection, store_schema.told_while_working(connection, working):
             numbers: list[int] = []
             session, ends = 0, np.empty((0, len(self.joints)))
             rows = scan(connection, self._columns, self._check)
@@ -256,10 +259,15 @@ class PairStore:
     writing; its death, whatever its kind, frees it.
     """
 
-    def __init__(self, file: Path, session: Session) -> None:
+    def __init__(self, file: Path, session: Session, *, working: Callable[[], None] = lambda: None) -> None:
+        """Not open yet.
+
+        Args:
+            working: is called again and again while the store is opened, which takes the longer the more pairs it has.
+        """
         self.file = file
         self.reader = PairReader(file)
-        self._session = session
+        self._session, self._working = session, working
         self._lock_file: int | None = None
         self._connection: sqlite3.Connection | None = None
         self._seq = 0
@@ -371,15 +379,17 @@ class PairStore:
             if not self._connection.execute("SELECT count(*) FROM sqlite_schema").fetchone()[0]:
                 store_schema.create(self._connection, self._fresh())
             store_schema.check_kind(self._connection, self.file)
-            what = store_schema.trouble(self._connection)
+            with store_schema.told_while_working(self._connection, self._working):
+                what = store_schema.trouble(self._connection)
             if what is not None:
                 self._rebuild(what)
-            store_schema.migrate(self._connection)
+            with store_schema.told_while_working(self._connection, self._working):
+                store_schema.migrate(self._connection)
             self._check_joints(store_schema.joints_of(store_schema.meta(self._connection)))
             self._connection.execute("PRAGMA journal_mode = WAL")
             self._connection.execute("PRAGMA synchronous = FULL")
             self.reader.__enter__()
-            self._audit = self.reader.audit()
+            self._audit = self.reader.audit(self._working)
             self._seq, self._newest_session = self._audit.newest, self._audit.session
             self._begin_session(self._connection)
         for said in self.complaints:
@@ -389,7 +399,7 @@ class PairStore:
         """Go on with a new file that has all that can be read."""
         self._require_open().close()
         try:
-            kept = rebuild(self.file, self._fresh())
+            kept = rebuild(self.file, self._fresh(), self._working)
         except OSError as error:
             raise StoreUnwritable(unwritable(self.file, error.errno, error.strerror)) from error
         self._connection = store_schema.connect(self.file)
