@@ -262,10 +262,12 @@ class _Search:
                 self._try(as_it_is.doubles(slides))
             self._try(other for reading in new for other in reading.neighbours(slides))
         best = self._best()[0]
-        doubtful = best == as_it_is and self.fits[best].error > ENOUGH_AS_IT_IS * spread
-        if doubtful or not _nameable(best, self.fits[best], spread):
-            self._fit([as_it_is], tools=self._aligned_tool())
+        if self.fits[best].error > (ENOUGH_AS_IT_IS if best == as_it_is else ENOUGH) * spread:
             self._try(as_it_is.mixed(slides))
+        best = self._best()[0]
+        if not _nameable(best, self.fits[best], spread):
+            self._fit([as_it_is], tools=self._aligned_tool())
+            self._try(as_it_is.mixed_exchanges(slides))
             self._try(other for reading in self._distinct(expanded) for other in reading.neighbours(slides))
         if as_it_is not in self.fits:
             self._fit([as_it_is], held=True)

@@ -76,7 +76,7 @@ class Reading:
         """
         joints = range(len(self.order))
         for k in joints:
-            yield replace(self, signs=_replaced(self.signs, {k: -self.signs[k]}))
+            yield self._with_sign(k)
         yield from self._turnings(slides)
         yield from (self._exchanged(j, k) for j, k in itertools.combinations(joints, 2))
         yield replace(self, signs=tuple(-sign for sign in self.signs))
@@ -98,14 +98,16 @@ class Reading:
                 yield self.turned([turns * (i == j) + others * (i == k) for i in joints])
 
     def mixed(self, slides: Sequence[bool]) -> Iterator[Reading]:
-        """All readings with two changes more of two kinds: a sign, a quarter turn, two columns exchanged."""
+        """All readings with a sign and a quarter turn more."""
+        for k in range(len(self.order)):
+            yield from self._with_sign(k)._turnings(slides)
+
+    def mixed_exchanges(self, slides: Sequence[bool]) -> Iterator[Reading]:
+        """All readings with two columns exchanged, and a sign or a quarter turn more."""
         joints = range(len(self.order))
-        signs = [replace(self, signs=_replaced(self.signs, {k: -self.signs[k]})) for k in joints]
-        exchanged = [self._exchanged(j, k) for j, k in itertools.combinations(joints, 2)]
-        for reading in signs:
-            yield from reading._turnings(slides)
-        for reading in exchanged:
-            yield from (replace(reading, signs=_replaced(reading.signs, {k: -reading.signs[k]})) for k in joints)
+        for j, k in itertools.combinations(joints, 2):
+            reading = self._exchanged(j, k)
+            yield from (reading._with_sign(i) for i in joints)
             yield from reading._turnings(slides)
 
     @property
@@ -131,6 +133,10 @@ class Reading:
         """What to do; arguments as of `looks`."""
         remedies = "; ".join(remedy for _, remedy in self._said(joints, zeros))
         return f"{remedies[0].upper()}{remedies[1:]}"
+
+    def _with_sign(self, k: int) -> Reading:
+        """With the joint k counting the other way."""
+        return replace(self, signs=_replaced(self.signs, {k: -self.signs[k]}))
 
     def _turnings(self, slides: Sequence[bool]) -> Iterator[Reading]:
         """Each joint in turn by a quarter turn more; those of the ends are left to the camera and the marker."""
