@@ -24,6 +24,7 @@ from . import store_schema
 from .retention import Keep, delete_until
 from .store_damage import Damage, count_pairs, oldest, rebuild, records, scan, scan_back
 from .store_file import NOTHING_CHANGED, damaged, explained, is_damage, lock, unwritable
+from .store_log import commits
 from .store_rows import Checked, as_json, checked, decoded, pair_of, require_sound, row_of, sealed
 
 log = logging.getLogger(__name__)
@@ -374,6 +375,7 @@ class PairStore:
     def _open(self) -> None:
         self._make_directory()
         self._lock_file = lock(self.file)
+        written = commits(self.file)
         with explained(self.file):
             self._connection = store_schema.connect(self.file)
             if not self._connection.execute("SELECT count(*) FROM sqlite_schema").fetchone()[0]:
@@ -384,6 +386,8 @@ class PairStore:
             if what is not None:
                 self._rebuild(what)
             with store_schema.told_while_working(self._connection, self._working):
+                if what is None:
+                    self._give_up(self._connection, written)
                 store_schema.migrate(self._connection)
             self._check_joints(store_schema.joints_of(store_schema.meta(self._connection)))
             self._connection.execute("PRAGMA journal_mode = WAL")
@@ -394,6 +398,22 @@ class PairStore:
             self._begin_session(self._connection)
         for said in self.complaints:
             log.error("%s", said)
+
+    def _give_up(self, connection: sqlite3.Connection, written: Sequence[bool]) -> None:
+        """Leave the numbers free of pairs that were committed behind a damaged place of the log.
+
+        One that is missing alone was torn by a power failure, and had not been accepted.
+        """
+        if not any(written):
+            return
+        read = connection.execute("PRAGMA wal_checkpoint(PASSIVE)").fetchone()[1]
+        lost = sum(written[read:])
+        if read >= 0 and lost > 1:
+            contents = store_schema.meta(connection)
+            newest = connection.execute("SELECT coalesce(max(seq), 0) FROM pairs").fetchone()[0]
+            given = max(newest + lost, store_schema.given_up_to(contents))
+            with store_schema.transaction(connection):
+                store_schema.write_meta(connection, {**contents, store_schema.GIVEN_UP_TO: str(given)})
 
     def _rebuild(self, what: str) -> None:
         """Go on with a new file that has all that can be read."""
