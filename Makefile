@@ -14,8 +14,11 @@ export PYTHONDONTWRITEBYTECODE :=
 BENCH_BUDGET_S ?= 120
 PEERS_BUDGET_S ?= 240
 GOALS_BUDGET_S ?= 3600
+SMOKE := tests/interfaces tests/effects tests/examples tests/kbmaps/test_rigid_learner.py tests/kbmaps/test_kernels.py \
+	tests/drivers/test_dynamixel_bus.py tests/vision/test_colour_model.py tests/sim_backend/test_sim_postures.py \
+	tests/diagnosis/test_eyes.py tests/daemon/test_sampler.py tests/daemon/test_learner.py tests/system/test_poisoned_pairs.py
 
-.PHONY: help setup demo test check docs soak bench peers goals lock wheel clean
+.PHONY: help setup demo test smoke check docs soak bench peers goals lock wheel clean
 
 help:           ## Show this list
 	@grep -E '^[a-z]+: .*##|^[a-z]+:  *##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 10
@@ -43,6 +46,9 @@ demo: $(DEMO_STAMP) ## Watch the whole thing learn in simulation, about a minute
 
 test: setup     ## Run the tests
 	@$(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder
+
+smoke: setup    ## A few tests of everything, in less than a minute
+	@$(BIN)/python -m pytest -n auto --dist loadfile $(SMOKE)
 
 check: setup    ## Lint: ruff, pyright, import-linter
 	@$(BIN)/ruff check .

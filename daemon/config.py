@@ -190,7 +190,13 @@ class Config:
         )
 
     def with_state_dir(self, folder: Path) -> Config:
-        """The same with another place for store and checkpoint, relative to the working directory."""
+        """The same with another place for store and checkpoint, relative to the working directory.
+
+        Raises:
+            ConfigError: it is a file.
+        """
+        if os.path.exists(folder) and not os.path.isdir(folder):
+            raise ConfigError("is a file, and store and checkpoint need a folder", file=folder, remedy=_STATE_REMEDY)
         daemon = msgspec.structs.replace(self.tables.daemon, state_dir=str(folder.absolute()))
         return replace(self.with_tables(msgspec.structs.replace(self.tables, daemon=daemon)), given_state_dir=folder)
 
@@ -227,6 +233,9 @@ class Config:
     def checkpoint_file(self) -> Path:
         """The learner's state."""
         return self.state_dir / "learner.ckpt"
+
+
+_STATE_REMEDY = "Give a folder with --state-dir; one that is not there yet is made"
 
 
 def state_home() -> Path:

@@ -17,6 +17,7 @@ log = logging.getLogger(__name__)
 BOUNDARY = "picture"
 # A browser that shows the pictures has a thread of its own here.
 MOST_VIEWERS = 32
+_END_CHECK_S = 0.05
 PAGE = b"<!doctype html><title>bodyschema</title><body style='margin:0;background:#111'><img src=/stream width=100%>"
 POLICY = "default-src 'none'; img-src 'self'; style-src 'unsafe-inline'; frame-ancestors 'none'"
 
@@ -48,7 +49,8 @@ class MjpegServer:
         except OSError as error:
             remedy = "Give another --port, or --port 0 for one that is free"
             raise ConfigError(f"port {self._port} cannot be used: {error.strerror}", remedy=remedy) from error
-        threading.Thread(target=self._server.serve_forever, name="pictures", daemon=True).start()
+        serve = self._server.serve_forever
+        threading.Thread(target=serve, args=(_END_CHECK_S,), name="pictures", daemon=True).start()
         return self
 
     def __exit__(

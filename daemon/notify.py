@@ -13,6 +13,8 @@ log = logging.getLogger(__name__)
 SOCKET, WATCHDOG, WATCHDOG_PID = "NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID"
 SEND_LIMIT_S = 0.5  # working loops tell: a systemd that does not listen must not hold them up
 LONGEST_STATUS = 400
+# systemd waits for so long for a start, and on for as long from each sign that it works, told this often [s].
+START_LIMIT_S, EXTEND_EVERY_S = 90, 5.0
 
 
 class Notifier:
@@ -26,6 +28,7 @@ class Notifier:
         """Tell nobody, or who listens on `address`: a path, or with `@` at its head an abstract name."""
         self._address = None if address is None else _as_address(address)
         self._failed = False
+        self._next_extension = 0.0
         self.watchdog_s = None if address is None else watchdog_s
 
     @classmethod
@@ -45,6 +48,13 @@ class Notifier:
     def ready(self) -> None:
         """All is up, or up again after `reloading`."""
         self._tell("READY=1")
+
+    def starting(self) -> None:
+        """Say that the start still works, as often as you like: systemd waits for `START_LIMIT_S` from now."""
+        now = time.monotonic()
+        if now >= self._next_extension:
+            self._next_extension = now + EXTEND_EVERY_S
+            self._tell(f"EXTEND_TIMEOUT_USEC={START_LIMIT_S * 1_000_000}")
 
     def reloading(self) -> None:
         """The configuration is read again; `ready` ends it."""

@@ -18,6 +18,7 @@ from interfaces.robot import RobotDescription
 from . import recordings
 from .bus import Bus
 from .keys import Keys
+from .store_damage import Damage
 from .wire import PairsReply, decode, pair_from_wire
 
 log = logging.getLogger(__name__)
@@ -30,6 +31,7 @@ class History:
 
     Attributes:
         next_seq: sequence number of the next pair.
+        missing: numbers between the pairs so far that the sampler has no pairs of.
     """
 
     def __init__(self, bus: Bus, robot: RobotDescription, from_seq: int) -> None:
@@ -37,6 +39,8 @@ class History:
         self._news = Event()
         self._store: str | None = None
         self.next_seq = from_seq
+        self.missing = Damage()
+        self._begun = False
         bus.subscribe(self._keys.pair, lambda _: self._news.set())
 
     def page(self) -> list[Pair]:
@@ -57,7 +61,9 @@ class History:
         self._store = reply.store
         pairs = [pair_from_wire(message, len(self._joints)) for message in reply.pairs]
         if pairs:
-            self.next_seq = pairs[-1].seq + 1
+            before = [self.next_seq - 1] if self._begun else []
+            self.missing |= Damage.between([*before, *(pair.seq for pair in pairs)])
+            self.next_seq, self._begun = pairs[-1].seq + 1, True
         return pairs
 
     def wait(self) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import sqlite3
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from itertools import islice, takewhile
@@ -24,6 +24,7 @@ from . import store_schema
 from .retention import Keep, delete_until
 from .store_damage import Damage, count_pairs, oldest, rebuild, records, scan, scan_back
 from .store_file import NOTHING_CHANGED, damaged, explained, is_damage, lock, unwritable
+from .store_log import commits
 from .store_rows import Checked, as_json, checked, decoded, pair_of, require_sound, row_of, sealed
 
 log = logging.getLogger(__name__)
@@ -188,14 +189,17 @@ class PairReader:
         with self._reading() as connection:
             return store_schema.trouble(connection)
 
-    def audit(self) -> Audit:
+    def audit(self, working: Callable[[], None] = lambda: None) -> Audit:
         """Look at each row. What cannot be read is among `damage` from then on.
+
+        Args:
+            working: is called again and again meanwhile.
 
         Raises:
             StoreError: the file cannot be read.
         """
         newest = self.last_seq()
-        with self._reading() as connection:
+        with self._reading() as connection, store_schema.told_while_working(connection, working):
             numbers: list[int] = []
             session, ends = 0, np.empty((0, len(self.joints)))
             rows = scan(connection, self._columns, self._check)
@@ -256,10 +260,15 @@ class PairStore:
     writing; its death, whatever its kind, frees it.
     """
 
-    def __init__(self, file: Path, session: Session) -> None:
+    def __init__(self, file: Path, session: Session, *, working: Callable[[], None] = lambda: None) -> None:
+        """Not open yet.
+
+        Args:
+            working: is called again and again while the store is opened, which takes the longer the more pairs it has.
+        """
         self.file = file
         self.reader = PairReader(file)
-        self._session = session
+        self._session, self._working = session, working
         self._lock_file: int | None = None
         self._connection: sqlite3.Connection | None = None
         self._seq = 0
@@ -366,30 +375,51 @@ class PairStore:
     def _open(self) -> None:
         self._make_directory()
         self._lock_file = lock(self.file)
+        written = commits(self.file)
         with explained(self.file):
             self._connection = store_schema.connect(self.file)
             if not self._connection.execute("SELECT count(*) FROM sqlite_schema").fetchone()[0]:
                 store_schema.create(self._connection, self._fresh())
             store_schema.check_kind(self._connection, self.file)
-            what = store_schema.trouble(self._connection)
+            with store_schema.told_while_working(self._connection, self._working):
+                what = store_schema.trouble(self._connection)
             if what is not None:
                 self._rebuild(what)
-            store_schema.migrate(self._connection)
+            with store_schema.told_while_working(self._connection, self._working):
+                if what is None:
+                    self._give_up(self._connection, written)
+                store_schema.migrate(self._connection)
             self._check_joints(store_schema.joints_of(store_schema.meta(self._connection)))
             self._connection.execute("PRAGMA journal_mode = WAL")
             self._connection.execute("PRAGMA synchronous = FULL")
             self.reader.__enter__()
-            self._audit = self.reader.audit()
+            self._audit = self.reader.audit(self._working)
             self._seq, self._newest_session = self._audit.newest, self._audit.session
             self._begin_session(self._connection)
         for said in self.complaints:
             log.error("%s", said)
 
+    def _give_up(self, connection: sqlite3.Connection, written: Sequence[bool]) -> None:
+        """Leave the numbers free of pairs that were committed behind a damaged place of the log.
+
+        One that is missing alone was torn by a power failure, and had not been accepted.
+        """
+        if not any(written):
+            return
+        read = connection.execute("PRAGMA wal_checkpoint(PASSIVE)").fetchone()[1]
+        lost = sum(written[read:])
+        if read >= 0 and lost > 1:
+            contents = store_schema.meta(connection)
+            newest = connection.execute("SELECT coalesce(max(seq), 0) FROM pairs").fetchone()[0]
+            given = max(newest + lost, store_schema.given_up_to(contents))
+            with store_schema.transaction(connection):
+                store_schema.write_meta(connection, {**contents, store_schema.GIVEN_UP_TO: str(given)})
+
     def _rebuild(self, what: str) -> None:
         """Go on with a new file that has all that can be read."""
         self._require_open().close()
         try:
-            kept = rebuild(self.file, self._fresh())
+            kept = rebuild(self.file, self._fresh(), self._working)
         except OSError as error:
             raise StoreUnwritable(unwritable(self.file, error.errno, error.strerror)) from error
         self._connection = store_schema.connect(self.file)

@@ -118,11 +118,12 @@ def scan_back(connection: sqlite3.Connection, columns: str, make: Make[Made]) ->
         yield made
 
 
-def rebuild(file: Path, fresh: dict[str, str]) -> Path:
+def rebuild(file: Path, fresh: dict[str, str], working: Callable[[], None] = lambda: None) -> Path:
     """Put a sound store of the present schema in the place of a damaged one, with all that can be read.
 
     Args:
         fresh: `meta` of a new store, for one whose own is lost.
+        working: is called again and again meanwhile.
 
     Returns:
         Where the damaged one was kept.
@@ -136,7 +137,8 @@ def rebuild(file: Path, fresh: dict[str, str]) -> Path:
             source.execute("PRAGMA journal_mode = DELETE")  # a log of the old file is not for the new one
             with closing(store_schema.connect(new)) as target:
                 target.execute("PRAGMA synchronous = FULL")
-                _copy(source, target, fresh)
+                with store_schema.told_while_working(target, working):
+                    _copy(source, target, fresh)
         kept = unused_name(file, "damaged")
         try:
             os.link(file, kept)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import sqlite3
 import uuid
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -23,6 +23,7 @@ GIVEN_UP_TO = "given_up_to"  # a key of `meta`: pairs up to this number may have
 NUMBERS = ("seq", "id", "session", "segment", "t", "from_seq")  # columns that are not texts
 LONGEST_IDENTITY = 100  # characters; a UUID has 36
 LARGEST_VALUE_BYTES = 2**26  # of one row; URDF and robot.toml of a session are the largest
+STEPS_UNTIL_TOLD = 100_000  # of SQLite's machine; it does some millions in a second
 APPLICATION_ID = 0x42534348  # "BSCH": how `file` and we tell a pair store from another SQLite file
 
 _TABLES = """
@@ -78,6 +79,17 @@ def connect(file: Path, *, readonly: bool = False) -> sqlite3.Connection:
     connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, LARGEST_VALUE_BYTES)
     connection.execute("PRAGMA trusted_schema = OFF")
     return connection
+
+
+@contextmanager
+def told_while_working(connection: sqlite3.Connection, working: Callable[[], None]) -> Iterator[None]:
+    """Call `working` again and again while SQLite works on statements of this connection."""
+    connection.set_progress_handler(working, STEPS_UNTIL_TOLD)
+    try:
+        yield
+    finally:
+        with contextlib.suppress(sqlite3.ProgrammingError):  # it is closed
+            connection.set_progress_handler(None, 0)
 
 
 @contextmanager

@@ -16,6 +16,7 @@ from interfaces.plugins import PluginConfig
 
 from .config import Config
 from .identity import is_local
+from .notify import START_LIMIT_S
 from .servo_wiring import configured_ports
 
 if TYPE_CHECKING:
@@ -287,7 +288,7 @@ def _kept_running(installed: Installed) -> str:
     steps = ["RestartSec=5"]
     if installed.systemd >= WITH_RESTART_STEPS:
         steps = ["RestartSec=1", "RestartSteps=6", "RestartMaxDelaySec=60"]
-    times = ["TimeoutStartSec=90", "TimeoutStopSec=30"]
+    times = [f"TimeoutStartSec={START_LIMIT_S}", "TimeoutStopSec=30"]
     return "\n".join(["WatchdogSignal=SIGABRT", *times, "KillMode=mixed", "Restart=on-failure", *steps])
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 
 RELEARN_AFTER_S = 30.0
@@ -92,6 +93,9 @@ WINDOW_S, BUCKET_S = 20.0, 0.1
 EARLY_S = 1.0  # before so much is seen, nothing is said about the rate
 LONGEST_HELD_S = 0.5
 AHEAD_S = 0.02  # a stamp of the future by less is the fault of news that were all held up before
+NEAR_EDGE = 6  # two buckets make the edge, and those of the next few tell how surely
+LATELY = 3  # buckets whose least delay is believed until the rate is known
+QUICKEST_SIGMA_S = 1e-3 / math.sqrt(3)  # USB polls once in a millisecond: nothing tells how long the quickest waited
 
 
 class StreamClock:
@@ -104,6 +108,7 @@ class StreamClock:
 
     Attributes:
         rate: how many host seconds a device second has.
+        sigma_s: 1-sigma of a time told now [s]; infinite while too little was heard.
     """
 
     def __init__(self, tick_s: float, ticks: int) -> None:
@@ -112,6 +117,19 @@ class StreamClock:
         self._least: deque[tuple[float, float]] = deque()  # by bucket: device time, least arrival minus device time
         self._device_s = self._origin_s = self._bucket_s = 0.0
         self._offset_s, self.rate = 0.0, 1.0
+        self._edge_s = self._above_s = 0.0  # length of the edge; how far above it the next buckets' least are
+
+    @property
+    def sigma_s(self) -> float:
+        """What the quickest news took, and how well the edge below all news is known."""
+        if len(self._least) <= LATELY:
+            return math.inf
+        if not self._edge_s:
+            lately = [offset for _, offset in list(self._least)[-LATELY:]]
+            unknown_rate_s = WORST * LATELY * BUCKET_S / math.sqrt(3)
+            return math.hypot(QUICKEST_SIGMA_S, unknown_rate_s, max(lately) - min(lately))
+        fraction = (self._device_s - self._origin_s) / self._edge_s
+        return math.hypot(QUICKEST_SIGMA_S, self._above_s * math.hypot(1 - fraction, fraction))
 
     def time(self, latest: float, stamp: int) -> float | None:
         """When the event was that was heard of at `latest` [s].
@@ -159,7 +177,9 @@ class StreamClock:
         mean = sum(device_s for device_s, _ in points) / len(points)
         (x0, y0), (x1, y1) = _edge_below(points, mean)
         slope = min(max((y1 - y0) / (x1 - x0), -WORST), WORST)
-        self.rate, self._origin_s, self._offset_s = 1.0 + slope, x0, y0
+        self.rate, self._origin_s, self._offset_s, self._edge_s = 1.0 + slope, x0, y0, x1 - x0
+        above = sorted(y - y0 - slope * (x - x0) for x, y in points)
+        self._above_s = above[min(NEAR_EDGE, len(above) - 1)]
 
 
 def _edge_below(points: list[tuple[float, float]], x: float) -> tuple[tuple[float, float], tuple[float, float]]:

@@ -11,6 +11,7 @@ from typing import Protocol
 from interfaces.errors import SourceError
 from interfaces.protocols import Clock
 
+from .echo import without_echo
 from .serial_line import DEFAULT_LATENCY_S, SerialLine
 
 BY_ID = "dev/serial/by-id"
@@ -139,7 +140,8 @@ def scan_port(
     all_bauds = dict.fromkeys(baud for scanner in scanners for baud in scanner.bauds)
     try:
         for baud in bauds or all_bauds:
-            with closing(open_port(port, baud, clock)) as line:
+            with closing(open_port(port, baud, clock)) as opened:
+                line = without_echo(opened, clock, latency_s)
                 for scanner in scanners:
                     if baud in scanner.bauds:
                         tell(f"{port}: {scanner.protocol} at {baud:,} bit/s; {_counted(found)} so far")

@@ -21,6 +21,8 @@ settings.register_profile("suite", TIMELESS, derandomize=True)
 settings.register_profile("soak", TIMELESS, print_blob=True)
 settings.load_profile("suite")
 
+QUICK = ("kbmaps/", "tests/interfaces/", "tests/kbmaps/")
+
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) -> Generator[None, Report, Report]:
@@ -30,6 +32,17 @@ def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) ->
 @pytest.hookimpl(wrapper=True)
 def pytest_make_collect_report(collector: pytest.Collector) -> Generator[None, Report, Report]:
     return with_remedy((yield))
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_auto_num_workers() -> int:
+    """Three for two processors: half of the tests wait for processes, clocks or disks."""
+    return (3 * len(os.sched_getaffinity(0)) + 1) // 2
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Files of many quick tests come last, so that no worker sits alone over a long one in the end."""
+    items.sort(key=lambda item: item.nodeid.startswith(QUICK))
 
 
 @pytest.fixture(scope="session")

@@ -53,3 +53,11 @@ def record(
             count = copy_history(history, joints, out)
     last = f", the last has the number {history.next_seq - 1}" if count else "; no file was left"
     console.print(f"{count} pairs written to {out}{last}", markup=False)
+    if history.missing.count:
+        one = history.missing.count == 1
+        console.print(
+            f"{history.missing.count} pair{'' if one else 's'} between them {'is' if one else 'are'} missing "
+            f"(number{'' if one else 's'} {history.missing}): the sampler's disk changed them, or they were deleted "
+            "([daemon] keep_days, keep_mb); `bodyschema status` tells which",
+            markup=False,
+        )

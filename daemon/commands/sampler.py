@@ -48,7 +48,7 @@ def sampler(
     with (  # the store comes last: what goes wrong before leaves no trace
         open_sources(config, sim=sim) as sources,
         Bus(listen=config.tables.zenoh.sampler, settings=config.zenoh_settings("sampler")) as bus,
-        PairStore(config.store_file, session_of(config, SystemClock())) as store,
+        PairStore(config.store_file, session_of(config, SystemClock()), working=notifier.starting) as store,
     ):
         service = Service(notifier, LOOPS, SystemClock(), devices=devices_of(config))
         process = Sampler(config, sources, bus, store, exit_at_end=exit_at_end, service=service)

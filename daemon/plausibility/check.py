@@ -19,26 +19,22 @@ from interfaces.errors import RecordingError
 from interfaces.recording import Recording
 from interfaces.records import FloatArray
 from interfaces.robot import RobotDescription
-from kbmaps import RigidChain, align
+from kbmaps import DegenerateDataError, RigidChain, align
 from kbmaps.chains.placement import place
 
-from .limits import reach_m, spread_m
+from .limits import MEASURED, SLIDES_M, TOOL_M, ZEROS_RAD, reach_m, spread_m
 from .reading import QUARTER, Reading
 
 # Rows that are read in other ways, evenly spread. Twice as many cost twice the time and change no verdict of the tests.
 ROWS = 80
 # With fewer rows nothing is refused: a wrong reading may fit by chance.
 FEWEST_ROWS = 40
-# Share of the rows, the nearest ones, that a fit is measured by: outliers and rows with another tool are left out.
-MEASURED = 0.7
-# How far zeros and marker may be off (1-sigma). Of arms with zeros off by 10° and a marker by 0.3 m all are placed.
-ZEROS_RAD, SLIDES_M, TOOL_M = 0.15, 0.05, 0.3
 # Readings of which the neighbours are tried, and how often: zeros of up to four joints a quarter turn off are found.
 WIDTH, DEPTH = 4, 5
 # Readings whose errors differ by less are one: zeros of the first and of the last joint make no difference.
 SAME = 0.005
 # Shares of the positions' spread that a fit may leave to be the last: of the columns as they are, and read otherwise.
-ENOUGH_AS_IT_IS, ENOUGH = 0.05, 0.01
+ENOUGH_AS_IT_IS, ENOUGH = 0.03, 0.01
 # Another reading is named when the pairs fit so many times better, and mentioned from `AS_GOOD` times on. Arms with
 # tolerances of 0.5° and 1 mm, zeros off by 10° and noise of 10 mm stay below 1.15 with all wrong readings.
 MUCH_BETTER, AS_GOOD = 1.5, 1.15
@@ -48,10 +44,15 @@ CERTAIN, A_CHANGE = 10.0, 3.0
 UNEXPLAINED, OF_REACH = 0.25, 0.02
 # ... and so many times the noise that is known.
 NOISES = 5.0
+# A reading with one change is named where it leaves half of this share of the spread, with two a third, and so on.
+# Right readings of real arms leave up to 0.032, wrong ones down to 0.03 with four changes and 0.09 with two.
+NAMED = 0.12
 # A zero this far off is mentioned. Of 300 generated arms whose zeros are off by up to 10°, one is.
 FAR_ZERO_RAD = math.radians(20.0)
 # A camera is not turned by so much against a pose that is known.
 TURNED_RAD = math.radians(30.0)
+# So many other readings that fit as well are told.
+LISTED = 2
 # Distances below this share of the reach are no longer told apart.
 EXACT = 1e-5
 
@@ -143,21 +144,20 @@ def plausibility(
     fit, names = search.fits[chosen], robot.joints
     before, after = search.fits[as_it_is].error, fit.error / chosen.scale
     noise = 0.0 if sigma_m is None else NOISES * sigma_m
-    if after > max(UNEXPLAINED * spread / chosen.scale, OF_REACH * reach, noise):
-        found = Plausibility(
-            f"the pairs are hardly of this robot: placed as well as it can be, the drawn arm misses them by "
-            f"{_mm(before)}, and with joints exchanged, counting the other way or a quarter turn off still by "
-            f"{_mm(after)}",
-            "Is the recording of another robot, or the URDF of another one? Where the positions are that noisy, say so "
-            "with --sigma-mm",
-        )
+    if before <= MUCH_BETTER * fit.error and not _nameable(chosen, fit, spread):
+        chosen, fit, after = as_it_is, search.fits[as_it_is], before
+    unexplained = after > max(UNEXPLAINED * spread / chosen.scale, OF_REACH * reach, noise)
+    if unexplained or (chosen != as_it_is and not _nameable(chosen, fit, spread) and after > noise):
+        looks = "" if chosen == as_it_is else chosen.looks(names, fit.zeros)
+        found = _hardly(_mm(before), _mm(after), looks)
     elif chosen != as_it_is:
         frame = _frame(fit.rotation, True) if robot.camera.pose_known and chosen.mirrored else ""
         text = (
             f"it seems that {chosen.looks(names, fit.zeros)}{frame}: the pairs then fit to {_mm(after)}, and as they "
             f"are to {_mm(before)}"
         )
-        either = "".join(f". As good a fit: {other.looks(names, search.fits[other].zeros)}" for other in others[:1])
+        either = "; or ".join(other.looks(names, search.fits[other].zeros) for other in others)
+        either = f". These pairs fit as well if {either}" if others else ""
         remedy = chosen.remedy(names, fit.zeros) + either
         if before > MUCH_BETTER * fit.error:
             found = Plausibility(text, remedy, misread=True)
@@ -170,6 +170,8 @@ def plausibility(
             for name, zero, slides in zip(names, fit.zeros, chain.prismatic, strict=True)
             if not slides and abs(zero) > FAR_ZERO_RAD and search.held_error() > MUCH_BETTER * fit.error
         ]
+        if fit.error > max(NAMED * spread, noise):
+            far.append(f"{_drawn_arm_misses(_mm(before))}: they may be of another robot, or their columns misread")
         found = Plausibility(warnings=tuple(far), undirected=search.undirected(names))
         if robot.camera.pose_known:
             found = _turned(chain, q[rows], x[rows], fit) or found
@@ -177,6 +179,31 @@ def plausibility(
         return found
     few = f"{found.refusal}. {found.remedy}. (These are {len(q)} pairs: {FEWEST_ROWS} would tell.)"
     return Plausibility(warnings=(few,))
+
+
+def _hardly(before: str, after: str, nearest: str) -> Plausibility:
+    """Refuse a recording that no reading explains.
+
+    Args:
+        before, after: distances of the pairs as they are, and in the nearest reading.
+        nearest: what that reading says of the recording; empty where it is the columns as they are.
+    """
+    doubted = f". The nearest reading is that {nearest}, and it does not fit" if nearest else ""
+    return Plausibility(
+        f"the pairs are hardly of this robot: {_drawn_arm_misses(before)}, and with joints exchanged, counting the "
+        f"other way or a quarter turn off still by {after}",
+        "Is the recording of another robot, or the URDF of another one, or is more than one thing wrong with the "
+        f"columns? Where the positions are that noisy, say so with --sigma-mm{doubted}",
+    )
+
+
+def _drawn_arm_misses(before: str) -> str:
+    return f"placed as well as it can be, the drawn arm misses the pairs by {before}"
+
+
+def _nameable(reading: Reading, fit: _Fit, spread: float) -> bool:
+    """Return True where a fit is so good that no wrong reading with as many changes has one like it."""
+    return fit.error < NAMED / (1 + reading.changes) * spread
 
 
 def _turned(chain: RigidChain, q: FloatArray, x: FloatArray, fit: _Fit) -> Plausibility | None:
@@ -216,7 +243,7 @@ class _Search:
         self.fits: dict[Reading, _Fit] = {}
 
     def verdict(self) -> tuple[Reading, Reading, list[Reading]]:
-        """The columns as they are, the simplest reading that fits as well as any, and others that do."""
+        """The columns as they are, the simplest reading that fits as well as any, and others nearly as simple."""
         as_it_is = Reading.plain(self._chain.joints)
         slides: list[bool] = self._chain.prismatic.tolist()
         self._try([as_it_is, *as_it_is.neighbours(slides)])
@@ -234,6 +261,14 @@ class _Search:
             if depth == 1:
                 self._try(as_it_is.doubles(slides))
             self._try(other for reading in new for other in reading.neighbours(slides))
+        best = self._best()[0]
+        if self.fits[best].error > (ENOUGH_AS_IT_IS if best == as_it_is else ENOUGH) * spread:
+            self._try(as_it_is.mixed(slides))
+        best = self._best()[0]
+        if not _nameable(best, self.fits[best], spread):
+            self._fit([as_it_is], tools=self._aligned_tool())
+            self._try(as_it_is.mixed_exchanges(slides))
+            self._try(other for reading in self._distinct(expanded) for other in reading.neighbours(slides))
         if as_it_is not in self.fits:
             self._fit([as_it_is], held=True)
         best = self.fits[self._best()[0]]
@@ -241,8 +276,15 @@ class _Search:
             (reading for reading in self.fits if self._as_good(self.fits[reading], best)),
             key=lambda reading: (reading.changes, reading.quarters != as_it_is.quarters, self.fits[reading].nats),
         )
-        others = [reading for reading in good[1:] if reading.changes == good[0].changes]
-        return as_it_is, good[0], others
+        others = [reading for reading in good[1:] if reading.changes <= good[0].changes + 1]
+        return as_it_is, good[0], others[:LISTED]
+
+    def _aligned_tool(self) -> FloatArray:
+        """Where the marker is (1, 3) [m] when the zeros are as drawn: its fit starts from many places."""
+        try:
+            return align(self._chain, self._q, self._x, pose_known=False, marker_known=False).marker_shift[None]
+        except DegenerateDataError:
+            return np.zeros((1, 3))
 
     def held_error(self) -> float:
         """RMS distance [m] of the nearest pairs as they are, with all zeros as drawn."""

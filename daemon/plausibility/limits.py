@@ -13,6 +13,7 @@ from interfaces.recording import Recording
 from interfaces.records import FloatArray
 from interfaces.robot import RobotDescription
 from interfaces.urdf import REVOLUTE
+from kbmaps import RigidChain
 
 BoolArray = NDArray[np.bool_]
 
@@ -24,6 +25,14 @@ BEYOND_LIMITS_RAD = 2.0 * math.pi
 MANY = 0.1
 # By how much to divide what is given in another unit, for metres.
 UNITS_PER_METRE = {"millimetres": 1000.0, "centimetres": 100.0, "inches": 39.37, "feet": 3.281}
+# Share of the rows, the nearest ones, that a fit is measured by: outliers and rows with another tool are left out.
+MEASURED = 0.7
+# How far zeros and marker may be off (1-sigma). Of arms with zeros off by 10° and a marker by 0.3 m all are placed.
+ZEROS_RAD, SLIDES_M, TOOL_M = 0.15, 0.05, 0.3
+# Rows by which a unit of length is told, and the share of the drawn positions' spread that a fit in it leaves at most.
+FITTED_ROWS, FITTING = 80, 0.1
+# Where none fits, units are told by the size of the positions: the next one too where it is off by less than a factor.
+ALSO = 2.0
 _UNITS_PER_SECOND = (("milliseconds", 1e3), ("microseconds", 1e6), ("nanoseconds", 1e9))
 # An arm that is guided, or goes from pose to pose, is never so slow in the middle [rad/s]; it is about so fast.
 SLOWEST, USUAL = 0.005, 0.3
@@ -84,16 +93,36 @@ def _require_radians(robot: RobotDescription, recording: Recording, file: Path) 
 def _require_metres(robot: RobotDescription, recording: Recording, file: Path) -> None:
     spread, reach = spread_m(recording.x), reach_m(robot)
     if spread > FARTHEST * reach:
-        drawn = spread_m(robot.chain.positions(recording.q))
-        name, factor = min(
-            UNITS_PER_METRE.items(), key=lambda unit: abs(math.log(spread / (unit[1] * max(drawn, 1e-9))))
-        )
+        units = _likely_units(robot.chain, recording)
         raise RecordingError(
             f"the positions x, y, z lie about {spread:.4g} m from their middle, and the arm reaches {reach:.3g} m: "
-            f"these look like {name}",
+            f"these look like {' or '.join(units)}",
             file=file,
-            remedy=f"Give positions in metres: divide by {factor:g}",
+            remedy=f"Give positions in metres: divide by {' or '.join(f'{UNITS_PER_METRE[unit]:g}' for unit in units)}",
         )
+
+
+def _likely_units(chain: RigidChain, recording: Recording) -> list[str]:
+    """The unit in which the drawn arm fits the positions; where it fits in none, one or two by their size."""
+    from kbmaps.chains.placement import place  # with scipy, which `predict` starts without
+
+    rows = np.unique(np.linspace(0, len(recording.q) - 1, FITTED_ROWS).astype(np.intp))
+    q, x, factors = recording.q[rows], recording.x[rows], np.array(list(UNITS_PER_METRE.values()))
+    drawn = max(spread_m(chain.positions(q)), 1e-9)
+    placed = place(
+        chain,
+        np.broadcast_to(q, (len(factors), *q.shape)),
+        x / factors[:, None, None],
+        zeros_std=np.where(chain.prismatic, SLIDES_M, ZEROS_RAD),
+        tool_std=TOOL_M,
+    )
+    errors = dict(zip(UNITS_PER_METRE, placed.errors(MEASURED).tolist(), strict=True))
+    best = min(errors, key=errors.__getitem__)
+    if errors[best] < FITTING * drawn:
+        return [best]
+    off = {unit: abs(math.log(spread_m(x) / (factor * drawn))) for unit, factor in UNITS_PER_METRE.items()}
+    nearest = sorted(off, key=off.__getitem__)
+    return nearest[: 2 if off[nearest[1]] < math.log(ALSO) else 1]
 
 
 def _require_seconds(robot: RobotDescription, recording: Recording, file: Path) -> None:

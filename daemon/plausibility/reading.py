@@ -76,16 +76,9 @@ class Reading:
         """
         joints = range(len(self.order))
         for k in joints:
-            yield replace(self, signs=_replaced(self.signs, {k: -self.signs[k]}))
-        for k in joints[1:-1]:  # those of the ends make no difference: camera and marker are fitted
-            if not slides[k]:
-                yield from (self.turned([turns * (j == k) for j in joints]) for turns in (1, -1, 2))
-        for j, k in itertools.combinations(joints, 2):
-            yield replace(
-                self,
-                order=_replaced(self.order, {j: self.order[k], k: self.order[j]}),
-                signs=_replaced(self.signs, {j: self.signs[k], k: self.signs[j]}),
-            )
+            yield self._with_sign(k)
+        yield from self._turnings(slides)
+        yield from (self._exchanged(j, k) for j, k in itertools.combinations(joints, 2))
         yield replace(self, signs=tuple(-sign for sign in self.signs))
         yield replace(self, mirrored=not self.mirrored)
         if self.unit == METRES:
@@ -103,6 +96,19 @@ class Reading:
         for j, k in itertools.combinations(turning, 2):
             for turns, others in itertools.product((1, -1, 2), repeat=2):
                 yield self.turned([turns * (i == j) + others * (i == k) for i in joints])
+
+    def mixed(self, slides: Sequence[bool]) -> Iterator[Reading]:
+        """All readings with a sign and a quarter turn more."""
+        for k in range(len(self.order)):
+            yield from self._with_sign(k)._turnings(slides)
+
+    def mixed_exchanges(self, slides: Sequence[bool]) -> Iterator[Reading]:
+        """All readings with two columns exchanged, and a sign or a quarter turn more."""
+        joints = range(len(self.order))
+        for j, k in itertools.combinations(joints, 2):
+            reading = self._exchanged(j, k)
+            yield from (reading._with_sign(i) for i in joints)
+            yield from reading._turnings(slides)
 
     @property
     def changes(self) -> int:
@@ -127,6 +133,25 @@ class Reading:
         """What to do; arguments as of `looks`."""
         remedies = "; ".join(remedy for _, remedy in self._said(joints, zeros))
         return f"{remedies[0].upper()}{remedies[1:]}"
+
+    def _with_sign(self, k: int) -> Reading:
+        """With the joint k counting the other way."""
+        return replace(self, signs=_replaced(self.signs, {k: -self.signs[k]}))
+
+    def _turnings(self, slides: Sequence[bool]) -> Iterator[Reading]:
+        """Each joint in turn by a quarter turn more; those of the ends are left to the camera and the marker."""
+        joints = range(len(self.order))
+        for k in joints[1:-1]:
+            if not slides[k]:
+                yield from (self.turned([turns * (j == k) for j in joints]) for turns in (1, -1, 2))
+
+    def _exchanged(self, j: int, k: int) -> Reading:
+        """With the columns of the joints j and k exchanged, together with their signs."""
+        return replace(
+            self,
+            order=_replaced(self.order, {j: self.order[k], k: self.order[j]}),
+            signs=_replaced(self.signs, {j: self.signs[k], k: self.signs[j]}),
+        )
 
     def _said(self, joints: Sequence[str], zeros: FloatArray) -> Iterator[tuple[str, str]]:
         moved = [k for k, column in enumerate(self.order) if column != k]

@@ -123,7 +123,7 @@ class ServoChain(OnlyAnswers, ABC, Generic[ServoT]):
         """Whether the status return level lets it answer to such an instruction."""
 
     def _listening(self, baud: int) -> list[ServoT]:
-        return [servo for servo in self.servos if abs(servo.baud - baud) <= BAUD_TOLERANCE * servo.baud]
+        return [servo for servo in self.servos if abs((its := servo.baud) - baud) <= BAUD_TOLERANCE * its]
 
     def _together(
         self, servos: list[ServoT], t: float, act: Callable[[ServoT, float], tuple[Any, bytes]], code: int
@@ -153,4 +153,6 @@ class ServoChain(OnlyAnswers, ABC, Generic[ServoT]):
 
 def mixed(packets: list[bytes]) -> bytes:
     """What is heard when all talk at the same time."""
+    if len(packets) == 1:
+        return packets[0]
     return bytes(reduce(and_, together) for together in zip(*packets, strict=False))

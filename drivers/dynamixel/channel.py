@@ -41,7 +41,7 @@ class Channel(ServoChannel):
         model = self.servo.model
         amperes = None if model.current_unit is None else current * model.current_unit
         alert = bool(answer.status.error & ALERT)
-        way = (self.servo.bus, answer.earliest)
+        way = (self.question(answer), answer.earliest)
         return Sample(*way, *between, position, velocity * model.velocity_unit, amperes, bool(moving), alert)
 
     def _of_protocol1(self, answer: Answer) -> Sample | None:
@@ -50,7 +50,7 @@ class Channel(ServoChannel):
             return None
         velocity = (speed & NUMBER1) * self.servo.model.velocity_unit * (-1 if speed & SIGN1 else 1)
         alert = answer.status.error != 0
-        way = (self.servo.bus, answer.earliest)
+        way = (self.question(answer), answer.earliest)
         return Sample(*way, answer.earliest, answer.latest, position, velocity, None, bool(moving), alert)
 
     def _is_possible(self, position: int) -> bool:

@@ -29,7 +29,7 @@ class Channel(ServoChannel):
             return None
         amperes = None if model.current_unit is None else told("current") * model.current_unit
         return Sample(
-            bus=self.servo.bus,
+            question=self.question(answer),
             expected=answer.earliest,
             earliest=answer.earliest,
             latest=answer.latest,

@@ -153,7 +153,7 @@ class Ros2Joints:
         if merged.t <= self._last_t:
             return None
         self._last_t, self.stamp_ns = merged.t, merged.stamp_ns
-        return JointReading(merged.t, frozen_array(merged.q))
+        return JointReading(merged.t, frozen_array(merged.q), merged.sigma_s)
 
     def _believed(self, who: Who, message: JointState, arrived: float) -> Merged | None:
         columns = {name: column for column, name in enumerate(message.names)}
@@ -175,7 +175,8 @@ class Ros2Joints:
             raise SourceLost("a joint is suddenly somewhere else, or the names were changed", retry_s=RETRY_S)
         if verdict is False:
             self._refuse(Refusal.TOO_FAST, self._wanted[places[0]])
-        return self._merging.put(told, message.header.stamp_ns, places, q) if verdict else None
+        sigma_s = self._sender(who).sigma_s
+        return self._merging.put(told, sigma_s, message.header.stamp_ns, places, q) if verdict else None
 
     def _told(self, who: Who, message: JointState, places: Sequence[int], arrived: float) -> float | Refusal:
         """When the message was true [s], or why it is not to be used."""

@@ -19,17 +19,20 @@ class Merged:
         stamp_ns: that message's stamp.
         q: positions.
         gap_s: the longest time between the two messages that a joint's position was taken from.
+        sigma_s: the largest 1-sigma of their times.
     """
 
     t: float
     stamp_ns: int
     q: tuple[float, ...]
     gap_s: float
+    sigma_s: float
 
 
 @dataclass(frozen=True, slots=True)
 class _Point:
     t: float
+    sigma_s: float
     stamp_ns: int
     q: float
 
@@ -50,12 +53,12 @@ class Merging:
         """The joints of which nothing has come."""
         return [place for place, track in enumerate(self._tracks) if not track]
 
-    def put(self, t: float, stamp_ns: int, places: Sequence[int], q: Sequence[float]) -> Merged | None:
+    def put(self, t: float, sigma_s: float, stamp_ns: int, places: Sequence[int], q: Sequence[float]) -> Merged | None:
         """Take positions `q` of the joints at `places`; the reading that they complete."""
         for place, value in zip(places, q, strict=True):
             track = self._tracks[place]
             if not track or t > track[-1].t:
-                track.append(_Point(t, stamp_ns, value))
+                track.append(_Point(t, sigma_s, stamp_ns, value))
         if self.missing():
             return None
         slowest = min((track[-1] for track in self._tracks), key=lambda point: point.t)
@@ -66,7 +69,8 @@ class Merging:
             return None
         self._told = slowest.t
         parts = [part for part in found if part is not None]
-        return Merged(slowest.t, slowest.stamp_ns, tuple(q for q, _ in parts), max(gap for _, gap in parts))
+        sigma_s = max(track[0].sigma_s for track in self._tracks)
+        return Merged(slowest.t, slowest.stamp_ns, tuple(q for q, _ in parts), max(gap for _, gap in parts), sigma_s)
 
 
 def _at(t: float, track: deque[_Point]) -> tuple[float, float] | None:

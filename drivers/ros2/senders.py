@@ -48,6 +48,11 @@ class Sender:
         self._newest_ns: dict[int, int] = {}
         self._astray: list[tuple[float, float]] = []
 
+    @property
+    def sigma_s(self) -> float:
+        """1-sigma of the last time told [s]."""
+        return self._clock.sigma_s
+
     def time_of(self, stamp_ns: int, places: Sequence[int], arrived: float) -> float | Refusal:
         """When the message was true [s] that tells of the joints at `places`, or why nothing tells that."""
         self.heard = arrived

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections import deque
+from statistics import median
 
 from drivers.device_clock import DeviceClock
 
@@ -13,6 +15,8 @@ WORST_DRIFT = 5e-3  # and by this share of the time since the last one
 SURE_AFTER = 3  # messages in a row that came too early: the others were late then, or the clock was set
 LATE_S = 5e-3  # when all are later than the first by so much,
 LATE_FOR_S = 1.0  # for so long, then the first's stamp was wrong
+LATELY = 51  # messages that tell how much the delays scatter
+QUICKEST_SIGMA_S = 0.5e-3  # what the quickest message took, nothing tells: on the loopback interface 0.2 ms
 STEADY = 0.5  # times go on at half speed at least while a quicker message shows that all came later than thought
 
 
@@ -32,6 +36,7 @@ class StampClock:
         self._max_delay_s = max_delay_s
         self._last: tuple[int, float] | None = None  # stamp and time
         self._early: list[float] = []
+        self._delays: deque[float] = deque(maxlen=LATELY)
         self._least_s = self._began = math.inf
         self._begin(0)
 
@@ -55,8 +60,20 @@ class StampClock:
         if self._last is not None:
             t = max(t, self._last[1] + STEADY * (stamp_ns - self._last[0]) * TICK_S)
         self._last = stamp_ns, t
+        self._heard += 1
+        self._delays.append(arrived - t)
         self._note_delay(arrived - t, stamp_ns, arrived)
         return t
+
+    @property
+    def sigma_s(self) -> float:
+        """1-sigma of the last time told [s].
+
+        That of the delays' scatter, and of what the quickest message took: a message may take up to the longest
+        delay, so the quickest of n is expected to have taken that by n + 1.
+        """
+        unseen_s = self._max_delay_s / (self._heard + 1)
+        return math.hypot(QUICKEST_SIGMA_S, unseen_s, median(self._delays) if self._delays else 0.0)
 
     def lateness_s(self, stamp_ns: int, arrived: float) -> float:
         """How much later a message came than the quickest would have; infinite before any."""
@@ -99,3 +116,5 @@ class StampClock:
     def _begin(self, stamp_ns: int) -> None:
         self._device, self._first_ns, self._last = DeviceClock(TICK_S, TICKS), stamp_ns, None
         self._early.clear()
+        self._delays.clear()
+        self._heard = 0

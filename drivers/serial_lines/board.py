@@ -33,9 +33,10 @@ class Counts:
 
 @dataclass(frozen=True, slots=True)
 class Timed:
-    """A reading and when it was measured [s]."""
+    """A reading, when it was measured [s], and the 1-sigma of that [s]."""
 
     t: float
+    sigma: float
     reading: Reading
 
 
@@ -140,7 +141,7 @@ class Board:
             return
         self._seq, self._doubts = reading.seq, 0
         self.counts.lines += 1
-        self._readings.append(Timed(t - self._delay_s, reading))
+        self._readings.append(Timed(t - self._delay_s, self._clock.sigma_s, reading))
 
     def _doubt(self) -> None:
         self._doubts += 1

@@ -27,7 +27,8 @@ log = logging.getLogger(__name__)
 BITS_PER_BYTE = 10
 HEADER_S = 4.0  # an Arduino starts anew when its port is opened, and takes two seconds
 ASK_EVERY_S = 0.5
-ANCHOR_S = 1.0
+ANCHOR_S = 2.0
+LARGEST_SIGMA_S = 5e-3  # of a reading's time
 LOST_AFTER_S = 0.25  # without a reading; within this no joint turns by half a turn unseen
 FEW_ATTEMPTS = 3
 SLACK_TICKS_PART = 1000  # of a turn
@@ -250,7 +251,7 @@ class SerialLineJoints:
         )
 
     def _anchor(self, port: Port) -> None:
-        """Find the turn that each joint is in: two readings that agree."""
+        """Find the turn that each joint is in, by two readings that agree; then wait until their times are known."""
         end, believed = self._clock.now() + ANCHOR_S, 0
         self._why = "no line"
         while self._clock.now() < end:
@@ -262,9 +263,11 @@ class SerialLineJoints:
                     self._turns.begin(self.encoders, raw)
                 counts = self._turns.continued(raw)
                 believed = believed + 1 if self._gate.offer(timed.t, counts) is None else 0
-                if believed == 2:
+                if believed >= 2:
                     self._turns.counts = counts
+                if believed == 2:
                     self._turns.check(raw)
+                if believed >= 2 and self._is_sure(timed):
                     return
             self._board.hear(port.receive(end), self._clock.now())
         raise SourceLost(f"the encoders cannot be read: {self._why}", retry_s=RETRY_S)
@@ -299,6 +302,9 @@ class SerialLineJoints:
         raw = self._raw(timed)
         if raw is None:
             return None
+        if not self._is_sure(timed):
+            self._believed_s = self._clock.now()  # the encoders are all there
+            return None
         counts = self._turns.continued(raw)
         refused = self._gate.offer(timed.t, counts)
         if refused is not None:
@@ -309,7 +315,14 @@ class SerialLineJoints:
         if timed.t <= self._last_t:
             return None
         self._last_t = timed.t
-        return JointReading(timed.t, frozen_array(self._turns.keep(counts)))
+        return JointReading(timed.t, frozen_array(self._turns.keep(counts)), timed.sigma)
+
+    def _is_sure(self, timed: Timed) -> bool:
+        """Whether its time is known well enough."""
+        if timed.sigma > LARGEST_SIGMA_S:
+            self._why = "lines that were held up, so that nothing tells their time"
+            return False
+        return True
 
     def _note_failing(self, joints: set[str]) -> None:
         for joint in sorted(joints - self._failing):

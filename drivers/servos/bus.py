@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable
+from collections import deque
+from collections.abc import Callable, Collection, Iterable
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from enum import StrEnum
+from itertools import chain
 from typing import TypeVar
 
 from interfaces.protocols import Clock
@@ -22,6 +24,7 @@ TOO_EARLY = 0.9  # an answer within this share of its time on the wire is anothe
 LONGEST_NOISE_S = 0.25
 QUIET_S = 2e-3
 OWED_S = 0.06  # how late an answer may come: more than the 50 ms for which busy USB hosts were seen to hold bytes back
+ASKED_LATELY = 4  # questions whose number of bytes is not asked for again at once
 MOST_SPARE = 10  # bytes: from the end of a reading's block to that of the documented registers of the X and P series
 
 Taken = TypeVar("Taken")
@@ -64,11 +67,12 @@ class Request:
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """One servo's answer, and between which times [s] it began to answer."""
+    """One servo's answer, between which times [s] it began to answer, and when it was asked [s]."""
 
     status: Status
     earliest: float
     latest: float
+    asked: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,11 +121,17 @@ class Owed:
         """Return True when this answer was owed; then it is owed no more."""
         return self._until.pop((protocol, status.id, len(status.data)), None) is not None
 
-    def size_for(self, request: Request, now: float) -> int | None:
-        """Return the smallest number of bytes to ask for that no owed answer of the same servos has."""
-        self._until = {answer: until for answer, until in self._until.items() if until > now}
+    def size_for(self, request: Request, now: float, lately: Collection[int]) -> int | None:
+        """Return the smallest number of bytes to ask for that no owed answer of the same servos has.
+
+        One that is not in `lately`, if there is one.
+        """
+        if self._until:
+            self._until = {answer: until for answer, until in self._until.items() if until > now}
         sizes = range(request.size, request.size + request.spare + 1)
-        return next((size for size in sizes if not self._alike(request, size)), None)
+        free = (size for size in sizes if not self._alike(request, size))
+        first = next(free, None)
+        return next((size for size in chain([first], free) if size not in lately), first)
 
     def until(self, request: Request) -> float:
         """Return when no answer that looks like one to `request` can come any more [s]."""
@@ -136,7 +146,9 @@ class Bus(ABC):
     """Servos behind one port. A late answer is never taken for that to a later question.
 
     A servo that did not answer in time is asked for another number of bytes from then on, until its answer can come no
-    more. After bytes that cannot be understood the line has to fall silent before the next question.
+    more. Where only the number of bytes tells answers apart, none of five questions in a row asks for the same: an
+    answer that comes twice is not taken for that to one of the next. After bytes that cannot be understood the line has
+    to fall silent before the next question.
 
     Attributes:
         return_delay_s: by ID, how long each waits before it answers; unknown ones may need the longest time.
@@ -155,6 +167,7 @@ class Bus(ABC):
         self._sent = self._free_s = 0.0
         self._owed = Owed()
         self._asked_size = self._question_size = 0
+        self._asked_lately: dict[tuple[int, ...], deque[int]] = {}
 
     @staticmethod
     @abstractmethod
@@ -190,10 +203,14 @@ class Bus(ABC):
 
     def send(self, request: Request) -> None:
         """Send it. Where its answers would look like late ones, wait first until those can come no more."""
-        size = self._owed.size_for(request, self._clock.now())
-        if size is None and self.is_weak(request):
+        is_weak = self.is_weak(request)
+        lately = self._asked_lately.setdefault(request.ids, deque(maxlen=ASKED_LATELY)) if is_weak else ()
+        size = self._owed.size_for(request, self._clock.now(), lately)
+        if size is None and is_weak:
             self._wait_out(self._owed.until(request))
         self._asked_size = request.size if size is None else size
+        if is_weak:
+            self._asked_lately[request.ids].append(self._asked_size)
         packet = request.packet(self._asked_size)
         self._question_size = len(packet)
         self._port.flush()
@@ -223,6 +240,8 @@ class Bus(ABC):
         while data := self._port.receive(until):
             received += data
             at += self._owed_size(received, at)
+            if self._clock.now() >= until:  # where noise comes without end, something is always there
+                break
         if at == len(received):
             return True
         self.counts.add(Trouble.NOISE)
@@ -237,7 +256,7 @@ class Bus(ABC):
             pass
 
     def _wait_out(self, until: float) -> None:
-        while self._port.receive(until):
+        while self._port.receive(until) and self._clock.now() < until:
             pass
 
     def _owed_size(self, received: bytearray, at: int) -> int:
@@ -319,8 +338,8 @@ class Bus(ABC):
     def _timed(self, request: Request, status: Status, earliest: float, inbox: Inbox, at: int) -> Answer:
         """When the packet at `at` was begun: all that came with it and after it was on the wire by the arrival."""
         latest = inbox.arrived - (len(inbox.received) - at) * self._byte_s
-        wanted = replace(status, data=status.data[: request.size])
-        return Answer(wanted, min(earliest, latest), latest)
+        wanted = Status(status.id, status.error, status.data[: request.size], status.size)
+        return Answer(wanted, min(earliest, latest), latest, self._sent)
 
     def _inbox(self, request: Request) -> Inbox:
         return Inbox(self._port, self._clock, self._deadline(request))

@@ -23,7 +23,7 @@ class Sample:
     """What a servo told.
 
     Attributes:
-        bus: which way it came.
+        question: the bus, and when it was asked there [s]; answers to one question have the same.
         expected: when it was so if nothing was held up [s].
         earliest, latest: between these times it was so [s].
         ticks: its position as it tells it.
@@ -32,7 +32,7 @@ class Sample:
         alert: something is wrong with the servo; the position is right nevertheless.
     """
 
-    bus: str
+    question: tuple[str, float]
     expected: float
     earliest: float
     latest: float
@@ -72,6 +72,10 @@ class Channel(ABC):
         self.newest, self.doubts = sample, 0
         return sample
 
+    def question(self, answer: Answer) -> tuple[str, float]:
+        """Return to which question it answers."""
+        return self.servo.bus, answer.asked
+
     @abstractmethod
     def _sample(self, answer: Answer) -> Sample | None:
         """What the answer says, if that is possible."""
@@ -109,12 +113,12 @@ class Channel(ABC):
 def middle(samples: Sequence[Sample]) -> tuple[float, float]:
     """The middle of the time in which the positions were taken [s], and by how much it may be wrong at most [s].
 
-    On one bus only the question can have been held up: the servos answer as the wire goes on. So one delay, which is in
-    the bounds of all, moves them all.
+    Of those who answer to one question only this can have been held up: the servos answer as the wire goes on. So one
+    delay, which is in the bounds of all, moves them all. Each question has a delay of its own.
     """
     total = unsure = 0.0
-    for bus in {sample.bus for sample in samples}:
-        there = [sample for sample in samples if sample.bus == bus]
+    for question in {sample.question for sample in samples}:
+        there = [sample for sample in samples if sample.question == question]
         least = max(sample.earliest - sample.expected for sample in there)
         most = min(sample.latest - sample.expected for sample in there)
         if least <= most:

@@ -9,6 +9,7 @@ from statistics import median, quantiles
 from typing import Any
 
 from drivers.checks import Check
+from drivers.echo import without_echo
 from interfaces.errors import SourceError
 from interfaces.protocols import Clock
 
@@ -38,7 +39,7 @@ def servo_checks(
             for name, bus in config.buses.items():
                 port, latency_s = open_port(bus, clock)
                 stack.callback(port.close)
-                buses[name] = make.bus(name, port, clock, latency_s)
+                buses[name] = make.bus(name, without_echo(port, clock, latency_s), clock, latency_s)
             found = _identified(make, config, buses, clock)
             yield from _presence(found)
             servos = [finding.servo for finding in found if finding.servo is not None]

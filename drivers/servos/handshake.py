@@ -18,6 +18,8 @@ RETURN_DELAY_UNIT_S = 2e-6
 SETTINGS = ("return_delay", "drive_mode", "operating_mode", "homing_offset")
 
 ATTEMPTS = 5
+# What a busy machine or a loose cable does too; not a wrong ID, rate or setting.
+PASSING = (Trouble.TIMEOUT, Trouble.FOREIGN, Trouble.WRONG_LENGTH, Trouble.EARLY)
 RETRY_S = 0.2
 LOOKS = 5  # at what a servo measures
 GARBLED = "garbled answers: two servos with this ID, or a bad cable"
@@ -105,15 +107,15 @@ def identify(bus: Bus, config: ServoConfig, model: Model, known: Mapping[int, Mo
     """Ask the servo of `config` whether it is a `model`; `known` are those that can be told by their number."""
     layout = model.layout
     head = Register(0, max(layout["model"].end, layout["firmware"].end))
-    data, trouble = _read_surely(bus, model, config.id, head)
+    data, trouble = read_register(bus, model, config.id, head)
     if data is None:
-        return Finding(config, _absence(bus, model, config.id, trouble), may_come_back=trouble is Trouble.TIMEOUT)
+        return Finding(config, _absence(bus, model, config.id, trouble), may_come_back=trouble in PASSING)
     number = layout.value("model", data)
     if number != model.number:
         other = known.get(number)
         return Finding(config, f"{other.name if other else f'model number {number}'}: wrong model")
     last = max(layout[name].end for name in SETTINGS if name in layout)
-    table, trouble = _read_surely(bus, model, config.id, Register(0, last))
+    table, trouble = read_register(bus, model, config.id, Register(0, last))
     if table is None:
         return Finding(config, _absence(bus, model, config.id, trouble), may_come_back=True)
     if _is_garbled(bus, model, config.id):
@@ -196,7 +198,19 @@ def restore_torque(bus: Bus, servo: FittedServo) -> None:
 
 
 def read_register(bus: Bus, model: Model, id: int, register: Register) -> tuple[bytes | None, Trouble | None]:
-    """Its bytes; without them what was wrong the last time of several."""
+    """Its bytes, twice the same where a wrong answer may pass its checksum; else what was wrong the last time."""
+    data, trouble = _read_once(bus, model, id, register)
+    for _ in range(ATTEMPTS):
+        if data is None or not bus.is_weak(bus.read_request(model, id, register)):
+            break
+        before = data
+        data, trouble = _read_once(bus, model, id, register)
+        if data == before:
+            break
+    return data, trouble
+
+
+def _read_once(bus: Bus, model: Model, id: int, register: Register) -> tuple[bytes | None, Trouble | None]:
     exchange = ask_again(bus, bus.read_request(model, id, register))
     return (exchange.answers[0].status.data if exchange.trouble is None else None), exchange.trouble
 
@@ -209,19 +223,6 @@ def ask_again(bus: Bus, request: Request) -> Exchange:
         if exchange.trouble is None:
             break
     return exchange
-
-
-def _read_surely(bus: Bus, model: Model, id: int, register: Register) -> tuple[bytes | None, Trouble | None]:
-    """As `read_register`, twice the same where a wrong answer may pass its checksum."""
-    data, trouble = read_register(bus, model, id, register)
-    for _ in range(ATTEMPTS):
-        if data is None or not bus.is_weak(bus.read_request(model, id, register)):
-            break
-        before = data
-        data, trouble = read_register(bus, model, id, register)
-        if data == before:
-            break
-    return data, trouble
 
 
 def _absence(bus: Bus, model: Model, id: int, trouble: Trouble | None) -> str:

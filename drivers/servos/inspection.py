@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from interfaces.errors import SourceLost
 from interfaces.protocols import Clock
 
-from .bus import Bus, Exchange
+from .bus import Bus, Exchange, Request
 from .drive import Drive
 from .handshake import FittedServo
 from .health import Health, supply_of
@@ -42,7 +42,7 @@ class Inspection:
             return
         servo = self._servos[self._looked % len(self._servos)]
         exchange = self._ask_state(servo)
-        if exchange.trouble is not None:
+        if exchange.trouble is not None or not self._is_confirmed(servo, exchange):
             return
         self._looked += 1
         if self._looked >= len(self._servos):  # the first round is made at once
@@ -60,11 +60,16 @@ class Inspection:
                 return f"joint {servo.joint!r} (ID {servo.id}): {trouble}"
         return None
 
+    def _is_confirmed(self, servo: FittedServo, exchange: Exchange) -> bool:
+        """Ask again for an alert or torque where the checksum lets one in 256 wrong answers through."""
+        told = _state_in(servo, exchange)
+        if not any(told) or not self._buses[servo.bus].is_weak(self._state_request(servo)):
+            return True
+        again = self._ask_state(servo)
+        return again.trouble is None and _state_in(servo, again) == told
+
     def _judge(self, servo: FittedServo, exchange: Exchange) -> None:
-        status, layout = exchange.answers[0].status, servo.model.layout
-        has_register = "hardware_error" in layout
-        bits = layout.value("hardware_error", status.data, layout.state.address) if has_register else status.error
-        has_torque = layout.value("torque", status.data, layout.state.address)
+        has_torque, bits = _state_in(servo, exchange)
         if has_torque and not any(servo.joint in drive.holding for drive in self._drives):
             raise SourceLost(f"the torque of joint {servo.joint!r} was switched on by another program", retry_s=0.0)
         self._health.note_alert(servo.joint, bits)
@@ -76,5 +81,15 @@ class Inspection:
             self._health.note_supply(servo.joint, servo.model, exchange.answers[0].status.data)
 
     def _ask_state(self, servo: FittedServo) -> Exchange:
-        bus = self._buses[servo.bus]
-        return bus.ask(bus.read_request(servo.model, servo.id, servo.model.layout.state))
+        return self._buses[servo.bus].ask(self._state_request(servo))
+
+    def _state_request(self, servo: FittedServo) -> Request:
+        return self._buses[servo.bus].read_request(servo.model, servo.id, servo.model.layout.state)
+
+
+def _state_in(servo: FittedServo, exchange: Exchange) -> tuple[int, int]:
+    """Return whether torque is on, and the bits of what is wrong."""
+    status, layout = exchange.answers[0].status, servo.model.layout
+    has_register = "hardware_error" in layout
+    bits = layout.value("hardware_error", status.data, layout.state.address) if has_register else status.error
+    return layout.value("torque", status.data, layout.state.address), bits

@@ -10,6 +10,7 @@ from itertools import zip_longest
 from types import TracebackType
 from typing import Any, Self
 
+from drivers.echo import without_echo
 from drivers.turn_count import TurnCount
 from drivers.turns import SpeedGate
 from interfaces.errors import SourceError, SourceLost
@@ -216,7 +217,8 @@ class ServoJoints:
             self._health.away.add(name)
             port, latency_s = self._open_port(config, self._clock)
             stack.callback(_close, port)
-            self._buses[name] = self._make.bus(name, port, self._clock, latency_s)
+            heard = without_echo(port, self._clock, latency_s)
+            self._buses[name] = self._make.bus(name, heard, self._clock, latency_s)
             self._buses[name].counts = self._counts[name]
             self._health.away.discard(name)
 

@@ -9,6 +9,7 @@ from enum import StrEnum
 from types import TracebackType
 from typing import Self
 
+from drivers.echo import without_echo
 from interfaces.errors import SourceError
 from interfaces.protocols import Clock
 
@@ -92,7 +93,8 @@ class Workbench:
             del self._buses[port]
             bus.close()
         opened, latency_s = self._open_at(port, baud)
-        self._buses[port] = (baud, self.make.bus(port, opened, self._clock, latency_s))
+        heard = without_echo(opened, self._clock, latency_s)
+        self._buses[port] = (baud, self.make.bus(port, heard, self._clock, latency_s))
         return self._buses[port][1]
 
     def fitted(self, bus: Bus, config: ServoConfig, model: Model) -> FittedServo:

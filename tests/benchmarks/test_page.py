@@ -101,8 +101,8 @@ def test_no_bound_is_given_where_the_right_model_is_no_rigid_chain():
     assert bounds(bent) == {}
 
 
-@pytest.fixture
-def page(tmp_path) -> str:
+@pytest.fixture(scope="module")
+def page(tmp_path_factory) -> str:
     results = Results(runs=[machine() | {"when": "now", "seconds": 1, "arguments": "a test"}])
     for task in simulated_tasks():
         for competitor in COMPETITORS:
@@ -111,8 +111,9 @@ def page(tmp_path) -> str:
                 results.outcomes[outcome.key] = outcome
         results.bounds[task.key, 30, 0, "drawn alike"] = 0.015
     results.growth = [Growth("joints", "nlms", d, 1e-4 * 3**d, 0.1) for d in (2, 3, 4)]
-    write_page(tmp_path / "peers.html", results, simulated_tasks(), COMPETITORS)
-    return (tmp_path / "peers.html").read_text()
+    file = tmp_path_factory.mktemp("page") / "peers.html"
+    write_page(file, results, simulated_tasks(), COMPETITORS)
+    return file.read_text()
 
 
 def test_the_page_has_every_task_with_a_chart(page):

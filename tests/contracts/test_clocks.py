@@ -29,7 +29,7 @@ def simulated_clock() -> Iterator[Clock]:
 SIMULATED = pytest.mark.skipif(find_spec("pybullet") is None, reason="no pybullet; to run it: pip install -e '.[sim]'")
 
 
-@pytest.fixture(params=[system_clock, pytest.param(simulated_clock, marks=SIMULATED)])
+@pytest.fixture(scope="module", params=[system_clock, pytest.param(simulated_clock, marks=SIMULATED)])
 def clock(request: pytest.FixtureRequest) -> Iterator[Clock]:
     with request.param() as clock:
         yield clock

@@ -69,9 +69,9 @@ from vision.trackers import tracker_of
 
 LIMIT_S = 500.0
 WAIT_S = 0.005
-SOME = 10
+SOME = 4
 ROWS = 60
-PICTURES = 150
+PICTURES = 50
 TIMES = np.cumsum(np.random.default_rng(1).uniform(0.01, 0.1, ROWS))
 
 
@@ -371,7 +371,7 @@ def feetech_servos_that_fall_silent() -> AbstractContextManager[Rig]:
 
 def encoders_that_fall_silent() -> AbstractContextManager[Rig]:
     said = count()
-    return encoders_on_the_bench(lambda reply: reply if next(said) < 250 else replace(reply, data=b""))
+    return encoders_on_the_bench(lambda reply: reply if next(said) < 300 else replace(reply, data=b""))
 
 
 def swinging(id: int) -> Callable[[float], float]:

@@ -18,7 +18,7 @@ REACH = np.radians(60.0)
 STEP = np.radians(2.0)
 STORE = "one"
 # A solver that is asked so rarely is as good after a hundred pairs, and much cheaper.
-NOW_AND_THEN = 10
+NOW_AND_THEN = 25
 
 
 def nominal_chain() -> RigidChain:
@@ -83,12 +83,14 @@ def new_learning(nominal: NominalModel | None = None, settings: LearnerConfig | 
     return Learning(nominal or nominal_model(), settings or LearnerConfig(), DirectSolver())
 
 
-def teach(learning: Learning, pairs: Iterable[Pair], *, background: bool = True, every: int = 1) -> None:
-    """Learn pairs, with all background work done after each, or after `every` so many."""
+def teach(learning: Learning, pairs: Iterable[Pair], *, background: bool = True, every: int = 5) -> None:
+    """Learn pairs, with all background work done after `every` so many and at the end."""
     for number, pair in enumerate(pairs, 1):
         learning.learn(pair, pair.t)
         while background and number % every == 0 and learning.work():
             pass
+    while background and learning.work():
+        pass
 
 
 @dataclass(frozen=True)

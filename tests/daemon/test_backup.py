@@ -118,7 +118,7 @@ def test_a_backup_of_a_running_sampler_has_every_pair_to_its_last(config, file) 
     thread = threading.Thread(target=sample)
     thread.start()
     try:
-        assert sampling.wait(30)
+        assert sampling.wait(300)
         made = write_backup(config, file, utc=UTC, version="0")
     finally:
         enough.set()

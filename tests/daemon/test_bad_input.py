@@ -244,7 +244,7 @@ def test_a_process_that_takes_the_connection_and_says_nothing_is_not_taken_for_n
     with (
         socket.create_server(("127.0.0.1", int(endpoint.rpartition(":")[2]))),
         pytest.raises(BusError, match=r"listens on .* but does not answer"),
-        client(endpoint),
+        client(endpoint, open_timeout_s=0.5),
     ):
         pass
 

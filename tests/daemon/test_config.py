@@ -49,6 +49,13 @@ def test_the_command_lines_state_dir_comes_first(tmp_path) -> None:
     assert config.state_dir == tmp_path / "other"
 
 
+def test_a_file_is_no_state_dir(tmp_path) -> None:
+    file = tmp_path / "notes"
+    file.touch()
+    with pytest.raises(ConfigError, match=r"notes: is a file, .* Give a folder with --state-dir"):
+        load(tmp_path).with_state_dir(file)
+
+
 LINE = ROBOT.count("\n")  # the tables appended begin on the next line
 
 

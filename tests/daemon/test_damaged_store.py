@@ -22,6 +22,7 @@ from daemon.recordings import from_store
 from daemon.retention import Keep
 from daemon.store import PairReader, PairStore, Session, leave_out_damage
 from daemon.store_damage import LEFT_FREE, Damage
+from daemon.store_log import commits
 from daemon.store_rows import COLUMNS, checksum
 from daemon.wire import JSON, PairsReply, decode, pair_to_wire
 from interfaces.errors import RecordingError, StoreError
@@ -442,3 +443,39 @@ def test_reading_circular_pages_ends(long) -> None:
         assert 0 < len(numbers(reader)) < LONG
     with PairStore(long, SESSION) as store:
         assert 0 < len(numbers(store)) < LONG
+
+
+FRAME_BYTES, LOG_HEADER_BYTES = 24 + PAGE_BYTES, 32
+
+
+def left_by_a_killed_sampler(folder: Path) -> Path:
+    """A store whose newest pairs are in the write-ahead log alone."""
+    with PairStore(folder / "live" / "pairs.sqlite", SESSION) as store:
+        add(store, PAIRS)
+        shutil.copytree(store.file.parent, folder / "killed")
+    return folder / "killed" / "pairs.sqlite"
+
+
+def with_a_flip_in_the_log(file: Path, commits_behind: int) -> None:
+    log = file.with_name(f"{file.name}-wal")
+    place = LOG_HEADER_BYTES + FRAME_BYTES * (len(commits(file)) - commits_behind) + 1000
+    data = bytearray(log.read_bytes())
+    data[place] ^= 1
+    log.write_bytes(data)
+
+
+def test_numbers_behind_a_flip_in_the_log_are_not_given_again(tmp_path: Path) -> None:
+    file = left_by_a_killed_sampler(tmp_path)
+    with_a_flip_in_the_log(file, 5)
+    with PairStore(file, SESSION) as store:
+        assert numbers(store)[-1] == PAIRS - 5
+        assert str(store.reader.damage) == f"{PAIRS - 4} to {PAIRS}"
+        add(store, 1)
+        assert numbers(store)[-1] == PAIRS + 1
+
+
+def test_a_torn_last_transaction_is_no_damage(tmp_path: Path) -> None:
+    file = left_by_a_killed_sampler(tmp_path)
+    with_a_flip_in_the_log(file, 1)
+    with PairStore(file, SESSION) as store:
+        assert store.complaints == []

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from hostile_folder import HostileFolder
 
-LIMIT_S = 100.0
+LIMIT_S = 400.0
 AT_WORK = """from daemon.fleet.diagnosing import workers
 if __name__ == "__main__":
     with workers(None, 1, 1) as client:

@@ -33,7 +33,7 @@ def turned(pairs: Sequence[Pair], chain: RigidChain, seed: int = 0, sigma_rad: f
 
 def learnt(scene: Scene, learning: Learning | None = None) -> Learning:
     learning = learning or new_learning()
-    teach(learning, turned(scene.pairs, scene.chain), every=NOW_AND_THEN)
+    teach(learning, turned(scene.pairs, scene.chain), every=10)
     return learning
 
 

@@ -15,6 +15,7 @@ from daemon.config import Config
 from daemon.findings import Findings
 from daemon.learning import DirectSolver, Learning, NominalModel
 from daemon.plausibility.check import Plausibility, plausibility
+from daemon.plausibility.limits import UNITS_PER_METRE, require_units
 from daemon.plausibility.reading import Reading
 from interfaces.clock import SystemClock
 from interfaces.errors import RecordingError
@@ -35,12 +36,7 @@ class Pairs:
     pose_known: bool = False
 
     def seen(self, rows: int | None = None) -> Plausibility:
-        chain = arm()
-        limits = np.full(6, 3.0)
-        robot = SimpleNamespace(
-            chain=chain, joints=JOINTS, lower=-limits, upper=limits, camera=SimpleNamespace(pose_known=self.pose_known)
-        )
-        return plausibility(robot, self.q[:rows], self.x[:rows])
+        return plausibility(robot(pose_known=self.pose_known), self.q[:rows], self.x[:rows])
 
     def read(self, reading: Reading) -> Pairs:
         """As `reading` would have to be undone: applied to this recording's columns."""
@@ -55,6 +51,12 @@ def arm() -> RigidChain:
     fixed[6, :3, 3] = 0.03, 0.08, 0.02
     axes = np.array([(0, 0, 1), (0, 1, 0), (0, 1, 0), (0, 1, 0), (0, 0, 1), (0, 1, 0)], dtype=float)
     return RigidChain(fixed, axes, np.zeros(6, dtype=bool))
+
+
+def robot(*, pose_known: bool = False) -> SimpleNamespace:
+    limits, tree = np.full(6, 3.0), SimpleNamespace(joint=lambda _: SimpleNamespace(kind="revolute"))
+    camera = SimpleNamespace(pose_known=pose_known)
+    return SimpleNamespace(chain=arm(), joints=JOINTS, lower=-limits, upper=limits, camera=camera, tree=tree)
 
 
 def pairs(
@@ -80,6 +82,12 @@ MISREAD = {
     "the columns q5 and q6 are exchanged": replace(PLAIN, order=(0, 1, 2, 3, 5, 4)),
     "the positions are mirrored": replace(PLAIN, mirrored=True),
     "the zero of q2 is about 90° off": PLAIN.turned((0, 1, 0, 0, 0, 0)),
+    "the columns q2 and q3 are exchanged and q5 counts the other way": replace(
+        PLAIN, order=(0, 2, 1, 3, 4, 5), signs=(1, 1, 1, 1, -1, 1)
+    ),
+    "q3 counts the other way and the zero of q2 is about 90° off": replace(
+        PLAIN.turned((0, 1, 0, 0, 0, 0)), signs=(1, 1, -1, 1, 1, 1)
+    ),
     "the zero of q2 is about 90° off and the zero of q3 is about 90° off": PLAIN.turned((0, 1, -1, 0, 0, 0)),
 }
 
@@ -99,6 +107,17 @@ def test_a_unit_of_length_is_named(unit, factor) -> None:
     found = replace(right, x=factor * right.x).seen()
     assert f"x, y, z are in {unit}" in (found.refusal or "")
     assert found.remedy.startswith(f"Divide x, y, z by {factor:g}")
+
+
+@pytest.mark.parametrize("unit", ["millimetres", "centimetres", "inches"])
+@pytest.mark.parametrize("span", [0.3, 1.2])
+def test_a_large_unit_is_named_before_anything_is_fitted(unit, span) -> None:
+    right = pairs()
+    q = span / 1.2 * (right.q - right.q.mean(axis=0))
+    x = UNITS_PER_METRE[unit] * arm().positions(q)
+    recording = SimpleNamespace(q=q, x=x, t=None, segment=None)
+    with pytest.raises(RecordingError, match=rf"these look like {unit}\. .* divide by {UNITS_PER_METRE[unit]:g}"):
+        require_units(robot(), recording, Path("pairs.csv"))
 
 
 def test_degrees_are_named_however_small() -> None:
@@ -166,6 +185,25 @@ def test_exchanged_positions_are_named_where_the_pose_is_known() -> None:
     q = pairs().q
     found = Pairs(q, arm().positions(q)[:, [1, 0, 2]], pose_known=True).seen()
     assert "the columns x, y, z hold y, x, z" in (found.refusal or "")
+
+
+def test_what_no_simple_reading_explains_gets_no_name() -> None:
+    many = replace(PLAIN, order=(2, 0, 1, 4, 3, 5), signs=(1, -1, 1, 1, -1, 1), quarters=(0, 1, -1, 0, 1, 0))
+    found = pairs().read(many).seen()
+    assert "hardly of this robot" in (found.refusal or "")
+    assert not found.misread
+
+
+def test_a_reading_that_fits_as_well_is_told_too() -> None:
+    found = pairs().read(replace(PLAIN, signs=(1, 1, 1, 1, 1, -1), mirrored=True)).seen()
+    assert "These pairs fit as well if " in found.remedy
+
+
+@pytest.mark.parametrize("off", [45, -45])
+def test_a_zero_half_a_quarter_turn_off_is_told(off) -> None:
+    right = pairs()
+    found = replace(right, q=right.q - np.radians([0.0, 0.0, off, 0.0, 0.0, 0.0])).seen()
+    assert "the zero of q3" in found.sentences[0].lower()
 
 
 def test_force_turns_a_refusal_into_a_warning() -> None:

@@ -66,6 +66,12 @@ def record(*arguments: object) -> None:
     app(["record", *map(str, arguments)], result_action="return_value")
 
 
+def test_numbers_that_are_missing_are_told(sampler, robot, tmp_path, capsys) -> None:
+    sampler.pairs = [pair(seq) for seq in (3, 4, 7, 8, 10)]
+    record(tmp_path / "a.csv", "--robot", robot)
+    assert "3 pairs between them are missing (numbers 5 to 6, 9)" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize("ending", ["csv", "parquet"])
 def test_all_pages_of_the_history_are_copied_exactly(sampler, robot, tmp_path, ending, capsys) -> None:
     pytest.importorskip("pyarrow")

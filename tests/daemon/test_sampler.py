@@ -34,11 +34,14 @@ LIMIT_S = 500.0
 KEYS = Keys("arm")
 
 
+def small_arm(folder: Path, endpoint: str) -> Config:
+    tables = f'[zenoh]\nsampler = "{endpoint}"\n[daemon]\nstate_dir = "state"\n'
+    return Config.load(write_small_arm(folder, tables), {})
+
+
 @pytest.fixture
 def config(tmp_path: Path, endpoint: str) -> Config:
-    return Config.load(
-        write_small_arm(tmp_path, f'[zenoh]\nsampler = "{endpoint}"\n[daemon]\nstate_dir = "state"\n'), {}
-    )
+    return small_arm(tmp_path, endpoint)
 
 
 @contextmanager
@@ -275,9 +278,10 @@ def test_pairs_are_published_in_order(config) -> None:
     assert np.array_equal([message.q for message in messages], walk.q)
 
 
-@pytest.fixture
-def ended(config) -> Iterator[Bus]:
+@pytest.fixture(scope="module")
+def ended(tmp_path_factory, free_endpoint) -> Iterator[Bus]:
     """A client of a sampler whose 1,200 pairs are all stored."""
+    config = small_arm(tmp_path_factory.mktemp("ended"), free_endpoint())
     walk = Walk(config.robot, 1200, step_deg=1.01)
     with running(config, walk.sources()) as bus:
         status_when(bus, lambda status: status.state == "ended")

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from daemon.notify import Notifier
+from daemon.notify import START_LIMIT_S, Notifier
 from daemon.service import SETTLED_S, SIGNS_PER_WATCHDOG, Service, with_health
 from interfaces.clock import SystemClock
 
@@ -97,6 +97,13 @@ def test_ready_is_said_once(service, systemd) -> None:
     service.ready()
     service.ready()
     assert systemd.all() == ["READY=1"]
+
+
+def test_a_start_that_works_is_given_more_time(systemd, tmp_path) -> None:
+    notifier = Notifier(str(tmp_path / "notify"))
+    for _ in range(100):
+        notifier.starting()
+    assert systemd.all() == [f"EXTEND_TIMEOUT_USEC={START_LIMIT_S}000000"]
 
 
 def test_a_reload_begins_with_its_time_and_ends_with_ready(service, systemd) -> None:

@@ -230,6 +230,17 @@ def closed(file: Path) -> Path:
     return file
 
 
+def test_opening_a_store_tells_that_it_works(closed, monkeypatch) -> None:
+    monkeypatch.setattr("daemon.store_schema.STEPS_UNTIL_TOLD", 100)
+    told: list[int] = []
+    with PairStore(closed, SESSION, working=lambda: told.append(1)) as store:
+        opened = len(told)
+        fill(store, 20)
+        store.read()
+    assert opened > 10
+    assert len(told) == opened
+
+
 def alter(file: Path, statement: str) -> None:
     connection = sqlite3.connect(file)
     connection.execute(statement)

@@ -127,7 +127,7 @@ def test_too_many_viewers_of_pictures_are_refused() -> None:
 
 
 def asked(server: MjpegServer, path: str, hosts: list[str]) -> http.client.HTTPResponse:
-    connection = http.client.HTTPConnection(server.address.split("/")[2], timeout=30)
+    connection = http.client.HTTPConnection(server.address.split("/")[2], timeout=300)
     connection.putrequest("GET", path, skip_host=True)
     for host in hosts:
         connection.putheader("Host", host)

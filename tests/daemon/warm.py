@@ -115,6 +115,7 @@ def _server() -> socket.socket:
             env=environment,
             pass_fds=[its.fileno()],
         ).returncode = 0  # nobody waits for it
+    atexit.register(ours.close)
     return ours
 
 

@@ -43,6 +43,7 @@ class Arm(ServoArm):
         paths: Sequence[Path] | None = None,
         *,
         latency_s: float = 0.0,
+        held_s: float = 0.0,
         delay_s: float = 0.0,
         seed: int = 0,
         fast: Literal["auto", "never"] = "auto",
@@ -53,7 +54,8 @@ class Arm(ServoArm):
         def servo(model: str, id: int, path: Path) -> Servo:
             return Servo(BY_NAME[model], id, path, return_delay_s=delay_s, booted_s=id * 0.1234)
 
-        super().__init__(models, paths, servo=servo, chain=Chain, port=HeardPort, latency_s=latency_s, seed=seed)
+        wire = {"latency_s": latency_s, "held_s": held_s, "seed": seed}
+        super().__init__(models, paths, servo=servo, chain=Chain, port=HeardPort, **wire)
         buses = {"arm": BusConfig("bench", fast_sync_read=fast)}
         self.config = DynamixelConfig(buses, self.entries(ServoConfig), **settings)
         self.driven(DynamixelJoints, self.config, limits=limits, last_pose=last_pose)

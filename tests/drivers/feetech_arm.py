@@ -42,6 +42,7 @@ class FeetechArm(ServoArm):
         paths: Sequence[Path] | None = None,
         *,
         latency_s: float = 0.0,
+        held_s: float = 0.0,
         delay_s: float = 0.0,
         seed: int = 0,
         sync: Literal["auto", "never"] = "auto",
@@ -53,6 +54,7 @@ class FeetechArm(ServoArm):
         def servo(model: str, id: int, path: Path) -> Servo:
             return Servo(BY_NAME[model], id, path, return_delay_s=delay_s, multi_turn=multi_turn)
 
-        super().__init__(models, paths, servo=servo, chain=Chain, port=HeardPort, latency_s=latency_s, seed=seed)
+        wire = {"latency_s": latency_s, "held_s": held_s, "seed": seed}
+        super().__init__(models, paths, servo=servo, chain=Chain, port=HeardPort, **wire)
         config = FeetechConfig({"arm": BusConfig("bench", sync_read=sync)}, self.entries(ServoConfig), **settings)
         self.driven(FeetechJoints, config, limits=limits, last_pose=last_pose)

@@ -28,6 +28,7 @@ class ServoArm:
     Args:
         servo: makes one of a model's name, an ID and its path.
         port: a class of ports, which may keep what is sent.
+        held_s: questions are held up by up to so long.
     """
 
     joints: ServoJoints
@@ -42,6 +43,7 @@ class ServoArm:
         port: type[VirtualPort],
         latency_s: float,
         seed: int,
+        held_s: float = 0.0,
     ) -> None:
         self.clock, rng = VirtualClock(), Random(seed)
         self.paths = [swing(k) for k in range(len(models))] if paths is None else list(paths)
@@ -50,7 +52,8 @@ class ServoArm:
         servos = [servo(model, k, self.paths[k - 1]) for k, model in enumerate(models, 1)]
         self.chain: Any = chain(servos, self.faults)
         jitter = (lambda: rng.uniform(0, latency_s)) if latency_s else at_once
-        self.port: Any = port(self.chain, self.clock, outwards=at_once, inwards=jitter)
+        held = (lambda: rng.uniform(0, held_s)) if held_s else at_once
+        self.port: Any = port(self.chain, self.clock, outwards=held, inwards=jitter)
         self._latency_s, self._models = latency_s, models
 
     def entries(self, kind: Callable[[str, int, str], Any]) -> tuple[Any, ...]:

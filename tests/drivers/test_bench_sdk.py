@@ -240,6 +240,36 @@ def test_the_homing_offset_is_added(port) -> None:
     assert P2.read4ByteTxRx(port, 1, 132)[0] == ticks(1) + 100
 
 
+@pytest.mark.parametrize(
+    ("model", "address", "size", "number"),
+    [
+        ("XM430-W350", 31, 1, 80),
+        ("XM430-W350", 38, 2, 1193),
+        ("XM430-W350", 44, 4, 200),
+        ("XM430-W350", 84, 2, 800),
+        ("XM540-W270", 38, 2, 2047),
+        ("XL330-M288", 34, 2, 35),
+        ("XL330-M288", 76, 2, 1600),
+        ("XL330-M288", 168, 2, 208),
+        ("XL430-W250", 80, 2, 4000),
+        ("MX-64(2.0)", 84, 2, 850),
+        ("PH54-200-S500", 52, 4, 2**32 - 501_433),
+        ("PH54-200-S500", 526, 2, 6153),
+        ("MX-28", 8, 2, 4095),
+        ("MX-28", 28, 1, 32),
+        ("MX-28", 34, 2, 1023),
+        ("AX-12A", 13, 1, 140),
+        ("AX-12A", 28, 1, 32),
+    ],
+)
+def test_limits_and_gains_are_those_of_a_new_servo(model, address, size, number) -> None:
+    chain = Chain([Servo(BY_NAME[model], 1, lambda t: 0.0, return_delay_s=0)])
+    chain.power_cycle(1.0)
+    handler = P2 if BY_NAME[model].protocol == 2 else P1
+    read = {1: handler.read1ByteTxRx, 2: handler.read2ByteTxRx, 4: handler.read4ByteTxRx}[size]
+    assert read(VirtualHandler(chain), 1, address) == (number, sdk.COMM_SUCCESS, 0)
+
+
 def test_factory_reset_keeps_what_it_is_asked_to(port, chain) -> None:
     chain.servo(2)["return_delay"] = 3
     assert P2.factoryReset(port, 2, 0x02)[0] == sdk.COMM_SUCCESS

@@ -79,14 +79,14 @@ def test_protocol_1_believes_no_more(pieces) -> None:
 
 @given(st.binary(min_size=16, max_size=16))
 def test_any_block_of_protocol_2_is_a_sample_or_refused(data) -> None:
-    answer = Answer(Status(1, 0, data, 27), 100.0, 100.001)
+    answer = Answer(Status(1, 0, data, 27), 100.0, 100.001, 99.999)
     sample = Channel(fitted("XM430-W350")).take(answer)
     assert sample is None or sample.ticks == int.from_bytes(data[12:], "little", signed=True)
 
 
 @given(st.binary(min_size=11, max_size=11))
 def test_any_block_of_protocol_1_is_a_sample_or_refused(data) -> None:
-    answer = Answer(Status(1, 0, data, 17), 100.0, 100.001)
+    answer = Answer(Status(1, 0, data, 17), 100.0, 100.001, 99.999)
     sample = Channel(fitted("AX-12A")).take(answer)
     assert sample is None or 0 <= sample.ticks <= 1023
 

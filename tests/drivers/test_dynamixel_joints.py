@@ -359,6 +359,16 @@ def test_times_are_those_of_the_sampling_to_half_a_millisecond(fast, delay_s) ->
     assert np.percentile(off, 99) < 0.5e-3
 
 
+@pytest.mark.parametrize(("model", "fast"), [("XM430-W350", "auto"), ("XM430-W350", "never"), ("MX-28", "never")])
+@pytest.mark.parametrize("held_s", [0.0, 2e-3])
+def test_a_reading_tells_how_sure_its_time_is(model, fast, held_s) -> None:
+    with (arm := Arm((model,) * 6, [lambda _: 0.5] * 6, latency_s=4e-3, held_s=held_s, fast=fast)).joints:
+        for _ in range(50):
+            reading = read(arm)[0]
+            assert abs(reading.t - arm.sampled()) <= math.sqrt(3) * reading.t_sigma + 1e-6
+            assert 0 <= reading.t_sigma < 4e-3
+
+
 def test_six_servos_are_read_two_hundred_times_a_second() -> None:
     with (arm := Arm(("XM430-W350",) * 6, fast="never")).joints:
         begin = arm.clock.now()

@@ -19,7 +19,7 @@ from interfaces.clock import SystemClock
 from interfaces.records import JointReading
 
 SIX = range(1, 7)
-LIMIT_S = 20.0
+LIMIT_S = 300.0
 
 
 @pytest.fixture

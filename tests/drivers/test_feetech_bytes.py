@@ -71,7 +71,7 @@ def test_only_intact_answers_of_who_was_asked_are_believed_whatever_comes(pieces
 def test_any_block_is_a_possible_sample_or_refused(model, size, data) -> None:
     servo = FittedServo("joint", "arm", 1, BY_NAME[model], 1, 2048, 778, 0, 0, 0, 0.0)
     block = data.draw(st.binary(min_size=size, max_size=size))
-    sample = Channel(servo).take(Answer(Status(1, 0, block, size + 6), 100.0, 100.001))
+    sample = Channel(servo).take(Answer(Status(1, 0, block, size + 6), 100.0, 100.001, 99.999))
     assert sample is None or abs(sample.ticks) <= (30_719 if model == "STS3215" else 1023)
 
 

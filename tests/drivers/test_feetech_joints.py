@@ -247,8 +247,10 @@ def test_times_are_those_of_the_sampling_to_half_a_millisecond() -> None:
     assert np.percentile(off, 99) < 0.5e-3
 
 
-def test_a_reading_tells_how_sure_its_time_is() -> None:
-    with (arm := FeetechArm(("STS3215",) * 6, latency_s=4e-3)).joints:
+@pytest.mark.parametrize(("model", "sync"), [("STS3215", "auto"), ("STS3215", "never"), ("SCS0009", "never")])
+@pytest.mark.parametrize("held_s", [0.0, 2e-3])
+def test_a_reading_tells_how_sure_its_time_is(model, sync, held_s) -> None:
+    with (arm := FeetechArm((model,) * 6, [lambda _: 0.5] * 6, latency_s=4e-3, held_s=held_s, sync=sync)).joints:
         for _ in range(50):
             reading = read(arm)[0]
             assert abs(reading.t - arm.sampled()) <= math.sqrt(3) * reading.t_sigma + 1e-6

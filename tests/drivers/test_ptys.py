@@ -33,7 +33,7 @@ from interfaces.clock import SystemClock
 from interfaces.errors import SourceError
 from interfaces.records import JointReading
 
-LIMIT_S = 20.0
+LIMIT_S = 300.0
 IDS = range(1, 7)
 NAMES = [f"joint{id}" for id in IDS]
 LIMITS = [(-2.0, 2.0)] * 6

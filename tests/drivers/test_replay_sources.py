@@ -127,15 +127,15 @@ def test_two_threads_play_it_through() -> None:
     def read_joints() -> None:
         with replay.joints as joints:
             while len(readings) < len(played):
-                reading = joints.read(10.0)
+                reading = joints.read(300.0)
                 assert reading is not None
                 readings.append(reading)
 
     thread = threading.Thread(target=read_joints)
     thread.start()
     with replay.marker as marker:
-        fixes = [marker.read(10.0) for _ in range(len(played))]
-    thread.join(10.0)
+        fixes = [marker.read(300.0) for _ in range(len(played))]
+    thread.join()
     assert [fix.t for fix in fixes if fix is not None] == [reading.t for reading in readings]
 
 

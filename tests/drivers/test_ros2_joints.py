@@ -18,6 +18,7 @@ from drivers.ros2.senders import Refusal
 from interfaces.errors import SourceError, SourceLost
 
 FASTEST = 1.2 * 0.7  # [rad/s]
+CLOCKS = dict.fromkeys(PATHS, lambda t: t)  # joints that tell the time
 # There is no checksum in the bytes, TCP's is all: another bit of a position is another position.
 SEEN_BY_THE_GATE = (Fault.BIT, Fault.WORD, Fault.SWAPPED_NAMES)
 
@@ -66,6 +67,37 @@ def test_messages_that_take_their_time_are_told_at_the_time_of_their_stamps() ->
         robot.read(2.0)
         worst = max(map(robot.error, robot.read(5.0)))
     assert worst < FASTEST * 0.003  # the quickest takes 2 ms, which nothing tells
+
+
+@pytest.mark.parametrize("delays_per_s", [100.0, 500.0, 2000.0])
+def test_the_time_sigma_holds_from_the_first_reading(delays_per_s) -> None:
+    rng = Random(3)
+    robot = Robot(paths=CLOCKS, delay=lambda: rng.expovariate(delays_per_s))
+    with robot.joints:
+        readings = robot.read(20.0)
+    assert max(abs(reading.t - reading.q[0]) - 3 * reading.t_sigma for reading in readings) < 0.0
+
+
+def test_the_time_sigma_is_about_a_millisecond_on_a_quick_network() -> None:
+    robot = Robot()
+    with robot.joints:
+        assert 0.1e-3 < robot.read(5.0)[-1].t_sigma < 1.5e-3
+
+
+def test_the_time_sigma_grows_with_the_scatter_of_the_delays() -> None:
+    rng = Random(3)
+    robot = Robot(delay=lambda: rng.uniform(0.0, 0.02))
+    with robot.joints:
+        assert 5e-3 < robot.read(5.0)[-1].t_sigma < 15e-3
+
+
+def test_of_joints_of_several_nodes_the_least_sure_time_counts() -> None:
+    robot = Robot([said("a", "pan", "lift"), said("b", "elbow", rate_hz=10.0)])
+    with robot.joints:
+        slow = robot.read(3.0)[-1].t_sigma
+    robot = Robot([said("a", "pan", "lift"), said("b", "elbow")])
+    with robot.joints:
+        assert robot.read(3.0)[-1].t_sigma < 0.5 * slow
 
 
 @pytest.mark.parametrize("drift", [-1e-4, 1e-4, 2e-3])

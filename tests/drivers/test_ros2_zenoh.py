@@ -22,7 +22,7 @@ from drivers.ros2.senders import Refusal
 from interfaces.clock import SystemClock
 from interfaces.errors import SourceLost
 
-LIMIT_S = 20.0
+LIMIT_S = 300.0
 NAMES = ("pan", "lift", "elbow")
 
 

@@ -190,6 +190,50 @@ def test_times_are_those_of_the_measurements_to_half_a_millisecond() -> None:
     assert np.percentile(turns, 99) < 0.5e-3
 
 
+def time_error(reading: JointReading) -> float:
+    """By how much the time is wrong [s] of a reading of `STEEP`, modulo a turn of it."""
+    turn_s = 2 * math.pi / 8.0
+    return (reading.t - reading.q[0] / 8.0 - 100.0 + turn_s / 2) % turn_s - turn_s / 2
+
+
+STEEP = (lambda t: 8.0 * (t - 100.0),)  # 8 rad/s tell the time to 0.05 ms, with 16,384 ticks
+
+
+def steep_arm(**settings) -> BoardArm:
+    return BoardArm(STEEP, ticks=16384, limits=[(-1e9, 1e9)], **settings)
+
+
+@pytest.mark.parametrize("drift", [0.0, 1e-4, -0.01])
+@pytest.mark.parametrize("latency_s", [0.0, 4e-3, 16e-3])
+def test_the_time_sigma_holds_from_the_first_reading(drift, latency_s) -> None:
+    with (arm := steep_arm(latency_s=latency_s, drift=drift)).joints:
+        readings = arm.read(2000)
+    assert max(abs(time_error(reading)) - 3 * reading.t_sigma for reading in readings) < 0.1e-3
+
+
+@pytest.mark.parametrize("latency_s", [0.0, 4e-3])
+def test_the_time_sigma_is_below_a_millisecond_when_the_clock_is_known(latency_s) -> None:
+    with (arm := steep_arm(latency_s=latency_s, drift=1e-4)).joints:
+        assert 0.3e-3 < arm.read(600)[-1].t_sigma < 1e-3
+
+
+def test_lines_held_up_at_the_opening_are_not_believed() -> None:
+    arm = steep_arm()
+    begin, end = arm.clock.now(), arm.clock.now() + 0.25
+    arm.faults.add(0, lambda reply, _: replace(reply, start=end) if begin < reply.start < end else reply)
+    with arm.joints:
+        readings = arm.read(600)
+    assert max(abs(time_error(reading)) - 3 * reading.t_sigma for reading in readings) < 0.1e-3
+    assert max(reading.t_sigma for reading in readings) < 5e-3
+
+
+def test_a_line_that_was_held_up_is_told_at_the_time_of_its_measurement() -> None:
+    with (arm := steep_arm()).joints:
+        arm.read(600)
+        arm.faults.add(0, lambda reply, _: replace(reply, start=reply.start + 15e-3), 3)
+        assert max(abs(time_error(reading)) for reading in arm.read(10)) < 1e-3
+
+
 def test_the_delay_before_the_line_is_taken_off() -> None:
     with (late_arm := BoardArm(delay_ms=3.0)).joints, (arm := BoardArm()).joints:
         assert arm.read(10)[-1].t - late_arm.read(10)[-1].t == pytest.approx(3e-3, abs=1e-6)
@@ -406,8 +450,8 @@ def test_the_sketch_says_what_the_driver_reads(tmp_path) -> None:
     text = re.sub(r"#include <(Arduino|Wire)\.h>", "", SKETCH.read_text())
     (tmp_path / "sketch.inc").write_text(text)
     (tmp_path / "harness.cpp").write_text(HARNESS)
-    subprocess.run(["g++", "-o", "said", "harness.cpp"], cwd=tmp_path, check=True, timeout=60)
-    said = subprocess.run([tmp_path / "said"], capture_output=True, check=True, timeout=10).stdout.splitlines()
+    subprocess.run(["g++", "-o", "said", "harness.cpp"], cwd=tmp_path, check=True, timeout=300)
+    said = subprocess.run([tmp_path / "said"], capture_output=True, check=True, timeout=300).stdout.splitlines()
     lines = [parse(line) for line in said]
     assert isinstance(lines[0], Header)
     assert lines[0].encoders == {"shoulder": 4096, "elbow": 4096, "wrist": 4096}

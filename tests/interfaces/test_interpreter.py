@@ -7,12 +7,18 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
+import pytest
 from hostile_folder import FIRST_PARTY, HostileFolder
+from small_arm import write_small_arm
 
 from interfaces.interpreter import module_command, safe_children
+from interfaces.robot import RobotDescription
 
 ROOT = Path(__file__).parents[2]
-LIMIT_S = 60.0
+LIMIT_S = 300.0
+# Nothing listens on these ports.
+SILENT = '[zenoh]\nsampler = "tcp/127.0.0.1:9"\nlearner = "tcp/127.0.0.1:10"\n'
 
 
 def test_a_child_imports_nothing_from_the_current_folder(tmp_path: Path) -> None:
@@ -20,6 +26,23 @@ def test_a_child_imports_nothing_from_the_current_folder(tmp_path: Path) -> None
     command = module_command("daemon", "--version")
     done = subprocess.run(command, capture_output=True, text=True, timeout=LIMIT_S, cwd=tmp_path, check=True)
     assert (hostile.executed, done.stderr) == ([], "")
+
+
+@pytest.mark.parametrize(
+    ("command", "said"), [(["status"], "does not answer"), (["diagnose", "pairs.csv"], "NOTHING FOUND")]
+)
+def test_a_command_executes_nothing_of_the_current_folder(tmp_path: Path, command: list[str], said: str) -> None:
+    here, robot = tmp_path / "hostile", tmp_path / "robot"
+    here.mkdir()
+    robot.mkdir()
+    hostile, file = HostileFolder(here), write_small_arm(robot, SILENT)
+    q = np.random.default_rng(0).uniform(-1.0, 1.0, (60, 2))
+    rows = np.column_stack([q, RobotDescription.load(file).chain.positions(q)])
+    np.savetxt(here / "pairs.csv", rows, delimiter=",", header="waist,shoulder,x,y,z", comments="")
+    whole = [Path(sys.executable).with_name("bodyschema"), *command, "--robot", file]
+    done = subprocess.run(whole, capture_output=True, text=True, timeout=LIMIT_S, cwd=here, check=False)
+    assert hostile.executed == []
+    assert said in done.stdout
 
 
 def test_a_users_own_vision_folder_is_not_ours(tmp_path: Path) -> None:

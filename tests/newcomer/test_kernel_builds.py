@@ -29,7 +29,7 @@ def built(folder: Path, **environment: str) -> Built:
     plain = {name: value for name, value in os.environ.items() if name not in ("BODYSCHEMA_PURE", "CC", "CFLAGS")}
     command = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(folder)]
     result = subprocess.run(
-        command, cwd=ROOT, env=plain | environment, capture_output=True, text=True, check=True, timeout=100
+        command, cwd=ROOT, env=plain | environment, capture_output=True, text=True, check=True, timeout=400
     )
     (wheel,) = folder.glob("*.whl")
     unpacked = folder / "unpacked"

@@ -141,7 +141,7 @@ def guided_recording(robot: RobotDescription, rows: int) -> str:
 
 
 def test_a_recording_of_one_s_own_is_replayed_as_on_the_page(desk) -> None:
-    recording = guided_recording(RobotDescription.load(desk / "robot.toml"), 100)
+    recording = guided_recording(RobotDescription.load(desk / "robot.toml"), 60)
     (desk / "guided.csv").write_text(recording, encoding="utf-8")
     done = typed("bodyschema replay guided.csv --speed 1", desk)
     assert done.returncode == 0, done.stderr

@@ -63,7 +63,7 @@ def test_an_interrupted_world_closes_its_renderer_and_says_nothing():
 
 def test_importing_the_package_does_not_load_pybullet():
     with run_python("import sys, sim_backend; sys.exit('pybullet' in sys.modules)") as python:
-        assert python.wait(60) == 0
+        assert python.wait(300) == 0
 
 
 def test_without_pybullet_the_remedy_is_named(monkeypatch):

@@ -12,7 +12,7 @@ from interfaces.errors import SourceEnded, SourceLost
 from interfaces.protocols import JointSource, StereoCamera
 from sim_backend import SimConfig, SimWorld, ToolChange
 
-WAIT_S = 20.0
+WAIT_S = 300.0
 
 
 @pytest.fixture

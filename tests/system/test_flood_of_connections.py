@@ -23,7 +23,7 @@ def test_both_processes_outlive_a_flood_of_connections(tmp_path: Path, free_endp
             for endpoint in (config.tables.zenoh.sampler, config.tables.zenoh.learner):
                 host, _, port = endpoint.removeprefix("tcp/").rpartition(":")
                 for _ in range(MANY):
-                    flood.enter_context(socket.create_connection((host, int(port)), timeout=10.0))
+                    flood.enter_context(socket.create_connection((host, int(port)), timeout=300.0))
         sampler_with(config, pairs + 200)
         expect_each_pair_learnt_once(config)
         assert (sampler.poll(), learner.poll()) == (None, None)

@@ -117,7 +117,7 @@ def test_a_killed_upgrade_leaves_older_pairs(older: Config) -> None:
     with PairReader(older.store_file) as reader:
         pairs = told(reader.read())
     command = [sys.executable, "-P", "-c", KILLED_WHILE_MIGRATING, str(older.file), "30"]
-    done = subprocess.run(command, timeout=120, check=False)
+    done = subprocess.run(command, timeout=400, check=False)
     assert done.returncode == -signal.SIGKILL
     with PairStore(older.store_file, session_of(older, SystemClock())) as store:
         assert told(store.read()) == pairs

@@ -1,4 +1,4 @@
-"""The page in a browser, with both processes running in simulation behind it."""
+"""The page in a browser, with both processes running behind it on a recording of an upper body."""
 
 from __future__ import annotations
 
@@ -13,14 +13,16 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+import warm
 
+from daemon.bus import is_alive
 from daemon.config import Config
-from daemon.demo.processes import started_daemon
-from daemon.demo.scene import Scene, prepare
+from daemon.demo.scene import prepare
 from daemon.keys import Keys
+from interfaces.recording import Recording
 
-pytest.importorskip("pybullet")
 pytest.importorskip("uvicorn")
 playwright = pytest.importorskip("playwright.sync_api")
 expect = playwright.expect
@@ -55,19 +57,40 @@ class PageServer:
         self._process.communicate()
 
 
+def recorded(config: Config) -> Recording:
+    """A quarter of an hour, with a tool that is 5 cm off."""
+    t = np.arange(9_000) / 10.0
+    turns, begin = np.random.default_rng(3).uniform([[0.2], [0.0]], [[0.6], [6.0]], (2, 7))
+    middle, swing = 0.5 * (config.robot.upper + config.robot.lower), 0.3 * (config.robot.upper - config.robot.lower)
+    q = middle + swing * np.sin(turns * t[:, None] + begin)
+    chain = config.robot.chain.with_tool([0.03, 0.02, -0.035])
+    return Recording(config.robot.joints, q, chain.positions(q), t)
+
+
 @pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Scene]:
+def robot_file(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """Of an upper body whose sampler and learner run."""
     scene = prepare(tmp_path_factory.mktemp("view") / "demo", 3)
-    with started_daemon(scene) as daemon:
-        config = Config.load(scene.robot_file, {})
+    file, config = scene.robot_file, Config.load(scene.robot_file, {})
+    recorded(config).write_csv(file.with_name("walk.csv"))
+    text = file.read_text(encoding="utf-8").replace("[daemon]\n", "[daemon]\nany_step = true\n")
+    file.write_text(f'{text}\n[drivers]\nrecording = "walk.csv"\n', encoding="utf-8")
+    with scene.log_file.open("wb") as log:
+        daemon = warm.Child("-m", "daemon", "run", "--robot", file, stderr=log)
+    try:
         for process in ("sampler", "learner"):
-            daemon.wait_for(getattr(config.tables.zenoh, process), Keys(config.robot.name).alive(process))
-        yield scene
+            while not is_alive(getattr(config.tables.zenoh, process), Keys(config.robot.name).alive(process)):
+                assert daemon.poll() is None, scene.log_file.read_text()
+        yield file
+        daemon.terminate()
+        assert daemon.wait() == 0
+    finally:
+        daemon.kill()
 
 
 @pytest.fixture(scope="module")
-def server(scene: Scene, free_endpoint) -> Iterator[PageServer]:
-    server = PageServer(scene.robot_file, free_endpoint().rpartition(":")[2])
+def server(robot_file: Path, free_endpoint) -> Iterator[PageServer]:
+    server = PageServer(robot_file, free_endpoint().rpartition(":")[2])
     yield server
     server.end()
 
@@ -171,9 +194,9 @@ def test_a_diagnosis_is_begun_and_stopped_by_buttons(page) -> None:
     expect(page.locator("#diagnose")).to_be_enabled()
 
 
-def test_a_learner_that_is_silent_is_named_and_the_page_goes_on_when_it_is_back(page, scene: Scene) -> None:
+def test_a_learner_that_is_silent_is_named_and_the_page_goes_on_when_it_is_back(page, robot_file: Path) -> None:
     says(page, "#pill-learner", "learning")
-    learner = child_of("learner", scene.robot_file)
+    learner = child_of("learner", robot_file)
     os.kill(learner, signal.SIGSTOP)
     try:
         says(page, "#notices", "The learner has not answered since .*bodyschema learner")

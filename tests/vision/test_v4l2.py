@@ -19,7 +19,7 @@ PROBE = Path(__file__).parent / "v4l2_shim" / "probe.py"
 ROOT = Path(__file__).parents[2]
 SIZE_PX = (160, 120)
 FPS = 60.0
-LIMIT_S = 60.0
+LIMIT_S = 300.0
 GREY = [np.full((SIZE_PX[1], SIZE_PX[0], 3), 60 + 2 * k, np.uint8) for k in range(60)]
 WIDE = [np.hstack([image, image + 40]) for image in GREY]
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 
-from drivers.dynamixel.models import LAYOUT_P, LAYOUT_X, TICK_S, TICKS, Model, baud_of, baud_value
+from drivers.dynamixel.models import TICK_S, TICKS, Model, baud_of, baud_value
 
+from .factory import factory_values, indirect_blocks
 from .frames import Error
 
 Angle = Callable[[float], float]
@@ -16,7 +17,6 @@ MODES_WITH_CURRENT, MODES_WITHOUT = (0, 1, 3, 4, 5, 16), (1, 3, 4, 16)
 GOALS = ("goal_current", "goal")
 WATCHDOG_UNIT_S = 0.02
 FIRED = -1  # Bus Watchdog
-FACTORY_CURRENT_LIMIT = 1193  # of the X430; the others have others
 REVERSE = 0x01  # Drive Mode
 VELOCITY_STEP_S = 0.01
 TICKS_PER_REPLY_DELAY_US = 2
@@ -27,12 +27,8 @@ FACTORY2 = {
     "baud": 1,
     "return_delay": 250,
     "operating_mode": POSITION_MODE,
-    "moving_threshold": 10,
-    "shutdown": 52,
     "status_return": 2,
-    "voltage": 120,
     "temperature": 31,
-    "current_limit": FACTORY_CURRENT_LIMIT,
 }
 FACTORY1 = {
     "firmware": 24,
@@ -41,12 +37,8 @@ FACTORY1 = {
     "return_delay": 250,
     "status_return": 2,
     "shutdown": 36,
-    "voltage": 120,
     "temperature": 31,
 }
-# Blocks of Indirect Addresses and Indirect Data: where they begin, and how many there are (e-Manual, XL430-W250 and
-# PH54-200-S500; the beginnings are those of dynamixel-sdk's control tables).
-INDIRECT = {LAYOUT_X.ram: ((168, 224, 28), (578, 634, 28)), LAYOUT_P.ram: ((168, 634, 128),)}
 READ_ONLY = (
     "model",
     "firmware",
@@ -60,7 +52,7 @@ READ_ONLY = (
 )
 LARGEST = {"id": 252, "torque": 1, "status_return": 2, "return_delay": 254}
 JUDGED = (*LARGEST, *GOALS, "operating_mode")
-RAM_OF_FACTORY = ("status_return", "voltage", "temperature")
+RAM_OF_FACTORY = ("status_return", "temperature")
 
 
 class Servo:
@@ -97,10 +89,9 @@ class Servo:
         self.glitch_ticks, self.excess_a = 0, 0.0
         self._angle = angle
         self._memory = bytearray(model.layout.size)
+        self._places = {name: (r.address, r.end, r.signed) for name, r in model.layout.registers.items()}
         self._indirect = {
-            data + k: pointer + 2 * k
-            for pointer, data, count in INDIRECT.get(model.layout.ram, ())
-            for k in range(count)
+            data + k: pointer + 2 * k for pointer, data, count in indirect_blocks(model) for k in range(count)
         }
         self._first_indirect = min(self._indirect, default=len(self._memory))
         self._reset_memory()
@@ -115,13 +106,15 @@ class Servo:
 
     def __getitem__(self, name: str) -> int:
         """The number in a register."""
-        register = self.model.layout[name]
-        return register.value(bytes(self._memory[register.address : register.end]))
+        address, end, signed = self._places[name]
+        if end == address + 1 and not signed:
+            return self._memory[address]
+        return int.from_bytes(self._memory[address:end], "little", signed=signed)
 
     def __setitem__(self, name: str, value: int) -> None:
         """Put a number into a register as the servo itself does, past all locks."""
-        register = self.model.layout[name]
-        self._memory[register.address : register.end] = register.bytes(value)
+        address, end, signed = self._places[name]
+        self._memory[address:end] = value.to_bytes(end - address, "little", signed=signed)
 
     @property
     def id(self) -> int:
@@ -274,6 +267,7 @@ class Servo:
         fresh = bytearray(len(self._memory))
         fresh[: self.model.layout.ram] = self._memory[: self.model.layout.ram]
         self._memory = fresh
+        self._put_factory_values(self.model.layout.ram)
         self._point_indirect()
         for name in RAM_OF_FACTORY:
             if self.model.layout[name].address >= self.model.layout.ram:
@@ -322,14 +316,17 @@ class Servo:
     def _reset_memory(self) -> None:
         self._memory[:] = bytes(len(self._memory))
         self._error1 = 0
+        self._put_factory_values(0)
         self._point_indirect()
         self["model"] = self.model.number
         for name, value in self._factory.items():
             self[name] = value
-        if self.model.protocol == 2:
-            turn = self.model.ticks_per_turn or 0
-            self["min_position"] = self.model.zero_ticks - turn // 2
-            self["max_position"] = self["min_position"] + turn - 1
+
+    def _put_factory_values(self, begin: int) -> None:
+        """Put what stands in a new servo from an address on."""
+        for address, size, value in factory_values(self.model):
+            if address >= begin:
+                self._memory[address : address + size] = value.to_bytes(size, "little", signed=value < 0)
 
     def _point_indirect(self) -> None:
         """Each Indirect Address points at its own Indirect Data."""

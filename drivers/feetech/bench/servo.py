@@ -103,7 +103,8 @@ class Servo:
 
     def __getitem__(self, name: str) -> int:
         """The number in a register."""
-        return self.model.layout.value(name, bytes(self._memory))
+        register = self.model.layout.registers.get(name)
+        return 0 if register is None else register.value(bytes(self._memory[register.address : register.end]))
 
     def __setitem__(self, name: str, value: int) -> None:
         """Put a number into a register as the servo itself does, past all locks, for good."""

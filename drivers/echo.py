@@ -1,0 +1,99 @@
+"""Adapters that send back what is sent, as those do that only join both lines of a half-duplex bus."""
+
+from __future__ import annotations
+
+import logging
+from typing import Protocol
+
+from interfaces.protocols import Clock
+
+log = logging.getLogger(__name__)
+
+PROBE = b"\x00"  # begins no packet
+BITS_PER_BYTE = 10
+HOST_S = 3e-3  # the operating system's part of the delay
+
+
+class Port(Protocol):
+    """An open serial port."""
+
+    @property
+    def baud(self) -> int:
+        """Bits per second."""
+        ...
+
+    def write(self, data: bytes) -> None:
+        """Send `data`."""
+        ...
+
+    def receive(self, until: float) -> bytes:
+        """What has arrived, else what arrives next; nothing when that is not before `until` on the clock."""
+        ...
+
+    def flush(self) -> None:
+        """Forget what has arrived."""
+        ...
+
+    def close(self) -> None:
+        """Give it free."""
+        ...
+
+
+def without_echo(port: Port, clock: Clock, latency_s: float) -> Port:
+    """Return `port`, without the echo of its adapter where there is one: a byte is sent to find out.
+
+    Args:
+        latency_s: how long the adapter may keep bytes back.
+    """
+    port.flush()
+    port.write(PROBE)
+    if port.receive(clock.now() + BITS_PER_BYTE / port.baud + 2 * latency_s + HOST_S) != PROBE:
+        return port
+    log.info("the adapter sends back what is sent; this is taken out of what is received")
+    return EchoFree(port, clock)
+
+
+class EchoFree:
+    """A port whose adapter sends back what is sent."""
+
+    def __init__(self, port: Port, clock: Clock) -> None:
+        """Nothing of what was sent is still to come back."""
+        self._port, self._clock = port, clock
+        self._own = bytearray()
+
+    @property
+    def baud(self) -> int:
+        """Bits per second."""
+        return self._port.baud
+
+    def write(self, data: bytes) -> None:
+        """Send `data`."""
+        self._own += data
+        self._port.write(data)
+
+    def receive(self, until: float) -> bytes:
+        """What has arrived besides what was sent, else what arrives next; nothing when that is not before `until`."""
+        while data := self._port.receive(until):
+            others = self._without_own(data)
+            if others:
+                return others
+        return b""
+
+    def flush(self) -> None:
+        """Forget what has arrived."""
+        while self._own and (data := self._port.receive(self._clock.now())):
+            self._without_own(data)
+        if not self._own:
+            self._port.flush()
+
+    def close(self) -> None:
+        """Give it free."""
+        self._port.close()
+
+    def _without_own(self, data: bytes) -> bytes:
+        size = min(len(data), len(self._own))
+        if data[:size] != self._own[:size]:  # somebody else talked at the same time
+            self._own.clear()
+            return data
+        del self._own[:size]
+        return data[size:]
