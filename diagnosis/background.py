@@ -53,6 +53,8 @@ class Background:
         run: of a simulation, whose background may be empty.
         whitening: (n, 3, 3), to units in which the stated noise is one.
         scales: of what is tolerated; None for no background at all.
+        before: the background from which this one has come; None where a simulation's own errors are known, and what
+            is tolerated lies about them.
 
     Attributes:
         effects: those of the background at rest: a link at each joint, eccentricity and ripple of each drive.
@@ -61,26 +63,24 @@ class Background:
         start: the amounts (p,) of the simulation, about which the columns are.
     """
 
-    def __init__(self, run: Simulated, whitening: FloatArray, scales: Scales | None) -> None:
+    def __init__(
+        self, run: Simulated, whitening: FloatArray, scales: Scales | None, before: Background | None = None
+    ) -> None:
         simulation = run.simulation
         self._whitening, self.scales = whitening, scales
-        own = simulation.background or background_effects(simulation, run.motion.q)
-        own = () if scales is None else own
+        own = () if scales is None else simulation.background or background_effects(simulation, run.motion.q)
         self.effects = tuple(_resting(effect) for effect in own)
-        self.start = np.concatenate([np.empty(0), *(effect.values[effect.amounts] for effect in own)])
+        amounts = np.concatenate([np.empty(0), *(effect.values[effect.amounts] for effect in own)])
+        # What is tolerated counts from here.
+        self._centre = amounts
+        if before is not None and before.scales is not None:
+            self._centre = np.append(before._centre, np.zeros(len(amounts) - len(before._centre)))
+        self.start = amounts - self._centre
         parts = [run.columns(effect)[:, :, effect.amounts] for effect in own]
         self.columns = np.concatenate([np.empty((len(run.motion), 3, 0)), *parts], axis=2)
         self.group = np.concatenate([np.empty(0, int), *map(_groups, self.effects)])
         units = np.concatenate([np.empty(0), *map(_units, self.effects)])
         self.tolerances = units if scales is None else units * np.asarray(scales)[self.group]
-
-    def scaled(self, scales: Scales) -> Background:
-        """The same about the same run with other scales."""
-        other = object.__new__(Background)
-        other._whitening, other.scales, other.effects, other.start = self._whitening, scales, self.effects, self.start
-        other.columns, other.group = self.columns, self.group
-        other.tolerances = np.concatenate([np.empty(0), *map(_units, self.effects)]) * np.asarray(scales)[self.group]
-        return other
 
     def shift(self, amounts: FloatArray) -> FloatArray:
         """What amounts (p,) other than those of the simulation add to what is measured (n, 3) [m]."""
@@ -90,7 +90,7 @@ class Background:
         """The background's effects with amounts (p,)."""
         ends = np.cumsum([len(effect.amounts) for effect in self.effects])
         return tuple(
-            _with(effect, amounts[end - len(effect.amounts) : end])
+            _with(effect, (self._centre + amounts)[end - len(effect.amounts) : end])
             for effect, end in zip(self.effects, ends, strict=True)
         )
 

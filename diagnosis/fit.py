@@ -339,14 +339,17 @@ class Fit:
             stays = [effect for effect in simulation.effects if effect not in also]
             moved = [effect.one_more(-2 - k) for k, effect in enumerate(also)]
             simulation = simulation.with_effects(stays).with_background((*simulation.background, *moved))
-        background = Background(simulation.run(self.observations.motion), self.observations.whitening, scales)
+        run = simulation.run(self.observations.motion)
+        background = Background(run, self.observations.whitening, scales, self.background)
         return improved(_at(self.observations, simulation, self.nuisances, self.noise, background))
 
     def settled(self) -> Fit:
         """The same with its tolerances in the simulation."""
+        if self.background.scales is None:
+            return self
         simulation = self.simulation.with_background(self.background.with_amounts(self.tolerated))
         run = simulation.run(self.observations.motion)
-        background = Background(run, self.observations.whitening, self.background.scales)
+        background = Background(run, self.observations.whitening, self.background.scales, self.background)
         return _at(self.observations, simulation, self.nuisances, self.noise, background)
 
     def without(self, cause: Effect) -> Fit:

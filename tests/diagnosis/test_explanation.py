@@ -40,6 +40,7 @@ def explained_beside(fits: list[Fit], worths: list[float], monkeypatch: pytest.M
     }
     shorter = {len(fit.causes): one for fit, one in known.items()}
     monkeypatch.setattr(explanation, "_with_unknown", lambda fit, *_: known.get(fit) or shorter[len(fit.causes)])
+    monkeypatch.setattr(explanation, "_rescaled", lambda best, *_: best)
     believing = cast(Any, Believing())
     return explain(fits[-1], fits, believing, believing, lambda _: None)
 
