@@ -108,7 +108,7 @@ class LearnerConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Tables(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """All tables of robot.toml; [robot] and [camera] are checked by `interfaces.robot`, the last two by `effects`."""
+    """All tables of robot.toml; [robot] and [camera] are checked by `interfaces.robot`, the last three by `effects`."""
 
     robot: dict[str, Any]
     camera: dict[str, Any]
@@ -119,6 +119,7 @@ class Tables(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     learner: LearnerConfig = LearnerConfig()
     sim: SimConfig = SimConfig()
     effects: tuple[dict[str, Any], ...] = ()
+    background: tuple[dict[str, Any], ...] = ()
     unexplained: dict[str, Any] | None = None
 
 

@@ -94,6 +94,12 @@ class Background:
             for effect, end in zip(self.effects, ends, strict=True)
         )
 
+    @property
+    def given(self) -> tuple[Effect, ...]:
+        """The errors about which everything is tolerated, as a simulation had them beforehand; none that are 0."""
+        given = self.with_amounts(np.zeros_like(self.start))
+        return given if self._centre.any() else ()
+
     def tolerates(self, effect: Effect) -> bool:
         """Whether an effect is a periodic error of a drive that is no larger than that of others."""
         if self.scales is None or effect.name not in _PERIODIC:

@@ -215,10 +215,13 @@ def diagnose(
     search = Search(hypotheses.effects, tell)
     unknowns = Unknowns(start)
     enough = partial(needs_no_more_names, unknowns=unknowns, search=search)
-    extended = _searched(together(start, hypotheses.effects), search, enough)
+    if start.is_exact:
+        extended = search.run(start, enough)
+    else:
+        extended = _searched(together(start, hypotheses.effects), search, enough)
     factor, rows = instrument_factor(extended), doubtful(extended)
     left_out = rows if rows.mean() <= MOST_DOUBTFUL else np.zeros_like(rows)
-    if abs(np.log(factor)) > _SAME_NOISE or left_out.any():
+    if not start.is_exact and (abs(np.log(factor)) > _SAME_NOISE or left_out.any()):
         observations = observations.with_factor(factor).without(left_out)
         start = aligned(observations, simulation)
         unknowns = Unknowns(start)
@@ -239,13 +242,16 @@ def diagnose(
         stands = standings(explanation.beside, search, blocks, seed)
     left = leftover(explanation, unknowns, blocks)
     fit = (explanation.fit if left.model is None else left.model.fit).settled()
+    made = tolerated(fit)
+    if left.model is None and not made.seen.any():
+        fit = fit.untolerated()
     return Diagnosis(
         hypotheses=hypotheses,
         nominal=fitted(observations, simulation, len(simulation.effects)),
         aligned=start,
         geometry=_geometry(start),
         extended=fit,
-        tolerated=tolerated(fit),
+        tolerated=made,
         standings=tuple(stands),
         left=left,
         blocks=blocks,

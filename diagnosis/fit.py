@@ -352,6 +352,14 @@ class Fit:
         background = Background(run, self.observations.whitening, self.background.scales, self.background)
         return _at(self.observations, simulation, self.nuisances, self.noise, background)
 
+    def untolerated(self) -> Fit:
+        """The same, refitted without any tolerance."""
+        if self.background.scales is None:
+            return self
+        simulation = self.simulation.with_background(self.background.given)
+        background = Background(simulation.run(self.observations.motion), self.observations.whitening, None)
+        return improved(_at(self.observations, simulation, self.nuisances, self.noise, background))
+
     def without(self, cause: Effect) -> Fit:
         """All causes but one, refitted."""
         return self.with_causes([effect for effect in self.causes if effect.identity != cause.identity])

@@ -36,6 +36,10 @@ _FARTHEST = 1.0
 _SMALLEST, _LARGEST, _QUIETEST = 1e-3, 1e2, 1e-3
 # So many of the most promising moves are tried with scales of their own.
 _TRIED = 4
+# Where all scales are smaller than this the arm may also be exactly as described, as a simulated one is.
+_MAY_BE_EXACT = 0.5
+# What of squares is rounding.
+_ROUNDED_OFF = 1e-13
 # Tolerances that are smaller than this share of what so many would be are not seen.
 _SEEN = 0.5
 # Sets of causes are changed so many times at most.
@@ -234,13 +238,25 @@ class Sets:
                 break
             logs = np.clip(logs + steps, np.log(_SMALLEST), np.log(_LARGEST))
             sigma = max(sigma * float(np.exp(quieter)), _QUIETEST * self._fit.noise.sigma)
+        worth, factor, amounts = self._worth(inner, toward, group, logs, sigma)
+        scales = Scales(*np.exp(logs).tolist())
+        worth -= scales.doubt
+        if max(scales) < _MAY_BE_EXACT:
+            exact = self._worth(inner, toward, group, np.full(3, np.log(_SMALLEST)), sigma)
+            if exact[0] > worth:
+                (worth, factor, amounts), scales, squares = exact, Scales(*[_SMALLEST] * 3), np.zeros(3)
+        worth -= sum(self._doubt_beside(k, chosen[:j]) for j, k in enumerate(chosen))
+        return Together(chosen, worth, scales, sigma, spent, squares, amounts, factor, columns)
+
+    def _worth(
+        self, inner: FloatArray, toward: FloatArray, group: np.ndarray, logs: FloatArray, sigma: float
+    ) -> tuple[float, tuple[FloatArray, bool], FloatArray]:
+        """The evidence of scales and noise [nats], the factor of the precision, and the amounts (p,)."""
         factor, variances, amounts = self._solved(inner, toward, group, logs, sigma)
         left = self._square - float(amounts @ toward)
         evidence = -0.5 * left / sigma**2 - self._rows * float(np.log(sigma))
         evidence -= float(np.log(np.diag(factor[0])).sum()) + 0.5 * float(np.log(variances).sum())
-        scales = Scales(*np.exp(logs))
-        worth = evidence - scales.doubt - sum(self._doubt_beside(k, chosen[:j]) for j, k in enumerate(chosen))
-        return Together(chosen, worth, scales, sigma, spent, squares, amounts, factor, columns)
+        return evidence, factor, amounts
 
     def _solved(
         self, inner: FloatArray, toward: FloatArray, group: np.ndarray, logs: FloatArray, sigma: float
@@ -248,7 +264,7 @@ class Sets:
         """Factor of the precision, variances beforehand (p,) and amounts (p,), in units of `_units`."""
         variances = np.where(group >= 0, np.exp(2.0 * logs)[group], 1.0)
         precision = inner / sigma**2
-        precision[np.diag_indices_from(precision)] += 1.0 / variances
+        precision[np.diag_indices_from(precision)] += 1.0 / variances + _ROUNDED_OFF * np.diag(precision)
         factor = cho_factor(precision, lower=True)
         return factor, variances, cho_solve(factor, toward / sigma**2)
 
