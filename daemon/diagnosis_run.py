@@ -234,7 +234,9 @@ def written(found: Found, folder: Path) -> None:
     extended = found.diagnosis.extended.simulation
     told = " ".join(filter(None, [f"{heading}.", modelled(found.file.unexplained)]))
     write_extended(extended, folder, told, replace=True)
-    write_corrected(extended, folder, heading)
+    # Tolerances alone are put into a URDF where the recording shows them.
+    bare = extended if found.diagnosis.tolerated.seen[:2].any() else extended.with_background(())
+    write_corrected(bare, folder, heading)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         (folder / DIAGNOSIS).write_text(found.json + "\n", encoding="utf-8")

@@ -40,8 +40,8 @@ _TRIED = 4
 _MAY_BE_EXACT = 0.5
 # What of squares is rounding.
 _ROUNDED_OFF = 1e-13
-# Tolerances that are smaller than this share of what so many would be are not seen.
-_SEEN = 0.5
+# Tolerances without which the data are so much less probable show in them [nats].
+_SHOWN = 3.0
 # Sets of causes are changed so many times at most.
 _MOST_MOVES = 60
 # So many sets are refitted at most, while one promises to be no less probable than the best by more than this [nats].
@@ -75,7 +75,6 @@ class Together:
         scales: of the tolerances.
         sigma: of the noise, in units of the stated one.
         spent: how many numbers of the data say how large each scale is (3,).
-        squares: of what each scale's tolerances are, in units of it (3,).
         amounts: of all columns that it has (p,).
         factor: of their precision, as `cho_factor` has it.
         columns: which they are (p,).
@@ -86,7 +85,6 @@ class Together:
     scales: Scales
     sigma: float
     spent: FloatArray
-    squares: FloatArray
     amounts: FloatArray
     factor: tuple[FloatArray, bool]
     columns: FloatArray
@@ -121,7 +119,8 @@ class Sets:
         flat *= self._units
         self._inner, self._toward = flat.T @ flat, flat.T @ self._target
         self._square, self._rows = float(self._target @ self._target), 3.0 * float(fit.noise.weights.sum())
-        self._doubts = [doubt + _NAMED + float(np.log(candidate.trials)) for candidate in candidates]
+        self._trials = [float(np.log(candidate.trials)) for candidate in candidates]
+        self._first = doubt + _NAMED
         ends = np.cumsum([0, *(len(effect.amounts) for effect in self.effects)])
         first = self._nuisances + self._tolerances
         self._places = [np.arange(first + a, first + b) for a, b in pairwise(ends)]
@@ -189,7 +188,7 @@ class Sets:
     def _doubt_beside(self, k: int, others: Sequence[int]) -> float:
         """What naming a cause costs where others are named [nats]."""
         kinds = {self.effects[j].name for j in others if j != k}
-        return min(self._doubts[k], _ANOTHER) if self.effects[k].name in kinds else self._doubts[k]
+        return self._trials[k] + (min(self._first, _ANOTHER) if self.effects[k].name in kinds else self._first)
 
     def _promising(self, here: Together) -> list[int]:
         """The candidates that are worth most where scales and noise stay as they are, the best first."""
@@ -215,13 +214,11 @@ class Sets:
         """A set of causes with the scales and the noise that give it the most evidence."""
         own = [self._places[k] for k in chosen]
         columns = np.sort(np.concatenate([np.arange(self._nuisances + self._tolerances), *own]).astype(np.intp))
-        group = np.full(len(columns), -1)
-        group[self._nuisances : self._nuisances + self._tolerances] = self._fit.background.group
+        group = self._group(columns)
         inner, toward = self._inner[np.ix_(columns, columns)], self._toward[columns]
         logs = np.log(near.scales if near else Scales())
         sigma = near.sigma if near else self._fit.noise.sigma
         members, spent = [group == g for g in range(3)], np.zeros(3)
-        squares = np.zeros(3)
         for done in range(_ROUNDS):
             factor, variances, amounts = self._solved(inner, toward, group, logs, sigma)
             inverse = cho_solve(factor, np.eye(len(columns)))
@@ -244,9 +241,27 @@ class Sets:
         if max(scales) < _MAY_BE_EXACT:
             exact = self._worth(inner, toward, group, np.full(3, np.log(_SMALLEST)), sigma)
             if exact[0] > worth:
-                (worth, factor, amounts), scales, squares = exact, Scales(*[_SMALLEST] * 3), np.zeros(3)
+                (worth, factor, amounts), scales = exact, Scales(*[_SMALLEST] * 3)
         worth -= sum(self._doubt_beside(k, chosen[:j]) for j, k in enumerate(chosen))
-        return Together(chosen, worth, scales, sigma, spent, squares, amounts, factor, columns)
+        return Together(chosen, worth, scales, sigma, spent, amounts, factor, columns)
+
+    def shown(self, here: Together) -> NDArray[np.bool_]:
+        """Without which scale's tolerances the data would be much less probable (3,)."""
+        inner, toward = self._inner[np.ix_(here.columns, here.columns)], self._toward[here.columns]
+        group = self._group(here.columns)
+        whole = self._worth(inner, toward, group, np.log(here.scales), here.sigma)[0]
+        without = []
+        for g in range(3):
+            logs = np.log(here.scales)
+            logs[g] = np.log(_SMALLEST)
+            without.append(self._worth(inner, toward, group, logs, here.sigma)[0])
+        return whole - np.array(without) > _SHOWN
+
+    def _group(self, columns: NDArray[np.intp]) -> NDArray[np.int64]:
+        """Of which scale some columns are (p,); -1 where they are no tolerance."""
+        group = np.full(len(columns), -1)
+        group[self._nuisances : self._nuisances + self._tolerances] = self._fit.background.group
+        return group
 
     def _worth(
         self, inner: FloatArray, toward: FloatArray, group: np.ndarray, logs: FloatArray, sigma: float
@@ -305,8 +320,9 @@ def together(start: Fit, hypotheses: Sequence[Effect]) -> Fit:
 def tolerated(fit: Fit) -> Tolerated:
     """The scales of tolerances that have the most evidence beside the causes of a fit."""
     causes = [Candidate(cause, 0.0, 1) for cause in fit.causes]
-    here = Sets(fit, causes, 0.0).of(tuple(range(len(causes))))
-    return Tolerated(here.scales, 1.0 / np.sqrt(2.0 * here.spent + 1.0 / SPREAD**2), here.squares > _SEEN * here.spent)
+    sets = Sets(fit, causes, 0.0)
+    here = sets.of(tuple(range(len(causes))))
+    return Tolerated(here.scales, 1.0 / np.sqrt(2.0 * here.spent + 1.0 / SPREAD**2), sets.shown(here))
 
 
 class _Place:
