@@ -1,0 +1,97 @@
+"""An arm that is a little off everywhere: what is larger than its tolerances is named, and nothing else."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from planted_cases import ELBOW, SHOULDER, measured, motion_of, surveyed_arm
+
+from diagnosis.conclusion import conclusion
+from diagnosis.diagnosis import diagnose
+from diagnosis.result import DiagnosisFile
+from effects import Effect, Simulation, load_simulation, write_extended
+from interfaces.errors import ConfigError
+from interfaces.robot import RobotDescription
+
+NOISE_M, ROWS = 1e-4, 150
+LENGTH_M, ANGLE_RAD, DRIVE_RAD = 4e-4, 1.2e-3, 2e-4
+
+
+def made(robot: RobotDescription, rng: np.random.Generator) -> tuple[Effect, ...]:
+    """Every link and every drive as a workshop makes them."""
+    found = []
+    for joint in robot.joints:
+        link = np.concatenate([LENGTH_M * rng.normal(size=3), ANGLE_RAD * rng.normal(size=3)])
+        found.append(Effect.at(robot, "link_geometry", joint, values=link))
+        found.append(Effect.at(robot, "joint_eccentricity", joint, values=DRIVE_RAD * rng.normal(size=2)))
+    return tuple(found)
+
+
+def found_in(robot: RobotDescription, seed: int, *causes: Effect) -> DiagnosisFile:
+    rng = np.random.default_rng([7, seed])
+    q = rng.uniform(0.7 * robot.lower, 0.7 * robot.upper, (ROWS, len(robot.joints)))
+    truth = Simulation(robot, causes, None, made(robot, rng))
+    x = truth.positions(motion_of(q)) + NOISE_M * rng.normal(size=(ROWS, 3))
+    return conclusion(diagnose(measured(robot, motion_of(q), x), Simulation(robot)))
+
+
+@pytest.fixture(scope="module")
+def robot() -> RobotDescription:
+    return surveyed_arm()
+
+
+@pytest.fixture(scope="module")
+def plain(robot: RobotDescription) -> DiagnosisFile:
+    return found_in(robot, 1)
+
+
+def test_nothing_is_named_where_all_is_within_tolerance(plain: DiagnosisFile) -> None:
+    assert (plain.verdict, plain.causes) == ("nothing_found", ())
+    assert "small errors everywhere" in plain.sentence
+
+
+def test_it_is_told_how_exactly_the_arm_is_made(plain: DiagnosisFile) -> None:
+    assert plain.tolerances is not None
+    assert 0.5e3 * LENGTH_M < plain.tolerances.length_mm.value < 2e3 * LENGTH_M
+    low, high = plain.tolerances.length_mm.ci95
+    assert low < plain.tolerances.length_mm.value < high
+
+
+def test_tolerances_make_the_simulation_nearly_as_right_as_the_noise(plain: DiagnosisFile) -> None:
+    assert plain.rms_mm.noise_floor is not None
+    assert plain.rms_mm.extended < 1.5e3 * NOISE_M * np.sqrt(3.0) < 0.5 * plain.rms_mm.aligned
+    assert plain.rms_mm.noise_floor < plain.rms_mm.extended
+
+
+def test_several_zeros_are_named_and_no_link_in_their_place(robot: RobotDescription) -> None:
+    hidden = {SHOULDER: 0.035, ELBOW: -0.04}
+    zeros = [Effect.at(robot, "joint_offset", joint, values=[size]) for joint, size in hidden.items()]
+    file = found_in(robot, 2, *zeros)
+    assert {(cause.effect, cause.where) for cause in file.causes} == {("joint_offset", joint) for joint in hidden}
+    by_joint = {cause.where: cause.parameters["offset_rad"].value for cause in file.causes}
+    assert by_joint[SHOULDER] == pytest.approx(0.035, abs=5.0 * ANGLE_RAD)
+    assert by_joint[ELBOW] == pytest.approx(-0.04, abs=5.0 * ANGLE_RAD)
+
+
+def test_a_bent_link_is_named_where_it_is_larger_than_tolerance(robot: RobotDescription) -> None:
+    bent = Effect.at(robot, "link_geometry", ELBOW, values=[4e-3, 0.0, 5e-3, 0.0, 0.02, 0.01])
+    file = found_in(robot, 3, bent)
+    assert [(cause.effect, cause.where) for cause in file.causes] == [("link_geometry", ELBOW)]
+
+
+def test_a_background_is_in_the_extended_simulation_and_comes_back(robot: RobotDescription, tmp_path: Path) -> None:
+    simulation = Simulation(robot, (), None, made(robot, np.random.default_rng(3)))
+    again = load_simulation(write_extended(simulation, tmp_path, "x"))
+    q = np.random.default_rng(4).uniform(robot.lower, robot.upper, (20, len(robot.joints)))
+    np.testing.assert_allclose(again.positions(motion_of(q)), simulation.positions(motion_of(q)), atol=1e-12)
+    assert again.effects == ()
+
+
+def test_a_background_with_an_unknown_joint_is_refused_with_its_line(robot: RobotDescription, tmp_path: Path) -> None:
+    file = write_extended(Simulation(robot, (), None, made(robot, np.random.default_rng(3))), tmp_path, "x")
+    file.write_text(file.read_text().replace(f'where = "{ELBOW}"', 'where = "knee"', 1))
+    with pytest.raises(ConfigError, match="background 5") as refused:
+        load_simulation(file)
+    assert refused.value.line is not None
