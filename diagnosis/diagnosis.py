@@ -15,6 +15,7 @@ from interfaces.records import FloatArray
 
 from .alignment import aligned
 from .alike import Alike, alike
+from .background import Scales
 from .contact import doubtful
 from .drives import with_small_ripples
 from .explanation import changed_by_the_way, explain, needs_no_more_names, without_one
@@ -226,8 +227,8 @@ def diagnose(
         start = aligned(observations, simulation)
         unknowns = Unknowns(start)
         enough = partial(needs_no_more_names, unknowns=unknowns, search=search)
-        begun = start.with_causes(extended.causes).tolerating(extended.background.scales)
-        extended = _searched(begun, search, enough)
+        scales = extended.background.scales or Scales()
+        extended = _searched(start.with_causes(extended.causes).tolerating(scales), search, enough)
     tell("asking whether something without a name is at work")
     blocks = blocks or Blocks.cut(len(recording))
     explanation = explain(extended, search.path, unknowns, search, tell)
@@ -262,15 +263,16 @@ def diagnose(
 
 def _searched(begun: Fit, search: Search, enough: Callable[[Sequence[Fit], float], bool]) -> Fit:
     """With what a search finds from there, and tolerances as large as they then are."""
+    extended = begun
     for _ in range(_RESCALED):
-        begun = with_small_ripples(begun)
-        extended = search.run(begun, enough)
+        extended = search.run(with_small_ripples(begun), enough)
+        before = extended.background.scales or Scales()
         # What has no name may be all there is, and make tolerances seem larger than they are.
         bare = extended.with_causes([])
-        search.path = [bare.tolerating(bare.background.scales.no_larger), bare, *search.path[1:]]
+        search.path = [bare.tolerating(before.no_larger), bare, *search.path[1:]]
         scales = tolerated(extended).scales
         small = [cause for cause in extended.causes if extended.background.tolerates(cause)]
-        if not small and np.abs(np.log(scales) - np.log(extended.background.scales)).max() < _SAME_SCALE:
+        if not small and np.abs(np.log(scales) - np.log(before)).max() < _SAME_SCALE:
             break
         begun = extended.tolerating(scales, small)
     return extended

@@ -92,13 +92,14 @@ def explain(
     margin = _MARGIN if is_rest else 0.0
     # So much may a way be worth beside fewer causes at most: to first order it explains no more than beside them all.
     hope = found.log_likelihood + best.promise if best.apart is None else np.inf
-    looked_at = {named(found.causes)}
+    looked_at = {(named(found.causes), found.background.scales)}
     for fit in [*path[:_FIRST], *path[_FIRST:][-_LAST:]]:
-        causes = named(fit.causes)
-        if causes in looked_at:
+        looked = named(fit.causes), fit.background.scales
+        if looked in looked_at:
             continue
-        looked_at.add(causes)
-        if hope - cost_of_names(fit.causes, search) < best.worth - (_AS_GOOD if best.unknown else 0.0):
+        looked_at.add(looked)
+        narrower = found.background.volume(found.noise.sigma) - fit.background.volume(found.noise.sigma)
+        if hope + narrower - cost_of_names(fit.causes, search) < best.worth - (_AS_GOOD if best.unknown else 0.0):
             continue
         other = _with_unknown(fit, unknowns, search, best.worth - (_AS_GOOD if best.unknown else 0.0))
         clearly = margin if best.fit is found and not other.is_specific else 0.0

@@ -82,9 +82,10 @@ def numbers_of(cause: Cause, *, timed: bool) -> list[Number]:
 
 
 def told_values(cause: Cause) -> dict[str, float]:
-    """The numbers of a cause that the recording tells; all where it tells none."""
-    told = {name: of.value for name, of in cause.parameters.items() if number(name, of).is_told}
-    return told or {name: of.value for name, of in cause.parameters.items()}
+    """The numbers of a cause without the shifts and turns that the recording does not tell; all where it tells none."""
+    parts = {name for name in cause.parameters if name.removeprefix("r")[1:] in ("_m", "_rad")}
+    told = {n: of.value for n, of in cause.parameters.items() if n not in parts or number(n, of).is_told}
+    return told if told.keys() & parts or not parts else {name: of.value for name, of in cause.parameters.items()}
 
 
 def telling(numbers: list[Number]) -> list[Number]:

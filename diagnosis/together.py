@@ -32,8 +32,9 @@ _NAMED = 3.0
 _ROUNDS, _STILL = 25, 0.02
 # No step of a logarithm is larger.
 _FARTHEST = 1.0
-# Scales are sought within these, and the noise from this share of the fit's on.
-_SMALLEST, _LARGEST, _QUIETEST = 1e-3, 1e2, 1e-3
+# No arm is made worse than the largest scale, nor better than the smallest; the noise is sought from this share of that
+# of the fit on.
+_SMALLEST, _LARGEST, _QUIETEST = 1e-3, 10.0, 1e-3
 # So many of the most promising moves are tried with scales of their own.
 _TRIED = 4
 # Where all scales are smaller than this the arm may also be exactly as described, as a simulated one is.
@@ -87,7 +88,7 @@ class Together:
     spent: FloatArray
     amounts: FloatArray
     factor: tuple[FloatArray, bool]
-    columns: FloatArray
+    columns: NDArray[np.intp]
 
 
 class Sets:

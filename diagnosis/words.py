@@ -158,7 +158,7 @@ def made_to(tolerances: Tolerances) -> str:
 
     length, angle = told(tolerances.length_mm, " mm"), told(tolerances.angle_deg, "°")
     drives = told(tolerances.drive_deg, "°", "±")
-    return f"Beside that, the arm is made to {length} and {angle}; its drives run true to {drives}."
+    return f"The arm is made to {length} and {angle}; its drives run true to {drives}."
 
 
 def beside_geometry(rms: Errors, alike: Sequence[Alike]) -> list[str]:

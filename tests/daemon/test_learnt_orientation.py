@@ -80,7 +80,7 @@ def test_the_status_says_how_well_models_predict_orientations(taught) -> None:
 
 def test_positions_are_learnt_as_without_orientations(scene, taught) -> None:
     without = new_learning()
-    teach(without, scene.pairs, every=NOW_AND_THEN)
+    teach(without, scene.pairs, every=10)
     assert np.array_equal(without.snapshot.predict(scene.q).x, taught.snapshot.predict(scene.q).x)
 
 

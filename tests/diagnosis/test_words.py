@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from diagnosis.result import Cause, Errors, Gain, Interval
-from diagnosis.words import finding, sentence
+from diagnosis.result import Cause, Errors, Gain, Interval, Tolerances
+from diagnosis.words import finding, made_to, sentence
 
 SHIFT = {"x_m": 0.001, "y_m": 0.0, "z_m": 0.0}
 TURN = {"rx_rad": 0.0, "ry_rad": 0.01, "rz_rad": 0.0}
@@ -42,3 +42,21 @@ def test_the_sentence_tells_what_the_causes_explain_and_what_the_smooth_model_ad
     said = sentence("unexplained", [_link(1.0)], errors, Gain(80.0, (75.0, 85.0)), named_mm=6.0)
     assert "it explains 40 % of the error, and 80 % of the error with a smooth model of what has no name" in said
     assert "10 mm → 6 mm → 2 mm" in said
+
+
+def test_a_slides_ripple_is_told_where_its_pitch_is_unsure():
+    numbers = {
+        "amplitude_m": Interval(2e-4, (1e-4, 3e-4)),
+        "phase_rad": Interval(0.0, (-9.0, 9.0)),
+        "cycles_per_m": Interval(10.0, (-90.0, 110.0)),
+    }
+    cause = Cause("joint_ripple", "lift", None, numbers, 1.0, 100.0, 80.0, 100.0, (), (), "")
+    said = sentence("explained", [cause], Errors(5.0, 5.0, 1.0, 1.0, 0.9), Gain(80.0, (75.0, 85.0)))
+    assert "joint lift has a ripple of ±0.2 mm, 10 times a metre" in said.lower()
+
+
+def test_tolerances_that_do_not_show_are_told_by_what_they_are_at_most():
+    size, none = Interval(0.3, (0.2, 0.4)), Interval(0.01, (0.0, 0.02))
+    assert made_to(Tolerances(size, none, none)) == (
+        "The arm is made to about 0.3 mm and 0.02° or better; its drives run true to ±0.02° or better."
+    )
