@@ -16,7 +16,8 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import cho_solve
+from scipy.linalg.lapack import dpotrf, dpotri, dpotrs
 
 from effects import Effect
 from interfaces.records import FloatArray
@@ -28,8 +29,8 @@ from .search import Key
 
 # What naming a cause costs beside what having looked for so many does [nats].
 _NAMED = 3.0
-# Rounds in which scales and noise are found, until their logarithms move by less than this.
-_ROUNDS, _STILL = 25, 0.02
+# Rounds in which scales and noise are found, from afar and beside a like set, until their logarithms move by less.
+_ROUNDS, _ROUNDS_NEAR, _STILL = 25, 8, 0.02
 # No step of a logarithm is larger.
 _FARTHEST = 1.0
 # No arm is made worse than the largest scale, nor better than the smallest; the noise is sought from this share of that
@@ -161,9 +162,10 @@ class Sets:
 
     def _without_one(self, here: Together) -> Together | None:
         """With one cause fewer, where that is more probable."""
-        ranked = sorted(here.chosen, key=lambda k: self._loss(here, k))
-        tried = [self.of(tuple(j for j in here.chosen if j != k), here) for k in ranked[:_TRIED]]
-        return _better(tried, here)
+        for k in sorted(here.chosen, key=lambda k: self._loss(here, k))[:_TRIED]:
+            if better := _better([self.of(tuple(j for j in here.chosen if j != k), here)], here):
+                return better
+        return None
 
     def _with_one_more(self, here: Together) -> Together | None:
         return _better([self.of((*here.chosen, k), here) for k in self._promising(here)[:_TRIED]], here)
@@ -220,9 +222,9 @@ class Sets:
         logs = np.log(near.scales if near else Scales())
         sigma = near.sigma if near else self._fit.noise.sigma
         members, spent = [group == g for g in range(3)], np.zeros(3)
-        for done in range(_ROUNDS):
+        for done in range(_ROUNDS if near is None else _ROUNDS_NEAR):
             factor, variances, amounts = self._solved(inner, toward, group, logs, sigma)
-            inverse = cho_solve(factor, np.eye(len(columns)))
+            inverse = dpotri(factor[0], lower=True)[0]
             told = 1.0 - np.diag(inverse) / variances
             # What a scale's tolerances say of it, and what workshops do (MacKay 1992, equation 4.10).
             spent = np.array([told[one].sum() for one in members])
@@ -281,8 +283,8 @@ class Sets:
         variances = np.where(group >= 0, np.exp(2.0 * logs)[group], 1.0)
         precision = inner / sigma**2
         precision[np.diag_indices_from(precision)] += 1.0 / variances + _ROUNDED_OFF * np.diag(precision)
-        factor = cho_factor(precision, lower=True)
-        return factor, variances, cho_solve(factor, toward / sigma**2)
+        factor = dpotrf(precision, lower=True, clean=False)[0]
+        return (factor, True), variances, dpotrs(factor, toward / sigma**2, lower=True)[0]
 
     def effect(self, here: Together, k: int) -> Effect:
         """One of the causes of a set, with its amounts."""
