@@ -16,8 +16,7 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_solve
-from scipy.linalg.lapack import dpotrf, dpotri, dpotrs
+from scipy.linalg import cho_solve, get_lapack_funcs
 
 from effects import Effect
 from interfaces.records import FloatArray
@@ -50,6 +49,8 @@ _MOST_MOVES = 60
 _MOST_REFITTED, _COMES_NEAR = 8, 15.0
 # What is wrong at one joint often is at others: zeros are set in one session. So much each costs but the first [nats].
 _ANOTHER = 2.0
+
+dpotrf, dpotri, dpotrs = get_lapack_funcs(("potrf", "potri", "potrs"), dtype=np.float64)
 
 
 @dataclass(frozen=True, eq=False)
