@@ -24,6 +24,8 @@ _TWICE = 2.0
 _PERIODIC = ("joint_eccentricity", "joint_ripple")
 # So many times as large as drives' errors usually are an error of a drive is one like others.
 _LIKE_OTHERS = 3.0
+# A row whose weight differs from one by less counts in full.
+_COUNTS_IN_FULL = 1e-9
 # Of the scales' logarithms before the data.
 SPREAD = 2.0
 
@@ -113,10 +115,25 @@ class Background:
         return 1.0 / np.square(self.tolerances)
 
     @cached_property
+    def white(self) -> FloatArray:
+        """`columns` (3 n, p), whitened."""
+        return (self._whitening @ self.columns).reshape(3 * len(self.columns), len(self.tolerances))
+
+    @cached_property
+    def _inner(self) -> FloatArray:
+        return self.white.T @ self.white
+
+    def inner(self, weights: FloatArray) -> FloatArray:
+        """Products (p, p) of the whitened columns with one another, rows weighted (n,)."""
+        partly = np.flatnonzero(1.0 - weights > _COUNTS_IN_FULL)
+        rows = self.white.reshape(len(weights), 3, -1)[partly] * np.sqrt(1.0 - weights[partly])[:, None, None]
+        flat = rows.reshape(3 * len(partly), len(self.tolerances))
+        return self._inner - flat.T @ flat
+
+    @cached_property
     def spectrum(self) -> FloatArray:
         """Squared lengths of what the background changes (p,), in units of the stated noise."""
-        flat = (self._whitening @ (self.columns * self.tolerances)).reshape(3 * len(self.columns), len(self.tolerances))
-        return np.maximum(np.linalg.eigvalsh(flat.T @ flat), 0.0)
+        return np.maximum(np.linalg.eigvalsh(self._inner * np.outer(self.tolerances, self.tolerances)), 0.0)
 
     def spent(self, sigma: float) -> float:
         """How many numbers of the data it takes for itself where the noise is `sigma` times the stated one."""

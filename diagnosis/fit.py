@@ -167,15 +167,30 @@ class Fit:
         """Square roots of the weights (n, 1)."""
         return np.sqrt(self.noise.weights)[:, None]
 
-    @cached_property
+    @property
     def run_columns(self) -> FloatArray:
         """Derivatives (n, 3, p) of what is measured by all amounts, and then by all tolerances [m]."""
         return np.concatenate([amount_columns(self.run, self.simulation.effects), self.background.columns], axis=2)
 
-    @cached_property
+    @property
     def columns(self) -> FloatArray:
         """`run_columns`, whitened and weighted."""
-        return self.weighted(self.run_columns)
+        return np.concatenate([self.effect_columns, self.tolerance_columns.reshape(*self.left.shape, -1)], axis=2)
+
+    @cached_property
+    def effect_columns(self) -> FloatArray:
+        """Derivatives (n, 3, p) of what is measured by the amounts of all effects, whitened and weighted."""
+        return self.weighted(amount_columns(self.run, self.simulation.effects))
+
+    @property
+    def tolerance_columns(self) -> FloatArray:
+        """Derivatives (3 n, p) of what is measured by all tolerances, whitened and weighted."""
+        return self.background.white * np.repeat(self.root_weights, 3, axis=0)
+
+    @property
+    def _amounts(self) -> int:
+        """How many amounts all effects have."""
+        return sum(len(effect.amounts) for effect in self.simulation.effects)
 
     def weighted(self, columns: FloatArray) -> FloatArray:
         """Columns (n, 3, p) [m] whitened and weighted."""
@@ -198,12 +213,13 @@ class Fit:
 
         To all that is tested the background is noise that is shared among the rows (Rasmussen and Williams 2006, 2.7).
         """
-        amounts = self.columns.shape[2] - len(self.tolerated)
-        flat = (self.columns[:, :, amounts:] * self.background.tolerances).reshape(self.left.size, len(self.tolerated))
-        values, vectors = np.linalg.eigh(flat.T @ flat)
+        tolerances = self.background.tolerances
+        inner = self.background.inner(self.noise.weights) * np.outer(tolerances, tolerances)
+        values, vectors = np.linalg.eigh(inner)
         there = values > 1e-9 * self.noise.sigma**2
         values, vectors = values[there], vectors[:, there]
-        return flat @ (vectors / np.sqrt(values)), values / (values + self.noise.sigma**2)
+        directions = self.tolerance_columns @ (tolerances[:, None] * vectors / np.sqrt(values))
+        return directions, values / (values + self.noise.sigma**2)
 
     def unshared(self, flat: FloatArray) -> FloatArray:
         """Weighted columns (3 n, k) in units in which the background and the noise together are white."""
@@ -226,8 +242,8 @@ class Fit:
     @cached_property
     def orthogonal(self) -> FloatArray:
         """An orthonormal basis (n, 3, r) of what the amounts of effects can change, `unshared`."""
-        n, p = len(self.left), self.columns.shape[2] - len(self.tolerated)
-        flat = self.unshared(self.columns[:, :, :p].reshape(3 * n, p))
+        n = len(self.left)
+        flat = self.unshared(self.effect_columns.reshape(3 * n, self._amounts))
         scales = np.linalg.norm(flat, axis=0)
         q, r = np.linalg.qr(flat / np.where(scales > 0.0, scales, 1.0))
         left, values, _ = np.linalg.svd(r)
@@ -276,19 +292,36 @@ class Fit:
         Returns:
             (p + s,), and [nats].
         """
-        flat = np.concatenate([self.columns, self.shape_columns], axis=2).reshape(self.left.size, -1)
         precision = np.append(self.precision, self._shape_precision) * self.noise.sigma**2
         own = [effect.values[effect.amounts] for effect in self.simulation.effects]
         values = np.concatenate([*own, self.tolerated])
-        normal = flat.T @ flat + np.diag(precision)
-        gradient = flat.T @ self.left.ravel()
+        normal, gradient = self._products()
+        normal[np.diag_indices_from(normal)] += precision
         gradient[: len(values)] -= precision[: len(values)] * values
         step = solved(normal, gradient)
         return step, 0.5 * float(step @ gradient) / self.noise.sigma**2
 
+    def _products(self) -> tuple[FloatArray, FloatArray]:
+        """Of all columns with one another (p + s, p + s), and with what is left (p + s,)."""
+        flat = np.concatenate([self.effect_columns, self.shape_columns], axis=2).reshape(self.left.size, -1)
+        roots = np.repeat(self.root_weights, 3, axis=0)
+        across = (flat * roots).T @ self.background.white
+        amounts, tolerances = self._amounts, len(self.tolerated)
+        places = np.r_[0:amounts, amounts + tolerances : flat.shape[1] + tolerances]
+        between = np.arange(amounts, amounts + tolerances)
+        normal = np.empty((flat.shape[1] + tolerances, flat.shape[1] + tolerances))
+        normal[np.ix_(places, places)] = flat.T @ flat
+        normal[np.ix_(places, between)] = across
+        normal[np.ix_(between, places)] = across.T
+        normal[np.ix_(between, between)] = self.background.inner(self.noise.weights)
+        gradient = np.empty(len(normal))
+        gradient[places] = flat.T @ self.left.ravel()
+        gradient[between] = self.background.white.T @ (self.left * self.root_weights).ravel()
+        return normal, gradient
+
     def places(self, cause: Effect) -> list[int]:
         """Where the amounts of a cause, then its periods and time constants are in `covariance`."""
-        amounts, shapes = 0, self.columns.shape[2]
+        amounts, shapes = 0, self._amounts + len(self.tolerated)
         for index, effect in enumerate(self.simulation.effects):
             own = effect.shapes if index >= self.nuisances else []
             if effect is cause:
@@ -299,7 +332,7 @@ class Fit:
     def moved(self, step: FloatArray) -> tuple[Simulation, FloatArray]:
         """The simulation with its numbers moved by a step (p + s,), and the tolerances."""
         effects, first = [], 0
-        shape = self.columns.shape[2]
+        shape = self._amounts + len(self.tolerated)
         for index, effect in enumerate(self.simulation.effects):
             values = effect.values.copy()
             values[effect.amounts] += step[first : first + len(effect.amounts)]
@@ -389,7 +422,7 @@ def improved(fit: Fit, least: float = -np.inf) -> Fit:
         least: where it cannot be expected to become as probable as this it is given up, as far as it has come [nats].
     """
     for done in range(_ROUNDS):
-        if not fit.columns.shape[2]:
+        if not fit.simulation.effects and not len(fit.tolerated):
             return fit
         step, promised = fit.step()
         hopeless = fit.log_likelihood + _SLACK * _rise(promised, fit) + _LITTLE < least

@@ -61,12 +61,13 @@ class Blocks:
 def held_out_errors(fit: Fit, blocks: Blocks) -> FloatArray:
     """Measured minus predicted (n, 3) [m], each row predicted without its own fold."""
     errors = fit.observations.x - fit.predicted
-    if not fit.columns.shape[2]:
+    if not len(fit.precision):
         return errors
     precision = np.diag(fit.precision) * fit.noise.sigma**2
+    run_columns, columns = fit.run_columns, fit.columns
     for fold in range(_FOLDS):
         own = blocks.fold == fold
-        errors[own] -= fit.run_columns[own] @ _solve(fit.columns[~own], fit.left[~own], precision)
+        errors[own] -= run_columns[own] @ _solve(columns[~own], fit.left[~own], precision)
     return errors
 
 

@@ -118,9 +118,9 @@ class Products:
     def _only_of(self, cause: Effect, flat: FloatArray) -> FloatArray:
         """The directions (r, f) of the basis (3 n, r) that no other effect can change."""
         places = set(self._fit.places(cause))
-        amounts = self._fit.columns.shape[2] - len(self._fit.tolerated)
-        others = [k for k in range(amounts) if k not in places]
-        seen = flat.T @ self._fit.unshared(self._fit.columns.reshape(len(flat), -1)[:, others])
+        columns = self._fit.effect_columns.reshape(len(flat), -1)
+        others = [k for k in range(columns.shape[1]) if k not in places]
+        seen = flat.T @ self._fit.unshared(columns[:, others])
         seen = seen / np.maximum(np.linalg.norm(seen, axis=0), 1e-300)
         left, values, _ = np.linalg.svd(seen)
         return left[:, int((values > _ROUNDED_OFF * values.max(initial=0.0)).sum()) :]

@@ -235,7 +235,7 @@ class _Amounts:
     ) -> None:
         self._fit, self._blocks = fit, blocks
         self._left_m = fit.observations.x - fit.predicted - (0.0 if bent is None else bent)
-        self._causes, self._lasting = fit.run_columns.shape[2], functions.shape[2]
+        self._causes, self._lasting = len(fit.precision), functions.shape[2]
         self._columns = np.concatenate([fit.run_columns, functions, timed], axis=2)
         weighted = fit.weighted(self._columns)
         self._flat = weighted.reshape(fit.left.size, -1)

@@ -39,8 +39,8 @@ _SMALLEST, _LARGEST, _QUIETEST = 1e-3, 10.0, 1e-3
 _TRIED = 4
 # Where all scales are smaller than this the arm may also be exactly as described, as a simulated one is.
 _MAY_BE_EXACT = 0.5
-# What of squares is rounding.
-_ROUNDED_OFF = 1e-13
+# What of squares is rounding; more of it where columns are one beyond that.
+_ROUNDED_OFF = (1e-13, 1e-10, 1e-7)
 # Tolerances without which the data are so much less probable show in them [nats].
 _SHOWN = 3.0
 # Sets of causes are changed so many times at most.
@@ -104,13 +104,13 @@ class Sets:
 
     def __init__(self, fit: Fit, candidates: Sequence[Candidate], doubt: float) -> None:
         self._fit = fit
-        amounts = fit.columns.shape[2] - len(fit.tolerated)
+        columns, amounts = fit.columns, fit.effect_columns.shape[2]
         causes = sum(len(effect.amounts) for effect in fit.causes)
         own = [effect.values[effect.amounts] for effect in fit.simulation.effects]
         now = np.concatenate([*own, fit.tolerated])
         rows = fit.left.size
-        self._target = fit.left.ravel() + fit.columns.reshape(rows, -1) @ now
-        parts = [fit.columns[:, :, : amounts - causes], fit.columns[:, :, amounts:]]
+        self._target = fit.left.ravel() + columns.reshape(rows, -1) @ now
+        parts = [columns[:, :, : amounts - causes], columns[:, :, amounts:]]
         self.effects = [candidate.effect for candidate in candidates]
         parts += [fit.weighted(fit.run.columns(effect)[:, :, effect.amounts]) for effect in self.effects]
         self._nuisances, self._tolerances = amounts - causes, len(fit.tolerated)
@@ -283,8 +283,13 @@ class Sets:
         """Factor of the precision, variances beforehand (p,) and amounts (p,), in units of `_units`."""
         variances = np.where(group >= 0, np.exp(2.0 * logs)[group], 1.0)
         precision = inner / sigma**2
-        precision[np.diag_indices_from(precision)] += 1.0 / variances + _ROUNDED_OFF * np.diag(precision)
-        factor = dpotrf(precision, lower=True, clean=False)[0]
+        squares = np.diag(precision).copy()
+        precision[np.diag_indices_from(precision)] += 1.0 / variances
+        for rounding in _ROUNDED_OFF:
+            precision[np.diag_indices_from(precision)] += rounding * squares
+            factor, failed = dpotrf(precision, lower=True, clean=False)
+            if not failed:
+                break
         return (factor, True), variances, dpotrs(factor, toward / sigma**2, lower=True)[0]
 
     def effect(self, here: Together, k: int) -> Effect:
