@@ -47,7 +47,7 @@ def conclusion(diagnosis: Diagnosis) -> DiagnosisFile:
     gain = Gain(percent, interval)
     return DiagnosisFile(
         verdict=verdict,
-        sentence=sentence(verdict, causes, rms, gain, _named_mm(diagnosis)),
+        sentence=sentence(verdict, causes, rms, gain, _named_mm(diagnosis), _tolerated_mm(diagnosis)),
         pairs=Pairs(len(diagnosis.markers), len(diagnosis.markers), diagnosis.outliers),
         rms_mm=rms,
         mean_mm=_mean_mm(diagnosis),
@@ -85,11 +85,17 @@ def _rms_mm(diagnosis: Diagnosis) -> Errors:
     kept = diagnosis.markers
     figures = {name: 1e3 * float(np.sqrt(np.square(d[kept]).mean())) for name, d in diagnosis.held_out.items()}
     traces = np.trace(diagnosis.noise[kept], axis1=1, axis2=2)
-    return Errors(**figures, noise_floor=1e3 * float(np.sqrt(traces.mean())))
+    # What is left of rows that were not fitted has all of the noise in it.
+    return Errors(**figures, noise_floor=min(1e3 * float(np.sqrt(traces.mean())), figures["extended"]))
 
 
 def _named_mm(diagnosis: Diagnosis) -> float | None:
     alone = diagnosis.with_names_alone
+    return None if alone is None else 1e3 * float(np.sqrt(np.square(alone[diagnosis.markers]).mean()))
+
+
+def _tolerated_mm(diagnosis: Diagnosis) -> float | None:
+    alone = diagnosis.with_tolerances_alone
     return None if alone is None else 1e3 * float(np.sqrt(np.square(alone[diagnosis.markers]).mean()))
 
 
@@ -101,7 +107,7 @@ def _mean_mm(diagnosis: Diagnosis) -> Errors:
     traces = np.trace(noise, axis1=1, axis2=2)
     shape = noise / np.maximum(traces, 1e-300)[:, None, None]
     lengths = np.sqrt(traces) * (1.0 - np.square(shape).sum(axis=(1, 2)) / 4.0)
-    return Errors(**figures, noise_floor=1e3 * float(lengths.mean()))
+    return Errors(**figures, noise_floor=min(1e3 * float(lengths.mean()), figures["extended"]))
 
 
 def _causes(diagnosis: Diagnosis) -> tuple[Cause, ...]:

@@ -46,6 +46,8 @@ MOST_DOUBTFUL = 0.25
 _HALF = 0.5
 # Tolerances of another size than that are taken up (in logarithms), so many times at most.
 _SAME_SCALE, _RESCALED = 0.25, 3
+# What is fitted takes at most this share of the noise for itself.
+_MOST_SPENT = 0.9
 # Of the instrument's noise, another size than that is taken up (in logarithms).
 _SAME_NOISE = 0.1
 
@@ -169,11 +171,22 @@ class Diagnosis:
     @cached_property
     def noise(self) -> FloatArray:
         """Covariances (n, 3, 3) [m²] of the noise, from what is left when all is explained that can be."""
-        fit = self.extended
+        fit, kept = self.extended, self.markers
         unstored = 0.0 if self.left.model is None else self.left.model.unstored
-        left = fit.observations.residuals(fit.predicted + unstored)[self.markers]
+        left = (fit.observations.x - fit.predicted - unstored)[kept]
         roots = np.linalg.inv(fit.observations.whitening)
-        return float(np.square(left).mean()) * roots @ np.swapaxes(roots, 1, 2)
+        stated = roots @ np.swapaxes(roots, 1, 2)
+        # In the shape of the stated noise, and as large as what is left is: what was fitted took its share of it.
+        spent = min(fit.background.spent(fit.noise.sigma) / max(left.size, 1), _MOST_SPENT)
+        size = np.square(left).sum() / np.trace(stated[kept], axis1=1, axis2=2).sum() / (1.0 - spent)
+        return float(size) * stated
+
+    @cached_property
+    def with_tolerances_alone(self) -> FloatArray | None:
+        """Distances (n,) [m] with the tolerances and no cause, on rows not fitted; None where no tolerance shows."""
+        if not self.causes or not self.tolerated.seen.any():
+            return None
+        return np.linalg.norm(held_out_errors(self.extended.with_causes([]), self.blocks), axis=1)
 
     @cached_property
     def alike(self) -> tuple[Alike, ...]:

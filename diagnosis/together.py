@@ -39,8 +39,8 @@ _SMALLEST, _LARGEST, _QUIETEST = 1e-3, 10.0, 1e-3
 _TRIED = 4
 # Where all scales are smaller than this the arm may also be exactly as described, as a simulated one is.
 _MAY_BE_EXACT = 0.5
-# What of squares is rounding; more of it where columns are one beyond that.
-_ROUNDED_OFF = (1e-13, 1e-10, 1e-7)
+# What of squares is rounding, and more of it where columns are one beyond that.
+_ROUNDED_OFF, _ONE_BEYOND_ROUNDING = 1e-13, 1e-8
 # Tolerances without which the data are so much less probable show in them [nats].
 _SHOWN = 3.0
 # Sets of causes are changed so many times at most.
@@ -283,13 +283,12 @@ class Sets:
         """Factor of the precision, variances beforehand (p,) and amounts (p,), in units of `_units`."""
         variances = np.where(group >= 0, np.exp(2.0 * logs)[group], 1.0)
         precision = inner / sigma**2
-        squares = np.diag(precision).copy()
-        precision[np.diag_indices_from(precision)] += 1.0 / variances
-        for rounding in _ROUNDED_OFF:
-            precision[np.diag_indices_from(precision)] += rounding * squares
-            factor, failed = dpotrf(precision, lower=True, clean=False)
-            if not failed:
-                break
+        squares, places = np.diag(precision).copy(), np.diag_indices_from(precision)
+        precision[places] += 1.0 / variances + _ROUNDED_OFF * squares
+        factor, failed = dpotrf(precision, lower=True, clean=False)
+        if failed:
+            precision[places] += _ONE_BEYOND_ROUNDING * squares
+            factor = dpotrf(precision, lower=True, clean=False)[0]
         return (factor, True), variances, dpotrs(factor, toward / sigma**2, lower=True)[0]
 
     def effect(self, here: Together, k: int) -> Effect:

@@ -17,8 +17,8 @@ from .rivals import Standing
 _DEG = 180.0 / np.pi
 # A scale error beyond which a joint turns the other way.
 _BACKWARDS = -1.0
-# Where tolerances explain so much of the error, they are what is said [%].
-_BY_TOLERANCES = 5.0
+# Where tolerances leave no more than this share of the error, it is said.
+_BY_TOLERANCES = 0.95
 # A size whose ends are farther apart than this factor is told by its larger end.
 _UNTOLD = 10.0
 # A sentence names so many causes; of more, the smallest are counted.
@@ -102,14 +102,22 @@ def finding(name: str, where: str | None, source: str | None, numbers: dict[str,
             return name if encoder is None else encoder.finding(at, numbers)
 
 
-def sentence(verdict: Verdict, causes: Sequence[Cause], rms: Errors, gain: Gain, named_mm: float | None = None) -> str:
+def sentence(
+    verdict: Verdict,
+    causes: Sequence[Cause],
+    rms: Errors,
+    gain: Gain,
+    named_mm: float | None = None,
+    tolerated_mm: float | None = None,
+) -> str:
     """The verdict in one sentence.
 
     Args:
         named_mm: RMS with the causes alone [mm], where there is a smooth model of what has no name beside them.
+        tolerated_mm: RMS with small errors everywhere and no cause [mm], where such errors show.
     """
     figures = f"{rms.aligned:.3g} mm → {rms.extended:.3g} mm on data not used in the fit"
-    if verdict == "nothing_found" and gain.held_out_percent >= _BY_TOLERANCES:
+    if verdict == "nothing_found" and rms.extended < _BY_TOLERANCES * rms.aligned:
         return f"No cause stands out: small errors everywhere explain {_share(gain)} ({figures})"
     if verdict == "nothing_found":
         return f"The simulation is right to within the noise: nothing found in {rms.aligned:.3g} mm of error"
@@ -137,6 +145,13 @@ def sentence(verdict: Verdict, causes: Sequence[Cause], rms: Errors, gain: Gain,
             f"{head}: {what} {_share(alone)}, and {_share(gain)} with a smooth model of what has no name "
             f"({figures}){ends[verdict]}"
         )
+    if tolerated_mm is not None and tolerated_mm < _BY_TOLERANCES * rms.aligned:
+        figures = (
+            f"{rms.aligned:.3g} mm → {tolerated_mm:.3g} mm by small errors everywhere → {rms.extended:.3g} mm on data "
+            "not used in the fit"
+        )
+        beside = replace(gain, held_out_percent=100.0 * (1.0 - rms.extended / max(tolerated_mm, 1e-12)))
+        return f"{head}: {what} {_share(beside)} that tolerances leave ({figures}){ends[verdict]}"
     if gain.held_out_percent <= 0.0:
         return f"{head}: this explains the pairs that were fitted and no others ({figures}){ends[verdict]}"
     return f"{head}: {what} {_share(gain)} ({figures}){ends[verdict]}"
