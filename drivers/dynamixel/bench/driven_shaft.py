@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from bisect import bisect_right
 from collections import deque
 from typing import TYPE_CHECKING
 
@@ -48,12 +47,12 @@ class DrivenShaft:
         self._moves.append((moved_s, before + angle))
 
     def _before(self, t: float) -> float:
-        moves = tuple(self._moves)
-        place = bisect_right(moves, t, key=lambda move: move[0])
-        if place == 0:
-            return moves[0][1]
-        t0, angle0 = moves[place - 1]
-        if place == len(moves) or not math.isfinite(t0):
-            return angle0
-        t1, angle1 = moves[place]
-        return angle0 + (angle1 - angle0) * (t - t0) / (t1 - t0)
+        after: tuple[float, float] | None = None
+        for before in reversed(self._moves):  # what is asked for is most often not long ago
+            if before[0] > t:
+                after = before
+                continue
+            if after is None or not math.isfinite(before[0]):
+                return before[1]
+            return before[1] + (after[1] - before[1]) * (t - before[0]) / (after[0] - before[0])
+        return self._moves[0][1]

@@ -93,6 +93,7 @@ class Servo:
         self._indirect = {
             data + k: pointer + 2 * k for pointer, data, count in indirect_blocks(model) for k in range(count)
         }
+        self._pointers = frozenset(self._indirect.values())
         self._first_indirect = min(self._indirect, default=len(self._memory))
         self._reset_memory()
         self["id"], self["baud"] = id, baud_value(model.layout, baud)
@@ -368,8 +369,8 @@ class Servo:
             return Error.ACCESS
         if address < layout.ram and self["torque"] and self.model.protocol == 2:
             return Error.ACCESS
-        for pointer in self._indirect.values():
-            if address <= pointer and pointer + 2 <= end:
+        for pointer in range(address, end - 1):
+            if pointer in self._pointers:
                 target = int.from_bytes(data[pointer - address : pointer - address + 2], "little")
                 if not layout.ram <= target < len(self._memory):
                     return Error.RANGE
