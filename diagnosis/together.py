@@ -327,6 +327,8 @@ def together(start: Fit, hypotheses: Sequence[Effect]) -> Fit:
 
 def tolerated(fit: Fit) -> Tolerated:
     """The scales of tolerances that have the most evidence beside the causes of a fit."""
+    if fit.background.scales is None:
+        return Tolerated(Scales(), np.full(3, SPREAD), np.zeros(3, dtype=np.bool_))
     causes = [Candidate(cause, 0.0, 1) for cause in fit.causes]
     sets = Sets(fit, causes, 0.0)
     here = sets.of(tuple(range(len(causes))))

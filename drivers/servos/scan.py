@@ -15,7 +15,7 @@ from .packets import Garbled, Packets, Status
 IDS = range(253)
 HOST_S = 5e-3  # the operating system's part of an answer's delay
 APART_S = 1e-3  # between two questions at least
-ATTEMPTS = 3
+ATTEMPTS = 5
 VOLT_PER_UNIT = 0.1
 OVERHEAD_OF_PING = 6  # bytes of the question in the older protocols
 
@@ -210,6 +210,8 @@ def _asked(bus: Bus, kind: Kind, id: int, register: Register) -> Exchange:
         exchange = bus.ask(request)
         if exchange.trouble is None:
             break
+        if exchange.trouble is not Trouble.TIMEOUT:  # what a busy machine has read late belongs to an earlier question
+            bus.settle()
     return exchange
 
 
