@@ -125,10 +125,7 @@ class Background:
 
     def inner(self, weights: FloatArray) -> FloatArray:
         """Products (p, p) of the whitened columns with one another, rows weighted (n,)."""
-        partly = np.flatnonzero(1.0 - weights > _COUNTS_IN_FULL)
-        rows = self.white.reshape(len(weights), 3, -1)[partly] * np.sqrt(1.0 - weights[partly])[:, None, None]
-        flat = rows.reshape(3 * len(partly), len(self.tolerances))
-        return self._inner - flat.T @ flat
+        return weighted_products(self.white, self._inner, weights)
 
     @cached_property
     def spectrum(self) -> FloatArray:
@@ -142,6 +139,17 @@ class Background:
     def volume(self, sigma: float) -> float:
         """What having so many possibilities costs [nats]."""
         return float(0.5 * np.log1p(self.spectrum / sigma**2).sum())
+
+
+def weighted_products(columns: FloatArray, inner: FloatArray, weights: FloatArray) -> FloatArray:
+    """Products (p, p) of columns (3 n, p) with one another, rows weighted (n,), from those without weights.
+
+    Only the rows that do not count in full are gone through.
+    """
+    partly = np.flatnonzero(1.0 - weights > _COUNTS_IN_FULL)
+    rows = columns.reshape(len(weights), 3, columns.shape[1])[partly] * np.sqrt(1.0 - weights[partly])[:, None, None]
+    flat = rows.reshape(3 * len(partly), columns.shape[1])
+    return inner - flat.T @ flat
 
 
 def background_effects(simulation: Simulation, q: FloatArray) -> tuple[Effect, ...]:

@@ -15,6 +15,7 @@ from scipy import stats
 
 from interfaces.records import FloatArray
 
+from .background import weighted_products
 from .families import Family, families
 from .fit import Fit, solved
 from .held_out import FEWEST_ROWS_A_BLOCK, Blocks, held_out_square, scores_p_value
@@ -30,8 +31,6 @@ _NUMBER = 2.0
 _TOLD, _LEFT = 1e-6, 1e-7
 # Whether blocks of time agree is asked of so many of a family's directions.
 _STRONGEST = 4
-# A row whose weight differs from one by less counts in full.
-_COUNTS_IN_FULL = 1e-9
 # Rounds in which families and causes are fitted in turn, until the likelihood rises by less than this [nats].
 _ROUNDS, _ENOUGH = 5, 0.1
 
@@ -80,10 +79,7 @@ class Way:
 
     def weighted_inner(self, weights: FloatArray) -> FloatArray:
         """The same with rows weighted (n,), by those that do not count in full."""
-        partly = np.flatnonzero(1.0 - weights > _COUNTS_IN_FULL)
-        rows = self.columns.reshape(len(weights), 3, -1)[partly] * np.sqrt(1.0 - weights[partly])[:, None, None]
-        flat = rows.reshape(3 * len(partly), self.columns.shape[1])
-        return self.inner - flat.T @ flat
+        return weighted_products(self.columns, self.inner, weights)
 
     @property
     def moves(self) -> int:
