@@ -78,7 +78,7 @@ goals: setup    ## What was to be reached beside what is; goes on where the last
 	@$(BIN)/python -m benchmarks.goals --budget-s $(GOALS_BUDGET_S)
 
 # All but rerun and pinocchio, which are large and serve one test each.
-EXTRAS := cameras sim plots export view fleet bench docs editable dev
+EXTRAS := cameras sim plots export bags view fleet bench docs editable dev
 LOCK := --quiet --python-version 3.11 --generate-hashes --no-emit-index-url --no-annotate --no-header
 lock:           ## Renew both lock files from pyproject.toml
 	@$(BIN)/python -m pip install --disable-pip-version-check --quiet uv
