@@ -61,8 +61,12 @@ class Checkout:
 
     def diagnose(self, case: DenseCase, out: Path, *options: str) -> Ran:
         """Run `bodyschema diagnose`."""
-        robot = str(case.recording.with_name("robot.toml"))
-        return self._run(DIAGNOSE, "diagnose", str(case.recording), "--robot", robot, "--out", str(out), *options)
+        return self.diagnose_file(case.recording, out, *options)
+
+    def diagnose_file(self, recording: Path, out: Path, *options: str) -> Ran:
+        """Run `bodyschema diagnose` on a recording, with the robot.toml beside it."""
+        robot = str(recording.with_name("robot.toml"))
+        return self._run(DIAGNOSE, "diagnose", str(recording), "--robot", robot, "--out", str(out), *options)
 
     def positions(self, extended: Path, recording: Path, out: Path) -> Ran:
         """Write the marker positions that the extended simulation predicts."""

@@ -1,0 +1,101 @@
+"""Diagnoses of public arms simulated by MuJoCo: causes hidden as hinges, springs and masses."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from .dense import Checkout
+from .mujoco_cases import HERE, outcome, placed_mm, run
+from .mujoco_hide import KINDS, STYLES, Truth, hide
+from .mujoco_urdf import MARKER, MODELS, Urdf
+from .mujoco_world import STEP_S, Hinge, World
+
+MODEL = MODELS[0]
+SHOULDER = MODEL.joints[1]
+PLAY = 0.01
+
+
+def driven(hinge: Hinge) -> tuple[np.ndarray, np.ndarray]:
+    """Angles of the shoulder's motor, and by how much its link is ahead of it, while it swings once to and fro."""
+    urdf = Urdf(MODEL, (0.0, 0.0, 0.0))
+    give = urdf.add_give(SHOULDER)
+    world = World(urdf.text_for_mujoco, MODEL.joints, {give: hinge}, MARKER)
+    rigid = World(Urdf(MODEL, (0.0, 0.0, 0.0)).text_for_mujoco, MODEL.joints, {}, MARKER)
+    t = np.arange(0.0, 8.0, STEP_S)
+    path = np.zeros((len(t), len(MODEL.joints)))
+    path[:, 1] = -0.6 * np.sin(2.0 * np.pi * t / 8.0)
+    rows = np.arange(100, len(t), 100)
+    _, turns = world.run(path, rows)
+    _, nominal = rigid.run(path, rows)
+    ahead = np.arctan2(turns[:, 0, 2], turns[:, 0, 0]) - np.arctan2(nominal[:, 0, 2], nominal[:, 0, 0])
+    return path[rows, 1], ahead
+
+
+def test_a_loaded_play_hangs_on_the_flank_that_gravity_chooses() -> None:
+    q, ahead = driven(Hinge(half_width=0.5 * PLAY))
+    leaning = np.abs(q) > 0.1  # else the arm stands upright
+    np.testing.assert_allclose(ahead[leaning], 0.5 * PLAY * np.sign(q[leaning]), atol=0.02 * PLAY)
+
+
+def test_a_play_held_by_friction_trails_its_motor() -> None:
+    q, ahead = driven(Hinge(half_width=0.5 * PLAY, bearing_friction=300.0, motor=SHOULDER))
+    moving = np.abs(np.gradient(q)) > 0.03
+    np.testing.assert_allclose(ahead[moving], -0.5 * PLAY * np.sign(np.gradient(q)[moving]), atol=0.05 * PLAY)
+
+
+def test_late_images_of_static_poses_change_nothing(tmp_path: Path) -> None:
+    case = hide(list(KINDS).index("late"), "static", tmp_path, rows=40)
+    assert case.truth == ()
+    assert placed_mm(case) < 1e3 * case.noise_m  # this seed has no tolerances
+
+
+def told(*causes: dict, verdict: str = "explained", depends_on: tuple[str, ...] = ()) -> dict:
+    return {"causes": causes, "verdict": verdict, "unexplained": {"depends_on": depends_on}}
+
+
+def cause(effect: str, where: str, *rivals: dict, share: float = 100.0, probability: float = 0.99) -> dict:
+    return {
+        "effect": effect,
+        "where": where,
+        "source": None,
+        "probability": probability,
+        "share_of_gain_percent": share,
+        "rivals": rivals,
+        "indistinguishable_from": (),
+    }
+
+
+PLAYS = (Truth("backlash@elbow", "play"),)
+BENDS = (Truth("", "bends", joints=("elbow", "wrist")),)
+
+
+@pytest.mark.parametrize(
+    ("truth", "answer", "expected"),
+    [
+        (PLAYS, told(cause("backlash", "elbow")), "right"),
+        (PLAYS, told(cause("settling", "elbow")), "wrong"),
+        (PLAYS, told(cause("settling", "elbow", cause("backlash", "elbow"), probability=0.6)), "honest"),
+        (PLAYS, told(verdict="unexplained", depends_on=("elbow",)), "honest"),
+        (PLAYS, told(verdict="nothing_found"), "vague"),
+        (BENDS, told(verdict="unexplained", depends_on=("wrist",)), "right"),
+        (BENDS, told(cause("link_geometry", "elbow")), "wrong"),
+    ],
+)
+def test_outcome_follows_from_truth_and_answer(truth, answer, expected) -> None:
+    assert outcome(truth, (), answer)[0] == expected
+
+
+def test_a_simulated_play_is_named(tmp_path: Path) -> None:
+    record = run(list(KINDS).index("play_by_friction"), "walk", tmp_path, Checkout(HERE.parents[1], 120.0), rows=150)
+    assert record.outcome == "right", record
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("style", STYLES)
+@pytest.mark.parametrize("seed", range(len(KINDS)))
+def test_no_simulated_cause_is_named_wrongly_for_sure(seed, style, tmp_path: Path) -> None:
+    record = run(seed, style, tmp_path, Checkout(HERE.parents[1], 300.0))
+    assert record.outcome not in ("wrong", "crashed"), record
