@@ -61,9 +61,9 @@ def without_consequence(simulation: Simulation, like: Recording | None = None) -
     for name in dict.fromkeys(effect.name for effect in simulation.effects):
         if KINDS[name].needs_times and like is not None and like.t is None:
             said.append(f"{name} changes nothing: the recording has no column t")
-        if name == "joint_compliance" and not simulation.bears_weight:
+        if KINDS[name].needs_weight and not simulation.bears_weight:
             said.append(f'{name} changes nothing: with hold = "torque_free" the guiding hand bears the weight')
-        elif name == "joint_compliance" and not simulation.gravity.known:
+        elif KINDS[name].needs_weight and not simulation.gravity.known:
             said.append(f"{name} changes nothing: the URDF states no masses")
     return said
 

@@ -9,6 +9,8 @@ from .fit import Fit
 
 # A joint that has made up for all but so much of what it lacked is at rest.
 _AT_REST = 0.05
+# A joint that has gone so many lengths of its hysteresis is strained as its last direction has it.
+_STRAINED = 3.0
 
 
 def before_contact(fit: Fit) -> NDArray[np.bool_]:
@@ -16,11 +18,12 @@ def before_contact(fit: Fit) -> NDArray[np.bool_]:
     motion = fit.observations.motion
     rows = np.zeros(len(motion), dtype=np.bool_)
     for effect in fit.simulation.effects:
-        if effect.name != "backlash":
+        if effect.name not in ("backlash", "hysteresis"):
             continue
+        reach = effect.values[0] if effect.name == "backlash" else _STRAINED * effect.values[1]
         q = motion.q[:, fit.simulation.place(effect).joint]
         for first, end in motion.runs:
-            crossed = np.maximum.accumulate(q[first:end]) - np.minimum.accumulate(q[first:end]) >= effect.values[0]
+            crossed = np.maximum.accumulate(q[first:end]) - np.minimum.accumulate(q[first:end]) >= reach
             rows[first:end] |= ~crossed
     return rows
 

@@ -25,7 +25,7 @@ _NUMBER = 3.0
 # What is left of large causes because their form is not quite theirs is nothing without a name: a share of them all,
 # and a larger one of those that depend on the way between two readings, which nobody has seen.
 _OF_THE_CAUSES, _OF_THE_WAY = 0.05, 0.12
-_BY_THE_WAY = ("backlash", "settling", "camera_latency")
+_BY_THE_WAY = ("backlash", "settling", "hysteresis", "camera_latency")
 # Less than this share of all is a rest.
 _REST = 0.25
 # Causes that the same ways without a name can be, as probably to within this, are no causes [nats].

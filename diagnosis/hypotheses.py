@@ -86,7 +86,7 @@ class _Limits:
     def excludes(self, kind: Kind) -> bool:
         """Whether no effect of this kind can be tested, or all of it is free anyway."""
         robot = self._simulation.robot
-        if kind.name == "joint_compliance":
+        if kind.needs_weight:
             return robot.robot.hold == "torque_free" or not self._simulation.gravity.known
         if kind.name == "camera_pose":
             return not robot.camera.pose_known

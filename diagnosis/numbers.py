@@ -10,7 +10,11 @@ from .result import Cause, Indistinguishable, Interval, Rejected
 _DEG = math.degrees(1.0)
 # By the end of a number's name: its factor and unit. The first that fits is taken.
 _UNITS: tuple[tuple[str, float, str], ...] = (
+    ("_kgm", 1.0, " kg·m"),
+    ("_kg", 1.0, " kg"),
     ("_rad_per_Nm", _DEG, "°/N·m"),
+    ("hold_Nm", 1.0, " N·m"),
+    ("hold_N", 1.0, " N"),
     ("_m_per_N", 1e3, " mm/N"),
     ("_rad", _DEG, "°"),
     ("_m", 1e3, " mm"),
@@ -28,6 +32,10 @@ _LABELS = {
     "cycles_per_m": "cycles a metre",
     "t0": "at",
     "width": "play",
+    "lag": "lags by",
+    "length": "turns round over",
+    "hold": "held by friction up to",
+    "mass": "mass",
     "fraction": "missing of a move",
     "rx": "turn about x",
     "ry": "turn about y",
@@ -45,7 +53,7 @@ _LEAST_DIGITS, _MOST_DIGITS = 0, 6
 # Half widths from which on a recording tells nothing of a length [m] or an angle [rad].
 _UNTOLD = (("_rad", 0.5), ("_m", 0.1))
 # Numbers that say when and how, not how much.
-_SAYS_HOW = ("t0", "cycles", "phase", "time_constant")
+_SAYS_HOW = ("t0", "cycles", "phase", "time_constant", "length", "hold")
 # An interval whose halves differ by more than this share is written with both its ends.
 _LOPSIDED = 0.3
 
@@ -113,7 +121,7 @@ def number(name: str, interval: Interval, *, timed: bool = True) -> Number:
 def _label(name: str) -> str:
     if name in _LABELS:
         return _LABELS[name]
-    for end in ("_rad_per_Nm", "_m_per_N", "_rad", "_m", "_s"):
+    for end in ("_rad_per_Nm", "_m_per_N", "_kgm", "_kg", "_Nm", "_N", "_m_per_N", "_rad", "_m", "_s"):
         if name.endswith(end):
             base = name.removesuffix(end)
             return _LABELS.get(base, base)

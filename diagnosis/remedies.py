@@ -137,6 +137,28 @@ class _Workshop:
             "spring that stays belongs into the simulation, as in extended.toml."
         )
 
+    def hysteresis(self, cause: Cause, numbers: Mapping[str, float]) -> str:
+        way = self._turn(cause, numbers, "length").replace("+", "")
+        return (
+            f"Look for friction behind the drive of {cause.where}: bearing, seal, cable, brake. Until then come to "
+            f"each pose from the same side, by several times {way}."
+        )
+
+    def gravity_backlash(self, cause: Cause, numbers: Mapping[str, float]) -> str:
+        play = self._turn(cause, numbers, "width").replace("+", "")
+        return (
+            f"Tighten or preload the gear of {cause.where}, or load it by a spring so that it stays on one flank. "
+            f"Poses in which the weight pulls the other way differ by {play}, from whichever side they are reached."
+        )
+
+    def payload(self, _: Cause, numbers: Mapping[str, float]) -> str:
+        mass = numbers["mass_kg"]
+        centre = [numbers[f"{axis}_kgm"] / max(mass, 1e-9) for axis in "xyz"]
+        return (
+            f"Weigh what the hand carries and give the link {self.robot.robot.marker_link} of the URDF an inertial "
+            f"with its mass: {mass:.2g} kg here, with its centre at {_list(np.round(centre, 3))} m. Or take it off."
+        )
+
     def link(self, cause: Cause, _: Mapping[str, float]) -> str:
         origin = self.robot.tree.joint(cause.where or "").T_parent_joint @ self._pose(cause)
         return f"In the URDF, give joint {cause.where} the {_origin(origin)}{self._in_urdf()}."
@@ -249,7 +271,10 @@ _BY_EFFECT: dict[str, Callable[[_Workshop, Cause, Mapping[str, float]], str]] = 
     "encoder_jump": _Workshop.jump,
     "backlash": _Workshop.backlash,
     "settling": _Workshop.settling,
+    "hysteresis": _Workshop.hysteresis,
     "joint_compliance": _Workshop.compliance,
+    "gravity_backlash": _Workshop.gravity_backlash,
+    "payload": _Workshop.payload,
     "link_geometry": _Workshop.link,
     "tool_offset": _Workshop.tool,
     "tool_slip": _Workshop.slip,

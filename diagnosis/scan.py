@@ -12,14 +12,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from effects import Effect
+from effects.flank import flanks
 from effects.moments import settled
 from interfaces.records import FloatArray
 
 from .fit import LARGEST, SHORTEST_DRIFT, Fit
 from .products import Products, System
 
-# The finest ripple that is looked for.
-_MOST_CYCLES = 100
+# Ripples of up to so many cycles a turn are looked for at every whole number, and finer ones, of a strain wave twice a
+# turn of the fastest common gear of 120, as coarsely as they can be told apart.
+_MOST_CYCLES, _FINEST = 100, 240
 # Half way between two shapes that are tried one explains so many times less at most: waves one over sinc² of a half.
 _BETWEEN = 2.5
 # Widths of a play that are tried [rad, m], and time constants as shares of the recording's time.
@@ -27,6 +29,9 @@ _WIDTHS = np.geomspace(2e-4, 0.15, 14)
 _TIME_CONSTANTS = np.geomspace(SHORTEST_DRIFT, 4.0, 24)
 # How much of what was missing is still missing at the next reading.
 _MEMORIES = np.linspace(0.0, 0.9, 19)
+# Lengths of a hysteresis [rad, m], and frictions that keep a loaded play on its flank, as shares of the largest load.
+_LENGTHS = np.geomspace(5e-4, 0.3, 14)
+_HOLDS = (0.0, 0.02, 0.05, 0.1, 0.2, 0.35)
 # As so many independent shapes those of a smooth family count.
 _COARSE = 5
 # Rows that have to lie on either side of a moment.
@@ -35,6 +40,10 @@ _BESIDE = 8
 _AT_95 = 3.841
 # A column of which so little is left beside what is fitted tells nothing.
 _TOLD_APART = 1e-7
+
+
+# Which choice is the best, gains (m,), its amounts (k,) and degrees of freedom.
+_Tried = tuple[int, FloatArray, FloatArray, int]
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,6 +120,10 @@ class Scan:
                 return self._finely(effect, span * _TIME_CONSTANTS, least)
             case "settling":
                 return self._finely(effect, _MEMORIES, least)
+            case "hysteresis":
+                return self._finely(effect, _LENGTHS, least)
+            case "gravity_backlash":
+                return self._hung(effect)
             case _:
                 gains, amounts, dofs = self._solved(self._linear(effect), effect)
                 if not dofs[0]:
@@ -206,6 +219,23 @@ class Scan:
             return None
         return Candidate(effect.with_values(amounts[best]), float(gains[best]), int(dofs[best]), len(_WIDTHS))
 
+    def _hung(self, effect: Effect) -> Candidate | None:
+        """A play under weight, over frictions; nothing where the weight never changes sides."""
+        run = self._fit.run
+        k = self._fit.simulation.place(effect).joint
+        torque = run.torques[:, k]
+        holds = np.abs(torque).max() * np.array(_HOLDS)
+        sides = np.stack([flanks(torque, hold) for hold in holds], axis=1)
+        changing = np.ptp(sides, axis=0) > 0.0
+        if not changing.any() or not run.simulation.bears_weight:
+            return None
+        holds, sides = holds[changing], sides[:, changing]
+        best, gains, amounts, dof = self._best(self._products.port(k).scaled(0.5 * sides), effect)
+        if not dof:
+            return None
+        values = np.append(amounts, holds[best])
+        return Candidate(effect.with_values(values), float(gains[best]), dof, len(holds))
+
     def _ripple(self, effect: Effect, least: float) -> Candidate | None:
         """Over all whole numbers of cycles a turn, then beside the best; of a slide, over those its path can tell."""
         place = self._fit.simulation.place(effect)
@@ -214,7 +244,8 @@ class Scan:
         coarse: FloatArray = np.asarray(first + step * np.arange(_MOST_CYCLES - 1), dtype=np.float64)
         # A peak is as wide as what turns the phase by one over the range.
         width = 1.0 / span if place.prismatic else 2.0 * np.pi / span
-        tried, cycles = self._best(self._products.kept(effect, lambda: self._rippled(effect, coarse)), effect), coarse
+        bands = [coarse] if place.prismatic else [coarse, np.arange(_MOST_CYCLES + 1.0, _FINEST, max(width, step))]
+        tried, cycles = max(((self._rippled_best(effect, band), band) for band in bands), key=_most_gain)
         if width < step or self._times(float(tried[1][tried[0]]), _BETWEEN) >= least:
             fine: FloatArray = coarse[tried[0]] + 0.5 * max(width, step) * np.linspace(-1.0, 1.0, 61)
             cycles = np.asarray(fine[fine > 0.5 * first], dtype=np.float64)
@@ -223,12 +254,17 @@ class Scan:
         if not dof:
             return None
         values = np.array([*amounts, cycles[best]])
-        return Candidate(effect.with_values(values), float(gains[best]), dof, 2 * len(coarse))
+        return Candidate(effect.with_values(values), float(gains[best]), dof, 2 * sum(map(len, bands)))
 
     def _times(self, gain: float, factor: float) -> float:
         """The gain of what explains so many times the squares of what has this gain."""
         share = -np.expm1(-gain / (3.0 * self._products.rows))
         return float(-3.0 * self._products.rows * np.log1p(-min(factor * share, 0.999999)))
+
+    def _rippled_best(self, effect: Effect, cycles: FloatArray) -> _Tried:
+        """The best of a band of numbers of cycles, which is tried in the place of each cause."""
+        begun = effect.with_values(np.append(effect.values[:-1], cycles[0]))
+        return self._best(self._products.kept(begun, lambda: self._rippled(effect, cycles)), effect)
 
     def _rippled(self, effect: Effect, cycles: FloatArray) -> System:
         """For each of equally spaced numbers of cycles (m,)."""
@@ -287,7 +323,7 @@ class Scan:
         dofs = self._dofs(inner, raw, effect)
         return np.where(dofs > 0, gains, 0.0), amounts, dofs
 
-    def _best(self, system: System, effect: Effect) -> tuple[int, FloatArray, FloatArray, int]:
+    def _best(self, system: System, effect: Effect) -> _Tried:
         """As `_solved`, of many systems: which is the best, gains (m,), its amounts (k,) and degrees of freedom."""
         inner, gradient, raw = system.at(self._state)
         gains, amounts = self._gains(inner, gradient, effect)
@@ -342,3 +378,8 @@ def _with_amounts(effect: Effect, amounts: FloatArray) -> Effect:
     values = effect.values.copy()
     values[effect.amounts] = amounts
     return effect.with_values(values)
+
+
+def _most_gain(tried: tuple[_Tried, FloatArray]) -> float:
+    (best, gains, _, _), _ = tried
+    return float(gains[best])

@@ -33,7 +33,7 @@ def instruments(fit: Fit, effect: Effect) -> FloatArray:
     if not remembers(effect):
         return fit.weighted(fit.run.columns(effect)[:, :, effect.amounts])
     motion, joint = fit.observations.motion, fit.simulation.robot.joints.index(str(effect.where))
-    between = _between(fit, motion, joint, _PLAY_FAR if effect.name == "backlash" else _FAR)
+    between = _between(fit, motion, joint, _PLAY_FAR if effect.name in ("backlash", "hysteresis") else _FAR)
     columns = np.empty((len(motion), 3, len(effect.amounts)))
     # Of each two rows one is replaced at a time, so that its neighbours are as they were read.
     for every_other in (slice(0, None, 2), slice(1, None, 2)):

@@ -71,6 +71,13 @@ def finding(name: str, where: str | None, source: str | None, numbers: dict[str,
             return f"{at} has {turned('width').lstrip('+')} of play"
         case "settling":
             return f"{at} was read before it came to rest: {100 * numbers['fraction']:.2g} % of each move was missing"
+        case "hysteresis":
+            lag, length = turned("lag").lstrip("+"), turned("length").lstrip("+")
+            return f"{at} lags by {lag} behind its reading, against the way it went, and turns round over {length}"
+        case "gravity_backlash":
+            return f"{at} has {turned('width').lstrip('+')} of play and hangs on the flank to which the weight pulls it"
+        case "payload":
+            return f"the hand carries {numbers['mass_kg']:.2g} kg that the URDF does not have"
         case "joint_compliance":
             if "compliance_rad_per_Nm" in numbers:
                 return f"{at} gives by {numbers['compliance_rad_per_Nm'] * _DEG:.2g}°/N·m under the arm's weight"

@@ -17,7 +17,7 @@ from .kinds import KINDS, Kind
 from .parameter import Parameter
 
 # A play, a spring or a rate that is negative is none.
-_POSITIVE = frozenset({"cycles_per_turn", "cycles_per_m", "time_constant_s"})
+_POSITIVE = frozenset({"cycles_per_turn", "cycles_per_m", "time_constant_s", "length_rad", "length_m"})
 
 # Name, where, source, and which of several of one kind at one place.
 Identity = tuple[str, str | None, str | None, int]

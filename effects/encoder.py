@@ -18,6 +18,7 @@ from .parameter import Parameter
 # Of the numerical derivative of a play by its width [rad, m].
 _WIDTH_STEP = 1e-6
 _PLAYS_KEPT, _MEMORIES_KEPT = 256, 256
+_LAGS_KEPT = 256
 # What is left of a move when it is forgotten.
 _FORGOTTEN = 1e-17
 # A magnet farther off its axis, as a share of its radius, is none that could be read.
@@ -206,6 +207,75 @@ class Settling(EncoderEffect):
         return np.stack([-missing, np.zeros_like(missing)], axis=1)
 
 
+class Hysteresis(EncoderEffect):
+    """Friction behind an elastic drive: the joint lags behind the reading, against the way it went (Dahl 1968).
+
+    true angle = reading - lag · z, where z moves towards the direction of motion over `length`:
+    dz = (sign(dq) - z) · |dq| / length.
+    """
+
+    name = "hysteresis"
+    remembers = True
+
+    def parameters(self, prismatic: bool) -> tuple[Parameter, ...]:
+        if prismatic:
+            return (Parameter("lag_m", 0.001, never_negative=True), Parameter("length_m", 0.005, None, smooth=True))
+        return (Parameter("lag_rad", 0.005, never_negative=True), Parameter("length_rad", 0.03, None, smooth=True))
+
+    def columns(self, motion: Motion, place: Place, values: FloatArray) -> FloatArray:
+        strained = _strained(motion, place.joint, float(values[1]))
+        return np.stack([-strained, np.zeros_like(strained)], axis=1)
+
+
+class Bristle:
+    """How far friction is strained, from -1 to 1, driven reading by reading.
+
+    Args:
+        length: way [rad, m] over which it turns round.
+    """
+
+    def __init__(self, length: float) -> None:
+        self._length = length
+        self._last: float | None = None
+        self.strained = 0.0
+
+    def begin(self, reading: float, leading: float) -> None:
+        """The reading stands at `reading` and has come in the direction of `leading`; 0: from nowhere."""
+        self._last, self.strained = reading, float(np.sign(leading))
+
+    def follow(self, reading: float) -> float:
+        """How far it is strained at the next reading."""
+        move = 0.0 if self._last is None else reading - self._last
+        kept = float(np.exp(-abs(move) / self._length))
+        self._last, self.strained = reading, float(np.sign(move)) * (1.0 - kept) + kept * self.strained
+        return self.strained
+
+
+@lru_cache(maxsize=_LAGS_KEPT)
+def _strained(motion: Motion, joint: int, length: float) -> FloatArray:
+    """How far a joint's friction is strained (n,), from -1 to 1; it begins in the direction of the first move.
+
+    Between two runs it is driven straight, as a play is.
+    """
+    moves = np.diff(motion.q[:, joint], prepend=motion.q[0, joint])
+    leading = moves[np.flatnonzero(moves)[:1]]
+    kept = np.exp(-np.abs(moves) / length)
+    strained = np.sign(moves) * (1.0 - kept)
+    strained[0], kept[0] = float(np.sign(leading[0])) if len(leading) else 0.0, 0.0
+    return frozen_array(_carried_on(strained, kept))
+
+
+def _carried_on(added: FloatArray, kept: FloatArray) -> FloatArray:
+    """Solve e_i = added_i + kept_i e_{i-1} for all rows (n,); nothing is kept of what is before the first."""
+    total, kept, back = added.copy(), kept.copy(), 1
+    # Of so many rows back, then of twice as many: `kept` is what is left of a row's own so far before.
+    while back < len(total) and np.abs(kept).max() > _FORGOTTEN:
+        total[back:] += kept[back:] * total[:-back]
+        kept[back:] *= kept[:-back]
+        back *= 2
+    return total
+
+
 @lru_cache(maxsize=_MEMORIES_KEPT)
 def _missing(motion: Motion, joint: int, memory: float) -> FloatArray:
     """What is missing of the last move and of what was before (n,); a search asks for the same ones again and again."""
@@ -214,13 +284,7 @@ def _missing(motion: Motion, joint: int, memory: float) -> FloatArray:
         return moves
     kept = np.sign(memory) * abs(memory) ** motion.pace
     kept[motion.begins] = 0.0
-    missing, back = moves.copy(), 1
-    # Of so many rows back, then of twice as many: `kept` is what is left of a row's own so far before.
-    while back < len(missing) and np.abs(kept).max() > _FORGOTTEN:
-        missing[back:] += kept[back:] * missing[:-back]
-        kept[back:] *= kept[:-back]
-        back *= 2
-    return frozen_array(missing)
+    return frozen_array(_carried_on(moves, kept))
 
 
 class Play:
@@ -280,4 +344,5 @@ ENCODER_EFFECTS: tuple[EncoderEffect, ...] = (
     EncoderJump(),
     Backlash(),
     Settling(),
+    Hysteresis(),
 )

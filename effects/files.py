@@ -49,6 +49,8 @@ MOST_MODEL_BYTES = 2**28
 _HEAD = ("effect", "where", "source")
 # By the end of a number's name: what no sane one exceeds, the unit that it then looks like, and what to do.
 _UNITS: tuple[tuple[str, float, str, str], ...] = (
+    ("_kgm", 100.0, "g·m", "Give kg·m"),
+    ("_kg", 500.0, "grams", "Give kilograms"),
     ("_rad_per_Nm", 1.0, "degrees or N·mm", "Give radians for each newton metre"),
     ("_m_per_N", 0.1, "millimetres", "Give metres for each newton"),
     ("_rad", math.pi, "degrees", "Give radians: 1° is 0.01745"),

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from interfaces.records import FloatArray, frozen_array
 from interfaces.robot import RobotDescription
-from interfaces.urdf import REVOLUTE, UrdfJoint, UrdfTree, standing
+from interfaces.urdf import REVOLUTE, PointMass, UrdfJoint, UrdfTree, standing
 from kbmaps.rotations import cross_matrix
 
 GRAVITY_M_S2 = 9.80665  # down the root link's z axis, as simulators load a URDF
@@ -37,12 +37,28 @@ class GravityLoad:
     """Gravity's torques about the joints of a robot, whatever holds them.
 
     Joints that are not read stand where robot.toml holds them. The tool's mass is not known and not counted.
+
+    Args:
+        masses: of links; those of the URDF by default.
     """
 
-    def __init__(self, robot: RobotDescription) -> None:
+    def __init__(self, robot: RobotDescription, masses: Mapping[str, PointMass] | None = None) -> None:
         self._robot = robot
-        self._bodies = _bodies(robot)
+        self._bodies = _bodies(robot, robot.tree.masses if masses is None else masses)
         self._outwards = [k for k in self._order() if k is not None]
+
+    @classmethod
+    def of_payload(cls, robot: RobotDescription, mass_kg: float, moment: FloatArray) -> GravityLoad:
+        """Return the load of a mass at the marker's link alone.
+
+        Args:
+            moment: mass times its place in the link's frame [kg·m], shape (3,).
+        """
+        load = cls(robot, {})
+        carrier, T = _carried(robot.tree, robot.robot.marker_link, robot.joints, robot.robot.held_at)
+        body = load._bodies[carrier]
+        body.mass_kg, body.moment = mass_kg, mass_kg * T[:3, 3] + T[:3, :3] @ moment
+        return load
 
     @property
     def known(self) -> bool:
@@ -105,14 +121,14 @@ class GravityLoad:
         return order
 
 
-def _bodies(robot: RobotDescription) -> dict[int | None, _Body]:
+def _bodies(robot: RobotDescription, masses: Mapping[str, PointMass]) -> dict[int | None, _Body]:
     tree, held_at = robot.tree, robot.robot.held_at
     bodies: dict[int | None, _Body] = {None: _Body(None, None, np.eye(4))}
     for name in robot.joints:
         joint = tree.joints[name]
         carrier, T = _carried(tree, joint.parent, robot.joints, held_at)
         bodies[robot.joints.index(name)] = _Body(joint, carrier, frozen_array(T @ joint.T_parent_joint))
-    for link, mass in tree.masses.items():
+    for link, mass in masses.items():
         carrier, T = _carried(tree, link, robot.joints, held_at)
         body = bodies[carrier]
         body.mass_kg += mass.mass_kg

@@ -27,6 +27,7 @@ class Kind:
         begins: whether it begins at a moment, its parameter `t0`.
         needs_times: whether it needs times, not only an order.
         needs_stereo: whether it needs the stereo calibration.
+        needs_weight: whether it needs joints that bear the arm's weight, and its masses.
     """
 
     name: str
@@ -38,6 +39,7 @@ class Kind:
     begins: bool = False
     needs_times: bool = False
     needs_stereo: bool = False
+    needs_weight: bool = False
 
     def parameters(self, prismatic: bool) -> tuple[Parameter, ...]:
         """Its numbers at a joint that turns, or slides."""
@@ -58,6 +60,7 @@ T0 = Parameter("t0", 0.0, None)
 TIME_CONSTANT = Parameter("time_constant_s", 600.0, None, smooth=True)
 _SHIFT = tuple(Parameter(f"{axis}_m", 0.01) for axis in "xyz")
 _TURN = tuple(Parameter(f"r{axis}_rad", 0.02) for axis in "xyz")
+_PAYLOAD = (Parameter("mass_kg", 1.0, never_negative=True), *(Parameter(f"{axis}_kgm", 0.05) for axis in "xyz"))
 _LINK = (*(Parameter(f"{axis}_m", 0.005) for axis in "xyz"), *_TURN)
 
 
@@ -101,7 +104,17 @@ KINDS: dict[str, Kind] = {
             True,
             (Parameter("compliance_rad_per_Nm", 0.001, never_negative=True),),
             (Parameter("compliance_m_per_N", 1e-5, never_negative=True),),
+            needs_weight=True,
         ),
+        Kind(
+            "gravity_backlash",
+            "structure",
+            True,
+            (Parameter("width_rad", 0.01, never_negative=True), Parameter("hold_Nm", 0.0, None)),
+            (Parameter("width_m", 0.002, never_negative=True), Parameter("hold_N", 0.0, None)),
+            needs_weight=True,
+        ),
+        Kind("payload", "structure", False, _PAYLOAD, _PAYLOAD, needs_weight=True),
         Kind("link_geometry", "structure", True, _LINK, _LINK),
         _free("tool_offset", "tool", *_SHIFT),
         _free("tool_slip", "tool", *_SHIFT, T0),

@@ -9,7 +9,7 @@ import numpy as np
 from interfaces.records import FloatArray
 
 from .effect import Effect
-from .encoder import Backlash, Place, Play, Settling
+from .encoder import Backlash, Bristle, Hysteresis, Place, Play, Settling
 from .motion import Motion
 from .simulation import Simulation
 
@@ -27,10 +27,12 @@ class LiveEncoders:
         encoder = [effect for effect in simulation.all_effects if effect.kind.encoder is not None]
         plays = [effect for effect in encoder if isinstance(effect.kind.encoder, Backlash)]
         settling = [effect for effect in encoder if isinstance(effect.kind.encoder, Settling)]
+        lags = [effect for effect in encoder if isinstance(effect.kind.encoder, Hysteresis)]
         self._place = simulation.place
         self._plays = [_LivePlay(simulation.place(effect), float(effect.values[0])) for effect in plays]
         self._settling = [_LiveSettling(simulation.place(effect), effect, row_readings) for effect in settling]
-        self._others = [effect for effect in encoder if effect not in plays and effect not in settling]
+        self._lags = [_LiveHysteresis(simulation.place(effect), effect) for effect in lags]
+        self._others = [effect for effect in encoder if effect not in (*plays, *settling, *lags)]
 
     def true_angles(self, q: FloatArray, t: float, move: FloatArray) -> FloatArray:
         """True joint angles (d,) [rad, m] at the readings q (d,) and the time t [s].
@@ -46,6 +48,8 @@ class LiveEncoders:
             angles[settling.joint] -= settling.missing(float(move[settling.joint]))
         for play in self._plays:
             angles[play.joint] += play.lag(float(q[play.joint]))
+        for lag in self._lags:
+            angles[lag.joint] -= lag.behind(float(q[lag.joint]))
         return angles
 
     def _correction(self, effect: Effect, motion: Motion) -> float:
@@ -85,3 +89,23 @@ class _LivePlay:
             self._moved = True
             self._play.begin(self._first, reading - self._first)
         return self._sign * (self._play.follow(reading) - reading)
+
+
+class _LiveHysteresis:
+    """Friction behind an elastic drive, whose first move says how it was strained."""
+
+    def __init__(self, place: Place, effect: Effect) -> None:
+        self.joint = place.joint
+        self._lag, length = effect.values
+        self._bristle = Bristle(float(length))
+        self._first: float | None = None
+        self._moved = False
+
+    def behind(self, reading: float) -> float:
+        """How far the joint lags [rad, m] at the next reading."""
+        if self._first is None:
+            self._first = reading
+        if not self._moved and reading != self._first:
+            self._moved = True
+            self._bristle.begin(self._first, reading - self._first)
+        return float(self._lag) * self._bristle.follow(reading)

@@ -14,6 +14,8 @@ from interfaces.urdf import inverse
 from kbmaps import RigidChain
 
 from .effect import Effect
+from .flank import flanks
+from .gravity import GravityLoad
 from .moments import after, settled
 from .motion import Motion
 from .poses import rotation
@@ -65,7 +67,7 @@ class Simulated:
     @cached_property
     def torques(self) -> FloatArray:
         """Gravity's torques (n, d) [N·m, N]."""
-        return self.simulation.gravity.torques(self.q)
+        return self.simulation.torques(self.q)
 
     @cached_property
     def wrenches(self) -> FloatArray:
@@ -100,6 +102,21 @@ class Simulated:
         if not self.simulation.bears_weight:
             return np.zeros((len(self.q), 3, 1))
         return self.by_joint[:, :, [k]] * self.torques[:, None, [k]]
+
+    def _gravity_backlash(self, effect: Effect) -> FloatArray:
+        k = self.simulation.place(effect).joint
+        if not self.simulation.bears_weight:
+            return np.zeros((len(self.q), 3, 2))
+        side = flanks(self.torques[:, k], float(effect.values[1]))
+        return _with_moment(self.by_joint[:, :, [k]] * 0.5 * side[:, None, None])
+
+    def _payload(self, effect: Effect) -> FloatArray:
+        springs = self.simulation.springs
+        if not (springs.any() and self.simulation.bears_weight):
+            return np.zeros((len(self.q), 3, len(effect.values)))
+        robot = self.simulation.robot
+        units = [GravityLoad.of_payload(robot, float(unit[0]), unit[1:]) for unit in np.eye(len(effect.values))]
+        return np.stack([self.by_joint @ (springs * one.torques(self.q))[:, :, None] for one in units], axis=2)[..., 0]
 
     def _link(self, effect: Effect) -> FloatArray:
         simulation = self.simulation
@@ -182,6 +199,8 @@ class Simulated:
 
     _BY_NAME: ClassVar[dict[str, Callable[[Simulated, Effect], FloatArray]]] = {
         "joint_compliance": _compliance,
+        "gravity_backlash": _gravity_backlash,
+        "payload": _payload,
         "link_geometry": _link,
         "tool_offset": _tool,
         "tool_slip": _tool_slip,

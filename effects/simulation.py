@@ -17,8 +17,9 @@ from interfaces.robot import RobotDescription
 from interfaces.urdf import inverse
 from kbmaps import RigidChain
 
-from .effect import Effect
+from .effect import Effect, Identity
 from .encoder import Place
+from .flank import flanks
 from .gravity import GravityLoad
 from .moments import after, settled
 from .motion import Motion
@@ -32,7 +33,7 @@ _SPRING_ROUNDS = 3
 RIGID = ("joint_offset", "link_geometry", "tool_offset", "camera_pose")
 # What an effect with a moment is after it; what is not there when nothing moves.
 _STAYS = {"encoder_jump": "joint_offset", "tool_slip": "tool_offset", "camera_moved": "camera_pose"}
-_OF_MOTION = ("backlash", "settling", "camera_latency", "thermal_drift")
+_OF_MOTION = ("backlash", "settling", "hysteresis", "camera_latency", "thermal_drift")
 
 
 class Residual(Protocol):
@@ -183,16 +184,46 @@ class Simulation:
         """Whether the joints bear the arm's weight; where they are torque-free, the guiding hand does."""
         return self.robot.robot.hold != "torque_free"
 
-    def given_way(self, q: FloatArray) -> FloatArray:
-        """How far the joints give under the arm's weight (n, d) [rad, m], their springs unloaded at q (n, d)."""
-        springs = np.zeros(q.shape[1])
+    def given_way(self, q: FloatArray, hung: dict[Identity, float] | None = None) -> FloatArray:
+        """How far the joints give under the arm's weight (n, d) [rad, m], their springs unloaded at q (n, d).
+
+        Args:
+            hung: on which flank each loaded play hung before the first row, updated to the last; None if not known.
+        """
+        given = np.zeros_like(q)
+        if not self.bears_weight:
+            return given
+        if self.springs.any():
+            for _ in range(_SPRING_ROUNDS):
+                given = self.springs * self.torques(q + given)
+        if loose := self._of("gravity_backlash"):
+            torques, sides = self.torques(q + given), {} if hung is None else hung
+            for effect in loose:
+                k = self.place(effect).joint
+                side = flanks(torques[:, k], float(effect.values[1]), sides.get(effect.identity, 0.0))
+                given[:, k] += 0.5 * effect.values[0] * side
+                sides[effect.identity] = float(side[-1])
+        return given
+
+    @cached_property
+    def springs(self) -> FloatArray:
+        """How far each joint gives for each newton metre (d,) [rad/(N·m), m/N]."""
+        springs = np.zeros(len(self.robot.joints))
         for effect in self._of("joint_compliance"):
             springs[self.place(effect).joint] += effect.values[0]
-        given = np.zeros_like(q)
-        if springs.any() and self.bears_weight:
-            for _ in range(_SPRING_ROUNDS):
-                given = springs * self.gravity.torques(q + given)
-        return given
+        return springs
+
+    def torques(self, q: FloatArray) -> FloatArray:
+        """Torques of gravity about the joints (n, d) [N·m, N], payloads counted, at q (n, d)."""
+        return sum((load.torques(q) for load in self._payloads), self.gravity.torques(q))
+
+    @cached_property
+    def _payloads(self) -> list[GravityLoad]:
+        return [
+            GravityLoad.of_payload(self.robot, float(effect.values[0]), effect.values[1:])
+            for effect in self._of("payload")
+            if effect.values.any()
+        ]
 
     @property
     def rigid_chain(self) -> RigidChain:

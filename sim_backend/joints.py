@@ -11,7 +11,7 @@ from math import ceil
 
 import numpy as np
 
-from effects import LiveEncoders, Motion
+from effects import Identity, LiveEncoders, Motion
 from interfaces.records import FloatArray
 
 from .truth import TrueRobot
@@ -40,12 +40,13 @@ class JointPaths:
         self._past: deque[FloatArray] = deque(maxlen=ceil(longest) + 3)
         self._t = 0.0
         self._unloaded = np.zeros(0)
+        self._hung: dict[Identity, float] = {}
 
     @property
     def plain(self) -> bool:
         """Whether the joints are where the drives are: no effect moves them."""
         return not any(
-            effect.kind.encoder is not None or effect.name in ("joint_compliance", "camera_latency")
+            effect.kind.encoder is not None or effect.name in ("joint_compliance", "gravity_backlash", "camera_latency")
             for effect in self._truth.beyond.all_effects
         )
 
@@ -69,7 +70,7 @@ class JointPaths:
         """True joint angles (d,) [rad or m] in a frame that is taken now."""
         if self.plain:
             return self._past[-1]
-        return self._unloaded + self._truth.beyond.given_way(self._unloaded[None])[0]
+        return self._unloaded + self._truth.beyond.given_way(self._unloaded[None], self._hung)[0]
 
     @property
     def row(self) -> Motion:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from effects import Effect, Motion
+from effects.flank import flanks
 from effects.moments import after
 from interfaces.records import FloatArray
 
@@ -127,11 +128,26 @@ def _settling(residuals: Residuals, effect: Effect) -> Panel:
     return _over(residuals, effect, factor * residuals.motion.moves[:, k], label, _remembered(residuals, effect))
 
 
+def _hysteresis(residuals: Residuals, effect: Effect) -> Panel:
+    """Over how far friction is strained."""
+    correction = _remembered(residuals, effect)
+    strained = -correction / max(float(effect.values[0]), 1e-12)
+    return _over(residuals, effect, strained, f"direction of the last moves of {effect.where}", correction)
+
+
 def _compliance(residuals: Residuals, effect: Effect) -> Panel:
     k = residuals.run.simulation.place(effect).joint
     torque = residuals.run.torques[:, k]
     label = f"gravity on {effect.where} [{'N' if residuals.slides(k) else 'N·m'}]"
     return _over(residuals, effect, torque, label, effect.values[0] * torque)
+
+
+def _gravity_backlash(residuals: Residuals, effect: Effect) -> Panel:
+    k = residuals.run.simulation.place(effect).joint
+    torque = residuals.run.torques[:, k]
+    label = f"gravity on {effect.where} [{'N' if residuals.slides(k) else 'N·m'}]"
+    side = flanks(torque, float(effect.values[1]))
+    return _over(residuals, effect, torque, label, 0.5 * effect.values[0] * side)
 
 
 def _backlash(residuals: Residuals, effect: Effect) -> Panel:
@@ -252,7 +268,9 @@ _BY_EFFECT: dict[str, Callable[[Residuals, Effect], Panel]] = {
     "encoder_jump": _jump,
     "backlash": _backlash,
     "settling": _settling,
+    "hysteresis": _hysteresis,
     "joint_compliance": _compliance,
+    "gravity_backlash": _gravity_backlash,
     "tool_slip": _since,
     "camera_moved": _since,
     "camera_scale": _by_distance,

@@ -112,4 +112,6 @@ def sized(robot: RobotDescription, where: tuple[str, str | None, str | None], sh
             values[k] = 3.0
         elif parameter.name == "memory":
             values[k] = 0.4
+        elif parameter.name.startswith("hold_"):
+            values[k] = 0.1
     return effect.with_values(values)

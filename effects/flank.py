@@ -1,0 +1,24 @@
+"""A joint with play that bears weight: it hangs on the flank to which gravity pulls it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from interfaces.records import FloatArray
+
+
+def flanks(torque: FloatArray, hold: float, before: float = 0.0) -> FloatArray:
+    """Return on which flank of its play a joint hangs (n,): 1 or -1, the sign of the torque on it.
+
+    It falls over when the torque exceeds `hold` the other way: friction in the gear keeps it where it is until then.
+
+    Args:
+        torque: of gravity about the joint, in the order of the rows [N·m or N], shape (n,).
+        hold: friction [N·m or N].
+        before: flank before the first row; 0 if that is not known, then the sign of the first torque counts.
+    """
+    sides = np.where(torque < 0.0, -1.0, 1.0)
+    decided = np.abs(torque) > hold
+    last = np.maximum.accumulate(np.where(decided, np.arange(len(torque)), -1))
+    first = before or (float(sides[0]) if len(sides) else 0.0)
+    return np.where(last >= 0, sides[np.maximum(last, 0)], first)
