@@ -244,10 +244,13 @@ class Scan:
         coarse: FloatArray = np.asarray(first + step * np.arange(_MOST_CYCLES - 1), dtype=np.float64)
         # A peak is as wide as what turns the phase by one over the range.
         width = 1.0 / span if place.prismatic else 2.0 * np.pi / span
-        bands = [coarse] if place.prismatic else [coarse, np.arange(_MOST_CYCLES + 1.0, _FINEST, max(width, step))]
+        bands = [coarse]
+        if not place.prismatic:
+            apart = max(min(width, 0.1 * (_FINEST - _MOST_CYCLES)), step)
+            bands.append(np.arange(_MOST_CYCLES + 1.0, _FINEST, apart))
         tried, cycles = max(((self._rippled_best(effect, band), band) for band in bands), key=_most_gain)
         if width < step or self._times(float(tried[1][tried[0]]), _BETWEEN) >= least:
-            fine: FloatArray = coarse[tried[0]] + 0.5 * max(width, step) * np.linspace(-1.0, 1.0, 61)
+            fine: FloatArray = cycles[tried[0]] + 0.5 * max(width, step) * np.linspace(-1.0, 1.0, 61)
             cycles = np.asarray(fine[fine > 0.5 * first], dtype=np.float64)
             tried = self._best(self._rippled(effect, cycles), effect)
         best, gains, amounts, dof = tried

@@ -41,8 +41,11 @@ EFFECTS = [
     ("backlash", ARM, None, {"width_rad": 0.01}),
     ("backlash", HEAD, None, {"width_rad": 0.02}),
     ("settling", ARM, None, {"fraction": 0.1, "memory": 0.3}),
+    ("hysteresis", ARM, None, {"lag_rad": 0.01, "length_rad": 0.03}),
     ("joint_compliance", ARM, None, {"compliance_rad_per_Nm": 0.004}),
     ("joint_compliance", "shoulder_flexion", None, {"compliance_rad_per_Nm": 0.002}),
+    ("gravity_backlash", ARM, None, {"width_rad": 0.01, "hold_Nm": 0.0}),
+    ("payload", None, None, {"mass_kg": 0.5, "x_kgm": 0.02, "y_kgm": 0.0, "z_kgm": 0.03}),
     ("link_geometry", HEAD, None, SHIFT | TURN),
     ("link_geometry", ARM, None, SHIFT | TURN),
     ("tool_offset", None, None, SHIFT),
@@ -62,12 +65,13 @@ SEEN = (("camera_scale", "camera_focal", "lens_distortion"), ("camera_moved", "t
 # Those without a memory of their own go through the same lines of the guided world.
 TOGETHER = (
     {"joint_scale", "joint_eccentricity", "joint_ripple", "joint_coupling"},
+    {"joint_compliance", "payload"},
     {"tool_offset", "camera_pose", "camera_scale", "camera_focal", "lens_distortion"},
 )
 
 
 def groups() -> list[list]:
-    """The effects as the guided world tries them: in two groups, and each other one alone."""
+    """The effects as the guided world tries them: in three groups, and each other one alone."""
     grouped = [[case for case in EFFECTS if case[0] in names] for names in TOGETHER]
     alone = [case for case in EFFECTS if not any(case[0] in names for names in TOGETHER)]
     return grouped + [[case] for case in alone if case[0] != "camera_latency"]  # whose formula is of smooth paths
