@@ -15,7 +15,7 @@ from .fit import Fit, amount_columns
 from .held_out import Blocks
 from .nameless import Nameless
 from .scan import Candidate
-from .scatter import remembers
+from .scatter import beyond_single_rows, remembers
 from .search import Search, describe, nats
 from .stability import Instead, named_again
 from .unknown import Unknowns
@@ -35,6 +35,8 @@ _Other = tuple[Fit | Nameless, Effect | None, str]
 # Poses of the motion over the whole range of the joints, which stands for any motion, and by how much the logarithms
 # of the times between them scatter there.
 _POSES, _UNEVEN = 400, 1.0
+# Smallest move there, as a share of a far one.
+_NEXT_TO_IT = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,6 +125,10 @@ def _standing(
         doubt = float(np.log(max(candidate.trials / max(itself.trials, 1), 1e-3)))
         tried.append((Instead(rival, candidate.dof - itself.dof, doubt), candidate.effect))
     behind = [nats(2.0 * (one.fit.log_likelihood - fit.log_likelihood), one.dof) - one.doubt for one, _ in tried]
+    behind = [
+        worth + (beyond_single_rows(fit, one.fit) if remembers(cause) and remembers(effect) else 0.0)
+        for worth, (one, effect) in zip(behind, tried, strict=True)
+    ]
     others: list[_Other] = [_as_fitted(one.fit, effect) for one, effect in tried]
     if unknowns is not None:
         near = unknowns.specific(without, _COMES_NEAR * itself.gain)
@@ -185,6 +191,9 @@ def widened(fit: Fit, joints: Iterable[int], uneven: float = 0.0) -> Motion:
     q = motion.q[rows].copy()
     for k in joints:
         q[:, k] = rng.uniform(max(robot.lower[k], -np.pi), min(robot.upper[k], np.pi), len(rows))
+        # The second of each run is anywhere from next to the first to far off: what has a memory differs there.
+        firsts, seconds = q[: len(rows) // 2 * 2 : 2, k], q[1::2, k]
+        seconds[:] = firsts + np.exp(rng.uniform(np.log(_NEXT_TO_IT), 0.0, len(seconds))) * (seconds - firsts)
     clock = motion.clock
     gaps = np.cumsum(np.exp(uneven * rng.normal(size=len(rows))))
     shares = (gaps - gaps[0]) / max(gaps[-1] - gaps[0], 1e-9)

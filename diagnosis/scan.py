@@ -121,7 +121,9 @@ class Scan:
             case "settling":
                 return self._finely(effect, _MEMORIES, least)
             case "hysteresis":
-                return self._finely(effect, _LENGTHS, least)
+                found = self._finely(effect, _LENGTHS, least)
+                # It has a length where a play has none: that has to be worth it.
+                return None if found is None else replace(found, trials=_COARSE * len(_WIDTHS))
             case "gravity_backlash":
                 return self._hung(effect)
             case _:

@@ -14,6 +14,8 @@ from .fit import Fit
 # Beside a move of how many times the readings' scatter that does not matter: to a play it is which way the joint came,
 # to anything else how far.
 _PLAY_FAR, _FAR = 4.0, 20.0
+# What one row may say for one memory and against another [nats].
+_MOST_OF_A_ROW = 1.0
 
 
 def remembers(effect: Effect) -> bool:
@@ -42,6 +44,16 @@ def instruments(fit: Fit, effect: Effect) -> FloatArray:
         run = fit.simulation.run(replace(motion, q=q))
         columns[every_other] = run.columns(effect)[every_other][:, :, effect.amounts]
     return fit.weighted(columns)
+
+
+def beyond_single_rows(one: Fit, other: Fit) -> float:
+    """Return what to add to the log-likelihood of `other` over `one` so that no row counts more than it may [nats].
+
+    Which memory a joint has only rows after a short move tell, and of those few one that is off by itself decides
+    easily: the first row after a bump, a joint that another one's swing pushed across its play.
+    """
+    ratios = other.row_log_likelihoods - one.row_log_likelihoods
+    return float((np.clip(ratios, -_MOST_OF_A_ROW, _MOST_OF_A_ROW) - ratios).sum())
 
 
 def _between(fit: Fit, motion: Motion, joint: int, far: float) -> FloatArray:

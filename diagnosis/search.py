@@ -14,7 +14,7 @@ from effects import Effect, Identity
 from .fit import Fit, improved
 from .held_out import Blocks, block_p_value
 from .scan import Candidate, Scan
-from .scatter import instruments, remembers
+from .scatter import beyond_single_rows, instruments, remembers
 
 # A cause has to be so much more probable than its absence [nats].
 NAMED = 3.0
@@ -33,6 +33,8 @@ _MOST_MOMENTS, _MOST_RIPPLES = 2, 4
 _CHEAPEST, _ROUNDS = 1.5, 30
 # What explains a smaller share of what a cause explains is no rival of it; within so much two are as probable [nats].
 _COMES_NEAR, _EQUAL = 0.8, 0.3
+# So much of the evidence for one memory of a joint instead of another may lie in a few rows [nats].
+_OF_SINGLE_ROWS = 10.0
 # A moment or a period that seems to explain so much more than that of the fit is tried in its place.
 _ELSEWHERE = 1.0
 # A period that explains less than it did by this has gone astray [nats].
@@ -236,8 +238,11 @@ class Search:
     def _exchanged(self, fit: Fit, beside: Beside, candidate: Candidate, least: float) -> tuple[Fit, float]:
         """With a candidate in the place of a cause, and what that is worth [nats]; roughly where below `least`."""
         doubts, dof = self.doubt(beside.itself) - self.doubt(candidate), candidate.dof - beside.itself.dof
+        alike = remembers(beside.itself.effect) and remembers(candidate.effect)
+        least -= _OF_SINGLE_ROWS if alike else 0.0
         tried = beside.exchanged(candidate, fit.log_likelihood + rise_for(least - doubts, dof))
-        return tried, nats(2.0 * (tried.log_likelihood - fit.log_likelihood), dof) + doubts
+        worth = nats(2.0 * (tried.log_likelihood - fit.log_likelihood), dof) + doubts
+        return tried, worth + (beyond_single_rows(fit, tried) if alike else 0.0)
 
     def _open(self, fit: Fit) -> list[Effect]:
         """The hypotheses that no cause of a fit is, and one more of those that begin at a moment."""
@@ -377,7 +382,7 @@ def most_of_a_kind(effect: Effect) -> int:
 
 def simplicity(effect: Effect) -> int:
     """The smaller, the simpler: of causes that are as probable the simplest is named."""
-    return len(effect.amounts) + (_OF_A_LINK if effect.name == "link_geometry" else 0)
+    return len(effect.amounts) + len(effect.shapes) + (_OF_A_LINK if effect.name == "link_geometry" else 0)
 
 
 def describe(effect: Effect) -> str:

@@ -15,6 +15,8 @@ STEP_S = 0.002
 MOTOR_KG_M2 = 1e8
 # A passive hinge swings at no more than this [rad/s], so that a step resolves it; its rest does not depend on it.
 FASTEST_RAD_S = 0.25 / STEP_S
+# Inertia and damping [N m s/rad] of a hinge without a spring, which hardly drag the link along.
+LIGHTEST_KG_M2, DAMPING = 0.005, 0.05
 SOLREF = (2.0 * STEP_S, 1.0)
 # The hardest limits and the driest friction that MuJoCo allows.
 SOLIMP = (0.9999, 0.9999, 0.001, 0.5, 2.0)
@@ -74,9 +76,9 @@ class World:
             model.dof_armature[address] = MOTOR_KG_M2
         for name, hinge in hinges.items():
             address = self.address(name)
-            inertia = max(0.05, hinge.stiffness / FASTEST_RAD_S**2)
+            inertia = max(LIGHTEST_KG_M2, hinge.stiffness / FASTEST_RAD_S**2)
             model.dof_armature[address] = inertia
-            model.dof_damping[address] = 2.0 * np.sqrt(max(hinge.stiffness, 400.0) * 2.0 * inertia)
+            model.dof_damping[address] = DAMPING + 2.0 * np.sqrt(2.0 * hinge.stiffness * inertia)
         mujoco.mj_setConst(model, self._data)
         self._body = model.body(marker_body).id
         self._bristles = [
