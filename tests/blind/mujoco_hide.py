@@ -264,7 +264,7 @@ def _marker_loose(drawn: Drawn) -> None:
     axis = np.append(drawn.rng.normal(size=2), 0.0)
     half = math.radians(float(drawn.rng.uniform(0.6, 2.0)))
     name = drawn.changed.loosen_marker(axis / np.linalg.norm(axis), 0.05, MARKER_XYZ)
-    drawn.hinges[name] = Hinge(half_width=half, friction=0.002)
+    drawn.hinges[name] = Hinge(half_width=half, friction=0.002, inertia=0.001)
     drawn.truth.append(Truth("", f"marker wobbles by +-{math.degrees(half):.2f} deg", joints=drawn.joints[1:]))
 
 

@@ -15,8 +15,8 @@ STEP_S = 0.002
 MOTOR_KG_M2 = 1e8
 # A passive hinge swings at no more than this [rad/s], so that a step resolves it; its rest does not depend on it.
 FASTEST_RAD_S = 0.25 / STEP_S
-# Inertia and damping [N m s/rad] of a hinge without a spring, which hardly drag the link along.
-LIGHTEST_KG_M2, DAMPING = 0.005, 0.05
+# Damping of a hinge for each of its inertia [1/s]: it comes to rest and hardly drags the link along.
+DAMPING_S = 10.0
 SOLREF = (2.0 * STEP_S, 1.0)
 # The hardest limits and the driest friction that MuJoCo allows.
 SOLIMP = (0.9999, 0.9999, 0.001, 0.5, 2.0)
@@ -34,6 +34,7 @@ class Hinge:
         bearing_friction: Coulomb friction [N·m] of the link's bearing, against the turn of motor and hinge together.
         bristle: stiffness of the bearing before it slides, Dahl's [N·m/rad]; None for friction that MuJoCo simulates.
         damped_bristle: LuGre instead of Dahl.
+        inertia: of the hinge itself [kg m2]: so light that it does not drag, so heavy that its stops do not chatter.
         motor: the joint in front of it, whose turn counts in the bearing.
     """
 
@@ -44,6 +45,7 @@ class Hinge:
     bristle: float | None = None
     damped_bristle: bool = False
     motor: str = ""
+    inertia: float = 0.03
 
 
 class World:
@@ -76,9 +78,9 @@ class World:
             model.dof_armature[address] = MOTOR_KG_M2
         for name, hinge in hinges.items():
             address = self.address(name)
-            inertia = max(LIGHTEST_KG_M2, hinge.stiffness / FASTEST_RAD_S**2)
+            inertia = max(hinge.inertia, hinge.stiffness / FASTEST_RAD_S**2)
             model.dof_armature[address] = inertia
-            model.dof_damping[address] = DAMPING + 2.0 * np.sqrt(2.0 * hinge.stiffness * inertia)
+            model.dof_damping[address] = DAMPING_S * hinge.inertia + 2.0 * np.sqrt(2.0 * hinge.stiffness * inertia)
         mujoco.mj_setConst(model, self._data)
         self._body = model.body(marker_body).id
         self._bristles = [
