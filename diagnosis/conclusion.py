@@ -8,6 +8,7 @@ from effects import Effect
 from interfaces.records import FloatArray
 
 from .advice import advice
+from .aliases import alias_sentences
 from .background import ANGLE_RAD, DRIVE_RAD, LENGTH_M
 from .contact import before_contact
 from .diagnosis import MOST_DOUBTFUL, Diagnosis
@@ -241,6 +242,7 @@ def _limitations(diagnosis: Diagnosis) -> tuple[str, ...]:
             "few runs cross it. What seems to jump or to change with time there may be that. Record longer runs, "
             "and move the joint to and fro in each."
         )
+    told += alias_sentences(diagnosis.extended)
     if diagnosis.ended_early:
         told.append(f"The search ended at its longest, with {len(diagnosis.causes)} causes: there may be more of them.")
     return tuple(told)

@@ -21,7 +21,7 @@ from .products import Products, System
 
 # Ripples of up to so many cycles a turn are looked for at every whole number, and finer ones, of a strain wave twice a
 # turn of the fastest common gear of 120, as coarsely as they can be told apart.
-_MOST_CYCLES, _FINEST = 100, 240
+_MOST_CYCLES, FINEST = 100, 240
 # Half way between two shapes that are tried one explains so many times less at most: waves one over sinc² of a half.
 _BETWEEN = 2.5
 # Widths of a play that are tried [rad, m], and time constants as shares of the recording's time.
@@ -248,8 +248,8 @@ class Scan:
         width = 1.0 / span if place.prismatic else 2.0 * np.pi / span
         bands = [coarse]
         if not place.prismatic:
-            apart = max(min(width, 0.1 * (_FINEST - _MOST_CYCLES)), step)
-            bands.append(np.arange(_MOST_CYCLES + 1.0, _FINEST, apart))
+            apart = max(min(width, 0.1 * (FINEST - _MOST_CYCLES)), step)
+            bands.append(np.arange(_MOST_CYCLES + 1.0, FINEST, apart))
         tried, cycles = max(((self._rippled_best(effect, band), band) for band in bands), key=_most_gain)
         if width < step or self._times(float(tried[1][tried[0]]), _BETWEEN) >= least:
             fine: FloatArray = cycles[tried[0]] + 0.5 * max(width, step) * np.linspace(-1.0, 1.0, 61)

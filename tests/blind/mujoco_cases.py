@@ -116,16 +116,20 @@ def _places(hidden: Truth) -> set[str]:
 
 def run(seed: int, style: Style, folder: Path, checkout: Checkout, rows: int | None = None) -> Judgement:
     """Hide, diagnose and judge one case."""
-    case = hide(seed, style, folder, rows=rows)
-    out = folder / "out"
+    return judged(hide(seed, style, folder, rows=rows), checkout)
+
+
+def judged(case: Case, checkout: Checkout) -> Judgement:
+    """Diagnose and judge a case."""
+    out = case.folder / "out"
     ran = diagnosed(case, out, checkout)
     told = _told(out, ran)
     what, false = outcome(case.truth, case.also, told) if told else ("crashed", [])
     floor = told["rms_mm"]["noise_floor"] if told else None
     noise_mm = rms_mm(case.taken.x - case.taken.x_true)
     return Judgement(
-        seed=seed,
-        style=style,
+        seed=case.seed,
+        style=case.style,
         kind=case.kind,
         model=case.model,
         rows=len(case.taken.q),

@@ -360,8 +360,22 @@ class Case:
     nominal: tuple[tuple[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
 
 
-def hide(seed: int, style: Style, folder: Path, *, rows: int | None = None) -> Case:
-    """Draw an arm by its seed, hide the causes of kind `seed` modulo their number, and record it."""
+def hide(
+    seed: int,
+    style: Style,
+    folder: Path,
+    *,
+    rows: int | None = None,
+    kind: str | None = None,
+    dense: float | None = None,
+) -> Case:
+    """Draw an arm by its seed, hide causes in it, and record it.
+
+    Args:
+        rows: of the recording; drawn by default.
+        kind: which causes; `seed` modulo the number of kinds by default.
+        dense: scale of the tolerances; drawn by default.
+    """
     rng = np.random.default_rng([seed, 7])
     model = MODELS[int(rng.integers(len(MODELS)))]
     urdf = Urdf(model, MOUNTS[int(rng.integers(len(MOUNTS)))])
@@ -369,7 +383,8 @@ def hide(seed: int, style: Style, folder: Path, *, rows: int | None = None) -> C
     middle, half = _range(urdf)
     postures = middle + half * rng.uniform(-1.0, 1.0, (200, len(half)))
     loads = nominal.loads(postures)[:, [nominal.address(name) for name in model.joints]]
-    dense = float(np.exp(rng.uniform(*np.log(DENSE_SCALES)))) if rng.random() < 0.5 else 0.0
+    drawn_dense = float(np.exp(rng.uniform(*np.log(DENSE_SCALES)))) if rng.random() < 0.5 else 0.0
+    dense = drawn_dense if dense is None else dense
     drawn = Drawn(
         urdf,
         urdf.copy(),
@@ -381,7 +396,7 @@ def hide(seed: int, style: Style, folder: Path, *, rows: int | None = None) -> C
         dense,
     )
     pose_known, marker_known = (bool(known) for known in rng.random(2) < 0.5)
-    kind = list(KINDS)[seed % len(KINDS)]
+    kind = list(KINDS)[seed % len(KINDS)] if kind is None else kind
     KINDS[kind](drawn)
     if dense:
         _make_dense(drawn)

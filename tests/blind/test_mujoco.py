@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from .dense import Checkout
-from .mujoco_cases import HERE, outcome, placed_mm, run
+from .mujoco_cases import HERE, judged, outcome, placed_mm, run
 from .mujoco_hide import KINDS, STYLES, Truth, hide
 from .mujoco_urdf import MARKER, MODELS, Urdf
 from .mujoco_world import STEP_S, Hinge, World
@@ -88,9 +88,26 @@ def test_outcome_follows_from_truth_and_answer(truth, answer, expected) -> None:
     assert outcome(truth, (), answer)[0] == expected
 
 
-def test_a_simulated_play_is_named(tmp_path: Path) -> None:
-    record = run(list(KINDS).index("play_by_friction"), "walk", tmp_path, Checkout(HERE.parents[1], 120.0), rows=150)
+# Each with and without tolerances at every link.
+@pytest.mark.parametrize(
+    ("kind", "style", "rows", "dense"),
+    [("play_by_gravity", "static", 80, 1.0), ("dahl", "walk", 200, 0.0), ("payload", "static", 80, 1.0)],
+)
+def test_a_simulated_cause_is_named(kind, style, rows, dense, tmp_path: Path) -> None:
+    case = hide(0, style, tmp_path, rows=rows, kind=kind, dense=dense)
+    record = judged(case, Checkout(HERE.parents[1], 120.0))
     assert record.outcome == "right", record
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("dense", [0.0, 1.0])
+@pytest.mark.parametrize("style", STYLES)
+@pytest.mark.parametrize("kind", ["play_by_friction", "play_by_gravity", "dahl", "lugre", "payload", "wave"])
+@pytest.mark.parametrize("seed", range(3))
+def test_what_lies_behind_a_motor_is_named_or_told(seed, kind, style, dense, tmp_path: Path) -> None:
+    case = hide(seed, style, tmp_path, kind=kind, dense=dense)
+    record = judged(case, Checkout(HERE.parents[1], 300.0))
+    assert record.outcome in ("right", "honest"), record
 
 
 @pytest.mark.soak

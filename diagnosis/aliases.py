@@ -1,0 +1,45 @@
+"""Ripples that a recording cannot tell from finer or coarser ones, because a joint was read at regular angles."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from effects import Effect
+from interfaces.records import FloatArray
+
+from .fit import Fit
+from .scan import FINEST
+
+# Two waves whose phases agree so well over all readings are one.
+_SAME = 0.97
+_FEWEST_CYCLES = 2
+
+
+def alias_sentences(fit: Fit) -> list[str]:
+    """Return a sentence for each ripple of a fit that has an alias."""
+    told = []
+    for cause in fit.causes:
+        others = aliases(fit, cause) if cause.name == "joint_ripple" and not cause.prismatic else []
+        if others:
+            listed = ", ".join(f"{cycles:.0f}" for cycles in others[:3])
+            told.append(
+                f"{cause.where} was read at such regular angles that a ripple of {cause.values[-1]:.0f} cycles a turn "
+                f"looks like one of {listed}{' and more' if len(others) > 3 else ''}. Read it at uneven angles."
+            )
+    return told
+
+
+def aliases(fit: Fit, ripple: Effect) -> list[float]:
+    """Return other numbers of cycles a turn that are the same as those of a ripple at all readings."""
+    q = fit.observations.motion.q[:, fit.simulation.place(ripple).joint]
+    own = float(ripple.values[-1])
+    cycles = np.arange(_FEWEST_CYCLES, FINEST + 1.0)
+    # Waves of the same phase, or of the opposite one, at each reading; neighbours of a ripple are no aliases.
+    same = np.maximum(_agreement(cycles - own, q), _agreement(cycles + own, q)) > _SAME
+    apart = np.abs(cycles - own) > 2.0 * np.pi / max(float(np.ptp(q)), 1e-6)
+    return [float(one) for one in cycles[same & apart]]
+
+
+def _agreement(cycles: FloatArray, q: FloatArray) -> FloatArray:
+    """Return how well waves of frequencies (m,) agree over readings (n,): 1 if all have the same phase."""
+    return np.abs(np.exp(1j * np.multiply.outer(cycles, q)).mean(axis=1))
