@@ -5,12 +5,16 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from effects.flank import flanks
+
 from .fit import Fit
 
 # A joint that has made up for all but so much of what it lacked is at rest.
 _AT_REST = 0.05
 # A joint that has gone so many lengths of its hysteresis is strained as its last direction has it.
 _STRAINED = 3.0
+# Friction of a loaded play is known to within this factor, and a load that is a smaller share of the largest is none.
+_FRICTION_WITHIN, _UPRIGHT = 2.0, 0.02
 
 
 def before_contact(fit: Fit) -> NDArray[np.bool_]:
@@ -39,6 +43,18 @@ def before_rest(fit: Fit) -> NDArray[np.bool_]:
     return rows
 
 
+def between_flanks(fit: Fit) -> NDArray[np.bool_]:
+    """Rows (n,) at which the flank that a loaded play hangs on depends on how large its friction is."""
+    rows = np.zeros(len(fit.observations.motion), dtype=np.bool_)
+    for effect in fit.simulation.effects:
+        if effect.name != "gravity_backlash":
+            continue
+        torque, hold = fit.run.torques[:, fit.simulation.place(effect).joint], float(effect.values[1])
+        less, more = hold / _FRICTION_WITHIN, hold * _FRICTION_WITHIN + _UPRIGHT * float(np.abs(torque).max())
+        rows |= flanks(torque, less) != flanks(torque, more)
+    return rows
+
+
 def doubtful(fit: Fit) -> NDArray[np.bool_]:
     """Rows (n,) whose past is not known well enough."""
-    return before_contact(fit) | before_rest(fit)
+    return before_contact(fit) | before_rest(fit) | between_flanks(fit)

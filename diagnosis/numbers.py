@@ -35,7 +35,7 @@ _LABELS = {
     "lag": "lags by",
     "length": "turns round over",
     "hold": "held by friction up to",
-    "mass": "mass",
+    **{f"{axis}_kgm": f"mass times {axis}" for axis in "xyz"},
     "fraction": "missing of a move",
     "rx": "turn about x",
     "ry": "turn about y",

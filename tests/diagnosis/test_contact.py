@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from planted_cases import INTERVAL_S, SHOULDER, desk_arm, measured, motion_of, seen, walk
 
 from diagnosis.alignment import aligned
-from diagnosis.contact import before_contact, before_rest
+from diagnosis.contact import before_contact, before_rest, between_flanks
 from diagnosis.fit import Fit
 from diagnosis.observations import Observations
 from effects import Effect, Motion, Simulation
@@ -62,3 +63,15 @@ def test_a_play_is_known_once_the_run_has_crossed_it(robot) -> None:
     crossing = dataclasses.replace(fit.observations, motion=motion_of(q), x=np.zeros((6, 3)))
     there = dataclasses.replace(fit, observations=crossing, simulation=Simulation(robot, (play,)), nuisances=0)
     np.testing.assert_array_equal(before_contact(there), [True, True, True, False, False, False])
+
+
+def test_a_flank_is_known_where_friction_does_not_matter(robot) -> None:
+    torque = np.array([10.0, 3.0, -0.4, -0.8, -3.0, -10.0])  # friction of 1 N m lets go at -1
+    play = Effect.at(robot, "gravity_backlash", SHOULDER, values=[0.01, 1.0])
+    k = robot.joints.index(SHOULDER)
+    loaded = SimpleNamespace(
+        observations=SimpleNamespace(motion=torque),
+        simulation=Simulation(robot, (play,)),
+        run=SimpleNamespace(torques=np.outer(torque, np.arange(len(robot.joints)) == k)),
+    )
+    np.testing.assert_array_equal(between_flanks(loaded), [False, False, False, True, False, False])
