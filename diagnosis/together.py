@@ -49,6 +49,8 @@ _MOST_MOVES = 60
 _MOST_REFITTED, _COMES_NEAR = 8, 15.0
 # What is wrong at one joint often is at others: zeros are set in one session. So much each costs but the first [nats].
 _ANOTHER = 2.0
+# To first order like a play, or a play like a spring: the search takes them up in the place of those.
+_LEFT_TO_THE_SEARCH = ("hysteresis", "gravity_backlash")
 
 dpotrf, dpotri, dpotrs = get_lapack_funcs(("potrf", "potri", "potrs"), dtype=np.float64)
 
@@ -341,7 +343,8 @@ class _Place:
     def __init__(self, fit: Fit, hypotheses: Sequence[Effect]) -> None:
         self.fit = fit
         present = {cause.key for cause in fit.causes}
-        scanned = Scan(fit).candidates([effect for effect in hypotheses if effect.key not in present])
+        others = [one for one in hypotheses if one.key not in present and one.name not in _LEFT_TO_THE_SEARCH]
+        scanned = Scan(fit).candidates(others)
         candidates = [Candidate(cause, 0.0, 1) for cause in fit.causes] + [_at_rest(one) for one in scanned]
         self._sets = Sets(fit, candidates, float(np.log(max(len(hypotheses), 1))))
         own = tuple(range(len(fit.causes)))
