@@ -49,8 +49,8 @@ _MOST_MOVES = 60
 _MOST_REFITTED, _COMES_NEAR = 8, 15.0
 # What is wrong at one joint often is at others: zeros are set in one session. So much each costs but the first [nats].
 _ANOTHER = 2.0
-# To first order like a play, or a play like a spring: the search takes them up in the place of those.
-_LEFT_TO_THE_SEARCH = ("hysteresis", "gravity_backlash")
+# To first order it looks like a play: the search takes it up in the place of one.
+_LEFT_TO_THE_SEARCH = ("hysteresis",)
 
 dpotrf, dpotri, dpotrs = get_lapack_funcs(("potrf", "potri", "potrs"), dtype=np.float64)
 
