@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from effects import Effect
-from interfaces.records import FloatArray
+from bodyschema.effects import Effect
+from bodyschema.interfaces.records import FloatArray
 
 from .advice import advice
 from .aliases import alias_sentences

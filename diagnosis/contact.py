@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from effects.flank import flanks
+from bodyschema.effects.flank import flanks
 
 from .fit import Fit
 

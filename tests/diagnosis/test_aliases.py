@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from planted_cases import motion_of, seen, surveyed_arm
 
-from diagnosis.aliases import alias_sentences, aliases
-from diagnosis.alignment import aligned
-from diagnosis.observations import Observations
-from effects import Effect, Simulation
+from bodyschema.diagnosis.aliases import alias_sentences, aliases
+from bodyschema.diagnosis.alignment import aligned
+from bodyschema.diagnosis.observations import Observations
+from bodyschema.effects import Effect, Simulation
 
 GRID_RAD = np.radians(5.0)  # 72 angles a turn
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from effect_arms import arm, sized, walk
 
-from effects import Effect, Motion, Simulation
-from effects.flank import flanks
+from bodyschema.effects import Effect, Motion, Simulation
+from bodyschema.effects.flank import flanks
 
 MOTION = walk()
 JOINT = "elbow"
