@@ -92,7 +92,17 @@ MISREAD = {
 }
 
 
-@pytest.mark.parametrize("said", MISREAD)
+# Of two columns misread alike, and of more than two, `make soak` knows more.
+RARELY = (
+    "q2 and q5 count the other way",
+    "the columns q1, q2 and q3 are in the order q2, q3, q1",
+    "the columns q2 and q3 are exchanged and q5 counts the other way",
+)
+
+
+@pytest.mark.parametrize(
+    "said", [pytest.param(said, marks=[pytest.mark.soak] if said in RARELY else []) for said in MISREAD]
+)
 def test_a_wrong_reading_is_refused_and_named(said) -> None:
     found = pairs().read(MISREAD[said]).seen()
     assert found.misread
@@ -226,9 +236,9 @@ CASES = {
 }
 
 
-def misread_ur5(case: str) -> tuple[Config, Recording]:
+def misread_ur5(case: str | None) -> tuple[Config, Recording]:
     config = Config.load(UR5 / "robot.toml", {})
-    order, signs, zero, axes = CASES[case]
+    order, signs, zero, axes = CASES[case] if case else (range(6), [1] * 6, 0.0, [0, 1, 2])
     recording = Recording.read(UR5 / "measured.csv", config.robot.joints)
     q = recording.q[:, list(order)] * signs + [0.0, zero, 0.0, 0.0, 0.0, 0.0]
     return config, dataclasses.replace(recording, q=q, x=recording.x[:, axes])
@@ -243,7 +253,11 @@ def test_a_misread_recording_of_a_real_arm_is_named(case) -> None:
 
 @real
 @pytest.mark.parametrize(
-    "name", ["ur5_laser", "wam_laser", "ur10_laser_a", "ur10_laser_b", "panda_eyeinhand", "tiago_eyehand"]
+    "name",
+    [
+        *("ur5_laser", "wam_laser", "ur10_laser_a", "ur10_laser_b", "panda_eyeinhand"),
+        pytest.param("tiago_eyehand", marks=pytest.mark.soak),
+    ],
 )
 def test_real_recordings_are_not_doubted(name) -> None:
     robot = Config.load(REAL_DATA / name / "robot.toml", {}).robot
@@ -252,11 +266,9 @@ def test_real_recordings_are_not_doubted(name) -> None:
 
 
 @real
-@pytest.mark.parametrize("case", [*CASES, None])
+@pytest.mark.parametrize("case", ["q3 counts the other way", None])
 def test_the_live_learner_names_a_wrong_reading(case) -> None:
-    config, recording = misread_ur5(case or "q3 counts the other way")
-    if case is None:
-        recording = Recording.read(UR5 / "measured.csv", config.robot.joints)
+    config, recording = misread_ur5(case)
     learning = Learning(NominalModel.extended_by(config.simulation), config.tables.learner, DirectSolver())
     findings = Findings(learning, config.robot, SystemClock())
     for k in range(45):

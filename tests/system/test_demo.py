@@ -21,7 +21,7 @@ pytest.importorskip("pybullet")
 
 # The limit only ends a demo that would never end; on a busy machine it takes longer, and passes.
 LIMIT_S = 400
-FIRST, SECOND = 60, 15
+FIRST, SECOND = 40, 10
 
 
 @dataclass(frozen=True)
