@@ -30,7 +30,7 @@ from interfaces.records import Pair
 from kbmaps import NLMS
 from kbmaps.contest import LISTED
 
-SEEDS = [0, 1, *(pytest.param(seed, marks=pytest.mark.soak) for seed in range(2, 8))]
+SEEDS = [0, *(pytest.param(seed, marks=pytest.mark.soak) for seed in range(1, 8))]
 MANY_SEEDS = range(4)
 HALF = 150
 
