@@ -106,6 +106,7 @@ def test_the_demo_refuses_a_folder_that_is_not_its_own(tmp_path: Path) -> None:
     assert precious.read_text() == "years of work"
 
 
+@pytest.mark.soak
 def test_the_demo_over_servos_learns_as_well(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "daemon", "demo", "--bus", "dynamixel", "--out", str(tmp_path / "out")]
     command += ["--pairs", str(FIRST), "--pairs-after", "10", "--seed", "3"]
