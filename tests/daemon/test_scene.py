@@ -6,12 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from daemon.config import Config
-from daemon.demo.scene import prepare
-from daemon.demo.tags import CUBE_M
-from daemon.wiring import open_sources
-from interfaces.errors import ConfigError
-from vision.tag_body import TagBody
+from bodyschema.daemon.config import Config
+from bodyschema.daemon.demo.scene import prepare
+from bodyschema.daemon.demo.tags import CUBE_M
+from bodyschema.daemon.wiring import open_sources
+from bodyschema.interfaces.errors import ConfigError
+from bodyschema.vision.tag_body import TagBody
 
 STICK_RADIUS_M = 0.005
 
