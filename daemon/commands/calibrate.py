@@ -11,7 +11,7 @@ from cyclopts.validators import Number
 
 from daemon.commands.calibrate_cameras import cameras, check
 from daemon.commands.latency import latency
-from daemon.commands.options import SourceRobotFile, flag, robot_file
+from daemon.commands.options import LeRobotFile, SourceRobotFile, flag, lerobot_lines, robot_file
 
 # Without a help of its own its page shows what `arm` says, beside the commands.
 calibrate = cyclopts.App(name="calibrate")
@@ -50,6 +50,8 @@ def arm(
     out: Annotated[
         Path | None, Parameter(help="Write the calibrated robot into this folder: a URDF and a robot.toml.")
     ] = None,
+    lerobot: LeRobotFile = None,
+    write: Annotated[bool, flag("Write the file of --lerobot; the old one is kept beside it.")] = False,
     as_json: Annotated[bool, flag("Print the figures as JSON.", name="--json")] = False,
     force: Annotated[
         bool, flag("Go on, and write, although the pairs do not seem to be of this robot, or its zeros are far off.")
@@ -72,7 +74,8 @@ def arm(
     robot.toml calls not known (`pose_known`, `marker_known`) is taken from the pairs alone, the rest is trusted to
     1° and 10 mm.
 
-    Next: `bodyschema run --robot OUT/robot.toml` starts from what was learnt.
+    Next: `bodyschema run --robot OUT/robot.toml` starts from what was learnt. With --lerobot the joint offsets go into
+    the servos instead, by LeRobot's own calibration file.
     """
     import math
     import sys
@@ -89,8 +92,13 @@ def arm(
     from daemon.present_tool import first_pair
     from daemon.wire import encode
     from interfaces.calibrated_files import write_calibrated
+    from interfaces.errors import RequestError
     from interfaces.recording import Recording
 
+    if write and (lerobot is None or out is not None):
+        raise RequestError(
+            "--write is for --lerobot FILE, and without --out: offsets belong into the servos or into a URDF, not both"
+        )
     config = Config.load(robot_file(robot, source))
     description, source = config.robot, source or config.store_file
     if source.suffix.lower() in recordings.STORE_ENDINGS:
@@ -111,18 +119,25 @@ def arm(
     if report.other_tool_from is None:
         seen.require(source, force=force)
     written = None
-    if out is not None:
+    if out is not None or write:
         if report.other_tool_from is not None:
             raise CalibrationError(f"nothing was written. {two_tools(report)}")
         if report.beyond is not None and not force:
             raise CalibrationError(f"nothing was written. {report.doubt} Or write it as it is with --force")
+    if out is not None:
         heading = f"Calibrated by bodyschema from {report.pairs} pairs of {source.name}"
         written = write_calibrated(description, found.figures.geometry, out, heading)
+    lines: list[str] = []
+    if lerobot is not None:
+        offsets = {zero.joint: math.radians(zero.zero) for zero in report.zeros if zero.half_width is not None}
+        lines = lerobot_lines(config, lerobot, offsets, write=write)
     if as_json:
         sys.stdout.write(encode(report).decode() + "\n")
         return
     console = Console(highlight=False)
     console.print(view(report))
+    for line in ["", *lines] if lines else []:
+        console.print(line, markup=False, soft_wrap=True)
     if written is not None:
         console.print(
             f"\n{written} written. Next: stop what runs with {config.file.name} (the new one has its ports), then "

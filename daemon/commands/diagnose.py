@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
-from daemon.commands.options import SourceRobotFile, flag, robot_file
+from daemon.commands.options import LeRobotFile, SourceRobotFile, flag, lerobot_lines, robot_file
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -31,6 +31,8 @@ def diagnose(
     effects: Annotated[str | None, Parameter(help="Look for these alone, as in backlash,joint_offset.")] = None,
     exclude: Annotated[str | None, Parameter(help="Do not look for these.")] = None,
     seed: Annotated[int, Parameter(help="Of the resampling behind the intervals.", validator=Number(gte=0))] = 0,
+    lerobot: LeRobotFile = None,
+    write: Annotated[bool, flag("Write the file of --lerobot; the old one is kept beside it.")] = False,
     as_json: Annotated[bool, flag("Print diagnosis.json.", name="--json")] = False,
     force: Annotated[bool, flag("Go on although the pairs do not seem to be of this robot.")] = False,
 ) -> None:
@@ -54,7 +56,10 @@ def diagnose(
     from daemon.config import Config
     from daemon.diagnosis_run import Asked, measured, results_in, run, written
     from daemon.diagnosis_view import view
+    from interfaces.errors import RequestError
 
+    if write and lerobot is None:
+        raise RequestError("--write is for --lerobot FILE. Give LeRobot's calibration file")
     config = Config.load(robot_file(robot, recording))
     asked = Asked.of(effects, exclude, seed)
     source = measured(config, recording, live=live)
@@ -66,11 +71,21 @@ def diagnose(
             written(found, out)
     for warning in found.warnings:
         told.print(f"Warning: {warning}", markup=False, soft_wrap=True)
+    lines: list[str] = []
+    if lerobot is not None:
+        offsets = {
+            cause.where: cause.parameters["offset_rad"].value
+            for cause in found.file.causes
+            if cause.effect == "joint_offset" and cause.where is not None and "offset_rad" in cause.parameters
+        }
+        lines = lerobot_lines(config, lerobot, offsets, write=write)
     if as_json:
         sys.stdout.write(found.json + "\n")
         return
     console = Console(highlight=False)
     console.print(view(found.file, found.remedies, timed=found.timed))
+    for line in ["", *lines] if lines else []:
+        console.print(line, markup=False, soft_wrap=True)
     if out is not None:
         console.print(
             f"\nOpen {out / 'report.html'}. Beside it are diagnosis.json and extended.toml, the simulation with what "

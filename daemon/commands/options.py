@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
+
+if TYPE_CHECKING:
+    from daemon.config import Config
 
 HERE = Path("robot.toml")
 VARIABLE = "BODYSCHEMA_ROBOT"
@@ -15,6 +19,14 @@ RobotFile = Annotated[Path, Parameter(env_var=VARIABLE, help="The robot's descri
 SourceRobotFile = Annotated[
     Path | None,
     Parameter(show_default=False, help=f"robot.toml; else the one beside the source, {VARIABLE}, or here."),
+]
+
+
+LeRobotFile = Annotated[
+    Path | None,
+    Parameter(
+        name="--lerobot", help="LeRobot's calibration file: show its homing offsets with the joint offsets found."
+    ),
 ]
 
 
@@ -35,3 +47,14 @@ def robot_file(given: Path | None, source: Path | None) -> Path:
     if source is not None and (beside := source.parent / HERE).exists():
         return beside
     return Path(os.environ.get(VARIABLE, HERE))
+
+
+def lerobot_lines(config: Config, file: Path, offsets_rad: Mapping[str, float], *, write: bool) -> list[str]:
+    """Return what joint offsets change in LeRobot's calibration `file`, after writing it where `write` says so."""
+    from daemon.lerobot_offsets import CorrectedCalibration, after_writing, difference
+
+    corrected = CorrectedCalibration.of(config, file, offsets_rad)
+    lines = difference(corrected)
+    if not any(change.ticks for change in corrected.changes):
+        return lines
+    return [*lines, after_writing(corrected.write()) if write else "Nothing is written without --write."]
