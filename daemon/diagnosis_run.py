@@ -93,8 +93,13 @@ class Source:
     name: str
 
 
-def measured(config: Config, file: Path | None, *, live: bool) -> Source:
+def measured(
+    config: Config, file: Path | None, opened: Callable[[Path], Recording] | None = None, *, live: bool
+) -> Source:
     """The pairs of a recording, of a store, or of the running sampler.
+
+    Args:
+        opened: reads `file`; by default as a recording or a store.
 
     Raises:
         RequestError: neither or both were asked for.
@@ -108,7 +113,7 @@ def measured(config: Config, file: Path | None, *, live: bool) -> Source:
         with client(config.route("sampler")) as bus:
             recording, name = _history(History(bus, config.robot, 1), joints), f"the sampler of {config.robot.name}"
     else:
-        recording, name = recordings.opened(file, joints), file.name
+        recording, name = recordings.opened(file, joints) if opened is None else opened(file), file.name
     require_units(config.robot, recording, file or Path(name))
     return Source(recording, name)
 

@@ -11,7 +11,15 @@ from cyclopts.validators import Number
 
 from daemon.commands.calibrate_cameras import cameras, check
 from daemon.commands.latency import latency
-from daemon.commands.options import LeRobotFile, SourceRobotFile, flag, lerobot_lines, robot_file
+from daemon.commands.options import (
+    AS_THEY_ARE,
+    LeRobotFile,
+    SourceOptions,
+    SourceRobotFile,
+    flag,
+    lerobot_lines,
+    robot_file,
+)
 
 # Without a help of its own its page shows what `arm` says, beside the commands.
 calibrate = cyclopts.App(name="calibrate")
@@ -24,7 +32,10 @@ calibrate.command(latency, sort_key=3)
 def arm(
     source: Annotated[
         Path | None,
-        Parameter(help="A recording (.csv, .parquet) or a pair store (.sqlite); else the robot's own store."),
+        Parameter(
+            help="A recording (.csv, .parquet), a ROS bag, a LeRobotDataset or a pair store (.sqlite); else the "
+            "robot's own store."
+        ),
     ] = None,
     /,
     *,
@@ -50,6 +61,7 @@ def arm(
     out: Annotated[
         Path | None, Parameter(help="Write the calibrated robot into this folder: a URDF and a robot.toml.")
     ] = None,
+    taken: SourceOptions = AS_THEY_ARE,
     lerobot: LeRobotFile = None,
     write: Annotated[bool, flag("Write the file of --lerobot; the old one is kept beside it.")] = False,
     as_json: Annotated[bool, flag("Print the figures as JSON.", name="--json")] = False,
@@ -93,7 +105,6 @@ def arm(
     from daemon.wire import encode
     from interfaces.calibrated_files import write_calibrated
     from interfaces.errors import RequestError
-    from interfaces.recording import Recording
 
     if write and (lerobot is None or out is not None):
         raise RequestError(
@@ -106,7 +117,7 @@ def arm(
         recording = recordings.of_robot(stored.recording, description.joints, source)
         first = first or first_pair(stored, source.with_name(config.checkpoint_file.name), description.name)
     else:
-        recording = Recording.read(source, description.joints)
+        recording = taken.opened(config, source, lerobot)
     first = first or 1
     recording = recordings.between(recording, first, last, source)
     sigma_m = None if sigma_mm is None else 1e-3 * sigma_mm

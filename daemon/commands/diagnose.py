@@ -10,7 +10,15 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
-from daemon.commands.options import LeRobotFile, SourceRobotFile, flag, lerobot_lines, robot_file
+from daemon.commands.options import (
+    AS_THEY_ARE,
+    LeRobotFile,
+    SourceOptions,
+    SourceRobotFile,
+    flag,
+    lerobot_lines,
+    robot_file,
+)
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -18,7 +26,10 @@ if TYPE_CHECKING:
 
 def diagnose(
     recording: Annotated[
-        Path | None, Parameter(help="A recording (.csv, .parquet) or a pair store (.sqlite); or --live.")
+        Path | None,
+        Parameter(
+            help="A recording (.csv, .parquet), a ROS bag, a LeRobotDataset or a pair store (.sqlite); or --live."
+        ),
     ] = None,
     /,
     *,
@@ -31,6 +42,7 @@ def diagnose(
     effects: Annotated[str | None, Parameter(help="Look for these alone, as in backlash,joint_offset.")] = None,
     exclude: Annotated[str | None, Parameter(help="Do not look for these.")] = None,
     seed: Annotated[int, Parameter(help="Of the resampling behind the intervals.", validator=Number(gte=0))] = 0,
+    taken: SourceOptions = AS_THEY_ARE,
     lerobot: LeRobotFile = None,
     write: Annotated[bool, flag("Write the file of --lerobot; the old one is kept beside it.")] = False,
     as_json: Annotated[bool, flag("Print diagnosis.json.", name="--json")] = False,
@@ -62,7 +74,7 @@ def diagnose(
         raise RequestError("--write is for --lerobot FILE. Give LeRobot's calibration file")
     config = Config.load(robot_file(robot, recording))
     asked = Asked.of(effects, exclude, seed)
-    source = measured(config, recording, live=live)
+    source = measured(config, recording, lambda file: taken.opened(config, file, lerobot), live=live)
     told = Console(stderr=True, highlight=False)
     with results_in(out), _progress(told) as tell:
         found = run(config, source, asked, tell, force=force)

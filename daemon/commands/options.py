@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
 if TYPE_CHECKING:
     from daemon.config import Config
+    from interfaces.recording import Recording
 
 HERE = Path("robot.toml")
 VARIABLE = "BODYSCHEMA_ROBOT"
@@ -28,6 +30,39 @@ LeRobotFile = Annotated[
         name="--lerobot", help="LeRobot's calibration file: show its homing offsets with the joint offsets found."
     ),
 ]
+
+
+DatasetCalibration = Annotated[
+    Path | None,
+    Parameter(name="--lerobot", help="Of a dataset: LeRobot's calibration file of the arm it was recorded with."),
+]
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class SourceOptions:
+    """What to take from a ROS bag or a LeRobotDataset."""
+
+    joint_topic: Annotated[str | None, Parameter(help="Of a bag: the topic with the joint states.")] = None
+    marker_topic: Annotated[str | None, Parameter(help="Of a bag: the topic with the marker's positions.")] = None
+    marker_frame: Annotated[str | None, Parameter(help="Of a bag: the marker's frame, where it comes by TF.")] = None
+    markers: Annotated[
+        Path | None, Parameter(help="Of a bag or a dataset: a file with the marker's positions (t, x, y, z).")
+    ] = None
+    lerobot_unit: Annotated[
+        Literal["degrees", "range_m100_100"] | None,
+        Parameter(help="Of a dataset: the unit of its readings, where they do not show it."),
+    ] = None
+
+    def opened(self, config: Config, source: Path, lerobot: Path | None = None) -> Recording:
+        """Return the recording in `source`; `lerobot` is LeRobot's calibration of the arm of a dataset."""
+        from daemon.foreign_recordings import Taken, opened
+
+        taken = Taken(self.joint_topic, self.marker_topic, self.marker_frame, self.markers, lerobot, self.lerobot_unit)
+        return opened(config, source, taken)
+
+
+AS_THEY_ARE = SourceOptions()
 
 
 def flag(text: str, *, name: str | None = None) -> Parameter:
