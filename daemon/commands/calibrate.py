@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import cyclopts
 from cyclopts import Parameter
@@ -20,6 +20,8 @@ from daemon.commands.options import (
     lerobot_lines,
     robot_file,
 )
+
+CAMERA_FRAME = "calibrated_camera"
 
 # Without a help of its own its page shows what `arm` says, beside the commands.
 calibrate = cyclopts.App(name="calibrate")
@@ -61,12 +63,24 @@ def arm(
     out: Annotated[
         Path | None, Parameter(help="Write the calibrated robot into this folder: a URDF and a robot.toml.")
     ] = None,
+    trust_urdf: Annotated[
+        bool, flag("Camera and tool alone: links and joint zeros are right as the URDF has them.")
+    ] = False,
+    only: Annotated[
+        Literal["offsets"] | None,
+        Parameter(help="offsets: joint offsets, camera and tool; the links are right as the URDF has them."),
+    ] = None,
+    camera_frame: Annotated[str, Parameter(help="What ROS calls the measurement frame, for TF.")] = CAMERA_FRAME,
     taken: SourceOptions = AS_THEY_ARE,
     lerobot: LeRobotFile = None,
     write: Annotated[bool, flag("Write the file of --lerobot; the old one is kept beside it.")] = False,
     as_json: Annotated[bool, flag("Print the figures as JSON.", name="--json")] = False,
     force: Annotated[
-        bool, flag("Go on, and write, although the pairs do not seem to be of this robot, or its zeros are far off.")
+        bool,
+        flag(
+            "Go on, and write, although the pairs do not seem to be of this robot, or its zeros are far off; replace "
+            "files in OUT."
+        ),
     ] = False,
 ) -> None:
     """Where camera and tool are and what the joint zeros are, with 95 % intervals; writes a calibrated URDF.
@@ -99,6 +113,7 @@ def arm(
     from daemon.calibration_report import CalibrationReport
     from daemon.calibration_view import two_tools, view
     from daemon.config import Config
+    from daemon.hand_eye import write_launch_file
     from daemon.plausibility.check import plausibility, told_sigma
     from daemon.plausibility.limits import require_units
     from daemon.present_tool import first_pair
@@ -110,6 +125,9 @@ def arm(
         raise RequestError(
             "--write is for --lerobot FILE, and without --out: offsets belong into the servos or into a URDF, not both"
         )
+    if trust_urdf and only is not None:
+        raise RequestError("--trust-urdf has no offsets to find. Give it, or --only offsets")
+    trusted = "urdf" if trust_urdf else "nothing" if only is None else "links"
     config = Config.load(robot_file(robot, source))
     description, source = config.robot, source or config.store_file
     if source.suffix.lower() in recordings.STORE_ENDINGS:
@@ -125,11 +143,13 @@ def arm(
     seen = plausibility(description, recording.q, recording.x, sigma_m=told_sigma(recording) or sigma_m)
     if seen.misread:
         seen.require(source, force=force)
-    found = Calibration.of(description, recording, sigma_m=sigma_m, zeros_rad=math.radians(zeros_deg))
-    report = CalibrationReport.of(found, seen, source.name, first)
+    settings = {"sigma_m": sigma_m, "zeros_rad": math.radians(zeros_deg)}
+    found = Calibration.of(description, recording, **settings, trusted=trusted)
+    free = None if trusted == "nothing" else Calibration.of(description, recording, **settings)
+    report = CalibrationReport.of(found, seen, source.name, first, camera_frame, free)
     if report.other_tool_from is None:
         seen.require(source, force=force)
-    written = None
+    written = launch = None
     if out is not None or write:
         if report.other_tool_from is not None:
             raise CalibrationError(f"nothing was written. {two_tools(report)}")
@@ -137,7 +157,8 @@ def arm(
             raise CalibrationError(f"nothing was written. {report.doubt} Or write it as it is with --force")
     if out is not None:
         heading = f"Calibrated by bodyschema from {report.pairs} pairs of {source.name}"
-        written = write_calibrated(description, found.figures.geometry, out, heading)
+        written = write_calibrated(description, found.figures.geometry, out, heading, replace=force)
+        launch = write_launch_file(report.hand_eye, out)
     lines: list[str] = []
     if lerobot is not None:
         offsets = {zero.joint: math.radians(zero.zero) for zero in report.zeros if zero.half_width is not None}
@@ -149,7 +170,9 @@ def arm(
     console.print(view(report))
     for line in ["", *lines] if lines else []:
         console.print(line, markup=False, soft_wrap=True)
+    console.print(f"\nIn ROS 2: {report.hand_eye.static_transform_publisher}", markup=False, soft_wrap=True)
     if written is not None:
+        console.print(f"{launch} written, which publishes the same.", markup=False, soft_wrap=True)
         console.print(
             f"\n{written} written. Next: stop what runs with {config.file.name} (the new one has its ports), then "
             f"`bodyschema run --robot {written}`",
