@@ -55,6 +55,13 @@ class HandEye(msgspec.Struct, frozen=True):
         )
 
 
+def in_shell_lines(pose: HandEye) -> str:
+    """Return the command in lines that fit a terminal and can be pasted together."""
+    command, *options = pose.static_transform_publisher.split(" --")
+    rows = [options[:3], options[3:5], options[5:7], *([option] for option in options[7:])]
+    return " \\\n".join([command, *("   " + "".join(f" --{option}" for option in row) for row in rows)])
+
+
 def covariance_of_turns(rpy: FloatArray, covariance: FloatArray) -> FloatArray:
     """Return the covariance (6, 6) of place and turns about the parent's axes.
 

@@ -113,7 +113,7 @@ def arm(
     from daemon.calibration_report import CalibrationReport
     from daemon.calibration_view import two_tools, view
     from daemon.config import Config
-    from daemon.hand_eye import write_launch_file
+    from daemon.hand_eye import in_shell_lines, write_launch_file
     from daemon.plausibility.check import plausibility, told_sigma
     from daemon.plausibility.limits import require_units
     from daemon.present_tool import first_pair
@@ -170,7 +170,7 @@ def arm(
     console.print(view(report))
     for line in ["", *lines] if lines else []:
         console.print(line, markup=False, soft_wrap=True)
-    console.print(f"\nIn ROS 2: {report.hand_eye.static_transform_publisher}", markup=False, soft_wrap=True)
+    console.print(f"\nIn ROS 2:\n{in_shell_lines(report.hand_eye)}", markup=False, soft_wrap=True)
     if written is not None:
         console.print(f"{launch} written, which publishes the same.", markup=False, soft_wrap=True)
         console.print(
