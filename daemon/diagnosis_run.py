@@ -23,6 +23,7 @@ from diagnosis.report import About, page
 from diagnosis.result import DiagnosisFile
 from diagnosis.words import modelled
 from effects import KINDS, write_corrected, write_extended
+from interfaces.calibrated_files import CAMERA_LINK
 from interfaces.errors import BodyschemaError, RecordingError, RequestError
 from interfaces.recording import Recording
 from interfaces.records import Pair
@@ -32,6 +33,7 @@ from interfaces.suggest import did_you_mean
 from . import recordings
 from .bus import client
 from .config import Config
+from .hand_eye import HandEye
 from .learning import NominalModel
 from .plausibility.check import plausibility, told_sigma
 from .plausibility.limits import require_units
@@ -147,8 +149,15 @@ class Found:
 
     @property
     def json(self) -> str:
-        """diagnosis.json."""
-        return msgspec.json.format(msgspec.json.encode(self.file, enc_hook=float), indent=1).decode()
+        """diagnosis.json, with the camera's pose beside what was found."""
+        told = msgspec.to_builtins(self.file, enc_hook=float) | {"hand_eye": msgspec.to_builtins(self.hand_eye)}
+        return msgspec.json.format(msgspec.json.encode(told), indent=1).decode()
+
+    @property
+    def hand_eye(self) -> HandEye:
+        """The camera's pose with what was found in it; how sure it is, `bodyschema calibrate` tells."""
+        placed = self.diagnosis.extended.simulation.placed
+        return HandEye.of(self.robot.camera.parent_link, CAMERA_LINK, placed.robot.camera.pose @ placed.camera_pose)
 
     @property
     def timed(self) -> bool:
