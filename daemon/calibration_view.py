@@ -102,7 +102,7 @@ def _trusted(report: CalibrationReport) -> str:
     free, expected = report.free_expected_mm, report.expected_mm
     if free is None or expected is None or expected < WRONG_URDF * free:
         return said
-    return f"{said} It is not: with them free, expect {free:.2g} mm on new poses. Calibrate without this option."
+    return f"{said} The recording says it is not: with nothing held, expect {free:.2g} mm on new poses."
 
 
 def _workmanship(report: CalibrationReport) -> str:

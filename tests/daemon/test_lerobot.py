@@ -15,6 +15,7 @@ import pytest
 from daemon.cli import command_line
 from daemon.config import Config
 from daemon.lerobot_offsets import CorrectedCalibration
+from daemon.reopen import Reopening
 from daemon.wiring import open_joints
 from drivers.bench.pty_shell import PtyShell
 from drivers.feetech.bench.chain import Chain
@@ -73,7 +74,8 @@ def both_arms(folder: Path) -> Iterator[dict[str, Path]]:
 
 
 def read(config: Config) -> np.ndarray:
-    with open_joints(config, SystemClock()) as joints:
+    clock = SystemClock()
+    with Reopening(open_joints(config, clock), "the arm", clock) as joints:
         for _ in range(60):
             if (reading := joints.read(1.0)) is not None:
                 return reading.q

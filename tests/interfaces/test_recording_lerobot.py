@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
 import pytest
+from lerobot_datasets import write_dataset
 
 from interfaces.errors import RecordingError
-from interfaces.lerobot import ARMS, RAD_PER_TICK, JointServo, MotorCalibration, Unit
+from interfaces.lerobot import ARMS, JointServo, MotorCalibration, Unit
 from interfaces.recording_lerobot import LeRobotUnits, read_lerobot_dataset
 from interfaces.tracks import MarkerTrack
 
-pa, pq = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.parquet")
+pytest.importorskip("pyarrow")
 
 MOTORS = tuple(ARMS["so101"].models)
 JOINTS = ARMS["so101"].joints
@@ -28,36 +28,11 @@ def path(t: np.ndarray, episode: int) -> np.ndarray:
     return np.sin(np.outer(t, np.arange(1, 7)) * 0.3 + episode)
 
 
-def dataset(folder: Path, version: str, unit: Unit, *, names: object = None, **info: object) -> Path:
-    """Write a dataset as LeRobot lays it out, of two episodes along `path`."""
-    (folder / "meta").mkdir(parents=True)
-    told = [f"{name}.pos" for name in MOTORS] if names is None else names
-    described = {"codebase_version": version, "robot_type": "so101_follower", "fps": FPS} | info
-    described["features"] = {"observation.state": {"dtype": "float32", "shape": [6], "names": told}}
-    (folder / "meta" / "info.json").write_text(json.dumps(described))
+def dataset(folder: Path, version: str, unit: Unit, **told: object) -> Path:
+    """Write a dataset of two episodes along `path`."""
     t = np.arange(FRAMES) / FPS
-    tables = []
-    for episode in range(EPISODES):
-        ticks = path(t, episode) / RAD_PER_TICK + [CALIBRATION[name].middle for name in MOTORS]
-        columns = [CALIBRATION[name].readings(ticks[:, k], unit, "feetech") for k, name in enumerate(MOTORS)]
-        state = np.column_stack(columns).astype(np.float32)
-        tables.append(
-            pa.table(
-                {
-                    "observation.state": pa.FixedSizeListArray.from_arrays(pa.array(state.ravel()), 6),
-                    "timestamp": t.astype(np.float32),
-                    "episode_index": np.full(FRAMES, episode),
-                }
-            )
-        )
-    chunk = folder / "data" / "chunk-000"
-    chunk.mkdir(parents=True)
-    if version.startswith("v3"):
-        pq.write_table(pa.concat_tables(tables), chunk / "file-000.parquet")
-    else:
-        for episode, table in enumerate(tables):
-            pq.write_table(table, chunk / f"episode_{episode:06d}.parquet")
-    return folder
+    episodes = [(t, path(t, episode)) for episode in range(EPISODES)]
+    return write_dataset(folder, version, unit, CALIBRATION, episodes, **told)
 
 
 def marker() -> MarkerTrack:
