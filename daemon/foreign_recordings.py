@@ -29,6 +29,7 @@ class Taken:
         markers: a file with the marker's positions: t, x, y, z, and in `segment` the episode.
         lerobot: LeRobot's calibration of the arm that a dataset was recorded with.
         lerobot_unit: of a dataset's readings.
+        delay_s: how late the marker's positions are stamped [s].
     """
 
     joint_topic: str | None = None
@@ -37,6 +38,7 @@ class Taken:
     markers: Path | None = None
     lerobot: Path | None = None
     lerobot_unit: Unit | None = None
+    delay_s: float = 0.0
 
 
 def opened(config: Config, source: Path, taken: Taken) -> Recording:
@@ -55,11 +57,11 @@ def opened(config: Config, source: Path, taken: Taken) -> Recording:
                 file=source,
                 remedy="Give the marker's positions with --markers FILE.csv: t, x, y, z, and the episode as segment",
             )
-        return read_lerobot_dataset(source, _units(config, source, taken), marker)
+        return read_lerobot_dataset(source, _units(config, source, taken), marker.earlier(taken.delay_s))
     if is_bag(source):
         robot = config.tables.drivers.ros2
         names = {} if robot is None else robot.names
-        topics = BagTopics(taken.joint_topic, taken.marker_topic, taken.marker_frame, names)
+        topics = BagTopics(taken.joint_topic, taken.marker_topic, taken.marker_frame, names, taken.delay_s)
         return read_bag(source, joints, topics, marker)
     return recordings.opened(source, joints)
 

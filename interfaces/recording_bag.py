@@ -49,12 +49,14 @@ class BagTopics:
         marker: topic of the marker's positions.
         frame: the marker's frame, where it comes by TF.
         names: what the joints are called in the bag, where they have other names.
+        delay_s: how late the marker's positions are stamped [s].
     """
 
     joints: str | None = None
     marker: str | None = None
     frame: str | None = None
     names: Mapping[str, str] = field(default_factory=dict)
+    delay_s: float = 0.0
 
 
 def is_bag(source: Path) -> bool:
@@ -77,7 +79,7 @@ def read_bag(source: Path, joints: tuple[str, ...], topics: BagTopics, marker: M
         found = _joint_track(bag, joint_topic, [topics.names.get(joint, joint) for joint in joints])
         if marker is None:
             marker = _marker_track(bag, _marker_topic(bag, topics), topics.frame)
-    return joined(joints, found, marker, source)
+    return joined(joints, found, marker.earlier(topics.delay_s), source)
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -57,6 +57,10 @@ class MarkerTrack:
     run: NDArray[np.int64]
     cov: FloatArray | None = None
     orientation: FloatArray | None = None
+
+    def earlier(self, delay_s: float) -> MarkerTrack:
+        """Return the track whose times are `delay_s` earlier: the positions were stamped that late."""
+        return replace(self, t=self.t - delay_s)
 
 
 def joined(names: tuple[str, ...], joints: JointTrack, marker: MarkerTrack, file: Path) -> Recording:

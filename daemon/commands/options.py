@@ -54,11 +54,23 @@ class SourceOptions:
         Parameter(help="Of a dataset: the unit of its readings, where they do not show it."),
     ] = None
 
+    marker_delay_ms: Annotated[
+        float, Parameter(help="Of a bag or a dataset: how late the marker's positions are stamped [ms].")
+    ] = 0.0
+
     def opened(self, config: Config, source: Path, lerobot: Path | None = None) -> Recording:
         """Return the recording in `source`; `lerobot` is LeRobot's calibration of the arm of a dataset."""
         from daemon.foreign_recordings import Taken, opened
 
-        taken = Taken(self.joint_topic, self.marker_topic, self.marker_frame, self.markers, lerobot, self.lerobot_unit)
+        taken = Taken(
+            self.joint_topic,
+            self.marker_topic,
+            self.marker_frame,
+            self.markers,
+            lerobot,
+            self.lerobot_unit,
+            1e-3 * self.marker_delay_ms,
+        )
         return opened(config, source, taken)
 
 

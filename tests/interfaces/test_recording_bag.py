@@ -77,6 +77,14 @@ def test_joints_come_in_any_order_under_other_names(tmp_path) -> None:
     assert read.q == pytest.approx(path(np.asarray(read.t) - BEGUN_S), abs=2e-5)
 
 
+def test_late_stamps_are_taken_back(tmp_path) -> None:
+    bag = write_bag(tmp_path / "bag", {"/js": states(), "/p": marker()}, mcap=True)
+    read = read_bag(bag, JOINTS, BagTopics(delay_s=0.05))
+    first = np.asarray(read.t)[0] - BEGUN_S
+    assert first == pytest.approx(0.05)
+    assert read.q[0] == pytest.approx(path(np.array([first]))[0], abs=1e-4)
+
+
 def refused(bag: Path) -> str:
     with pytest.raises(RecordingError) as error:
         read_bag(bag, JOINTS, BagTopics())
