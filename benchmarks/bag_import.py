@@ -8,6 +8,7 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from rosbags.rosbag2 import StoragePlugin, Writer
@@ -44,7 +45,7 @@ def _write(bag: Path, plugin: StoragePlugin) -> None:
     types, empty = store.types, np.array([])
     state, pose = "sensor_msgs/msg/JointState", "geometry_msgs/msg/PoseStamped"
 
-    def header(t: float) -> object:
+    def header(t: float) -> Any:
         stamp = types["builtin_interfaces/msg/Time"](BEGUN_S + int(t), int(t % 1 * 1e9))
         return types["std_msgs/msg/Header"](stamp, "camera")
 

@@ -18,12 +18,14 @@ from daemon.lerobot_offsets import CorrectedCalibration
 from daemon.reopen import Reopening
 from daemon.wiring import open_joints
 from drivers.bench.pty_shell import PtyShell
+from drivers.dynamixel.bench.servo import Servo as DynamixelServo
+from drivers.dynamixel.models import BY_NAME as DYNAMIXEL
 from drivers.feetech.bench.chain import Chain
 from drivers.feetech.bench.servo import Servo
 from drivers.feetech.models import BY_NAME
 from interfaces.clock import SystemClock
 from interfaces.errors import ConfigError
-from interfaces.lerobot import ARMS, MotorCalibration, read_calibration
+from interfaces.lerobot import ARMS, JointServo, MotorCalibration, corrections, read_calibration
 from interfaces.recording import Recording
 
 SO101 = Path(__file__).parents[2] / "examples" / "so101"
@@ -125,6 +127,20 @@ def test_written_offsets_correct_the_readings(arm, tmp_path) -> None:
         q = read(robot)
     expected = [math.degrees(POSE_RAD[name] + offsets[name]) for name in JOINTS]
     assert np.degrees(q) == pytest.approx(expected, abs=0.1)
+
+
+@pytest.mark.parametrize("inverted", [0, 1])
+def test_dynamixel_offsets_correct_the_readings(inverted, tmp_path) -> None:
+    """An elbow of a Koch leader, which LeRobot sets to count the other way in the servo itself."""
+    before = MotorCalibration(3, inverted, -512, 900, 3100)
+    servo = JointServo("elbow_flex", "dynamixel", 1, before.middle)
+    (change,) = corrections({"elbow_flex": before}, [servo], {"elbow_flex": math.radians(3.0)})
+    arm = DynamixelServo(DYNAMIXEL["XL330-M077"], 3, lambda _: 0.4, return_delay_s=0)
+    arm["drive_mode"], readings = inverted, []
+    for motor in (change.before, change.after):
+        arm["homing_offset"] = motor.homing_offset
+        readings.append(servo.angles(np.array(float(arm.position(0.0)))))
+    assert math.degrees(readings[1] - readings[0]) == pytest.approx(3.0, abs=0.05)
 
 
 def test_offsets_stay_within_what_a_servo_keeps() -> None:
