@@ -10,8 +10,8 @@ import numpy as np
 from interfaces.errors import RecordingError
 from interfaces.lerobot import Unit, read_calibration, where_calibrations_are
 from interfaces.recording import Recording, read_table
-from interfaces.recording_bag import BagTopics, is_bag, read_bag
-from interfaces.recording_lerobot import LeRobotUnits, is_lerobot_dataset, read_lerobot_dataset
+from interfaces.recording_bag import METADATA, BagTopics, is_bag, read_bag
+from interfaces.recording_lerobot import INFO, LeRobotUnits, is_lerobot_dataset, read_lerobot_dataset
 from interfaces.tracks import MarkerTrack
 
 from . import recordings
@@ -63,6 +63,12 @@ def opened(config: Config, source: Path, taken: Taken) -> Recording:
         names = {} if robot is None else robot.names
         topics = BagTopics(taken.joint_topic, taken.marker_topic, taken.marker_frame, names, taken.delay_s)
         return read_bag(source, joints, topics, marker)
+    if source.is_dir() and not source.suffix:
+        raise RecordingError(
+            f"a folder with neither {METADATA}, as of a ROS bag, nor {INFO}, as of a LeRobotDataset",
+            file=source,
+            remedy="Name a recording",
+        )
     return recordings.opened(source, joints)
 
 
@@ -84,7 +90,7 @@ def read_marker_track(file: Path) -> MarkerTrack:
 def _units(config: Config, source: Path, taken: Taken) -> LeRobotUnits:
     if taken.lerobot is None:
         raise RecordingError(
-            "which calibration was it recorded with?",
+            "a dataset does not say how its arm was calibrated",
             file=source,
             remedy=f"Give --lerobot CALIBRATION.json. {where_calibrations_are()}",
         )

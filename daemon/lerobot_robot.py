@@ -61,10 +61,10 @@ def lerobot_robot_toml(
         ConfigError: the URDF has other joints, or the calibration is not of this arm.
     """
     tree = UrdfTree.load(urdf)
-    servos = _servos(arm, tree, read_calibration(calibration, arm.joints), calibration)
     guess = guess_of(tree, os.path.relpath(urdf, robot.parent), _end(tree, arm.joints))._replace(
         name=key_name(calibration.stem)
     )
+    servos = _servos(arm, tree, read_calibration(calibration, arm.joints), calibration)
     return robot_toml(guess, cameras) + _servo_tables(arm, servos, calibration, port)
 
 

@@ -128,6 +128,8 @@ def _opened(source: Path) -> Iterator[_Bag]:
     from rosbags.rosbag1 import ReaderError as Reader1Error
     from rosbags.rosbag2 import ReaderError as Reader2Error
 
+    if not source.exists():
+        raise RecordingError("there is no such file", file=source, remedy="Name a bag that is there")
     errors = (AnyReaderError, Reader1Error, Reader2Error)
     try:
         with AnyReader([source], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:

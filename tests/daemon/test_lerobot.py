@@ -45,7 +45,9 @@ READ_BY_LEROBOT = [
 
 
 def config(*arguments: object) -> None:
-    words = ["config", "init", "--lerobot", "so101", "--urdf", SO101 / "so101.urdf", *arguments]
+    words = ["config", "init", "--lerobot", "so101", *arguments]
+    if "--urdf" not in words:
+        words += ["--urdf", SO101 / "so101.urdf"]
     command_line("config")(list(map(str, words)), exit_on_error=False, result_action="return_value")
 
 
@@ -108,6 +110,12 @@ def test_two_arms_on_two_ports_are_asked_about(tmp_path) -> None:
     told = r"such arms are on .*leader and .*follower"
     with both_arms(tmp_path) as ports, pytest.raises(ConfigError, match=told):
         config("--calibration", SO101 / "leader.json", *(f"--port={port}" for port in ports.values()))
+
+
+def test_joints_of_another_urdf_are_named(tmp_path) -> None:
+    desk_arm = SO101.parent / "desk_arm" / "desk_arm.urdf"
+    with pytest.raises(ConfigError, match=r"has no joint shoulder_pan.*; it has base_yaw"):
+        config("--urdf", desk_arm, "--calibration", SO101 / "leader.json", "--port", "x", "--robot", tmp_path / "r")
 
 
 def test_zero_is_the_middle_of_the_recorded_range(tmp_path) -> None:
