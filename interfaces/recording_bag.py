@@ -86,7 +86,6 @@ def read_bag(source: Path, joints: tuple[str, ...], topics: BagTopics, marker: M
 class _Bag:
     source: Path
     reader: Any
-    errors: tuple[type[Exception], ...]
 
     @property
     def types(self) -> dict[str, str]:
@@ -119,22 +118,20 @@ class _Bag:
 @contextmanager
 def _opened(source: Path) -> Iterator[_Bag]:
     try:
-        from rosbags.highlevel import AnyReader, AnyReaderError
+        from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
     except ImportError as error:
         raise RecordingError(
             "reading a ROS bag needs the extra `bags`", file=source, remedy="Type: pip install 'bodyschema[bags]'"
         ) from error
-    from rosbags.rosbag1 import ReaderError as Reader1Error
-    from rosbags.rosbag2 import ReaderError as Reader2Error
-
     if not source.exists():
         raise RecordingError("there is no such file", file=source, remedy="Name a bag that is there")
-    errors = (AnyReaderError, Reader1Error, Reader2Error)
     try:
         with AnyReader([source], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
-            yield _Bag(source, reader, errors)
-    except (*errors, OSError, ValueError, KeyError) as error:
+            yield _Bag(source, reader)
+    except RecordingError:
+        raise
+    except Exception as error:  # of damaged bytes rosbags raises whatever comes, MemoryError among them
         said = str(error).strip().split("\n")[0].rstrip(".")
         remedy = "A bag whose recording was cut off: `ros2 bag reindex`; one of splits: name the folder"
         raise RecordingError(f"the bag cannot be read: {said}", file=source, remedy=remedy) from error
