@@ -95,7 +95,10 @@ class _Bag:
     @property
     def counts(self) -> Counter[str]:
         """How many messages each topic has."""
-        return Counter({c.topic: c.msgcount for c in self.reader.connections})
+        counts: Counter[str] = Counter()
+        for connection in self.reader.connections:
+            counts[connection.topic] += connection.msgcount
+        return counts
 
     def messages(self, topic: str) -> Iterator[tuple[float, Any]]:
         """Yield all messages of a topic with the time at which they were received [s]."""
@@ -167,12 +170,11 @@ def _marker_topic(bag: _Bag, topics: BagTopics) -> str:
         topic = _asked(bag, topics.marker, [*known, *tf], "--marker-topic", "positions")
         known, tf = [topic] if topic in known else [], [topic] if topic in tf else []
     if topics.frame is not None:
-        moving = [
-            topic for topic in tf if any(_child(t) == topics.frame for m in bag.some(topic) for t in m.transforms)
-        ]
-        if moving:
-            return min(moving, key=lambda topic: topic.endswith("static"))
-        frames = sorted({_child(t) for topic in tf for m in bag.some(topic) for t in m.transforms})
+        seen = {topic: _frames(bag, topic, topics.frame) for topic in tf}
+        leading = [topic for topic in tf if any(child == topics.frame for _, child in seen[topic])]
+        if leading:
+            return min(leading, key=lambda topic: topic.endswith("static"))
+        frames = sorted({child for pairs in seen.values() for _, child in pairs})
         raise bag.wrong(
             f"no transform leads to the frame {topics.frame!r}; there are {', '.join(frames) or 'none'}",
             f"Correct --marker-frame. {did_you_mean(topics.frame, frames)}" if frames else "Record /tf.",
@@ -182,7 +184,7 @@ def _marker_topic(bag: _Bag, topics: BagTopics) -> str:
     if known:
         raise bag.wrong(f"several topics have positions: {', '.join(known)}", "Give the marker's with --marker-topic.")
     if tf:
-        pairs = sorted({(t.header.frame_id, _child(t)) for topic in tf for m in bag.some(topic) for t in m.transforms})
+        pairs = sorted({pair for topic in tf for pair in _frames(bag, topic)})
         listed = ", ".join(f"{child} in {parent}" for parent, child in pairs)
         raise RecordingError(
             f"which frame of TF is the marker? There are {listed}",
@@ -193,6 +195,16 @@ def _marker_topic(bag: _Bag, topics: BagTopics) -> str:
         "there is no topic with positions of a marker",
         "Record PointStamped, PoseStamped, TransformStamped or TF of it, or give --markers FILE.csv.",
     )
+
+
+def _frames(bag: _Bag, topic: str, wanted: str | None = None) -> set[tuple[str, str]]:
+    """Return parent and child of the transforms on a topic, of all messages or until the child `wanted` comes."""
+    found: set[tuple[str, str]] = set()
+    for _, message in bag.messages(topic):
+        found |= {(transform.header.frame_id, _child(transform)) for transform in message.transforms}
+        if any(child == wanted for _, child in found):
+            break
+    return found
 
 
 def _asked(bag: _Bag, topic: str, known: Sequence[str], option: str, what: str) -> str:

@@ -103,6 +103,15 @@ def test_frames_of_tf_are_listed(tmp_path) -> None:
     assert "There are tag_0 in camera. Give it with --marker-frame" in refused(bag)
 
 
+def test_a_tag_that_comes_late_is_found(tmp_path) -> None:
+    kind, tags = marker("TFMessage")
+    hands = [(t, tf(t, np.ones(3), "base", "hand")) for t in np.arange(0, SECONDS, 0.005).tolist()]
+    late = [(t, fix) for t, fix in tags if t > 2.0]
+    messages = sorted(hands + late, key=lambda timed: timed[0])
+    bag = write_bag(tmp_path / "bag", {"/js": states(), "/tf": (kind, messages)}, mcap=True)
+    assert len(read_bag(bag, JOINTS, BagTopics(frame="tag_0"))) == len(late)
+
+
 def test_missing_joints_are_named(tmp_path) -> None:
     bag = write_bag(tmp_path / "bag", {"/js": states(("lift", "wrist")), "/p": marker()}, mcap=True)
     assert "/js says nothing of elbow; it has lift, wrist" in refused(bag)
