@@ -72,7 +72,7 @@ def read_lerobot_dataset(source: Path, units: LeRobotUnits, marker: MarkerTrack)
             file=source / INFO,
             remedy="Correct [robot] joints of robot.toml",
         )
-    state, t, episode = _rows(source)
+    state, t, episode = _rows(source, names)
     columns = [names.index(servo.joint) for servo in units.servos]
     readings = state[:, columns]
     unit = units.unit or _unit_of(readings, source)
@@ -118,7 +118,7 @@ def _motor_names(info: _Info, source: Path) -> list[str]:
     return [name.removesuffix(".pos") for name in names]
 
 
-def _rows(source: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _rows(source: Path, names: Sequence[str]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return states (n, k), times (n,) [s] and episodes (n,) of all files, in their order."""
     try:
         import pyarrow
@@ -134,7 +134,8 @@ def _rows(source: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     for file in files:
         try:
             table = pyarrow.parquet.read_table(file, columns=list(_COLUMNS))
-            states.append(np.array(table.column(STATE).to_pylist(), dtype=np.float64))
+            flat = pyarrow.concat_arrays(table.column(STATE).chunks).flatten().to_numpy(zero_copy_only=False)
+            states.append(flat.astype(np.float64).reshape(len(table), len(names)))
             times.append(table.column("timestamp").to_numpy().astype(np.float64))
             episodes.append(table.column("episode_index").to_numpy().astype(np.int64))
         except (pyarrow.ArrowException, KeyError, ValueError, OSError) as error:
