@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
-from interfaces.errors import RecordingError
-from interfaces.lerobot import Unit, read_calibration, where_calibrations_are
-from interfaces.recording import Recording, read_table
-from interfaces.recording_bag import METADATA, BagTopics, is_bag, read_bag
-from interfaces.recording_lerobot import INFO, LeRobotUnits, is_lerobot_dataset, read_lerobot_dataset
-from interfaces.tracks import MarkerTrack
+from bodyschema.interfaces.errors import RecordingError
+from bodyschema.interfaces.lerobot import Unit, read_calibration, where_calibrations_are
+from bodyschema.interfaces.recording import Recording, read_table
+from bodyschema.interfaces.recording_bag import METADATA, BagTopics, is_bag, read_bag
+from bodyschema.interfaces.recording_lerobot import INFO, LeRobotUnits, is_lerobot_dataset, read_lerobot_dataset
+from bodyschema.interfaces.tracks import MarkerTrack
 
 from . import recordings
 from .config import Config

@@ -9,9 +9,9 @@ import msgspec
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from interfaces.errors import ConfigError
-from interfaces.records import FloatArray
-from interfaces.rpy import rotation_of
+from bodyschema.interfaces.errors import ConfigError
+from bodyschema.interfaces.records import FloatArray
+from bodyschema.interfaces.rpy import rotation_of
 
 LAUNCH = "hand_eye.launch.py"
 _STEP = 1e-6  # of the numerical derivative by roll, pitch and yaw [rad]

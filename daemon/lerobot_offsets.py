@@ -8,8 +8,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from interfaces.errors import ConfigError
-from interfaces.lerobot import RAD_PER_TICK, Calibrations, Correction, calibration_json, corrections, read_calibration
+from bodyschema.interfaces.errors import ConfigError
+from bodyschema.interfaces.lerobot import (
+    RAD_PER_TICK,
+    Calibrations,
+    Correction,
+    calibration_json,
+    corrections,
+    read_calibration,
+)
 
 from .config import Config
 from .lerobot_robot import joint_servos

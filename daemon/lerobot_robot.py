@@ -8,10 +8,18 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from interfaces.errors import ConfigError
-from interfaces.lerobot import ARMS, RAD_PER_TICK, Calibrations, JointServo, LeRobotArm, Make, read_calibration
-from interfaces.suggest import did_you_mean
-from interfaces.urdf import MOVING, UrdfTree
+from bodyschema.interfaces.errors import ConfigError
+from bodyschema.interfaces.lerobot import (
+    ARMS,
+    RAD_PER_TICK,
+    Calibrations,
+    JointServo,
+    LeRobotArm,
+    Make,
+    read_calibration,
+)
+from bodyschema.interfaces.suggest import did_you_mean
+from bodyschema.interfaces.urdf import MOVING, UrdfTree
 
 from .robot_template import guess_of, key_name, quoted, robot_toml
 from .scan_report import ScannedPort

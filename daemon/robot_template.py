@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:
-    from interfaces.urdf import UrdfTree
+    from bodyschema.interfaces.urdf import UrdfTree
 
 
 class Guess(NamedTuple):
@@ -135,7 +135,7 @@ def guess_from(urdf: Path, robot: Path) -> Guess:
     Raises:
         RobotError: the URDF cannot be read.
     """
-    from interfaces.urdf import MOVING, UrdfTree
+    from bodyschema.interfaces.urdf import MOVING, UrdfTree
 
     tree = UrdfTree.load(urdf)
     root = _root(tree)
@@ -147,7 +147,7 @@ def guess_from(urdf: Path, robot: Path) -> Guess:
 
 def guess_of(tree: UrdfTree, urdf: str, end: str) -> Guess:
     """Return the chain of moving joints from the root of `tree` to the link `end`."""
-    from interfaces.urdf import MOVING
+    from bodyschema.interfaces.urdf import MOVING
 
     root = _root(tree)
     joints = [joint.name for joint, _ in tree.path(root, end) if joint.kind in MOVING]

@@ -9,9 +9,9 @@ import cyclopts
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
-from daemon.commands.calibrate_cameras import cameras, check
-from daemon.commands.latency import latency
-from daemon.commands.options import (
+from bodyschema.daemon.commands.calibrate_cameras import cameras, check
+from bodyschema.daemon.commands.latency import latency
+from bodyschema.daemon.commands.options import (
     AS_THEY_ARE,
     LeRobotFile,
     SourceOptions,
@@ -108,18 +108,18 @@ def arm(
 
     from rich.console import Console
 
-    from daemon import recordings
-    from daemon.calibration import Calibration, CalibrationError
-    from daemon.calibration_report import CalibrationReport
-    from daemon.calibration_view import two_tools, view
-    from daemon.config import Config
-    from daemon.hand_eye import in_shell_lines, write_launch_file
-    from daemon.plausibility.check import plausibility, told_sigma
-    from daemon.plausibility.limits import require_units
-    from daemon.present_tool import first_pair
-    from daemon.wire import encode
-    from interfaces.calibrated_files import write_calibrated
-    from interfaces.errors import RequestError
+    from bodyschema.daemon import recordings
+    from bodyschema.daemon.calibration import Calibration, CalibrationError
+    from bodyschema.daemon.calibration_report import CalibrationReport
+    from bodyschema.daemon.calibration_view import two_tools, view
+    from bodyschema.daemon.config import Config
+    from bodyschema.daemon.hand_eye import in_shell_lines, write_launch_file
+    from bodyschema.daemon.plausibility.check import plausibility, told_sigma
+    from bodyschema.daemon.plausibility.limits import require_units
+    from bodyschema.daemon.present_tool import first_pair
+    from bodyschema.daemon.wire import encode
+    from bodyschema.interfaces.calibrated_files import write_calibrated
+    from bodyschema.interfaces.errors import RequestError
 
     if write and (lerobot is None or out is not None):
         raise RequestError(

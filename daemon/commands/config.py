@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Annotated
 import cyclopts
 from cyclopts import Parameter
 
-from daemon.commands.options import HERE, RobotFile, flag, several
+from bodyschema.daemon.commands.options import HERE, RobotFile, flag, several
 
 if TYPE_CHECKING:
-    from daemon.config import Config
-    from effects import Effect
-    from interfaces.robot import RobotDescription
+    from bodyschema.daemon.config import Config
+    from bodyschema.effects import Effect
+    from bodyschema.interfaces.robot import RobotDescription
 
 config = cyclopts.App(
     name="config",
@@ -53,7 +53,7 @@ def init(
     Next: mend what is marked CHECK, then `bodyschema config check`. With --sim nothing is left to mend:
     `bodyschema run --sim`. With --lerobot: `bodyschema joints`.
     """
-    from interfaces.errors import ConfigError
+    from bodyschema.interfaces.errors import ConfigError
 
     try:
         if sim:
@@ -61,7 +61,7 @@ def init(
         elif lerobot is not None:
             write_new(robot, _of_lerobot(lerobot, urdf, robot, calibration, port))
         else:
-            from daemon.robot_template import EXAMPLE, guess_from, robot_toml
+            from bodyschema.daemon.robot_template import EXAMPLE, guess_from, robot_toml
 
             write_new(robot, robot_toml(EXAMPLE if urdf is None else guess_from(urdf, robot)))
     except OSError as error:
@@ -78,9 +78,9 @@ def check(*, robot: RobotFile = HERE) -> None:
 
     Next: `bodyschema replay` for a recording that you have; `bodyschema run`.
     """
-    from daemon.config import Config
-    from daemon.synthesis import without_consequence
-    from interfaces.urdf import REVOLUTE
+    from bodyschema.daemon.config import Config
+    from bodyschema.daemon.synthesis import without_consequence
+    from bodyschema.interfaces.urdf import REVOLUTE
 
     checked = Config.load(robot)
     checked.require_learnable()
@@ -127,7 +127,7 @@ def show(*, robot: RobotFile = HERE) -> None:
     """
     import msgspec
 
-    from daemon.config import Config
+    from bodyschema.daemon.config import Config
 
     checked = Config.load(robot)
     tables = msgspec.to_builtins(checked.tables)
@@ -138,11 +138,11 @@ def show(*, robot: RobotFile = HERE) -> None:
 
 def _of_lerobot(name: str, urdf: Path | None, robot: Path, calibration: Path | None, ports: Sequence[str]) -> str:
     """Return a robot.toml for an arm of LeRobot."""
-    from daemon import servo_wiring
-    from daemon.lerobot_robot import lerobot_arm, lerobot_port, lerobot_robot_toml
-    from daemon.wiring import connected_cameras
-    from interfaces.errors import ConfigError
-    from interfaces.lerobot import where_calibrations_are
+    from bodyschema.daemon import servo_wiring
+    from bodyschema.daemon.lerobot_robot import lerobot_arm, lerobot_port, lerobot_robot_toml
+    from bodyschema.daemon.wiring import connected_cameras
+    from bodyschema.interfaces.errors import ConfigError
+    from bodyschema.interfaces.lerobot import where_calibrations_are
 
     arm = lerobot_arm(name)
     if urdf is None:
@@ -174,14 +174,14 @@ def _numbers(values: Iterable[float]) -> str:
 def _camera_lines(config: Config) -> list[str]:
     if config.tables.vision.cameras is None:
         return []
-    from daemon.camera_wiring import camera_lines
+    from bodyschema.daemon.camera_wiring import camera_lines
 
     return list(camera_lines(config))
 
 
 def _standing_still(description: RobotDescription) -> list[str]:
     """Moving joints between camera and marker that are not learnt."""
-    from interfaces.urdf import MOVING
+    from bodyschema.interfaces.urdf import MOVING
 
     path = description.tree.path(description.camera.parent_link, description.robot.marker_link)
     return [joint.name for joint, _ in path if joint.kind in MOVING and joint.name not in description.joints]
@@ -196,7 +196,7 @@ def say(text: str) -> None:
 
 def write_new(file: Path, text: str) -> None:
     """Write a file that is not there yet; ConfigError when it is."""
-    from interfaces.errors import ConfigError
+    from bodyschema.interfaces.errors import ConfigError
 
     try:
         with file.open("x", encoding="utf-8") as stream:
@@ -206,7 +206,7 @@ def write_new(file: Path, text: str) -> None:
 
 
 def _copy_model(robot: Path) -> None:
-    from daemon.wiring import demonstration_model
+    from bodyschema.daemon.wiring import demonstration_model
 
     model = demonstration_model()
     write_new(robot, model.read_text(encoding="utf-8"))

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
-from daemon.commands.options import (
+from bodyschema.daemon.commands.options import (
     AS_THEY_ARE,
     LeRobotFile,
     SourceOptions,
@@ -65,10 +65,10 @@ def diagnose(
 
     from rich.console import Console
 
-    from daemon.config import Config
-    from daemon.diagnosis_run import Asked, measured, results_in, run, written
-    from daemon.diagnosis_view import view
-    from interfaces.errors import RequestError
+    from bodyschema.daemon.config import Config
+    from bodyschema.daemon.diagnosis_run import Asked, measured, results_in, run, written
+    from bodyschema.daemon.diagnosis_view import view
+    from bodyschema.interfaces.errors import RequestError
 
     if write and lerobot is None:
         raise RequestError("--write is for --lerobot FILE. Give LeRobot's calibration file")

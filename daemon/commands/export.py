@@ -7,7 +7,7 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from daemon.commands.options import AS_THEY_ARE, HERE, DatasetCalibration, RobotFile, SourceOptions, flag
+from bodyschema.daemon.commands.options import AS_THEY_ARE, HERE, DatasetCalibration, RobotFile, SourceOptions, flag
 
 
 def export(
@@ -34,8 +34,8 @@ def export(
     """
     from rich.console import Console
 
-    from daemon import recordings
-    from daemon.config import Config
+    from bodyschema.daemon import recordings
+    from bodyschema.daemon.config import Config
 
     recordings.check_target(out, force=force)
     if source.suffix.lower() in recordings.STORE_ENDINGS:

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import Parameter
 
 if TYPE_CHECKING:
-    from daemon.config import Config
-    from interfaces.recording import Recording
+    from bodyschema.daemon.config import Config
+    from bodyschema.interfaces.recording import Recording
 
 HERE = Path("robot.toml")
 VARIABLE = "BODYSCHEMA_ROBOT"
@@ -60,7 +60,7 @@ class SourceOptions:
 
     def opened(self, config: Config, source: Path, lerobot: Path | None = None) -> Recording:
         """Return the recording in `source`; `lerobot` is LeRobot's calibration of the arm of a dataset."""
-        from daemon.foreign_recordings import Taken, opened
+        from bodyschema.daemon.foreign_recordings import Taken, opened
 
         taken = Taken(
             self.joint_topic,
@@ -98,7 +98,7 @@ def robot_file(given: Path | None, source: Path | None) -> Path:
 
 def lerobot_lines(config: Config, file: Path, offsets_rad: Mapping[str, float], *, write: bool) -> list[str]:
     """Return what joint offsets change in LeRobot's calibration `file`, after writing it where `write` says so."""
-    from daemon.lerobot_offsets import CorrectedCalibration, after_writing, difference
+    from bodyschema.daemon.lerobot_offsets import CorrectedCalibration, after_writing, difference
 
     corrected = CorrectedCalibration.of(config, file, offsets_rad)
     lines = difference(corrected)

@@ -11,15 +11,15 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from daemon.calibration import Calibration
-from daemon.calibration_report import CalibrationReport
-from daemon.calibration_view import sentences
-from daemon.chain_figures import HALF_WIDTH_95
-from daemon.cli import command_line
-from daemon.hand_eye import HandEye, write_launch_file
-from daemon.plausibility.check import Plausibility
-from interfaces.recording import Recording
-from interfaces.robot import RobotDescription
+from bodyschema.daemon.calibration import Calibration
+from bodyschema.daemon.calibration_report import CalibrationReport
+from bodyschema.daemon.calibration_view import sentences
+from bodyschema.daemon.chain_figures import HALF_WIDTH_95
+from bodyschema.daemon.cli import command_line
+from bodyschema.daemon.hand_eye import HandEye, write_launch_file
+from bodyschema.daemon.plausibility.check import Plausibility
+from bodyschema.interfaces.recording import Recording
+from bodyschema.interfaces.robot import RobotDescription
 from kbmaps import ChainParameters, ChainTolerances
 
 DESK_ARM = Path(__file__).parents[2] / "examples" / "desk_arm"

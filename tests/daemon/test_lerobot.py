@@ -12,21 +12,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from daemon.cli import command_line
-from daemon.config import Config
-from daemon.lerobot_offsets import CorrectedCalibration
-from daemon.reopen import Reopening
-from daemon.wiring import open_joints
-from drivers.bench.pty_shell import PtyShell
-from drivers.dynamixel.bench.servo import Servo as DynamixelServo
-from drivers.dynamixel.models import BY_NAME as DYNAMIXEL
-from drivers.feetech.bench.chain import Chain
-from drivers.feetech.bench.servo import Servo
-from drivers.feetech.models import BY_NAME
-from interfaces.clock import SystemClock
-from interfaces.errors import ConfigError
-from interfaces.lerobot import ARMS, JointServo, MotorCalibration, corrections, read_calibration
-from interfaces.recording import Recording
+from bodyschema.daemon.cli import command_line
+from bodyschema.daemon.config import Config
+from bodyschema.daemon.lerobot_offsets import CorrectedCalibration
+from bodyschema.daemon.reopen import Reopening
+from bodyschema.daemon.wiring import open_joints
+from bodyschema.drivers.bench.pty_shell import PtyShell
+from bodyschema.drivers.dynamixel.bench.servo import Servo as DynamixelServo
+from bodyschema.drivers.dynamixel.models import BY_NAME as DYNAMIXEL
+from bodyschema.drivers.feetech.bench.chain import Chain
+from bodyschema.drivers.feetech.bench.servo import Servo
+from bodyschema.drivers.feetech.models import BY_NAME
+from bodyschema.interfaces.clock import SystemClock
+from bodyschema.interfaces.errors import ConfigError
+from bodyschema.interfaces.lerobot import ARMS, JointServo, MotorCalibration, corrections, read_calibration
+from bodyschema.interfaces.recording import Recording
 
 SO101 = Path(__file__).parents[2] / "examples" / "so101"
 JOINTS = ARMS["so101"].joints

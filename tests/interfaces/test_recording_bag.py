@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from interfaces.errors import RecordingError
-from interfaces.recording_bag import BagTopics, read_bag
-from interfaces.tracks import JointTrack, MarkerTrack, joined
+from bodyschema.interfaces.errors import RecordingError
+from bodyschema.interfaces.recording_bag import BagTopics, read_bag
+from bodyschema.interfaces.tracks import JointTrack, MarkerTrack, joined
 
 pytest.importorskip("rosbags")
 from written_bags import (

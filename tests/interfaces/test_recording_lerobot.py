@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from lerobot_datasets import write_dataset
 
-from interfaces.errors import RecordingError
-from interfaces.lerobot import ARMS, JointServo, MotorCalibration, Unit
-from interfaces.recording_lerobot import LeRobotUnits, read_lerobot_dataset
-from interfaces.tracks import MarkerTrack
+from bodyschema.interfaces.errors import RecordingError
+from bodyschema.interfaces.lerobot import ARMS, JointServo, MotorCalibration, Unit
+from bodyschema.interfaces.recording_lerobot import LeRobotUnits, read_lerobot_dataset
+from bodyschema.interfaces.tracks import MarkerTrack
 
 pytest.importorskip("pyarrow")
 

@@ -8,16 +8,16 @@ from typing import Self
 
 import numpy as np
 
-from daemon.config import Config
-from drivers.bench.virtual_port import VirtualClock, VirtualPort
-from drivers.feetech.bench.chain import Chain
-from drivers.feetech.bench.servo import Servo
-from drivers.feetech.joints import FeetechJoints
-from drivers.feetech.models import BY_NAME
-from interfaces.lerobot import RAD_PER_TICK, Calibrations
-from interfaces.recording import Recording
-from interfaces.records import FloatArray
-from interfaces.robot import RobotDescription
+from bodyschema.daemon.config import Config
+from bodyschema.drivers.bench.virtual_port import VirtualClock, VirtualPort
+from bodyschema.drivers.feetech.bench.chain import Chain
+from bodyschema.drivers.feetech.bench.servo import Servo
+from bodyschema.drivers.feetech.joints import FeetechJoints
+from bodyschema.drivers.feetech.models import BY_NAME
+from bodyschema.interfaces.lerobot import RAD_PER_TICK, Calibrations
+from bodyschema.interfaces.recording import Recording
+from bodyschema.interfaces.records import FloatArray
+from bodyschema.interfaces.robot import RobotDescription
 from kbmaps import ChainParameters, ChainTolerances
 
 SPEED_RAD_S = math.radians(30.0)
