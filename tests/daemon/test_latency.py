@@ -102,7 +102,8 @@ def test_the_95_percent_intervals_of_slowly_guided_arms_cover_95_percent() -> No
     assert len(found) > 50
     off = np.array([each.latency_s / each.sigma_s for each in found])
     print(f"rms {1e3 * np.sqrt(np.mean([each.latency_s**2 for each in found])):.2f} ms, off / sigma {np.sort(off)}")
-    assert 0.9 < np.mean(np.abs(off) < 1.96) < 0.99
+    assert np.mean(np.abs(off) < 1.96) > 0.9
+    assert np.sqrt(np.mean(off**2)) > 0.4  # and claims no more than there is
 
 
 def in_step(seed: int, latency_s: float) -> Wiggle:
