@@ -1,9 +1,8 @@
 """How long before its time stamp an image was taken, from encoders and marker while the arm was moved.
 
-The marker is where the joint angles of the exposure's middle bring it. Nobody needs to know that function well: among
-all shifts in time the true one lets the positions follow most closely from the angles. A smooth function tells roughly
-which shift that is, whatever the arm; the drawn chain with its tolerances fitted along tells it thirty times more
-exactly, as it has no freedom to move with the time.
+The marker is where the joint angles at the middle of the exposure bring it. Among all shifts in time the true one lets the
+positions follow most closely from the angles. A smooth function of the angles tells the shift roughly, for any arm. The
+nominal chain, fitted with its tolerances, tells it more precisely, as it is less free to follow a wrong shift.
 """
 
 from __future__ import annotations
@@ -39,7 +38,7 @@ LITTLE_M = 0.01
 SETTLING = 5  # steps to where the chain is loosely fitted; from there two are enough
 # How an arm differs from its URDF, where the pairs do not tell: it only has to hold what they do not show.
 LOOSE = ChainTolerances(axes=0.02, points=0.005, zeros=0.1, tool=0.1, base_rotation=0.5, base_translation=0.5)
-REFINED_S = 0.024  # on both sides of what the smooth function says: of 30 simulated arms it was off by up to 15 ms
+REFINED_S = 0.024  # on both sides of what the smooth function says
 
 
 class LatencyError(BodyschemaError):
