@@ -45,7 +45,7 @@ COMMANDS = {
     "ik": "Ask for joint angles that bring the marker to a position.",
     "command": "Pause, resume, tell of a changed tool, reset, checkpoint.",
     "record": "Copy the running sampler's pairs into a file.",
-    "export": "A store or a recording into CSV, Parquet, MCAP or Rerun.",
+    "export": "Pairs or a robot into CSV, Parquet, MCAP, Rerun, MJCF, URDF.",
     "backup": "Pairs, checkpoint and description in one file, while running.",
     "restore": "Put a backup back, verified; overwrites nothing unasked.",
 }

@@ -1,0 +1,7 @@
+"""The simulation in the formats of other programs, with a list of what each of them cannot hold."""
+
+from .mjcf import write_mjcf
+from .replay import replayed
+from .urdf import write_urdf
+
+__all__ = ["replayed", "write_mjcf", "write_urdf"]
