@@ -13,14 +13,19 @@ import numpy as np
 from diagnosis.alignment import aligned
 from diagnosis.observations import Observations
 from effects import Motion, Simulation
-from effects.exports import replayed, write_mjcf, write_urdf
+from effects.exports import replayed, write_correction, write_mjcf, write_urdf
+from effects.exports.correction import held_by_correction
 from effects.exports.replay import mujoco_version
 from interfaces.errors import ConfigError
 from interfaces.recording import Recording
 from interfaces.records import FloatArray
 
-MJCF, URDF = ".xml", ".urdf"
-_WRITERS: dict[str, Callable[[Simulation, Path, str], list[str]]] = {MJCF: write_mjcf, URDF: write_urdf}
+MJCF, URDF, CORRECTION = ".xml", ".urdf", ".json"
+_WRITERS: dict[str, Callable[[Simulation, Path, str], list[str]]] = {
+    MJCF: write_mjcf,
+    URDF: write_urdf,
+    CORRECTION: write_correction,
+}
 _WITHOUT_MUJOCO = "Not replayed: MuJoCo is not installed (pip install mujoco)"
 
 
@@ -92,6 +97,8 @@ def compared(simulation: Simulation, recording: Recording, out: Path) -> tuple[l
             why_not = _WITHOUT_MUJOCO
         else:
             predicted[f"{out.name} in MuJoCo {version_}"] = replayed(out, simulation.robot.joints, motion)
+    elif out.suffix.lower() == CORRECTION:
+        predicted[f"what {out.name} holds"] = held_by_correction(simulation).positions(motion)
     else:
         predicted[out.name] = _seen_by_urdf(out, simulation, motion.q)
     return _rows(predicted, recording.x), why_not

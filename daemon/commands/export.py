@@ -20,8 +20,8 @@ def export(
     out: Annotated[
         Path,
         Parameter(
-            help="The file; its ending says the format: .csv, .parquet, .mcap, .rrd for pairs, .xml (MJCF) or .urdf "
-            "for a robot."
+            help="The file; its ending says the format: .csv, .parquet, .mcap, .rrd for pairs, .xml (MJCF), .urdf "
+            "or .json (run-time correction) for a robot."
         ),
     ],
     /,
@@ -32,13 +32,13 @@ def export(
     ] = None,
     force: Annotated[bool, flag("Replace OUT when it is there.")] = False,
 ) -> None:
-    """Turn pairs into CSV, Parquet, MCAP or a Rerun file, and a robot with what was found into MJCF or URDF.
+    """Turn pairs into files of other programs, and a robot with what was found into MJCF, URDF or a correction.
 
     A store may be in use by a running sampler. MCAP opens in Foxglove: joints and positions under `/pair`, the marker
     under `/marker`, and as metadata what the joints were read with (servos, firmware, homing offsets).
 
     A robot is an extended.toml that `bodyschema diagnose` wrote, or a robot.toml. What the format cannot hold is
-    printed, and stands in the file.
+    printed, and stands in the file. examples/correction has programs that read the correction at run time.
 
     Needs: for a recording robot.toml, which names its joints; for Parquet and MCAP the extra `export`
     (`pip install 'bodyschema[export]'`), for .rrd the extra `rerun`. MuJoCo, if it is installed, replays the MJCF.

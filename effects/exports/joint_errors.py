@@ -23,6 +23,11 @@ _WHY_NOT = {
 _UNKNOWN = "this effect has no counterpart there"
 
 
+def why_not(effect: Effect) -> str:
+    """Return why an effect is in no model of the arm."""
+    return _WHY_NOT.get(effect.name, _UNKNOWN)
+
+
 @dataclass(frozen=True)
 class Wave:
     """A periodic error: amplitude · cos(frequency · reading - phase).
@@ -75,7 +80,7 @@ class JointErrors:
             case "joint_compliance":
                 self.compliance += float(effect.values[0])
             case _:
-                return _WHY_NOT.get(effect.name, _UNKNOWN)
+                return why_not(effect)
         return None
 
     def _take_wave(self, effect: Effect) -> None:
@@ -139,22 +144,28 @@ class ArmErrors:
             if effect.name == "joint_compliance" and not simulation.bears_weight:
                 why = 'with hold = "torque_free" the guiding hand bore the weight'
             elif effect.where is None:
-                why = _WHY_NOT.get(effect.name, _UNKNOWN)
+                why = why_not(effect)
             else:
                 why = joints[effect.where].take(effect)
             if why is not None:
                 left_out.append(LeftOut(effect, why))
-        return cls(stayed, joints, tuple(left_out), tuple(_notes(simulation)))
+        return cls(stayed, joints, tuple(left_out), tuple(moment_notes(simulation)))
 
     def told(self) -> list[str]:
         """Sentences on what is not in the file, or in another way."""
         told = sentences(self.left_out)
-        if self.simulation.residual is not None:
-            told.append("not in the file: [unexplained], a learnt map of the readings: it has no counterpart there")
-        return [*told, *self.notes]
+        return [*told, *residual_note(self.simulation), *self.notes]
 
 
-def _notes(simulation: Simulation) -> Iterator[str]:
+def residual_note(simulation: Simulation) -> list[str]:
+    """Return a sentence on what no effect explains, where there is such a thing."""
+    if simulation.residual is None:
+        return []
+    return ["not in the file: [unexplained]: a learnt map of the readings has no counterpart there"]
+
+
+def moment_notes(simulation: Simulation) -> Iterator[str]:
+    """Yield a sentence on each effect that began at a moment."""
     for effect in simulation.all_effects:
         if effect.kind.begins:
             at = "" if effect.where is None else f" at {effect.where}"

@@ -17,14 +17,13 @@ from typing import Any
 
 import numpy as np
 
-from effects.corrected import corrected_geometry
 from effects.gravity import GRAVITY_M_S2
 from effects.simulation import Simulation
-from interfaces.calibrated import CalibratedGeometry
 from interfaces.errors import RobotError
 from interfaces.records import FloatArray
 from interfaces.urdf import MOVING, UrdfJoint, standing
 
+from .geometry import geometry_without_zeros
 from .joint_errors import ArmErrors, JointErrors, Wave, numbers
 from .link_parts import LinkParts, placed, rod, texts
 
@@ -85,9 +84,7 @@ class _Document:
         self._robot, self._tree = robot, robot.tree
         self._errors = ArmErrors.of(self.simulation)
         self._parts = LinkParts.of(robot.tree.file, self.folder)
-        # Zeros go into `ref`.
-        geometry = corrected_geometry(_without_zeros(self._errors.simulation))
-        self._geometry = geometry or CalibratedGeometry({}, robot.camera.pose, np.array(robot.robot.marker_xyz))
+        self._geometry = geometry_without_zeros(self._errors.simulation)  # zeros go into `ref`
         self._root = etree.Element("mujoco", model=robot.name)
         self._settings()
         self._asset = self._add(self._root, "asset")
@@ -342,11 +339,3 @@ class _Document:
             name = f"{'_'.join(filter(None, effect.key))}_{count}"
             self._add(self._custom, "numeric", name=name, data=texts(effect.values))
             self._add(self._custom, "text", name=name, data=numbers(effect))
-
-
-def _without_zeros(simulation: Simulation) -> Simulation:
-    own, background = (
-        [effect for effect in effects if effect.name != "joint_offset"]
-        for effects in (simulation.effects, simulation.background)
-    )
-    return simulation.with_effects(own).with_background(background)

@@ -4,14 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
-
-from effects.corrected import corrected_geometry
 from effects.simulation import RIGID, Simulation
-from interfaces.calibrated import CalibratedGeometry
 from interfaces.calibrated_files import calibrated_urdf
 
-from .joint_errors import LeftOut, sentences
+from .geometry import geometry_of
+from .joint_errors import LeftOut, moment_notes, residual_note, sentences
 
 _WHY_NOT = "a URDF has zeros, links and fixed frames alone"
 
@@ -29,12 +26,8 @@ def write_urdf(simulation: Simulation, file: Path, heading: str) -> list[str]:
         OSError: it cannot be written.
     """
     robot, stayed = simulation.robot, simulation.after_moments
-    geometry = corrected_geometry(stayed)
-    if geometry is None:
-        geometry = CalibratedGeometry({}, robot.camera.pose, np.array(robot.robot.marker_xyz))
+    geometry = geometry_of(stayed)
     left_out = [LeftOut(effect, _WHY_NOT) for effect in stayed.all_effects if effect.name not in RIGID]
-    told = sentences(left_out)
-    if simulation.residual is not None:
-        told.append(f"not in the file: [unexplained]: {_WHY_NOT}")
+    told = [*sentences(left_out), *residual_note(simulation), *moment_notes(simulation)]
     file.write_bytes(calibrated_urdf(robot, geometry, file.parent, "\n".join([heading, *told])))
     return told
