@@ -20,11 +20,14 @@ from interfaces.errors import ConfigError
 from interfaces.recording import Recording
 from interfaces.records import FloatArray
 
-MJCF, URDF, CORRECTION = ".xml", ".urdf", ".json"
+from .driver_snippets import write_snippets
+
+MJCF, URDF, CORRECTION, DRIVERS = ".xml", ".urdf", ".json", ".txt"
 _WRITERS: dict[str, Callable[[Simulation, Path, str], list[str]]] = {
     MJCF: write_mjcf,
     URDF: write_urdf,
     CORRECTION: write_correction,
+    DRIVERS: write_snippets,
 }
 _WITHOUT_MUJOCO = "Not replayed: MuJoCo is not installed (pip install mujoco)"
 

@@ -20,8 +20,8 @@ def export(
     out: Annotated[
         Path,
         Parameter(
-            help="The file; its ending says the format: .csv, .parquet, .mcap, .rrd for pairs, .xml (MJCF), .urdf "
-            "or .json (run-time correction) for a robot."
+            help="The file; its ending says the format: .csv, .parquet, .mcap, .rrd for pairs, .xml (MJCF), .urdf, "
+            ".json (run-time correction) or .txt (settings of drivers) for a robot."
         ),
     ],
     /,
@@ -48,6 +48,7 @@ def export(
     from rich.console import Console
 
     from daemon import recordings
+    from interfaces.errors import RequestError
     from interfaces.recording import Recording
     from interfaces.robot import RobotDescription
 
@@ -56,8 +57,6 @@ def export(
         _export_robot(source, out, measured, console, force=force)
         return
     if measured is not None:
-        from interfaces.errors import RequestError
-
         raise RequestError("--measured goes with a robot: give an extended.toml in the place of SOURCE")
     recordings.check_target(out, force=force)
     if source.suffix.lower() in recordings.STORE_ENDINGS:
@@ -74,8 +73,11 @@ def _export_robot(source: Path, out: Path, measured: Path | None, console: Conso
     from daemon import recordings, robot_export
     from daemon.plausibility.limits import require_units
     from effects import load_simulation
+    from interfaces.errors import RequestError
 
     robot_export.check_target(out, force=force)
+    if measured is not None and out.suffix.lower() == robot_export.DRIVERS:
+        raise RequestError("--measured goes with a model: settings of drivers (.txt) predict nothing")
     simulation = load_simulation(source)
     recording = None
     if measured is not None:
