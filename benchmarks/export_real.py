@@ -10,11 +10,13 @@ as described, placed by the rows that were diagnosed. A gain is to lie in the in
 from __future__ import annotations
 
 import argparse
+import importlib
 import sys
 import tempfile
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from diagnosis.alignment import aligned
 from diagnosis.conclusion import conclusion
@@ -34,9 +36,7 @@ DRAWS = 2000
 def corrected(file: Path, q: FloatArray) -> FloatArray:
     """Positions (n, 3) [m] by the Python reader of correction.json."""
     sys.path.insert(0, str(READERS))
-    from correction import Correction  # pyright: ignore[reportMissingImports]
-
-    reader = Correction(file.read_text(encoding="utf-8"))
+    reader = importlib.import_module("correction").Correction(file.read_text(encoding="utf-8"))
     return np.array([reader.read(row)[1][3::4] for row in q.tolist()])
 
 
@@ -45,7 +45,7 @@ def rms_mm(distances: FloatArray) -> float:
     return float(1e3 * np.sqrt(np.square(distances).mean()))
 
 
-def gain(before: FloatArray, after: FloatArray, blocks: FloatArray) -> str:
+def gain(before: FloatArray, after: FloatArray, blocks: NDArray[np.int64]) -> str:
     """By how much the RMS falls [%], with the 95 % interval over resampled blocks of rows."""
     numbers, rng = np.unique(blocks), np.random.default_rng(0)
     sums = np.array([[np.square(d[blocks == b]).sum() for d in (before, after)] for b in numbers])
