@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import os
 import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from interfaces.errors import RobotError
 from interfaces.limited import read_at_most
 from interfaces.records import FloatArray
 from interfaces.rpy import rotation_of
@@ -57,11 +60,13 @@ class LinkParts:
             geoms = [parts._geom(visual, colours, urdf, folder) for visual in link.iterfind("visual")]
             parts.geoms[link.get("name")] = [geom for geom in geoms if geom is not None]
             if link.find("inertial/inertia") is not None:
-                parts.inertias[link.get("name")] = _inertia(link.find("inertial"))
+                with _blamed_on(link, urdf):
+                    parts.inertias[link.get("name")] = _inertia(link.find("inertial"))
         for joint in root.iterfind("joint[mimic]"):
             mimic = joint.find("mimic")
-            numbers = float(mimic.get("multiplier", "1")), float(mimic.get("offset", "0"))
-            parts.mimics[joint.get("name")] = (mimic.get("joint"), *numbers)
+            with _blamed_on(joint, urdf):
+                numbers = float(mimic.get("multiplier", "1")), float(mimic.get("offset", "0"))
+            parts.mimics[joint.get("name")] = (mimic.get("joint", ""), *numbers)
         return parts
 
     def _geom(self, visual: Any, colours: dict[str, str], urdf: Path, folder: Path) -> dict[str, str] | None:
@@ -122,6 +127,16 @@ def placed(T: FloatArray) -> dict[str, str]:
 def texts(values: FloatArray) -> str:
     """Numbers as an attribute, exactly."""
     return " ".join(map(repr, (np.atleast_1d(values) + 0.0).tolist()))  # no minus before a zero
+
+
+@contextmanager
+def _blamed_on(element: Any, urdf: Path) -> Iterator[None]:
+    """RobotError where an attribute in `element` is no number."""
+    try:
+        yield
+    except ValueError as error:
+        what = f"{element.tag} {element.get('name')!r}: {error}"
+        raise RobotError(what, file=urdf, line=element.sourceline, remedy="Give numbers") from None
 
 
 def _coloured(material: Any) -> bool:

@@ -152,9 +152,10 @@ class _Document:
     def _link(self, parent: Any, link: str, T: FloatArray, above: UrdfJoint | None) -> None:
         """Add a link at the pose T (4, 4) in `parent`, and all that hangs on it."""
         # MuJoCo keeps the name of the world for itself.
-        body = parent if link == _WORLD else self._add(parent, "body", name=link, **placed(T))
+        is_world = link == _WORLD and parent is self._world
+        body = parent if is_world else self._add(parent, "body", name=link, **placed(T))
         mass = self._tree.masses.get(link)
-        if mass is not None and mass.mass_kg > 0.0 and body is not parent:
+        if mass is not None and mass.mass_kg > 0.0 and not is_world:
             inertia = self._parts.inertias.get(link, np.zeros((3, 3)))
             full = inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
             self._add(body, "inertial", pos=texts(mass.centre), mass=repr(mass.mass_kg), fullinertia=texts(full))
@@ -212,9 +213,8 @@ class _Document:
         heavy = {"armature": f"{inertia:.4g}"} if errors.play else {}
         self._joint(body, joint.name, **kind, **limits, **zero, **heavy)
         gain = f"{_SERVO_RATE**2 * inertia:.4g}"
-        if joint.name in self._parts.mimics:
-            master, factor, offset = self._parts.mimics[joint.name]
-            self._tie(joint.name, master, factor, offset)
+        if (mimic := self._parts.mimics.get(joint.name)) and self._moves(self._tree.joint(mimic[0])):
+            self._tie(joint.name, *mimic)
         else:
             self._add(
                 self._actuator,

@@ -9,8 +9,9 @@ import pytest
 from effect_arms import arm, everywhere, sized, walk
 from public_arms import ARMS, public_arm, readings
 
-from effects import KINDS, Effect, Motion, Simulation
-from effects.exports import replayed, write_mjcf
+from effects import KINDS, Effect, Kind, Motion, Parameter, Simulation
+from effects.exports import replayed, write_correction, write_mjcf
+from interfaces.errors import RobotError
 from interfaces.records import FloatArray
 from interfaces.robot import RobotDescription
 
@@ -144,3 +145,26 @@ def test_meshes_are_kept_and_missing_ones_are_listed(tmp_path: Path) -> None:
     assert "meshes" in told[0]
     model = mujoco.MjModel.from_xml_path(str(file))
     assert (model.nmesh, model.ngeom > 5) == (0, True)
+
+
+@pytest.mark.parametrize(("write", "name"), [(write_mjcf, "model.xml"), (write_correction, "correction.json")])
+def test_effects_that_are_not_known_are_listed(write, name: str, tmp_path: Path) -> None:
+    size = (Parameter("size_rad", 0.1),)
+    robot = arm(tmp_path)
+    new = Effect(Kind("new_effect", "encoder", True, size, size), "elbow", None, np.array([0.1]))
+    [told] = write(Simulation(robot, (new,)), tmp_path / name, "made by a test")
+    assert told.startswith("not in the file: new_effect at elbow")
+
+
+def test_springs_that_the_hand_relieved_are_left_out(tmp_path: Path) -> None:
+    robot, file = arm(tmp_path, hold="torque_free"), tmp_path / "model.xml"
+    [told] = write_mjcf(Simulation(robot, (effect(robot, "joint_compliance"),)), file, "made by a test")
+    assert "guiding hand" in told
+    assert not mujoco.MjModel.from_xml_path(str(file)).jnt_stiffness.any()
+
+
+def test_a_wrong_number_in_the_urdf_has_its_line(tmp_path: Path) -> None:
+    robot = arm(tmp_path)
+    robot.tree.file.write_text(robot.tree.file.read_text().replace('ixx="0.01"', 'ixx="much"', 1))
+    with pytest.raises(RobotError, match=r"everything\.urdf, line 1: link .base.*much"):
+        write_mjcf(Simulation(robot), tmp_path / "model.xml", "made by a test")
