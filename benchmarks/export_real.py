@@ -1,6 +1,6 @@
 """Exported models on measured data that they were not diagnosed from: does MuJoCo gain what `diagnose` promised?
 
-    python -m benchmarks.export_real --data ../shared/data
+    python -m benchmarks.export_real --data $DATA
 
 Of each recording three tenths are held out, in blocks. The rest is diagnosed, and exported as MJCF and correction.json.
 MuJoCo and examples/correction/correction.py then predict the held-out rows from their readings. *Before* is the robot

@@ -10,6 +10,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -92,6 +93,8 @@ class _Document:
         self._tendon, self._equality, self._actuator, self._custom = (
             self._add(self._root, tag) for tag in ("tendon", "equality", "actuator", "custom")
         )
+        sky = {"builtin": "gradient", "rgb1": "0.9 0.92 0.95", "rgb2": "0.6 0.65 0.7", "width": "64", "height": "384"}
+        self._add(self._asset, "texture", type="skybox", **sky)
         for mesh in self._parts.meshes:
             self._add(self._asset, "mesh", **mesh)
         self._add(self._world, "light", pos="0 0 3", dir="0 0 -1", directional="true")
@@ -108,7 +111,7 @@ class _Document:
             some = ", ".join(self._parts.unreadable[:3]) + (", ..." if len(self._parts.unreadable) > 3 else "")
             told.append(f"not in the file: {len(self._parts.unreadable)} meshes ({some}): missing, or not STL or OBJ")
         if not self.simulation.gravity.known:
-            told.append("the URDF states no masses: the file's masses are placeholders, its motion under forces is not")
+            told.append("the URDF states no masses: those of the file are placeholders, so its dynamics mean nothing")
         return told
 
     def written(self, told: list[str]) -> bytes:
@@ -120,9 +123,9 @@ class _Document:
             f"{MARKER} in the frame of the site {MEASUREMENT}.",
             "At rest the arm stands as found. Armature, damping, gains and friction were chosen, not measured.",
         ]
-        text = "\n".join(line.replace("--", "- -") for line in lines)
-        self._root.insert(0, etree.Comment(f"\n{text}\n"))
-        for group in (self._asset, self._tendon, self._equality, self._actuator, self._custom):
+        text = "\n".join(lines)
+        self._root.insert(0, etree.Comment(re.sub("-(?=-)", "- ", f"\n{text}\n")))  # no comment may have two in a row
+        for group in (self._tendon, self._equality, self._actuator, self._custom):
             if not len(group):
                 self._root.remove(group)
         etree.indent(self._root, space="  ")
