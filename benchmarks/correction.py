@@ -16,9 +16,9 @@ from pathlib import Path
 
 import numpy as np
 
-from effects import Effect, Simulation
-from effects.exports import write_correction
-from interfaces.robot import RobotDescription
+from bodyschema.effects import Effect, Simulation
+from bodyschema.effects.exports import write_correction
+from bodyschema.interfaces.robot import RobotDescription
 
 READERS = Path(__file__).resolve().parents[1] / "examples" / "correction"
 JOINTS = tuple(f"q{k}" for k in range(1, 7))

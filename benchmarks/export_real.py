@@ -18,14 +18,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from diagnosis.alignment import aligned
-from diagnosis.conclusion import conclusion
-from diagnosis.diagnosis import diagnose
-from diagnosis.observations import Observations
-from effects import Motion, load_simulation
-from effects.exports import replayed, write_correction, write_mjcf
-from interfaces.recording import Recording
-from interfaces.records import FloatArray
+from bodyschema.diagnosis.alignment import aligned
+from bodyschema.diagnosis.conclusion import conclusion
+from bodyschema.diagnosis.diagnosis import diagnose
+from bodyschema.diagnosis.observations import Observations
+from bodyschema.effects import Motion, load_simulation
+from bodyschema.effects.exports import replayed, write_correction, write_mjcf
+from bodyschema.interfaces.recording import Recording
+from bodyschema.interfaces.records import FloatArray
 
 READERS = Path(__file__).resolve().parents[1] / "examples" / "correction"
 ROBOTS = ("ur5_laser", "wam_laser")

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from effects import Simulation
-from effects.exports.geometry import geometry_of
-from effects.exports.joint_errors import ArmErrors, JointErrors
-from interfaces.rpy import rpy_of
+from bodyschema.effects import Simulation
+from bodyschema.effects.exports.geometry import geometry_of
+from bodyschema.effects.exports.joint_errors import ArmErrors, JointErrors
+from bodyschema.interfaces.rpy import rpy_of
 
 from .config import Config
 

@@ -10,15 +10,15 @@ from pathlib import Path
 
 import numpy as np
 
-from diagnosis.alignment import aligned
-from diagnosis.observations import Observations
-from effects import Motion, Simulation
-from effects.exports import replayed, write_correction, write_mjcf, write_urdf
-from effects.exports.correction import held_by_correction
-from effects.exports.replay import mujoco_version
-from interfaces.errors import ConfigError
-from interfaces.recording import Recording
-from interfaces.records import FloatArray
+from bodyschema.diagnosis.alignment import aligned
+from bodyschema.diagnosis.observations import Observations
+from bodyschema.effects import Motion, Simulation
+from bodyschema.effects.exports import replayed, write_correction, write_mjcf, write_urdf
+from bodyschema.effects.exports.correction import held_by_correction
+from bodyschema.effects.exports.replay import mujoco_version
+from bodyschema.interfaces.errors import ConfigError
+from bodyschema.interfaces.recording import Recording
+from bodyschema.interfaces.records import FloatArray
 
 from .driver_snippets import write_snippets
 
@@ -118,8 +118,8 @@ def _rows(predicted: dict[str, FloatArray], x: FloatArray) -> list[Row]:
 
 
 def _seen_by_urdf(file: Path, simulation: Simulation, q: FloatArray) -> FloatArray:
-    from interfaces.calibrated_files import CAMERA_LINK, MARKER_LINK
-    from interfaces.urdf import UrdfTree, chain_between
+    from bodyschema.interfaces.calibrated_files import CAMERA_LINK, MARKER_LINK
+    from bodyschema.interfaces.urdf import UrdfTree, chain_between
 
     robot, none = simulation.robot, np.zeros(3)
     chain = chain_between(

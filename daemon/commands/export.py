@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from daemon.commands.options import HERE, RobotFile, flag
+from bodyschema.daemon.commands.options import HERE, RobotFile, flag
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -47,10 +47,10 @@ def export(
     """
     from rich.console import Console
 
-    from daemon import recordings
-    from interfaces.errors import RequestError
-    from interfaces.recording import Recording
-    from interfaces.robot import RobotDescription
+    from bodyschema.daemon import recordings
+    from bodyschema.interfaces.errors import RequestError
+    from bodyschema.interfaces.recording import Recording
+    from bodyschema.interfaces.robot import RobotDescription
 
     console = Console(highlight=False, soft_wrap=True)
     if source.suffix.lower() == ".toml":
@@ -70,10 +70,10 @@ def export(
 def _export_robot(source: Path, out: Path, measured: Path | None, console: Console, *, force: bool) -> None:
     from rich.table import Table
 
-    from daemon import recordings, robot_export
-    from daemon.plausibility.limits import require_units
-    from effects import load_simulation
-    from interfaces.errors import RequestError
+    from bodyschema.daemon import recordings, robot_export
+    from bodyschema.daemon.plausibility.limits import require_units
+    from bodyschema.effects import load_simulation
+    from bodyschema.interfaces.errors import RequestError
 
     robot_export.check_target(out, force=force)
     if measured is not None and out.suffix.lower() == robot_export.DRIVERS:

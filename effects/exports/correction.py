@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from effects.effect import Effect
-from effects.gravity import GRAVITY_M_S2, carried
-from effects.simulation import RIGID, Simulation
-from interfaces.records import FloatArray
-from interfaces.urdf import inverse
+from bodyschema.effects.effect import Effect
+from bodyschema.effects.gravity import GRAVITY_M_S2, carried
+from bodyschema.effects.simulation import RIGID, Simulation
+from bodyschema.interfaces.records import FloatArray
+from bodyschema.interfaces.urdf import inverse
 
 from .geometry import geometry_without_zeros
 from .joint_errors import LeftOut, moment_notes, residual_note, sentences, why_not

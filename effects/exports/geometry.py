@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from effects.corrected import corrected_geometry
-from effects.simulation import Simulation
-from interfaces.calibrated import CalibratedGeometry
+from bodyschema.effects.corrected import corrected_geometry
+from bodyschema.effects.simulation import Simulation
+from bodyschema.interfaces.calibrated import CalibratedGeometry
 
 
 def geometry_of(simulation: Simulation) -> CalibratedGeometry:

@@ -8,8 +8,8 @@ from typing import Self
 
 import numpy as np
 
-from effects.effect import Effect
-from effects.simulation import RIGID, Simulation
+from bodyschema.effects.effect import Effect
+from bodyschema.effects.simulation import RIGID, Simulation
 
 _OF_THE_MEASUREMENT = "an error of the measurement, not of the arm"
 _WHY_NOT = {

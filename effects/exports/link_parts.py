@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from interfaces.errors import RobotError
-from interfaces.limited import read_at_most
-from interfaces.records import FloatArray
-from interfaces.rpy import rotation_of
+from bodyschema.interfaces.errors import RobotError
+from bodyschema.interfaces.limited import read_at_most
+from bodyschema.interfaces.records import FloatArray
+from bodyschema.interfaces.rpy import rotation_of
 from kbmaps.rotations import quaternions
 
 # What MuJoCo reads, and the most triangles of an STL file for it.

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from effects.motion import Motion
-from interfaces.errors import ConfigError
-from interfaces.records import FloatArray
+from bodyschema.effects.motion import Motion
+from bodyschema.interfaces.errors import ConfigError
+from bodyschema.interfaces.records import FloatArray
 
 from .mjcf import MARKER, MEASUREMENT
 

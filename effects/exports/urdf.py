@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from effects.simulation import RIGID, Simulation
-from interfaces.calibrated_files import calibrated_urdf
+from bodyschema.effects.simulation import RIGID, Simulation
+from bodyschema.interfaces.calibrated_files import calibrated_urdf
 
 from .geometry import geometry_of
 from .joint_errors import LeftOut, moment_notes, residual_note, sentences

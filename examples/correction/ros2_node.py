@@ -16,10 +16,10 @@ import time
 import zenoh
 from correction import Correction
 
-from drivers.ros2 import rmw
-from drivers.ros2.cdr import Malformed
-from drivers.ros2.link import open_session
-from drivers.ros2.messages import JOINT_STATE, JointState, decode_joint_state, encode_joint_state
+from bodyschema.drivers.ros2 import rmw
+from bodyschema.drivers.ros2.cdr import Malformed
+from bodyschema.drivers.ros2.link import open_session
+from bodyschema.drivers.ros2.messages import JOINT_STATE, JointState, decode_joint_state, encode_joint_state
 
 NODE = "bodyschema_correction"
 

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from daemon.driver_snippets import write_snippets
-from effects import Effect, Simulation
-from interfaces.robot import RobotDescription
-from interfaces.rpy import rotation_of
+from bodyschema.daemon.driver_snippets import write_snippets
+from bodyschema.effects import Effect, Simulation
+from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.interfaces.rpy import rotation_of
 
 DESK_ARM = Path(__file__).parents[2] / "examples" / "desk_arm"
 UR_JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from small_arm import write_small_arm
 
-from daemon.cli import app
-from daemon.synthesis import simulated
-from effects import Effect, Simulation, load_simulation, write_extended
-from interfaces.errors import ConfigError, RequestError
-from interfaces.recording import Recording
-from interfaces.robot import RobotDescription
+from bodyschema.daemon.cli import app
+from bodyschema.daemon.synthesis import simulated
+from bodyschema.effects import Effect, Simulation, load_simulation, write_extended
+from bodyschema.interfaces.errors import ConfigError, RequestError
+from bodyschema.interfaces.recording import Recording
+from bodyschema.interfaces.robot import RobotDescription
 
 
 @pytest.fixture

@@ -11,14 +11,14 @@ import pytest
 import zenoh
 from ros2_robot import PATHS
 
-from drivers.ros2 import rmw
-from drivers.ros2.bench.node import Node
-from drivers.ros2.bench.zenoh_robot import ZenohRobot
-from drivers.ros2.link import open_session
-from drivers.ros2.messages import JOINT_STATE, decode_joint_state
-from effects import Effect, Simulation
-from effects.exports import write_correction
-from interfaces.robot import RobotDescription
+from bodyschema.drivers.ros2 import rmw
+from bodyschema.drivers.ros2.bench.node import Node
+from bodyschema.drivers.ros2.bench.zenoh_robot import ZenohRobot
+from bodyschema.drivers.ros2.link import open_session
+from bodyschema.drivers.ros2.messages import JOINT_STATE, decode_joint_state
+from bodyschema.effects import Effect, Simulation
+from bodyschema.effects.exports import write_correction
+from bodyschema.interfaces.robot import RobotDescription
 
 READERS = Path(__file__).parents[2] / "examples" / "correction"
 NAMES = tuple(PATHS)

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from effects import Motion
-from interfaces.robot import RobotDescription
+from bodyschema.effects import Motion
+from bodyschema.interfaces.robot import RobotDescription
 
 # folder and file in pybullet_data, joints, marker link, camera's parent
 ARMS = {

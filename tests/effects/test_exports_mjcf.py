@@ -9,11 +9,11 @@ import pytest
 from effect_arms import arm, everywhere, sized, walk
 from public_arms import ARMS, public_arm, readings
 
-from effects import KINDS, Effect, Kind, Motion, Parameter, Simulation
-from effects.exports import replayed, write_correction, write_mjcf
-from interfaces.errors import RobotError
-from interfaces.records import FloatArray
-from interfaces.robot import RobotDescription
+from bodyschema.effects import KINDS, Effect, Kind, Motion, Parameter, Simulation
+from bodyschema.effects.exports import replayed, write_correction, write_mjcf
+from bodyschema.interfaces.errors import RobotError
+from bodyschema.interfaces.records import FloatArray
+from bodyschema.interfaces.robot import RobotDescription
 
 mujoco = pytest.importorskip("mujoco")
 

@@ -42,7 +42,9 @@ def test_the_tutorial_ends_with_its_numbers(tmp_path: Path, monkeypatch, capfd) 
             monkeypatch.setattr(sys, "argv", words)
             exec(poses, {})
             continue
-        run = warm.run("-m", "daemon", *words, cwd=folder, env={"OPENBLAS_NUM_THREADS": "1", "PATH": "/usr/bin:/bin"})
+        run = warm.run(
+            "-m", "bodyschema", *words, cwd=folder, env={"OPENBLAS_NUM_THREADS": "1", "PATH": "/usr/bin:/bin"}
+        )
         assert run.returncode == 0, run.stderr
         told = run.stdout
     for name, numbers in figures(SHOWN).items():
