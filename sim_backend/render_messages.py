@@ -9,7 +9,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from interfaces.records import ImageArray
+from bodyschema.interfaces.records import ImageArray
 
 from .config import CameraConfig
 from .physics_urdf import PhysicsUrdf

@@ -14,21 +14,21 @@ from rich.console import Console
 
 pytest.importorskip("matplotlib")
 
-from daemon.cli import app
-from daemon.reproduce import EXPERIMENTS, Column, Comparison, Curve, Experiment, Panel, Reading, Run
-from daemon.reproduce.arm import JOINTS, OTHER_SIX, arm, longer_tool
-from daemon.reproduce.exactness import exactness
-from daemon.reproduce.experiment import MEAN_NOISE
-from daemon.reproduce.fig4 import fig4
-from daemon.reproduce.fig5 import fig5
-from daemon.reproduce.fig6 import fig6
-from daemon.reproduce.fig7 import fig7
-from daemon.reproduce.measured import Measured, guided_walk, postures
-from daemon.reproduce.models import WITH_DRAWING, Contender, Knowledge, learn_all
-from daemon.reproduce.show import show
-from daemon.reproduce.stream import in_stages
-from daemon.reproduce.walk import walk
-from interfaces.errors import ConfigError
+from bodyschema.daemon.cli import app
+from bodyschema.daemon.reproduce import EXPERIMENTS, Column, Comparison, Curve, Experiment, Panel, Reading, Run
+from bodyschema.daemon.reproduce.arm import JOINTS, OTHER_SIX, arm, longer_tool
+from bodyschema.daemon.reproduce.exactness import exactness
+from bodyschema.daemon.reproduce.experiment import MEAN_NOISE
+from bodyschema.daemon.reproduce.fig4 import fig4
+from bodyschema.daemon.reproduce.fig5 import fig5
+from bodyschema.daemon.reproduce.fig6 import fig6
+from bodyschema.daemon.reproduce.fig7 import fig7
+from bodyschema.daemon.reproduce.measured import Measured, guided_walk, postures
+from bodyschema.daemon.reproduce.models import WITH_DRAWING, Contender, Knowledge, learn_all
+from bodyschema.daemon.reproduce.show import show
+from bodyschema.daemon.reproduce.stream import in_stages
+from bodyschema.daemon.reproduce.walk import walk
+from bodyschema.interfaces.errors import ConfigError
 from kbmaps import ChainTolerances, NonFiniteError
 
 PAGE = Path(__file__).parents[2] / "docs" / "reproduced.md"

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from effect_arms import arm, everywhere, sized, walk
 
-from effects import KINDS, Motion, Simulation
-from sim_backend import ErrorConfig, SimConfig
-from sim_backend.posed import PERIOD_S, PosedWorld
-from sim_backend.truth import GEOMETRY
+from bodyschema.effects import KINDS, Motion, Simulation
+from bodyschema.sim_backend import ErrorConfig, SimConfig
+from bodyschema.sim_backend.posed import PERIOD_S, PosedWorld
+from bodyschema.sim_backend.truth import GEOMETRY
 
 CLOSE_M = 1e-6
 NO_ERRORS = ErrorConfig(
