@@ -1,8 +1,8 @@
 """How long before its time stamp an image was taken, from encoders and marker while the arm was moved.
 
-The marker is where the joint angles at the middle of the exposure bring it. Among all shifts in time the true one lets the
-positions follow most closely from the angles. A smooth function of the angles tells the shift roughly, for any arm. The
-nominal chain, fitted with its tolerances, tells it more precisely, as it is less free to follow a wrong shift.
+The marker is where the joint angles at the middle of the exposure bring it. Among all shifts in time the true one lets
+the positions follow most closely from the angles. A smooth function of the angles tells the shift roughly, for any arm.
+The nominal chain, fitted with its tolerances, tells it more precisely, as it is less free to follow a wrong shift.
 """
 
 from __future__ import annotations
