@@ -499,7 +499,7 @@ def flip_each(bits: Iterable[int], archive: Path, robot: Path) -> Counter[str]:
 @pytest.fixture
 def at_rest(monkeypatch) -> None:
     """No process is asked for: there is none."""
-    monkeypatch.setattr("daemon.restoring.is_alive", lambda *_: False)
+    monkeypatch.setattr("bodyschema.daemon.restoring.is_alive", lambda *_: False)
 
 
 @pytest.mark.usefixtures("at_rest")

@@ -1,4 +1,4 @@
-"""What the world shows is what `effects.Simulation` says that it shows, effect by effect."""
+"""What the world shows is what `bodyschema.effects.Simulation` says that it shows, effect by effect."""
 
 from __future__ import annotations
 
@@ -167,7 +167,7 @@ class NoRenderer:
 
 @pytest.mark.parametrize("case", [case for case in EFFECTS if case[0] != "camera_latency"], ids=named)
 def test_the_posed_world_shows_what_the_simulation_says(case, monkeypatch) -> None:
-    monkeypatch.setattr("sim_backend.posed.RenderProcess", NoRenderer)
+    monkeypatch.setattr("bodyschema.sim_backend.posed.RenderProcess", NoRenderer)
     simulation = extended(case)
     robot = simulation.robot
     rng = np.random.default_rng(3)

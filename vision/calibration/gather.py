@@ -23,7 +23,7 @@ _NUMBERS = re.compile(r"\d+(\.\d+)?")
 
 
 class Detector(Protocol):
-    """Finds one board; see `vision.board.BoardDetector`."""
+    """Finds one board; see `bodyschema.vision.board.BoardDetector`."""
 
     def find(self, image: ImageArray) -> Corners | NotFound: ...
 
