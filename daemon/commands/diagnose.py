@@ -59,7 +59,8 @@ def diagnose(
 
     Needs: a recording or a store and its robot.toml, no hardware; with --live a running sampler.
 
-    Next: open OUT/report.html; OUT/extended.toml takes the place of robot.toml in any command.
+    Next: open OUT/report.html; OUT/extended.toml takes the place of robot.toml in any command, and
+    `bodyschema export` turns it into models for MuJoCo, controllers and drivers.
     """
     import sys
 
