@@ -34,9 +34,11 @@ class Pairs:
     q: np.ndarray
     x: np.ndarray
     pose_known: bool = False
+    marker_known: bool = False
 
     def seen(self, rows: int | None = None) -> Plausibility:
-        return plausibility(robot(pose_known=self.pose_known), self.q[:rows], self.x[:rows])
+        known = robot(pose_known=self.pose_known, marker_known=self.marker_known)
+        return plausibility(known, self.q[:rows], self.x[:rows])
 
     def read(self, reading: Reading) -> Pairs:
         """As `reading` would have to be undone: applied to this recording's columns."""
@@ -53,10 +55,17 @@ def arm() -> RigidChain:
     return RigidChain(fixed, axes, np.zeros(6, dtype=bool))
 
 
-def robot(*, pose_known: bool = False) -> SimpleNamespace:
+def robot(*, pose_known: bool = False, marker_known: bool = False) -> SimpleNamespace:
     limits, tree = np.full(6, 3.0), SimpleNamespace(joint=lambda _: SimpleNamespace(kind="revolute"))
-    camera = SimpleNamespace(pose_known=pose_known)
-    return SimpleNamespace(chain=arm(), joints=JOINTS, lower=-limits, upper=limits, camera=camera, tree=tree)
+    return SimpleNamespace(
+        chain=arm(),
+        joints=JOINTS,
+        lower=-limits,
+        upper=limits,
+        camera=SimpleNamespace(pose_known=pose_known),
+        robot=SimpleNamespace(marker_known=marker_known),
+        tree=tree,
+    )
 
 
 def pairs(
@@ -195,6 +204,30 @@ def test_exchanged_positions_are_named_where_the_pose_is_known() -> None:
     q = pairs().q
     found = Pairs(q, arm().positions(q)[:, [1, 0, 2]], pose_known=True).seen()
     assert "the columns x, y, z hold y, x, z" in (found.refusal or "")
+
+
+LAST = PLAIN.turned((0, 0, 0, 0, 0, 1))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_zero_of_the_last_joint_is_named_where_the_marker_is_known(seed) -> None:
+    right = replace(pairs(seed, tool=0.003), marker_known=True)
+    assert right.seen().sentences == ()
+    found = right.read(LAST).seen()
+    assert "the zero of q6 is about 90° off" in (found.refusal or "")
+    assert found.remedy.startswith("Add -90° to the readings of q6")
+    assert "marker_known = false" in found.remedy
+
+
+def test_a_zero_of_the_last_joint_is_named_beside_another_fault() -> None:
+    right = replace(pairs(tool=0.003), marker_known=True)
+    found = right.read(replace(LAST, signs=(1, 1, -1, 1, 1, 1))).seen()
+    assert "q3 counts the other way and the zero of q6 is about 90° off" in (found.refusal or "")
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_marker_elsewhere_is_no_zero_of_the_last_joint(seed) -> None:
+    assert replace(pairs(seed, tool=0.05), marker_known=True).seen().sentences == ()
 
 
 def test_what_no_simple_reading_explains_gets_no_name() -> None:
