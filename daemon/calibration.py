@@ -21,6 +21,7 @@ from kbmaps import (
     RigidChain,
     RigidLearner,
     align,
+    unexplained_variance,
 )
 
 from .chain_figures import ChainFigures, is_told
@@ -31,6 +32,8 @@ IntArray = NDArray[np.intp]
 # How many pairs are asked. No arm is quite rigid, and thousands of pairs would take its sag for bad workmanship.
 JUDGED_PAIRS = 300
 SLIDE_ZEROS_M = 0.02
+# No measured coordinate is surer.
+ROUNDING_M = 1e-9
 # A number is shown when it is left so much less uncertain than it was.
 MUCH_SURER = 1.0 / 3.0
 # Of what is said to be known, and of what is not, once it has been fitted: then far more than the fit can be off.
@@ -134,19 +137,32 @@ def _learners(
     nominal: RigidChain, choices: list[ChainTolerances], recording: Recording, sigma_m: float | None
 ) -> tuple[tuple[RigidLearner, ...], FloatArray]:
     """Learners of all pairs whose tolerances make some of the pairs probable, and their shares."""
-    sigma = sigma_m if recording.cov is None else np.sqrt(np.trace(recording.cov, axis1=1, axis2=2) / 3.0)
+    told = None if recording.cov is None else recording.cov + ROUNDING_M**2 * np.eye(3)
     some = np.unique(np.linspace(0, len(recording) - 1, JUDGED_PAIRS).astype(np.intp))
 
     def learner(tolerances: ChainTolerances, rows: IntArray) -> RigidLearner:
         fresh = RigidLearner(nominal, tolerances)
-        told = None if sigma is None else np.broadcast_to(sigma, len(recording))[rows]
-        fresh.learn(recording.q[rows], recording.x[rows], told)
+        if told is None:
+            fresh.learn(recording.q[rows], recording.x[rows], sigma_m)
+        else:
+            fresh.learn(recording.q[rows], recording.x[rows], cov=told[rows])
         return fresh
 
+    if told is not None:
+        told = told + _of_the_arm(learner(choices[-1], some), recording, some) * np.eye(3)
     evidence = np.array([learner(tolerances, some).log_evidence for tolerances in choices])
     kept, shares = probable(evidence)
     everything = np.arange(len(recording))
     return tuple(learner(choices[k], everything) for k in kept), shares
+
+
+def _of_the_arm(learner: RigidLearner, recording: Recording, rows: IntArray) -> float:
+    """Variance [m²] of a coordinate in these rows that the instrument, which tells its own, has not: encoders, play."""
+    assert recording.cov is not None
+    good = rows[learner.inliers]
+    residuals = recording.x[good] - learner.predict(recording.q[good])
+    freedom = max(learner.scatter.freedom, 1.0)
+    return unexplained_variance(residuals, recording.cov[good] + ROUNDING_M**2 * np.eye(3), freedom)
 
 
 def _tolerances(robot: RobotDescription, zeros_rad: float) -> list[ChainTolerances]:

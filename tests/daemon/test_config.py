@@ -147,7 +147,10 @@ def test_one_camera_alone_has_a_calibration_without_a_baseline(tmp_path) -> None
     [
         (ONE_EYE, r"vision\.radius_m is missing: one camera alone tells the depth from the marker's size"),
         (f'{ONE_EYE}[vision]\nmarker = "tag"\n', r"vision\.tag\.side_m is missing.*black square"),
-        (f'{ONE_EYE}[vision]\nmarker = "cluster"\n[[vision.cluster.tags]]\nid = 1\n', r"vision\.tag\.side_m is missing"),
+        (
+            f'{ONE_EYE}[vision]\nmarker = "cluster"\n[[vision.cluster.tags]]\nid = 1\n',
+            r"vision\.tag\.side_m is missing",
+        ),
         (f"{ONE_EYE}baseline_m = 0.1\n", r"one eye alone has no baseline_m"),
         (ONE_EYE.replace("eyes = 1\n", ""), r"baseline_m missing.*eyes = 1"),
         (
