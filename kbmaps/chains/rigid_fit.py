@@ -68,7 +68,7 @@ class RigidFit:
 
 @dataclass(frozen=True, eq=False)
 class _Point:
-    """Residuals (n, 3) and Jacobian (n, 3, f), as sure in all directions, and norms in units (n,) at one change (size,).
+    """Residuals (n, 3) and Jacobian (n, 3, f), as sure in all directions, and norms in units (n,) at a change (size,).
 
     The f free parameters are counted from the prior's mean in columns of its root; `offset` (f,) is where they are.
     """
