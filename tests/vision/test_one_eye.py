@@ -7,15 +7,23 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from ball_renderer import SMALL, Look
+from board_renderer import TrueRig, webcams
 from numpy.typing import ArrayLike
 from scenes import Ball, reason, sigmas_off, stage
 from scipy.spatial.transform import Rotation
+from shown_board import BOARD, SIZE, corner_views
 from tag_renderer import Sheet, photograph
 
 from interfaces.camera import StereoCalibration
 from interfaces.errors import SourceError
 from interfaces.records import FloatArray, MarkerFix, MarkerMiss, Reason, StereoFrame
+from vision.calibration.calibrate import Asked, Calibrated, calibrate
+from vision.calibration.guidance import Coverage
+from vision.calibration.view import ONE_EYE
 from vision.config import VisionConfig
+from vision.rectified import Rectification
+from vision.rig import OneEyeRig, OtherCameras
+from vision.rig_file import read_rig, write_rig
 from vision.tag_body import TagBody
 from vision.tag_config import ClusterConfig, PlacedTag, TagConfig
 from vision.tag_tracker import TagTracker
@@ -132,3 +140,51 @@ def test_two_balls_are_ambiguous() -> None:
 
 def test_no_ball_is_none() -> None:
     assert reason(tracker_of(ONE, BALL).track(replace(stage(), right=None))) is Reason.NO_MARKER
+
+
+@pytest.fixture(scope="module")
+def calibrated() -> tuple[TrueRig, Calibrated]:
+    """One camera of a pair drawn at random, and its calibration of 20 views."""
+    rng = np.random.default_rng(31)
+    rig = webcams(rng)
+    views = [replace(view, right=None) for view in corner_views(rig, rng)]
+    return rig, calibrate(views, BOARD, Asked(SIZE, ("A1",), "2026-01-01T00:00:00Z", model="pinhole"))
+
+
+def test_one_camera_is_calibrated_within_its_intervals(calibrated) -> None:
+    rig, found = calibrated
+    truth = [*rig.left.focal_px, *rig.left.principal_point_px, *rig.left.distortion]
+    assert np.abs((found.rig.vector - truth) / found.rig.sigma).max() < 4.0
+    assert found.rig.sigma[0] < 1.0
+
+
+def test_its_file_says_the_same(calibrated, tmp_path) -> None:
+    _, found = calibrated
+    write_rig(found.rig, tmp_path / "cameras.toml")
+    read = read_rig(tmp_path / "cameras.toml")
+    assert isinstance(read, OneEyeRig)
+    assert read.serials == ("A1",)
+    assert np.allclose(read.vector, found.rig.vector)
+    assert np.allclose(read.covariance, found.rig.covariance, rtol=1e-4, atol=1e-12)
+
+
+def test_rectified_it_is_the_same_camera_without_distortion(calibrated) -> None:
+    rig, found = calibrated
+    rectification = Rectification(found.rig)
+    x = np.array([[0.05, -0.1, 0.8], [-0.1, 0.02, 0.7]])
+    assert not rectification.calibration.is_stereo
+    assert np.abs(rectification.points(rig.left.image(x), 0) - rectification.calibration.project(x)[:, :2]).max() < 1.5
+
+
+def test_another_camera_than_the_calibrated_one_is_refused(calibrated) -> None:
+    rig = calibrated[1].rig
+    rig.require(SIZE, ("A1",))
+    for size, serials, said in ((SIZE, ("B2",), "the camera is B2"), (SIZE, ("A1", "B2"), "two look")):
+        with pytest.raises(OtherCameras, match=said):
+            rig.require(size, serials)
+
+
+def test_what_is_missing_of_its_views_is_said_of_one_image() -> None:
+    missing = Coverage.of([], BOARD, SIZE, ONE_EYE).missing()
+    assert "bring the board to the upper left of the image" in missing
+    assert "tilt the board's right edge away from the camera, by 30°" in missing
