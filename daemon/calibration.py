@@ -21,6 +21,7 @@ from kbmaps import (
     RigidChain,
     RigidLearner,
     align,
+    rotation_matrices,
     unexplained_variance,
 )
 
@@ -85,7 +86,9 @@ class Calibration:
             )
         known = {"pose_known": robot.camera.pose_known, "marker_known": robot.robot.marker_known}
         try:
-            placed = align(robot.chain, recording.q, recording.x, **known)
+            turned = recording.orientation
+            turns = None if turned is None else rotation_matrices("orientation", turned)
+            placed = align(robot.chain, recording.q, recording.x, turns=turns, **known)
             learners, shares = _learners(placed.chain, _tolerances(robot, zeros_rad), recording, sigma_m)
             learners[0].report()  # fits it, so that what cannot be fitted shows here
         except KBMapsError as error:
