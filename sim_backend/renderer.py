@@ -42,7 +42,8 @@ class Stick:
             bullet.removeBody(self._id, physicsClientId=client)
             self._id = -1
         length = float(np.linalg.norm(tip))
-        if length < _SHORTEST_STICK_M:
+        # What stands in the world, before a camera that the arm carries, is on no stick.
+        if length < _SHORTEST_STICK_M or self._body.stands(self._link):
             return
         shape = bullet.createVisualShape(
             bullet.GEOM_CYLINDER,
